@@ -16,13 +16,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import numpy as np
-from _page import size, table, write
-from _push import Push
+from _bench import Push, size, table, write
 from joblib import Parallel, delayed
-from true_machine import told
+from true_machine import calibrated
 
 import stewart_drake as sd
 from stewart_drake.files.fileio import replacing
@@ -101,7 +98,7 @@ def of_seed(drawn: str, seed: int) -> list[str]:
 def scenario_of(row: Row, seed: int, folder: str) -> Scenario:
     """Return the scenario of one run."""
     plant = (*row.settings, *of_seed(row.drawn, seed))
-    known = told(plant, folder) if row.known else ()
+    known = calibrated(plant, folder) if row.known else ()
     settings = ("plant.kind=exact", *plant, *known)
     return load_compatible(row.scenario, row.controller, settings)
 

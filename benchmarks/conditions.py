@@ -1,27 +1,17 @@
-"""A delay believed wrongly under twenty conditions that nothing was tuned for.
+"""A wrongly believed delay under twenty conditions that nothing was tuned for.
 
-`python benchmarks/conditions.py` writes benchmarks/results/conditions.md: other machines, periods
-and motions, the delay believed a quarter too short or too long, with the estimator
-(`adaptive_lqi`) and without (`predictor_lqi`). All on the exact plant.
+Other machines, periods and motions, the delay believed a quarter too short or too long, with the
+estimator (`adaptive_lqi`) and without (`predictor_lqi`). All on the exact plant.
 """
 
-import math
-import os
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
-from _page import RESULTS
-from delay_estimator import CpuTime
-from joblib import Parallel, delayed
+from _bench import EXACT, ON, CpuTime, believed, grouped, table, write
 
 import stewart_drake as sd
-from stewart_drake.files.versions import versions
-from stewart_drake.loop import controller as step_timer
+from stewart_drake.loop import sampling
 
 SCALED = "reference.amplitude=[0.13,0.13,0.13,0.01,0.01,0.04]"
-ON = ("start=on_reference", "queue=reference")
 
-# Scenario, settings, what they are. The true delay is the scenario's.
+# Scenario, settings, description. The true delay is the scenario's.
 CONDITIONS = (
     ("desktop", (), "camera tour, gravity, 0.06 s of 0.02 s periods"),
     ("desktop", ("delay.steps=5",), "the same, 0.1 s"),
@@ -44,50 +34,35 @@ CONDITIONS = (
     ("paper", (*ON, "delay.fraction=0.37"), "0.837 s"),
     ("paper", (*ON, "plant.joint_damping=1e-3", "plant.payload_mass=0.3"), "friction, payload"),
 )
+KINDS = [(name, f) for name in ("adaptive_lqi", "predictor_lqi") for f in (0.75, 1.25, 1.0)]
+ABOUT = (
+    "E_ac in % s; in brackets the slowest step with the estimator, CPU time. Believed are three "
+    "and five quarters of the true delay, or itself."
+)
 
 
 def run(number: int, controller: str, factor: float) -> str:
-    """E_ac in % s, or how the run ended."""
-    step_timer.time = CpuTime  # type: ignore[assignment,attr-defined]
+    """Return E_ac in % s, or how the run ended."""
+    sampling.time = CpuTime  # type: ignore[assignment,attr-defined]
     name, settings, _ = CONDITIONS[number]
-    chosen = ("plant.kind=exact", *settings)
-    scenario = sd.load_scenario(name, controller, chosen)
-    periods = factor * scenario.true_delay.periods
-    steps = math.floor(periods + 1e-9)
-    believed = (
-        f"controller.delay_steps={steps}",
-        f"controller.delay_fraction={max(0.0, round(periods - steps, 9))}",
-    )
-    result = sd.simulate(
-        sd.load_scenario(name, controller, (*chosen, *believed)), judge_stability=False
-    )
+    scenario = sd.load_scenario(name, controller, (EXACT, *settings))
+    belief = believed(factor * scenario.eta, scenario.controller.period)
+    scenario = sd.load_scenario(name, controller, (EXACT, *settings, *belief))
+    result = sd.simulate(scenario, judge_stability=False)
     if result.stopped is not None:
         return f"left at {result.stopped.time:.2f} s"
     worst = result.summary["controller_step_ms"]["worst"]
-    return f"{result.accumulated_error:.3g}" + (
-        f" ({worst:.0f} ms)" if controller[0] == "a" else ""
-    )
+    step = f" ({worst:.0f} ms)" if controller == "adaptive_lqi" else ""
+    return f"{result.accumulated_error:.3g}{step}"
 
 
 def main() -> None:
-    """Write the table."""
-    kinds = [("adaptive_lqi", 0.75), ("adaptive_lqi", 1.25), ("adaptive_lqi", 1.0)]
-    kinds += [("predictor_lqi", 0.75), ("predictor_lqi", 1.25), ("predictor_lqi", 1.0)]
-    jobs = (delayed(run)(k, *kind) for k in range(len(CONDITIONS)) for kind in kinds)
-    found = iter(Parallel(n_jobs=-1)(jobs))
+    numbers = range(len(CONDITIONS))
+    found = grouped(run, {k: [(k, *kind) for kind in KINDS] for k in numbers})
     heads = ["estimated, 3/4", "5/4", "right", "taken for known, 3/4", "5/4", "right"]
-    lines = [" | ".join(["scenario", "condition", *heads]), " | ".join(["---"] * 8)]
-    for name, _, words in CONDITIONS:
-        lines.append(" | ".join([f"`{name}`", words, *(next(found) for _ in kinds)]))
-    about = ", ".join(f"{name} {version}" for name, version in versions().items())
-    text = "# A delay believed wrongly, conditions that nothing was tuned for\n\n"
-    text += f"Made by `python benchmarks/conditions.py` with {about}.\n\n"
-    text += "E_ac in % s; behind it the slowest step with the estimator, CPU time. "
-    text += "Believed are three and five quarters of the true delay, or itself.\n\n"
-    text += "\n".join(f"| {line} |" for line in lines) + "\n"
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / "conditions.md").write_text(text, encoding="utf-8")
-    print(text)
+    rows = [[f"`{CONDITIONS[k][0]}`", CONDITIONS[k][2], *found[k]] for k in numbers]
+    title = "A wrongly believed delay, conditions that nothing was tuned for"
+    write(__file__, title, [ABOUT, table(["scenario", "condition", *heads], rows)])
 
 
 if __name__ == "__main__":

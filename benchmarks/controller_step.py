@@ -5,7 +5,6 @@ Times of steps are medians over a run and its worst step, each the least of seve
 benchmarks/results/controller_step.md.
 """
 
-import os
 import subprocess
 import sys
 import time
@@ -16,10 +15,8 @@ from pathlib import Path
 from timeit import timeit
 from typing import Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import numpy as np
-from _page import table, write
+from _bench import table, write
 
 import stewart_drake as sd
 from stewart_drake.dynamics.stewart import plant_parameters

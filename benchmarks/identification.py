@@ -26,13 +26,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from stewart_drake.types import Array
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import numpy as np
-from _page import RESULTS, size
+from _bench import RESULTS, size
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
@@ -53,6 +48,7 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COULOMB_SPEED
 from stewart_drake.studies import uncertainty
 from stewart_drake.studies.study_options import Ranges
+from stewart_drake.types import Array
 
 MACHINES = size("MACHINES", 50)
 FRESH = int(os.environ.get("FRESH", "1000"))

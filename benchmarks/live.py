@@ -22,11 +22,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import numpy as np
 import xarray as xr
-from _page import QUICK, RESULTS, size
+from _bench import QUICK, RESULTS, size
 
 import stewart_drake as sd
 from stewart_drake.files.versions import versions

@@ -6,16 +6,13 @@ stands. Times are of the processor and include the draw, the law's parts and the
 
 import argparse
 import json
-import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import numpy as np
-from _page import size, table, write
+from _bench import size, table, write
 
 import stewart_drake as sd
 from stewart_drake.loop.bulk import run_in_bulk

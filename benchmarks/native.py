@@ -3,16 +3,13 @@
 A time is the least of its repeats. Writes benchmarks/results/native.md.
 """
 
-import os
 import sys
 import time
 from collections.abc import Callable
 from typing import Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import numpy as np
-from _page import write
+from _bench import write
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 
 import stewart_drake as sd

@@ -9,19 +9,14 @@ that of the processor for the stepping alone, per simulated second, the least of
 interleaved repeats.
 """
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from stewart_drake.types import Array
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
-from _page import RESULTS, table, write
+from _bench import RESULTS, table, write
 from matplotlib.figure import Figure
 from mujoco_model import Closure, MujocoStewart
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
@@ -36,6 +31,7 @@ from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.reporting.style import figure_style, write_figures
 from stewart_drake.scenario.signals import POSE, RATES
+from stewart_drake.types import Array
 
 ROUNDS, BUDGET = 25, 2.0
 """Repeats of each candidate, and the seconds after which it gets no more (but two at least)."""

@@ -4,17 +4,12 @@ The paper's model at home, sampled at 0.1 s, identity weights. Times are the lea
 interleaved repeats. Writes benchmarks/results/riccati.md.
 """
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from stewart_drake.types import Array
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import numpy as np
-from _page import table, write
+from _bench import table, write
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 from scipy.linalg import solve_discrete_are
 
@@ -23,6 +18,7 @@ from stewart_drake.law.delay_model import ChainModel, DelayedModel, chain, delay
 from stewart_drake.law.error_model import double_integrators
 from stewart_drake.law.riccati import augmented_gain, full_gain, reduced_gain
 from stewart_drake.mechanism.assembly import torque_map
+from stewart_drake.types import Array
 
 PERIOD = 0.1
 STEPS = (0, 1, 5, 8, 10, 20, 30)

@@ -10,11 +10,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import numpy as np
-from _page import QUICK, size, table, write
+from _bench import QUICK, size, table, write
 from joblib import Parallel, delayed
 
 import stewart_drake as sd

@@ -4,16 +4,13 @@ The plants' full curves are in plants.md, the parts of a controller step in cont
 all gains in riccati.md. Writes benchmarks/results/speed.md.
 """
 
-import os
 import tempfile
 import time
 from collections.abc import Sequence
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import joblib
 import numpy as np
-from _page import table, write
+from _bench import table, write
 from controller_step import evaluations, walls
 from plants import SAP_STEPS, drake_run, motions
 from plants import reference as plant_reference

@@ -5,16 +5,12 @@ runs use `predictor_lqi` unless the row says otherwise. What is unknown, noisy o
 benchmarks/claims.py.
 """
 
-import os
-import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import numpy as np
-from _page import run_sections
-from _page import table as plain_table
+from _bench import run_sections
+from _bench import table as plain_table
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
@@ -186,4 +182,4 @@ SECTIONS: dict[str, Callable[[], str]] = {
 
 
 if __name__ == "__main__":
-    run_sections(__file__, "Tracking", SECTIONS, sys.argv[1:])
+    run_sections(__file__, "Tracking", SECTIONS)

@@ -1,36 +1,28 @@
-"""A plant with friction and a payload that nobody told: `python benchmarks/true_machine.py`.
+"""A plant with friction and a payload that are unknown to the controller.
 
-Writes benchmarks/results/true_machine.md; SEEDS of the environment is the number of runs with
-noise. All runs are of `paper` with `predictor_lqi` and a delay of 0.8 s that is known, on the exact
-plant where nothing else is said. The reference takes 0.013 N m.
+SEEDS of the environment is the number of runs with noise. All runs are of `paper` with
+`predictor_lqi` and a known delay of 0.8 s, on the exact plant by default. The reference takes
+0.013 N m.
 """
 
-import os
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import numpy as np
-from _page import RESULTS, size
-from joblib import Parallel, delayed
+from _bench import EXACT, ON, PAYLOAD, grouped, noise, section, size, table, write
 
 import stewart_drake as sd
-from stewart_drake.files.versions import versions
 from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.scenario.calibration import Calibration, save_calibration
 from stewart_drake.scenario.signals import PLANT_PARAMETERS
 
-AMPLITUDES = np.tile([0.2617993878] * 3 + [0.02, 0.02, 0.08], 2)
-ON_REFERENCE = ("start=on_reference", "queue=reference")
-STARTS = {"on the reference": ON_REFERENCE, "from rest": ()}
+STARTS = {"on the reference": ON, "from rest": ()}
 SEEDS = range(100, 100 + size("SEEDS", 5))
 BIAS = "plant.torque_bias=[3e-4,-3e-4,3e-4,-3e-4,3e-4,-3e-4]"
-THREE = (BIAS, "plant.payload_mass=0.4", "plant.joint_damping=1e-3")
-ASIDE = ("plant.payload_mass=0.4", "plant.payload_position=[0.03,-0.02,0.05]")
+THREE = (BIAS, PAYLOAD, "plant.joint_damping=1e-3")
+ASIDE = (PAYLOAD, "plant.payload_position=[0.03,-0.02,0.05]")
 PLANTS: dict[str, tuple[str, ...]] = {
     "nothing": (),
     **{
@@ -49,13 +41,13 @@ LAWS: dict[str, tuple[str, ...]] = {
     "default": (),
     "coulomb": ("controller.estimate=[torque_bias,payload,damping,coulomb]",),
 }
-NOISE = "sensor.noise_std=[" + ",".join(f"{1e-3 * a:.10g}" for a in AMPLITUDES) + "]"
+NOISE = noise(1e-3)
 PRIORS = (None, 1e-2, 3e-3, 1e-3, 3e-4)
-"""Of the bias, N m; None is the shipped one."""
+"""Prior standard deviations of the bias, N m; None is the shipped one."""
 
 
-def told(settings: Sequence[str], folder: str) -> tuple[str, ...]:
-    """A file with the plant's true values, nearly exact."""
+def calibrated(settings: Sequence[str], folder: str) -> tuple[str, ...]:
+    """Return the setting of a calibration with the plant's true values, nearly exact."""
     scenario = sd.load_scenario("paper", settings=settings)
     mechanism = sd.load_mechanism("paper")
     truth = np.array(scenario.plant.parameters)
@@ -67,25 +59,14 @@ def told(settings: Sequence[str], folder: str) -> tuple[str, ...]:
     return (f"controller.calibration={path}",)
 
 
-def run(settings: Sequence[str]) -> float:
-    """E_ac of one run, NaN where it does not complete."""
-    scenario = sd.load_scenario("paper", "predictor_lqi", ("plant.kind=exact", *settings))
+def run(*settings: str) -> float:
+    """Return E_ac of one run, NaN if it does not complete."""
+    scenario = sd.load_scenario("paper", "predictor_lqi", (EXACT, *settings))
     return sd.simulate(scenario, judge_stability=False).accumulated_error
 
 
-def table(title: str, columns: Sequence[str], rows: dict[str, list[list[Any]]]) -> str:
-    """A row per name, a cell per list of settings: the mean over them, and how many completed."""
-    jobs = [case for cells in rows.values() for cell in cells for case in cell]
-    found = iter(Parallel(n_jobs=-1)(delayed(run)(case) for case in jobs))
-    lines = [" | ".join(("the plant has", *columns)), " | ".join(["---"] * (1 + len(columns)))]
-    for name, cells in rows.items():
-        values = [[next(found) for _ in cell] for cell in cells]
-        lines.append(" | ".join((name, *(cell_text(v) for v in values))))
-    return f"## {title}\n\n" + "\n".join(f"| {line} |" for line in lines) + "\n"
-
-
 def cell_text(errors: list[float]) -> str:
-    """Mean E_ac of those that completed."""
+    """Return the mean E_ac of the runs that completed."""
     done = [e for e in errors if np.isfinite(e)]
     if not done:
         return "lost"
@@ -93,35 +74,46 @@ def cell_text(errors: list[float]) -> str:
     return f"{np.mean(done):.3g}{lost}"
 
 
+def means(title: str, columns: Sequence[str], rows: dict[str, list[list[Any]]]) -> str:
+    """Return a table: a row per name, a cell per list of settings with the mean over them."""
+    cells = {(name, k): cell for name, some in rows.items() for k, cell in enumerate(some)}
+    found = grouped(run, cells)
+    lines = [
+        (name, *(cell_text(found[name, k]) for k in range(len(some))))
+        for name, some in rows.items()
+    ]
+    return section(title, table(("the plant has", *columns), lines))
+
+
 def friction(folder: str) -> str:
-    """What the law does with it, what estimating and what knowing gain."""
+    """Return runs with the default, with estimated friction, and with known values."""
     columns = [f"{law}, {start}" for start in STARTS for law in (*LAWS, "known")]
     rows = {
         name: [
             [(*plant, *where, *law)]
             for where in STARTS.values()
-            for law in (*LAWS.values(), told(plant, folder))
+            for law in (*LAWS.values(), calibrated(plant, folder))
         ]
         for name, plant in PLANTS.items()
     }
-    return table("E_ac, clean", columns, rows)
+    return means("E_ac, clean", columns, rows)
 
 
 def noisy(folder: str) -> str:
-    """The same with noise of 0.1 % of the amplitudes, on the reference."""
+    """Return the same with noise of 0.1 % of the amplitudes, on the reference."""
     rows = {
         name: [
-            [(*plant, *ON_REFERENCE, *law, NOISE, f"sensor.seed={seed}") for seed in SEEDS]
-            for law in (*LAWS.values(), told(plant, folder))
+            [(*plant, *ON, *law, NOISE, f"sensor.seed={seed}") for seed in SEEDS]
+            for law in (*LAWS.values(), calibrated(plant, folder))
         ]
         for name, plant in PLANTS.items()
     }
     title = f"E_ac on the reference with noise of 0.1 %, mean of {len(SEEDS)} seeds"
-    return table(title, (*LAWS, "known"), rows)
+    return means(title, (*LAWS, "known"), rows)
 
 
 def multibody(folder: str) -> str:
-    """On the multibody plant, with two steps."""
+    """Return runs on the multibody plant, with two steps."""
     plants = ("nothing", "Coulomb friction 0.001 N m", "payload 0.4 kg at 30, -20, 50 mm")
     engines = {
         "exact": (),
@@ -130,56 +122,40 @@ def multibody(folder: str) -> str:
     }
     rows = {
         name: [
-            [(*ON_REFERENCE, *PLANTS[name], *told(PLANTS[name], folder), *engine)]
+            [(*ON, *PLANTS[name], *calibrated(PLANTS[name], folder), *engine)]
             for engine in engines.values()
         ]
         for name in plants
     }
-    return table("E_ac on the reference, known, on both plants", list(engines), rows)
+    return means("E_ac on the reference, known, on both plants", list(engines), rows)
 
 
 def priors(_: str) -> str:
-    """What another standard deviation of the bias does to the runs that are shown elsewhere."""
+    """Return runs with other prior standard deviations of the bias."""
     plants = {
         "nothing": (),
         "bias 3e-4": (BIAS,),
         "bias 3e-4, payload 0.4 kg, damping 1e-3": THREE,
         "bias of 5e-3": ("plant.torque_bias=[5e-3,-5e-3,5e-3,-5e-3,5e-3,-5e-3]",),
     }
-    rows = {}
-    for name, plant in plants.items():
-        for more, noise in {"": (), ", noise of 0.1 %": (NOISE,)}.items():
-            seeds = SEEDS if noise else SEEDS[:1]
-            rows[name + more] = [
-                [
-                    (*plant, *ON_REFERENCE, *noise, *prior(std), f"sensor.seed={seed}")
-                    for seed in seeds
-                ]
-                for std in PRIORS
-            ]
+    settings = [() if s is None else (f"controller.prior={{torque_bias: {s}}}",) for s in PRIORS]
+    rows = {
+        name + more: [
+            [(*plant, *ON, *noise, *prior, f"sensor.seed={seed}") for seed in seeds]
+            for prior in settings
+        ]
+        for name, plant in plants.items()
+        for more, noise, seeds in (("", (), SEEDS[:1]), (", noise of 0.1 %", (NOISE,), SEEDS))
+    }
     columns = ["shipped, 0.018 N m", *(f"{std:g} N m" for std in PRIORS[1:])]
-    return table("E_ac on the reference by the prior of the bias", columns, rows)
-
-
-def prior(std: float | None) -> tuple[str, ...]:
-    """The setting of a bias' standard deviation."""
-    return () if std is None else (f"controller.prior={{torque_bias: {std}}}",)
+    return means("E_ac on the reference by the prior of the bias", columns, rows)
 
 
 def main() -> None:
-    """Run and write."""
-    packages = ", ".join(f"{package} {number}" for package, number in versions().items())
-    parts = [
-        "# A plant that nobody told\n",
-        f"Made by `python benchmarks/true_machine.py` with {packages}.\n",
-    ]
     with tempfile.TemporaryDirectory() as folder:
-        for section in (friction, noisy, multibody, priors):
-            parts.append(section(folder))
-            print(parts[-1], flush=True)
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    (RESULTS / "true_machine.md").write_text("\n".join(parts))
+        parts = (make(folder) for make in (friction, noisy, multibody, priors))
+        write(__file__, "A plant with unknown friction and payload", parts)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

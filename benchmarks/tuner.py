@@ -5,17 +5,14 @@ gains under three conditions. Writes benchmarks/results/tuner.md; what it runs i
 (out/tuner-bench by default), and a second start goes on from there.
 """
 
-import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import numpy as np
-from _page import size, table, write
+from _bench import size, table, write
 
 import stewart_drake as sd
 from stewart_drake.reporting.document import number
