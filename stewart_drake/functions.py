@@ -242,7 +242,7 @@ def run_live(
     Raises:
         ConfigError: bad input, no such machine, or one that does not begin.
     """
-    from stewart_drake.live.connect import address_of
+    from stewart_drake.live.contact import address_of
     from stewart_drake.live.endpoint import read_key
     from stewart_drake.live.session import drive, prepare_session
 

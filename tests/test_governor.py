@@ -10,8 +10,8 @@ from stewart_drake.live.governor import (
     LEAST_MARGIN,
     TORQUE_SHARE,
     Blend,
-    Governed,
     Governor,
+    GovernorState,
     response,
 )
 from stewart_drake.mechanism.files import load_mechanism
@@ -57,7 +57,7 @@ def test_the_response_is_that_of_three_equal_poles():
 
 
 def at_rest(pose):
-    return Governed(np.append(pose, np.zeros(12)), pose)
+    return GovernorState(np.append(pose, np.zeros(12)), pose)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_a_motion_of_the_scenario_is_taken_over_and_given_back():
     motion = make_reference(SineConfig(), 100.0)
     for t in np.arange(0.0, 6.0, 0.7):
         begun = one.begin(evaluate(motion, t))
-        assert isinstance(begun, Governed), begun
+        assert isinstance(begun, GovernorState), begun
         way = one.future(begun.state, begun.applied)
         assert one.problem(way) is None
         rest = one.after(begun, 0.5)

@@ -13,11 +13,11 @@ import pytest
 
 from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.live import connect
-from stewart_drake.live.connect import await_free, call, open_endpoint
-from stewart_drake.live.contact import Contact
+from stewart_drake.live import contact as contacts
+from stewart_drake.live.checks import ReportCheck
+from stewart_drake.live.contact import Contact, await_free, call, open_endpoint
 from stewart_drake.live.endpoint import ANSWERS, ANSWERS_AT_ONCE
-from stewart_drake.live.loop import Nobody
+from stewart_drake.live.loop import Viewer
 from stewart_drake.live.machine import Machine
 from stewart_drake.live.page import PageViewer
 from stewart_drake.live.protocol import (
@@ -30,7 +30,6 @@ from stewart_drake.live.protocol import (
     Refusal,
     encode,
 )
-from stewart_drake.live.reports import ReportCheck
 from stewart_drake.live.session import drive, prepare_session
 from stewart_drake.loop.peer import FAULTS, Fault, Part, Reason, identity_of, in_words
 from stewart_drake.mechanism.files import load_mechanism
@@ -211,7 +210,7 @@ def test_a_machine_of_version_1_is_refused_in_one_line(contact_with):
 
 @pytest.fixture
 def impatient(monkeypatch):
-    monkeypatch.setattr(connect, "_PATIENCE", 0.3)
+    monkeypatch.setattr(contacts, "_PATIENCE", 0.3)
 
 
 def test_a_machine_in_use_is_named(quiet_machine, impatient):
@@ -245,9 +244,9 @@ def test_a_machine_in_use_is_named(quiet_machine, impatient):
 def test_a_sequence_that_restarts_is_named(contact_with, impatient):
     """Every answer has sequence 7: only the first is taken."""
     contact = contact_with(encode(replace(OFFER, watchdog=SECOND // 10)))
-    contact.ask()
-    time.sleep(0.1)
-    assert [m.head.sequence for m in contact.receive()] == [7]
+    while not contact.ask():
+        pass
+    assert contact.last.head.sequence == 7
     with pytest.raises(ConfigError) as refused:
         await_free(contact)
     assert re.fullmatch(
@@ -376,7 +375,7 @@ def test_silence_stop_and_end_are_said():
     assert messages(run)[-1].why == FAULTS[Fault.NONE]
 
 
-class Watching(Nobody):
+class Watching(Viewer):
     """Keeps how it ended."""
 
     def __init__(self):

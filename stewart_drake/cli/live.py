@@ -70,7 +70,7 @@ def live(
     The law is that of `simulate`; a page in the browser has sliders for the pose. Ctrl-C brings the
     plate to rest and ends it; Ctrl-C again, or Stop on the page, stops it at once.
     """
-    from stewart_drake.live.connect import address_of
+    from stewart_drake.live.contact import address_of
     from stewart_drake.live.endpoint import read_key
     from stewart_drake.live.session import check_armed, check_jitter, drive, plans, prepare_session
     from stewart_drake.scenario.loading import load_scenario

@@ -1,12 +1,14 @@
-"""The controller's view of its machine: what has come from it, and how long the link takes.
+"""The controller's contact with its machine: finding it, what has come, how long the link takes.
 
-No clock is compared with another one. A measurement carries the instant at which it was taken, a
-plan the instants at which its torques shall act, both of the machine's clock; how long a plan may
-take is what is left of that. So the way there and the way back count together, as a round trip.
+No two clocks are compared. A measurement carries the time at which it was taken and a plan the
+times at which its torques act, both of the machine's clock. The way there and the way back
+therefore count together, as a round trip.
 """
 
+import contextlib
 import math
 import select
+import socket
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -14,13 +16,16 @@ from typing import Final
 
 import numpy as np
 
-from stewart_drake.live.endpoint import Address, Endpoint, Session, now
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.live.endpoint import Address, Endpoint, Session, is_loopback, now
 from stewart_drake.live.protocol import (
     NEVER,
     NOTHING,
     SECOND,
+    VERSION,
     ControllerFlags,
     ControllerMessage,
+    MachineFlags,
     MachineMessage,
     Refusal,
 )
@@ -29,27 +34,34 @@ from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.types import Array
 
 _TRIPS: Final = 256
-"""Round trips that are remembered."""
+"""Number of round trips that are kept."""
 _SETTLED: Final = 48
-"""Datagrams after which one that has not arrived counts as lost, and is forgotten."""
+"""Number of datagrams after which an unanswered one counts as lost."""
 _PHASES: Final = 128
-"""Measurements of which the one that came soonest tells when the next will come."""
+"""Number of measurements from which the next arrival is predicted."""
+_REQUEST_PERIOD: Final = SECOND // 50
+"""Time between two requests for a session, ns."""
+_PATIENCE: Final = 5.0
+"""Longest wait for an answer, s."""
+_ENOUGH_TRIPS: Final = 100
+"""Number of round trips that suffice for a design."""
+_LONGEST_CALL: Final = 5.0
+"""Longest wait for that number, s."""
 
 
 @dataclass
 class Link:
-    """What is known of the way there and back.
+    """Statistics of the link, there and back.
+
+    A request without an answer counts as half a datagram lost there and half an answer lost on the
+    way back: the machine keeps no state of requests.
 
     Attributes:
-        trips: last round trips, s: from sending a datagram to having its answer, without the time
-            that the machine held it.
-        sent: datagrams.
-        lost: of them, as the machine says.
-        missed: measurements that never came, by their numbers.
-        came: that did.
-
-    A request without an answer counts as half a datagram lost there and half an answer missed: the
-    machine remembers nothing of requests.
+        trips: last round trips, s, without the time for which the machine held a datagram.
+        sent: number of datagrams whose fate is known.
+        lost: number of them that did not arrive.
+        missed: number of measurements that did not come, by their sequence.
+        came: number of measurements that came.
     """
 
     trips: deque[float] = field(default_factory=lambda: deque(maxlen=_TRIPS))
@@ -60,22 +72,22 @@ class Link:
 
     @property
     def typical(self) -> float:
-        """Median round trip, s; NaN before there is one."""
+        """Median round trip, s; NaN without any."""
         return float(np.median(self.trips)) if self.trips else math.nan
 
     @property
     def spread(self) -> float:
-        """Standard deviation of the round trips, s; NaN before there is one."""
+        """Standard deviation of the round trips, s; NaN without any."""
         return float(np.std(self.trips)) if self.trips else math.nan
 
     @property
     def longest(self) -> float:
-        """Of the round trips that are remembered, s; NaN before there is one."""
+        """Longest round trip, s; NaN without any."""
         return max(self.trips, default=math.nan)
 
     @property
     def shortest(self) -> float:
-        """The same."""
+        """Shortest round trip, s; NaN without any."""
         return min(self.trips, default=math.nan)
 
     @property
@@ -98,22 +110,21 @@ class Contact:
     """A session with a machine.
 
     Args:
-        endpoint: to be used; whoever made it closes it.
-        address: of the machine.
-        identity: of the machine that the controller is designed for.
+        endpoint: socket; the caller closes it.
+        address: address of the machine.
+        identity: identity of the machine that the controller is designed for.
 
     Attributes:
         link: see `Link`.
-        last: newest message of the machine, by its sequence, or None.
+        last: newest message of the machine by its sequence, or None.
         offered: nonce of the newest offer; 0 without one.
         session: see `live.endpoint.Session`.
-        heard: ns of the own clock, when something of the machine was last taken.
+        heard: own clock when the last message was accepted, ns.
     """
 
     def __init__(self, endpoint: Endpoint, address: Address, identity: Identity) -> None:
-        self._endpoint, self.identity, self.offered = endpoint, identity, 0
-        self.session = Session.drawn(address)
-        self.link = Link()
+        self.endpoint, self.identity, self.offered = endpoint, identity, 0
+        self.session, self.link = Session.drawn(address), Link()
         self.last: MachineMessage | None = None
         self.heard = now()
         self._pending: dict[int, bool] = {}
@@ -124,31 +135,32 @@ class Contact:
 
     @property
     def refused(self) -> dict[str, int]:
-        """Datagrams that were not acted upon, by cause."""
-        return {cause.value: n for cause, n in self._endpoint.refused.items()}
+        """Number of refused datagrams by cause."""
+        return {cause.value: n for cause, n in self.endpoint.refused.items()}
 
     @property
-    def unsent(self) -> int:
-        """Datagrams that the system did not take."""
-        return self._endpoint.unsent
-
-    @property
-    def endpoint(self) -> Endpoint:
-        """Where datagrams come in."""
-        return self._endpoint
+    def where(self) -> str:
+        """Name of the machine in messages."""
+        host, port = self.session.address
+        return f"machine at {host}:{port}"
 
     def join(self) -> None:
-        """From now on as in the session that the machine has offered."""
+        """Use the session that the machine has offered."""
         self.session.nonce = self.offered
 
-    def ask(self) -> None:
-        """Send a request for a session, or for another look at the machine's offer."""
+    def ask(self) -> bool:
+        """Request a session and listen for a request period; return whether a message came."""
         head = replace(self.session.head(now()), nonce=self.offered)
-        message = ControllerMessage(head, identity=self.identity)
-        self._endpoint.send(message, self.session.address)
-        if self.offered:  # else the machine may leave it unanswered
+        self.endpoint.send(ControllerMessage(head, identity=self.identity), self.session.address)
+        if self.offered:  # otherwise the machine may leave it unanswered
             self._pending[head.sequence] = False
             self._requests.add(head.sequence)
+        until, came = now() + _REQUEST_PERIOD, False
+        while now() < until:
+            for _ in self.wait(until):
+                came = True
+        self._check_identity()
+        return came
 
     def send(
         self,
@@ -159,49 +171,45 @@ class Contact:
         begin: int = NEVER,
         flags: ControllerFlags = NOTHING,
     ) -> int:
-        """Send a datagram of these fields; its sequence."""
+        """Send a datagram of these fields; return its sequence."""
         rows = np.empty((0, NUM_TORQUES)) if torques is None else torques
         head = self.session.head(now())
         message = ControllerMessage(head, flags, sampled, playout, begin, rows)
-        self._endpoint.send(message, self.session.address)
+        self.endpoint.send(message, self.session.address)
         self._pending[head.sequence] = False
         return head.sequence
 
     def has_arrived(self, sequence: int) -> bool:
-        """Whether the machine has said that a datagram was there."""
+        """Return whether the machine has acknowledged a datagram."""
         return self._pending.get(sequence, False)
 
     def wait(self, until: int) -> Iterator[MachineMessage]:
-        """What comes until a time of the own clock, ns; at once if that is past."""
+        """Wait for messages until a time of the own clock, ns, and yield them."""
         left = max(0, until - now()) / SECOND
-        if select.select([self._endpoint], [], [], left)[0]:
+        if select.select([self.endpoint], [], [], left)[0]:
             yield from self.receive()
 
     def receive(self) -> Iterator[MachineMessage]:
-        """What has come, each once, whatever the order."""
-        for message, address in self._endpoint.receive():
+        """Yield each message that has come, once, in the order of arrival."""
+        for message, address in self.endpoint.receive():
             assert isinstance(message, MachineMessage)
-            time = now()
-            newest = self.session.window.tell(message.head.sequence)
+            time, newest = now(), self.session.window.newest
             refused = self.session.refusal(message.head, address, time)
             if refused is not None:
-                self._endpoint.refuse(refused, newest if refused != Refusal.FOREIGN else "")
+                sequences = f"sequence {message.head.sequence} after {newest}"
+                self.endpoint.refuse(refused, sequences if refused != Refusal.FOREIGN else "")
                 continue
             self.heard = time
             self._note(message, time)
             yield message
 
     def forget_waiting(self) -> None:
-        """Count what came while nobody looked, and no more: how late it was is not the link's."""
-        for message, address in self._endpoint.receive():
+        """Count the messages that have waited in the socket, without their round trips."""
+        for message, address in self.endpoint.receive():
             assert isinstance(message, MachineMessage)
             if self.session.refusal(message.head, address, now()) is None:
                 self.link.came += 1
-                self._mark(message)
-
-    def refuse(self, cause: Refusal, detail: str = "") -> None:
-        """Count a message that was taken but is of no use."""
-        self._endpoint.refuse(cause, detail)
+                self._acknowledge(message)
 
     def _note(self, message: MachineMessage, time: int) -> None:
         head, link = message.head, self.link
@@ -214,10 +222,10 @@ class Contact:
             self._first, self._followed = self._first or head.sequence, self._followed + 1
         gaps = self.session.window.newest - self._first + 1 - self._followed if self._first else 0
         self._phases.append((time - message.sampled / message.rate) / SECOND)
-        if head.acknowledged > self._newest:  # else its answer was there before
+        if head.acknowledged > self._newest:  # the first answer to a datagram
             self._newest = head.acknowledged
             link.trips.append((time - head.echo - head.held / message.rate) / SECOND)
-        self._mark(message)
+        self._acknowledge(message)
         for settled in [n for n in self._pending if n <= head.acknowledged - _SETTLED]:
             link.sent += 1
             unanswered = not self._pending.pop(settled)
@@ -227,24 +235,122 @@ class Contact:
             self._unanswered += 0.5 * unanswered * asked
         link.missed = self._unanswered + max(0, gaps)
 
-    def _mark(self, message: MachineMessage) -> None:
-        for i, there in enumerate(message.arrived):
-            if there and message.head.acknowledged - i in self._pending:
+    def _acknowledge(self, message: MachineMessage) -> None:
+        for i in np.flatnonzero(message.arrived).tolist():
+            if message.head.acknowledged - i in self._pending:
                 self._pending[message.head.acknowledged - i] = True
 
-    @property
-    def soonest(self) -> float:
-        """s of the own clock at which a measurement of the machine's time 0 would have come."""
-        return min(self._phases, default=math.nan)
-
-    def lateness(self, most: float) -> float:
-        """By how much the last measurements came later than the soonest, s.
-
-        Those that took longer than `most`, as where this process stood still, do not count.
-        """
-        late = (phase - self.soonest for phase in self._phases)
-        return max((each for each in late if each <= most), default=0.0)
-
     def due(self, sampled: int, rate: float) -> float:
-        """s of the own clock at which a measurement taken at ns of the machine's may come."""
-        return self.soonest + sampled / rate / SECOND
+        """Return the earliest arrival of a measurement taken at `sampled`, s of the own clock."""
+        return min(self._phases, default=math.nan) + sampled / rate / SECOND
+
+    def lateness(self, longest: float) -> float:
+        """Return the largest delay of the last measurements after the earliest arrival, s.
+
+        Delays above `longest`, such as those of a suspended process, do not count.
+        """
+        soonest = min(self._phases, default=math.nan)
+        return max((p - soonest for p in self._phases if p - soonest <= longest), default=0.0)
+
+    def _check_identity(self) -> None:
+        """Refuse a machine that the controller is not designed for.
+
+        Raises:
+            ConfigError: the parts that differ, of both sides.
+        """
+        offered = None if self.last is None else self.last.identity
+        differs = None if offered is None else offered.differing(self.identity)
+        if differs is not None:
+            raise ConfigError(
+                f"{self.where} has {differs[0]}; the controller is designed for {differs[1]}"
+            )
+
+
+# ---------------------------------------------------------------- finding a machine
+
+
+def address_of(text: str) -> Address:
+    """Return the address of HOST:PORT.
+
+    Raises:
+        ConfigError: not of this form, or an unknown host.
+    """
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise ConfigError(f"--machine: got {text!r}; expected HOST:PORT, such as 127.0.0.1:7000")
+    with contextlib.suppress(OSError, UnicodeError):
+        return socket.gethostbyname(host), int(port)
+    raise ConfigError(f"--machine: got {text!r}; expected the name or address of a host")
+
+
+def open_endpoint(address: Address, key: bytes | None) -> Endpoint:
+    """Return a socket for a controller of the machine at an address.
+
+    Raises:
+        ConfigError: an address beyond loopback without a key.
+    """
+    if key is None and not is_loopback(address[0]):
+        raise ConfigError(
+            f"--machine: got {address[0]} without a key; expected a loopback address, or --key FILE"
+        )
+    host = "127.0.0.1" if is_loopback(address[0]) else "0.0.0.0"
+    return Endpoint(MachineMessage, host, 0, key)
+
+
+def call(contact: Contact) -> MachineMessage:
+    """Request a session until the machine offers one and the link is known; return its offer.
+
+    Raises:
+        ConfigError: no answer, or a machine that the controller is not designed for.
+    """
+    began, first, where = now(), 0, contact.where
+    while True:
+        came = contact.ask()
+        first = first or (now() if came else 0)
+        for other in contact.endpoint.versions:
+            if other.address == contact.session.address:
+                raise ConfigError(
+                    f"--machine: {where} speaks protocol version {other.version}; expected "
+                    f"{VERSION}, of the same release on both sides"
+                )
+        if not first and now() - began > _PATIENCE * SECOND:
+            raise ConfigError(
+                f"--machine: got {where.removeprefix('machine at ')}, where nothing "
+                f"answers{_refusals(contact)}; expected a machine of protocol version {VERSION}, "
+                "such as stewart-drake machine SCENARIO --port PORT"
+            )
+        known = len(contact.link.trips) >= _ENOUGH_TRIPS or now() - first > _LONGEST_CALL * SECOND
+        if first and known and contact.last is not None:
+            return contact.last
+
+
+def await_free(contact: Contact) -> None:
+    """Wait for a new offer of a machine that no other controller drives.
+
+    Raises:
+        ConfigError: another controller still drives it, or the machine is silent.
+    """
+    contact.forget_waiting()
+    began, last, where = now(), contact.last, contact.where
+    assert last is not None
+    patience = max(_PATIENCE * SECOND, 2 * last.watchdog)
+    while now() - began <= patience:
+        if contact.ask() and MachineFlags.BUSY not in (contact.last or last).flags:
+            return
+    silent = (now() - contact.heard) / SECOND
+    if silent < patience / SECOND:
+        raise ConfigError(
+            f"{where} is in use by another controller (retry {last.watchdog / SECOND:g} s after it "
+            "stops)"
+        )
+    if contact.endpoint.refusal:
+        raise ConfigError(
+            f"{where} sent nothing for {silent:.1f} s{_refusals(contact)}; the last was "
+            f"{contact.endpoint.refusal}"
+        )
+    raise ConfigError(f"{where} was silent for {silent:.1f} s")
+
+
+def _refusals(contact: Contact) -> str:
+    refused = ", ".join(f"{n} of cause {cause}" for cause, n in contact.refused.items())
+    return f" that could be taken ({refused} refused)" if refused else ""

@@ -1,9 +1,9 @@
-"""The law for a machine that is really there: the scenario's, over the link as it was found.
+"""The law for a machine at the other end of a link: the scenario's law over the measured link.
 
-A torque acts a fixed time eta after the measurement that it rests on was taken, as in the scenario:
-the machine's buffer waits for what comes sooner. On its way back a measurement has spent some of
-eta, so that the law sees a link of round trips whose measurements are of now. What comes later than
-its time, or never, the repetitions and plans of packets stand in for (theory.md, section 25).
+A torque acts a fixed time eta after its measurement, as in the scenario: the machine's buffer holds
+packets that come sooner. A measurement spends a part of eta on its way back, so that the law sees a
+link of round trips with measurements without delay. Repetitions and plans of packets replace
+torques that come late or never (theory.md, section 25).
 """
 
 import math
@@ -38,26 +38,26 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 _ROOM: Final = 0.25
-"""Share of what was seen of the link's jitter by which a round trip may yet be longer."""
+"""Allowance for a longer round trip, as a share of the measured jitter."""
 _COMPUTING: Final = 0.01
-"""s, for the law's step and for waking up."""
+"""Time for a step of the law and for waking up, s."""
 _TRIED: Final = 5
-"""Number of steps of which the quickest counts."""
+"""Number of steps whose shortest is reported."""
 _LEAST_LOSS: Final = 0.01
-"""Of packets; none was seen to be lost in a few seconds."""
+"""Smallest assumed loss of packets: the call takes a few seconds only."""
 
 
 class Design(NamedTuple):
     """Law and settings of a controller before its start.
 
     Attributes:
-        experiment: of the scenario as it is seen.
-        law: that is stepped.
-        planned: the motion that it follows from a start at rest at the scenario's first pose.
-        queue: (L, 6) torques in flight at a begin, as the scenario says.
-        repeats: torques that a packet says again.
-        torque_limit: of each motor, N m: the tighter one of the scenario's and of the machine's.
-        step: s that a step of the law takes here, and what it is stepped by.
+        experiment: experiment of the scenario over the measured link.
+        law: control law.
+        planned: its reference from the scenario's start.
+        queue: torques (L, 6) in flight at the begin.
+        repeats: number of torques that a packet repeats.
+        torque_limit: tighter limit of the scenario and the machine, N m.
+        step: time of a step of the law here, s, and the name of its implementation.
     """
 
     experiment: Experiment
@@ -70,31 +70,31 @@ class Design(NamedTuple):
 
 
 def check_controller(scenario: Scenario) -> None:
-    """Refuse what `live` does not run.
+    """Refuse a scenario with a tuner or servos.
 
     Raises:
-        ConfigError: one line.
+        ConfigError: such a scenario.
     """
     if found := differing(scenario, {"tuner.kind": "fixed", "actuator.kind": "torque"}):
         raise ConfigError(found.problem("for live"))
 
 
 def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario:
-    """The scenario with the link that was found in the place of its own.
+    """Return the scenario with the measured link.
 
     Args:
         scenario: its delay, or the bound of its network, is the time from a measurement to its
             torque.
-        link: as it was found.
-        machine: what the machine says of itself.
+        link: measured link.
+        machine: message of the machine.
 
     Raises:
-        ConfigError: the link takes longer than that.
+        ConfigError: round trips longer than that time.
     """
     loss = max(scenario.sensor.loss, link.loss_back)
     sensor = replace(scenario.sensor, delay=0.0, loss=loss, faults=[])
     seen = replace(scenario, sensor=sensor, plant=replace(scenario.plant, kind="exact"))
-    if MachineFlags.WIRE in machine.flags:  # it does as the scenario says
+    if MachineFlags.WIRE in machine.flags:  # it delays torques as the scenario does
         return seen
     c = scenario.controller
     if c.delay_estimator != "none":
@@ -102,8 +102,7 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
             f"controller.delay_estimator: got {c.delay_estimator!r}; expected 'none' for a machine "
             "that keeps to the play-out times of torques"
         )
-    jitter = link.longest - link.shortest
-    longest = link.longest + _ROOM * jitter + _COMPUTING
+    longest = link.longest + _ROOM * link.jitter + _COMPUTING
     network = NetworkConfig(
         low=link.shortest,
         high=longest,
@@ -128,7 +127,7 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
 
 
 def _whole_delay(scenario: Scenario, found: NetworkConfig) -> float:
-    """s from a measurement to its torque: as the scenario says, or of the link that was found."""
+    """Return the time from a measurement to its torque, of the scenario or else of the link, s."""
     c, link = scenario.controller, scenario.link
     if link.kind == "wire":
         return scenario.eta
@@ -138,10 +137,10 @@ def _whole_delay(scenario: Scenario, found: NetworkConfig) -> float:
 
 
 def design(scenario: Scenario, machine: MachineMessage) -> Design:
-    """The law for a scenario as it is seen.
+    """Return the law for a scenario over the measured link.
 
     Raises:
-        ConfigError: as `loop.preparation.prepare` and `control_law`.
+        ConfigError: see `loop.preparation.prepare` and `control_law`.
     """
     experiment = prepare(scenario)
     law, planned, _ = control_law(experiment)
@@ -154,10 +153,7 @@ def design(scenario: Scenario, machine: MachineMessage) -> Design:
 
 
 def _step_time(law: PredictiveLqi, motion: Trajectory, queue: Array) -> tuple[float, str]:
-    """The shortest of some steps along a motion, s of this thread, and what the law is stepped by.
-
-    What else the computer does meanwhile does not count: it is the least that a step takes.
-    """
+    """Return the shortest time of some steps, s of this thread, and their implementation."""
     served: Any
     served, backend = serving(replace(law, silence=0))
     memory, weights, took = served.initial_memory(queue), np.ones(2), list[float]()

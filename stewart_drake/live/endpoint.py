@@ -1,6 +1,6 @@
-"""A socket for datagrams of `live.protocol`, and who is at its other end.
+"""A socket for datagrams of `live.protocol`, and the sessions over it.
 
-Without a key only the loopback interface is used. What is not acted upon is counted by its cause.
+Without a key only the loopback interface is used. Refused datagrams are counted by their cause.
 """
 
 import contextlib
@@ -33,28 +33,28 @@ from stewart_drake.live.protocol import (
 Address = tuple[str, int]
 
 WINDOW: Final = 64
-"""Datagrams by which one may be overtaken and still be told from a replay."""
+"""Number of datagrams by which one may be overtaken without counting as late."""
 AT_ONCE: Final = 256
-"""Datagrams that are read before anything else is done."""
+"""Largest number of datagrams that are read at once."""
 SHORTEST_KEY: Final = 16
-"""Bytes."""
+"""Shortest key, bytes."""
 LONGEST_KEY: Final = 4096
-"""Bytes."""
+"""Longest key, bytes."""
 ANSWERS: Final = 50
-"""Requests of unknown addresses that are answered in a second."""
+"""Number of requests of unknown addresses that are answered in a second."""
 ANSWERS_AT_ONCE: Final = 10
-"""Of them, without a pause."""
-STOOD: Final = SECOND // 5
-"""ns by which a process that comes late has stood still."""
+"""Number of them without a pause."""
+STALL: Final = SECOND // 5
+"""Delay of a process from which on it is reported as a stall, ns."""
 
 
 def now() -> int:
-    """ns of this process's clock, which nobody sets."""
+    """Return this process's monotonic clock, ns."""
     return time.monotonic_ns()
 
 
 class OtherVersion(NamedTuple):
-    """A datagram of another version of the protocol, and where it came from."""
+    """A datagram of another version of the protocol, and its sender."""
 
     version: int
     session: int
@@ -66,19 +66,19 @@ class Endpoint:
     """A UDP socket that never blocks.
 
     Args:
-        takes: the class of message that comes in; the other side's own is malformed.
-        host: to listen at; a name or number of an interface.
-        port: 0 is any that is free.
-        key: shared with the other side; None takes loopback addresses only.
+        takes: class of the messages of the other side; any other is malformed.
+        host: name or number of an interface.
+        port: port; 0 is any free one.
+        key: shared key; without one only loopback addresses are allowed.
 
     Attributes:
-        refused: datagrams that were not acted upon, by cause; who finds more of them adds them.
-        refusal: the last of them, in words; empty before there is one.
-        versions: other versions of the protocol that were heard, since they were last looked at.
-        unsent: datagrams that the system did not take: a full buffer, no way there.
+        refused: number of refused datagrams by cause.
+        refusal: cause of the last one in words; empty before the first.
+        versions: datagrams of other versions of the protocol; the reader empties it.
+        unsent: number of datagrams that the system did not send.
 
     Raises:
-        ConfigError: no key beyond loopback, a key that is too short, an address that is not free.
+        ConfigError: no key beyond loopback, a key that is too short, or an address in use.
     """
 
     def __init__(
@@ -110,23 +110,23 @@ class Endpoint:
 
     @property
     def address(self) -> Address:
-        """Where it listens."""
+        """Address of the socket."""
         host, port = self._socket.getsockname()
         return host, port
 
     def fileno(self) -> int:
-        """For `select`."""
+        """Return the descriptor, for `select`."""
         return self._socket.fileno()
 
     def close(self) -> None:
-        """Nothing is sent or got any more."""
+        """Close the socket."""
         self._socket.close()
 
     def send(self, message: Message, to: Address) -> bool:
-        """Whether it went out; what did not is counted.
+        """Send a message; return whether the system took it.
 
         Raises:
-            ConfigError: no key, and not to loopback.
+            ConfigError: an address beyond loopback without a key.
         """
         self._check_reach(to[0], "machine")
         try:
@@ -137,23 +137,23 @@ class Endpoint:
         return True
 
     def refuse(self, cause: Refusal, detail: str = "") -> None:
-        """Count a datagram that is not acted upon."""
+        """Count a refused datagram."""
         self.refused[cause] += 1
         self.refusal = f"{cause.value}: {detail}" if detail else cause.value
 
     def refuse_version(self, other: "OtherVersion") -> None:
-        """Say to a peer of another version which one is spoken here, in a head alone."""
+        """Send this side's version to a peer of another one, in a head alone."""
         with contextlib.suppress(OSError):
             self._socket.sendto(version_refusal(other.session, other.sequence), other.address)
 
     def receive(self) -> Iterator[tuple[Message, Address]]:
-        """What has come, at most AT_ONCE of it; the rest next time."""
+        """Yield what has come, at most AT_ONCE datagrams."""
         for _ in range(AT_ONCE):
             try:
                 data, address = self._socket.recvfrom(LONGEST + 1)
             except BlockingIOError:
                 return
-            except ConnectionError:  # what was sent before found nobody
+            except ConnectionError:  # nobody listens at the address of an earlier datagram
                 continue
             try:
                 message = decode(data, self._key)
@@ -170,10 +170,10 @@ class Endpoint:
 
 
 def read_key(path: Path | None) -> bytes | None:
-    """Return the bytes of a key's file without line breaks at its end; None without a file.
+    """Return the key in a file, without line breaks at its end; None without a file.
 
     Raises:
-        ConfigError: it cannot be read, or is too short or too long to be a key.
+        ConfigError: a file that cannot be read, or a key that is too short or too long.
     """
     if path is None:
         return None
@@ -192,7 +192,7 @@ def read_key(path: Path | None) -> bytes | None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address or a name is of this machine alone."""
+    """Return whether an address or a name is a loopback one."""
     try:
         return ipaddress.ip_address(socket.gethostbyname(host)).is_loopback
     except (OSError, UnicodeError, ValueError):
@@ -201,22 +201,18 @@ def is_loopback(host: str) -> bool:
 
 @dataclass
 class Window:
-    """Which sequence numbers were there already, of the last WINDOW.
+    """Sequence numbers that have come, of the last WINDOW.
 
     Attributes:
-        newest: of them, 0 for none.
-        seen: bit i is for `newest` - i.
+        newest: the newest, 0 for none.
+        seen: bit i is set if `newest` - i has come.
     """
 
     newest: int = 0
     seen: int = 0
 
-    def tell(self, sequence: int) -> str:
-        """Return what is wrong with a number that `take` refuses."""
-        return f"sequence {sequence} after {self.newest}"
-
     def take(self, sequence: int) -> Refusal | None:
-        """Note a number; why it is refused, or None."""
+        """Note a number; return why it is refused, or None."""
         behind = self.newest - sequence
         if behind < 0:
             self.seen = (self.seen << -behind if -behind < WINDOW else 0) & (2**WINDOW - 1) | 1
@@ -232,14 +228,14 @@ class Window:
 
 @dataclass
 class Session:
-    """One side's view of a session: who is there, what was sent, what has come.
+    """One side's view of a session.
 
     Attributes:
-        number: drawn by the controller.
-        address: of the other side.
-        nonce: drawn by the machine; 0 where it has not offered one.
-        window: of what has come.
-        heard: ns of the own clock when the last one was taken, 0 for none.
+        number: random number of the controller.
+        address: address of the other side.
+        nonce: random number of the machine; 0 before its offer.
+        window: sequence numbers that have come.
+        heard: own clock when the last datagram was accepted, ns; 0 for none.
     """
 
     number: int
@@ -253,21 +249,21 @@ class Session:
 
     @classmethod
     def drawn(cls, address: Address) -> "Session":
-        """A new one of a controller's."""
-        return cls(draw(), address)
+        """Return a new session of a controller."""
+        return cls(secrets.randbits(64) or 1, address)
 
     @classmethod
     def confirmed(cls, head: Head, address: Address, time: int) -> "Session":
-        """Return a machine's, begun by a datagram with the nonce of an offer.
+        """Return a session of a machine, begun by a datagram with the nonce of its offer.
 
-        The machine counts on from the sequences of its offers, which are those of the requests.
+        Its sequences continue those of the offers, which repeat the requests'.
         """
         session = cls(head.session, address, head.nonce, _sent=head.sequence - 1)
         session.refusal(head, address, time)
         return session
 
     def head(self, time: int) -> Head:
-        """Of the next datagram, which is sent now, in ns of the own clock."""
+        """Return the head of the next datagram, sent at `time`, ns of the own clock."""
         self._sent += 1
         held = time - self._got if self.window.newest else 0
         return Head(
@@ -275,7 +271,7 @@ class Session:
         )
 
     def refusal(self, head: Head, address: Address, time: int) -> Refusal | None:
-        """Why a datagram is not taken, or None: then it is noted, with the time of now."""
+        """Accept a datagram that came at `time`, ns of the own clock; return why not, or None."""
         if head.session != self.number or address != self.address:
             return Refusal.FOREIGN
         if self.nonce not in (0, head.nonce):
@@ -289,20 +285,15 @@ class Session:
         return refused
 
 
-def draw() -> int:
-    """A number of 64 bits that nobody guesses, not 0."""
-    return secrets.randbits(64) or 1
-
-
 class Offers:
-    """Offers of sessions, without any memory of who has asked.
+    """Offers of sessions, without state per request.
 
-    A nonce follows from the session, the address that asks and the number of sessions so far, under
-    a secret that is drawn at the start. So only who got an offer knows it, and what was recorded of
-    earlier sessions is worthless.
+    A nonce is an HMAC of the session, its address and the number of sessions so far, under a secret
+    of this process. Only the receiver of an offer knows it, and recorded sessions cannot be
+    replayed.
 
     Args:
-        secret: 32 bytes; drawn if None.
+        secret: 32 bytes; random by default.
     """
 
     def __init__(self, secret: bytes | None = None) -> None:
@@ -310,17 +301,17 @@ class Offers:
         self._sessions, self._tokens, self._counted = 0, float(ANSWERS_AT_ONCE), 0
 
     def nonce(self, session: int, address: Address) -> int:
-        """Return the nonce that is offered to an address for a session, not 0."""
+        """Return the nonce for a session and an address, not 0."""
         text = f"{session} {address[0]} {address[1]} {self._sessions}"
         digest = hmac.new(self._secret, text.encode(), hashlib.sha256).digest()
         return int.from_bytes(digest[:8], "little") or 1
 
     def taken(self) -> None:
-        """Withdraw all offers: a session has begun."""
+        """Withdraw all offers, because a session has begun."""
         self._sessions += 1
 
     def may_answer(self, time: int) -> bool:
-        """Whether an unknown address is answered at ns of the own clock; then it counts."""
+        """Take an answer to an unknown address from the allowance; return whether there is one."""
         grown = self._tokens + (time - self._counted) * ANSWERS / SECOND
         self._tokens, self._counted = min(float(ANSWERS_AT_ONCE), grown), time
         if self._tokens < 1:

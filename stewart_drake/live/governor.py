@@ -1,4 +1,4 @@
-"""A target that somebody moves by hand, approached smoothly and as far as the machine can go.
+"""Reference governor: a target set by hand, approached smoothly and within the machine's limits.
 
 Each coordinate follows an applied target g through three equal poles,
 
@@ -9,18 +9,19 @@ so that pose, rates and accelerations are continuous. With e = q - g at the star
     e(t) = (c0 + c1 t + c2 t^2) exp(-w t),
     c0 = e,   c1 = q' + w e,   c2 = (q'' + 2 w q' + w^2 e) / 2.
 
-The impulse response of three equal poles is positive: a target that moves one way moves the
-coordinate that way, without overshoot, and a pose at rest never turns back.
+The impulse response of three equal poles is positive. A target that moves one way therefore moves
+the coordinate that way without overshoot, and a pose at rest never turns back.
 
-The governor moves g towards the target, by the largest share k in [0, 1] for which the whole future
-under g + k (target - g) keeps to the limits (a scalar reference governor; Garone, Di Cairano,
+The governor moves g towards the target by the largest share k in [0, 1] for which the whole future
+under g + k (target - g) keeps to the limits (scalar reference governor; Garone, Di Cairano,
 Kolmanovsky, "Reference and command governors for systems with constraints", Automatica 75, 2017).
-k = 0 is the future that was found good before, so that there is always one: whatever is asked for,
-and whenever it ends, the plate goes on within the limits and comes to rest at g.
+k = 0 is the future that was checked before, so that a solution always exists: the plate stays
+within the limits and can come to rest at g at any time.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -28,6 +29,7 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import PITCH_LIMIT, home_sign, margin, standing
+from stewart_drake.law.motion import between
 from stewart_drake.law.startup import sizes
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
@@ -41,39 +43,39 @@ from stewart_drake.scenario.trajectories import evaluate, through_states
 from stewart_drake.types import Array
 
 PACE: Final = 4.0
-"""1/s, w: a step is done to 5 % after 6.3 / w = 1.6 s."""
+"""Pole w, 1/s: a step is complete to 5 % after 6.3 / w = 1.6 s."""
 LEAST_MARGIN: Final = 0.05
-"""Of the workspace (`dynamics.workspace.margin`), below which no target is followed."""
+"""Smallest workspace margin (`dynamics.workspace.margin`) of a motion by hand."""
 TORQUE_SHARE: Final = 0.8
-"""Of the motors' limit that a motion by hand may take; feedback needs the rest."""
+"""Share of the torque limit for a motion by hand; feedback needs the rest."""
 _GUARD: Final = 0.005
-"""By which the margin is larger at the instants that are looked at, for those in between."""
+"""Additional margin at the checked instants, for those in between."""
 _TORQUE_GUARD: Final = 0.995
-"""Share of the torque that is used there, for the same reason."""
+"""Share of the torque that is allowed at the checked instants, for the same reason."""
 _SETTLED: Final = 18.0
 """w t after which 2e-6 of a step are left."""
 _FINE, _COARSE, _UNTIL = 0.1, 0.5, 6.0
-"""Steps of w t of the look ahead, before and after `_UNTIL`."""
-_CLOSE: Final = 2e-4
-"""rad, and shares of the reach, to which it is found how far a target can be approached."""
+"""Steps of w t at which the future is checked, before and after `_UNTIL`."""
+_RESOLUTION: Final = 2e-4
+"""Accuracy of the applied target, rad and shares of the reach."""
 _FARTHEST: Final = 4.0
-"""The same, from home: farther targets are clipped to it. No machine travels that far."""
-_THERE: Final = 1e-6
-"""The same, within which it is reached."""
+"""Distance from home to which a target is clipped, in the same units; no machine goes that far."""
+_REACHED: Final = 1e-6
+"""Distance within which a target is reached, in the same units."""
 _BLENDS: Final = (1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
-"""s; lengths of a way onto a motion, tried in this order."""
+"""Durations of a blend onto a motion, s, tried in this order."""
 _BLEND_STEP: Final = 0.02
-"""s between the instants at which such a way is looked at."""
+"""Time between the checked instants of a blend, s."""
 
 
 def response(state: Array, applied: Array, pace: float, times: Array) -> Array:
-    """(n, 18) pose, rates and accelerations at `times` (n,) s from a state (18,), g constant.
+    """Return pose, rates and accelerations (n, 18) of the three poles with a constant target.
 
     Args:
-        state: pose, rates, accelerations.
-        applied: (6,) g, rad and m.
-        pace: w, 1/s.
-        times: s, >= 0.
+        state: pose, rates and accelerations (18,) at time 0.
+        applied: target g (6,), rad and m.
+        pace: pole w, 1/s.
+        times: instants (n,), s, >= 0.
     """
     e, v, a = state[POSE] - applied, state[RATES], state[ACCELERATIONS]
     c0, c1, c2 = e, v + pace * e, (a + 2 * pace * v + pace**2 * e) / 2
@@ -88,14 +90,14 @@ def response(state: Array, applied: Array, pace: float, times: Array) -> Array:
     return out
 
 
-class Governed(NamedTuple):
-    """What a governor remembers, at the beginning of a period.
+class GovernorState(NamedTuple):
+    """State of a governor at the beginning of a period.
 
     Attributes:
-        state: (18,) pose, rates and accelerations of the reference, rad, m and per s, s^2.
-        applied: (6,) g, where it comes to rest if nothing more is asked for.
-        limit: what keeps it from the target, in words, or None.
-        turn: which coordinate goes on alone next, where all together cannot.
+        state: pose, rates and accelerations (18,) of the reference, rad, m and per s, s^2.
+        applied: applied target g (6,), at which the reference comes to rest.
+        limit: limit that keeps g from the target, in words, or None.
+        turn: coordinate that moves alone next if all together cannot.
     """
 
     state: Array
@@ -104,14 +106,26 @@ class Governed(NamedTuple):
     turn: int = 0
 
 
-@dataclass(frozen=True)
-class Governor:
-    """Keeps a reference by hand within the workspace and the motors' limits.
+class Blend(NamedTuple):
+    """A blend onto a motion.
 
     Attributes:
-        dynamics: of the machine as it is known.
-        torque_limit: of each motor, N m, infinite for none; TORQUE_SHARE of it is used.
-        pace: w, 1/s.
+        way: trajectory of the blend, then the motion.
+        end: time at which the motion is reached, s.
+    """
+
+    way: Trajectory
+    end: float
+
+
+@dataclass(frozen=True)
+class Governor:
+    """Keeps a reference set by hand within the workspace and the torque limits.
+
+    Attributes:
+        dynamics: nominal dynamics.
+        torque_limit: limit of each motor, N m, of which TORQUE_SHARE is used.
+        pace: pole w, 1/s.
     """
 
     dynamics: StewartDynamics
@@ -128,84 +142,85 @@ class Governor:
         return sizes(self.dynamics.mechanism)
 
     def problem(self, states: Array) -> str | None:
-        """Which limit states (n, 18) pass, in words, or None."""
-        mechanism, least = self.dynamics.mechanism, LEAST_MARGIN + _GUARD
+        """Return the limit that reference states (n, 18) exceed, in words, or None."""
+        if self._within(states):
+            return None
+        mechanism = self.dynamics.mechanism
         margins = [margin(mechanism, state[POSE]) for state in states]
-        if not min(margins) >= least:  # or NaN
-            return self._named(states[int(np.argmin(margins))])
-        return self._torque_problem(states)
+        if min(margins) >= LEAST_MARGIN + _GUARD:
+            return self._torque_problem(states)
+        found, sign = (
+            standing(mechanism, states[int(np.argmin(margins)), POSE]),
+            home_sign(mechanism),
+        )
+        leg = int(found.sines.argmin())
+        limits = {
+            f"leg {LEGS[leg]} comes to the end of its reach": found.sines[leg],
+            "the pitch comes near 90 degrees": PITCH_LIMIT - abs(found.pitch),
+            "the cranks would hardly hold the plate there": sign * found.parallel,
+        }
+        return min(limits, key=lambda limit: limits[limit])
+
+    def _within(self, states: Array) -> bool:
+        """Return whether `problem` finds none; tries the end and every eighth state first."""
+        mechanism, least = self.dynamics.mechanism, LEAST_MARGIN + _GUARD
+        ordered = chain(states[::-8], states[::-1])
+        inside = all(margin(mechanism, state[POSE]) >= least for state in ordered)
+        return inside and self._torque_problem(states) is None
 
     def _torque_problem(self, states: Array) -> str | None:
-        most = TORQUE_SHARE * self.torque_limit
-        if np.isinf(most):
+        limit = TORQUE_SHARE * self.torque_limit
+        if np.isinf(limit):
             return None
         torques = np.abs(
             [self.dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS]) for x in states]
         ).max(axis=0)
         motor = int(np.argmax(torques))
-        if torques[motor] <= _TORQUE_GUARD * most:
+        if torques[motor] <= _TORQUE_GUARD * limit:
             return None
-        return f"motor {LEGS[motor]} would take {torques[motor]:.3g} N m of {most:.3g}"
-
-    def _named(self, state: Array) -> str:
-        now = standing(self.dynamics.mechanism, state[POSE])
-        sign = home_sign(self.dynamics.mechanism)
-        leg = int(now.sines.argmin())
-        limits = {
-            f"leg {LEGS[leg]} comes to the end of its reach": now.sines[leg],
-            "the pitch comes near 90 degrees": PITCH_LIMIT - abs(now.pitch),
-            "the cranks would hardly hold the plate there": sign * now.parallel,
-        }
-        return min(limits, key=lambda reason: limits[reason])
+        return f"motor {LEGS[motor]} would take {torques[motor]:.3g} N m of {limit:.3g}"
 
     def future(self, state: Array, applied: Array) -> Array:
-        """(n, 18) the way on from a state (18,) to rest at g (6,), where it is looked at."""
+        """Return the checked states (n, 18) from a state (18,) to rest at g (6,)."""
         return response(state, applied, self.pace, self._times)
 
-    def follow(self, governed: Governed, target: Array) -> Governed:
-        """With g moved towards a target (6,) as far as the limits let it; the state is the same."""
-        # A huge target would take a bisection per factor of two, and overflow.
-        reach = _FARTHEST * self._size
-        home = self.dynamics.mechanism.home
+    def follow(self, governed: GovernorState, target: Array) -> GovernorState:
+        """Move g towards a target (6,) as far as the limits allow; the reference stays."""
+        # Unclipped, a huge target would take a bisection per factor of two, and overflow.
+        reach, home = _FARTHEST * self._size, self.dynamics.mechanism.home
         target = np.clip(target, home - reach, home + reach)
-        away = target - governed.applied
-        if np.abs(away / self._size).max() <= _THERE:
-            return governed._replace(applied=np.array(target), limit=None)
-        limit = self.problem(self.future(governed.state, target))
+        step = target - governed.applied
+        limit = None
+        if np.abs(step / self._size).max() > _REACHED:
+            limit = self.problem(self.future(governed.state, target))
         if limit is None:
             return governed._replace(applied=np.array(target), limit=None)
-        share = self._share(governed, away)
-        if share == 0:  # what cannot go together goes on alone, one at a time
+        share = self._share(governed, step)
+        if share == 0:  # try one coordinate alone, another one each time
             alone = np.zeros(NUM_COORDINATES)
-            alone[governed.turn] = away[governed.turn]
-            away, share = alone, self._share(governed, alone)
+            alone[governed.turn] = step[governed.turn]
+            step, share = alone, self._share(governed, alone)
             governed = governed._replace(turn=(governed.turn + 1) % NUM_COORDINATES)
-        return governed._replace(applied=governed.applied + share * away, limit=limit)
+        return governed._replace(applied=governed.applied + share * step, limit=limit)
 
-    def _share(self, governed: Governed, away: Array) -> float:
-        low, high, size = 0.0, 1.0, np.abs(away / self._size).max()
-        while (high - low) * size > _CLOSE:
+    def _share(self, governed: GovernorState, step: Array) -> float:
+        low, high, size = 0.0, 1.0, np.abs(step / self._size).max()
+        while (high - low) * size > _RESOLUTION:
             middle = (low + high) / 2
-            future = self.future(governed.state, governed.applied + middle * away)
+            future = self.future(governed.state, governed.applied + middle * step)
             low, high = (middle, high) if self._within(future) else (low, middle)
         return low
 
-    def _within(self, states: Array) -> bool:
-        """Whether `problem` has none; most often the last state shows it."""
-        mechanism, least = self.dynamics.mechanism, LEAST_MARGIN + _GUARD
-        inside = all(margin(mechanism, state[POSE]) >= least for state in states[::-1])
-        return inside and self._torque_problem(states) is None
-
-    def after(self, governed: Governed, time: float) -> Governed:
-        """The same `time` s later."""
+    def after(self, governed: GovernorState, time: float) -> GovernorState:
+        """Advance the reference by `time` s."""
         state = response(governed.state, governed.applied, self.pace, np.array([time]))[0]
         return governed._replace(state=state)
 
     def stop_pose(self, state: Array) -> Array:
-        """(6,) the target at which a motion (18,) comes to rest soonest without turning back.
+        """Return the target (6,) at which a motion (18,) stops soonest without turning back.
 
-        The rates are [v + (a + w v) t - w c2 t^2] exp(-w t). With c2 = 0 they keep their sign where
-        a + w v has that of v; where it has not, they do with -4 w c2 v = (a + w v)^2.
+        The rates are [v + (a + w v) t - w c2 t^2] exp(-w t). With c2 = 0 they keep their sign if
+        a + w v has the sign of v; otherwise they do with -4 w c2 v = (a + w v)^2.
         """
         q, v, a = state[POSE], state[RATES], state[ACCELERATIONS]
         w, slope = self.pace, a + self.pace * v
@@ -214,46 +229,32 @@ class Governor:
         c2[back] = -(slope[back] ** 2) / (4 * w * v[back])
         return q - (2 * c2 - a - 2 * w * v) / w**2
 
-    def begin(self, state: Array) -> Governed | str:
-        """Take over from a motion (18,) that somebody else has made: towards rest, within limits.
+    def begin(self, state: Array) -> GovernorState | str:
+        """Return a governor that stops a motion (18,), or the limit that prevents it.
 
-        Tried is to stop at once, then to stop on the way home, ever nearer to it.
-
-        Returns:
-            What to go on with, or the limit by which there is no way to rest now.
+        Tries to stop at once, then at poses nearer and nearer to home.
         """
         stop, home = self.stop_pose(state), self.dynamics.mechanism.home
         first = self.problem(self.future(state, stop))
         if first is None:
-            return Governed(state, stop)
+            return GovernorState(state, stop)
         for share in (0.1, 0.25, 0.5, 0.75, 1.0):
             applied = stop + share * (home - stop)
-            if self.problem(self.future(state, applied)) is None:
-                return Governed(state, applied, first)
+            if self._within(self.future(state, applied)):
+                return GovernorState(state, applied, first)
         return first
 
-    def onto(self, state: Array, time: float, motion: Trajectory) -> "Blend | str":
-        """The shortest way from a state (18,) at `time` s onto a motion that is within the limits.
+    def onto(self, state: Array, time: float, motion: Trajectory) -> Blend | str:
+        """Return the shortest blend from a state (18,) at `time` s onto a motion within the limits.
 
-        Returns:
-            The way, or the limit that the longest one passes.
+        Without any it returns the limit that the longest one exceeds.
         """
-        limit = ""
+        states = np.empty((0, NUM_REFERENCE))
         for duration in _BLENDS:
-            end = time + duration
-            way = through_states([(time, state, end, evaluate(motion, end))], motion)
-            steps = np.arange(time, end, _BLEND_STEP)
-            found = self.problem(np.array([evaluate(way, float(t)) for t in steps]))
-            if found is None:
-                return Blend(way, end)
-            limit = found
-        return limit
-
-
-class Blend(NamedTuple):
-    """A way onto a motion."""
-
-    way: Trajectory
-    """The way, then the motion."""
-    end: float
-    """s, when the motion is reached."""
+            goal = evaluate(motion, time + duration)
+            shares = np.arange(0.0, 1.0, _BLEND_STEP / duration)
+            states = np.array([between(state, goal, duration, share) for share in shares])
+            if self._within(states):
+                end = time + duration
+                return Blend(through_states([(time, state, end, goal)], motion), end)
+        return self.problem(states) or ""

@@ -1,10 +1,10 @@
-"""The law in real time: a step for each measurement of a machine at the other end of a link.
+"""The law in real time: one step for each measurement of a machine at the other end of a link.
 
-Sample k is the instant t0 + k dt of the machine's clock. Its step begins when its measurement is
-there, or when that is later than any of the last ones was: then it counts as lost, and the model
-stands in. So the step is as periodic as what comes over the link, and never waits for what does not
-come. A step that is sent more than a period after its sample was due has missed its deadline; it is
-taken all the same, one after the other, until the loop has caught up.
+Sample k is the instant t0 + k dt of the machine's clock. Its step begins when its measurement has
+come, or when that is later than all of the last ones: then it counts as missing, and the model
+replaces it. The step is thus as periodic as the link, and never waits for a lost datagram. A step
+that ends more than a period after its sample was due misses its deadline. Late steps are taken all
+the same, one after the other, until the loop has caught up.
 """
 
 import math
@@ -12,7 +12,7 @@ import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -21,11 +21,10 @@ from stewart_drake.law.channel import Packets, Report, Wire
 from stewart_drake.law.core_law import AnyMemory, serving
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.timeline import Timeline, TorqueSchedule
-from stewart_drake.live.blind import LONGEST_GAP, stays_within_reach
-from stewart_drake.live.connect import await_free
-from stewart_drake.live.contact import Contact
+from stewart_drake.live.checks import LONGEST_GAP, ReportCheck, stays_within_reach
+from stewart_drake.live.contact import Contact, await_free
 from stewart_drake.live.design import Design
-from stewart_drake.live.endpoint import STOOD, now
+from stewart_drake.live.endpoint import STALL, now
 from stewart_drake.live.log import LiveRecord
 from stewart_drake.live.protocol import (
     NEVER,
@@ -36,8 +35,7 @@ from stewart_drake.live.protocol import (
     MachineMessage,
     Refusal,
 )
-from stewart_drake.live.reports import ReportCheck
-from stewart_drake.live.steering import Steering, Wish
+from stewart_drake.live.steering import Request, Steering
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.peer import Fault
 from stewart_drake.loop.recording import has_measured
@@ -45,100 +43,62 @@ from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, PACKETS, POSE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
-OFF: Final = 0.08
-"""Share of the motion by which a prediction is off the way, so that a new one is planned."""
-AT_START: Final = 0.02
-"""The same, by which a plate is where the scenario begins."""
-STANDS: Final = 0.005
-"""The same, per s, by which it moves that has come to rest."""
+REPLAN_ERROR: Final = 0.08
+"""Prediction error at which a new reference is planned, as a share of the motion."""
+START_ERROR: Final = 0.02
+"""Distance from the scenario's start up to which the plate is there, in the same unit."""
+REST_RATE: Final = 0.005
+"""Rate up to which the plate is at rest, in the same unit per s."""
 RESTING: Final = 8.0
-"""s in which it must."""
+"""Longest time for coming to rest, s."""
 SILENT: Final = 1.0
-"""Silence that is reported, s, or ten periods."""
+"""Silence of the machine that is reported, s; at least ten periods."""
 PATIENCE: Final = 10.0
-"""s of silence after which the controller gives up."""
+"""Silence of the machine after which the run ends, s."""
 _LEAD: Final = 0.05
-"""s, beside a round trip, from asking for a begin until then."""
+"""Time from the first request of a begin until then, in addition to a round trip, s."""
 _REPEATED: Final = 0.05
-"""s after which it is asked for again."""
+"""Time between two such requests, s."""
 _ANSWER: Final = 10.0
-"""s in which the machine must have begun."""
+"""Longest wait for the begin, s."""
 _SPARE: Final = 0.002
-"""s for which a measurement is waited for beside the usual."""
+"""Wait for a measurement in addition to the usual one, s."""
 _FURTHEST: Final = 4096
-"""Samples ahead of the next one whose measurements are kept."""
-_GONE: Final = 64
+"""Largest number of samples by which a measurement may be ahead of the next one."""
+_KEPT: Final = 64
 """Number of past samples whose messages are kept."""
 
 
 class End(NamedTuple):
-    """How a run ended: a status as of `loop.results.RunSummary`, and what stopped it."""
+    """How a run ended: its status (`loop.results.RunSummary`) and the failure, if any."""
 
     status: str
     stopped: Failure | None
 
     @property
     def words(self) -> str:
-        """The status, and what stopped the run."""
+        """Status and failure in words."""
         status = self.status.replace("_", " ")
         return status if self.stopped is None else f"{status}: {self.stopped}"
 
 
-class Viewer(Protocol):
-    """Who watches, and may ask for something."""
-
-    def show(self, seen: "Seen") -> None:
-        """The loop as it is now; never waits."""
-        ...
-
-    def wish(self) -> Wish:
-        """What is asked for."""
-        ...
-
-    def stopped(self) -> bool:
-        """Whether the end is asked for."""
-        ...
-
-    def ended(self, words: str) -> None:
-        """Show how the run ended; the last call."""
-        ...
-
-
-class Nobody:
-    """No viewer."""
-
-    def show(self, seen: "Seen") -> None:
-        """Nothing."""
-
-    def wish(self) -> Wish:
-        """The scenario's motion."""
-        return Wish()
-
-    def stopped(self) -> bool:
-        """Never."""
-        return False
-
-    def ended(self, words: str) -> None:
-        """Nothing."""
-
-
-class Seen(NamedTuple):
+class Snapshot(NamedTuple):
     """The loop at a sample.
 
     Attributes:
-        time: s since the begin.
-        state: (12,) of the plate.
-        wanted: (18,) of the reference.
-        torque: (6,) N m, that acts.
+        time: time since the begin, s.
+        state: estimated state (12,).
+        wanted: reference (18,).
+        torque: torque that acts (6,), N m.
         error: mean pose error, % of peak to peak.
-        eta: s, from a measurement to its torque, as the law believes.
-        trip: s, median round trip of the link.
-        spread: s, standard deviation of those.
+        eta: delay from a measurement to its torque as the law assumes it, s.
+        trip: median round trip, s.
+        spread: standard deviation of the round trips, s.
         lost: share of the datagrams that are lost, there and back.
-        missed: deadlines.
-        safe: why the machine is at its safe torque, or None.
-        by_hand: whether a hand leads.
-        limit: what keeps the plate from what is asked for, or None.
+        missed: number of missed deadlines.
+        safe: why the safe torque acts, or None.
+        by_hand: whether the target is set by hand.
+        limit: limit that prevents the requested motion, or None.
     """
 
     time: float
@@ -156,17 +116,35 @@ class Seen(NamedTuple):
     limit: str | None
 
 
+class Viewer:
+    """Shows a run and passes on requests; this one does neither."""
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Show the loop at a sample, without waiting."""
+
+    def request(self) -> Request:
+        """Return the present request."""
+        return Request()
+
+    def stopped(self) -> bool:
+        """Return whether an immediate stop is requested."""
+        return False
+
+    def ended(self, words: str) -> None:
+        """Show how the run ended; the last call."""
+
+
 @dataclass
-class Pace:
-    """How periodic the loop was.
+class Timing:
+    """Timing of the loop.
 
     Attributes:
         samples: number of steps.
-        late: s, of the last one: from the soonest that its measurement could have come until its
-            torques went out: what the link adds, the wait for what is lost, the step.
+        late: delay of the last step, s: from the earliest arrival of its measurement until its
+            torques were sent. It includes the jitter of the link and the wait for a lost datagram.
         resting: the same of the steps that bring the plate to rest, which are not recorded.
-        missed: how many of them took a period longer than measurements usually do.
-        overtaken: measurements that came after their step.
+        missed: number of steps whose delay exceeded a period and the usual jitter.
+        overtaken: number of measurements that came after their step.
     """
 
     samples: int = 0
@@ -179,17 +157,17 @@ class Pace:
         """Return entries of summary.json, from `late` (n,) of the recorded steps."""
         late = np.append(recorded, self.resting)
         late = late if len(late) else np.array([math.nan])
-        median = float(np.median(late))
+        p99 = float(np.quantile(late, 0.99))
         return {
             "samples": self.samples,
             "deadlines_missed": self.missed,
             "measurements_overtaken": self.overtaken,
             "sent_after_due_ms": {
-                "median": 1e3 * median,
-                "p99": 1e3 * float(np.quantile(late, 0.99)),
+                "median": 1e3 * float(np.median(late)),
+                "p99": 1e3 * p99,
                 "worst": 1e3 * float(late.max()),
             },
-            "jitter_std_ms": 1e3 * float(np.std(np.clip(late, None, np.quantile(late, 0.99)))),
+            "jitter_std_ms": 1e3 * float(np.std(np.clip(late, None, p99))),
         }
 
 
@@ -197,22 +175,21 @@ class LiveLoop:
     """Runs a law against a machine.
 
     Args:
-        design: what to run.
-        steering: of the reference, from t = 0 on.
-        contact: a session that the machine has offered.
-        viewer: who watches.
+        design: law and settings.
+        steering: reference from t = 0 on.
+        contact: session that the machine has offered.
+        viewer: shows the run.
         say: prints a line.
-        max_missing: s without a usable measurement after which the run ends; None is as long as the
-            estimator's uncertainty allows (`live.blind`).
-        log: CSV file that the rows of the record are written to as they come; None is a temporary
-            one.
+        max_missing: longest gap of usable measurements, s. By default as long as the estimator's
+            uncertainty allows (`live.checks`).
+        log: CSV file of the record, written as the run goes on; a temporary one by default.
 
     Attributes:
-        record: of the run.
-        pace: see `Pace`.
-        memory: of the law, as of the last sample.
-        recoveries: how often a new way was planned.
-        taken_over: whether the plate was anywhere else than at the scenario's start.
+        record: record of the run.
+        timing: see `Timing`.
+        memory: memory of the law after the last sample.
+        recoveries: number of new references that were planned.
+        taken_over: whether the plate was not at the scenario's start.
     """
 
     def __init__(
@@ -230,7 +207,7 @@ class LiveLoop:
         self._law: Any
         self._law = serving(design.law).law
         self.record = LiveRecord(design.experiment, design.torque_limit, log, say)
-        self.pace = Pace()
+        self.timing = Timing()
         self.memory: AnyMemory = self._law.initial_memory(design.queue)
         self.recoveries, self.taken_over = 0, False
         self._measured, self._known = -1, self.memory
@@ -238,20 +215,20 @@ class LiveLoop:
         self._period, self._weights = c.period, np.array([c.w_Q, c.w_R])
         self._size = 2 * design.experiment.motion_scale
         self._sends = isinstance(design.law.channel, Packets)
-        # The next torque alone: what a plan goes on with may still change.
+        # Of the next torque alone: the planned ones after it may still change.
         self._horizon = float(replace(design.law, channel=Wire()).preview_times.max())
         self._began, self._came = 0, dict[int, MachineMessage]()
         self._sequences = dict[int, int]()
         self._flags, self._silent_since = MachineFlags(0), 0
         self._asked, self._recording = NOTHING, True
-        self._parked = self._leads = self._late = False
+        self._parked = self._leads = self._stalled = False
         self._safe: str | None = None
         self._check = ReportCheck(design.torque_limit)
 
-    # -------------------------------------------------------------- the begin
+    # -------------------------------------------------------------- begin
 
     def begin(self, flags: ControllerFlags) -> None:
-        """Agree with the machine on when the run begins, and wait until then.
+        """Agree with the machine on the begin of the run, and wait until then.
 
         Raises:
             ConfigError: another controller drives it.
@@ -263,8 +240,8 @@ class LiveLoop:
         assert last is not None
         contact.join()
         self._parked = bool(last.flags & (MachineFlags.PARKED | MachineFlags.RESETS))
-        # Of the machine's clock, or earlier by the way back.
-        here = (clock.monotonic() - contact.soonest) * last.rate
+        # The machine's clock, or earlier by the way back.
+        here = (clock.monotonic() - contact.due(0, last.rate)) * last.rate
         lead = _LEAD + contact.link.longest
         asked, until = round((here + lead * last.rate) * SECOND), now() + round(_ANSWER * SECOND)
         step = round(min(self._period / last.rate, _REPEATED) * SECOND)
@@ -287,28 +264,27 @@ class LiveLoop:
         values, size = message.values, self._design.law.sensing.size
         if values is not None and values.size != size:
             found = f"a measurement of {values.size} numbers; expected {size}"
-            self._contact.refuse(Refusal.MALFORMED, found)
+            self._contact.endpoint.refuse(Refusal.MALFORMED, found)
             return
         k = round((message.sampled - message.begin) / message.period)
-        if k > self.pace.samples + _FURTHEST:
-            self._contact.refuse(Refusal.MALFORMED)
+        if k > self.timing.samples + _FURTHEST:
+            self._contact.endpoint.refuse(Refusal.MALFORMED)
             return
-        if k < self.pace.samples:
-            self.pace.overtaken += 1
-            self._contact.refuse(Refusal.LATE)
+        if k < self.timing.samples:
+            self.timing.overtaken += 1
+            self._contact.endpoint.refuse(Refusal.LATE)
         self._came.setdefault(k, message)
 
-    # -------------------------------------------------------------- the run
+    # -------------------------------------------------------------- run
 
     def run(self, duration: float, ending: Callable[[], bool] = lambda: False) -> End:
-        """Go on for so many s, which may be infinite, then bring the plate to rest.
+        """Run for `duration` s, which may be infinite, then bring the plate to rest.
+
+        A stop of the viewer, Ctrl-C or a failure ends the run at once.
 
         Args:
-            duration: s, that are recorded.
+            duration: recorded time, s.
             ending: whether to come to rest before that.
-
-        Returns:
-            How it ended. A viewer's stop, Ctrl-C, and whatever goes wrong end it at once.
         """
         end, k = End("completed", None), 0
         try:
@@ -319,29 +295,32 @@ class LiveLoop:
                 k += 1
             if end.status == "completed":
                 if k * self._period < duration - 1e-9:
-                    end = End("interrupted", Failure(k * self._period, None, math.nan, "ended"))
+                    end = self._end("interrupted", k, "ended")
                 self._come_to_rest(k)
         except KeyboardInterrupt:
-            end = End("interrupted", Failure(k * self._period, None, math.nan, "stopped"))
+            end = self._end("interrupted", k, "stopped")
         self.stop()
         self._viewer.ended(end.words)
         return end
+
+    def _end(self, status: str, k: int, reason: str, leg: int | None = None) -> End:
+        return End(status, Failure(k * self._period, leg, math.nan, reason))
 
     def _step(self, k: int) -> End:
         if self._viewer.stopped():
             raise KeyboardInterrupt
         message = self._await(k)
-        self._tell_lag(k)
-        return self._over(k, message) or self._sample(k, message) or End("completed", None)
+        self._report_stall(k)
+        return self._watch(k, message) or self._sample(k, message) or End("completed", None)
 
     def _come_to_rest(self, k: int) -> None:
-        """Go on until the plate stands, without a record."""
+        """Go on, without a record, until the plate is at rest."""
         self._recording, last = False, k + math.ceil(RESTING / self._period)
         while k < last and self._step(k).status == "completed":
             way, t = self._steering.way, k * self._period
             wanted = np.array([way.at(t)[RATES], way.at(t + self._horizon)[RATES]])
             rates = np.vstack([wanted, self.memory.belief.state[RATES]])
-            if np.all(np.abs(rates) <= STANDS * self._size):
+            if np.all(np.abs(rates) <= REST_RATE * self._size):
                 return
             k += 1
 
@@ -352,14 +331,14 @@ class LiveLoop:
             clock.sleep(0.01)
 
     def _due(self, k: int) -> int:
-        """ns of the own clock at which the measurement of a sample may come at the soonest."""
+        """Return the earliest arrival of the measurement of a sample, ns of the own clock."""
         last = self._contact.last
         assert last is not None
         sampled = self._began + round(k * self._period * SECOND)
         return round(self._contact.due(sampled, last.rate) * SECOND)
 
     def _await(self, k: int) -> MachineMessage | None:
-        """The message with a sample's measurement, or None once it is too late."""
+        """Return the message with a sample's measurement, or None once it is too late."""
         for message in self._contact.receive():
             self._take(message)
         usual = self._contact.lateness(self._period) + _SPARE
@@ -369,44 +348,41 @@ class LiveLoop:
                 break
             for message in self._contact.wait(until):
                 self._take(message)
-        for old in [n for n in self._came if n < k - _GONE]:
+        for old in [n for n in self._came if n < k - _KEPT]:
             del self._came[old]
         return self._came.get(k)
 
-    def _tell_lag(self, k: int) -> None:
-        """Report once that this process is late by more than the link adds."""
+    def _report_stall(self, k: int) -> None:
+        """Report once that this process is late by more than the jitter of the link."""
         lag = now() - self._due(k) - self._contact.lateness(self._period) * SECOND
-        if lag > STOOD and not self._late:
+        if lag > STALL and not self._stalled:
             self._say(
                 f"at {k * self._period:.1f} s: stood still for {lag / SECOND:.1f} s; the machine "
                 "went on by its buffer"
             )
-        self._late = lag > STOOD
+        self._stalled = lag > STALL
 
-    def _over(self, k: int, message: MachineMessage | None) -> End | None:
-        """Why it does not go on, or None; what changes about the machine is said."""
-        time = k * self._period
-        silent = (now() - self._contact.heard) / SECOND
+    def _watch(self, k: int, message: MachineMessage | None) -> End | None:
+        """Report changes of the machine; return the end of the run, or None."""
+        time, contact = k * self._period, self._contact
+        silent = (now() - contact.heard) / SECOND
         if silent > max(SILENT, 10 * self._period):
             if not self._silent_since:
-                self._silent_since = self._contact.heard
+                self._silent_since = contact.heard
                 self._say(f"at {time:.1f} s: the machine is silent since {silent:.1f} s; waiting")
             if silent > PATIENCE:
-                reason = f"the machine was silent for {PATIENCE:g} s"
-                return End("lost_machine", Failure(time, None, math.nan, reason))
+                return self._end("lost_machine", k, f"the machine was silent for {PATIENCE:g} s")
         elif self._silent_since:
-            gone = (self._contact.heard - self._silent_since) / SECOND
+            gone = (contact.heard - self._silent_since) / SECOND
             self._silent_since = 0
             self._say(f"at {time:.1f} s: the machine is heard again, after {gone:.1f} s")
-        last = self._contact.last
-        if last is not None and last.reason.fault == Fault.ENDED:
-            return End("lost_machine", Failure(time, None, math.nan, last.why))
+        if contact.last is not None and contact.last.reason.fault == Fault.ENDED:
+            return self._end("lost_machine", k, contact.last.why)
         if message is None:
             return None
         before, self._flags = self._flags, message.flags
         if MachineFlags.LEFT in message.flags:
-            leg = message.reason.leg or None
-            return End("left_workspace", Failure(time, leg, math.nan, message.why))
+            return self._end("left_workspace", k, message.why, message.reason.leg or None)
         self._safe = message.why if MachineFlags.SAFE in message.flags else None
         if MachineFlags.SAFE in message.flags & ~before:
             self._say(f"at {time:.1f} s: the machine is at its safe torque: {self._safe}")
@@ -415,28 +391,29 @@ class LiveLoop:
         return None
 
     def _sample(self, k: int, message: MachineMessage | None) -> End | None:
+        """Step the law and send its torques; return the end of the run, or None."""
         design, t = self._design, k * self._period
-        measured = None if message is None else message.values
-        nothing = np.full(design.law.sensing.size, np.nan)
-        measurement, report = Measurement.of(nothing if measured is None else measured), None
+        values = None if message is None else message.values
+        missing = np.full(design.law.sensing.size, np.nan)
+        measurement, report = Measurement.of(missing if values is None else values), None
         if message is not None:
             acted = self._acted(message)
             problem = self._check.problem(acted) if self._sends else None
             if problem is not None:
-                return End("refused", Failure(t, None, math.nan, problem))
+                return self._end("refused", k, problem)
             self.record.acted(acted)
             report = self._report(k)
         if not self._leads:
-            if not measurement.complete and not self._parked:  # who knows where it is
+            if not measurement.complete and not self._parked:  # the pose is unknown
                 self._contact.send(begin=self._began, flags=self._asked)
                 return self._lost(k)
             refused = self._start(t, measurement, message)
             if refused is not None:
-                return End("refused", Failure(t, None, math.nan, refused))
+                return self._end("refused", k, refused)
             self._leads = True
         counts = self.memory.counts
-        wish = self._viewer.wish() if self._recording else Wish(rest=True)
-        self._steering = self._steering.on(t + self._horizon, wish)
+        request = self._viewer.request() if self._recording else Request(rest=True)
+        self._steering = self._steering.on(t + self._horizon, request)
         way = self._steering.way
         started = clock.perf_counter()
         self.memory = self._law.step(
@@ -448,39 +425,38 @@ class LiveLoop:
         )
         seconds = clock.perf_counter() - started
         self._send(k)
-        self._note_pace(k)
+        self._note_timing(k)
         wanted = way.at(t)
         if self._recording:
-            # A way onto the motion is judged by the motion, as in a simulation.
+            # A blend onto the motion is judged by the motion, as in a simulation.
             judged = wanted if self._by_hand else evaluate(self._steering.motion, t)
             packets = self._packets(k, message)
-            late = self.pace.late
+            late = self.timing.late
             self.record.sample(k, self.memory, measurement, judged, seconds, late, packets)
         self._recover(k)
-        self._viewer.show(self._seen(k, wanted))
+        self._viewer.show(self._snapshot(k, wanted))
         if has_measured(self.memory, counts):
             self._measured, self._known = k, self.memory
         return self._lost(k)
 
     def _lost(self, k: int) -> End | None:
-        """Return the end of a run whose measurements have been missing for too long, or None."""
+        """Return the end of a run without usable measurements for too long, or None."""
         gap = (k - self._measured) * self._period
         if self._may_miss(gap):
             return None
         last = self._contact.last
         assert last is not None
         silent = last.rate * (now() - self._contact.heard) / SECOND
+        if silent >= gap - self._period:
+            return self._end("lost_machine", k, f"the machine was silent for {silent:.3g} s")
         before, after = self._known.counts._asdict(), self.memory.counts._asdict()
         causes = [
             f"{after[name] - before[name]} {name.removeprefix('measurements_')}"
             for name in after
             if name.startswith("measurements_") and after[name] > before[name]
         ]
-        status = "lost_contact"
         reason = f"no usable measurement for {gap:.3g} s ({', '.join(causes) or 'none came'})"
-        if silent >= gap - self._period:
-            status, reason = "lost_machine", f"the machine was silent for {silent:.3g} s"
-        return End(status, Failure(k * self._period, None, math.nan, reason))
+        return self._end("lost_contact", k, reason)
 
     def _may_miss(self, gap: float) -> bool:
         """Return whether the run goes on after `gap` s without a usable measurement."""
@@ -512,21 +488,21 @@ class LiveLoop:
             begin=self._began,
             flags=self._asked,
         )
-        self._sequences.pop(k - 2 * _GONE, None)
+        self._sequences.pop(k - 2 * _KEPT, None)
         timeline = self._design.law.timeline
         self._check.sent(first + round((eta - timeline.fraction * P) / P), packet)
 
-    def _note_pace(self, k: int) -> None:
-        late = (now() - self._due(k)) / SECOND
-        self.pace.samples, self.pace.late = self.pace.samples + 1, late
+    def _note_timing(self, k: int) -> None:
+        timing, late = self.timing, (now() - self._due(k)) / SECOND
+        timing.samples, timing.late = timing.samples + 1, late
         if not self._recording:
-            self.pace.resting.append(late)
-        self.pace.missed += late > self._period + self._contact.lateness(self._period)
+            timing.resting.append(late)
+        timing.missed += late > self._period + self._contact.lateness(self._period)
 
     # -------------------------------------------------------------- reports
 
     def _acted(self, message: MachineMessage) -> dict[int, Array]:
-        """Torques (6,) that have acted, by the number of the period that they began."""
+        """Return the torques (6,) that have acted by the number of the period that they began."""
         if message.acted_from == NEVER:
             return {}
         P = message.period
@@ -535,7 +511,7 @@ class LiveLoop:
         return {newest - i: torque for i, torque in enumerate(message.acted)}
 
     def _report(self, k: int) -> Report:
-        """What the law is told of its packets and torques at a sample."""
+        """Return the report on packets and torques for the law."""
         number = reported(self._design.law.kept)
         packets = [self._sequences.get(k - 1 - i) for i in range(number)]
         arrived = np.array([n is not None and self._contact.has_arrived(n) for n in packets])
@@ -548,24 +524,27 @@ class LiveLoop:
         return Report(arrived, np.array(acted).reshape(-1, NUM_TORQUES))
 
     def _packets(self, k: int, message: MachineMessage | None) -> Array:
-        """Counts as of `scenario.signals.PACKETS`; which were late only the machine knows."""
+        """Return the counts of `scenario.signals.PACKETS`; only the machine knows the late ones."""
         last = message or self._contact.last
         if last is None or not self._sends:
             return np.full(len(PACKETS), np.nan)
         return np.array([k + 1.0, self._contact.link.lost, math.nan, last.played, last.dry])
 
-    # -------------------------------------------------------------- the way
+    # -------------------------------------------------------------- reference
 
     def _start(
         self, t: float, measurement: Measurement, message: MachineMessage | None
     ) -> str | None:
-        """Lead the plate from where it is, if not at the scenario's start; why not, or None."""
+        """Lead a plate that is not at the scenario's start to the motion; return why not, or None.
+
+        A parked machine without a measurement is taken to be at the start.
+        """
         design, law = self._design, self._design.law
         first = law.sensing.start(measurement) if measurement.complete else None
         if first is None:
-            return None  # put there, as it says
+            return None
         away = np.abs(first.state - design.experiment.start) / np.tile(self._size, 2)
-        if away.max() <= AT_START:
+        if away.max() <= START_ERROR:
             return None
         self.taken_over = True
         acts = np.zeros(NUM_TORQUES)
@@ -574,15 +553,15 @@ class LiveLoop:
         queue = np.tile(acts, (len(design.queue), 1))
         self._law = serving(replace(law, silence=0)).law
         self.memory = self._law.initial_memory(queue)
-        anew = self._anew(t, first.state, _until_next(law.timeline, queue), None)
-        if isinstance(anew, str):
-            return f"there is no way from where the plate is: {anew}"
-        self._steering = anew
+        steering = self._replanned(t, first.state, _until_next(law.timeline, queue), None)
+        if isinstance(steering, str):
+            return f"no reference from the present pose: {steering}"
+        self._steering = steering
         self._say("the plate is not where the scenario begins: it is led there first")
         return None
 
     def _recover(self, k: int) -> None:
-        """Plan a new way where the prediction is off the old one."""
+        """Plan a new reference if the prediction is too far from the old one."""
         belief, law = self.memory.belief, self._design.law
         if not (
             belief.has_state and belief.feeds_back and belief.settled and not self.memory.silence
@@ -597,17 +576,18 @@ class LiveLoop:
         ahead = law.plant.predict(belief.state, schedule, belief.parameters)[-1]
         wanted = self._steering.way.at(t + belief.timeline.eta + self._period)[:NUM_STATE]
         away = np.abs(ahead - wanted) / np.tile(self._size, 2)
-        if not away.max() > OFF:  # or NaN
+        if not away.max() > REPLAN_ERROR:  # or NaN
             return
-        anew = self._anew(t, belief.state, schedule, belief.parameters)
-        if isinstance(anew, str):
-            return  # the next sample may see another
-        self._steering, self.memory = anew, self.memory.without_error()
+        steering = self._replanned(t, belief.state, schedule, belief.parameters)
+        if isinstance(steering, str):
+            return  # tried again at the next sample
+        self._steering, self.memory = steering, self.memory.without_error()
         self.recoveries += 1
 
-    def _anew(
+    def _replanned(
         self, t: float, state: Array, schedule: TorqueSchedule, parameters: Array | None
     ) -> Steering | str:
+        """Return a reference from the state after the torques in flight, or why there is none."""
         plant = self._design.law.plant
         dynamics = plant.dynamics if parameters is None else plant.dynamics.assuming(parameters)
         states = np.vstack([state, plant.predict(state, schedule, parameters)])
@@ -617,11 +597,9 @@ class LiveLoop:
             failure = diagnose(plant.mechanism, t, x[POSE])
             if failure is not None:
                 return f"{failure.reason} before a torque can act"
-        torques = (
-            np.vstack([schedule.torques[:1], schedule.torques]) if len(schedule.torques) else None
-        )
-        if torques is None:
-            torques = np.zeros((1, NUM_TORQUES))
+        torques = np.zeros((1, NUM_TORQUES))
+        if len(schedule.torques):
+            torques = np.vstack([schedule.torques[:1], schedule.torques])
         full = np.array(
             [
                 np.append(x, dynamics.accelerations(x[POSE], x[RATES], torque))
@@ -629,12 +607,12 @@ class LiveLoop:
             ]
         )
         times = t + np.append(0.0, np.cumsum(schedule.durations))
-        return self._steering.anew(times, full)
+        return self._steering.replan(times, full)
 
-    def _seen(self, k: int, wanted: Array) -> Seen:
+    def _snapshot(self, k: int, wanted: Array) -> Snapshot:
         link, memory = self._contact.link, self.memory
         error = memory.belief.state[POSE] - wanted[POSE]
-        return Seen(
+        return Snapshot(
             time=k * self._period,
             state=np.array(memory.belief.state),
             wanted=wanted,
@@ -644,7 +622,7 @@ class LiveLoop:
             trip=link.typical,
             spread=link.spread,
             lost=1 - (1 - link.loss_there) * (1 - link.loss_back),
-            missed=self.pace.missed,
+            missed=self.timing.missed,
             safe=self._safe,
             by_hand=self._by_hand,
             limit=self._steering.limit,
@@ -652,5 +630,5 @@ class LiveLoop:
 
 
 def _until_next(timeline: Timeline, flying: Array) -> TorqueSchedule:
-    """What acts from now until the next torque does, of torques (n >= L, 6) that are under way."""
+    """Return the schedule until the next torque acts, of torques (n >= L, 6) in flight."""
     return timeline.until_next(timeline.queue(np.vstack([np.zeros(NUM_TORQUES), flying])))

@@ -20,7 +20,7 @@ import numpy as np
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.body import Body, body_of
-from stewart_drake.live.endpoint import STOOD, Address, Endpoint, Offers, Session, now, read_key
+from stewart_drake.live.endpoint import STALL, Address, Endpoint, Offers, Session, now, read_key
 from stewart_drake.live.motors import Motors, Plan
 from stewart_drake.live.options import MachineOptions, Settings
 from stewart_drake.live.protocol import (
@@ -295,7 +295,7 @@ class Machine:
             lag = time - when
             if self._running:
                 self.longest_lag = max(lag, self.longest_lag)
-                if lag > STOOD and do != self._silence:
+                if lag > STALL and do != self._silence:
                     self._tell_lag(lag, when)
             do(when)
 

@@ -1,9 +1,8 @@
-"""The page of a live run: the machine in Meshcat, readouts, sliders, and the button that stops it.
+"""The page of a live run: the machine in Meshcat, readouts, sliders and a stop button.
 
-It is served by a process of its own, so that neither drawing nor a browser takes time from the
-loop. Both servers listen on this computer alone. What asks the machine to do something must bring
-the token that is in the page's address: other pages in the same browser, which can send to this
-computer too, do not know it.
+A separate process serves it, so that neither drawing nor a browser delays the loop. Both servers
+listen on this computer only. A request to the machine must carry the token of the page's address,
+which other pages in the same browser do not know.
 """
 
 import json
@@ -24,8 +23,8 @@ import numpy as np
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import jsonable
-from stewart_drake.live.loop import Seen
-from stewart_drake.live.steering import Wish
+from stewart_drake.live.loop import Snapshot, Viewer
+from stewart_drake.live.steering import Request
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.reporting.page import environment
 from stewart_drake.reporting.style import FACTORS
@@ -34,21 +33,21 @@ from stewart_drake.scenario.signals import COORDINATE_NAMES, NUM_COORDINATES, PO
 from stewart_drake.types import Array
 
 _FRAME: Final = 1 / 30
-"""s between two frames."""
-_TOLD: Final = 0.1
-"""s between two readouts."""
+"""Time between two frames, s."""
+_READOUT: Final = 0.1
+"""Time between two readouts, s."""
 _LAST: Final = 0.5
-"""s for which the page is served after the loop is gone."""
+"""Time for which the page is served after the end of the loop, s."""
 _START: Final = 60.0
-"""s in which the page must be there."""
+"""Longest wait for the page, s."""
 _LONGEST: Final = 4096
-"""Bytes of what a browser may send."""
+"""Longest request of a browser, bytes."""
 _AHEAD: Final = 0.2
-"""s for which the plate is drawn on its way between two samples, at the most."""
+"""Longest extrapolation of the pose between two samples, s."""
 
 
 class Opened(NamedTuple):
-    """Of the page's process, once it is there."""
+    """The address of the page, once its process serves it."""
 
     url: str
 
@@ -59,19 +58,19 @@ class Ended(NamedTuple):
     words: str
 
 
-class Asked(NamedTuple):
-    """What was asked for on the page."""
+class PageRequest(NamedTuple):
+    """A request made on the page."""
 
     target: Array | None
     stop: bool
 
 
-class PageViewer:
-    """A `live.loop.Viewer`: the page, in a process of its own.
+class PageViewer(Viewer):
+    """The page, in a separate process.
 
     Args:
-        mechanism: to be shown.
-        title: of the page.
+        mechanism: mechanism to draw.
+        title: title of the page.
     """
 
     def __init__(self, mechanism: Mechanism, title: str) -> None:
@@ -80,10 +79,10 @@ class PageViewer:
         self._process = context.Process(target=serve, args=(other, mechanism, title), daemon=True)
         self._process.start()
         other.close()
-        self._wish, self._stop, self._there, self._credit = Wish(), False, True, True
+        self._request, self._stop, self._open, self._ready = Request(), False, True, True
 
     def opened(self) -> str:
-        """The page's address, with its token; once, waits for it.
+        """Wait for the page; return its address with the token. To be called once.
 
         Raises:
             ConfigError: the page's process did not start.
@@ -91,30 +90,27 @@ class PageViewer:
         with suppress(EOFError):
             if self._connection.poll(_START):
                 return str(self._connection.recv().url)
-        raise ConfigError("--no-browser: not given, and the page did not start; expected it")
+        raise ConfigError("the browser page did not start; run with --no-browser")
 
-    def show(self, seen: Seen) -> None:
-        """See `Viewer`: what the page has no time for is left out."""
+    def show(self, snapshot: Snapshot) -> None:
+        """Send a sample to the page, or leave it out while the page draws another one."""
         self._read()
-        if self._credit and self._there:
-            self._credit = False
-            with self._gone():
-                self._connection.send(seen)
+        if self._ready and self._open:
+            self._ready = False
+            with self._until_closed():
+                self._connection.send(snapshot)
 
-    def wish(self) -> Wish:
-        """See `Viewer`."""
+    def request(self) -> Request:
         self._read()
-        return self._wish
+        return self._request
 
     def stopped(self) -> bool:
-        """See `Viewer`."""
         return self._stop
 
     def ended(self, words: str) -> None:
-        """See `Viewer`: the page says so, and its process stays until it was sent."""
         self._read()
-        if self._there:
-            with self._gone():
+        if self._open:
+            with self._until_closed():
                 self._connection.send(Ended(words))
 
     def close(self) -> None:
@@ -125,73 +121,69 @@ class PageViewer:
             self._process.terminate()
 
     def _read(self) -> None:
-        with self._gone():
-            while self._there and self._connection.poll():
-                said = self._connection.recv()
-                if isinstance(said, Asked):
-                    self._wish, self._stop = Wish(said.target), self._stop or said.stop
+        with self._until_closed():
+            while self._open and self._connection.poll():
+                received = self._connection.recv()
+                if isinstance(received, PageRequest):
+                    self._request = Request(received.target)
+                    self._stop = self._stop or received.stop
                 else:
-                    self._credit = True
+                    self._ready = True
 
     @contextmanager
-    def _gone(self) -> Iterator[None]:
-        """Where the page's process has ended the loop goes on without it, and the motion leads."""
+    def _until_closed(self) -> Iterator[None]:
+        """Go on without the page, on the scenario's motion, if its process has ended."""
         try:
             yield
         except (EOFError, OSError):
-            self._there, self._wish = False, Wish()
+            self._open, self._request = False, Request()
 
 
 # ---------------------------------------------------------------- the page's process
 
 
-class _Board:
-    """What the loop last said, for the threads that serve browsers."""
+class Readouts:
+    """The newest readouts as JSON, for the threads that serve browsers."""
 
     def __init__(self) -> None:
-        self.news = threading.Condition()
-        self.said: str = "{}"
-        self.number = 0
+        self._changed = threading.Condition()
+        self._text, self._number = "{}", 0
 
-    def put(self, said: dict[str, Any]) -> None:
-        with self.news:
-            self.said = json.dumps(jsonable(said), allow_nan=False)
-            self.number += 1
-            self.news.notify_all()
+    def put(self, values: dict[str, Any]) -> None:
+        """Replace the readouts."""
+        with self._changed:
+            self._text = json.dumps(jsonable(values), allow_nan=False)
+            self._number += 1
+            self._changed.notify_all()
 
     def after(self, number: int) -> tuple[str, int]:
-        with self.news:
-            self.news.wait_for(lambda: self.number != number, timeout=5.0)
-            return self.said, self.number
+        """Wait up to 5 s for readouts other than `number`; return them and their number."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._number != number, timeout=5.0)
+            return self._text, self._number
 
 
 def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
-    """Serve the page until the loop is gone.
-
-    Args:
-        connection: to the loop.
-        mechanism: to be shown.
-        title: of the page.
-    """
+    """Serve the page until the loop closes the connection."""
     import signal
 
     from pydrake.geometry import Meshcat, MeshcatParams
 
     from stewart_drake.loop.scene import Scene
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the loop, which then closes this
-    logging.getLogger("drake").setLevel(logging.WARNING)  # the address that counts is the page's
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the loop, which closes this
+    logging.getLogger("drake").setLevel(logging.WARNING)  # hides Meshcat's own address
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
-    scene, board = Scene(mechanism, meshcat), _Board()
+    scene, readouts = Scene(mechanism, meshcat), Readouts()
     token, lock = secrets.token_urlsafe(24), threading.Lock()
-
     low, high = slider_range(mechanism)
 
-    def ask(asked: Asked) -> None:
-        if asked.target is not None:
-            asked = asked._replace(target=np.clip(asked.target, low / FACTORS, high / FACTORS))
+    def ask(request: PageRequest) -> None:
+        if request.target is not None:
+            target = np.clip(request.target, low / FACTORS, high / FACTORS)
+            request = request._replace(target=target)
         with lock, suppress(OSError):
-            connection.send(asked)
+            connection.send(request)
 
     sliders = [
         {"name": name, "unit": "deg" if i < 3 else "mm", "low": low[i], "high": high[i]}
@@ -199,34 +191,34 @@ def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
     ]
     page = environment().get_template("live.html.j2")
     text = page.render(title=title, meshcat=meshcat.web_url(), token=token, sliders=sliders)
-    server = _Server(("127.0.0.1", 0), _handler(text, token, board, ask))
+    server = _Server(("127.0.0.1", 0), _handler(text, token, readouts, ask))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     with lock:
         connection.send(Opened(f"http://127.0.0.1:{server.server_port}/?token={token}"))
     with suppress(EOFError, OSError):
-        _draw(connection, lock, scene, board)
-    time.sleep(_LAST)  # for the browsers to hear how it ended
+        _draw(connection, lock, scene, readouts)
+    time.sleep(_LAST)  # for browsers to receive the end
     server.shutdown()
     scene.close()
 
 
-def _draw(connection: Connection, lock: threading.Lock, scene: Any, board: _Board) -> None:
-    """Draw what the loop says, and on between its samples."""
+def _draw(connection: Connection, lock: threading.Lock, scene: Any, readouts: Readouts) -> None:
+    """Draw the snapshots, and extrapolate between them."""
     from stewart_drake.loop.scene import full_color, torque_shares
 
-    seen, came, largest, told = None, 0.0, list[float](), 0.0
+    seen, came, largest, written = None, 0.0, list[float](), 0.0
     ended: dict[str, Any] = {}
     while True:
         started = time.monotonic()
         if connection.poll(_FRAME if seen is None else 0):
-            said = connection.recv()
-            if isinstance(said, Ended):
-                ended = {"ended": said.words}
-                board.put(ended if seen is None else _words(seen) | ended)
+            received = connection.recv()
+            if isinstance(received, Ended):
+                ended = {"ended": received.words}
+                readouts.put(ended if seen is None else _values(seen) | ended)
                 continue
-            seen, came = said, started
+            seen, came = received, started
             with lock:
-                connection.send(None)  # ready for more
+                connection.send(None)  # ready for the next
             largest = [*largest[-1000:], float(np.abs(seen.torque).max())]
             scene.paint(torque_shares(seen.torque, full_color(np.array(largest))))
         if seen is None:
@@ -235,14 +227,14 @@ def _draw(connection: Connection, lock: threading.Lock, scene: Any, board: _Boar
         pose, wanted = (x[POSE] + ahead * x[RATES] for x in (seen.state, seen.wanted))
         if np.all(np.isfinite(pose)):
             scene.show(pose, wanted)
-        if started - told >= _TOLD:
-            told = started
-            board.put(_words(seen) | ended)
+        if started - written >= _READOUT:
+            written = started
+            readouts.put(_values(seen) | ended)
         time.sleep(max(0.0, _FRAME - (time.monotonic() - started)))
 
 
-def _words(seen: Seen) -> dict[str, Any]:
-    """For the page: numbers in degrees and mm, ms, %."""
+def _values(seen: Snapshot) -> dict[str, Any]:
+    """Return the readouts in degrees, mm, ms and %."""
     return {
         "time": round(seen.time, 2),
         "wanted": np.round(FACTORS * seen.wanted[POSE], 2).tolist(),
@@ -264,18 +256,18 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Report what goes wrong, but for a browser that closes its connection."""
+        """Report an error, except that a browser has closed its connection."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
 
 
-def _handler(text: str, token: str, board: _Board, ask: Any) -> type[BaseHTTPRequestHandler]:
+def _handler(text: str, token: str, readouts: Readouts, ask: Any) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         def log_message(self, *_: Any) -> None:
-            """Nothing."""
+            pass
 
         def _allowed(self, given: str) -> bool:
-            # The name by which it was asked for, too: another site's name may lead here.
+            # The host name is checked too: a foreign name may resolve to this address.
             host = self.headers.get("Host", "").rpartition(":")[0]
             good = host in ("127.0.0.1", "localhost") and secrets.compare_digest(
                 given.encode(), token.encode()
@@ -308,11 +300,11 @@ def _handler(text: str, token: str, board: _Board, ask: Any) -> type[BaseHTTPReq
             if not (few and length.isdecimal() and int(length) <= _LONGEST):
                 self.send_error(413)
                 return
-            asked = read_wish(self.rfile.read(int(length)))
-            if asked is None:
+            request = read_request(self.rfile.read(int(length)))
+            if request is None:
                 self.send_error(400)
                 return
-            ask(asked)
+            ask(request)
             self._answer("application/json", b"{}")
 
         def _answer(self, kind: str, data: bytes) -> None:
@@ -329,26 +321,20 @@ def _handler(text: str, token: str, board: _Board, ask: Any) -> type[BaseHTTPReq
             self.send_header("Content-Type", "text/event-stream")
             self.send_header("Cache-Control", "no-store")
             self.end_headers()
+            number = -1
             with suppress(OSError):  # the browser is gone
-                for said in _news(board):
-                    self.wfile.write(f"data: {said}\n\n".encode())
+                while True:
+                    text, number = readouts.after(number)
+                    self.wfile.write(f"data: {text}\n\n".encode())
                     self.wfile.flush()
 
     return Handler
 
 
-def _news(board: _Board) -> Iterator[str]:
-    number = -1
-    while True:
-        said, number = board.after(number)
-        yield said
+def read_request(data: bytes) -> PageRequest | None:
+    """Return a browser's request, or None for anything else.
 
-
-def read_wish(data: bytes) -> Asked | None:
-    """What a browser has sent: `target`, six numbers in degrees and mm or null, and `stop`.
-
-    Returns:
-        None for what is no such thing.
+    It is JSON with `target`, six numbers in degrees and mm or null, and `stop`.
     """
     try:
         found = json.loads(data)
@@ -358,7 +344,7 @@ def read_wish(data: bytes) -> Asked | None:
         return None
     target = found.get("target")
     if target is None:
-        return Asked(None, found.get("stop", False))
+        return PageRequest(None, found.get("stop", False))
     numbers = isinstance(target, list) and len(target) == NUM_COORDINATES
     if not numbers or not all(type(x) in (int, float) for x in target):
         return None
@@ -366,4 +352,4 @@ def read_wish(data: bytes) -> Asked | None:
         pose = np.array(target, dtype=np.float64) / FACTORS
     except OverflowError:  # an integer of hundreds of digits
         return None
-    return Asked(pose, found.get("stop", False)) if np.all(np.isfinite(pose)) else None
+    return PageRequest(pose, found.get("stop", False)) if np.all(np.isfinite(pose)) else None

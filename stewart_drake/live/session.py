@@ -1,4 +1,4 @@
-"""A controller's session with a machine, from the first call to what it leaves behind."""
+"""A controller's session with a machine, from the first call to the result."""
 
 import contextlib
 import math
@@ -11,12 +11,11 @@ from typing import Any, Final, NamedTuple
 
 from stewart_drake.dynamics.threads import one_blas_thread
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.live.connect import call, open_endpoint
-from stewart_drake.live.contact import Contact
+from stewart_drake.live.contact import Contact, call, open_endpoint
 from stewart_drake.live.design import Design, as_seen, check_controller, design
 from stewart_drake.live.endpoint import Address, Endpoint
 from stewart_drake.live.governor import Governor
-from stewart_drake.live.loop import LiveLoop, Nobody, Viewer
+from stewart_drake.live.loop import LiveLoop, Viewer
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerFlags, MachineFlags
 from stewart_drake.live.steering import Steering, Way
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
@@ -30,18 +29,19 @@ from stewart_drake.studies.verdict import milliseconds
 from stewart_drake.types import Array
 
 LEAST_MEASURED: Final = 0.9
-"""Share of the samples that must have been measured for E_ac and the cost to mean something."""
+"""Smallest share of measured samples for which E_ac and the cost are given."""
 _MOST: Final = 0.5
-"""Share of a period that a step may take."""
+"""Share of a period above which a step counts as slow."""
 
 
 class Ready(NamedTuple):
-    """A machine that has been found, and the law for it; nothing has moved yet.
+    """A machine that was found, and the law for it, before anything moves.
 
     Attributes:
-        endpoint, contact: through which it is found.
-        design: of the scenario over the link as it was found.
-        margin: of the loop whose torques all act the time eta after their measurement.
+        endpoint: socket.
+        contact: contact with the machine.
+        design: law for the scenario over the link that was found.
+        margin: stability margin of the loop with a constant delay eta.
     """
 
     endpoint: Endpoint
@@ -51,13 +51,13 @@ class Ready(NamedTuple):
 
     @property
     def simulated(self) -> bool:
-        """Whether the machine says that it is a simulation."""
+        """Whether the machine reports that it is a simulation."""
         last = self.contact.last
         return last is not None and MachineFlags.SIMULATION in last.flags
 
     @property
     def jitter_problem(self) -> str | None:
-        """Reason for which the link's jitter may lose the plate, or None."""
+        """Reason why the jitter of the link may destabilise the loop, or None."""
         if self.margin.stable is False:
             return "the loop is unstable even without jitter: the plate may be lost"
         jitter, on_wire = self.contact.link.jitter, self.design.experiment.scenario.link
@@ -66,25 +66,21 @@ class Ready(NamedTuple):
         return (
             f"the jitter of {milliseconds(jitter)} is more than the "
             f"{milliseconds(self.margin.delay_margin)} of delay error that the loop is stable for, "
-            "and the machine has no play-out buffer: where the jitter reaches the motors, errors "
+            "and the machine has no play-out buffer: jitter that reaches the motors makes errors "
             "grow until the plate is lost"
         )
 
 
-def prepare_session(
-    scenario: Scenario,
-    address: Address,
-    key: bytes | None = None,
-) -> Ready:
-    """Find a machine, find out about the link, and make the law for it.
+def prepare_session(scenario: Scenario, address: Address, key: bytes | None = None) -> Ready:
+    """Find a machine, measure the link and design the law for it.
 
     Args:
-        scenario: whose law and motion it shall be.
-        address: of the machine.
-        key: shared with it; None for loopback.
+        scenario: law and motion.
+        address: address of the machine.
+        key: shared key; not needed on loopback.
 
     Raises:
-        ConfigError: one line that names what does not fit.
+        ConfigError: no machine there, or one that does not fit the scenario.
     """
     endpoint = open_endpoint(address, key)
     try:
@@ -101,7 +97,7 @@ def prepare_session(
 
 
 def _in_time(experiment: Experiment) -> Experiment:
-    """Return the experiment with a constant delay, as where every packet comes in time."""
+    """Return the experiment with a constant delay, as if every packet came in time."""
     sc = experiment.scenario
     if sc.link.kind == "wire":
         return experiment
@@ -113,7 +109,7 @@ def _in_time(experiment: Experiment) -> Experiment:
 
 
 def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
-    """Return lines on what will happen, before anything moves."""
+    """Return lines about the machine, the link and the law, for before the begin."""
     contact, made = ready.contact, ready.design
     machine, link, sc = contact.last, contact.link, made.experiment.scenario
     assert machine is not None
@@ -143,7 +139,7 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
 
 
 def _stability(ready: Ready) -> list[str]:
-    """Return lines that compare the loop's margin with the link's jitter, and what helps."""
+    """Return lines that compare the stability margin with the jitter, and remedies."""
     margin, link, sc = ready.margin, ready.contact.link, ready.design.experiment.scenario
     shorter, longer = (milliseconds(s) for s in (margin.margins.shorter, margin.margins.longer))
     judged = f"stable for delay errors from -{shorter} to +{longer}"
@@ -164,14 +160,14 @@ def _stability(ready: Ready) -> list[str]:
         return [found]
     return [
         found,
-        f"warning: {ready.jitter_problem}. What helps: a machine with a play-out buffer that is "
+        f"warning: {ready.jitter_problem}. Remedies: a machine with a play-out buffer that is "
         "longer than any round trip; a lower bandwidth (--set controller.w_R=1000); --controller "
         "adaptive_lqi where the delay is off by a constant",
     ]
 
 
 def _cautions(made: Design) -> list[str]:
-    """Return lines on the time of a step, and on what will go worse than in the scenario."""
+    """Return lines about the time of a step and an unsuitable queue."""
     sc, (step, backend) = made.experiment.scenario, made.step
     period = sc.controller.period
     slow = f"; more than {_MOST:.0%}: expect missed deadlines" if step > _MOST * period else ""
@@ -194,42 +190,42 @@ def _queue_advice(scenario: Scenario) -> str | None:
 
 
 def check_armed(ready: Ready, armed: bool) -> None:
-    """Refuse a machine that is no simulation, unless that was asked for.
+    """Refuse a real machine without --arm.
 
     Raises:
-        ConfigError: one line.
+        ConfigError: a real machine, not armed.
     """
     if not ready.simulated and not armed:
         ready.endpoint.close()
         raise ConfigError(
-            "--arm: got none, for a machine that does not say that it is a simulation; expected "
-            "--arm, with nobody in its reach"
+            "--arm: not given, for a machine that does not report that it is a simulation; "
+            "expected --arm, with all people out of its reach"
         )
 
 
 def check_jitter(ready: Ready, accepted: bool) -> None:
-    """Refuse a link whose jitter is more than the loop is stable for, unless that was accepted.
+    """Refuse a link with more jitter than the loop is stable for, unless that is accepted.
 
     Raises:
-        ConfigError: one line.
+        ConfigError: too much jitter, not accepted.
     """
     problem = ready.jitter_problem
     if problem is not None and not accepted:
         ready.endpoint.close()
-        raise ConfigError(f"--yes: not given, and {problem}; expected --yes to start all the same")
+        raise ConfigError(f"--yes: not given, and {problem}; expected --yes to start anyway")
 
 
 @contextlib.contextmanager
 def before_others() -> Iterator[str]:
-    """Let this process run before all that are not in real time, where the system permits it.
+    """Give this process real-time priority if the system permits it.
 
     Yields:
-        `real time`, or `usual`.
+        The scheduling, `real time` or `usual`.
     """
     try:
         policy, given = os.sched_getscheduler(0), os.sched_getparam(0)
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-    except (AttributeError, OSError):  # another system, or no right to
+    except (AttributeError, OSError):  # not on this system, or not permitted
         yield "usual"
         return
     try:
@@ -253,26 +249,26 @@ def drive(
     """Run the loop; the machine moves.
 
     Args:
-        ready: of `prepare_session`; its socket is closed in the end.
+        ready: result of `prepare_session`; its socket is closed.
         duration: s, or infinite.
-        armed: whether a machine that is no simulation may be driven.
-        accept_jitter: whether to start where the jitter is more than the loop is stable for.
-        viewer: who watches.
-        ending: whether to come to rest and end.
+        armed: whether a real machine may be driven.
+        accept_jitter: whether to start with more jitter than the loop is stable for.
+        viewer: shows the run and passes on requests.
+        ending: whether to bring the plate to rest and end.
         say: prints a line.
-        max_missing: s without a usable measurement after which the run ends, see `LiveLoop`.
-        log: file that the rows of the record are written to as they come, see `LiveLoop`.
+        max_missing: see `LiveLoop`.
+        log: see `LiveLoop`.
 
     Raises:
-        ConfigError: not armed for a real machine, more jitter than is accepted, or a machine that
-            does not begin.
+        ConfigError: not armed for a real machine, too much jitter, or a machine that does not
+            begin.
     """
     check_armed(ready, armed)
     check_jitter(ready, accept_jitter)
     made, contact = ready.design, ready.contact
     governor = Governor(made.law.plant.dynamics, made.torque_limit)
     steering = Steering(governor, made.experiment.reference, Way.along(made.planned))
-    loop = LiveLoop(made, steering, contact, viewer or Nobody(), say, max_missing, log)
+    loop = LiveLoop(made, steering, contact, viewer or Viewer(), say, max_missing, log)
     started = clock.perf_counter()
     try:
         with one_blas_thread, before_others() as scheduled:
@@ -297,20 +293,20 @@ def drive(
         )
     if len(late) < samples or not summary["measured_share"] >= LEAST_MEASURED:
         summary["accumulated_error"] = summary["cost"] = math.nan
-    told = _told(loop, contact, late) | {"scheduled": scheduled}
+    live = _live_summary(loop, contact, late) | {"scheduled": scheduled}
     return SimulationResult(
         scenario=as_run,
         status=status,
         stopped=stopped,
         signals=loop.record.dataset(),
-        summary=LiveSummary(**summary, live=told),
+        summary=LiveSummary(**summary, live=live),
     )
 
 
-def _told(loop: LiveLoop, contact: Contact, late: Array) -> dict[str, Any]:
+def _live_summary(loop: LiveLoop, contact: Contact, late: Array) -> dict[str, Any]:
     """Return `live` of summary.json."""
     link, last = contact.link, contact.last
-    return loop.pace.summary(late) | {
+    return loop.timing.summary(late) | {
         "taken_over": loop.taken_over,
         "recoveries": loop.recoveries,
         "round_trip_ms": {
@@ -324,5 +320,5 @@ def _told(loop: LiveLoop, contact: Contact, late: Array) -> dict[str, Any]:
         "periods_dry": 0 if last is None else last.dry,
         "refused": contact.refused,
         "refused_by_machine": 0 if last is None else last.refused,
-        "unsent": contact.unsent,
+        "unsent": contact.endpoint.unsent,
     }
