@@ -1,4 +1,4 @@
-"""The stewart-drake command. Drake is imported by the commands that need it, not for --help."""
+"""The stewart-drake command. Commands import Drake when they run, so that --help is fast."""
 
 import errno
 import functools
@@ -18,7 +18,7 @@ from stewart_drake.reporting.terminal import echo
 
 _BAD_INPUT: Final = 2
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-# Releases of typer keep their usage errors in different places; all derive from this class.
+# The base class of usage errors; its module differs between releases of typer.
 _UsageError: Final[Any] = typer.BadParameter.__mro__[1]
 
 app = typer.Typer(rich_markup_mode=None)
@@ -54,16 +54,16 @@ def main(arguments: list[str] | None = None) -> int:
         return _command().main(arguments, "stewart-drake", standalone_mode=False) or 0
     except _UsageError as error:
         return _complain(_usage_message(error))
-    except typer.Abort:  # Ctrl-C in a command that has nothing to keep
+    except typer.Abort:  # Ctrl-C
         return INTERRUPTED
-    except ImportError as error:  # what Drake makes of a Ctrl-C while it is loaded
+    except ImportError as error:  # Drake turns Ctrl-C into nested ones while it is loaded
         cause: BaseException | None = error
-        while isinstance(cause, ImportError):  # one for each module that was loading another
+        while isinstance(cause, ImportError):
             cause = cause.__cause__
         if isinstance(cause, KeyboardInterrupt):
             return INTERRUPTED
         raise
-    except BrokenPipeError:  # whoever read the output has seen enough
+    except BrokenPipeError:  # the reader of the output has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except _bad_input() as error:
@@ -76,15 +76,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 @functools.cache
 def _command() -> Any:
-    """All of it, as typer hands it to click; made once, also where a process runs many commands."""
+    """Return the whole command line as a click command."""
     add_examples(app)
     return typer.main.get_command(app)
 
 
 def _prepare_surroundings() -> None:
-    """Give closed standard streams a place, and figures Matplotlib's backend for files.
+    """Reopen closed standard streams, and select Matplotlib's backend for files.
 
-    The first file to be opened would take a closed stream's number, and what Drake says with it.
+    The first opened file would take the number of a closed stream, and with it Drake's messages.
     """
     os.environ["MPLBACKEND"] = "agg"
     for number, name in enumerate(("stdin", "stdout", "stderr")):

@@ -1,9 +1,8 @@
-"""The commands of `reporting.analyses.ANALYSES`: analyze hautus, delay and so on, and layout."""
+"""Commands of `reporting.analyses.ANALYSES`: analyze hautus, delay and so on, and layout."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cached_property
-from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +31,7 @@ app = typer.Typer(rich_markup_mode=None, help="Analyse a loop before it is built
 
 
 class _Command(TyperCommand):
-    """Command of an analysis. Its study, which has the options, is imported when it is called."""
+    """Command of an analysis, which imports the options of its study when it is called."""
 
     @cached_property
     def _made(self) -> Any:
@@ -40,19 +39,8 @@ class _Command(TyperCommand):
         single.command()(_callback(str(self.name)))
         return typer.main.get_command(single)
 
-    @property
-    def params(self) -> Any:
-        return self._made.params
-
-    @params.setter
-    def params(self, _: Any) -> None: ...
-
-    @property
-    def callback(self) -> Any:
-        return self._made.callback
-
-    @callback.setter
-    def callback(self, _: Any) -> None: ...
+    params = property(lambda self: self._made.params, lambda self, _: None)  # type: ignore[assignment]
+    callback = property(lambda self: self._made.callback, lambda self, _: None)  # type: ignore[assignment]
 
 
 def add_analyses(root: typer.Typer) -> None:
@@ -63,7 +51,7 @@ def add_analyses(root: typer.Typer) -> None:
 
 
 def _callback(name: str) -> Callable[..., int]:
-    """Return a function with the parameters that the command line offers for an analysis."""
+    """Return a function with the parameters of an analysis on the command line."""
     row = ANALYSES[name]
 
     @with_options(options_of(name), without=() if row.controller else ("controller",))
@@ -94,26 +82,19 @@ def _callback(name: str) -> Callable[..., int]:
             settings=typed,
             options={"controller": controller, **given.words, "out": out},
         )
-        with TemporaryDirectory() as scratch, _progress(name, out, quiet) as progress:
+        kept = GO_ON.replace("runs", row.keeps) if out else "nothing is kept without --out"
+        first = "preparing" if row.counts else "computing"
+        with (
+            TemporaryDirectory() as scratch,
+            stopping(kept) if row.keeps else contextlib.nullcontext(),
+            count_bar(row.counts or name, quiet, first) as progress,
+        ):
             loaded = load(controller)
-            delivery.tell_link(loaded)
+            delivery.say_link(loaded)
             found = analyze(
                 name, loaded, options, command=command, directory=out or scratch, progress=progress
             )
-        files = getattr(found.study, "files", ())
-        return delivery.answer(
-            found, *files, interrupted=getattr(found.study, "interrupted", False)
-        )
+        files, interrupted = (getattr(found.study, key, ()) for key in ("files", "interrupted"))
+        return delivery.answer(found, *files, interrupted=bool(interrupted))
 
     return run
-
-
-@contextlib.contextmanager
-def _progress(name: str, out: Path | None, quiet: bool) -> Iterator[Any]:
-    """Show what is counted, and say at Ctrl-C what is kept."""
-    row = ANALYSES[name]
-    kept = GO_ON.replace("runs", row.keeps) if out else "nothing is kept without --out"
-    with stopping(kept) if row.keeps else contextlib.nullcontext():
-        first = "preparing" if row.counts else "computing"
-        with count_bar(row.counts or name, quiet, first) as progress:
-            yield progress

@@ -1,4 +1,4 @@
-"""What the commands share: their usual options, and how they answer."""
+"""Options that commands share, and the output of results."""
 
 import contextlib
 import fcntl
@@ -24,12 +24,12 @@ INTERRUPTED: Final = 130
 """Exit status after Ctrl-C."""
 
 GO_ON: Final = "finished runs are kept, the same command goes on from there"
-_held: Final = contextlib.ExitStack()
-"""What is to be undone when the running command ends."""
+_at_exit: Final = contextlib.ExitStack()
+"""Clean-up when the running command ends."""
 
 
 def _shipped(kind: "Kind") -> Callable[[str], list[str]]:
-    """What a shell offers for an argument: the shipped names that go on from what is typed."""
+    """Return the completion of shipped names."""
 
     def complete(incomplete: str) -> list[str]:
         from stewart_drake.files.resources import shipped
@@ -40,24 +40,20 @@ def _shipped(kind: "Kind") -> Callable[[str], list[str]]:
 
 
 def complete_setting(incomplete: str) -> list[str]:
-    """What a shell offers for `--set`: fields, and where a field has few values, these."""
+    """Complete `--set`: fields, and the values of a field that has few."""
     from stewart_drake.scenario.loading import setting_choices
 
     return [text for text in setting_choices() if text.startswith(incomplete)]
 
 
-ScenarioName = Annotated[
-    str,
-    typer.Argument(
-        metavar="SCENARIO", help="Shipped name or file.", autocompletion=_shipped("scenario")
-    ),
-]
-MechanismName = Annotated[
-    str,
-    typer.Argument(
-        metavar="MECHANISM", help="Shipped name or file.", autocompletion=_shipped("mechanism")
-    ),
-]
+def _name(metavar: str, kind: "Kind") -> Any:
+    return typer.Argument(
+        metavar=metavar, help="Shipped name or file.", autocompletion=_shipped(kind)
+    )
+
+
+ScenarioName = Annotated[str, _name("SCENARIO", "scenario")]
+MechanismName = Annotated[str, _name("MECHANISM", "mechanism")]
 Settings = Annotated[
     list[str] | None,
     typer.Option(
@@ -78,27 +74,27 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON,
 
 
 def check_writable(directory: Path | None, *, alone: bool = True) -> None:
-    """Make the directory of `--out` if there is none; see also `release`.
+    """Make the directory of `--out`, if any; see also `release`.
 
     Args:
         directory: or None.
-        alone: whether no other command may write there until this one ends.
+        alone: whether to lock it against other commands until this one ends.
 
     Raises:
-        ConfigError: it cannot be written to, or another command is writing there.
+        ConfigError: not writable, or locked by another command.
     """
     if directory is None:
         return
     try:
         made = [path for path in (directory, *directory.parents) if not path.exists()]
         directory.mkdir(parents=True, exist_ok=True)
-        _held.callback(_remove_empty, made)
+        _at_exit.callback(_remove_empty, made)
         with tempfile.TemporaryFile(dir=directory):
             pass
         if alone:
-            # A lock on the directory itself leaves no file, and ends with the process in any case.
+            # A lock on the directory itself leaves no file and ends with the process.
             lock = os.open(directory, os.O_RDONLY)
-            _held.callback(os.close, lock)
+            _at_exit.callback(os.close, lock)
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         remove_partials(directory)
     except BlockingIOError:
@@ -117,7 +113,7 @@ def check_file(path: Path) -> None:
     """Make the directory of a file that `--out` names.
 
     Raises:
-        ConfigError: it is a directory or a device itself, or its own cannot be written to.
+        ConfigError: a directory or a device, or not writable.
     """
     if path.exists() and not path.is_file():
         kind = "a directory" if path.is_dir() else "no regular file"
@@ -126,8 +122,8 @@ def check_file(path: Path) -> None:
 
 
 def release() -> None:
-    """End what `check_writable` has begun: unlock, remove made directories that stayed empty."""
-    _held.close()
+    """Unlock directories, and remove new ones that stayed empty."""
+    _at_exit.close()
 
 
 def _remove_empty(directories: list[Path]) -> None:
@@ -138,7 +134,7 @@ def _remove_empty(directories: list[Path]) -> None:
 
 @contextlib.contextmanager
 def stopping(text: str) -> Iterator[None]:
-    """On Ctrl-C in here the command ends at once, with these words."""
+    """On Ctrl-C print `text` and end the command."""
     try:
         yield
     except KeyboardInterrupt:
@@ -147,11 +143,11 @@ def stopping(text: str) -> Iterator[None]:
 
 
 class Delivery:
-    """What a command says and leaves behind; made before anything is computed.
+    """Output of a command: text, and files in a folder; made before the computation.
 
     Args:
-        out: the directory of `--out`, or None; see `check_writable`.
-        quiet, as_json: the command's options.
+        out: directory of `--out`, or None; see `check_writable`.
+        quiet, as_json: options of the command.
     """
 
     def __init__(self, out: Path | None, quiet: bool, as_json: bool = False) -> None:
@@ -160,25 +156,26 @@ class Delivery:
         self._written: list[str] = []
 
     def say(self, text: str) -> None:
-        """Print it, unless nothing or only JSON is wanted."""
+        """Print a text, unless `--quiet` or `--json` is given."""
         if not self.silent:
             echo(text)
 
-    def tell(self, line: str) -> None:
-        """Print a line, wrapped to a screen."""
+    def say_wrapped(self, *lines: str) -> None:
+        """Print lines, each wrapped at 80 columns."""
         from stewart_drake.reporting.document import wrap
 
-        self.say(wrap(line))
+        for line in lines:
+            self.say(wrap(line))
 
-    def tell_link(self, scenario: "Scenario") -> None:
-        """Print the network that is assumed, if there is one."""
+    def say_link(self, scenario: "Scenario") -> None:
+        """Print the assumed network, if any."""
         from stewart_drake.scenario.link import link_text
 
         if text := link_text(scenario):
-            self.tell(f"link: {text}")
+            self.say_wrapped(f"link: {text}")
 
     def discard(self, *names: str) -> None:
-        """Delete files of an earlier run, as far as they exist, and its summary."""
+        """Delete files of an earlier run, and its summary."""
         if self.out is not None:
             for name in ("summary.json", *names):
                 (self.out / name).unlink(missing_ok=True)
@@ -192,7 +189,7 @@ class Delivery:
             self.wrote("summary.json")
 
     def draw(self, what: str, draw: Callable[[Path], Any]) -> None:
-        """What comes after the results, into `out`; a failure costs it alone, and is told.
+        """Write figures or a page after the results; an error in drawing is only a warning.
 
         A file that cannot be written, as on a full disk, is an error as everywhere.
         """
@@ -210,23 +207,28 @@ class Delivery:
             self.wrote(f"{len(found)} figures" if what == "figures" else what)
 
     def wrote(self, *names: str) -> None:
-        """To be told at the end."""
+        """Add names to the list of written files."""
         self._written += names
 
-    def answer(self, found: "AnalysisResult", *beside: str, interrupted: bool = False) -> int:
-        """Print a result, write summary.json and the page, name the files `beside`; the status."""
+    def answer(self, found: "AnalysisResult", *files: str, interrupted: bool = False) -> int:
+        """Print an analysis, write summary.json and the page, and return the exit status.
+
+        Args:
+            found: the result.
+            files: names of further files that it wrote.
+            interrupted: whether Ctrl-C ended it.
+        """
         from stewart_drake.reporting.results import PAGE
 
         self.say(str(found))
-        # No page of an earlier run beside this one's numbers, which come first.
-        self.discard(PAGE)
+        self.discard(PAGE)  # a page of an earlier run would contradict the new numbers
         self.write(found.summary)
         self.draw(PAGE, found.write_page)
-        self.wrote(*beside)
+        self.wrote(*files)
         return self.end(found.summary, interrupted)
 
     def end(self, summary: Mapping[str, Any], interrupted: bool = False) -> int:
-        """Tell what was written, print the summary if it is wanted; the exit status."""
+        """Print the names of the written files, or the summary as JSON; return the exit status."""
         from stewart_drake.files.jsonio import jsonable
         from stewart_drake.reporting.document import WIDTH, wrap
 
@@ -240,7 +242,7 @@ class Delivery:
 
 
 def open_meshcat() -> Any:
-    """A Meshcat server, on a free port."""
+    """Start a Meshcat server on a free port."""
     from pydrake.geometry import Meshcat
 
     return Meshcat()

@@ -1,4 +1,4 @@
-"""A machine from its logs, and the plan of a log: identify."""
+"""Command identify: a machine from its logs, and the plan of a log."""
 
 import re
 from pathlib import Path
@@ -71,9 +71,9 @@ def identify(
 ) -> int:
     """Find delay, friction and geometry in a log.
 
-    Even in that of a lost run. Writes mechanism.yaml and calibration.yaml for simulate, and a page.
-    A CSV log has the columns time[s], torque_1[N m] to torque_6 as they were commanded,
-    angle_1[rad] to angle_6, and where they were measured roll[rad] to z[m].
+    The run may have ended early. Writes mechanism.yaml and calibration.yaml for simulate, and a
+    page. A CSV log has the columns time[s], torque_1[N m] to torque_6 (commanded), angle_1[rad] to
+    angle_6 and, if measured, roll[rad] to z[m].
     """
     tolerances = read_tolerances(tolerance or ())
     precision = _precision(bits, pose_std)

@@ -1,4 +1,4 @@
-"""The loop in real time, and a simulated machine for it: live, machine."""
+"""Commands of the loop in real time: live, and machine, a simulated machine."""
 
 import contextlib
 import ctypes
@@ -25,21 +25,18 @@ from stewart_drake.cli.common import (
 from stewart_drake.cli.options import Given, with_options
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.options import LiveOptions, MachineOptions
-from stewart_drake.reporting.document import wrap
 from stewart_drake.reporting.terminal import echo
 
 if TYPE_CHECKING:
-    from stewart_drake.live.machine import Machine
     from stewart_drake.live.page import PageViewer
     from stewart_drake.loop.results import SimulationResult
     from stewart_drake.scenario.config import Scenario
 
 LOG: Final = "log.csv"
 _EACH_WAY: Final = (0.35, 0.4)
-"""Of the scenario's delay, between which the link of the demo's machine takes: 0.28 to 0.32 s of
-the paper's 0.8 s."""
+"""Transit time of the demo's link each way, as a share of the scenario's delay."""
 _LOST: Final = 0.02
-"""Of its packets, each way."""
+"""Loss of the demo's link each way."""
 _REQUESTS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -68,7 +65,7 @@ def live(
     """Drive a machine over UDP in real time.
 
     The law is that of `simulate`; a page in the browser has sliders for the pose. Ctrl-C brings the
-    plate to rest and ends it; Ctrl-C again, or Stop on the page, stops it at once.
+    plate to rest and ends the run; Ctrl-C again, or Stop on the page, stops it at once.
     """
     from stewart_drake.live.contact import address_of
     from stewart_drake.live.endpoint import read_key
@@ -90,26 +87,30 @@ def live(
         )
         delivery.say(f"calling {where}")
         ready = prepare_session(loaded, address_of(where), read_key(options.key))
-        for line in plans(ready, span, name):
-            delivery.tell(line)
+        delivery.say_wrapped(*plans(ready, span, name))
         check_armed(ready, options.armed)
-        # Nothing is at stake with the demo's own machine.
+        # The demo's machine is simulated, so nobody is asked.
         problem = None if options.accept_jitter or demo else ready.jitter_problem
         check_jitter(ready, problem is None or _agreed(problem))
         if viewer is not None:
-            _show(viewer.opened())
+            url = viewer.opened()
+            echo(f"page: {url}", error=True)  # also with --quiet
+            if sys.stdout.isatty():
+                webbrowser.open(url)
         if not ready.simulated and sys.stdin.isatty():
             input("Enter begins, Ctrl-C leaves it alone")
         delivery.discard("signals.nc")
         how: Any = {"armed": options.armed, "viewer": viewer, "max_missing": options.max_missing}
         how["log"] = None if out is None else out / LOG
         with _Ending() as ending:
-            result = drive(ready, span, ending=ending, say=delivery.tell, accept_jitter=True, **how)
+            result = drive(
+                ready, span, ending=ending, say=delivery.say_wrapped, accept_jitter=True, **how
+            )
     return _delivered(delivery, result)
 
 
 def _agreed(problem: str) -> bool:
-    """Ask at a terminal whether to go on; without one the answer is no."""
+    """Ask at a terminal whether to go on; elsewhere the answer is no."""
     if not sys.stdin.isatty():
         return False
     echo(f"{problem}; go on? [y/N]", error=True)
@@ -118,7 +119,7 @@ def _agreed(problem: str) -> bool:
 
 @contextlib.contextmanager
 def _page(scenario: "Scenario", name: str) -> Iterator["PageViewer"]:
-    """The page's process, which takes as long to start as the machine is called."""
+    """Start the process of the page while the machine is being contacted."""
     from stewart_drake.live.page import PageViewer
     from stewart_drake.mechanism.files import load_mechanism
 
@@ -129,31 +130,22 @@ def _page(scenario: "Scenario", name: str) -> Iterator["PageViewer"]:
         viewer.close()
 
 
-def _show(url: str) -> None:
-    # A reader needs the address even when everything else is quiet.
-    echo(f"page: {url}", error=True)
-    if sys.stdout.isatty():
-        webbrowser.open(url)
-
-
 def _delivered(delivery: Delivery, result: "SimulationResult") -> int:
     """Write and print the result, and return the exit status."""
     from stewart_drake.reporting.run import run_document
 
-    stopped = result.stopped
-    told: Any = result.summary
-    s = told["live"]
-    if stopped is not None:
-        delivery.tell(f"{result.status.replace('_', ' ')}: {stopped}")
+    summary: Any = result.summary
+    s = summary["live"]
+    if result.stopped is not None:
+        delivery.say_wrapped(f"{result.status.replace('_', ' ')}: {result.stopped}")
     if result.status == "completed":
         delivery.say(run_document(result).plain())
     late = s["sent_after_due_ms"]
-    text = (
+    delivery.say_wrapped(
         f"{s['samples']} samples, {s['deadlines_missed']} deadlines missed; torques went out "
         f"{late['median']:.0f} ms after the soonest measurement (99 %: {late['p99']:.0f}, worst "
         f"{late['worst']:.0f}); {s['periods_played']} periods played, {s['periods_dry']} dry"
     )
-    delivery.tell(text)
     if delivery.out is not None:
         result.save(delivery.out)
         delivery.wrote("summary.json", "signals.nc", LOG)
@@ -162,7 +154,7 @@ def _delivered(delivery: Delivery, result: "SimulationResult") -> int:
 
 
 def _end_with_parent() -> Callable[[], None] | None:
-    """Return what a child calls to be terminated when its parent is killed, None without Linux."""
+    """Return a function that ends a child process with its parent, or None without Linux."""
     if sys.platform != "linux":
         return None
     prctl, set_death_signal = ctypes.CDLL(None).prctl, 1
@@ -201,7 +193,7 @@ def _demo_machine(
 
 
 class _Ending:
-    """Ctrl-C, or a request to end, once: come to rest; twice: at once."""
+    """Whether Ctrl-C or SIGTERM asks for rest; a second one raises KeyboardInterrupt."""
 
     def __init__(self) -> None:
         self._asked = False
@@ -241,51 +233,31 @@ def machine(
 
     Plant, sensor, delay, link and limits are those of the scenario. Ctrl-C ends it.
     """
+
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
     from stewart_drake.live.machine import open_machine
     from stewart_drake.scenario.loading import load_scenario
 
     options, loaded = given.options(), load_scenario(scenario, controller, settings or ())
-    delivery = Delivery(None, quiet, as_json)
-    with given.named(), open_machine(loaded, options, delivery.tell) as (running, address):
-        delivery.tell_link(loaded)
-        interrupted = _run(
-            running,
-            options.duration or math.inf,
-            lambda: delivery.say(_first_lines(running, scenario, address)),
-        )
-    summary = running.summary()
-    delivery.say(_last_lines(summary))
-    return delivery.end(summary, interrupted)
-
-
-def _run(machine: "Machine", duration: float, listens: Callable[[], None]) -> bool:
-    """Say that it listens and go on; whether Ctrl-C, or a request to end, came first."""
-
-    def ask_to_end(*_: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, ask_to_end)
-    try:
-        listens()
-        machine.run(duration)
-    except KeyboardInterrupt:
-        return True
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    return False
-
-
-def _first_lines(machine: "Machine", scenario: str, address: tuple[str, int]) -> str:
-    return (
-        f"machine {scenario} at {address[0]}:{address[1]}: simulated by {machine.goes_by}, every "
-        f"{1e-6 * machine.period:g} ms\nwaits for a controller; Ctrl-C ends it"
-    )
-
-
-def _last_lines(summary: dict[str, Any]) -> str:
-    s = summary
+    delivery, interrupted = Delivery(None, quiet, as_json), False
+    with given.named(), open_machine(loaded, options, delivery.say_wrapped) as (running, address):
+        delivery.say_link(loaded)
+        before = signal.signal(signal.SIGTERM, interrupt)
+        try:
+            delivery.say(
+                f"machine {scenario} at {address[0]}:{address[1]}: simulated by {running.goes_by}, "
+                f"every {1e-6 * running.period:g} ms\nwaits for a controller; Ctrl-C ends it"
+            )
+            running.run(options.duration or math.inf)
+        except KeyboardInterrupt:
+            interrupted = True
+        finally:
+            signal.signal(signal.SIGTERM, before)
+    s: Any = running.summary()
     refused = ", ".join(f"{number} {cause}" for cause, number in s["refused"].items() if number)
-    lines = (
+    delivery.say_wrapped(
         f"ended after {s['time_s']:.1f} s: {s['sessions']} sessions, {s['runs']} runs, "
         f"{s['silences']} silences, at most {1e3 * s['longest_lag_s']:.0f} ms behind",
         f"datagrams: {s['received']} received, {s['sent']} sent, {s['unsent']} not sent, "
@@ -293,4 +265,4 @@ def _last_lines(summary: dict[str, Any]) -> str:
         f"{refused or 'none'}",
         f"torques: {s['played']} played, {s['dry']} periods dry",
     )
-    return "\n".join(wrap(line) for line in lines)
+    return delivery.end(s, interrupted)

@@ -22,7 +22,6 @@ from stewart_drake.reporting.terminal import echo
 from stewart_drake.studies.study_options import LARGEST, Measurements
 
 if TYPE_CHECKING:
-    from stewart_drake.studies.new_machine import NewMachine
     from stewart_drake.studies.options import Option
 
 app = typer.Typer(rich_markup_mode=None, help="Check and view a mechanism.")
@@ -42,10 +41,10 @@ def sdf(
     text = model_sdf(mechanism)
     if out is None:
         typer.echo(text, nl=False)
-        return
-    check_file(out)
-    write_whole(out, text)
-    echo(f"written to {out}")
+    else:
+        check_file(out)
+        write_whole(out, text)
+        echo(f"written to {out}")
 
 
 @app.command()
@@ -94,7 +93,7 @@ def view(
         delivery.wrote("view.html")
         delivery.end({})
         return
-    # A reader needs the address even when everything else is quiet.
+    # The address is printed also with --quiet.
     echo(f"showing it at {viewer.meshcat.web_url()}, ends with {STOP!r} there or Ctrl-C")
     viewer.run(delivery.say)
 
@@ -112,17 +111,23 @@ def new(
 ) -> int:
     """Make a machine and a first scenario from a few measurements.
 
-    What is not given is asked for. Lengths in m, masses in kg; moments of inertia are estimated.
+    Asks for the measurements that are not given. Lengths in m, masses in kg; moments of inertia
+    are estimated.
     """
+    from stewart_drake.reporting.mechanism import document
     from stewart_drake.studies import new_machine as study
+    from stewart_drake.studies.verdict import Verdict, loop_verdict
 
     delivery = Delivery(folder, quiet, as_json)
-    study.check_free(folder)  # before nine questions
+    study.check_free(folder)
     asked = _asked(given.missing, sys.stdin.isatty() and not (quiet or as_json))
     measurements = given.options(more=asked)
     with given.named():
         made = study.new_machine(measurements, _name_of(folder), folder)
-    _tell(delivery, made)
+    margin = made.margin
+    delay = Verdict(margin.eta, margin.pole, margin.pole_time)
+    delivery.say(document(made.check).plain())
+    delivery.say_wrapped(made.verdict, loop_verdict(margin), str(delay))
     delivery.wrote(study.MACHINE, study.SCENARIO)
     delivery.write(made.summary)
     status = delivery.end(made.summary)
@@ -130,25 +135,12 @@ def new(
     return status
 
 
-def _tell(delivery: Delivery, made: "NewMachine") -> None:
-    """The machine at home, the motion, and what the delay does."""
-    from stewart_drake.reporting.mechanism import document
-    from stewart_drake.studies.verdict import Verdict, loop_verdict
-
-    delivery.say(document(made.check).plain())
-    margin = made.margin
-    delay = Verdict(margin.eta, margin.pole, margin.pole_time)
-    for text in (made.verdict, loop_verdict(margin), str(delay)):
-        delivery.tell(text)
-
-
 def _asked(missing: "list[Option]", asking: bool) -> dict[str, float]:
-    """Ask for what is missing at a terminal; elsewhere it is an error."""
+    """Ask for missing measurements at a terminal; elsewhere they are an error."""
     if missing and not asking:
         flags = ", ".join("--" + one.name.replace("_", "-") for one in missing)
         raise ConfigError(
-            f"new: got no {flags}; expected what is measured on the machine; "
-            "a terminal is asked for it"
+            f"new: got no {flags}; expected the measurements as options, or a terminal to ask at"
         )
     return {one.name: _ask(one.help[0].lower() + one.help[1:-1]) for one in missing}
 
@@ -163,7 +155,7 @@ def _ask(question: str) -> float:
 
 
 def _name_of(folder: Path) -> str:
-    """A machine's name from that of its folder; `machine` where it makes none."""
+    """Return the name of a machine from its folder, or `machine` if that is no valid name."""
     from stewart_drake.mechanism.geometry import RESERVED_NAMES
 
     name = re.sub("[^A-Za-z0-9_-]", "_", folder.resolve().name)

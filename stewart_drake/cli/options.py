@@ -27,12 +27,12 @@ class Given:
 
     @property
     def missing(self) -> list[Option]:
-        """Options without a default that were not given."""
+        """Required options that were not given."""
         return [one for one in _offered(self._kind) if one.required and not self._given(one)]
 
     @property
     def words(self) -> dict[str, Any]:
-        """Typed values, as the command on a page shows them."""
+        """Typed values for the command on a page."""
         return {_dashed(one): self._typed[_name(one)] for one in _offered(self._kind, True)}
 
     def options(
@@ -44,10 +44,10 @@ class Given:
 
         Args:
             load: loads the scenario with another controller.
-            more: values by field that take the place of what was typed.
+            more: values by field, which replace typed ones.
 
         Raises:
-            ConfigError: a value that is not accepted.
+            ConfigError: a bad value.
         """
         with self.named():
             values = {one.name: self._value(one, load) for one in _offered(self._kind)}
@@ -55,10 +55,13 @@ class Given:
 
     @contextlib.contextmanager
     def named(self) -> Iterator[None]:
-        """In an error, call a field by the option that sets it."""
+        """Replace the name of a field in an error by the option that sets it."""
         flags = {one.name: f"--{_dashed(one)}" for one in _offered(self._kind)}
-        with flags_named(flags):
+        try:
             yield
+        except ConfigError as error:
+            name, colon, rest = str(error).partition(":")
+            raise ConfigError(f"{flags.get(name, name)}{colon}{rest}") from None
 
     def _given(self, one: Option) -> bool:
         return self._typed[_name(one)] is not None
@@ -98,16 +101,6 @@ def with_options(
         return run
 
     return decorate
-
-
-@contextlib.contextmanager
-def flags_named(flags: Mapping[str, str]) -> Iterator[None]:
-    """In an error, call a field by the option that sets it."""
-    try:
-        yield
-    except ConfigError as error:
-        name, colon, rest = str(error).partition(":")
-        raise ConfigError(f"{flags.get(name, name)}{colon}{rest}") from None
 
 
 def _offered(kind: type[Options], recorded: bool = False) -> list[Option]:

@@ -27,19 +27,14 @@ from stewart_drake.reporting.terminal import count_bar, echo, progress_bars
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
-    from stewart_drake.loop.results import SimulationResult
-    from stewart_drake.mechanism.geometry import Mechanism
-
 
 CSV: Final = "signals.csv"
 REPLAY: Final = "replay.html"
 RUN_FIGURES: Final = ("states", "errors", "torques", "parameters", "delay", "weights")
-"""All that `run_figures` may write; what is older is removed."""
+"""All that `run_figures` may write; those of an earlier run are deleted."""
 COMPARED_FIGURES: Final = ("states", "errors", "weights")
 OF_CONTROLLERS: Final = ("torques", "delay")
-"""Those that `comparison_figures` may write, of all and of each controller."""
-_POLL: Final = 0.1
-"""s between two looks whether somebody watches."""
+"""All that `comparison_figures` may write, of all controllers and of each."""
 
 
 def simulate(
@@ -75,10 +70,10 @@ def simulate(
     experiment = prepare(load_scenario(scenario, controller, settings or ()))
     delivery = Delivery(out, quiet, as_json)
     viewer = open_meshcat() if meshcat else None
-    delivery.tell_link(experiment.scenario)
+    delivery.say_link(experiment.scenario)
     margin = controller_margin(experiment)
-    delivery.tell(loop_verdict(margin))
-    delivery.tell(str(Verdict(margin.eta, margin.pole, margin.pole_time)))
+    delay = Verdict(margin.eta, margin.pole, margin.pole_time)
+    delivery.say_wrapped(loop_verdict(margin), str(delay))
     for text in cautions_before(experiment, margin):
         delivery.say(Caution(text).plain())
     if viewer is not None:
@@ -87,7 +82,29 @@ def simulate(
     with progress_bars([name], experiment.scenario.duration, quiet) as progress:
         result = run(experiment, progress=progress[name], meshcat=viewer, judge_stability=margin)
     delivery.say(run_document(result).plain())
-    _write_run(delivery, result, experiment.truth, name, csv, replay or meshcat)
+
+    def draw(folder: Path) -> list[Path]:
+        from stewart_drake.reporting.figures import run_figures
+
+        return run_figures(result, folder)
+
+    def film(folder: Path) -> None:
+        from stewart_drake.reporting.replay import write_replay
+
+        write_replay(result, experiment.truth, folder / REPLAY, name)
+
+    # The summary is written last of the results: where it exists, the signals are of the same run.
+    delivery.discard(CSV, REPLAY, *_pictures(RUN_FIGURES))
+    if out is not None:
+        if csv:
+            from stewart_drake.reporting.csv_file import write_csv
+
+            write_csv(result.signals, out / CSV)
+        result.save(out)
+        delivery.wrote("summary.json", "signals.nc", *[".csv"] * csv)
+    delivery.draw("figures", draw)
+    if replay or meshcat:
+        delivery.draw(REPLAY, film)
     status = delivery.end(result.summary, interrupted=result.status == "interrupted")
     if viewer is not None:
         from stewart_drake.reporting.replay import replay as play
@@ -99,51 +116,14 @@ def simulate(
 
 
 def _await_viewer(viewer: "Meshcat") -> None:
-    """Tell where to look; a person at a terminal is given the time to open it there."""
-    # A reader needs the address even when everything else is quiet.
-    asked = sys.stdin.isatty()
-    start = ", starts when it is opened there, or with Enter" if asked else ""
+    """Print the address, also with --quiet; at a terminal wait until it is opened."""
+    interactive = sys.stdin.isatty()
+    start = ", starts when it is opened there, or with Enter" if interactive else ""
     echo(f"showing it live at {viewer.web_url()}{start}", error=True)
-    while asked and viewer.GetNumActiveConnections() == 0:
-        if select.select([sys.stdin], [], [], _POLL)[0]:
+    while interactive and viewer.GetNumActiveConnections() == 0:
+        if select.select([sys.stdin], [], [], 0.1)[0]:
             sys.stdin.readline()
             return
-
-
-def _write_run(
-    delivery: Delivery,
-    result: "SimulationResult",
-    mechanism: "Mechanism",
-    name: str,
-    csv: bool,
-    replay: bool,
-) -> None:
-    """Write what a run leaves behind."""
-    if delivery.out is None:
-        return
-    # The summary comes last of the results: where there is one, the signals beside it are of the
-    # same run. What is drawn of them comes after that.
-    delivery.discard(CSV, REPLAY, *_pictures(RUN_FIGURES))
-    if csv:
-        from stewart_drake.reporting.csv_file import write_csv
-
-        write_csv(result.signals, delivery.out / CSV)
-    result.save(delivery.out)
-    delivery.wrote("summary.json", "signals.nc", *[".csv"] * csv)
-
-    def draw(folder: Path) -> list[Path]:
-        from stewart_drake.reporting.figures import run_figures
-
-        return run_figures(result, folder)
-
-    def film(folder: Path) -> None:
-        from stewart_drake.reporting.replay import write_replay
-
-        write_replay(result, mechanism, folder / REPLAY, name)
-
-    delivery.draw("figures", draw)
-    if replay:
-        delivery.draw(REPLAY, film)
 
 
 def _pictures(names: Iterable[str]) -> list[str]:
@@ -159,7 +139,7 @@ def export(
 ) -> None:
     """Convert saved signals to CSV.
 
-    A line per instant; the header names each column's unit.
+    A line per instant; the header has the unit of each column.
     """
     from stewart_drake import functions
 
@@ -168,8 +148,8 @@ def export(
     text = functions.export_csv(signals, out)
     if out is None:
         typer.echo(text, nl=False)
-        return
-    echo(f"written to {out}")
+    else:
+        echo(f"written to {out}")
 
 
 def export_c(
@@ -199,7 +179,7 @@ def compare(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Run the shipped controllers on a scenario, as a table."""
+    """Compare the shipped controllers on a scenario."""
     from stewart_drake.loop.preparation import prepare
     from stewart_drake.reporting.run import comparison_document
     from stewart_drake.scenario.loading import load_compatible
@@ -214,8 +194,8 @@ def compare(
     experiment = prepare(load_compatible(scenario, settings=settings or ()))
     delivery = Delivery(out, quiet, as_json)
     names = tuple(study.shown(scenario, settings or ()))
-    delivery.tell_link(experiment.scenario)
-    delivery.tell(str(delay_verdict(experiment)))
+    delivery.say_link(experiment.scenario)
+    delivery.say_wrapped(str(delay_verdict(experiment)))
     with progress_bars(names, experiment.scenario.duration, quiet) as progress:
         results = study.compare(
             scenario, settings or (), lambda name, time, error: progress[name](time, error)
@@ -243,7 +223,7 @@ def report(
 ) -> int:
     """Write one HTML file about a scenario.
 
-    It is run, compared under all shipped controllers, and analysed.
+    Runs it, compares all shipped controllers on it, and analyses it.
     """
     from stewart_drake.loop.preparation import simulated_machine
     from stewart_drake.reporting import report as report_document
@@ -255,7 +235,6 @@ def report(
     started, name = time.perf_counter(), Path(scenario).stem
     with count_bar("runs, analyses", delivery.silent) as progress:
         found = collect(scenario, settings or (), progress, controller)
-    # An earlier scenario's files must not stay next to this one's numbers.
     delivery.discard(REPLAY, PAGE)
     summary = report_document.report_summary(found)
     delivery.write(summary)

@@ -1,8 +1,7 @@
-"""Tuners: tune dataset, tune train, tune evaluate."""
+"""Commands of the tuner: tune dataset, tune train, tune evaluate."""
 
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -20,9 +19,6 @@ from stewart_drake.cli.options import Given, with_options
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.reporting.terminal import count_bar
 from stewart_drake.tuning.options import DataOptions, EvaluationOptions, TrainingOptions
-
-if TYPE_CHECKING:
-    from stewart_drake.tuning.training import Training
 
 app = typer.Typer(
     rich_markup_mode=None, help="Make data for the neural tuner, train it, evaluate it."
@@ -43,9 +39,9 @@ def dataset(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Run a grid of 180 scenarios, or a family's conditions.
+    """Run a grid of 180 scenarios, or the conditions of a family.
 
-    The grid has delays, frequencies and weights; a family has faults of timing, friction, noise.
+    The grid varies delay, frequency and weights. A family has faults of timing, friction and noise.
     """
     from stewart_drake.functions import make_tuner_data
 
@@ -76,9 +72,15 @@ def train(
 ) -> int:
     """Train the network on a data set.
 
-    By Levenberg-Marquardt on labels, or, of a family, by regret and by its own runs.
+    By Levenberg-Marquardt on labels. With --regret on the runs of a family, then on runs of the
+    network itself.
     """
     from stewart_drake.functions import train_tuner
+
+    def draw(folder: Path) -> list[Path]:
+        from stewart_drake.reporting.tuner import training_figures
+
+        return training_figures(found.study, folder)
 
     if out.suffix != ".json":
         raise ConfigError(f"--out: got {str(out)!r}; expected a file ending in .json")
@@ -95,7 +97,7 @@ def train(
     delivery.write(found.summary)
     delivery.say(found.table())
     if not options.regret:
-        delivery.draw("figures", partial(_training_figures, found.study))
+        delivery.draw("figures", draw)
     return delivery.end(found.summary)
 
 
@@ -119,7 +121,7 @@ def evaluate(
 ) -> int:
     """Compare a tuner with fixed gains on unseen scenarios.
 
-    With --family on fresh conditions of a family, where lost plates count.
+    With --family on fresh conditions of a family, where runs that end early count too.
     """
     from stewart_drake.functions import evaluate_tuner
     from stewart_drake.reporting.page import command_line, write_page
@@ -150,9 +152,3 @@ def evaluate(
     page = "worth.html"
     delivery.draw(page, lambda folder: [write_page(found.document, found.made, folder / page)])
     return delivery.end(found.summary)
-
-
-def _training_figures(training: "Training", folder: Path) -> list[Path]:
-    from stewart_drake.reporting.tuner import training_figures
-
-    return training_figures(training, folder)

@@ -1,6 +1,6 @@
-"""The table of analyses. Command line, `sd.analyze_*` and documentation follow from it.
+"""The table of analyses, from which command line, `sd.analyze_*` and documentation follow.
 
-What a row names is imported when it is needed, so that the table serves the command's help.
+Studies are imported when they run, so that the table serves the help of the commands.
 """
 
 from importlib import import_module
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from stewart_drake.studies.options import Options
 
 RENAMED: Final = {"beside": "also"}
-"""Options of 0.2 by their names of today."""
+"""Options of 0.2, with their present names."""
 
 
 class Analysis(NamedTuple):
@@ -24,13 +24,12 @@ class Analysis(NamedTuple):
     Attributes:
         help: of the command.
         examples: of the command, without the program's name.
-        counts: what its progress counts; nothing where it takes no `progress`.
-        keeps: what of it a folder keeps, so that a stopped study can go on; then the study takes a
-            folder.
-        controller: whether the command takes `--controller`.
-        exact: whether it runs the exact plant unless `--set` says otherwise.
-        alone: whether it is a command of its own, not one of `analyze`.
-        second: argument of the Python function that may be given by position.
+        counts: pieces that its progress counts; empty without progress.
+        keeps: pieces that a folder keeps, so that a stopped study can continue.
+        controller: whether the command has `--controller`.
+        exact: whether the default plant is the exact one.
+        alone: whether the command is not one of `analyze`.
+        second: argument of the Python function that may be positional.
     """
 
     help: str
@@ -98,7 +97,7 @@ options, `reporting.NAME.document` describes it."""
 
 
 def words_of(name: str) -> tuple[str, ...]:
-    """Return the words of an analysis' command; joined by `_` they name the Python function."""
+    """Return the words of an analysis's command, which joined by `_` name the Python function."""
     return (name,) if ANALYSES[name].alone else ("analyze", name)
 
 
@@ -126,8 +125,8 @@ def analyze(
         name: of the analysis.
         scenario: to study.
         options: of the study; its defaults if None.
-        command: that does the same again, for the page.
-        directory: where the study keeps its runs, if it keeps some.
+        command: repeats the analysis; shown on the page.
+        directory: folder of a study's runs.
         progress: called with the number of finished runs and of all.
     """
     from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Public functions: what the commands do, from Python and in notebooks."""
+"""Public functions of runs, comparisons, reports and analyses."""
 
 import functools
 import inspect
@@ -23,25 +23,22 @@ R = TypeVar("R")
 S = TypeVar("S")
 
 
-def _with(shown: Callable[[S], R]) -> Callable[[Callable[P, S]], Callable[P, R]]:
-    """Return a decorator that converts results and keeps signature and docstring."""
+def _with(shown: Callable[[S], R], function: Callable[P, S]) -> Callable[P, R]:
+    """Return the function with its result converted, with the same signature and docstring."""
 
-    def decorate(function: Callable[P, S]) -> Callable[P, R]:
-        @functools.wraps(function)
-        def call(*args: P.args, **kwargs: P.kwargs) -> R:
-            return shown(function(*args, **kwargs))
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        return shown(function(*args, **kwargs))
 
-        return call
-
-    return decorate
+    return call
 
 
-def _run(result: LoopResult) -> SimulationResult:
+def _shown(result: LoopResult) -> SimulationResult:
     return SimulationResult.of(result)
 
 
-simulate = _with(_run)(simulation.simulate)
-compare = _with(ComparisonResult)(comparison.compare)
+simulate = _with(_shown, simulation.simulate)
+compare = _with(ComparisonResult, comparison.compare)
 
 
 def report(
@@ -52,7 +49,7 @@ def report(
     Args:
         scenario: a shipped name or a path.
         settings: as `load_scenario` takes them.
-        controller: laid over the scenario's own, see `reporting.report.collect`.
+        controller: replaces the scenario's own, see `reporting.report.collect`.
 
     Raises:
         ConfigError: bad input.
@@ -73,7 +70,7 @@ def report(
 
 
 def analysis_function(name: str) -> Callable[..., AnalysisResult]:
-    """Return the Python function of an analysis, with a signature made of its options."""
+    """Return the Python function of an analysis, with its options as arguments."""
     row, function, signature = ANALYSES[name], "_".join(words_of(name)), _signature(name)
 
     def call(*args: Any, **kwargs: Any) -> AnalysisResult:
@@ -81,7 +78,7 @@ def analysis_function(name: str) -> Callable[..., AnalysisResult]:
             raise TypeError(f"{function}: got {old}, an option of 0.2; expected {RENAMED[old]}")
         given = signature.bind(*args, **kwargs).arguments
         scenario, directory = given.pop("scenario"), given.pop("directory", None)
-        told = "".join(f", {key}={value!r}" for key, value in given.items())
+        shown = "".join(f", {key}={value!r}" for key, value in given.items())
         loaded = as_scenario(scenario)
         if row.exact:
             loaded, given = _exact(loaded), _exact(given)
@@ -90,7 +87,7 @@ def analysis_function(name: str) -> Callable[..., AnalysisResult]:
                 name,
                 loaded,
                 options_of(name)(**given),
-                command=f"sd.{function}({scenario!r}{told})",
+                command=f"sd.{function}({scenario!r}{shown})",
                 directory=directory or scratch,
             )
 
@@ -101,7 +98,7 @@ def analysis_function(name: str) -> Callable[..., AnalysisResult]:
 
 
 def _exact(value: Any) -> Any:
-    """Return scenarios, also in mappings, with a plant that needs no physics engine."""
+    """Return scenarios, also in mappings, with the exact plant."""
     if isinstance(value, Scenario):
         return replace(value, plant=value.plant.without_engine)
     return {k: _exact(v) for k, v in value.items()} if isinstance(value, Mapping) else value
@@ -122,12 +119,11 @@ def _signature(name: str) -> inspect.Signature:
 
 def _documentation(name: str) -> str:
     row = ANALYSES[name]
-    told = {"scenario": "or a shipped name or a path."}
-    told |= {one.name: one.help for one in options_of(name).described()}
+    meanings = {"scenario": "or a shipped name or a path."}
+    meanings |= {one.name: one.help for one in options_of(name).described()}
     if row.keeps:
-        kept = f"where {row.keeps} are kept, so that a second call goes on with them;"
-        told["directory"] = f"{kept} None is nowhere."
-    lines = [row.help.split("\n")[0], "", "Args:", *argument_lines(told)]
+        meanings["directory"] = f"folder of the {row.keeps}, from which a second call continues."
+    lines = [row.help.split("\n")[0], "", "Args:", *argument_lines(meanings)]
     return "\n".join([*lines, "", "Raises:", "    ConfigError: bad input."])
 
 

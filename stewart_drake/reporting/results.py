@@ -1,7 +1,6 @@
 """Results of runs, comparisons and analyses, with methods that show and save them.
 
-`loop` and `studies` return plain results and may not import this room, so the public functions
-convert theirs to these classes.
+`loop` and `studies` return plain results, which the public functions convert to these classes.
 """
 
 import html as escaping
@@ -28,23 +27,22 @@ PAGE: Final = "report.html"
 
 
 class Figures(dict[str, "Figure"]):
-    """Figures by name; a notebook shows them."""
+    """Figures by name, shown by a notebook."""
 
     def _repr_html_(self) -> str:
         from stewart_drake.reporting.page import source
 
-        pictures = (
+        return "\n".join(
             f'<img src="{source(figure)}" alt="{escaping.escape(name)}">'
             for name, figure in self.items()
         )
-        return "\n".join(pictures)
 
     def __repr__(self) -> str:
         return f"Figures({', '.join(self)})"
 
 
 class Replay:
-    """The animation of a run as HTML; a notebook shows it."""
+    """The animation of a run as HTML, shown by a notebook."""
 
     def __init__(self, text: str) -> None:
         self.html = text
@@ -53,7 +51,7 @@ class Replay:
         return f"Replay({len(self.html) / 1e6:.1f} MB of HTML)"
 
     def _repr_html_(self) -> str:
-        return framed(self.html)
+        return _framed(self.html)
 
 
 class SimulationResult(loop_results.SimulationResult):
@@ -61,7 +59,7 @@ class SimulationResult(loop_results.SimulationResult):
 
     @classmethod
     def of(cls, result: loop_results.SimulationResult) -> "SimulationResult":
-        """Return a run's result with the methods that show it."""
+        """Return a result of `loop` with the methods that show it."""
         return cls(**vars(result))
 
     def table(self) -> str:
@@ -74,10 +72,7 @@ class SimulationResult(loop_results.SimulationResult):
         """Return figures by name.
 
         Args:
-            directory: where they are also written, as PNG and SVG; it is made.
-
-        Raises:
-            OSError: the directory cannot be written to.
+            directory: folder to write PNG and SVG files into, if not None; it is made.
         """
         from stewart_drake.reporting.figures import draw_run
 
@@ -94,16 +89,13 @@ class SimulationResult(loop_results.SimulationResult):
         """Show the run in three dimensions: in Meshcat, as a file, or in a notebook.
 
         Args:
-            path: of the HTML file to write, which plays without a network; its folder is made.
-            meshcat: where it is played instead.
-            mechanism: that was run, by default the scenario's.
+            path: HTML file to write, which plays without a network; its folder is made.
+            meshcat: where to play it instead.
+            mechanism: the machine, by default the scenario's.
             title: of the page.
 
         Returns:
-            The path, the Meshcat, or without either what a notebook shows.
-
-        Raises:
-            OSError: the file cannot be written.
+            The path, the Meshcat, or without either an object that a notebook shows.
         """
         from stewart_drake.reporting.replay import replay, replay_html, write_replay
 
@@ -154,11 +146,7 @@ class ComparisonResult(Mapping[str, SimulationResult]):
         }
 
     def save(self, directory: str | Path) -> None:
-        """Write NAME.nc of every controller, then summary.json; the directory is made.
-
-        Raises:
-            OSError: the directory cannot be written to.
-        """
+        """Write NAME.nc of every controller, then summary.json; the directory is made."""
         save_comparison(self, directory)
 
 
@@ -167,10 +155,10 @@ class AnalysisResult:
     """Result of an analysis or a report. Printed it is text, in a notebook a page.
 
     Attributes:
-        study: everything that was found.
+        study: all numbers.
         summary: content of `summary.json`.
         document: description of the study.
-        made: how it was made.
+        made: origin of the page.
         write: writes further files of the study into a folder and returns their names.
     """
 
@@ -181,7 +169,7 @@ class AnalysisResult:
     write: Callable[[Any, Path], list[str]] | None = None
 
     def write_files(self, folder: Path | None) -> list[str]:
-        """Write the study's own files into a folder, if it has some, and return their names."""
+        """Write the study's further files into a folder and return their names."""
         return [] if folder is None or self.write is None else self.write(self.study, folder)
 
     @property
@@ -198,7 +186,7 @@ class AnalysisResult:
     def _repr_html_(self) -> str:
         from stewart_drake.reporting.page import html
 
-        return framed(html(self.document, self.made))
+        return _framed(html(self.document, self.made))
 
     def table(self) -> str:
         """Return the text that the command prints."""
@@ -212,24 +200,13 @@ class AnalysisResult:
         return _drawn({f"figure_{k}": one.drawn for k, one in enumerate(pictures, 1)}, directory)
 
     def write_page(self, directory: Path) -> Path:
-        """Write report.html into a directory and return its path.
-
-        Raises:
-            OSError: the directory cannot be written to.
-        """
+        """Write report.html into a directory and return its path."""
         from stewart_drake.reporting.page import write_page
 
         return write_page(self.document, self.made, directory / PAGE)
 
     def save(self, directory: str | Path) -> Path:
-        """Write report.html and summary.json into a directory, which is made.
-
-        Returns:
-            The path of the page.
-
-        Raises:
-            OSError: the directory cannot be written to.
-        """
+        """Write report.html and summary.json into a directory, which is made; return the page."""
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)
         self.write_files(folder)
@@ -246,9 +223,9 @@ def analysis_result(
     """Do a study and describe its result.
 
     Args:
-        study: does it; the result has a `summary`, plain data.
-        document: describes the result.
-        command: that does the same again, as typed.
+        study: returns the numbers, with a `summary` of plain data.
+        document: describes them.
+        command: repeats the study, as typed.
         write: see `AnalysisResult`.
     """
     from stewart_drake.reporting.page import Provenance
@@ -259,7 +236,7 @@ def analysis_result(
     return AnalysisResult(found, found.summary, document(found), made, write)
 
 
-def framed(page: str) -> str:
+def _framed(page: str) -> str:
     """Return a page inside another one, where its scripts reach nothing outside."""
     return (
         f'<iframe srcdoc="{escaping.escape(page)}" sandbox="allow-scripts" '
