@@ -216,21 +216,23 @@ static void network(const stewart_tuner *t, const real *values, real *weights)
 
 static real ratio_of(const real *weights) { return REAL(log10)(weights[0] / weights[1]); }
 
-int stewart_decide(const stewart_tuner *t, const real *memory, real *weights)
+void stewart_tuner_features(const stewart_tuner *t, const real *window, real *values)
 {
-    const real *last = memory, *window = memory + 3, *row = window + columns_of(t) * (N - 1);
-    real values[STEWART_FEATURES], goal[2], ratio;
-    int any = 0, usable;
-    for (int i = 0; i < columns_of(t); i++)
-        any |= !isnan(row[i]);
-    stewart_copy(2, t->first, weights);
-    if (!any) /* nothing is known before the first sample */
-        return 0;
     if (t->health)
         health(t, window, values);
     else
         for (int i = 0; i < STEWART_FEATURES; i++)
             values[i] = density(t, window, i);
+}
+
+int stewart_decide_by(const stewart_tuner *t, const real *values, const real *last, real *weights)
+{
+    real goal[2], ratio;
+    int usable;
+    if (t->policy == STEWART_FIXED_WEIGHTS) {
+        stewart_copy(2, t->first, weights);
+        return 0;
+    }
     if (t->policy == STEWART_RULE) {
         real above = values[SURPRISE_PEAK] - t->knee;
         ratio = t->ratio - t->slope * (above > 0 ? above : 0);
@@ -254,45 +256,55 @@ int stewart_decide(const stewart_tuner *t, const real *memory, real *weights)
     return !usable;
 }
 
-/* ---- what a sample adds ----------------------------------------------------------------------- */
+int stewart_decide(const stewart_tuner *t, const real *memory, real *weights)
+{
+    const real *window = memory + 3, *row = window + columns_of(t) * (N - 1);
+    real values[STEWART_FEATURES];
+    int any = 0;
+    for (int i = 0; i < columns_of(t); i++)
+        any |= !isnan(row[i]);
+    stewart_copy(2, t->first, weights);
+    if (!any) /* nothing is known before the first sample */
+        return 0;
+    stewart_tuner_features(t, window, values);
+    return stewart_decide_by(t, values, memory, weights);
+}
+
+/* ---- a row of the window ----------------------------------------------------------------------- */
 
 /* Measurement less prediction (12), changes (6) of the accelerations at the beginning and at the end of
    the last period, and in `acted` the torque (6) that acted last for the one of the period before. NaN
    and zeros before there is a state. */
-static void innovate(const stewart_law *law, const real *before, const real *after, real *innovation,
-                     real *late, real *early, real *acted, stewart_scratch scratch)
+static void innovate(const stewart_tuner_input *in, real *innovation, real *late, real *early,
+                     real *acted, stewart_scratch scratch)
 {
-    const stewart_layout *l = &law->layout;
-    const real *state = before + l->state.at, *theta = before + l->parameters.at, *following;
+    const stewart_schedule *schedule = &in->schedule;
     real a[3][U];
     stewart_belief belief;
-    stewart_schedule schedule;
     stewart_fill(U, 0, late);
     stewart_fill(U, 0, early);
-    if (!stewart_all_finite(X, state)) {
+    if (!stewart_all_finite(X, in->state)) {
         stewart_fill(X, (real)NAN, innovation);
         stewart_fill(U, (real)NAN, acted);
         return;
     }
-    law->observer->last_period(law, before + l->observer.at, l->in_flight.rows,
-                               before + l->in_flight.at, &schedule, &following, &scratch);
-    real *states = stewart_take(&scratch, X * schedule.number);
-    const real *last = schedule.torques + U * (schedule.number - 1);
-    stewart_predict(&law->machine, theta, &schedule, state, states);
-    stewart_believe(&law->machine, theta, &belief);
-    if (schedule.number > 1)
+    real *states = stewart_take(&scratch, X * schedule->number);
+    const real *last = schedule->torques + U * (schedule->number - 1);
+    stewart_predict(in->machine, in->theta, schedule, in->state, states);
+    stewart_believe(in->machine, in->theta, &belief);
+    if (schedule->number > 1)
         stewart_copy(U, last - U, acted);
     else if (!stewart_all_finite(U, acted))
         stewart_copy(U, last, acted);
-    const real *torques[3] = {acted, last, following};
+    const real *torques[3] = {acted, last, in->following};
     for (int k = 0; k < 3; k++)
-        stewart_accelerations(&belief.plant, state, state + 6, torques[k], a[k]);
+        stewart_accelerate(&belief, in->state, torques[k], a[k]);
     for (int i = 0; i < U; i++) {
         late[i] = a[1][i] - a[0][i];
         early[i] = a[2][i] - a[1][i];
     }
     for (int i = 0; i < X; i++)
-        innovation[i] = after[l->measurement.at + i] - states[X * (schedule.number - 1) + i];
+        innovation[i] = in->measured[i] - states[X * (schedule->number - 1) + i];
     stewart_copy(U, last, acted);
 }
 
@@ -305,26 +317,14 @@ static real known_product(const real *x, const real *y)
     return isfinite(sum) ? sum : 0;
 }
 
-static real doubt_of(const stewart_law *law, const stewart_tuner *t, const real *after)
-{
-    real theta[STEWART_MAX_ESTIMATED], std[STEWART_MAX_ESTIMATED];
-    if (!t->doubts)
-        return 0;
-    law->observer->parameters(law, after + law->layout.observer.at, theta, std);
-    for (int i = 0; i < law->machine.estimated; i++)
-        std[i] /= t->prior[i];
-    return mean_square(law->machine.estimated, std);
-}
-
 /* A row of health, after the last one in its place. */
-static void health_row(const stewart_law *law, const stewart_tuner *t, const real *before,
-                       const real *after, const real *wanted, const real *weights, real *row,
-                       stewart_scratch scratch)
+static void health_row(const stewart_tuner *t, const stewart_tuner_input *in, const real *wanted,
+                       const real *weights, real *row, stewart_scratch scratch)
 {
-    const stewart_layout *l = &law->layout;
     real innovation[X], over_floor[X], late[U], early[U], fed[2][U], change[U], error[6];
-    real *acted = row + ACTED;
-    innovate(law, before, after, innovation, late, early, acted, scratch);
+    real doubt[STEWART_MAX_ESTIMATED];
+    const int p = in->machine->estimated;
+    innovate(in, innovation, late, early, row + ACTED, scratch);
     for (int i = 0; i < X; i++) {
         const real noise = t->noise[i], model = MODEL_ERROR * t->motion[i];
         const real floor = REAL(sqrt)(2 * noise * noise + model * model);
@@ -337,16 +337,13 @@ static void health_row(const stewart_law *law, const stewart_tuner *t, const rea
         }
     }
     for (int i = 0; i < U; i++) {
-        const real *memories[2] = {after, before};
-        for (int k = 0; k < 2; k++) {
-            const real *m = memories[k];
-            real back = m[l->torque.at + i] - m[l->feedforward.at + i];
-            fed[k][i] = between(-HUGEST, back / t->torque, HUGEST);
-        }
+        for (int k = 0; k < 2; k++)
+            fed[k][i] = between(-HUGEST, (in->torque[k][i] - in->feedforward[k][i]) / t->torque, HUGEST);
         change[i] = fed[0][i] - fed[1][i];
-        error[i] = (after[l->measurement.at + i] - wanted[i]) / t->tolerance[i];
-        error[i] = between(-HUGEST, error[i], HUGEST);
+        error[i] = between(-HUGEST, (in->measured[i] - wanted[i]) / t->tolerance[i], HUGEST);
     }
+    for (int i = 0; t->doubts && i < p; i++)
+        doubt[i] = in->std[i] / t->prior[i];
     row[ERROR] = mean_square(6, error);
     row[FEEDBACK] = mean_square(U, fed[0]);
     row[CHANGE] = mean_square(U, change);
@@ -357,17 +354,25 @@ static void health_row(const stewart_law *law, const stewart_tuner *t, const rea
     row[EARLY] = known_product(over_floor + 6, early);
     row[EARLY_WEIGHT] = known_product(early, early);
     row[RATIO] = ratio_of(weights);
-    row[DOUBT] = doubt_of(law, t, after);
+    row[DOUBT] = t->doubts ? mean_square(p, doubt) : 0;
 }
 
-/* [measured or estimated state less the reference; torque]. */
-static void density_row(const stewart_law *law, const real *after, const real *wanted, real *row)
+void stewart_tuner_observe(const stewart_tuner *t, real *memory, const stewart_tuner_input *input,
+                           const real *wanted, const real *weights, int fell_back,
+                           stewart_scratch scratch)
 {
-    const stewart_layout *l = &law->layout;
-    const real *state = after + (law->measured == X ? l->measurement.at : l->state.at);
-    for (int i = 0; i < X; i++)
-        row[i] = state[i] - wanted[i];
-    stewart_copy(U, after + l->torque.at, row + X);
+    const int columns = columns_of(t);
+    real *window = memory + 3, *row = window + columns * (N - 1);
+    memmove(window, window + columns, (size_t)(columns * (N - 1)) * sizeof(real));
+    if (t->health) {
+        health_row(t, input, wanted, weights, row, scratch);
+    } else { /* [state less the reference; torque] */
+        for (int i = 0; i < X; i++)
+            row[i] = input->measured[i] - wanted[i];
+        stewart_copy(U, input->torque[0], row + X);
+    }
+    stewart_copy(2, weights, memory);
+    memory[2] += (real)fell_back;
 }
 
 int stewart_tuned_step_scratch(const stewart_law *law)
@@ -379,18 +384,24 @@ int stewart_tuned_step(const stewart_law *law, const stewart_tuner *t, real *mem
                        real *tuner_memory, real *scratch_memory, stewart_sample *sample,
                        const real *wanted, real *torque)
 {
-    const int columns = columns_of(t);
-    real *before = scratch_memory, *window = tuner_memory + 3, *row = window + columns * (N - 1);
+    const stewart_layout *l = &law->layout;
+    real *before = scratch_memory, theta[STEWART_MAX_ESTIMATED], std[STEWART_MAX_ESTIMATED];
     stewart_scratch scratch = {scratch_memory + law->memory};
     int fell_back = stewart_decide(t, tuner_memory, sample->weights);
     stewart_copy(law->memory, memory, before);
     int status = stewart_step(law, memory, scratch.next, sample, torque);
-    memmove(window, window + columns, (size_t)(columns * (N - 1)) * sizeof(real));
-    if (t->health)
-        health_row(law, t, before, memory, wanted, sample->weights, row, scratch);
-    else
-        density_row(law, memory, wanted, row);
-    stewart_copy(2, sample->weights, tuner_memory);
-    tuner_memory[2] += (real)fell_back;
+    stewart_tuner_input input = {
+        .machine = &law->machine,
+        .state = before + l->state.at,
+        .theta = before + l->parameters.at,
+        .measured = memory + (law->measured == X ? l->measurement.at : l->state.at),
+        .torque = {memory + l->torque.at, before + l->torque.at},
+        .feedforward = {memory + l->feedforward.at, before + l->feedforward.at},
+        .std = std,
+    };
+    law->observer->last_period(law, before + l->observer.at, l->in_flight.rows,
+                               before + l->in_flight.at, &input.schedule, &input.following, &scratch);
+    law->observer->parameters(law, memory + l->observer.at, theta, std);
+    stewart_tuner_observe(t, tuner_memory, &input, wanted, sample->weights, fell_back, scratch);
     return status;
 }

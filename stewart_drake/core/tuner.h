@@ -1,4 +1,4 @@
-/* Weights of the law at run time: what they are decided by, and who decides. */
+/* Weights of the law at run time: features of the loop, and policies that decide by them. */
 
 #pragma once
 
@@ -7,9 +7,9 @@
 #define STEWART_WINDOW 31 /* samples that a decision rests on */
 #define STEWART_FEATURES 18
 
-/* Who decides: a network as the paper has it, which moves each weight by a factor; a network that has
-   a start and moves along the ratio w_Q / w_R; or a rule of two lines for that ratio. */
-enum { STEWART_PAPER_NETWORK, STEWART_RATIO_NETWORK, STEWART_RULE };
+/* Policies: a network as the paper has it, which moves each weight by a factor; a network that has a
+   start and moves along the ratio w_Q / w_R; a rule of two lines for that ratio; or fixed weights. */
+enum { STEWART_PAPER_NETWORK, STEWART_RATIO_NETWORK, STEWART_RULE, STEWART_FIXED_WEIGHTS };
 
 typedef struct {
     int health;         /* whether features are of health, else the paper's densities */
@@ -30,7 +30,18 @@ typedef struct {
     real bounds[4];     /* lower, then upper ones of w_Q and w_R */
 } stewart_tuner;
 
-/* Numbers of the tuner's memory: weights of the last sample, fallbacks, the window. */
+/* Inputs of a tuner: of a law at a sample, and at the sample before. */
+typedef struct {
+    const stewart_machine *machine;
+    const real *state, *theta; /* estimated at the sample before; NaN without an estimate */
+    stewart_schedule schedule; /* torques since then */
+    const real *following;     /* the torque that acts next */
+    const real *measured;      /* (12) state at the sample, as it is measured or else estimated */
+    const real *torque[2], *feedforward[2]; /* of the sample, and of the one before */
+    const real *std;           /* (p) of the estimated parameters */
+} stewart_tuner_input;
+
+/* Numbers of the tuner's memory: weights of the last sample, fallbacks, the window (31, columns). */
 int stewart_tuner_memory(const stewart_tuner *tuner);
 
 void stewart_tuner_start(const stewart_tuner *tuner, real *memory);
@@ -38,11 +49,22 @@ void stewart_tuner_start(const stewart_tuner *tuner, real *memory);
 /* The newest row of the window, and its length. */
 int stewart_newest_row(const stewart_tuner *tuner, const real *memory, real *row);
 
-/* Weights (2) of the next sample. Returns whether who decides had to be passed over. */
+/* Features (18) of a window. */
+void stewart_tuner_features(const stewart_tuner *tuner, const real *window, real *values);
+
+/* Weights (2) of the next sample. Returns whether the policy failed and the weights go back. */
 int stewart_decide(const stewart_tuner *tuner, const real *memory, real *weights);
 
-/* `stewart_step` with weights of a tuner, which observes it: `wanted` (12) is the reference's pose and
-   rates at the sample; those of `sample` do not count. */
+/* The same for given features (18) and weights (2) of the last sample. */
+int stewart_decide_by(const stewart_tuner *tuner, const real *values, const real *last, real *weights);
+
+/* Takes a sample into the memory: `wanted` (12) is the reference's pose and rates, `weights` (2) those
+   that were used. Scratch: 12 numbers for each torque of the schedule. */
+void stewart_tuner_observe(const stewart_tuner *tuner, real *memory, const stewart_tuner_input *input,
+                           const real *wanted, const real *weights, int fell_back,
+                           stewart_scratch scratch);
+
+/* `stewart_step` with weights of a tuner, which observes it; those of `sample` do not count. */
 int stewart_tuned_step(const stewart_law *law, const stewart_tuner *tuner, real *memory,
                        real *tuner_memory, real *scratch, stewart_sample *sample,
                        const real *wanted, real *torque);
