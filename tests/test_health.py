@@ -10,28 +10,31 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.bulk import ending_of, run_in_bulk
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.loop.tuner import RULES, health_of, weights_source
-from stewart_drake.tuner.features import (
-    HIGHEST,
-    LOWEST,
-    NAMES,
-    DensityFeatures,
-    Row,
-)
 from stewart_drake.tuner.network import WINDOW, Network, load_network, save_network
 from stewart_drake.tuner.source import (
-    FALL,
-    LEAST,
-    MOST,
-    RISE,
+    NAMES,
+    DensityFeatures,
+    FixedPolicy,
     RatioPolicy,
     Rule,
     WeightsSource,
     ratio_of,
-    towards,
     weights_of,
 )
-from stewart_drake.tuning.data import FixedPolicy, watched_run, watching
+from stewart_drake.tuning.data import watched_run, watching
 from stewart_drake.tuning.families import FAMILIES, SAMPLES
+
+LOWEST, HIGHEST = -6.0, 4.0
+"""Bounds of a feature."""
+FALL, RISE = 0.35, 0.15
+"""Decades of w_Q / w_R per sample."""
+LEAST, MOST = -4.0, 2.0
+"""Bounds of log10(w_Q / w_R)."""
+ROW = (
+    *("error", "feedback", "change", "surprise", "missed", "late", "late_weight", "early"),
+    *("early_weight", "ratio", "doubt"),
+)
+"""A row of the window; the torque that acted last follows."""
 
 FOLLOWS = ("plant.kind=exact", "start=on_reference", "queue=reference")
 BLIND = (*FOLLOWS, "controller.estimate=[]")
@@ -54,8 +57,9 @@ def health():
     made = []
 
     def make(experiment, law):
-        made.append(health_of(experiment, law))
-        return WeightsSource(made[-1], FixedPolicy(np.ones(2)))
+        features, policy = health_of(experiment, law), FixedPolicy(np.ones(2))
+        made.append(WeightsSource(law.plant, features, policy))
+        return made[-1]
 
     run_in_bulk(scenario("duration=0.2", *BLIND), tuner=make)
     return made[0]
@@ -63,7 +67,7 @@ def health():
 
 def window(**columns):
     """One of rows in which everything is 0 but these."""
-    rows = {name: np.zeros(WINDOW) for name in Row._fields}
+    rows = {name: np.zeros(WINDOW) for name in ROW}
     rows |= {name: np.broadcast_to(value, WINDOW) for name, value in columns.items()}
     return np.column_stack([*rows.values(), np.zeros((WINDOW, 6))])
 
@@ -145,9 +149,13 @@ def test_a_missed_measurement_is_left_out():
 # ------------------------------------------------------------------------- who decides
 
 
+def decide(policy, values, last):
+    return WeightsSource(None, DensityFeatures(), policy).decide_by(values, last)
+
+
 @pytest.mark.parametrize("goal", [-4.0, -1.0, 0.1, 2.0])
 def test_weights_go_towards_a_ratio_and_fall_faster_than_they_rise(goal):
-    found = ratio_of(towards(goal, weights_of(0.0)))
+    found = ratio_of(decide(Rule(goal, 0.0, 0.0), np.zeros(18), weights_of(0.0)).weights)
     assert found == pytest.approx(min(max(goal, -FALL), RISE))
 
 
@@ -155,7 +163,7 @@ def test_the_rule_is_two_lines():
     rule, values = Rule(-1.0, 2.0, 0.5), np.zeros(18)
     for x, ratio in ((0.2, -1.0), (0.5, -1.0), (0.6, -1.2), (9.0, LEAST)):
         values[NAMES.index("surprise_peak")] = x
-        decision = rule.decide(values, weights_of(ratio))
+        decision = decide(rule, values, weights_of(ratio))
         assert ratio_of(decision.weights) == pytest.approx(ratio)
         assert not decision.fell_back
     assert rule.first == pytest.approx(weights_of(-1.0))
@@ -178,10 +186,10 @@ def network(start=None, features="health", **changed):
 
 
 def test_weights_stay_in_bounds_and_move_as_fast_as_they_may():
-    source = WeightsSource(DensityFeatures(), RatioPolicy(network(weights_of(-1.0))))
+    policy = RatioPolicy(network(weights_of(-1.0)))
     rng, last = np.random.default_rng(1), weights_of(-1.0)
     for _ in range(300):
-        decision = source.policy.decide(rng.normal(0, 100, 18), last)
+        decision = decide(policy, rng.normal(0, 100, 18), last)
         moved = ratio_of(decision.weights) - ratio_of(last)
         assert -FALL - 1e-9 <= moved <= RISE + 1e-9
         assert LEAST - 1e-9 <= ratio_of(decision.weights) <= MOST + 1e-9
@@ -191,7 +199,7 @@ def test_weights_stay_in_bounds_and_move_as_fast_as_they_may():
 
 def test_what_fails_leads_back_to_the_start_and_is_counted():
     policy = RatioPolicy(network(weights_of(-2.0)))
-    decision = policy.decide(np.full(18, np.nan), weights_of(0.0))
+    decision = decide(policy, np.full(18, np.nan), weights_of(0.0))
     assert decision.fell_back
     assert ratio_of(decision.weights) == pytest.approx(-FALL)
 

@@ -35,7 +35,6 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
-from stewart_drake.tuner.compiled import compiled_tuner
 from stewart_drake.types import Array
 
 SOURCES: Final = (
@@ -72,9 +71,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     law, tuner = recorded.law, None
     if isinstance(law, PredictiveLqi):
         source = weights_source(experiment, law)
-        tuner = None if source is None else compiled_tuner(source)
-        if (source is None) != (tuner is None):
-            raise ConfigError("tuner.kind: is not exported as it is; expected a shipped kind")
+        tuner = None if source is None else source.compiled
     files = {name: (FOLDER / name).read_text("utf-8") for name in _sources(compiled, tuner)}
     if single:
         defined = "#define STEWART_FLOAT\n\n#include"

@@ -63,7 +63,6 @@ from stewart_drake.scenario.signals import (
 )
 from stewart_drake.scenario.timing import event_time, instants, look_time
 from stewart_drake.scenario.trajectories import evaluate
-from stewart_drake.tuner.compiled import compiled_tuner
 from stewart_drake.tuner.source import Decision, WeightsSource
 from stewart_drake.types import Array
 
@@ -150,7 +149,7 @@ class Ending(NamedTuple):
             law asked for (6)], in rad, m, rad/s, m/s and N m.
         error_so_far: E_ac in % s up to the end, complete or not; NaN where nothing ran.
         weights: (k, 2) w_Q and w_R at the samples.
-        rows: (k, n) row of the tuner's window for each sample (`tuner.features`); n = 0 without a
+        rows: (k, n) row of the tuner's window for each sample (core/tuner.c); n = 0 without a
             tuner, and in Drake's loop.
         loop: `native`, or the other loop and the field that made it necessary; empty if the true
             machine cannot take the start pose.
@@ -355,7 +354,7 @@ class CompiledController:
 
     Args:
         prepared: a run with a law that `law.core_law.uncovered` accepts.
-        tuner: of `tuner.compiled`, or None.
+        tuner: `stewart_tuner`, or None.
         wanted: (k, 12) reference at each sample, for a tuner.
 
     Attributes:
@@ -448,7 +447,7 @@ class PythonController:
         after = self._served.step(self._memory, measured, motion, decision.weights, report)
         if source is not None:
             self._tuned = source.observe(self._tuned, decision, after, self._wanted[sample])
-            self.rows.append(self._tuned.window[-1])
+            self.rows.append(source.row(self._tuned))
         self.weights.append(decision.weights)
         self._memory = after
         packets = isinstance(law.channel, Packets)
@@ -667,15 +666,15 @@ def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
     """
     law, when, source = prepared.law, preparation.when, prepared.tuner
     wanted = preparation.references[when.sampled]
-    field, tuner = core_law.uncovered(law), None if source is None else compiled_tuner(source)
+    field, tuner = core_law.uncovered(law), None if source is None else source.compiled
     experiment = prepared.experiment
     controller: CompiledController | PythonController
-    if field is None and (source is None) == (tuner is None):
+    if field is None:
         loop, controller = "native", CompiledController(prepared, tuner, wanted)
         course = run_loop(experiment, when, controller, law)
     else:
-        python = f"law in Python ({field})" if field else "weights in Python (tuner.kind)"
-        loop, controller = f"native, {python}", PythonController(prepared, when, wanted)
+        loop = f"native, law in Python ({field})"
+        controller = PythonController(prepared, when, wanted)
         with one_blas_thread:
             course = run_loop(experiment, when, controller, law)
     looked = len(course.states)

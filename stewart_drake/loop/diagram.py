@@ -47,8 +47,7 @@ from stewart_drake.scenario.signals import (
     SIGNALS,
     exported_ports,
 )
-from stewart_drake.tuner.features import DensityFeatures
-from stewart_drake.tuner.source import PaperPolicy
+from stewart_drake.tuner.source import DensityFeatures, PaperPolicy
 
 _TOLD: Final = ("density", "reference")
 """Inputs that a tuner may have: outputs of the systems of the same name."""

@@ -24,10 +24,11 @@ from stewart_drake.loop.sampling import Sample, update_every, weak
 from stewart_drake.scenario.config import AnnTunerConfig, FixedTunerConfig, RuleTunerConfig
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES, RATES, WEIGHTS
 from stewart_drake.scenario.trajectories import evaluate, spread_instants
-from stewart_drake.tuner.features import DensityFeatures, Features, HealthFeatures
 from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Kind, Network, density
 from stewart_drake.tuner.source import (
     MAX_FACTOR,
+    DensityFeatures,
+    HealthFeatures,
     PaperPolicy,
     RatioPolicy,
     Rule,
@@ -248,19 +249,19 @@ def _fixed(config: FixedTunerConfig, experiment: Experiment, law: PredictiveLqi)
 def _ann(config: AnnTunerConfig, experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
     network, c = experiment.network, experiment.scenario.controller
     assert network is not None
-    features: Features = DensityFeatures(network.density)
+    features: DensityFeatures | HealthFeatures = DensityFeatures(network.density)
     if network.features == "health":
         features = health_of(experiment, law)
     if network.start is None:
-        return WeightsSource(features, PaperPolicy(network, np.array([c.w_Q, c.w_R])))
-    return WeightsSource(features, RatioPolicy(network))
+        return WeightsSource(law.plant, features, PaperPolicy(network, np.array([c.w_Q, c.w_R])))
+    return WeightsSource(law.plant, features, RatioPolicy(network))
 
 
 def _rule(config: RuleTunerConfig, experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
     usual = RULES[bool(experiment.scenario.controller.estimate)]
     given = {name: getattr(config, name) for name in ("ratio", "slope", "knee")}
     own = {name: value for name, value in given.items() if value is not None}
-    return WeightsSource(health_of(experiment, law), replace(usual, **own))
+    return WeightsSource(law.plant, health_of(experiment, law), replace(usual, **own))
 
 
 TUNERS: Final[Mapping[type, Callable[[Any, Experiment, PredictiveLqi], WeightsSource | None]]] = {
@@ -292,7 +293,6 @@ def health_of(experiment: Experiment, law: PredictiveLqi) -> HealthFeatures:
     if isinstance(observer, CoreObserver) and observer.settings is not None:
         prior = observer.settings.parameters.std
     return HealthFeatures(
-        plant=law.plant,
         noise=np.array(sensing.noise_std),
         motion=motion,
         tolerance=TOLERANCE * motion,

@@ -135,7 +135,7 @@ class Network:
         output: what the output layer gives: `weights` (w_Q, w_R) or `log_weights`, their natural
             logarithms.
         density: the kind of density it was trained on, `magnitude` or `signed`.
-        features: what its inputs are, `densities` (`tuner.network`) or `health` (`tuner.features`).
+        features: what its inputs are, `densities` (`tuner.network`) or `health` (`tuner.source`).
         start: (2,) w_Q and w_R at the first sample, and to go back to; null is what the controller
             has. A network with a start moves along w_Q / w_R, see `tuner.source`.
         card: where it comes from: data, seed, versions, errors; plain JSON values.

@@ -1,87 +1,68 @@
-"""Where the weights of a sample come from while the controller runs, state in and state out.
+"""Weights of the law at run time, by core/tuner.c: features, policy, and memory in, memory out.
+
+A tuner keeps a window of rows, one for each of the last 31 samples. Its features are the paper's
+densities (45), or `health`, which relates timing, surprise, error and feedback to their usual size
+(NAMES). Densities divide each signal by its own mean, so that no scale survives in them.
 
 Weights move along the ratio r = log10(w_Q / w_R), on which alone the gain depends, with
-w_Q w_R = 1. From one sample to the next r falls by FALL at the most and rises by RISE: caution is
-needed at once, and is given up slowly. A network that says where it begins (`Network.start`) is
-limited so; one of the paper's kind moves each weight by a factor, `tuner.source.tune`.
+w_Q w_R = 1. From one sample to the next r falls by 0.35 at the most and rises by 0.15: caution is
+needed at once, and is given up slowly. The paper's network moves each weight by a factor instead.
 """
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from functools import cached_property
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from stewart_drake.core.library import core
+from stewart_drake.law.compiled import Compiled, machine_of, numbers
 from stewart_drake.law.core_law import AnyMemory
-from stewart_drake.tuner.features import PEAK, Features, empty_window
-from stewart_drake.tuner.network import Network
+from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.scenario.signals import NUM_STATE
+from stewart_drake.tuner.network import NUM_INPUTS, Kind, Network
 from stewart_drake.types import Array
 
 MAX_FACTOR: Final = 1.5
-"""By which w_Q and w_R change at most from one sample to the next, up or down."""
-FALL: Final = 0.35
-RISE: Final = 0.15
-"""Decades of w_Q / w_R per sample."""
-LEAST: Final = -4.0
-MOST: Final = 2.0
-"""Ratios, log10(w_Q / w_R), that are thought of."""
-
-
-class Decision(NamedTuple):
-    """The weights of a sample.
-
-    Attributes:
-        weights: (2,) w_Q and w_R, finite and above zero.
-        fell_back: whether who decides had to be passed over.
-    """
-
-    weights: Array
-    fell_back: bool
-
-
-class Policy(Protocol):
-    """From features to weights."""
-
-    @property
-    def first(self) -> Array:
-        """(2,) weights of the first sample."""
-
-    def decide(self, values: Array, last: Array) -> Decision:
-        """The weights of a sample, from features (18,) and the weights (2,) of the one before."""
+"""Largest change of w_Q and w_R from one sample to the next, as a factor up or down."""
+NAMES: Final = (
+    "timing_31", "timing_10", "timing_bound", "timing_detectable",
+    "error_10", "error_31", "feedback_4", "feedback_20", "surprise_3", "surprise_15",
+    "surprise_of_tolerance", "surprise_peak", "ratio", "noise", "delay", "doubt",
+    "feedback_change", "feedback_growth",
+)  # fmt: skip
+"""Features `health`; a number is that of the samples of a root mean square."""
+_MATRICES: Final = ("input_mean", "input_scale", "W1", "b1", "W2", "b2")
 
 
 def ratio_of(weights: Array) -> float:
-    """log10(w_Q / w_R)."""
+    """Return log10(w_Q / w_R)."""
     return float(np.log10(weights[0] / weights[1]))
 
 
 def weights_of(ratio: float) -> Array:
-    """(2,) w_Q and w_R of a ratio, w_Q w_R = 1."""
+    """Return w_Q and w_R (2,) of a ratio, with w_Q w_R = 1."""
     return np.array([10 ** (ratio / 2), 10 ** (-ratio / 2)])
-
-
-def towards(ratio: float, last: Array) -> Array:
-    """Weights (2,) as near a ratio as one sample allows."""
-    now = ratio_of(last)
-    return weights_of(min(max(ratio, now - FALL), now + RISE))
 
 
 def tune(
     network: Network, densities: Array, last: Array, fixed: Array, factor: float = MAX_FACTOR
 ) -> tuple[Array, bool]:
-    """The weights of the next sample: clipped to the network's bounds, then limited in rate.
+    """Compute the weights of the next sample by the paper's network.
 
-    Weights are scales, so the rate is a factor: last / factor <= w <= last * factor. The gain,
-    which depends on w_Q / w_R, sees at most its square.
+    They are clipped to the network's bounds, then limited in rate. Weights are scales, so the rate
+    is a factor: last / factor <= w <= last * factor. The gain, which depends on w_Q / w_R, changes
+    with its square at most.
 
     Args:
-        network: what decides.
+        network: gives the weights.
         densities: (18,).
         last: (2,) weights of the last sample; NaN before the first, which takes `fixed`.
-        fixed: (2,) weights to go back to, at the same rate, where the network's are not finite.
+        fixed: (2,) weights to return to, at the same rate, where the network's are not finite.
         factor: above 1.
 
     Returns:
-        w_Q and w_R (2,), finite and above zero, and whether the network had to be passed over.
+        w_Q and w_R (2,), finite and above zero, and whether the network failed.
     """
     if not np.all(np.isfinite(last)):
         return fixed, False
@@ -92,58 +73,78 @@ def tune(
 
 
 @dataclass(frozen=True)
-class PaperPolicy:
-    """A network as the paper has it, see `tuner.source.tune`.
+class DensityFeatures:
+    """The paper's densities (45), see `tuner.network`."""
+
+    kind: Kind = "magnitude"
+
+
+@dataclass(frozen=True)
+class HealthFeatures:
+    """The features NAMES of a law that measures the state.
 
     Attributes:
-        network: what decides.
-        first: (2,) weights at the start, and to go back to.
+        noise: (12,) standard deviation of a measurement.
+        motion: (12,) half the peak to peak of the reference, and the same per second.
+        tolerance: (12,) tolerable error of the pose, and per second of the rates.
+        torque: largest that the reference takes, N m.
+        prior: (p,) standard deviations of the estimated parameters, or None.
+        delay: assumed delay times the reference's angular frequency.
+    """
+
+    noise: Array
+    motion: Array
+    tolerance: Array
+    torque: float
+    prior: Array | None
+    delay: float
+
+
+@dataclass(frozen=True)
+class FixedPolicy:
+    """Fixed weights.
+
+    Attributes:
+        first: (2,) w_Q and w_R.
+    """
+
+    first: Array
+
+
+@dataclass(frozen=True)
+class PaperPolicy:
+    """The paper's network, see `tune`.
+
+    Attributes:
+        network: gives the weights.
+        first: (2,) weights at the start, and to return to.
     """
 
     network: Network
     first: Array
 
-    def decide(self, values: Array, last: Array) -> Decision:
-        """See `Policy`."""
-        return Decision(*tune(self.network, values, last, self.first))
-
 
 @dataclass(frozen=True)
 class RatioPolicy:
-    """A network that begins somewhere, and goes back there where it fails.
-
-    Attributes:
-        network: one with a start.
-    """
+    """A network with a start, to which it returns where it fails."""
 
     network: Network
 
     @property
     def first(self) -> Array:
-        """(2,)."""
-        start = self.network.start
-        assert start is not None
-        return start
-
-    def decide(self, values: Array, last: Array) -> Decision:
-        """See `Policy`."""
-        raw = self.network(values)
-        usable = bool(np.all(np.isfinite(raw)))
-        goal = np.clip(raw, *self.network.bounds) if usable else self.first
-        return Decision(towards(ratio_of(goal), last), not usable)
+        """Weights (2,) of the first sample."""
+        assert self.network.start is not None
+        return self.network.start
 
 
 @dataclass(frozen=True)
 class Rule:
-    """Two lines: a constant ratio while predictions hold, less and less where they do not,
+    """A constant ratio as long as predictions hold, and a falling one where they do not.
 
         r = ratio - slope max(0, x - knee),
 
     x = log10(nu + 0.1), nu the largest innovation of the last 31 samples over its floor (root mean
-    square of the twelve values), the feature `surprise_peak` of `tuner.features`.
-
-    Attributes:
-        ratio, slope, knee: see above.
+    square of the twelve values), the feature `surprise_peak`.
     """
 
     ratio: float
@@ -152,71 +153,142 @@ class Rule:
 
     @property
     def first(self) -> Array:
-        """(2,)."""
+        """Weights (2,) of the first sample."""
         return weights_of(self.ratio)
 
-    def decide(self, values: Array, last: Array) -> Decision:
-        """See `Policy`."""
-        ratio = self.ratio - self.slope * max(0.0, float(values[PEAK]) - self.knee)
-        usable = bool(np.isfinite(ratio))
-        goal = min(max(ratio, LEAST), MOST) if usable else self.ratio
-        return Decision(towards(goal, last), not usable)
+
+class Decision(NamedTuple):
+    """Weights (2,) of a sample, finite and above zero; and whether the policy failed."""
+
+    weights: Array
+    fell_back: bool
 
 
 class TunerMemory(NamedTuple):
-    """What a tuner carries from one sample to the next.
+    """Memory of a tuner: numbers of the core, and the memory of the law."""
 
-    Attributes:
-        window: of its features.
-        law: what the law remembers.
-        weights: (2,) of the last sample.
-        fallbacks: samples at which who decides was passed over.
-    """
-
-    window: Array
+    data: Array
     law: AnyMemory
-    weights: Array
-    fallbacks: int
+
+    @property
+    def fallbacks(self) -> int:
+        """Samples at which the policy failed."""
+        return int(self.data[2])
 
 
 @dataclass(frozen=True)
 class WeightsSource:
-    """A tuner: features and a policy.
+    """A tuner for one law.
 
     Attributes:
-        features: what it decides by.
-        policy: what decides.
+        plant: model of the plant in the law.
+        features: input of the policy.
+        policy: gives the weights.
     """
 
-    features: Features
-    policy: Policy
+    plant: NominalPlant
+    features: DensityFeatures | HealthFeatures
+    policy: FixedPolicy | PaperPolicy | RatioPolicy | Rule
+
+    @cached_property
+    def compiled(self) -> Compiled:
+        """The `stewart_tuner`."""
+        c, features, policy = core(), self.features, self.policy
+        it = c.ffi.new("stewart_tuner *")
+        if isinstance(features, DensityFeatures):
+            it.is_signed = features.kind == "signed"
+        else:
+            it.health, it.torque, it.delay = 1, features.torque, features.delay
+            for name in ("noise", "motion", "tolerance"):
+                setattr(it, name, getattr(features, name).tolist())
+            if features.prior is not None:
+                it.doubts, it.prior[0 : len(features.prior)] = 1, features.prior.tolist()
+        it.first = policy.first.tolist()
+        if isinstance(policy, FixedPolicy):
+            it.policy = c.lib.STEWART_FIXED_WEIGHTS
+            return Compiled(it)
+        if isinstance(policy, Rule):
+            it.policy = c.lib.STEWART_RULE
+            it.ratio, it.slope, it.knee = policy.ratio, policy.slope, policy.knee
+            return Compiled(it)
+        paper, network = isinstance(policy, PaperPolicy), policy.network
+        it.policy = c.lib.STEWART_PAPER_NETWORK if paper else c.lib.STEWART_RATIO_NETWORK
+        it.hidden, it.logarithms = network.hidden, network.output == "log_weights"
+        it.bounds = np.ravel(network.bounds).tolist()
+        kept = tuple(numbers(getattr(network, name)) for name in _MATRICES)
+        for name, array in zip(_MATRICES, kept, strict=True):
+            setattr(it, name, c.at(array))
+        return Compiled(it, kept)
 
     def start(self, law: AnyMemory) -> TunerMemory:
-        """Before the first sample of a law."""
-        return TunerMemory(empty_window(self.features), law, self.policy.first, 0)
+        """Return the memory before the first sample of a law."""
+        it, c = self.compiled.it, core()
+        memory = np.empty(c.lib.stewart_tuner_memory(it))
+        c.lib.stewart_tuner_start(it, c.at(memory))
+        return TunerMemory(memory, law)
 
     def decide(self, memory: TunerMemory) -> Decision:
-        """The weights of the next sample, from data up to the last one."""
-        if np.isnan(memory.window[-1]).all():  # nothing is known before the first
-            return Decision(self.policy.first, False)
-        return self.policy.decide(self.features.values(memory.window), memory.weights)
+        """Return the weights of the next sample, from data up to the last one."""
+        weights, c = np.empty(2), core()
+        fell_back = c.lib.stewart_decide(self.compiled.it, c.at(memory.data), c.at(weights))
+        return Decision(weights, bool(fell_back))
+
+    def decide_by(self, values: Array, last: Array) -> Decision:
+        """Return the weights from features (18,) and the weights (2,) of the sample before."""
+        weights, c = np.empty(2), core()
+        given = map(c.at, (numbers(values), numbers(last), weights))
+        return Decision(weights, bool(c.lib.stewart_decide_by(self.compiled.it, *given)))
+
+    def values(self, window: Array) -> Array:
+        """Return the features (18,) of a window (31, columns), NaN before the first sample."""
+        found, c = np.empty(NUM_INPUTS), core()
+        c.lib.stewart_tuner_features(self.compiled.it, c.at(numbers(window)), c.at(found))
+        return found
+
+    def row(self, memory: TunerMemory) -> Array:
+        """Return the newest row of the window."""
+        c, row = core(), np.empty(len(memory.data))
+        return row[: c.lib.stewart_newest_row(self.compiled.it, c.at(memory.data), c.at(row))]
 
     def observe(
         self, memory: TunerMemory, decision: Decision, after: AnyMemory, wanted: Array
     ) -> TunerMemory:
-        """After a sample.
+        """Take a sample into the memory.
 
         Args:
-            memory: before it.
-            decision: about it.
-            after: what the law remembers since.
-            wanted: (12,) pose and rates of the reference there.
+            memory: before the sample.
+            decision: weights of the sample.
+            after: memory of the law after the sample.
+            wanted: (12,) pose and rates of the reference.
         """
-        window, ratio = memory.window, ratio_of(decision.weights)
-        row = self.features.row(window[-1], memory.law, after, wanted, ratio)
-        return TunerMemory(
-            np.vstack([window[1:], row]),
-            after,
-            decision.weights,
-            memory.fallbacks + decision.fell_back,
+        c, before, data = core(), memory.law, memory.data.copy()
+        belief, measured = before.belief, after.measurement
+        if len(measured) != NUM_STATE:
+            measured = after.belief.state
+        schedule, following = belief.timeline.last_period(before.in_flight)
+        kept: dict[str, Any] = {
+            "state": belief.state,
+            "theta": belief.parameters,
+            "following": following,
+            "measured": measured,
+            "std": after.belief.estimate.parameter_std,
+        }
+        kept = {name: numbers(value) for name, value in kept.items()}
+        acted = [numbers(part) for part in schedule]
+        pairs = [[numbers(m.torque), numbers(m.feedforward)] for m in (after, before)]
+        given = c.ffi.new(
+            "stewart_tuner_input *",
+            {
+                "machine": machine_of(self.plant).it,
+                "schedule": [len(acted[0]), *map(c.at, acted), 0],
+                "torque": [c.at(pair[0]) for pair in pairs],
+                "feedforward": [c.at(pair[1]) for pair in pairs],
+                **{name: c.at(value) for name, value in kept.items()},
+            },
         )
+        weights, reference = numbers(decision.weights), numbers(wanted)
+        c.lib.stewart_tuner_observe(
+            *(self.compiled.it, c.at(data), given, c.at(reference), c.at(weights)),
+            *(decision.fell_back, c.scratch(NUM_STATE * len(acted[0]))),
+        )
+        return TunerMemory(data, after)

@@ -13,7 +13,6 @@ import hashlib
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -34,9 +33,8 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import TUNER_INPUTS, WEIGHTS
 from stewart_drake.studies.jobs import Progress, run_jobs
-from stewart_drake.tuner.features import HealthFeatures
 from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Network, densities
-from stewart_drake.tuner.source import Decision, RatioPolicy, WeightsSource
+from stewart_drake.tuner.source import FixedPolicy, HealthFeatures, RatioPolicy, WeightsSource
 from stewart_drake.tuning.families import SAMPLES, Family, with_gain
 from stewart_drake.types import Array
 
@@ -78,21 +76,12 @@ Gains = tuple[tuple[float, float], ...]
 # ---------------------------------------------------------------- one condition
 
 
-@dataclass(frozen=True)
-class FixedPolicy:
-    """Policy with fixed weights `first` (2,), w_Q and w_R."""
-
-    first: Array
-
-    def decide(self, values: Array, last: Array) -> Decision:
-        return Decision(self.first, False)
-
-
 def watching(w_Q: float, w_R: float) -> MakeTuner:
     """Return the factory of a tuner that computes `health` while the weights are fixed."""
 
     def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
-        return WeightsSource(health_of(experiment, law), FixedPolicy(np.array([w_Q, w_R])))
+        fixed = FixedPolicy(np.array([w_Q, w_R]))
+        return WeightsSource(law.plant, health_of(experiment, law), fixed)
 
     return make
 
@@ -110,12 +99,12 @@ def watched_run(scenario: Scenario, tuner: MakeTuner, samples: int) -> tuple[End
     Returns:
         How it ended, and the features (samples, 18) after every second sample, else NaN.
     """
-    made: list[HealthFeatures] = []
+    made: list[WeightsSource] = []
 
     def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource | None:
         source = tuner(experiment, law)
         assert source is not None and isinstance(source.features, HealthFeatures)
-        made.append(source.features)
+        made.append(source)
         return source
 
     ending, health = run_in_bulk(scenario, tuner=make), np.full((samples, NUM_INPUTS), np.nan)
@@ -150,7 +139,7 @@ def roll_out(scenario: Scenario, network: Network, samples: int) -> bytes:
     """Run a condition with a network; return the same file of one run."""
 
     def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
-        return WeightsSource(health_of(experiment, law), RatioPolicy(network))
+        return WeightsSource(law.plant, health_of(experiment, law), RatioPolicy(network))
 
     return _file([watched_run(scenario, make, samples)], scenario.duration)
 
