@@ -25,8 +25,7 @@ from pydrake.systems.primitives import Sine
 from scipy.integrate import solve_ivp
 
 import stewart_drake as sd
-from stewart_drake.dynamics.native_plant import NativePlant
-from stewart_drake.dynamics.open_loop import Drive, in_c
+from stewart_drake.dynamics.open_loop import Drive, NativePlant, in_c
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.reporting.style import figure_style, write_figures

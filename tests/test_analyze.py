@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.dynamics.workspace import standing
+from stewart_drake.dynamics.workspace import measures_at
 from stewart_drake.files.resources import resolve
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.reference_config import HoldConfig, SineConfig, WaypointsConfig
@@ -145,7 +145,7 @@ def singular_mechanism(folder):
     def rolled(angle):
         return np.concatenate([[angle], PAPER.home[1:]])
 
-    roll = brentq(lambda a: standing(PAPER, rolled(a)).parallel, -1.39, -1.42, xtol=1e-15)
+    roll = brentq(lambda a: measures_at(PAPER, rolled(a)).parallel, -1.39, -1.42, xtol=1e-15)
     text = resolve("mechanism", "paper").read_text()
     path = folder / "singular.yaml"
     path.write_text(text.replace("home: [0, 0,", f"home: [{roll!r}, 0,", 1))

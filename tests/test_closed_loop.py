@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import stewart_drake as sd
-from stewart_drake.dynamics.workspace import standing
+from stewart_drake.dynamics.workspace import measures_at
 from stewart_drake.files.resources import data_root
 from stewart_drake.loop import results as metrics
 from stewart_drake.loop.diagram import build_closed_loop
@@ -123,7 +123,7 @@ def test_a_run_that_leaves_the_workspace_says_when_and_which_leg(plant):
     assert stopped is not None and stopped.leg is not None
     assert 1.2 < stopped.time < 1.6
     assert result.failure is not None and f"leg {stopped.leg}" in result.failure
-    sines = standing(sd.load_mechanism("paper"), result.signals.pose.values[-1]).sines
+    sines = measures_at(sd.load_mechanism("paper"), result.signals.pose.values[-1]).sines
     assert np.argmin(sines) == stopped.leg - 1  # nearest to its dead centre in the last log row
     assert result.signals.time.values[-1] <= stopped.time
 

@@ -25,7 +25,7 @@ from stewart_drake.dynamics.workspace import (
     diagnose,
     home_sign,
     margin,
-    standing,
+    measures_at,
 )
 from stewart_drake.loop.exact import ExactPlant, set_accuracy
 from stewart_drake.loop.platforms import MultibodyStewart
@@ -261,7 +261,7 @@ def test_at_a_dead_centre_the_simulation_ends_in_time_and_names_the_leg(scheme):
         assert found.time == pytest.approx(expected.time, rel=0.02, abs=1e-3)
         assert "end of its reach" in found.reason
         assert abs(found.margin) < 1e-3
-        now = standing(PAPER, x[:6])
+        now = measures_at(PAPER, x[:6])
         assert now.sines[found.leg - 1] == now.sines.min() <= DEAD_CENTRE_SINE
         legs.add(found.leg)
         if np.partition(now.sines, 1)[1] > 0.1:  # only one leg is near its end
@@ -286,7 +286,7 @@ def test_under_gravity_and_strong_torques_the_simulation_ends_too(seed):
         assert np.all(np.isfinite(x))
         assert 0 < failure.time < 20
         if failure.leg is not None:
-            assert standing(PAPER, x[:6]).sines[failure.leg - 1] <= DEAD_CENTRE_SINE
+            assert measures_at(PAPER, x[:6]).sines[failure.leg - 1] <= DEAD_CENTRE_SINE
 
 
 @pytest.mark.parametrize(
@@ -351,14 +351,14 @@ def crossing(mechanism, seed):
     scale = np.array([1, 1, 1, 0.3, 0.3, 0.3])
 
     def parallel(distance):
-        return sign * standing(mechanism, mechanism.home + distance * direction).parallel
+        return sign * measures_at(mechanism, mechanism.home + distance * direction).parallel
 
     while True:
         direction = rng.normal(0, 1, 6) * scale
         direction /= np.linalg.norm(direction / scale)
         low = 0.0
         for high in np.linspace(0.02, 2, 100):
-            now = standing(mechanism, mechanism.home + high * direction)
+            now = measures_at(mechanism, mechanism.home + high * direction)
             if now.sines.min() < 0.1 or abs(now.pitch) > 1.3:
                 break
             if parallel(high) < 0:
@@ -375,7 +375,7 @@ def test_at_a_parallel_singularity_the_simulation_ends(index):
     pose, direction = crossing(mechanism, 2)
     sign = home_sign(mechanism)
     before, after = (
-        sign * standing(mechanism, pose + s * 1e-3 * direction).parallel for s in (-1, 1)
+        sign * measures_at(mechanism, pose + s * 1e-3 * direction).parallel for s in (-1, 1)
     )
     assert before > 0 > after
     start = np.concatenate([pose - 0.1 * direction, direction])
@@ -390,7 +390,9 @@ def test_at_a_parallel_singularity_the_simulation_ends(index):
     assert "parallel singularity" in failure.reason
     assert 0 < failure.time < 1
     # Before the sign changes, and not by far.
-    assert sign * standing(mechanism, x[:6]).parallel == pytest.approx(SINGULARITY_LIMIT, rel=0.1)
+    assert sign * measures_at(mechanism, x[:6]).parallel == pytest.approx(
+        SINGULARITY_LIMIT, rel=0.1
+    )
 
 
 def test_at_the_limit_of_the_pitch_the_simulation_ends():

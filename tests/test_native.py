@@ -19,7 +19,7 @@ from stewart_drake.core.layout import SIGNATURES
 from stewart_drake.dynamics import generate, native_functions
 from stewart_drake.dynamics.native_functions import NativeFunctions, functions_of
 from stewart_drake.dynamics.stewart import plant_parameters
-from stewart_drake.dynamics.workspace import margin, standing
+from stewart_drake.dynamics.workspace import margin, measures_at
 from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, PAYLOAD
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.virtual_machine import VirtualMachine
@@ -149,7 +149,7 @@ def test_the_margin_is_the_least_of_the_measures():
         sign = -1.0 if index == 6 else 1.0
         expected = sign * measures[index] - 0.25 if index == 6 else measures[index] - 0.25
         assert functions.margin(PAPER.home, sign, least) == pytest.approx(expected, abs=1e-15)
-    assert margin(PAPER, PAPER.home) == standing(PAPER, PAPER.home).margin > 0.1
+    assert margin(PAPER, PAPER.home) == measures_at(PAPER, PAPER.home).margin > 0.1
 
 
 def test_threads_have_buffers_of_their_own():

@@ -8,8 +8,14 @@ from pydrake.systems.primitives import ConstantVectorSource
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from stewart_drake.dynamics.native_plant import Ended, NativePlant
-from stewart_drake.dynamics.open_loop import Drive, IntegrationError, in_c, integrate
+from stewart_drake.dynamics.open_loop import (
+    Drive,
+    Ended,
+    IntegrationError,
+    NativePlant,
+    in_c,
+    integrate,
+)
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.loop.exact import ExactPlant, set_accuracy

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from stewart_drake.cli import main
 from stewart_drake.core.layout import DEAD_CENTRE_SINE
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, margin, standing
+from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, margin, measures_at
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop.preparation import assemble, check_instants, prepare
@@ -150,7 +150,7 @@ def test_travel_ends_on_the_border(name):
         for end, reason in ((t.low, t.low_reason), (t.high, t.high_reason)):
             pose = mechanism.home + end * np.eye(6)[k]
             assert 0 <= margin(mechanism, pose) < 1e-3
-            now = standing(mechanism, pose)
+            now = measures_at(mechanism, pose)
             if "end of its reach" in reason:
                 np.testing.assert_allclose(now.sines.min(), DEAD_CENTRE_SINE, atol=1e-4)
             else:

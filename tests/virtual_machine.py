@@ -10,8 +10,7 @@ import casadi as ca
 import numpy as np
 
 from stewart_drake.dynamics import equations
-from stewart_drake.dynamics.measures import assembled, leg_measures
-from stewart_drake.dynamics.numbers import numbers_of
+from stewart_drake.dynamics.equations import leg_measures, numbers_of, workspace_measures
 from stewart_drake.identification.model import Compiled
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_PLANT_PARAMETERS, NUM_STATE, POSE, RATES
@@ -100,7 +99,7 @@ class VirtualMachine:
             for i, leg in enumerate(legs)
         ]
         sines, wrenches = zip(*each, strict=True)
-        return assembled(ca.vertcat(*sines), ca.horzcat(*wrenches), pose)
+        return workspace_measures(ca.vertcat(*sines), ca.horzcat(*wrenches), pose)
 
     @cached_property
     def measures(self) -> Compiled:

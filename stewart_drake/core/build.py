@@ -21,7 +21,7 @@ ROOT = FOLDER.parents[1]
 LIBRARY = FOLDER / "_dynamics.so"
 EQUATIONS = FOLDER / "equations.h"
 MODELS = ROOT / "models"
-GENERATORS = ("equations", "derivatives", "measures", "emit", "numbers", "generate")
+GENERATORS = ("equations", "derivatives", "generate")
 """Modules of `dynamics` that write equations.h."""
 
 # Neither contracted to fused operations nor reordered: the numbers are those of the equations in

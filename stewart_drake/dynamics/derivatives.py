@@ -14,7 +14,7 @@ The torque is that at the shaft, with d = damping, c = coulomb_friction, s = cou
     -d torque / d alpha_dot = d + c (1 - slip^2) / s,
     -d torque / ds = -c (1 - slip^2) alpha_dot / s^2.
 
-Slips are an argument here: tanh, for which no compiler does several legs at once, is taken outside.
+Slips are arguments here: no compiler vectorises tanh over the legs, so it is computed outside.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from typing import NamedTuple
 import casadi as ca
 
 from stewart_drake.dynamics import equations
-from stewart_drake.dynamics.numbers import CommonNumbers, LegNumbers
+from stewart_drake.dynamics.equations import CommonNumbers, LegNumbers
 from stewart_drake.scenario.signals import (
     COULOMB,
     COULOMB_SPEED,
@@ -33,7 +33,7 @@ from stewart_drake.scenario.signals import (
 
 
 class Plate(NamedTuple):
-    """How the plate moves, accelerations included; all in W."""
+    """Motion of the plate with accelerations, in W."""
 
     R_WP: ca.SX
     w: ca.SX
@@ -50,7 +50,7 @@ def _plate(s: dict[str, ca.SX]) -> Plate:
 
 
 def plate_alone(common: CommonNumbers, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
-    """Its part of dF/d[pose; rates] (6, 12) and of M (6, 6)."""
+    """Return the plate's part of dF/d[pose; rates] (6, 12) and of M (6, 6)."""
     R_WP, w, _, g_W = plate = _plate(s)
     payload = s["parameters"][PAYLOAD]
     I_W = ca.mtimes([R_WP, ca.diag(common.plate_inertia), R_WP.T])
@@ -67,20 +67,20 @@ def plate_alone(common: CommonNumbers, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.S
 
 
 def _payload(plate: Plate, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
-    """Its place r from the COM, and how it accelerates against that; (3,) each, in W."""
+    """Return the place r of the payload from the COM, and its relative acceleration, in W."""
     r = ca.mtimes(plate.R_WP, s["parameters"][PAYLOAD_POSITION])
     return r, ca.cross(plate.w_dot, r) + ca.cross(plate.w, ca.cross(plate.w, r))
 
 
 def _joint(leg: LegNumbers, plate: Plate, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """b (3,) in W; position q and velocity (3,) of Q in S."""
+    """Return b (3,) in W, and position q and velocity (3,) of Q in S."""
     b = ca.mtimes(plate.R_WP, leg.p_PQ)
     q = ca.mtimes(leg.R_WS.T, s["pose"][3:] + b - leg.p_WS)
     return b, q, ca.mtimes(leg.R_WS.T, s["rates"][3:] + ca.cross(plate.w, b))
 
 
 def crank_rate(leg: LegNumbers, common: CommonNumbers, s: dict[str, ca.SX]) -> ca.SX:
-    """alpha_dot of a leg, rad/s."""
+    """Return alpha_dot of a leg, rad/s."""
     _, q, velocity = _joint(leg, _plate(s), s)
     numbers = (*leg.symbols, *common.symbols)
     reduced = equations.Leg(*equations.leg_at_joint(leg, common)(q, velocity, 0, *numbers))
@@ -95,9 +95,9 @@ def leg_on_plate(
     bias: ca.SX,
     slip: ca.SX,
 ) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
-    """What a leg adds to both, its row (1, 6) of B', and its crank's rate.
+    """Return a leg's parts of dF/d[pose; rates] and M, its row (1, 6) of B', and its crank's rate.
 
-    To the first in two parts: (6, 12), and less (3, 12) in the first rows, because b turns.
+    The first has two parts: (6, 12), less (3, 12) in the first rows, because b turns.
     """
     plate, R_WS = _plate(s), leg.R_WS
     w, w_dot = plate.w, plate.w_dot
@@ -121,9 +121,9 @@ def leg_on_plate(
 def assembled(
     dF_dx: ca.SX, M: ca.SX, arm: ca.SX, arm_rates: ca.SX, slips: ca.SX, s: dict[str, ca.SX]
 ) -> list[ca.SX]:
-    """The results of `residual_derivatives` from sums over plate and legs, and of single legs.
+    """Return the results of `residual_derivatives` from sums over plate and legs.
 
-    The payload m takes the force m k, k its acceleration less gravity's, which its place changes:
+    The payload m takes the force m k, with k its acceleration less gravity. Its place changes k:
 
         dr = R dp,   dk = ([w_dot x] + [w x]^2) dr,   d[r x m k; m k] = m [dr x k + r x dk; dk].
     """
@@ -153,7 +153,7 @@ def _leg_residual(leg: LegNumbers, common: CommonNumbers) -> ca.Function:
     rate = ca.dot(reduced.arm, w)
     shaft = equations.shaft_torque(torque, bias, rate, slip, p)
     f = ca.mtimes(reduced.mass, a) + reduced.bias - reduced.arm * shaft
-    # At a slip that is held, and what its change with the crank's rate adds.
+    # at constant slip, plus the change of the slip with the crank's rate
     slope = p[COULOMB] * (1 - slip**2) / p[COULOMB_SPEED]
     df = ca.jacobian(f, moved) + slope * ca.mtimes(reduced.arm, ca.jacobian(rate, moved))
     arguments = [q, w, a, torque, bias, slip, p, gravity, *numbers]

@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from stewart_drake.core.layout import DEAD_CENTRE_SINE, SHAPES
-from stewart_drake.dynamics.numbers import CommonNumbers, LegNumbers, Number
+from stewart_drake.core.layout import COMMON_NUMBERS, DEAD_CENTRE_SINE, LEG_NUMBERS, SHAPES
+from stewart_drake.mechanism.geometry import Mechanism, plate_radius
 from stewart_drake.scenario.signals import (
     BIAS,
     COULOMB,
@@ -31,9 +31,79 @@ from stewart_drake.scenario.signals import (
     PAYLOAD_POSITION,
 )
 
+Number = float | ca.SX
+Numbers = ca.DM | ca.SX
+
+
+class LegNumbers(NamedTuple):
+    """Numbers of one leg; see `Mechanism`."""
+
+    crank_length: Number
+    rod_length: Number
+    branch: Number
+    R_WS: Numbers
+    p_PQ: Numbers
+    p_WS: Numbers
+    symbols: tuple[ca.SX, ...] = ()
+    """Further arguments of a function of the numbers: none for floats."""
+
+
+class CommonNumbers(NamedTuple):
+    """Numbers of plate, cranks and rods; the crank's inertia is that about the motor axis."""
+
+    plate_mass: Number
+    plate_inertia: Numbers
+    crank_mass: Number
+    crank_center: Number
+    crank_inertia: Number
+    rod_mass: Number
+    rod_center: Number
+    rod_inertia: tuple[Number, Number, Number]
+    radius: Number
+    """Mean distance of the plate's joints from its COM, m."""
+    symbols: tuple[ca.SX, ...] = ()
+
+
+def numbers_of(mechanism: Mechanism) -> tuple[list[LegNumbers], CommonNumbers]:
+    """Return the numbers of a machine, floats."""
+    m = mechanism
+    legs = [
+        LegNumbers(float(u), float(rod), float(branch), ca.DM(R_WS), ca.DM(p_PQ), ca.DM(p_WS))
+        for u, rod, branch, R_WS, p_PQ, p_WS in zip(
+            m.crank_lengths, m.rod_lengths, m.branches, m.R_WS, m.p_PQ, m.p_WS, strict=True
+        )
+    ]
+    I_a, I_y, I_t = (float(moment) for moment in m.rod.inertia)
+    common = CommonNumbers(
+        m.plate.mass,
+        ca.DM(m.plate.inertia),
+        m.crank.mass,
+        m.crank.center,
+        float(m.crank.inertia[2]),
+        m.rod.mass,
+        m.rod.center,
+        (I_a, I_y, I_t),
+        plate_radius(m),
+    )
+    return legs, common
+
+
+def leg_numbers(symbols: ca.SX) -> LegNumbers:
+    """Return the numbers of a leg from its part (18,) of the geometry."""
+    u, rod, branch, R_WS, p_PQ, p_WS = ca.vertsplit(symbols, [0, 1, 2, 3, 12, 15, LEG_NUMBERS])
+    return LegNumbers(u, rod, branch, ca.reshape(R_WS, 3, 3), p_PQ, p_WS, (symbols,))
+
+
+def common_numbers(symbols: ca.SX) -> CommonNumbers:
+    """Return the numbers of all legs and the plate from the last part (13,) of the geometry."""
+    ends = [0, 1, *range(4, COMMON_NUMBERS + 1)]
+    plate, inertia, m, center, I_crank, rod, f, I_a, I_y, I_t, radius = ca.vertsplit(symbols, ends)
+    moments = I_a, I_y, I_t
+    return CommonNumbers(plate, inertia, m, center, I_crank, rod, f, moments, radius, (symbols,))
+
 
 class Leg(NamedTuple):
-    """One leg seen from its plate joint; all in its motor frame S."""
+    """One leg reduced to its plate joint, in its motor frame S."""
 
     mass: ca.SX
     """m (3, 3) kg."""
@@ -46,7 +116,7 @@ class Leg(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """(EOM) at symbolic pose, rates, parameters and gravity, and what belongs to it."""
+    """Terms of (EOM) at symbolic pose, rates, parameters and gravity."""
 
     mass: ca.SX
     """M (6, 6)."""
@@ -65,7 +135,7 @@ class Motion(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """What plate and legs add up to."""
+    """Sums over plate and legs."""
 
     M_ww: ca.SX
     """(3, 3), as the next two: blocks of M."""
@@ -78,12 +148,11 @@ class Sums(NamedTuple):
     """J."""
 
     def plus(self, other: "Sums") -> "Sums":
-        """Both."""
         return Sums(*(a + b for a, b in zip(self, other, strict=True)))
 
 
 class PlateMotion(NamedTuple):
-    """How the plate moves: all that a leg needs to know, in W."""
+    """Motion of the plate, in W."""
 
     R_WP: ca.SX
     position: ca.SX
@@ -95,16 +164,16 @@ class PlateMotion(NamedTuple):
 
 
 def cross_matrix(a: ca.SX) -> ca.SX:
-    """(3, 3) with cross_matrix(a) b = a x b."""
+    """Return (3, 3) with cross_matrix(a) b = a x b."""
     return ca.skew(a)
 
 
 def _held_above(x: ca.SX, threshold: float) -> ca.SX:
-    """x above the threshold, three times differentiable everywhere, at least half the threshold.
+    """Return x above the threshold, continued smoothly to half the threshold below it.
 
-    Integrator stages step past the workspace boundary before its witness sees it, where sin^2
-    becomes negative. With y = x / threshold in [0, 1] the slope is the quintic smoothstep, whose
-    integral is 5/2 y^4 - 3 y^5 + y^6.
+    It is three times differentiable. Integrator stages pass the workspace boundary, where sin^2
+    becomes negative, before the witness function detects it. With y = x / threshold in [0, 1] the
+    slope is the quintic smoothstep; its integral is 5/2 y^4 - 3 y^5 + y^6.
     """
     y = x / threshold
     inside = ca.fmin(ca.fmax(y, 0.0), 1.0)
@@ -113,7 +182,7 @@ def _held_above(x: ca.SX, threshold: float) -> ca.SX:
 
 
 def leg_at_joint(leg: LegNumbers, common: CommonNumbers) -> ca.Function:
-    """Crank and rod of a leg reduced to Q: (q, w, gravity) in S and the numbers -> `Leg`.
+    """Return crank and rod of a leg reduced to Q: (q, w, gravity) in S and the numbers -> `Leg`.
 
     Crank tip T at u c, its direction of motion t = n x c, rod direction r, all unit vectors, n the
     motor axis (z of S). The rod's length gives r.(w - v_T) = 0 with v_T = u alpha_dot t, so
@@ -184,12 +253,12 @@ def leg_at_joint(leg: LegNumbers, common: CommonNumbers) -> ca.Function:
 
 
 def swing_cosine(q: ca.SX, u: Number, length: Number) -> ca.SX:
-    """cos(delta) = C / hypot(A, B); beyond [-1, 1] the leg does not reach q."""
+    """Return cos(delta) = C / hypot(A, B); beyond [-1, 1] the leg does not reach q."""
     return (ca.sumsqr(q) + u**2 - length**2) / (2 * u * ca.sqrt(q[0] ** 2 + q[1] ** 2))
 
 
 def crank_directions(q: ca.SX, u: Number, length: Number, branch: Number) -> tuple[ca.SX, ca.SX]:
-    """Directions c of the crank and t of its tip's motion, equation (2) without its angles.
+    """Return directions c of the crank and t of its tip's motion, equation (2) without its angles.
 
     alpha = azimuth of Q + branch * delta with cos(delta) = C / hypot(A, B).
     """
@@ -215,7 +284,7 @@ def _unequal_sides(
     a_T: ca.SX,
     length: Number,
 ) -> tuple[ca.SX, ca.SX]:
-    """Mass (3, 3) and bias (3,), before D', of a moment of inertia about y = n x r / |n x r|.
+    """Return mass (3, 3) and bias (3,), before D', of an inertia about y = n x r / |n x r|.
 
     omega_y = y.(r x d) / l = z.d with z = (y x r) / l. The angular momentum I omega_y y has the
     rate I (omega_y_dot y + omega_y y_dot). The second part does no virtual power: y stays
@@ -231,7 +300,7 @@ def _unequal_sides(
 
 
 def rotation(angles: ca.SX) -> ca.SX:
-    """R_WP (3, 3) = Rz(psi) Ry(theta) Rx(phi)."""
+    """Return R_WP (3, 3) = Rz(psi) Ry(theta) Rx(phi)."""
     (cf, ct, cp), (sf, st, sp) = (ca.vertsplit(f(angles)) for f in (ca.cos, ca.sin))
     return ca.vertcat(
         ca.horzcat(cp * ct, cp * st * sf - sp * cf, cp * st * cf + sp * sf),
@@ -241,7 +310,7 @@ def rotation(angles: ca.SX) -> ca.SX:
 
 
 def angle_rate_map(angles: ca.SX) -> ca.SX:
-    """E (3, 3): angular velocity in W = E d(roll, pitch, yaw)/dt."""
+    """Return E (3, 3): angular velocity in W = E d(roll, pitch, yaw)/dt."""
     (_, ct, cp), (_, st, sp) = (ca.vertsplit(f(angles)) for f in (ca.cos, ca.sin))
     return ca.vertcat(
         ca.horzcat(cp * ct, -sp, 0), ca.horzcat(sp * ct, cp, 0), ca.horzcat(-st, 0, 1)
@@ -249,18 +318,17 @@ def angle_rate_map(angles: ca.SX) -> ca.SX:
 
 
 def plate_motion(pose: ca.SX, rates: ca.SX, gravity: ca.SX) -> PlateMotion:
-    """The plate's motion in W."""
     angles, position = pose[:3], pose[3:]
     w, v = ca.mtimes(angle_rate_map(angles), rates[:3]), rates[3:]
     return PlateMotion(rotation(angles), position, w, v, ca.vertcat(0, 0, -gravity))
 
 
 def plate_alone(common: CommonNumbers, plate: PlateMotion, parameters: ca.SX) -> Sums:
-    """The plate's part of (EOM), with its payload.
+    """Return the plate's part of (EOM), with its payload.
 
-    That is a point mass m at r, fixed in the plate. It moves with v + w x r and takes the force
-    f = m (v_dot + w_dot x r + w x (w x r) - g), which enters as [r x f; f]. At r = 0 it is a part
-    of the plate's mass; here is what r adds to that.
+    The payload is a point mass m at r, fixed in the plate. It moves with v + w x r and takes the
+    force f = m (v_dot + w_dot x r + w x (w x r) - g), which enters as [r x f; f]. At r = 0 it is
+    part of the plate's mass; the terms with r are added here.
     """
     R_WP, position, w, v, g_W = plate
     payload = parameters[PAYLOAD]
@@ -284,7 +352,7 @@ def plate_alone(common: CommonNumbers, plate: PlateMotion, parameters: ca.SX) ->
 def leg_on_plate(
     leg: LegNumbers, common: CommonNumbers, plate: PlateMotion
 ) -> tuple[Sums, ca.SX, ca.SX]:
-    """What a leg adds to (EOM), its row (1, 6) of B', and its crank's rate."""
+    """Return a leg's part of (EOM), its row (1, 6) of B', and its crank's rate."""
     R_WP, position, w, v, g_W = plate
     R_WS = leg.R_WS
     b = ca.mtimes(R_WP, leg.p_PQ)
@@ -310,7 +378,7 @@ def leg_on_plate(
 
 
 def assembled(sums: Sums, arm: ca.SX, crank_rates: ca.SX, pose: ca.SX, rates: ca.SX) -> Motion:
-    """(EOM) of plate and legs; `arm` is B'."""
+    """Return (EOM) of plate and legs; `arm` is B'."""
     E = angle_rate_map(pose[:3])
     w = ca.mtimes(E, rates[:3])
     M = ca.vertcat(ca.horzcat(sums.M_ww, sums.M_wv), ca.horzcat(sums.M_wv.T, sums.M_vv))
@@ -326,15 +394,15 @@ def assembled(sums: Sums, arm: ca.SX, crank_rates: ca.SX, pose: ca.SX, rates: ca
 
 
 def _symmetric(matrix: ca.SX) -> ca.SX:
-    """Both triangles from the lower one, which halves the work of products known symmetric."""
+    """Return a symmetric matrix from its lower triangle, which halves the work."""
     return ca.tril2symm(ca.tril(matrix))
 
 
 def slip(crank_rates: ca.SX, parameters: ca.SX) -> ca.SX:
-    """(6,) in [-1, 1]: Coulomb friction by its size, tanh(alpha_dot / its speed).
+    """Return (6,) Coulomb friction over its size, tanh(alpha_dot / its speed).
 
-    Real Coulomb friction jumps where a crank turns back. This one has a slope, so that integrators
-    keep their order, and a crank that holds a load creeps: coulomb_speed says how slowly.
+    Unlike real Coulomb friction it is smooth at zero rate, so that integrators keep their order. A
+    crank that holds a load creeps, slower for a smaller coulomb_speed.
     """
     return ca.tanh(crank_rates / parameters[COULOMB_SPEED])
 
@@ -342,32 +410,32 @@ def slip(crank_rates: ca.SX, parameters: ca.SX) -> ca.SX:
 def shaft_torque(
     torque: ca.SX, bias: ca.SX, crank_rate: ca.SX, slip: ca.SX, parameters: ca.SX
 ) -> ca.SX:
-    """What reaches the crank, or each of six: motor and bias less viscous and Coulomb friction."""
+    """Return the torque at a crank, or six: motor and bias less viscous and Coulomb friction."""
     return torque + bias - (parameters[DAMPING] * crank_rate + parameters[COULOMB] * slip)
 
 
 def force(motion: Motion, torque: ca.SX, parameters: ca.SX, slip: ca.SX) -> ca.SX:
-    """B torque - h, the generalised force (6,) beside M nu_dot."""
+    """Return the generalised force (6,) B torque - h."""
     shaft = shaft_torque(torque, parameters[BIAS], motion.crank_rates, slip, parameters)
     return ca.mtimes(motion.arm.T, shaft) - motion.bias
 
 
 def accelerations(motion: Motion, torque: ca.SX, parameters: ca.SX, slip: ca.SX) -> ca.SX:
-    """Of the pose (6,), under motor torques."""
+    """Return the accelerations of the pose (6,) under motor torques."""
     nu_dot = solve_symmetric(motion.mass, force(motion, torque, parameters, slip))
     return ca.solve(motion.rates_map, nu_dot - motion.nu_dot_bias)
 
 
 def inverse_dynamics(motion: Motion, accelerations: ca.SX, parameters: ca.SX, slip: ca.SX) -> ca.SX:
-    """Motor torques (6,) that give these accelerations."""
-    # Without motor torque `force` is what bias, friction and h exert.
+    """Return the motor torques (6,) for given accelerations of the pose."""
+    # `force` without motor torque: bias, friction and h
     passive = force(motion, ca.SX.zeros(NUM_LEGS), parameters, slip)
     nu_dot = ca.mtimes(motion.rates_map, accelerations) + motion.nu_dot_bias
     return ca.solve(motion.arm.T, ca.mtimes(motion.mass, nu_dot) - passive)
 
 
 def terms(motion: Motion) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """M (6, 6), bias (6,) and B (6, 6) in pose coordinates."""
+    """Return M (6, 6), bias (6,) and B (6, 6) in pose coordinates."""
     N = motion.rates_map
     return (
         ca.mtimes([N.T, motion.mass, N]),
@@ -377,7 +445,7 @@ def terms(motion: Motion) -> tuple[ca.SX, ca.SX, ca.SX]:
 
 
 def solve_symmetric(matrix: ca.SX, right: ca.SX) -> ca.SX:
-    """matrix^-1 right for a symmetric positive definite matrix (n, n), by Cholesky, unrolled."""
+    """Return matrix^-1 right for a positive definite matrix (n, n), by unrolled Cholesky."""
     upper = ca.chol(matrix)  # matrix = upper' upper
     n = matrix.shape[0]
     x = ca.SX(right)
@@ -389,5 +457,35 @@ def solve_symmetric(matrix: ca.SX, right: ca.SX) -> ca.SX:
 
 
 def symbols() -> dict[str, ca.SX]:
-    """Fresh symbols for every argument of the equations."""
+    """Return new symbols for all arguments of the equations."""
     return {name: ca.SX.sym(name, *shape) for name, shape in SHAPES.items()}
+
+
+def leg_measures(
+    leg: LegNumbers, common: CommonNumbers, R_WP: ca.SX, position: ca.SX, angle: ca.SX | None
+) -> tuple[ca.SX, ca.SX]:
+    """Return the sine of the crank's angle off dead centre, and the rod's unit wrench (6,).
+
+    The sine is defined also out of reach, where the square is negative. The wrench's moment is
+    taken over the plate's mean radius, so that all six have no unit.
+    """
+    u, R_WS = leg.crank_length, leg.R_WS
+    b = ca.mtimes(R_WP, leg.p_PQ)
+    q = ca.mtimes(R_WS.T, position + b - leg.p_WS)
+    azimuth = ca.atan2(q[1], q[0])
+    if angle is None:
+        cosine = swing_cosine(q, u, leg.rod_length)
+        square = 1 - cosine**2
+        swing = ca.acos(ca.fmin(ca.fmax(cosine, -1.0), 1.0))
+        alpha, sine = azimuth + leg.branch * swing, ca.sign(square) * ca.sqrt(ca.fabs(square))
+    else:
+        alpha, sine = angle, leg.branch * ca.sin(angle - azimuth)
+    rod = (q - u * ca.vertcat(ca.cos(alpha), ca.sin(alpha), 0)) / leg.rod_length
+    e = ca.mtimes(R_WS, rod)
+    return sine, ca.vertcat(ca.cross(b, e) / common.radius, e)
+
+
+def workspace_measures(sines: ca.SX, wrenches: ca.SX, pose: ca.SX) -> ca.SX:
+    """Return the measures (8,) of `workspace` from the sines (6,) and the wrenches (6, 6)."""
+    # CasADi expands the determinant by minors: no division, so it passes zero smoothly.
+    return ca.vertcat(sines, ca.det(wrenches), -ca.fabs(pose[1]))

@@ -2,8 +2,8 @@
 
     d2(pose)/dt2 = map (torque + bias),      map = `mechanism.assembly.torque_map` at home,
 
-everywhere and without limits. It is the model that the paper's controller is designed with, taken
-for the machine. Legs have no mass, and nothing else of a plant's parameters has a place in it.
+everywhere and without limits. The paper designs its controller with this model; here it is the
+plant. Legs have no mass, and the torque bias is the only parameter.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stewart_drake.dynamics.functions import Call
+from stewart_drake.dynamics.native_functions import Call
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.mechanism.assembly import TorqueMap, torque_map
@@ -31,7 +31,7 @@ from stewart_drake.types import Array
 
 
 class FrozenMap:
-    """Functions of `dynamics.functions.MotionFunctions`, of a torque map (6, 6) that stays.
+    """Functions as those of `native_functions.NativeFunctions`, for a constant torque map (6, 6).
 
     With M the plate's mass matrix at home, M accelerations = M map (torque + bias).
     """
@@ -44,37 +44,32 @@ class FrozenMap:
         self._mass[ANGLES, ANGLES] = E.T @ R_WP @ np.diag(plate.inertia) @ R_WP.T @ E
 
     def accelerations(self, *arguments: ArrayLike) -> Sequence[Array]:
-        """(pose, rates, torque, parameters, gravity) -> accelerations (6,)."""
         _, _, torque, parameters, _ = arguments
         return [self.map @ (np.asarray(torque) + np.asarray(parameters)[BIAS])]
 
     def inverse_dynamics(self, *arguments: ArrayLike) -> Sequence[Array]:
-        """(pose, rates, accelerations, parameters, gravity) -> torque (6,)."""
         _, _, accelerations, parameters, _ = arguments
         return [np.linalg.solve(self.map, accelerations) - np.asarray(parameters)[BIAS]]
 
     def energy(self, *arguments: ArrayLike) -> Sequence[Array]:
-        """(pose, rates, parameters, gravity) -> J."""
         rates = np.asarray(arguments[1])
         return [rates @ self._mass @ rates / 2]
 
     def terms(self, *arguments: ArrayLike) -> Sequence[Array]:
-        """(pose, rates, parameters, gravity) -> M, bias and, transposed, the actuation map."""
         return [self._mass.copy(), np.zeros(NUM_COORDINATES), (self._mass @ self.map).T]
 
     def residual_derivatives(self, *arguments: ArrayLike) -> Sequence[Array]:
-        """Of F = accelerations - map (torque + bias), transposed, as of the exact dynamics."""
+        """Return the derivatives of F = accelerations - map (torque + bias), transposed."""
         by_parameters = np.zeros((NUM_PLANT_PARAMETERS, NUM_COORDINATES))
         by_parameters[BIAS] = -self.map.T
         nothing = np.zeros((NUM_STATE, NUM_COORDINATES))
         return [nothing, by_parameters, np.eye(NUM_COORDINATES), self.map]
 
     def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
-        """d[pose; rates]/dt (12,)."""
         return np.concatenate([state[RATES], self.map @ (torque + parameters[BIAS])])
 
     def many_steps(self, steps: int) -> Call:
-        """(state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12): parabolas."""
+        """Return the function for steps along parabolas."""
 
         def through(*arguments: ArrayLike) -> Sequence[Array]:
             state, torques, parameters, _, h = map(np.asarray, arguments)
@@ -90,9 +85,7 @@ class FrozenMap:
 
 
 class FrozenDynamics(StewartDynamics):
-    """`StewartDynamics` of that plant: the map at home, at any pose, in or out of reach.
-
-    Gravity and all parameters but the torque bias change nothing.
+    """Dynamics of the paper's plant: the map at home, at any pose, in or out of reach.
 
     Attributes:
         map: (6, 6) accelerations per torque.
@@ -107,30 +100,28 @@ class FrozenDynamics(StewartDynamics):
         return f"FrozenDynamics({self.mechanism})"
 
     def require_reach(self, pose: Array) -> None:
-        """Any pose will do."""
+        """Accept any pose."""
 
     def massless_map(self, pose: Array, form: TorqueMap = "virtual_work") -> Array:
-        """(6, 6) that of home."""
         return torque_map(self.mechanism, self.mechanism.home, form)
 
 
 class Band(NamedTuple):
-    """Where the plate may be that has no workspace: next to its reference.
+    """Limits of a plate without a workspace: a band about its reference.
 
     Attributes:
-        reference: the pose (6,) that it shall have at a time in s.
-        width: (6,) rad and m, by which it may be off either way.
+        reference: pose (6,) of the reference at a time in s.
+        width: (6,) rad and m, largest error in either direction.
     """
 
     reference: Callable[[float], Array]
     width: Array
 
     def margin(self, time: float, pose: Array) -> float:
-        """Positive inside, in widths."""
+        """Return a margin in widths, positive inside."""
         return float(1 - np.max(np.abs(pose - self.reference(time)) / self.width))
 
     def diagnose(self, time: float, pose: Array) -> Failure | None:
-        """See `dynamics.workspace.diagnose`."""
         left = self.margin(time, pose)
         if left > 0:
             return None

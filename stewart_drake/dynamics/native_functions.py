@@ -1,44 +1,44 @@
-"""The functions of a mechanism's dynamics, of the compiled core: a mechanism is data."""
+"""Compiled functions of a mechanism's dynamics, and the limit of threads for linear algebra."""
 
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from threadpoolctl import OpenBLASController, threadpool_limits
 
 from stewart_drake.core.layout import SHAPES, SIGNATURES
 from stewart_drake.core.library import core
-from stewart_drake.dynamics.functions import Call
 from stewart_drake.mechanism.geometry import Mechanism, geometry_of
 from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, NUM_STATE, NUM_TORQUES
 from stewart_drake.types import Array
 
+Call = Callable[..., Sequence[Array]]
+"""Broadcasts its arguments; returns new arrays, matrices transposed. Several threads may call."""
+
 
 class Buffers(NamedTuple):
-    """Where a function reads arguments from and writes results to, and what makes it do so."""
+    """Places of arguments and results, a call that evaluates, and the memory that it uses."""
 
     arguments: list[Array]
     results: list[Array]
     evaluate: Callable[[], object]
     owner: object
-    """`evaluate` points into it without keeping it."""
 
 
 class Buffered(ABC):
-    """A function with fixed places for arguments and results; every thread has its own.
+    """Function with fixed places for arguments and results, one set per thread.
 
-    A matrix argument or result is held by columns, the row order of its transpose. Results are
-    fresh arrays.
+    The place of a matrix has its columns one after the other.
     """
 
     def __init__(self) -> None:
         self._own = threading.local()
 
     def __call__(self, *arguments: ArrayLike) -> Sequence[Array]:
-        """Evaluate; every argument is broadcast to its place."""
         places, results, evaluate, _ = self.own_buffers()
         for place, argument in zip(places, arguments, strict=True):
             place[...] = argument
@@ -46,7 +46,7 @@ class Buffered(ABC):
         return [result.copy() for result in results]
 
     def own_buffers(self) -> Buffers:
-        """Those of this thread."""
+        """Return the buffers of this thread."""
         try:
             return self._own.buffers
         except AttributeError:
@@ -55,7 +55,7 @@ class Buffered(ABC):
 
     @abstractmethod
     def buffers(self) -> Buffers:
-        """Those of one more thread."""
+        """Make the buffers of one more thread."""
 
 
 class NativeFunction(Buffered):
@@ -69,73 +69,77 @@ class NativeFunction(Buffered):
     def __init__(self, name: str, geometry: Array) -> None:
         super().__init__()
         self._name, self._geometry = name, geometry
-        self._core = core()
 
     def buffers(self) -> Buffers:
-        """Return arrays of this thread, and a call of the function with their addresses."""
-        names, shapes = SIGNATURES[self._name]
+        (names, shapes), c = SIGNATURES[self._name], core()
         given, results = {n: np.zeros(SHAPES[n]) for n in names}, [np.zeros(s) for s in shapes]
-        at = {name: self._core.at(array) for name, array in given.items()}
-        first = self._core.at(self._geometry)
+        at = {name: c.at(array) for name, array in given.items()}
+        first = c.at(self._geometry)
         if "gravity" in at:
-            first = self._core.plant(first, at.pop("parameters"), at.pop("gravity"))
+            first = c.plant(first, at.pop("parameters"), at.pop("gravity"))
         if self._name == "measures":
-            at["angles"] = self._core.ffi.NULL
-        function = getattr(self._core.lib, f"stewart_{self._name.removesuffix('_of_tree')}")
-        evaluate = partial(function, first, *at.values(), *map(self._core.at, results))
+            at["angles"] = c.ffi.NULL
+        function = getattr(c.lib, f"stewart_{self._name.removesuffix('_of_tree')}")
+        evaluate = partial(function, first, *at.values(), *map(c.at, results))
         return Buffers(list(given.values()), results, evaluate, first)
 
 
 class NativeFunctions:
-    """Functions of `dynamics.functions.MotionFunctions` and measures of the workspace.
+    """Functions of one machine, by the names of `core.layout.SIGNATURES`.
 
-    `measures` takes a pose and returns the eight of `dynamics.measures`; `measures_of_tree` takes
-    the crank angles (6,) too, where these are known.
+    `measures` are the eight of the workspace (`equations.measures`); `measures_of_tree` takes known
+    crank angles (6,) too.
 
     Raises:
-        ConfigError: there is no compiled core.
+        ConfigError: the compiled core is missing.
     """
 
+    accelerations: Call
+    inverse_dynamics: Call
+    energy: Call
+    terms: Call
+    residual_derivatives: Call
+    measures: Call
+    measures_of_tree: Call
+
     def __init__(self, mechanism: Mechanism) -> None:
-        self._geometry, self._core = geometry_of(mechanism), core()
-        named = {name: NativeFunction(name, self._geometry) for name in SIGNATURES}
-        self.accelerations = named["accelerations"]
-        self.inverse_dynamics = named["inverse_dynamics"]
-        self.energy, self.terms = named["energy"], named["terms"]
-        self.residual_derivatives = named["residual_derivatives"]
-        self.measures, self.measures_of_tree = named["measures"], named["measures_of_tree"]
-        self._change, self._first = named["change"], self._core.at(self._geometry)
+        geometry = geometry_of(mechanism)
+        for name in SIGNATURES:
+            setattr(self, f"_{name}" if name == "change" else name, NativeFunction(name, geometry))
+        self._first = core().at(geometry)
 
     def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
-        """d[pose; rates]/dt (12,): a plain call of `_change`, in half its time."""
-        places, results, evaluate, _ = self._change.own_buffers()
+        """Return d[pose; rates]/dt (12,), in half the time of a `Call`."""
+        places, results, evaluate, _ = self._change.own_buffers()  # type: ignore[attr-defined]
         places[0][...], places[1][...] = state, torque
         places[2][...], places[3][...] = parameters, gravity
         evaluate()
-        return results[0].copy()
+        return np.array(results[0])
 
     def margin(self, pose: Array, sign: float, least: Array) -> float:
-        """Return by how much the measures of a pose are above `least` (8,); NaN if one is NaN.
+        """Return the least distance of the measures of a pose above `least` (8,); NaN for NaN.
 
-        `sign`: the parallel measure's at home.
+        `sign` is that of the parallel measure at home.
         """
-        at = self._core.at
-        given = self._first, at(np.array(pose, np.float64)), sign, at(least)
-        return float(self._core.lib.stewart_margin(*given))
+        c = core()
+        pose = np.array(pose, np.float64)
+        return float(c.lib.stewart_margin(self._first, c.at(pose), sign, c.at(least)))
 
     def many_steps(self, steps: int) -> Call:
-        """(state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12), one call."""
+        """Return (state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12).
 
-        c, first = self._core, self._first
+        Steps are those of the classical Runge-Kutta method.
+        """
 
         def call(*arguments: ArrayLike) -> Sequence[Array]:
+            c = core()
             shapes = (NUM_STATE,), (steps, NUM_TORQUES), (NUM_PLANT_PARAMETERS,), (1,), (steps,)
             given = [np.empty(shape) for shape in shapes]
             for place, argument in zip(given, arguments, strict=True):
                 place[...] = argument
             states = np.empty((steps, NUM_STATE))
             state, torques, parameters, gravity, h, result = map(c.at, (*given, states))
-            plant = c.plant(first, parameters, gravity)
+            plant = c.plant(self._first, parameters, gravity)
             c.lib.stewart_steps(plant, steps, state, torques, h, result)
             return [states]
 
@@ -144,9 +148,42 @@ class NativeFunctions:
 
 @lru_cache(maxsize=64)
 def functions_of(mechanism: Mechanism) -> NativeFunctions:
-    """Return the functions of a mechanism, which all of this process share.
+    """Return the functions of a mechanism, shared by the whole process.
 
     Raises:
-        ConfigError: there is no compiled core.
+        ConfigError: the compiled core is missing.
     """
     return NativeFunctions(mechanism)
+
+
+class _OneBlasThread:
+    """A context with linear algebra on one thread, until the last user in the process leaves it."""
+
+    def __init__(self) -> None:
+        self._lock, self._users = threading.Lock(), 0
+        self._limit: threadpool_limits | None = None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._limit is None:
+                self._limit = threadpool_limits(limits=1, user_api="blas")
+                _leave_control()
+            self._users += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0 and self._limit is not None:
+                self._limit.restore_original_limits()
+                self._limit = None
+                _leave_control()
+
+
+def _leave_control() -> None:
+    """Let any thread change the limit, which threadpoolctl from 3.8 on allows its setter only."""
+    leave = getattr(OpenBLASController, "clear_controlling_thread", None)
+    if leave is not None:
+        leave()
+
+
+one_blas_thread: Final = _OneBlasThread()

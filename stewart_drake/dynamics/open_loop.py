@@ -1,12 +1,12 @@
-"""The exact plant alone, under torques that are known beforehand, without Drake.
+"""The exact plant alone under known torques, without Drake (core/plant.h).
 
-DOP853, the Runge-Kutta method of order 8 of Dormand and Prince, goes from one change of the torques
-to the next and stops where the plate leaves its workspace (docs/theory.md, section 32). It runs in
-the compiled core, core/plant.h.
+DOP853, the Runge-Kutta method of order 8 of Dormand and Prince, integrates from one change of the
+torques to the next and stops where the plate leaves its workspace (docs/theory.md, section 32).
 """
 
 import math
 from collections.abc import Sequence
+from enum import IntEnum
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stewart_drake.core.library import core
-from stewart_drake.dynamics.native_plant import Ended, NativePlant
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.dynamics.workspace import Failure, diagnose, margin
+from stewart_drake.dynamics.workspace import LEAST, Failure, diagnose, home_sign, margin
+from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE
 from stewart_drake.types import Array
 
@@ -25,6 +25,70 @@ _NONE: Final = (0.0,) * NUM_TORQUES
 
 class IntegrationError(ArithmeticError):
     """No step is short enough for the accuracy."""
+
+
+class Ended(IntEnum):
+    """End of a run in C."""
+
+    INSIDE = 0
+    LEFT = 1
+    TOO_SHORT_STEPS = 2
+    CONTROLLER_FAILED = 3
+
+
+class NativePlant:
+    """A plant at t = 0, for one run by a function of core/plant.h.
+
+    Args:
+        dynamics: equations of motion, with the true parameters.
+        start: (12,) state.
+        times: (n,) s, ascending, at which states are wanted; the last one is the end.
+        accuracy: error of a step in a coordinate x, in units of 1 + |x|.
+        longest_step: s.
+
+    Attributes:
+        states: (n, 12) result; the first `seen` are valid.
+        run: the `stewart_run`.
+    """
+
+    def __init__(
+        self,
+        dynamics: StewartDynamics,
+        start: Array,
+        times: Array,
+        accuracy: float,
+        longest_step: float,
+    ) -> None:
+        c, mechanism = core(), dynamics.mechanism
+        self.states = np.empty((len(times), NUM_STATE))
+        numbers = geometry_of(mechanism), dynamics.plant_parameters, dynamics.gravity
+        copies = [np.array(one, np.float64) for one in numbers]
+        plant = c.plant(*map(c.at, copies))
+        self.run: Any = c.ffi.new("stewart_run *")
+        self.run.plant, self.run.sign, self.run.least = plant, home_sign(mechanism), list(LEAST)
+        self.run.tolerance, self.run.longest, self.run.end = accuracy, longest_step, times[-1]
+        self.run.number, self.run.times = len(times), c.at(times)
+        self.run.states, self.run.state = c.at(self.states), list(start)
+        self._kept = copies, plant, times
+
+    def call(self, name: str, *arguments: Any) -> Ended:
+        """Run by a function of plant.h with its further arguments."""
+        return Ended(getattr(core().lib, f"stewart_{name}")(self.run, *arguments))
+
+    @property
+    def seen(self) -> int:
+        """Number of valid states."""
+        return int(self.run.seen)
+
+    @property
+    def time(self) -> float:
+        """End of the run, s."""
+        return float(self.run.time)
+
+    @property
+    def final(self) -> Array:
+        """(12,) state at the end."""
+        return np.array(list(self.run.state))
 
 
 class Drive(NamedTuple):
@@ -45,22 +109,22 @@ class Drive(NamedTuple):
     start: float = 0.0
 
     def torque(self, time: float) -> Array:
-        """(6,) N m at a time in s."""
+        """Return the torques (6,) in N m at a time in s."""
         swing = np.sin(self.frequency * time + np.asarray(self.phase))
         return np.asarray(np.asarray(self.constant) + np.asarray(self.amplitude) * swing)
 
 
 class Course(NamedTuple):
-    """What a plant did.
+    """Result of `integrate`.
 
     Attributes:
-        times: (n,) s, those that were asked for, up to the end.
-        states: (n, 12) there.
-        end: s, the last of the times that were asked for, or when the plate left.
-        final: (12,) state there.
-        failure: how it left its workspace, or None.
-        steps: of the integrator.
-        evaluations: of the dynamics.
+        times: (n,) s, the requested times up to the end.
+        states: (n, 12) at those times.
+        end: s, the last requested time, or the instant at which the plate left its workspace.
+        final: (12,) state at the end.
+        failure: why the plate left its workspace, or None.
+        steps: number of steps.
+        evaluations: number of evaluations of the dynamics.
     """
 
     times: Array
@@ -80,22 +144,22 @@ def integrate(
     accuracy: float = 1e-9,
     longest_step: float = math.inf,
 ) -> Course:
-    """Follow the exact plant from t = 0 up to the last of `times`, or out of its workspace.
+    """Integrate the exact plant from t = 0 to the last of `times`, or out of its workspace.
 
-    Whether it is in there is looked at where steps end and at `times`; the instant at which it left
-    is found to 1e-13 s.
+    The workspace is checked at the ends of steps and at `times`. The instant of leaving is found to
+    1e-13 s.
 
     Args:
         dynamics: equations of motion, with the true parameters.
         start: (12,) state at t = 0, in the workspace.
         drives: torques, each until the next one starts, the first at t = 0.
-        times: (n,) s, ascending, where states are wanted.
+        times: (n,) s, ascending, at which states are wanted.
         accuracy: error of a step in a coordinate x, in units of 1 + |x| (rad, m, and per s).
         longest_step: s.
 
     Raises:
-        ValueError: a shape, an order or a range that is none of these.
-        IntegrationError: the accuracy cannot be had.
+        ValueError: a wrong shape, order or range.
+        IntegrationError: no step is short enough for the accuracy.
     """
     x0, looks = np.array(start, dtype=np.float64), np.array(times, dtype=np.float64)
     _check(x0, drives, looks, accuracy, longest_step)

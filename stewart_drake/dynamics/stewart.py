@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stewart_drake.core.layout import DEAD_CENTRE_SINE, STANDARD_GRAVITY
-from stewart_drake.dynamics.functions import MotionFunctions
 from stewart_drake.dynamics.native_functions import functions_of
-from stewart_drake.dynamics.workspace import standing
+from stewart_drake.dynamics.workspace import measures_at
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.assembly import TorqueMap, torque_map
 from stewart_drake.mechanism.geometry import Mechanism
@@ -32,18 +31,18 @@ from stewart_drake.types import Array
 
 
 class Linearization(NamedTuple):
-    """State-space derivatives of d[pose; rates]/dt at a point."""
+    """Derivatives of d[pose; rates]/dt at a point.
+
+    A (12, 12) by the state, B (12, 6) by the torque, G (12, p) by the free parameters.
+    """
 
     A: Array
-    """(12, 12) with respect to the state."""
     B: Array
-    """(12, 6) with respect to the torque."""
     G: Array
-    """(12, p) with respect to the free parameters."""
 
 
 def _check(**arguments: ArrayLike) -> None:
-    """ValueError unless each has six components; in their place one would count for all."""
+    """Check that each argument has six components; one number would be broadcast to six."""
     for name, value in arguments.items():
         if getattr(value, "shape", None) != (6,):
             _shaped(name, value, (6,))
@@ -56,7 +55,7 @@ def _shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> ArrayLike:
 
 
 def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """A copy of what is finite and of this shape."""
+    """Return a copy of finite numbers of this shape."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -70,11 +69,11 @@ def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def plant_parameters(values: ArrayLike | None = None) -> Array:
-    """All parameters of the plant (13,), in the order of `scenario.signals.PLANT_PARAMETERS`.
+    """Return all parameters of the plant (13,), in the order of `PLANT_PARAMETERS`.
 
     Args:
-        values: all of them, or the first eight; the rest is no Coulomb friction, and a payload at
-            the plate's COM. None is a plant without any.
+        values: all of them, or the first eight; then without Coulomb friction, and with a payload
+            at the plate's COM. None is a plant without any.
 
     Raises:
         ConfigError: another shape, numbers that are not finite, a speed that is not positive.
@@ -89,14 +88,13 @@ def plant_parameters(values: ArrayLike | None = None) -> Array:
     whole = _finite("parameters", values, (NUM_PLANT_PARAMETERS,))
     if not whole[COULOMB_SPEED] > 0:
         raise ConfigError(
-            f"parameters: got a coulomb_speed of {whole[COULOMB_SPEED]:g} rad/s; expected more "
-            "than 0"
+            f"parameters: got a coulomb_speed of {whole[COULOMB_SPEED]:g} rad/s; expected above 0"
         )
     return whole
 
 
 def _slice(indices: list[int]) -> slice | list[int]:
-    """The same as a slice, which is ten times as fast, where they follow one another."""
+    """Return consecutive indices as a slice, which is ten times as fast."""
     if indices and indices == list(range(indices[0], indices[-1] + 1)):
         return slice(indices[0], indices[-1] + 1)
     return indices
@@ -108,11 +106,11 @@ class StewartDynamics:
     Loops are closed exactly: the state is [pose; rates] (12,). The plant's parameters (13,) are
     torque bias (6, N m), payload (kg), viscous damping of the crank shafts (N m s/rad), their
     Coulomb friction (N m) with the speed over which it builds up (rad/s), and where the payload is
-    (3, m in the plate's frame, from its COM). They are arguments of the compiled functions.
+    (3, m in the plate's frame, from its COM).
 
-    Some of them are `free`: the methods' `parameters` (p,), and the columns of G, are these, the
-    rest is as the calculator has it. By default bias, payload and damping are free (8,). A free
-    name that is none of the plant's, such as a constant of a sensor, changes nothing here.
+    Some of them are `free`: the methods' `parameters` (p,) and the columns of G. The others are
+    constant. By default bias, payload and damping are free (8,). A free name that the plant lacks,
+    such as a constant of a sensor, has no effect.
 
     Args:
         mechanism: the machine.
@@ -124,16 +122,14 @@ class StewartDynamics:
         ConfigError: gravity or parameters of another shape, or not finite.
 
     Attributes:
-        plant_parameters: (13,) all of them.
-        parameters: (p,) those that are free, the default of the methods' `parameters`.
+        plant_parameters: (13,) all parameters.
+        parameters: (p,) the free ones, the default of the methods' `parameters`.
 
-    Every method raises ValueError for an argument of another shape than it names: one number does
-    not stand for six. Values are not looked at, so that NaN gives NaN.
-
-    A calculator can be copied, pickled, and used by several threads.
+    Methods raise ValueError for an argument of another shape; one number is not broadcast to six.
+    NaN gives NaN. A calculator can be copied, pickled, and used by several threads.
 
     Calls do not check reach: outside the workspace derivatives stay finite and smooth but mean
-    nothing (see `equations._held_above`). Use `Mechanism.reach_margins` or `dynamics.workspace`.
+    nothing (`equations._held_above`). Use `Mechanism.reach_margins` or `dynamics.workspace`.
     """
 
     def __init__(
@@ -149,26 +145,25 @@ class StewartDynamics:
         self.gravity = float(scale * _finite("gravity", gravity, ()))
         self.plant_parameters = plant_parameters(parameters)
         self.free = tuple(free)
-        # Which of the free ones are the plant's, and where among all of those.
+        # Places of the plant's parameters among the free ones, and among all of the plant's.
         own = [i for i, name in enumerate(free) if name in PLANT_PARAMETERS]
         place = [PLANT_PARAMETERS.index(free[i]) for i in own]
         self._own, self._place = _slice(own), _slice(place)
         self.parameters = self.free_of(self.plant_parameters)
-        self._functions: MotionFunctions = functions_of(mechanism)
+        self._functions: Any = functions_of(mechanism)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Compiled functions cannot be copied, but made again, or found.
         return type(self), (self.mechanism, self.gravity, self.plant_parameters, self.free)
 
     def __repr__(self) -> str:
         return f"StewartDynamics({self.mechanism}, gravity {self.gravity:g} m/s^2)"
 
     def assuming(self, parameters: ArrayLike) -> "StewartDynamics":
-        """The same with other free parameters (p,)."""
+        """Return a calculator with other free parameters (p,)."""
         return type(self)(self.mechanism, self.gravity, self.complete(parameters), self.free)
 
     def complete(self, parameters: ArrayLike | None) -> Array:
-        """All of the plant's (13,) with these free ones (p,), None for those that it has."""
+        """Return all parameters of the plant (13,) for free ones (p,); None is the default."""
         if parameters is None:
             return self.plant_parameters
         _shaped("parameters", parameters, (len(self.free),))
@@ -177,19 +172,18 @@ class StewartDynamics:
         return whole
 
     def free_of(self, of_plant: Array) -> Array:
-        """Those (p, ...) that are free of all of a plant's (13, ...), 0 for what is none of its."""
+        """Return the free rows (p, ...) of (13, ...), 0 for names that the plant lacks."""
         spread = np.zeros((len(self.free), *of_plant.shape[1:]))
         spread[self._own] = of_plant[self._place]
         return spread
 
     def require_reach(self, pose: Array) -> None:
-        """Raises UnreachablePoseError for a pose (6,) out of reach or at a dead centre."""
-        # Beyond a leg's reach its sine is below that, too; a sine of NaN is none above it.
-        if not standing(self.mechanism, pose).sines.min() >= DEAD_CENTRE_SINE:
+        """Raise UnreachablePoseError for a pose (6,) out of reach or at a dead centre, or NaN."""
+        if not measures_at(self.mechanism, pose).sines.min() >= DEAD_CENTRE_SINE:
             raise UnreachablePoseError(self.mechanism.reach_margins(pose))
 
     def massless_map(self, pose: Array, form: TorqueMap = "virtual_work") -> Array:
-        """(6, 6) the paper's accelerations per torque at a pose: see `mechanism.assembly`."""
+        """Return the paper's accelerations per torque (6, 6), see `mechanism.assembly`."""
         return torque_map(self.mechanism, pose, form)
 
     def accelerations(
@@ -199,14 +193,14 @@ class StewartDynamics:
         torque: ArrayLike,
         parameters: ArrayLike | None = None,
     ) -> Array:
-        """Second derivative (6,) of the pose under motor torques (6,) in N m."""
+        """Return the second derivative (6,) of the pose under motor torques (6,) in N m."""
         _check(pose=pose, rates=rates, torque=torque)
         return self._functions.accelerations(
             pose, rates, torque, self.complete(parameters), self.gravity
         )[0]
 
     def change(self, state: Array, torque: Array) -> Array:
-        """d[pose; rates]/dt (12,), for an integrator, whose arrays have the right shape."""
+        """Return d[pose; rates]/dt (12,) without checks of shapes, for an integrator."""
         return self._functions.change(state, torque, self.plant_parameters, self.gravity)
 
     def inverse_dynamics(
@@ -216,14 +210,14 @@ class StewartDynamics:
         accelerations: ArrayLike,
         parameters: ArrayLike | None = None,
     ) -> Array:
-        """Motor torques (6,) in N m that give these accelerations (6,)."""
+        """Return the motor torques (6,) in N m for accelerations (6,)."""
         _check(pose=pose, rates=rates, accelerations=accelerations)
         return self._functions.inverse_dynamics(
             pose, rates, accelerations, self.complete(parameters), self.gravity
         )[0]
 
     def equilibrium_torque(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> Array:
-        """Motor torques (6,) in N m that hold the plate still.
+        """Return the motor torques (6,) in N m that hold the plate still.
 
         Raises:
             UnreachablePoseError: the pose is out of reach.
@@ -236,26 +230,26 @@ class StewartDynamics:
     def energy(
         self, pose: ArrayLike, rates: ArrayLike, parameters: ArrayLike | None = None
     ) -> float:
-        """Kinetic plus potential energy in J."""
+        """Return the kinetic plus potential energy in J."""
         _check(pose=pose, rates=rates)
         return float(
             self._functions.energy(pose, rates, self.complete(parameters), self.gravity)[0]
         )
 
     def mass_matrix(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> Array:
-        """Mass matrix (6, 6) in pose coordinates: kinetic energy = rates' M rates / 2."""
+        """Return the mass matrix (6, 6): kinetic energy = rates' M rates / 2."""
         _check(pose=pose)
         return self._functions.terms(pose, 0.0, self.complete(parameters), self.gravity)[0]
 
     def bias(self, pose: ArrayLike, rates: ArrayLike, parameters: ArrayLike | None = None) -> Array:
-        """Bias (6,): M accelerations + bias = actuation_map (torque + torque bias - friction)."""
+        """Return h (6,): M accelerations + h = actuation_map (torque + torque bias - friction)."""
         _check(pose=pose, rates=rates)
         return self._functions.terms(pose, rates, self.complete(parameters), self.gravity)[1]
 
     def wrench_accelerations(
         self, pose: ArrayLike, wrench: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
-        """What a wrench on the plate adds to the accelerations of the pose (6,).
+        """Return the accelerations of the pose (6,) due to a wrench on the plate.
 
         A wrench F = [moment; force] at the plate's COM, in W, has the power
         moment . w + force . v = F . nu: it is a generalised force of nu, and joins (EOM) as
@@ -277,14 +271,14 @@ class StewartDynamics:
         return np.linalg.solve(self.mass_matrix(pose, parameters), force)
 
     def actuation_map(self, pose: ArrayLike) -> Array:
-        """Generalised force (6, 6) in pose coordinates per torque: the Jacobian's transpose."""
+        """Return the generalised force per torque (6, 6): the Jacobian's transpose."""
         _check(pose=pose)
         return self._functions.terms(pose, 0.0, 0.0, 0.0)[2].T
 
     def linearize(
         self, pose: ArrayLike, rates: ArrayLike | None = None, torque: ArrayLike | None = None
     ) -> tuple[Array, Array]:
-        """A (12, 12), B (12, 6) of d[pose; rates]/dt; rates zero, torque at equilibrium by default.
+        """Return A, B of d[pose; rates]/dt; rates zero, torque at equilibrium by default.
 
         Raises:
             UnreachablePoseError: no torque was given and the pose is out of reach.
@@ -301,12 +295,12 @@ class StewartDynamics:
         parameters: ArrayLike | None = None,
         wrench: ArrayLike | None = None,
     ) -> Linearization:
-        """Exact derivatives at any point, from those of the residual F(state, accelerations).
+        """Return exact derivatives at any point, from those of F(state, accelerations).
 
         F = M nu_dot + h - B torque = 0 defines the accelerations implicitly, so that their
         derivatives are -(M N)^-1 dF, with dF taken at constant accelerations: no derivative of a
-        matrix inverse is needed. A constant `wrench` (6,), see `wrench_accelerations`, is a
-        constant part of F, so that it changes nothing but the accelerations there.
+        matrix inverse is needed. A constant `wrench` (6,) (`wrench_accelerations`) is a constant
+        part of F and changes the accelerations only.
         """
         _check(pose=pose, rates=rates, torque=torque)
         whole = self.complete(parameters)
@@ -332,9 +326,10 @@ class StewartDynamics:
         substeps: int = 1,
         parameters: ArrayLike | None = None,
     ) -> Array:
-        """States (n, 12) after each of n torques (n, 6) held for `durations` s, (n,) or one.
+        """Return the states (n, 12) after each of n torques (n, 6) held for `durations` s.
 
-        Each hold is cut into `substeps` steps of the classical Runge-Kutta method; one call.
+        Each hold, of `durations` (n,) or one, has `substeps` steps of the classical Runge-Kutta
+        method.
         """
         _shaped("state", state, (NUM_STATE,))
         torques = np.asarray(torques, dtype=np.float64)

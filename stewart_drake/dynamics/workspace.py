@@ -1,4 +1,4 @@
-"""Where a mechanism may be: off dead centres and parallel singularities, angles distinct."""
+"""Workspace of a mechanism: no dead centres, no parallel singularities, distinct angles."""
 
 from functools import lru_cache
 from typing import NamedTuple, Protocol
@@ -12,18 +12,17 @@ from stewart_drake.scenario.signals import LEGS, NUM_LEGS
 from stewart_drake.types import Array
 
 PITCH_LIMIT = np.deg2rad(85.0)
-"""Roll and yaw become one rotation at a pitch of 90 degrees."""
+"""Largest pitch. At 90 degrees roll and yaw are one rotation."""
 SINGULARITY_LIMIT = 1e-3
-"""Least |det| of the dimensionless wrenches of the six rods, see `parallel_measure`."""
+"""Least |det| of the dimensionless wrenches of the six rods."""
 LEAST = np.array([DEAD_CENTRE_SINE] * NUM_LEGS + [SINGULARITY_LIMIT, -PITCH_LIMIT])
-"""What the measures (8,) must be above."""
+"""Lower bounds of the measures (8,)."""
 
 
 class Failure(NamedTuple):
-    """Why a run stopped: time in s, leg (from 1, or None), margin and the reason in words.
+    """Reason of an early end: time in s, leg (from 1, or None), margin and text.
 
-    `margin` is the reach margin of that leg in m, or the measure that the reason names, NaN for
-    none.
+    `margin` is the reach margin of that leg in m, or the measure named in the text, NaN for none.
     """
 
     time: float
@@ -36,10 +35,13 @@ class Failure(NamedTuple):
         return f"{self.reason} at t = {self.time:.3f} s{margin}"
 
 
-class Standing(NamedTuple):
-    """`sines` (6,): of the cranks' angles off dead centre, negative on the other branch.
-    `parallel`: signed measure of parallel singularity, 0 where cranks no longer hold the plate.
-    `pitch`: rad. `margin`: see the function of this name."""
+class Measures(NamedTuple):
+    """Distances from the workspace's boundary at a pose.
+
+    `sines` (6,): sines of the cranks' angles off dead centre, negative on the other branch.
+    `parallel`: signed measure of parallel singularity, 0 where the cranks do not hold the plate.
+    `pitch`: rad. `margin`: see the function of this name.
+    """
 
     sines: Array
     parallel: float
@@ -47,19 +49,19 @@ class Standing(NamedTuple):
     margin: float
 
 
-def standing(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> Standing:
-    """Where a pose (6,) is in the workspace; defined everywhere, also out of reach.
+def measures_at(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> Measures:
+    """Return the measures of a pose (6,), in or out of reach.
 
-    With the crank angles (6,) of a simulated tree given, a crank that has passed its dead centre
-    shows as a negative sine; from the pose alone it cannot be seen.
+    A crank that has passed its dead centre has a negative sine if the crank angles (6,) of a
+    simulated tree are given. The pose alone does not show it.
     """
     measures = _measures(mechanism, pose, crank_angles)
     parallel, least = float(measures[NUM_LEGS]), _margin_of(measures, home_sign(mechanism))
-    return Standing(measures[:NUM_LEGS], parallel, float(pose[1]), least)
+    return Measures(measures[:NUM_LEGS], parallel, float(pose[1]), least)
 
 
 def margin(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> float:
-    """Positive where `standing` is permitted, zero on the boundary, dimensionless; NaN for NaN."""
+    """Return a margin, positive inside the workspace, zero on its boundary; NaN for NaN."""
     sign = home_sign(mechanism)
     if crank_angles is None:
         return functions_of(mechanism).margin(pose, sign, LEAST)
@@ -73,7 +75,7 @@ def _margin_of(measures: Array, sign: float) -> float:
 
 
 def _measures(mechanism: Mechanism, pose: Array, crank_angles: Array | None) -> Array:
-    """(8,): the six sines, the parallel measure, minus the pitch's amount in rad."""
+    """Return (8,): the six sines, the parallel measure, minus the size of the pitch in rad."""
     functions = functions_of(mechanism)
     if crank_angles is None:
         return functions.measures(pose)[0]
@@ -82,17 +84,17 @@ def _measures(mechanism: Mechanism, pose: Array, crank_angles: Array | None) -> 
 
 @lru_cache(maxsize=64)
 def home_sign(mechanism: Mechanism) -> float:
-    """Sign of `Standing.parallel` at home, which a continuous motion can only change at zero."""
+    """Return the sign of `Measures.parallel` at home; continuous motions change it at 0 only."""
     return float(np.sign(_measures(mechanism, mechanism.home, None)[NUM_LEGS]))
 
 
 def diagnose(
     mechanism: Mechanism, time: float, pose: Array, crank_angles: Array | None = None
 ) -> Failure | None:
-    """The failure at a pose that has left the permitted region, or None inside it."""
+    """Return the failure at a pose outside the workspace, or None inside it."""
     if not np.all(np.isfinite(pose)):
         return Failure(time, None, np.nan, "the simulated state is not finite")
-    now, sign = standing(mechanism, pose, crank_angles), home_sign(mechanism)
+    now, sign = measures_at(mechanism, pose, crank_angles), home_sign(mechanism)
     if now.margin > 0:
         return None
     leg = int(now.sines.argmin())
@@ -107,26 +109,24 @@ def diagnose(
 
 
 class Limits(Protocol):
-    """Where a plant's plate may be, at which time."""
+    """Limits of a plate's motion."""
 
     def margin(self, time: float, pose: Array) -> float:
-        """Positive where a pose (6,) is permitted at a time in s."""
+        """Return a margin, positive where a pose (6,) is permitted at a time in s."""
         ...
 
     def diagnose(self, time: float, pose: Array) -> Failure | None:
-        """The failure at a pose that is not permitted, else None."""
+        """Return the failure at a pose that is not permitted, else None."""
         ...
 
 
 class Workspace(NamedTuple):
-    """The limits of a machine, always the same: `margin` and `diagnose`."""
+    """Limits of a machine, at all times the same."""
 
     mechanism: Mechanism
 
     def margin(self, time: float, pose: Array) -> float:
-        """Of the module's function."""
         return margin(self.mechanism, pose)
 
     def diagnose(self, time: float, pose: Array) -> Failure | None:
-        """Of the module's function."""
         return diagnose(self.mechanism, time, pose)

@@ -17,8 +17,8 @@ import numpy as np
 
 from stewart_drake.core.layout import LEG_NUMBERS, SHAPES
 from stewart_drake.dynamics import equations
+from stewart_drake.dynamics.equations import leg_numbers, numbers_of
 from stewart_drake.dynamics.native_functions import Buffered, Buffers
-from stewart_drake.dynamics.numbers import leg_numbers, numbers_of
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import (

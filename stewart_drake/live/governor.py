@@ -28,7 +28,7 @@ import numpy as np
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.dynamics.workspace import PITCH_LIMIT, home_sign, margin, standing
+from stewart_drake.dynamics.workspace import PITCH_LIMIT, home_sign, margin, measures_at
 from stewart_drake.law.motion import between
 from stewart_drake.law.startup import sizes
 from stewart_drake.scenario.signals import (
@@ -150,7 +150,7 @@ class Governor:
         if min(margins) >= LEAST_MARGIN + _GUARD:
             return self._torque_problem(states)
         found, sign = (
-            standing(mechanism, states[int(np.argmin(margins)), POSE]),
+            measures_at(mechanism, states[int(np.argmin(margins)), POSE]),
             home_sign(mechanism),
         )
         leg = int(found.sines.argmin())

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from stewart_drake.dynamics.threads import one_blas_thread
+from stewart_drake.dynamics.native_functions import one_blas_thread
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.contact import Contact, call, open_endpoint
 from stewart_drake.live.design import Design, as_seen, check_controller, design

@@ -16,9 +16,8 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.core.library import core
 from stewart_drake.core.link import Link
-from stewart_drake.dynamics.native_plant import Ended, NativePlant
-from stewart_drake.dynamics.open_loop import IntegrationError
-from stewart_drake.dynamics.threads import one_blas_thread
+from stewart_drake.dynamics.native_functions import one_blas_thread
+from stewart_drake.dynamics.open_loop import Ended, IntegrationError, NativePlant
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve

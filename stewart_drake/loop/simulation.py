@@ -11,7 +11,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
 
-from stewart_drake.dynamics.threads import one_blas_thread
+from stewart_drake.dynamics.native_functions import one_blas_thread
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.loop.cautions import cautions_after, cautions_before
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin

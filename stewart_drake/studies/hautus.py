@@ -21,7 +21,7 @@ from pydrake.systems.primitives import (
 from threadpoolctl import threadpool_limits
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, Failure, diagnose, standing
+from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, Failure, diagnose, measures_at
 from stewart_drake.law.delay_model import chain, delayed_model
 from stewart_drake.law.error_model import (
     ContinuousModel,
@@ -239,7 +239,7 @@ def _linearized(found: Assessment, gravity: bool, pose: Array) -> ContinuousMode
     dynamics = StewartDynamics(mechanism, gravity=gravity)
     if not gravity:
         return linear_model(*dynamics.linearize(pose, torque=np.zeros(NUM_TORQUES)))
-    if abs(standing(mechanism, pose).parallel) < SINGULARITY_LIMIT:
+    if abs(measures_at(mechanism, pose).parallel) < SINGULARITY_LIMIT:
         return "near a parallel singularity the torques that hold the plate have no bound"
     return linear_model(*dynamics.linearize(pose))
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 from scipy.ndimage import label
 
-from stewart_drake.dynamics.workspace import Failure, diagnose, home_sign, margin, standing
+from stewart_drake.dynamics.workspace import Failure, diagnose, home_sign, margin, measures_at
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import LegGeometry, Legs, leg_geometry
 from stewart_drake.scenario.signals import COORDINATES, NUM_COORDINATES
@@ -93,7 +93,7 @@ def rate_gains(mechanism: Legs, legs: LegGeometry, W: Array) -> Array:
 def measure(mechanism: Mechanism, pose: Array) -> Measures:
     """Return all measures of a pose (6,), which may be out of reach."""
     pose = np.asarray(pose, dtype=np.float64)
-    now, sign = standing(mechanism, pose), home_sign(mechanism)
+    now, sign = measures_at(mechanism, pose), home_sign(mechanism)
     rest = (np.full(6, np.nan), np.nan, np.nan, np.nan)
     if now.margin > 0:
         legs = leg_geometry(mechanism, pose)
