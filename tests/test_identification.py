@@ -356,7 +356,7 @@ def test_pose_uncertainty_is_that_of_drawn_machines():
     np.testing.assert_allclose(np.std(away, axis=0), std, rtol=0.15)
     spread = np.diag(unknowns.std[unknowns.free] ** 2)
     whole = pose_uncertainty(unknowns, unknowns.mean, spread, PAPER.home)
-    assert whole.angle[0] <= whole.angle[1] and whole.position_beside[0] < whole.position[0]
+    assert whole.angle[0] <= whole.angle[1] and whole.position_change[0] < whole.position[0]
 
 
 def test_pose_uncertainty_is_taken_over_the_workspace_of_the_machine_found():
@@ -539,7 +539,7 @@ def test_a_multisine_rests_at_both_ends_and_stays_inside():
     assert min(PAPER.reach_margins(pose).min() for pose in poses) > 0
     moved = (poses - PAPER.home)[100:-100]
     assert np.linalg.cond(moved / moved.std(axis=0)) < 10  # no two coordinates move alike
-    with pytest.raises(ConfigError, match="not even 5 % fits the workspace"):
+    with pytest.raises(ConfigError, match="too large for the workspace even at 5 %"):
         fitted_multisine(PAPER, PAPER.home, np.full(6, 100.0), 2.0)
 
 

@@ -4,8 +4,8 @@ Minimised over the unknowns p and the first state x_i of every segment is
 
     chi^2 = sum |(y - h(x(t); p)) / sigma|^2 + |(p - p_0) / sigma_0|^2,
 
-measurements and what was known before. A step solves J'J d = -J'r with J'J + lambda diag(J'J) in
-the place of J'J. A first state meets the measurements of one segment only, J'J is an arrow,
+measurements and prior. A step solves J'J d = -J'r with J'J + lambda diag(J'J) in the place of J'J.
+A first state affects the measurements of one segment only, so that J'J is an arrow,
 
     J'J = [N_pp, N_pi; N_ip, N_ii],   d_i = -N_ii^-1 (g_i + N_ip d_p),
     (N_pp - sum N_pi N_ii^-1 N_ip) d_p = -(g_p - sum N_pi N_ii^-1 g_i),
@@ -28,50 +28,34 @@ from stewart_drake.identification.shooting import (
     integrate,
     plan_steps,
 )
-from stewart_drake.identification.unknowns import (
-    DELAY,
-    GEOMETRY,
-    NUM_UNKNOWNS,
-    OFFSETS,
-    Unknowns,
-)
+from stewart_drake.identification.unknowns import DELAY, GEOMETRY, NUM_UNKNOWNS, OFFSETS, Unknowns
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array
 
-MOST_DELAY: Final = 0.1
-"""Largest change of the delay in one iteration, s."""
-ENOUGH: Final = 0.01
-"""Gain of chi^2 below which an iteration is the last."""
+MOST_DELAY: Final = 0.1  # largest change of the delay in one iteration, s
+ENOUGH: Final = 0.01  # gain of chi^2 below which an iteration is the last
 MOST_ITERATIONS: Final = 60
+# chi^2 per value of a segment that no similar machine explains; an error of a millimetre in the
+# drawing causes some fifty
 ASTRAY: Final = 1e3
-"""chi^2 per value of a segment that no similar machine explains; a drawing that is off by a
-millimetre leaves some fifty."""
-_SLOPES_STEP: Final = 0.02
-"""Step of the integration of slopes, s."""
-_STEP_ERROR: Final = 0.05
-"""Root-mean-square error of the integration in standard deviations of a measurement."""
-_SHORTEST_STEP: Final = 1e-3
-"""s."""
-_DAMPING: Final = (1e-3, 1e-9, 1e12)
-"""First, least and largest."""
+_SLOPES_STEP: Final = 0.02  # step of the integration of slopes, s
+_STEP_ERROR: Final = 0.05  # RMS error of the integration in standard deviations of a measurement
+_SHORTEST_STEP: Final = 1e-3  # s
+_DAMPING: Final = (1e-3, 1e-9, 1e12)  # first, least and largest
 
 
 class Guess(NamedTuple):
     """Values of the unknowns and of the first states."""
 
-    values: Array
-    """(NUM_UNKNOWNS,)."""
-    first: Array
-    """(n, 12) first states of the segments."""
+    values: Array  # (NUM_UNKNOWNS,)
+    first: Array  # (n, 12)
 
 
 class Residuals(NamedTuple):
     """Residuals of a guess."""
 
-    measured: Array
-    """(m, n, 18) of n segments in standard deviations, 0 for missing measurements."""
-    prior: Array
-    """(free unknowns,)."""
+    measured: Array  # (m, n, 18) of n segments in standard deviations, 0 for missing measurements
+    prior: Array  # (free unknowns,)
 
     @property
     def chi2(self) -> float:
@@ -82,16 +66,25 @@ class Residuals(NamedTuple):
 
 
 class Normal(NamedTuple):
-    """J'J and J'r, segment by segment; columns: free unknowns, then a first state."""
+    """J'J and J'r, segment by segment; columns: k free unknowns, then a first state."""
 
-    of_segments: Array
-    """(n, k + 12, k + 12)."""
-    gradients: Array
-    """(n, k + 12)."""
-    of_prior: Array
-    """(k,) on the diagonal."""
-    prior_gradient: Array
-    """(k,)."""
+    of_segments: Array  # (n, k + 12, k + 12)
+    gradients: Array  # (n, k + 12)
+    of_prior: Array  # (k,) on the diagonal
+    prior_gradient: Array  # (k,)
+
+    @property
+    def joined(self) -> tuple[Array, Array]:
+        """N_pp (k, k) and g_p (k,)."""
+        k = len(self.of_prior)
+        N_pp = self.of_segments[:, :k, :k].sum(0) + np.diag(self.of_prior)
+        return N_pp, self.gradients[:, :k].sum(0) + self.prior_gradient
+
+    @property
+    def of_first(self) -> tuple[Array, Array]:
+        """N_ip (n, 12, k) and N_ii (n, 12, 12)."""
+        k = len(self.of_prior)
+        return self.of_segments[:, k:, :k], self.of_segments[:, k:, k:]
 
 
 class Fit(NamedTuple):
@@ -99,8 +92,7 @@ class Fit(NamedTuple):
 
     guess: Guess
     residuals: Residuals
-    covariance: Array
-    """(k, k) of the free unknowns."""
+    covariance: Array  # (k, k) of the free unknowns
     iterations: int
 
 
@@ -115,8 +107,7 @@ class Problem:
     @property
     def count(self) -> int:
         """Number of measured values."""
-        values = (s.log.values[s.rows] for s in self.segments)
-        return sum(int(np.isfinite(one).sum()) for one in values)
+        return sum(int(np.isfinite(s.log.values[s.rows]).sum()) for s in self.segments)
 
     def model(self) -> MachineModel:
         """Return the model that evaluates all segments at once."""
@@ -131,6 +122,11 @@ class Problem:
         for i, s in enumerate(self.segments):
             values[: len(s.rows), i] = s.log.values[s.rows]
         return values, np.array([s.log.std for s in self.segments])
+
+    def kept(self, start: Guess, kept: NDArray[np.intp]) -> "tuple[Problem, Guess]":
+        """Return the problem and a guess of it with these segments only."""
+        segments = [self.segments[k] for k in kept]
+        return replace(self, segments=segments), Guess(start.values, start.first[kept])
 
 
 class Evaluator:
@@ -148,7 +144,7 @@ class Evaluator:
         """Return the residuals and the normal equations of a guess.
 
         Slopes are integrated with longer steps than trajectories: they cost ten times as much, and
-        their error moves the minimum by that share of a standard deviation only.
+        their relative error moves the minimum by the same share of a standard deviation only.
         """
         residuals = self.residuals(guess)
         slopes_step = max(self.problem.longest_step, _SLOPES_STEP)
@@ -168,28 +164,26 @@ class Evaluator:
         """Return the residuals and J (m, n, 18, columns) at m samples of n segments."""
         unknowns, free = self.problem.unknowns, self.free
         numbers = unknowns.numbers(guess.values)
-        plan = plan_steps(self.problem.segments, guess.values[DELAY], longest_step)
-        course = integrate(self.model, numbers, guess.first, plan, sensitive)
-        m, n, _ = course.states.shape
-        seen = np.empty((m, n, NUM_MEASURED))
+        steps = plan_steps(self.problem.segments, guess.values[DELAY], longest_step)
+        states, state_slopes = integrate(self.model, numbers, guess.first, steps, sensitive)
+        m, n, _ = states.shape
+        predicted = np.empty((m, n, NUM_MEASURED))
         J = np.zeros((m, n, NUM_MEASURED, len(free) + NUM_STATE if sensitive else 0))
-        seen[:, :, POSE.start :] = course.states
+        predicted[:, :, POSE.start :] = states
         any_angle = bool(np.isfinite(self.values[:, :, ANGLES]).any())
         with np.errstate(all="ignore"):
             for k in range(m) if any_angle else ():
-                alpha, by_pose, by_geometry = self.model.crank_angles(
-                    course.states[k, :, :6], numbers
-                )
-                seen[k, :, ANGLES] = alpha + guess.values[OFFSETS]
+                alpha, by_pose, by_geometry = self.model.crank_angles(states[k, :, :6], numbers)
+                predicted[k, :, ANGLES] = alpha + guess.values[OFFSETS]
                 if sensitive:
-                    slopes = by_pose @ course.slopes[k][:, :6]
+                    slopes = by_pose @ state_slopes[k][:, :6]
                     slopes[:, :, NUM_STATE + NUM_DYNAMIC : NUMBERS.stop] += by_geometry
                     J[k, :, ANGLES] = self._columns(slopes, np.eye(6))
-            residual = self.values - seen
+            residual = self.values - predicted
             residual[:, :, ANGLES] = np.remainder(residual[:, :, ANGLES] + np.pi, 2 * np.pi) - np.pi
             residual /= self.std
         if sensitive:
-            J[:, :, POSE.start :] = self._columns(course.slopes, np.zeros((NUM_STATE, 6)))
+            J[:, :, POSE.start :] = self._columns(state_slopes, np.zeros((NUM_STATE, 6)))
             J *= -1 / self.std[:, :, None]
             J[np.isnan(self.values)] = 0.0
         residual[np.isnan(self.values)] = 0.0
@@ -198,8 +192,7 @@ class Evaluator:
 
     def _columns(self, slopes: Array, offsets: Array) -> Array:
         """Return the columns of S as those of free unknowns and first state."""
-        rows = slopes.shape[:-1]
-        whole = np.empty((*rows, NUM_UNKNOWNS))
+        whole = np.empty((*slopes.shape[:-1], NUM_UNKNOWNS))
         whole[..., : OFFSETS.start] = slopes[..., NUMBERS]
         whole[..., OFFSETS] = offsets
         whole[..., DELAY] = slopes[..., -1]
@@ -210,71 +203,75 @@ def followed(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
     """Return a problem without the segments whose first trajectory leaves the workspace."""
     measured = Evaluator(problem).residuals(start).measured
     with np.errstate(over="ignore"):
-        return _of(problem, start, np.flatnonzero(np.isfinite(np.sum(measured**2, axis=(0, 2)))))
+        finite = np.isfinite(np.sum(measured**2, axis=(0, 2)))
+    return problem.kept(start, np.flatnonzero(finite))
 
 
 def nearest(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
     """Return the half of the segments whose first trajectories are nearest to the measurements.
 
     The others, such as the last one before a plate was lost, would pull all unknowns towards
-    shorter trajectories. From the values of the nearest they start near, too.
+    shorter trajectories. From the values of this half they start near, too.
     """
     away = misfit(Evaluator(problem).residuals(start), problem)
-    return _of(problem, start, np.sort(np.argsort(away)[: (len(away) + 1) // 2]))
+    return problem.kept(start, np.sort(np.argsort(away)[: (len(away) + 1) // 2]))
 
 
 def misfit(residuals: Residuals, problem: Problem) -> Array:
     """Return chi^2 per value (n,) of each segment."""
-    values, _ = problem.measured()
-    squares = np.sum(residuals.measured**2, axis=(0, 2))
-    return np.asarray(squares / np.isfinite(values).sum(axis=(0, 2)))
-
-
-def _of(problem: Problem, start: Guess, kept: NDArray[np.intp]) -> tuple[Problem, Guess]:
-    segments = [problem.segments[k] for k in kept]
-    return replace(problem, segments=segments), Guess(start.values, start.first[kept])
+    counts = np.isfinite(problem.measured()[0]).sum(axis=(0, 2))
+    return np.asarray(np.sum(residuals.measured**2, axis=(0, 2)) / counts)
 
 
 def solve(problem: Problem, start: Guess, most: int = MOST_ITERATIONS) -> Fit:
     """Return the most probable guess after at most `most` iterations from a `followed` start."""
     evaluator = Evaluator(problem)
-    guess, damping = start, _DAMPING[0]
+    guess, damping, iterations = start, _DAMPING[0], 0
     residuals, normal = evaluator.normal(guess)
-    iterations = 0
-    while iterations < most:
+    gained = np.inf
+    while iterations < most and gained >= ENOUGH:
         iterations += 1
         before, gained = residuals.chi2, 0.0
-        while damping < _DAMPING[2]:
+        while damping < _DAMPING[2] and gained == 0.0:
             trial = _moved(guess, *_step(normal, damping), evaluator.free)
             chi2 = evaluator.residuals(trial).chi2
             if chi2 < before:
                 guess, gained = trial, before - chi2
-                break
-            damping *= 10
-        if gained == 0.0:
-            break
-        damping = max(damping / 10, _DAMPING[1])
-        residuals, normal = evaluator.normal(guess)
-        if gained < ENOUGH:
-            break
+            else:
+                damping *= 10
+        if gained > 0.0:
+            damping = max(damping / 10, _DAMPING[1])
+            residuals, normal = evaluator.normal(guess)
     return Fit(guess, residuals, covariance(normal), iterations)
 
 
 class Solution(NamedTuple):
     """Fit of segments of logs, without those that were left out."""
 
-    whole: Problem
-    """All segments."""
-    problem: Problem
-    """Segments that were fitted."""
-    begun: Guess
-    """Start of the fit."""
+    whole: Problem  # all segments
+    problem: Problem  # segments that were fitted
+    begun: Guess  # start of the fit
     fit: Fit
+
+    @property
+    def delay(self) -> float:
+        """Delay, s."""
+        return float(self.fit.guess.values[DELAY])
+
+    @property
+    def delay_std(self) -> float:
+        """Standard deviation of the delay, s, the last of the unknowns."""
+        return float(np.sqrt(self.fit.covariance[-1, -1]))
 
     @property
     def left_out(self) -> int:
         """Number of segments that were not fitted."""
         return len(self.whole.segments) - len(self.problem.segments)
+
+    @property
+    def share(self) -> float:
+        """Share of the values of all segments that was fitted."""
+        return self.problem.count / self.whole.count
 
     @property
     def chi2(self) -> float:
@@ -289,7 +286,7 @@ class Solution(NamedTuple):
     def without_worst(self, most: int = MOST_ITERATIONS) -> "Solution":
         """Return the fit from the same start without the segment of the largest misfit."""
         kept = np.delete(np.arange(len(self.problem.segments)), self.misfit.argmax())
-        problem, begun = _of(self.problem, self.begun, kept)
+        problem, begun = self.problem.kept(self.begun, kept)
         return Solution(self.whole, problem, begun, solve(problem, begun, most))
 
     def refitted(self, problem: Problem) -> "Solution":
@@ -300,8 +297,8 @@ class Solution(NamedTuple):
 def finer(problem: Problem, guess: Guess, residual: float = 1.0) -> Problem | None:
     """Return the problem with half the step, or None if that hardly changes its residuals.
 
-    The change is compared with `residual` standard deviations. How fine is enough depends
-    on the machine: Coulomb friction turns round within some hundredths of a second.
+    The change is compared with `residual` standard deviations. The necessary step depends on the
+    machine: Coulomb friction changes its sign within some hundredths of a second.
     """
     halved = replace(problem, longest_step=problem.longest_step / 2)
     if halved.longest_step < _SHORTEST_STEP:
@@ -311,44 +308,33 @@ def finer(problem: Problem, guess: Guess, residual: float = 1.0) -> Problem | No
 
 
 def _moved(guess: Guess, unknown: Array, first: Array, free: NDArray[np.intp]) -> Guess:
-    values = guess.values.copy()
+    values, before = guess.values.copy(), guess.values[DELAY]
     values[free] += unknown
-    before = guess.values[DELAY]
     values[DELAY] = np.clip(values[DELAY], max(0.0, before - MOST_DELAY), before + MOST_DELAY)
     return Guess(values, guess.first + first)
 
 
 def _step(normal: Normal, damping: float) -> tuple[Array, Array]:
     """Return the changes of the free unknowns (k,) and of the first states (n, 12)."""
-    k = len(normal.of_prior)
-    whole, g = _joined(normal)
-    N_ip, N_ii = normal.of_segments[:, k:, :k], normal.of_segments[:, k:, k:]
+    k, (N_pp, g) = len(normal.of_prior), normal.joined
+    N_ip, N_ii = normal.of_first
     damped = N_ii + damping * np.einsum("nij,ij->nij", N_ii, np.eye(NUM_STATE))
     eliminated = np.linalg.solve(damped, np.dstack([N_ip, normal.gradients[:, k:, None]]))
     turned = N_ip.transpose(0, 2, 1)
-    reduced = whole + damping * np.diag(np.diag(whole)) - (turned @ eliminated[:, :, :k]).sum(0)
+    reduced = N_pp + damping * np.diag(np.diag(N_pp)) - (turned @ eliminated[:, :, :k]).sum(0)
     right = g - (turned @ eliminated[:, :, k:]).sum(0)[:, 0]
     unknown = -np.linalg.solve(reduced, right)
     first = -(eliminated[:, :, k] + eliminated[:, :, :k] @ unknown)
     return unknown, first
 
 
-def _joined(normal: Normal) -> tuple[Array, Array]:
-    """Return N_pp (k, k) and g_p (k,)."""
-    k = len(normal.of_prior)
-    whole = normal.of_segments[:, :k, :k].sum(0) + np.diag(normal.of_prior)
-    return whole, normal.gradients[:, :k].sum(0) + normal.prior_gradient
-
-
 def covariance(normal: Normal) -> Array:
     """Return the covariance (k, k) of the free unknowns, for any first states."""
-    k = len(normal.of_prior)
-    whole, _ = _joined(normal)
-    N_ip, N_ii = normal.of_segments[:, k:, :k], normal.of_segments[:, k:, k:]
-    information = whole - (N_ip.transpose(0, 2, 1) @ np.linalg.solve(N_ii, N_ip)).sum(0)
-    scale = np.sqrt(1 / normal.of_prior)  # unknowns in units of what was known before
-    scaled = scale[:, None] * information * scale
-    found: Array = scale[:, None] * np.linalg.inv(scaled) * scale
+    N_ip, N_ii = normal.of_first
+    information = normal.joined[0]
+    information = information - (N_ip.transpose(0, 2, 1) @ np.linalg.solve(N_ii, N_ip)).sum(0)
+    scale = np.sqrt(1 / normal.of_prior)  # prior standard deviations
+    found: Array = scale[:, None] * np.linalg.inv(scale[:, None] * information * scale) * scale
     return (found + found.T) / 2
 
 
@@ -358,8 +344,7 @@ def chi2_per_value(residuals: Residuals, problem: Problem) -> dict[str, float]:
     Each fitted first state takes twelve degrees of freedom, in equal shares of all values. The
     prior's terms make up for the unknowns.
     """
-    values, _ = problem.measured()
-    there = np.isfinite(values)
+    there = np.isfinite(problem.measured()[0])
     fitted = NUM_STATE * len(problem.segments)
     share = 1 - fitted / there.sum()
     found = {

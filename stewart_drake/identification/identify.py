@@ -23,7 +23,6 @@ from stewart_drake.identification.fit import (
 )
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
 from stewart_drake.identification.logs import ANGLES, Log
-from stewart_drake.identification.shooting import Segment
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import (
     DELAY,
@@ -41,12 +40,9 @@ from stewart_drake.types import Array
 
 WRONG: Final = 1.5
 """chi^2 per value above which a fit is wrong and its intervals have no meaning."""
-USUAL_DELAY: Final = 0.1
-"""Believed delay without any other information, s."""
-_FEW: Final = 15
-"""Number of iterations over the segments that are fitted first."""
-_COARSE: Final = 0.1
-"""Error of the coarse delay, s."""
+USUAL_DELAY: Final = 0.1  # believed delay without any other information, s
+_FEW: Final = 15  # iterations over the segments that are fitted first
+_COARSE: Final = 0.1  # error of the coarse delay, s
 
 
 @dataclass(frozen=True)
@@ -87,17 +83,15 @@ class Identification:
     def values(self) -> Array:
         """Values found, with friction not below zero."""
         found = self.fit.guess.values.copy()
-        for place in ONE_SIDED:
-            found[place] = max(0.0, found[place])
+        found[[*ONE_SIDED]] = np.maximum(0.0, found[[*ONE_SIDED]])
         return found
 
     @cached_property
     def covariance(self) -> Array:
         """Covariance of all unknowns, 0 for known ones; of the prior if the fit is wrong."""
-        unknowns = self.unknowns
         if not self.right:
-            return np.diag(unknowns.std**2)
-        return unknowns.whole(self.fit.covariance)
+            return np.diag(self.unknowns.std**2)
+        return self.unknowns.whole(self.fit.covariance)
 
     @property
     def std(self) -> Array:
@@ -116,12 +110,9 @@ class Identification:
         If the fit is wrong, that is the delay alone, as uncertain as before.
         """
         places = np.r_[DYNAMIC, OFFSETS, DELAY] if self.right else np.array([DELAY])
-        return Calibration(
-            fingerprint(mechanism),
-            tuple(NAMES[k] for k in places),
-            self.values[places],
-            self.covariance[np.ix_(places, places)],
-        )
+        names = tuple(NAMES[k] for k in places)
+        P = self.covariance[np.ix_(places, places)]
+        return Calibration(fingerprint(mechanism), names, self.values[places], P)
 
     @cached_property
     def unseen(self) -> tuple[int, list[str]]:
@@ -184,32 +175,26 @@ def identify(
     """
     if len({log.gravity for log in logs}) > 1:
         raise ConfigError(
-            "LOG: got logs with gravity and without; expected one machine, as it stands"
+            "LOG: got logs with gravity and without; expected one machine in one place"
         )
     tolerances = Tolerances() if tolerances is None else tolerances
-    told = [log.delay for log in logs if log.delay is not None]
-    believed = delay if delay is not None else told[0] if told else USUAL_DELAY
-    poses = [start.measured_poses(log, mechanism) for log in logs]
-    for log, own in zip(logs, poses, strict=True):
-        start.check_poses(log, own)
-    # The longest log has most to say.
-    longest = max(range(len(logs)), key=lambda i: len(logs[i].times))
-    unknowns = _unknowns(logs, poses, mechanism, tolerances, believed)
-    middle = np.nanmedian(np.vstack(poses), axis=0)
+    delays = (delay, *(log.delay for log in logs), USUAL_DELAY)
+    believed = next(one for one in delays if one is not None)
+    pairs = [(log, start.measured_poses(log, mechanism)) for log in logs]
+    unknowns = _unknowns(pairs, mechanism, tolerances, believed)
+    middle = np.nanmedian(np.vstack([poses for _, poses in pairs]), axis=0)
     lasting = max(float(log.times[-1] - log.times[0]) for log in logs)
     if tolerances.delay > 0 and lasting < short_logs.length_needed(unknowns):
-        short = short_logs.fit_short(logs, poses, unknowns, WRONG)
-        return Identification(logs, unknowns, short, middle)
+        return Identification(logs, unknowns, short_logs.fit_short(pairs, unknowns, WRONG), middle)
     starts = [(believed, 1.0)]
     if tolerances.delay > 0:
-        coarse = start.coarse_delay(
-            logs[longest], poses[longest], mechanism, believed, tolerances.delay
-        )
-        # Where the plate was lost, long trajectories lead nowhere; and the coarse delay may err.
+        longest = max(pairs, key=lambda pair: len(pair[0].times))
+        coarse = start.coarse_delay(*longest, mechanism, believed, tolerances.delay)
+        # Long trajectories lead nowhere after a loss of the plate; and the coarse delay may err.
         starts = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5)]
     tried = list[_Begun]()
-    for delay_at_first, share in starts:
-        tried.append(_begin(delay_at_first, share, logs, poses, unknowns))
+    for first_delay, share in starts:
+        tried.append(_begin(first_delay, share, pairs, unknowns))
         if tried[-1].chi2 <= WRONG:
             break
     found = _grown(min(tried, key=lambda one: one.chi2))
@@ -221,44 +206,32 @@ def identify(
 class _Begun(NamedTuple):
     """Result of a start."""
 
-    chi2: float
-    """Per value of the segments that were fitted first."""
+    chi2: float  # per value of the segments that were fitted first
     whole: Problem
-    guess: Guess
-    """Values found, and the measured first states of all segments."""
+    guess: Guess  # values found, and the measured first states of all segments
 
 
-def _begin(
-    delay: float,
-    share: float,
-    logs: Sequence[Log],
-    poses: Sequence[Array],
-    unknowns: Unknowns,
-) -> _Begun:
+def _begin(delay: float, share: float, pairs: Sequence[start.Pair], unknowns: Unknowns) -> _Begun:
     """Fit the nearest segments, from a delay in s, with a share of the usual length."""
-    segments, states, values = list[Segment](), list[Array](), unknowns.mean.copy()
+    values = unknowns.mean.copy()
+    values[DELAY] = delay
     late = _COARSE if unknowns.std[DELAY] > 0 else 0.0
-    for log, own in zip(logs, poses, strict=True):
-        parts = start.segments_and_states(log, own, unknowns.mechanism, delay, late, share)
-        segments += parts[0]
-        states += parts[1]
-    first, values[DELAY] = np.array(states), delay
-    whole = Problem(segments, unknowns)
-    problem, guess = followed(whole, Guess(values, first))
+    whole, first = start.problem_of(pairs, unknowns, values, late, share=share)
+    problem, guess = followed(whole, first)
     if not problem.segments:
-        return _Begun(np.inf, whole, Guess(values, first))
+        return _Begun(np.inf, whole, first)
     near, guess = nearest(problem, guess)
     fit = solve(near, guess, _FEW)
     chi2 = chi2_per_value(fit.residuals, near)["all"]
-    return _Begun(chi2, whole, Guess(fit.guess.values, first))
+    return _Begun(chi2, whole, Guess(fit.guess.values, first.first))
 
 
 def _grown(begun: _Begun) -> Solution:
     """Return the fit of all segments, without those that nothing fits.
 
-    If the nearest segments are explained and all of them are not, a trajectory may have gone
-    astray, such as the last before a plate was lost. Such segments are left out, as long as more
-    than the nearest remain.
+    If the nearest segments are explained and all of them are not, a trajectory may have diverged,
+    such as the last before a plate was lost. Such segments are left out, as long as more than the
+    nearest remain.
     """
     problem, guess = followed(begun.whole, begun.guess)
     if not problem.segments:
@@ -278,24 +251,18 @@ def _grown(begun: _Begun) -> Solution:
 
 
 def _unknowns(
-    logs: Sequence[Log],
-    poses: Sequence[Array],
-    mechanism: Mechanism,
-    tolerances: Tolerances,
-    believed: float,
+    pairs: Sequence[start.Pair], mechanism: Mechanism, tolerances: Tolerances, believed: float
 ) -> Unknowns:
     """Return the prior, with the largest torque and the largest crank speed of the logs."""
     speeds = []
-    for log, own in zip(logs, poses, strict=True):
-        known = np.isfinite(own).all(axis=1)
-        J = mechanism.jacobian(np.median(own[known], axis=0))
-        turned = own[known] @ J.T
-        spans = np.diff(log.times[known])
-        speeds.append(np.abs(np.diff(turned, axis=0) / spans[:, None]).max())
+    for log, poses in pairs:
+        known = np.isfinite(poses).all(axis=1)
+        J = mechanism.jacobian(np.median(poses[known], axis=0))
+        turns, spans = np.diff(poses[known] @ J.T, axis=0), np.diff(log.times[known])
+        speeds.append(float(np.abs(turns / spans[:, None]).max()))
     if not max(speeds) > 0:
         raise ConfigError("LOG: got a plate that does not move; expected one that does")
-    torque = max(float(np.abs(log.torques).max()) for log in logs)
-    unknowns = unknowns_of(mechanism, tolerances, believed, torque, float(max(speeds)))
-    if not any(log.measures(ANGLES) for log in logs):
-        unknowns = unknowns.without_encoders()
-    return unknowns
+    torque = max(float(np.abs(log.torques).max()) for log, _ in pairs)
+    unknowns = unknowns_of(mechanism, tolerances, believed, torque, max(speeds))
+    has_encoders = any(log.measures(ANGLES) for log, _ in pairs)
+    return unknowns if has_encoders else unknowns.without_encoders()

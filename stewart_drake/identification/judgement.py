@@ -18,13 +18,10 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import ANGLES, LEGS, NUM_LEGS, POSITION
 from stewart_drake.types import Array
 
-UNSEEN: Final = 0.8
-"""Share of its variance before the log that a direction keeps, if the log does not see it."""
-_ALIKE: Final = 0.9
-"""Share of a named direction that lies among those the log does not see, if it is one of them."""
+UNSEEN: Final = 0.8  # share of its prior variance above which a direction counts as unseen
+_ALIKE: Final = 0.9  # share of a named direction inside the unseen ones, to be one of them
 _POSES: Final = 200
-_ROOM: Final = 0.3
-"""Of the margin in the middle: where the workspace counts as ended."""
+_ROOM: Final = 0.3  # share of the margin in the middle at which the workspace counts as ended
 _GROUPS: Final = {
     "torque biases": "torque_bias_",
     "the payload's mass": "payload_mass",
@@ -41,16 +38,16 @@ _GROUPS: Final = {
 
 
 class PoseUncertainty(NamedTuple):
-    """Standard deviations of a pose that is computed from crank angles, over the workspace."""
+    """Standard deviations of a pose that is computed from crank angles: median and worst.
 
-    angle: tuple[float, float]
-    """rad, the largest of the three: median and worst over the workspace."""
-    position: tuple[float, float]
-    """m, alike."""
-    angle_beside: tuple[float, float]
-    """rad: of the change from the pose in the middle, for which base and plate may stand anyhow."""
-    position_beside: tuple[float, float]
-    """m, alike."""
+    The last two are those of the change from the pose in the middle of the workspace, which does
+    not depend on the places of base and plate.
+    """
+
+    angle: tuple[float, float]  # rad, the largest of the three
+    position: tuple[float, float]  # m, likewise
+    angle_change: tuple[float, float]
+    position_change: tuple[float, float]
 
     @property
     def summary(self) -> dict[str, dict[str, float]]:
@@ -102,7 +99,7 @@ def unseen(unknowns: Unknowns, covariance: Array) -> tuple[int, list[str]]:
     free, std = unknowns.free, unknowns.std[unknowns.free]
     values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
     space = vectors[:, values > UNSEEN]
-    count, told = space.shape[1], list[str]()
+    count, names = space.shape[1], list[str]()
     singles = {
         NAMES[k].replace("_", " "): np.eye(NUM_UNKNOWNS)[k]
         for k in free
@@ -114,13 +111,13 @@ def unseen(unknowns: Unknowns, covariance: Array) -> tuple[int, list[str]]:
         if np.linalg.norm(d) == 0 or space.shape[1] == 0:
             continue
         if np.sum(inside**2) > _ALIKE * (d @ d):
-            told.append(name)
-            # What is left of the space is perpendicular to what has a name.
+            names.append(name)
+            # The rest of the space is perpendicular to the named directions.
             inside = inside / np.linalg.norm(inside)
             space = space @ np.linalg.svd(inside[:, None])[0][:, 1:]
     if space.shape[1]:
-        told.append(f"{space.shape[1]} mixtures of {_mixture(free, space)}")
-    return count, told
+        names.append(f"{space.shape[1]} mixtures of {_mixture(free, space)}")
+    return count, names
 
 
 def _mixture(free: NDArray[np.intp], space: Array) -> str:
@@ -135,9 +132,9 @@ def _mixture(free: NDArray[np.intp], space: Array) -> str:
 
 
 def workspace_poses(mechanism: Mechanism, middle: Array, seed: int = 0) -> Array:
-    """Return poses (n, 6) all over the workspace around a pose, which is the first of them.
+    """Return poses (n, 6) all over the workspace around a pose, the first of them.
 
-    They lie on rays in random directions, where enough of the margin in the middle is left.
+    They lie on rays in random directions, with at least a share of the margin in the middle.
     """
     rng, size = np.random.default_rng(seed), np.repeat([1.0, mechanism.crank_lengths.mean()], 3)
     least, poses = _ROOM * margin(mechanism, middle), [middle]
@@ -163,7 +160,7 @@ def pose_uncertainty(
     d pose = -J^-1 (dh/dgeometry d geometry + d offset),   J = dh/dpose.
 
     Args:
-        unknowns: what was free.
+        unknowns: before the log.
         values: (NUM_UNKNOWNS,) as found.
         covariance: (k, k) of the free ones.
         middle: pose (6,) around which the workspace is taken.

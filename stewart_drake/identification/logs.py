@@ -1,6 +1,6 @@
-"""Logs of a machine, and their files: those of `simulate` (.nc), and CSV of a machine's own.
+"""Logs of a machine, and their files: those of `simulate` (.nc), and CSV of real machines.
 
-A log holds torques with the times at which they were sent, and what was measured.
+A log holds torques with the times at which they were sent, and measurements.
 """
 
 import math
@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-import xarray as xr
-from numpy.typing import NDArray
 
 from stewart_drake.core.layout import STANDARD_GRAVITY
 from stewart_drake.files.arrayio import load_netcdf
@@ -20,7 +18,7 @@ from stewart_drake.files.yamlio import parse_yaml, validate
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.renames import with_new_names
-from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, NUM_LEGS, NUM_STATE, NUM_TORQUES
+from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, NUM_LEGS, NUM_STATE
 from stewart_drake.types import Array
 
 # Measurements of a log
@@ -30,12 +28,9 @@ RATES: Final = slice(12, 18)
 NUM_MEASURED: Final = NUM_LEGS + NUM_STATE
 KINDS: Final = {"angles": ANGLES, "pose": POSE, "rates": RATES}
 
-
 EXPECTED: Final = "a log: signals.nc of simulate, or CSV with time, torque_1 ... and angle_1 ..."
-FINEST: Final = 0.01
-"""Least time between two measurements, s; more frequent ones are left out."""
-_LEAST_VALUES: Final = 96
-"""Least number of values in a log: six crank angles at 16 instants, or a state at eight."""
+FINEST: Final = 0.01  # least time between two measurements, s; more frequent ones are left out
+_LEAST_VALUES: Final = 96  # of a log: six crank angles at 16 instants, or a state at eight
 _TORQUES: Final = [f"torque_{leg}" for leg in LEGS]
 _CRANKS: Final = [f"angle_{leg}" for leg in LEGS]
 _MEASURED: Final = [(ANGLES, _CRANKS), (POSE, list(COORDINATE_NAMES))]
@@ -49,10 +44,9 @@ _HEADER: Final = (
     "time[s], torque_1[N m] to torque_6, angle_1[rad] to angle_6 and, where it was measured, "
     "roll[rad], pitch, yaw, x[m], y, z (or mN m, deg, mm)"
 )
-LEAST_STD: Final = np.repeat([1e-6, 1e-7, 1e-5, 1e-6], 3)
-"""Least standard deviation of a state, rad, m and per s: the error of the integration."""
-LEAST_ANGLE: Final = 1e-6
-"""Least standard deviation of a crank angle, rad."""
+# Least standard deviations: the error of the integration
+LEAST_STD: Final = np.repeat([1e-6, 1e-7, 1e-5, 1e-6], 3)  # state: rad, m and per s
+LEAST_ANGLE: Final = 1e-6  # crank angle, rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +81,6 @@ class Log:
         return self.torques[np.maximum(last, 0)]
 
     def measures(self, kind: slice) -> bool:
-        """Return whether there is any value of a kind."""
         return bool(np.isfinite(self.values[:, kind]).any())
 
 
@@ -99,12 +92,9 @@ def angle_std(bits: int) -> float:
 class Precision(NamedTuple):
     """Standard deviations of the measurements in a CSV log."""
 
-    angle: float = angle_std(14)
-    """rad."""
-    pose_angle: float = 1e-4
-    """rad."""
-    pose_position: float = 2e-5
-    """m."""
+    angle: float = angle_std(14)  # rad
+    pose_angle: float = 1e-4  # rad
+    pose_position: float = 2e-5  # m
 
     @property
     def std(self) -> Array:
@@ -114,7 +104,7 @@ class Precision(NamedTuple):
 
 
 def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bool = True) -> Log:
-    """Read a log.
+    """Read a log without empty rows, and with at most one row per `FINEST` s.
 
     Args:
         path: a file of `simulate` where it ends in .nc, else CSV.
@@ -126,126 +116,77 @@ def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bo
         ConfigError: one line, with the file, and row and column where there are such.
     """
     if path.suffix == ".nc":
-        return _of_run(path, mechanism)
-    return _of_csv(path, mechanism, precision, STANDARD_GRAVITY if gravity else 0.0)
-
-
-# ---------------------------------------------------------------- runs of simulate
+        log = _of_run(path, mechanism)
+    else:
+        log = _of_csv(path, mechanism, precision, STANDARD_GRAVITY if gravity else 0.0)
+    if len(log.sent) < 2:
+        raise ConfigError(f"{path}: got one torque throughout; expected torques that change")
+    kept, last = list[int](), -math.inf
+    for row in np.flatnonzero(np.isfinite(log.values).any(axis=1)):
+        if log.times[row] - last > FINEST - 1e-6:
+            kept.append(int(row))
+            last = float(log.times[row])
+    values = log.values[kept]
+    count = int(np.isfinite(values).sum())
+    if count < _LEAST_VALUES:
+        raise ConfigError(
+            f"{path}: got {count} measured values, at {len(kept)} instants; expected at least "
+            f"{_LEAST_VALUES}"
+        )
+    return replace(log, times=log.times[kept], values=values)
 
 
 def _of_run(path: Path, mechanism: Mechanism) -> Log:
+    """Return the log of a run's signals."""
     signals = load_netcdf(path, EXPECTED)
-    scenario = _scenario_of(path, signals)
-    problem = _run_problem(signals, scenario)
-    if problem:
+    try:
+        data = with_new_names(parse_yaml(signals.attrs["scenario"], f"{path}: scenario"))
+        time, measured = signals.time.values, signals.measurement.transpose("time", ...).values
+        commanded = signals.torque_commanded.transpose("time", "leg").values
+        applied = signals.torque_applied.transpose("time", "leg").values
+        believed = float(signals.delay_estimate.values[-1])
+    except (KeyError, AttributeError, ValueError, TypeError) as error:
+        raise ConfigError(f"{path}: lacks a signal ({error}); expected {EXPECTED}") from None
+    scenario = validate(Scenario, data, f"{path}: scenario")
+    if problem := _run_problem(scenario):
         raise ConfigError(f"{path}: {problem}; expected {EXPECTED}")
-    period, time = scenario.controller.period, signals.time.values
+    period = scenario.controller.period
     # Held signals show a sample's value from its instant on, and every sample has a row.
     count = int(min(time[-1] / period + 1e-9, len(time))) + 1
     samples: Array = period * np.arange(count, dtype=np.float64)
     rows = np.minimum(np.searchsorted(time, samples - 1e-9), len(time) - 1)
-    seen = time[rows] < samples + period - 1e-9
-    if not seen.all():
+    if not np.all(time[rows] < samples + period - 1e-9):
         raise ConfigError(
             f"{path}: log_period: got a step of {np.diff(time, prepend=0.0).max():.4g} s, longer "
             f"than the controller's {period:g} s; expected each of its samples in the log"
         )
-    torques, believed = _sent(signals, scenario, samples, rows)
-    own = scenario.actuator.torque_limit
-    limit = mechanism.effort_limit if own is None else own
-    times, values, std = _measured(signals.measurement, scenario, samples, rows)
+    torques = commanded[rows]
+    if scenario.link.kind == "network":
+        # Other torques may act than were sent, but their time is known: a bound later. So the
+        # torques that acted then are taken as sent.
+        believed = scenario.eta
+        then = np.searchsorted(time, samples + believed - 1e-9)
+        torques = applied[np.minimum(then, len(time) - 1)]
+    limit = scenario.actuator.torque_limit
+    times, values, std = _measured(measured[rows], scenario, samples)
     changing = scenario.queue == "reference" or scenario.link.kind == "network"
-    return _checked(
-        Log(
-            name=str(path),
-            sent=samples,
-            torques=_limited(torques, limit),
-            times=times,
-            values=values,
-            std=std,
-            gravity=STANDARD_GRAVITY if scenario.plant.gravity else 0.0,
-            delay=believed if math.isfinite(believed) else None,
-            before=None if changing else signals.torque_applied.transpose("time", "leg").values[0],
-        ),
-        path,
+    return Log(
+        name=str(path),
+        sent=samples,
+        torques=_limited(torques, mechanism.effort_limit if limit is None else limit),
+        times=times,
+        values=values,
+        std=std,
+        gravity=STANDARD_GRAVITY if scenario.plant.gravity else 0.0,
+        delay=believed if math.isfinite(believed) else None,
+        before=None if changing else applied[0],
     )
 
 
-def _sent(
-    signals: xr.Dataset, scenario: Scenario, samples: Array, rows: NDArray[np.intp]
-) -> tuple[Array, float]:
-    """Return the torques (n, 6) that were sent at `samples` and arrived, and their delay in s.
-
-    Over a network other torques may act than were sent, but when they act is known: a bound later.
-    So the torques that acted then stand for those that were sent.
-    """
-    if scenario.link.kind != "network":
-        torques = signals.torque_commanded.transpose("time", "leg").values[rows]
-        return torques, float(signals.delay_estimate.values[-1])
-    eta, time = scenario.eta, signals.time.values
-    then = np.minimum(np.searchsorted(time, samples + eta - 1e-9), len(time) - 1)
-    return signals.torque_applied.transpose("time", "leg").values[then], eta
-
-
-def _measured(
-    signal: xr.DataArray, scenario: Scenario, samples: Array, rows: NDArray[np.intp]
-) -> tuple[Array, Array, Array]:
-    """Return instants (n,), values (n, 18) and their std (18,) of a run's measurements.
-
-    Args:
-        signal: of the record.
-        scenario: of the run.
-        samples: instants of the controller's samples, s.
-        rows: of the record that show them.
-    """
-    sensor, said = scenario.sensor, signal.transpose("time", ...).values[rows]
-    if sensor.kind == "state":
-        values = np.full((len(rows), NUM_MEASURED), np.nan)
-        values[:, POSE.start :] = said
-        noise = np.hypot(sensor.noise_std, LEAST_STD)
-        return samples, values, np.concatenate([np.full(6, np.inf), noise])
-    # Readings of the period before a sample, the oldest first; the first sample has none.
-    ago = np.arange(sensor.samples - 1, -1, -1) * scenario.controller.period / sensor.samples
-    times, angles = (samples[:, None] - ago).ravel(), said.reshape(-1, NUM_LEGS)
-    kept = times > -1e-9
-    values = np.full((kept.sum(), NUM_MEASURED), np.nan)
-    values[:, ANGLES] = angles[kept]
-    error = LEAST_ANGLE if sensor.bits is None else angle_std(sensor.bits)
-    return times[kept], values, np.concatenate([np.full(6, error), np.full(NUM_STATE, np.inf)])
-
-
-def _scenario_of(path: Path, signals: xr.Dataset) -> Scenario:
-    text = signals.attrs.get("scenario")
-    data = parse_yaml(text, f"{path}: scenario") if isinstance(text, str) else None
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path}: says nothing of its scenario; expected {EXPECTED}")
-    return validate(Scenario, with_new_names(data), f"{path}: scenario")
-
-
-def _run_problem(signals: xr.Dataset, scenario: Scenario) -> str | None:
+def _run_problem(scenario: Scenario) -> str | None:
     """Return why a run cannot serve as a log, or None."""
-    sensor, measured = scenario.sensor, {"state": NUM_STATE}
-    if sensor.kind != "state":
-        measured = {"encoder": NUM_LEGS * sensor.samples}
-    shapes: dict[str, dict[str, int]] = {
-        "torque_commanded": {"leg": NUM_TORQUES},
-        "torque_applied": {"leg": NUM_TORQUES},
-        "measurement": measured,
-        "delay_estimate": {},
-    }
-    for name, others in shapes.items():
-        if name not in signals.data_vars:
-            return f"{name} is missing"
-        found = {str(d): n for d, n in signals[name].sizes.items() if d != "time"}
-        if found != others or signals[name].dtype.kind != "f" or "time" not in signals[name].dims:
-            return f"{name} is no signal over time of {others or 'one number'}"
-    time = signals.time.values if "time" in signals.coords else np.empty(0)
-    if time.dtype.kind != "f" or not len(time) or not np.isfinite(time).all():
-        return "time is missing, or no number"
-    if not np.all(np.diff(time) > 0):
-        return "time does not increase"
     if scenario.link.kind == "network" and scenario.link.back is not None:
-        return "its measurements came over a network, each of an age of its own (link.return)"
+        return "its measurements came over a network and have different ages (link.return)"
     if scenario.actuator.kind != "torque":
         return f"its motors got no torques (actuator.kind {scenario.actuator.kind!r})"
     if scenario.sensor.delay > 0:
@@ -253,12 +194,33 @@ def _run_problem(signals: xr.Dataset, scenario: Scenario) -> str | None:
     return None
 
 
+def _measured(measured: Array, scenario: Scenario, samples: Array) -> tuple[Array, Array, Array]:
+    """Return instants (n,), values (n, 18) and their std (18,) of a run's measurements.
+
+    Args:
+        measured: at each sample of the controller.
+        scenario: of the run.
+        samples: instants of the controller's samples, s.
+    """
+    sensor = scenario.sensor
+    if sensor.kind == "state":
+        values = np.full((len(samples), NUM_MEASURED), np.nan)
+        values[:, POSE.start :] = measured
+        noise = np.hypot(sensor.noise_std, LEAST_STD)
+        return samples, values, np.concatenate([np.full(6, np.inf), noise])
+    # Readings of the period before a sample, the oldest first; the first sample has none.
+    ago = np.arange(sensor.samples - 1, -1, -1) * scenario.controller.period / sensor.samples
+    times = (samples[:, None] - ago).ravel()
+    kept = times > -1e-9
+    values = np.full((kept.sum(), NUM_MEASURED), np.nan)
+    values[:, ANGLES] = measured.reshape(-1, NUM_LEGS)[kept]
+    error = LEAST_ANGLE if sensor.bits is None else angle_std(sensor.bits)
+    return times[kept], values, np.concatenate([np.full(6, error), np.full(NUM_STATE, np.inf)])
+
+
 def _limited(torques: Array, limit: float | str | None) -> Array:
     """Return torques (n, 6) within the motors' limit."""
     return torques if limit is None or isinstance(limit, str) else np.clip(torques, -limit, limit)
-
-
-# ---------------------------------------------------------------- CSV
 
 
 def _of_csv(path: Path, mechanism: Mechanism, precision: Precision, gravity: float) -> Log:
@@ -274,48 +236,20 @@ def _of_csv(path: Path, mechanism: Mechanism, precision: Precision, gravity: flo
             f"{table.place(bad, 'time')}: got {time[bad]:.9g} s after {time[bad - 1]:.9g} s; "
             "expected increasing times"
         )
-    told = np.isfinite(torques)
-    for bad in np.flatnonzero(told.any(axis=1) != told.all(axis=1))[:1]:
+    there = np.isfinite(torques)
+    for bad in np.flatnonzero(there.any(axis=1) != there.all(axis=1))[:1]:
         raise ConfigError(
             f"{table.place(bad)}: got some of the six torques; expected all or none of them"
         )
-    said = np.flatnonzero(told.all(axis=1))
-    # A repeated torque goes on acting, so only changes are kept.
-    changed = np.any(np.diff(torques[said], axis=0, prepend=np.nan) != 0, axis=1)
-    log = Log(
+    rows = np.flatnonzero(there.all(axis=1))
+    # A repeated torque continues, so only changes are kept.
+    changed = rows[np.any(np.diff(torques[rows], axis=0, prepend=np.nan) != 0, axis=1)]
+    return Log(
         name=str(path),
-        sent=time[said][changed],
-        torques=_limited(torques[said][changed], mechanism.effort_limit),
+        sent=time[changed],
+        torques=_limited(torques[changed], mechanism.effort_limit),
         times=time,
         values=values,
         std=precision.std,
         gravity=gravity,
     )
-    return _checked(log, path)
-
-
-# ---------------------------------------------------------------- both
-
-
-def _checked(log: Log, path: Path) -> Log:
-    """Return a log without empty rows, and with at most one row per `FINEST` s.
-
-    Raises:
-        ConfigError: there is too little in it.
-    """
-    if len(log.sent) < 2:
-        raise ConfigError(f"{path}: got one torque throughout; expected torques that change")
-    measured = np.flatnonzero(np.isfinite(log.values).any(axis=1))
-    kept, last = list[int](), -math.inf
-    for row in measured:
-        if log.times[row] - last > FINEST - 1e-6:
-            kept.append(int(row))
-            last = float(log.times[row])
-    values = log.values[kept]
-    count = int(np.isfinite(values).sum())
-    if count < _LEAST_VALUES:
-        raise ConfigError(
-            f"{path}: got {count} measured values, at {len(kept)} instants; expected at least "
-            f"{_LEAST_VALUES}"
-        )
-    return replace(log, times=log.times[kept], values=values)

@@ -5,7 +5,7 @@ that a torque gives, every derivative at constant a is that of a itself by
 
     da/dz = -(M N)^-1 dF/dz,   nu_dot = N a + ...,
 
-whatever z is: state, parameters of the dynamics, or numbers of a leg. The expressions are those of
+for z the state, parameters of the dynamics, or numbers of a leg. The expressions are those of
 `dynamics.equations`; only the legs' numbers are symbols.
 """
 
@@ -42,32 +42,27 @@ NUM_DYNAMIC: Final = SHAPES["parameters"][0]
 class Numbers(NamedTuple):
     """Numbers of a machine."""
 
-    parameters: Array
-    """(NUM_DYNAMIC,) of the dynamics."""
-    legs: Array
-    """(6, LEG_NUMBERS), see `core.layout`."""
+    parameters: Array  # (NUM_DYNAMIC,) of the dynamics
+    legs: Array  # (6, LEG_NUMBERS), see `core.layout`
 
 
 class Slopes(NamedTuple):
     """Accelerations at n points, and their derivatives."""
 
-    accelerations: Array
-    """(n, 6)."""
-    state: Array
-    """(n, 6, 12)."""
-    numbers: Array
-    """(n, 6, NUM_DYNAMIC + NUM_GEOMETRY)."""
+    accelerations: Array  # (n, 6)
+    state: Array  # (n, 6, 12)
+    numbers: Array  # (n, 6, NUM_DYNAMIC + NUM_GEOMETRY)
 
 
 class SymbolicLegs(NamedTuple):
-    """The symbols that stand for a machine's legs (18, 6), and those of the equations."""
+    """Symbols of a machine's legs (18, 6), and those of the equations."""
 
     s: dict[str, ca.SX]
     legs: ca.SX
 
     @property
     def geometry(self) -> ca.SX:
-        """What is free of the legs' numbers (NUM_GEOMETRY,), leg by leg."""
+        """Free numbers of the legs (NUM_GEOMETRY,), leg by leg."""
         return ca.vec(self.legs[list(LEG_PLACES), :])
 
 
@@ -103,7 +98,7 @@ class MachineModel:
     Args:
         mechanism: bodies, motor frames and branches, which stay.
         gravity: m/s^2 along -z.
-        points: at how many points each call evaluates.
+        points: number of points that each call evaluates.
     """
 
     def __init__(self, mechanism: Mechanism, gravity: float, points: int) -> None:

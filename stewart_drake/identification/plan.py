@@ -39,19 +39,14 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 MOTION: Final = "motion.csv"
-_EVERY: Final = 0.02
-"""Time between two measurements of the foreseen log, s."""
-GRID: Final = 0.02
-"""s between two samples of the motion."""
-_LINES: Final = 5
-_LOW: Final = 0.1
+_EVERY: Final = 0.02  # time between two measurements of the predicted log, s
+GRID: Final = 0.02  # time between two samples of the motion, s
+_LINES: Final = 5  # sines of a coordinate
+_LOW: Final = 0.1  # Hz
 _HIGH: Final = 0.7
-"""Hz."""
 _GOLDEN: Final = (np.sqrt(5) - 1) / 2
-_RISE: Final = 2.0
-"""s."""
-_ROOM: Final = 0.5
-"""Of the workspace's margin at the middle of the motion, what is left at least."""
+_RISE: Final = 2.0  # s
+_ROOM: Final = 0.5  # least share of the workspace's margin at the middle of the motion
 _LEAST_SHARE: Final = 0.05
 
 
@@ -122,11 +117,11 @@ class Plan:
 
 
 def multisine(middle: Array, peak: Array, duration: float) -> tuple[Array, Array]:
-    """Times (n,) in s and poses (n, 6).
+    """Return times (n,) in s and poses (n, 6) of the motion.
 
     Args:
         middle: (6,) pose.
-        peak: (6,) of each coordinate's departure from it, rad and m.
+        peak: (6,) largest departure of each coordinate from it, rad and m.
         duration: s.
     """
     time = GRID * np.arange(round(duration / GRID) + 1)
@@ -157,7 +152,7 @@ def fitted_multisine(
             return time, poses, share
         share *= 0.9
     raise ConfigError(
-        f"--plan: got a motion of which not even {100 * _LEAST_SHARE:g} % fits the workspace; "
+        f"--plan: got a motion too large for the workspace even at {100 * _LEAST_SHARE:g} %; "
         "expected a smaller one, around a pose with room on all sides"
     )
 
@@ -188,16 +183,11 @@ def plan(
     peak = amplitude * experiment.motion_scale
     times, poses, share = fitted_multisine(mechanism, middle, peak, duration)
     motion = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(times, poses.T)
-    log, states = _foreseen(experiment, motion, times[-1], std)
+    log, states = _predicted(experiment, motion, times[-1], std)
     torque = float(np.abs(log.torques).max())
     speeds = np.einsum("ij,nj->ni", mechanism.jacobian(middle), states[:, 6:])
-    unknowns = unknowns_of(
-        mechanism,
-        Tolerances() if tolerances is None else tolerances,
-        sc.eta,
-        torque,
-        float(np.abs(speeds).max()),
-    )
+    speed = float(np.abs(speeds).max())
+    unknowns = unknowns_of(mechanism, tolerances or Tolerances(), sc.eta, torque, speed)
     if not np.isfinite(std[ANGLES]).all():
         unknowns = unknowns.without_encoders()
     length = segment_length(log, log.values[:, POSE], mechanism, sc.eta)
@@ -215,10 +205,10 @@ def plan(
     return Plan(changed, share, times, poses, unknowns, spread)
 
 
-def _foreseen(
+def _predicted(
     experiment: Experiment, motion: PiecewisePolynomial, end: float, std: Array
 ) -> tuple[Log, Array]:
-    """Return the log of a controller that follows the motion exactly, and its states (n, 12)."""
+    """Return the log of perfect tracking of the motion, and its states (n, 12)."""
     sc, mechanism = experiment.scenario, experiment.mechanism
     dynamics = StewartDynamics(mechanism, experiment.nominal.gravity)
     period, eta = sc.controller.period, sc.eta

@@ -1,14 +1,14 @@
-"""Trajectories of a machine under held torques that come late, with their sensitivities.
+"""Trajectories of a machine under held torques with a delay, with their sensitivities.
 
 A log is cut into segments, each with a free first state, which are integrated side by side.
 With x_dot = f(x, T; p) the sensitivity S = dx/d[x_0; p; delay] obeys
 
     S_dot = A S + df/dp,   S = [1, 0, 0] at the start,
 
-and at an instant t_k + delay at which the torque changes from T to T+, an instant that moves with
-the delay, x stays and S jumps in the delay's column by f(x, T) - f(x, T+): what a moment longer of
-the old torque does. That is exact wherever the instant lies, so that no whole number of samples
-has to be searched for. Both equations are integrated by the classical Runge-Kutta method.
+and at an instant t_k + delay at which the torque changes from T to T+, which moves with the delay,
+x stays and S jumps in the delay's column by f(x, T) - f(x, T+), the effect of holding the old
+torque longer. That is exact for any instant, so that the delay need not be a whole number of
+samples. Both equations are integrated by the classical Runge-Kutta method.
 """
 
 from typing import Final, NamedTuple
@@ -21,65 +21,51 @@ from stewart_drake.identification.model import NUM_DYNAMIC, NUM_GEOMETRY, Machin
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, RATES
 from stewart_drake.types import Array
 
-_INSTANT: Final = 1e-9
-"""s; events closer to each other are one."""
+_INSTANT: Final = 1e-9  # s; events closer to each other are one
+# Columns of S: first state, parameters of the dynamics and numbers of the legs, and last the delay
 FIRST: Final = slice(0, NUM_STATE)
-"""Columns of S: first state,"""
 NUMBERS: Final = slice(NUM_STATE, NUM_STATE + NUM_DYNAMIC + NUM_GEOMETRY)
-"""parameters of the dynamics and numbers of the legs, and last the delay."""
 
 
 class Segment(NamedTuple):
     """Stretch of a log that is integrated from a free first state."""
 
     log: Log
-    start: float
-    """s."""
-    rows: NDArray[np.intp]
-    """Of the log's samples, in order."""
+    start: float  # s
+    rows: NDArray[np.intp]  # of the log's samples, in order
 
 
-class Plan(NamedTuple):
-    """Steps (m, n) of n segments side by side, s; a segment that has ended waits in steps of 0."""
+class Steps(NamedTuple):
+    """Steps (m, n) of n segments side by side; a segment that has ended has steps of 0."""
 
-    h: Array
-    torques: Array
-    """(m, n, 6) that act in a step."""
-    after: Array
-    """(m, n, 6) that act after it."""
-    sample: NDArray[np.intp]
-    """Number of the segment's sample at the end of a step, -1 where there is none."""
+    h: Array  # s
+    torques: Array  # (m, n, 6) during a step
+    after: Array  # (m, n, 6) after it
+    sample: NDArray[np.intp]  # number of the segment's sample at the end of a step, or -1
 
 
-class Course(NamedTuple):
-    """States and sensitivities at the samples of n segments, at most m each."""
+class Trajectories(NamedTuple):
+    """States and sensitivities at the samples of n segments, at most m each; NaN without one."""
 
-    states: Array
-    """(m, n, 12), NaN where a segment has fewer samples."""
-    slopes: Array
-    """(m, n, 12, columns)."""
+    states: Array  # (m, n, 12)
+    slopes: Array  # (m, n, 12, columns)
 
 
-def plan_steps(segments: list[Segment], delay: float, longest_step: float) -> Plan:
+def plan_steps(segments: list[Segment], delay: float, longest_step: float) -> Steps:
     """Return the steps from sample to sample and from torque to torque; times in s."""
     plans = [_steps_of(segment, delay, longest_step) for segment in segments]
-    longest = max(len(h) for h, *_ in plans)
-    joined = Plan(
-        np.zeros((longest, len(plans))),
-        np.zeros((longest, len(plans), NUM_TORQUES)),
-        np.zeros((longest, len(plans), NUM_TORQUES)),
-        np.full((longest, len(plans)), -1),
-    )
+    longest, n = max(len(h) for h, *_ in plans), len(plans)
+    torques, after = np.zeros((2, longest, n, NUM_TORQUES))
+    joined = Steps(np.zeros((longest, n)), torques, after, np.full((longest, n), -1))
     for i, one in enumerate(plans):
         m = len(one.h)
         for whole, part in zip(joined, one, strict=True):
             whole[:m, i] = part
-        # As if the last torque went on: a segment that waits has no switch.
-        joined.torques[m:, i] = joined.after[m:, i] = one.after[-1]
+        torques[m:, i] = after[m:, i] = one.after[-1]  # no jump after the segment's end
     return joined
 
 
-def _steps_of(segment: Segment, delay: float, longest_step: float) -> Plan:
+def _steps_of(segment: Segment, delay: float, longest_step: float) -> Steps:
     log, start = segment.log, segment.start
     samples = log.times[segment.rows]
     arrivals = log.sent + delay
@@ -89,41 +75,38 @@ def _steps_of(segment: Segment, delay: float, longest_step: float) -> Plan:
     gaps = np.diff(events, prepend=start)
     parts = np.maximum(1, np.ceil(gaps / longest_step - 1e-9)).astype(int)
     ends = np.cumsum(parts) - 1
-    m = ends[-1] + 1
-    sample = np.full(m, -1)
+    sample = np.full(ends[-1] + 1, -1)
     sample[ends[np.searchsorted(events, samples - _INSTANT)]] = np.arange(len(samples))
-    # The torque within a step, and just after it.
     middle = np.repeat(np.maximum(events - gaps / 2, start + 2 * _INSTANT), parts)
-    applied = log.applied_torque(middle, delay)
-    after = np.vstack([applied[1:], log.applied_torque(samples[-1:] + 2 * _INSTANT, delay)])
-    return Plan(np.repeat(gaps / parts, parts), applied, after, sample)
+    torques = log.applied_torque(middle, delay)
+    after = np.vstack([torques[1:], log.applied_torque(samples[-1:] + 2 * _INSTANT, delay)])
+    return Steps(np.repeat(gaps / parts, parts), torques, after, sample)
 
 
 def integrate(
-    model: MachineModel, numbers: Numbers, first: Array, plan: Plan, sensitive: bool
-) -> Course:
+    model: MachineModel, numbers: Numbers, first: Array, steps: Steps, sensitive: bool
+) -> Trajectories:
     """Integrate all segments from their first states (n, 12).
 
     A state that grows beyond all bounds ends as NaN or infinity, without a warning.
     """
-    n, count = len(first), int(plan.sample.max()) + 1
+    n, count = len(first), int(steps.sample.max()) + 1
     columns = NUMBERS.stop + 1 if sensitive else 0
     x, S = first.copy(), np.zeros((n, NUM_STATE, columns))
     if sensitive:
         S[:, :, FIRST] = np.eye(NUM_STATE)
-    course = Course(
-        np.full((count, n, NUM_STATE), np.nan), np.zeros((count, n, NUM_STATE, columns))
-    )
+    states = np.full((count, n, NUM_STATE), np.nan)
+    slopes = np.zeros((count, n, NUM_STATE, columns))
     with np.errstate(all="ignore"):
-        for h, torques, after, sample in zip(*plan, strict=True):
+        for h, torques, after, sample in zip(*steps, strict=True):
             x, S = _step(model, numbers, x, S, torques, h)
             if sensitive and np.any(torques != after):
                 old = model.accelerations(x, torques, numbers)
                 S[:, RATES, -1] += old - model.accelerations(x, after, numbers)
             there = np.flatnonzero(sample >= 0)
-            course.states[sample[there], there] = x[there]
-            course.slopes[sample[there], there] = S[there]
-    return course
+            states[sample[there], there] = x[there]
+            slopes[sample[there], there] = S[there]
+    return Trajectories(states, slopes)
 
 
 def _step(
@@ -131,8 +114,8 @@ def _step(
 ) -> tuple[Array, Array]:
     """Return states and sensitivities after a step of the classical Runge-Kutta method.
 
-    The sensitivities are exact derivatives of the step, stage by stage by the chain rule. They may
-    have no columns.
+    The sensitivities, which may have no columns, are exact derivatives of the step: the chain rule
+    is applied to each stage.
     """
 
     def f(x: Array, S: Array) -> tuple[Array, Array]:

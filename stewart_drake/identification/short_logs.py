@@ -13,56 +13,35 @@ import numpy as np
 
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.identification import start
 from stewart_drake.identification.fit import (
     ASTRAY,
     MOST_ITERATIONS,
-    Guess,
-    Problem,
     Solution,
     finer,
     followed,
     solve,
 )
 from stewart_drake.identification.logs import Log
-from stewart_drake.identification.shooting import Segment
+from stewart_drake.identification.start import Pair, problem_of
 from stewart_drake.identification.unknowns import DELAY, GEOMETRY, Unknowns
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.types import Array
 
-Pair = tuple[Log, Array]
-"""A log, and the poses (n, 6) of its instants."""
-
-_RESPONSE: Final = 1.0
-"""s of motion after the longest delay, from which on a log is not short."""
-_ROOM: Final = 0.2
-"""Share of the margin at home below which a pose is too near the edge of the workspace."""
-_LONG_AGO: Final = 1e3
-"""s before the first torque of a log."""
-_GRID: Final = 0.05
-"""s between delays of the scan."""
-_SCANNED: Final = 0.3
-"""Longest segment of the scan, s."""
-_FEW: Final = 4
-"""Iterations of the scan at each delay."""
-_LOST: Final = 1e4
-"""chi^2 per value of a segment that cannot be followed."""
-_RIVAL: Final = 30.0
-"""Factor of the least chi^2 of the scan, or of 1, up to which other delays are fitted too."""
-_STARTS: Final = 3
-"""Largest number of delays that are fitted with free geometry."""
-_APART: Final = 0.01
-"""Least difference of two such delays, s."""
-_LATE: Final = 0.02
-"""s by which a delay may be longer than at the start of a fit."""
-_STEP: Final = 0.01
-"""Longest integration step at first, s."""
-_MOST: Final = 0.5
-"""Share of the values after the delay that has to be fitted, at least."""
-_CHANGES: Final = 3
-"""Least number of changes of the torques within the segments."""
-_VAGUE: Final = 1e-3
-"""Largest standard deviation of a delay that is accepted, s."""
+_RESPONSE: Final = 1.0  # s of motion after the longest delay, from which on a log is not short
+_ROOM: Final = 0.2  # share of the margin at home below which a pose is too near the edge
+_LONG_AGO: Final = 1e3  # s before the first torque of a log
+_GRID: Final = 0.05  # s between delays of the scan
+_SCANNED: Final = 0.3  # longest segment of the scan, s
+_FEW: Final = 4  # iterations of the scan at each delay
+_LOST: Final = 1e4  # chi^2 per value of a segment that cannot be followed
+_RIVAL: Final = 30.0  # largest chi^2 of a fitted delay over the least one of the scan, or over 1
+_STARTS: Final = 3  # largest number of delays that are fitted with free geometry
+_APART: Final = 0.01  # least difference of two such delays, s
+_LATE: Final = 0.02  # s by which a delay may be longer than at the start of a fit
+_STEP: Final = 0.01  # longest integration step at first, s
+_MOST: Final = 0.5  # least share of the values after the delay that has to be fitted
+_CHANGES: Final = 3  # least number of changes of the torques within the segments
+_VAGUE: Final = 1e-3  # largest standard deviation of a delay that is accepted, s
 
 
 def length_needed(unknowns: Unknowns) -> float:
@@ -71,34 +50,31 @@ def length_needed(unknowns: Unknowns) -> float:
 
 
 @np.errstate(all="ignore")
-def fit_short(
-    logs: Sequence[Log], poses: Sequence[Array], unknowns: Unknowns, worst: float
-) -> Solution:
+def fit_short(pairs: Sequence[Pair], unknowns: Unknowns, worst: float) -> Solution:
     """Return the fit with the only delay that explains the logs.
 
     Args:
-        logs: of one machine.
-        poses: (n, 6) of the instants of each.
+        pairs: logs of one machine with their poses.
         unknowns: before the logs.
         worst: largest chi^2 per value of a fit that explains the logs.
 
     Raises:
         ConfigError: no delay, or more than one, explains the logs; names the length needed.
     """
-    pairs = [_inside(*pair, unknowns.mechanism) for pair in zip(logs, poses, strict=True)]
+    pairs = [_inside(*pair, unknowns.mechanism) for pair in pairs]
     right = list[Solution]()
     for values in _scanned(pairs, unknowns):
         with suppress(np.linalg.LinAlgError):  # a trajectory grew beyond all bounds
             one = _grown(pairs, unknowns, values)
-            if one and _explains(one, worst) and _apart(one, right):
+            if one and _explains(one, worst) and _is_apart(one, right):
                 right.append(one)
-    if len(right) == 1 and _std(right[0]) <= _VAGUE:
+    if len(right) == 1 and right[0].delay_std <= _VAGUE:
         return right[0]
-    told = " and ".join(f"{_delay(one):.3g} s (+-{1e3 * _std(one):.2g} ms)" for one in right)
-    longest = max(logs, key=lambda log: len(log.times))
+    found = " and ".join(f"{one.delay:.3g} s (+-{1e3 * one.delay_std:.2g} ms)" for one in right)
+    longest, _ = max(pairs, key=lambda pair: len(pair[0].times))
     raise ConfigError(
         f"{longest.name}: got a log of {longest.times[-1] - longest.times[0]:.3g} s, explained by "
-        f"{'delays of ' + told if told else 'no delay'}; expected one delay, known to "
+        f"{'delays of ' + found if found else 'no delay'}; expected one delay, known to "
         f"{1e3 * _VAGUE:g} ms: a log of at least {length_needed(unknowns):.3g} s (the longest "
         f"possible delay and {_RESPONSE:g} s of motion), or a narrower --tolerance delay=S"
     )
@@ -133,40 +109,25 @@ def _scanned(pairs: Sequence[Pair], unknowns: Unknowns) -> list[Array]:
     found.sort(key=_cost)
     kept = list[Solution]()
     for one in found:
-        if _cost(one) <= _RIVAL * max(1.0, _cost(found[0])) and _apart(one, kept):
+        if _cost(one) <= _RIVAL * max(1.0, _cost(found[0])) and _is_apart(one, kept):
             kept.append(one)
     return [one.fit.guess.values for one in kept[:_STARTS]]
 
 
-def _apart(one: Solution, others: Sequence[Solution]) -> bool:
-    """Return whether the delay of a fit differs from those of others."""
-    return all(abs(_delay(one) - _delay(other)) > _APART for other in others)
-
-
-def _delay(one: Solution) -> float:
-    return float(one.fit.guess.values[DELAY])
-
-
-def _std(one: Solution) -> float:
-    """Return the standard deviation of the delay, s, the last of the unknowns."""
-    return float(np.sqrt(one.fit.covariance[-1, -1]))
-
-
-def _share(one: Solution) -> float:
-    """Return the share of the values of all segments that was fitted."""
-    return one.problem.count / one.whole.count
+def _is_apart(one: Solution, others: Sequence[Solution]) -> bool:
+    return all(abs(one.delay - other.delay) > _APART for other in others)
 
 
 def _cost(one: Solution) -> float:
     """Return chi^2 per value of all segments, `_LOST` for those that could not be followed."""
-    return _share(one) * one.chi2 + (1 - _share(one)) * _LOST
+    return one.share * one.chi2 + (1 - one.share) * _LOST
 
 
 def _explains(one: Solution, worst: float) -> bool:
     """Return whether most values are fitted, with a chi^2 of at most `worst` per value."""
-    spans = [(s.log.sent[1:] + _delay(one), s) for s in one.problem.segments]
+    spans = [(s.log.sent[1:] + one.delay, s) for s in one.problem.segments]
     changes = sum(int(np.sum((t > s.start) & (t < s.log.times[s.rows[-1]]))) for t, s in spans)
-    return one.chi2 <= worst and _share(one) > _MOST and changes >= _CHANGES
+    return one.chi2 <= worst and one.share > _MOST and changes >= _CHANGES
 
 
 def _fitted(
@@ -177,18 +138,12 @@ def _fitted(
     most: int = MOST_ITERATIONS,
 ) -> Solution | None:
     """Return the fit from a start, with segments of `longest` s; None if none can be followed."""
-    segments, first, delay = list[Segment](), list[Array](), float(values[DELAY])
-    for log, poses in pairs:
-        with suppress(ConfigError):  # too little of this log is left after the delay
-            parts = start.segments_and_states(
-                log, poses, unknowns.mechanism, delay, _LATE, longest=longest
-            )
-            segments += parts[0]
-            first += parts[1]
-    if not segments:
+    whole, guess = problem_of(
+        pairs, unknowns, values, _LATE, longest=longest, step=_STEP, skip_short=True
+    )
+    if not whole.segments:
         return None
-    whole = Problem(segments, unknowns, _STEP)
-    problem, guess = followed(whole, Guess(values, np.array(first)))
+    problem, guess = followed(whole, guess)
     if not problem.segments:
         return None
     return Solution(whole, problem, guess, solve(problem, guess, most))

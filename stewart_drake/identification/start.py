@@ -1,38 +1,37 @@
 """Start of a fit: measured poses, segments, their first states, and a coarse delay."""
 
+from collections.abc import Iterable
+from contextlib import nullcontext, suppress
 from typing import Final
 
 import numpy as np
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification.fit import Guess, Problem
 from stewart_drake.identification.logs import ANGLES, POSE, Log
 from stewart_drake.identification.logs import RATES as MEASURED_RATES
 from stewart_drake.identification.shooting import Segment
+from stewart_drake.identification.unknowns import DELAY, Unknowns
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import ForwardKinematicsError
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES
-from stewart_drake.scenario.signals import POSE as STATE_POSE
 from stewart_drake.scenario.signals import RATES as STATE_RATES
 from stewart_drake.types import Array
 
-LONGEST: Final = 2.0
+Pair = tuple[Log, Array]
+"""A log, and the poses (n, 6) at its instants."""
+
+LONGEST: Final = 2.0  # length of a segment, s
 SHORTEST: Final = 0.2
-"""Length of a segment, s."""
-_GROWTHS: Final = 3.0
-"""Largest exponent of the growth of an error over a segment."""
-_LOOKS: Final = 40
-"""Number of instants at which the growth of errors is computed."""
-_CUBIC: Final = 0.3
-"""Length of the cubic that gives rates, s."""
-_LEAST_ROWS: Final = 4
-_FEWEST: Final = 8
-"""Least number of poses that give rates."""
-_WINDOW: Final = 0.3
-"""Least length of the polynomial that gives an acceleration, s."""
-_DEGREE: Final = 4
-_GRID: Final = 0.01
-"""Step of the delays, s."""
+_GROWTHS: Final = 3.0  # largest exponent of the growth of an error over a segment
+_LOOKS: Final = 40  # number of instants at which the growth of errors is computed
+_CUBIC: Final = 0.3  # length of the cubic that gives rates, s
+_LEAST_ROWS: Final = 4  # of a segment
+_FEWEST: Final = 8  # least number of poses that give rates
+_WINDOW: Final = 0.3  # least length of the polynomial that gives an acceleration, s
+_DEGREE: Final = 4  # of that polynomial
+_GRID: Final = 0.01  # step of the delays, s
 _LEAST_WINDOWS: Final = 8
 
 
@@ -40,7 +39,7 @@ def measured_poses(log: Log, mechanism: Mechanism) -> Array:
     """Return the plate's poses (n, 6) at the log's instants, measured or from the crank angles.
 
     Raises:
-        ConfigError: no pose of this mechanism has such angles.
+        ConfigError: no pose of this mechanism has such angles, or there are too few whole poses.
     """
     poses, last = log.values[:, POSE].copy(), mechanism.home
     for row in range(len(poses)):
@@ -51,22 +50,18 @@ def measured_poses(log: Log, mechanism: Mechanism) -> Array:
             except ForwardKinematicsError as error:
                 raise ConfigError(
                     f"{log.name}: at t = {log.times[row]:.4g} s the crank angles do not suit the "
-                    f"mechanism {mechanism.name} ({error}); expected a log of this machine, "
-                    "angles counted as its crank_zero and motor_axis say"
+                    f"mechanism {mechanism.name} ({error}); expected a log of this machine, with "
+                    "angles as its crank_zero and motor_axis define them"
                 ) from None
         if np.isfinite(poses[row]).all():
             last = poses[row]
-    return poses
-
-
-def check_poses(log: Log, poses: Array) -> None:
-    """Refuse a log with too few whole poses (n, 6) for a start."""
     count = int(np.isfinite(poses).all(axis=1).sum())
     if count < _FEWEST:
         raise ConfigError(
             f"{log.name}: got all six crank angles, or a whole pose, at {count} instants; expected "
             f"at least {_FEWEST}"
         )
+    return poses
 
 
 def coarse_delay(
@@ -78,44 +73,41 @@ def coarse_delay(
     end elsewhere. A polynomial of degree four through the poses of a window gives pose, rates and
     accelerations in its middle, the drawing's inverse dynamics the torque for them, smoothed by
     about (1 - s^2)^2 over the window. It is compared with the torques that were sent, smoothed
-    alike and late by each delay within three standard deviations of the belief.
+    alike and delayed by each value within three standard deviations of the believed one.
     """
     dynamics = StewartDynamics(mechanism, log.gravity)
     known = np.flatnonzero(np.isfinite(poses).all(axis=1))
     times = log.times[known]
     half = max(_WINDOW, 4.5 * float(np.median(np.diff(times)))) / 2
     middles = np.arange(times[0] + half, times[-1] - half, _GRID * 10)
-    needed = np.empty((len(middles), NUM_TORQUES))
+    needed = np.full((len(middles), NUM_TORQUES), np.nan)
     for i, middle in enumerate(middles):
         near = known[np.abs(times - middle) <= half + 1e-9]
-        if len(near) <= _DEGREE:
-            needed[i] = np.nan
-            continue
-        powers = np.polynomial.polynomial.polyfit(log.times[near] - middle, poses[near], _DEGREE)
-        needed[i] = dynamics.inverse_dynamics(powers[0], powers[1], 2 * powers[2])
+        if len(near) > _DEGREE:
+            from_middle = log.times[near] - middle
+            powers = np.polynomial.polynomial.polyfit(from_middle, poses[near], _DEGREE)
+            needed[i] = dynamics.inverse_dynamics(powers[0], powers[1], 2 * powers[2])
     span = np.arange(-half, half + _GRID / 2, _GRID)
     weights = (1 - (span / half) ** 2) ** 2
     weights /= weights.sum()
+
+    def misfit(delay: float) -> float:
+        """Return the variance of torques needed less torques at the plant, relative to the former.
+
+        Longer delays leave fewer windows to compare, in which less may have moved.
+        """
+        there = np.isfinite(needed).all(axis=1) & (middles + span[0] >= log.sent[0] + delay)
+        if there.sum() < _LEAST_WINDOWS:
+            return np.inf
+        instants = middles[there, None] + span
+        torques = log.applied_torque(instants.ravel(), delay).reshape(*instants.shape, NUM_TORQUES)
+        apart = needed[there] - np.einsum("s,nsj->nj", weights, torques)
+        left, whole = (np.var(one, axis=0).sum() for one in (apart, needed[there]))
+        return float(left / whole) if whole > 0 else np.inf
+
     delays = np.arange(max(0.0, believed - 3 * std), believed + 3 * std + _GRID / 2, _GRID)
-    costs = [_misfit(needed, middles, delay, log, span, weights) for delay in delays]
+    costs = [misfit(delay) for delay in delays]
     return float(delays[int(np.argmin(costs))]) if np.isfinite(costs).any() else believed
-
-
-def _misfit(
-    needed: Array, middles: Array, delay: float, log: Log, span: Array, weights: Array
-) -> float:
-    """Return the variance of torques needed less those that act, as a share of the former's.
-
-    Late delays leave fewer windows to compare, in which less may have moved.
-    """
-    there = np.isfinite(needed).all(axis=1) & (middles + span[0] >= log.sent[0] + delay)
-    if there.sum() < _LEAST_WINDOWS:
-        return np.inf
-    instants = middles[there, None] + span
-    applied = log.applied_torque(instants.ravel(), delay).reshape(*instants.shape, NUM_TORQUES)
-    apart = needed[there] - np.einsum("s,nsj->nj", weights, applied)
-    left, whole = (np.var(one, axis=0).sum() for one in (apart, needed[there]))
-    return float(left / whole) if whole > 0 else np.inf
 
 
 def segment_length(log: Log, poses: Array, mechanism: Mechanism, delay: float) -> float:
@@ -141,8 +133,8 @@ def segments_of(log: Log, start: float, length: float) -> list[Segment]:
     few = np.isfinite(log.values[rows]).sum() < 2 * NUM_STATE
     if few or len(rows) < 2 * _LEAST_ROWS or log.times[-1] - log.times[rows[0]] < SHORTEST:
         raise ConfigError(
-            f"{log.name}: got measurements up to t = {log.times[-1]:.4g} s, of which those from "
-            f"{start:.4g} s on count, when torques act that are in the log; expected a longer log"
+            f"{log.name}: too short: got measurements from {start:.4g} s, the arrival of the first "
+            f"logged torque, to {log.times[-1]:.4g} s; expected a longer log"
         )
     first, last = log.times[rows[0]], log.times[-1]
     edges = np.linspace(first, last, max(1, round((last - first) / length)) + 1)
@@ -160,26 +152,41 @@ def segments_of(log: Log, start: float, length: float) -> list[Segment]:
     return segments
 
 
-def segments_and_states(
-    log: Log,
-    poses: Array,
-    mechanism: Mechanism,
-    delay: float,
+def problem_of(
+    pairs: Iterable[Pair],
+    unknowns: Unknowns,
+    values: Array,
     late: float,
+    *,
     share: float = 1.0,
     longest: float = np.inf,
-) -> tuple[list[Segment], list[Array]]:
-    """Return segments from the arrival of the first torque on, and their first states (12,).
+    step: float = 0.02,
+    skip_short: bool = False,
+) -> tuple[Problem, Guess]:
+    """Return the problem of all logs and its first guess.
 
-    They last a `share` of the usual length, at most `longest` s. The delay in s may be longer by
-    `late`.
+    Args:
+        pairs: logs with their poses.
+        unknowns: before the logs.
+        values: of the unknowns (NUM_UNKNOWNS,); a log counts from the first torque's arrival on.
+        late: longest error of their delay, s.
+        share: length of the segments, relative to `segment_length`.
+        longest: length of a segment, s.
+        step: longest integration step, s.
+        skip_short: whether to leave out logs that are too short.
 
     Raises:
         ConfigError: see `segments_of`.
     """
-    length = min(longest, share * segment_length(log, poses, mechanism, delay))
-    segments = segments_of(log, float(log.sent[0]) + delay + late, length)
-    return segments, [first_state(log, poses, int(segment.rows[0])) for segment in segments]
+    segments, delay = list[Segment](), float(values[DELAY])
+    first = list[Array]()
+    for log, poses in pairs:
+        with suppress(ConfigError) if skip_short else nullcontext():
+            length = min(longest, share * segment_length(log, poses, unknowns.mechanism, delay))
+            parts = segments_of(log, float(log.sent[0]) + delay + late, length)
+            segments += parts
+            first += [first_state(log, poses, int(part.rows[0])) for part in parts]
+    return Problem(segments, unknowns, step), Guess(values, np.array(first))
 
 
 def first_state(log: Log, poses: Array, row: int) -> Array:
@@ -191,6 +198,4 @@ def first_state(log: Log, poses: Array, row: int) -> Array:
     near = known[min(int(np.searchsorted(known, row)), len(known) - _FEWEST) :]
     near = near[: max(_FEWEST, int(np.searchsorted(log.times[near], log.times[row] + _CUBIC)))]
     cubic = np.polynomial.polynomial.polyfit(log.times[near] - log.times[row], poses[near], 3)
-    state = np.empty(NUM_STATE)
-    state[STATE_POSE], state[STATE_RATES] = cubic[0], cubic[1]
-    return state
+    return np.concatenate([cubic[0], cubic[1]])

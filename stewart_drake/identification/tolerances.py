@@ -1,4 +1,4 @@
-"""How far a machine may be off its drawing; nothing heavy is imported here."""
+"""Tolerances of a machine's drawing; nothing heavy is imported here."""
 
 from collections.abc import Iterable
 from typing import Annotated, Final
@@ -13,11 +13,10 @@ _Std = Annotated[float, Field(ge=0, le=1e3)]
 
 @dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
 class Tolerances:
-    """Standard deviations of what is not known before any log; 0 is known, None by the machine.
+    """Prior standard deviations of a machine's unknowns; 0 is known, None depends on the machine.
 
-    By the machine and the log: a bias and Coulomb friction as large as the largest torque that was
-    commanded, viscous friction that takes this torque at the largest crank speed, a payload as
-    heavy as the plate, anywhere on it.
+    None is for bias and Coulomb friction the largest commanded torque, for viscous friction this
+    torque at the largest crank speed, for the payload the mass of the plate, anywhere on it.
 
     Attributes:
         lengths: of cranks and rods.
@@ -43,11 +42,11 @@ class Tolerances:
 
 
 TOLERANCE_UNITS: Final = units_of(Tolerances)
-"""By name of a field, its unit and what it is of."""
+"""Unit and meaning of each field."""
 
 
 def read_tolerances(settings: Iterable[str]) -> Tolerances:
-    """Tolerances from `name=value` settings, the value in YAML; the rest keeps its default.
+    """Return tolerances from `name=value` settings, the value in YAML.
 
     Raises:
         ConfigError: in one line.

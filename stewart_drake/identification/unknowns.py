@@ -112,9 +112,9 @@ def unknowns_of(
 
     Args:
         mechanism: as drawn.
-        tolerances: how far off it may be.
-        delay: that is believed in, s.
-        torque: largest that was commanded, N m: a bias may be as large, and friction at `speed`.
+        tolerances: of the drawing.
+        delay: believed one, s.
+        torque: largest commanded one, N m, prior of bias and of friction at `speed`.
         speed: largest of a crank, rad/s.
     """
     mean, std = np.zeros(NUM_UNKNOWNS), np.zeros(NUM_UNKNOWNS)
