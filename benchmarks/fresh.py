@@ -1,0 +1,116 @@
+"""Compare the law with 0.2 under drawn conditions that were used for no tuning.
+
+`python benchmarks/fresh.py [JOBS]` writes benchmarks/results/fresh.json and fresh.md. A condition is a machine, a
+motion, a delay, a period, a sensor, a link and unknown parameters, drawn from SEED. Each runs with
+three seeds of its noise and signs, on the exact plant. fresh_0.2.json has the same runs of 0.2's law,
+made by the same command before the filter's noise changed.
+"""
+
+import json
+import os
+import sys
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+from _page import RESULTS
+from joblib import Parallel, delayed
+
+import stewart_drake as sd
+from stewart_drake.law.startup import reference_torque
+from stewart_drake.loop.preparation import prepare
+
+SEED, CONDITIONS, SEEDS = 20290, 40, 3
+
+
+def settings_of(number: int) -> tuple[str, str, list[str]]:
+    """Return scenario, controller and settings of a condition, without signs and seeds."""
+    rng = np.random.Generator(np.random.Philox([SEED, number]))
+    base = str(rng.choice(["paper", "paper", "paper_clear", "desktop", "motion_base", "gravity"]))
+    period = float(rng.choice([0.01, 0.02, 0.05, 0.1, 0.2]))
+    low, high = {"desktop": (0.04, 0.1), "motion_base": (0.06, 0.2), "gravity": (0.06, 0.16)}.get(
+        base, (0.15, 1.5)
+    )
+    if base in ("desktop", "gravity"):
+        period = min(period, 0.02)
+    delay = rng.uniform(low, high)
+    steps, fraction = divmod(delay / period, 1.0)
+    fraction = 0.0 if rng.random() < 0.6 else round(fraction, 3)
+    chosen = [
+        "plant.kind=exact",
+        f"controller.period={period}",
+        f"delay.steps={max(int(steps), 1)}",
+        f"delay.fraction={fraction}",
+    ]
+    name = {"paper_clear": "paper"}.get(base, base)
+    if base == "paper_clear":
+        chosen.append("mechanism=paper_clear")
+    if base in ("paper", "paper_clear", "gravity"):
+        share = rng.uniform(0.3, 1.0)
+        amplitude = share * np.array([np.pi / 12] * 3 + [0.02, 0.02, 0.08])
+        chosen.append(f"reference.amplitude={[round(float(a), 6) for a in amplitude]}")
+        chosen.append(f"reference.frequency={round(rng.uniform(0.5, 1.5), 3)}")
+        at_rest = base != "gravity" and rng.random() < 0.3
+        chosen += [] if at_rest else ["start=on_reference", "queue=reference"]
+    if rng.random() < 0.25:
+        chosen += ["sensor.kind=encoders", f"sensor.bits={rng.choice([14, 17, 20])}"]
+        if rng.random() < 0.5:
+            chosen.append("sensor.samples=5")
+    adaptive = "sensor.kind=encoders" not in chosen and rng.random() < 0.3
+    if rng.random() < 0.15:
+        chosen.append("sensor.loss=0.1")
+    elif rng.random() < 0.15:
+        chosen.append(f"delay.jitter_std={round(0.01 * period, 5)}")
+    if adaptive:
+        wrong = rng.uniform(0.8, 1.2) * (max(int(steps), 1) + fraction)
+        chosen += [
+            f"controller.delay_steps={int(wrong)}",
+            f"controller.delay_fraction={wrong % 1:.3f}",
+            "controller.delay_max=2.0",
+        ]
+    return name, "adaptive_lqi" if adaptive else "predictor_lqi", chosen
+
+
+def run(number: int, seed: int) -> dict[str, Any]:
+    """Return E_ac and the status of one run."""
+    name, controller, chosen = settings_of(number)
+    rng = np.random.Generator(np.random.Philox([SEED, 1000 + number]))
+    sizes = rng.uniform(0, 1, 5)  # of the unknowns, the same for every seed
+    kinds = rng.random(5) < 0.5
+    experiment = prepare(sd.load_scenario(name, controller, chosen))
+    motion = experiment.motion_scale
+    torque = reference_torque(experiment.nominal, experiment.reference, experiment.scenario.duration)
+    signs = np.random.Generator(np.random.Philox([SEED, 2000 + number, seed]))
+    bias = kinds[0] * 0.05 * sizes[0] * torque * signs.choice([-1.0, 1.0], 6)
+    plate = experiment.mechanism.plate.mass
+    noise = kinds[1] * 1e-3 * sizes[1] * np.concatenate([motion, motion])
+    chosen += [
+        f"plant.torque_bias={[float(f'{b:.4g}') for b in bias]}",
+        f"plant.payload_mass={kinds[2] * 0.12 * sizes[2] * plate:.4g}",
+        f"plant.joint_damping={kinds[3] * 0.05 * sizes[3] * torque:.4g}",
+        f"plant.coulomb_friction={kinds[4] * (sizes[4] < 0.3) * 0.01 * torque:.4g}",
+    ]
+    if "sensor.kind=encoders" not in chosen:
+        chosen.append(f"sensor.noise_std={[float(f'{s:.4g}') for s in noise]}")
+    chosen += [f"sensor.seed={seed}", f"delay.seed={seed}"]
+    result = sd.simulate(sd.load_scenario(name, controller, chosen), judge_stability=False)
+    done = result.status == "completed"
+    return {
+        "condition": number,
+        "seed": seed,
+        "scenario": name,
+        "controller": controller,
+        "settings": chosen,
+        "status": result.status,
+        "E_ac": result.accumulated_error if done else None,
+    }
+
+
+if __name__ == "__main__":
+    jobs = int(sys.argv[1]) if len(sys.argv) > 1 else 2
+    pairs = [(number, seed) for number in range(CONDITIONS) for seed in range(SEEDS)]
+    rows = Parallel(n_jobs=jobs)(delayed(run)(*pair) for pair in pairs)
+    (RESULTS / "fresh.json").write_text(json.dumps(rows, indent=0) + "\n", encoding="utf-8")
+    for row in rows:
+        print(row["condition"], row["seed"], row["scenario"], row["status"], row["E_ac"])
