@@ -12,7 +12,6 @@
 #include "short.h"
 
 #define MOST_COUNTED ((real)1e6)
-#define CATCH_UP ((real)0.3) /* s, of a way back */
 
 /* ---- the memory ------------------------------------------------------------------------------- */
 
@@ -191,13 +190,6 @@ static int preview_times(const stewart_law *law, const stewart_outlook *outlook,
     return n;
 }
 
-/* The rows that are followed at a sample, of a preview of its times. */
-typedef struct {
-    int number;
-    real *times, *reference, *followed;
-    int missing; /* whether something of the reference was */
-} course;
-
 /* Whether nothing is fed back yet. A limit spoils the plan: what it takes away is known without a
    measurement. */
 static int is_quiet(const stewart_law *law, const real *memory)
@@ -207,95 +199,32 @@ static int is_quiet(const stewart_law *law, const real *memory)
            !stewart_at_limit(&law->machine, in_flight->rows, memory + in_flight->at);
 }
 
-/* Rows of the predicted motion, and the state (12) where the next torque acts. */
-static void predict_way(const stewart_law *law, const stewart_outlook *outlook, const course *c, real *way,
-                        real *state, stewart_scratch scratch)
-{
-    const stewart_schedule *until = &outlook->until;
-    real *states = stewart_take(&scratch, X * (until->number + 1)), ends[2][ROW], begin = 0;
-    stewart_belief belief;
-    stewart_believe(&law->machine, outlook->theta, &belief);
-    stewart_copy(X, outlook->state, states);
-    stewart_predict(&law->machine, outlook->theta, until, states, states + X);
-    stewart_copy(X, states + X * until->number, state);
-    for (int i = 0; i < c->number; i++) {
-        stewart_copy(X, state, way + ROW * i);
-        stewart_fill(6, 0, way + ROW * i + X);
-    }
-    for (int k = 0; k < until->number; k++) {
-        const real h = until->durations[k], *torque = until->torques + U * k;
-        for (int end = 0; end < 2; end++) {
-            stewart_copy(X, states + X * (k + end), ends[end]);
-            stewart_accelerations(&belief.plant, ends[end], ends[end] + 6, torque, ends[end] + X);
-        }
-        for (int i = 0; i < c->number; i++)
-            if (c->times[i] >= begin && c->times[i] < begin + h)
-                stewart_between(ends[0], ends[1], h, (c->times[i] - begin) / h, way + ROW * i);
-        begin += h;
-    }
-}
-
-/* After a gap: up to the instant at which the next torque begins to act, what was followed before, at
-   the first preview ever, and as long as nothing is fed back, the predicted motion; from then on the
-   way back. */
-static void return_after_gap(const stewart_law *law, const real *memory, const stewart_outlook *outlook,
-                             int ended, stewart_way_back *back, const course *c,
-                             stewart_scratch scratch)
+/* The course of the last sample in the memory. */
+static stewart_course last_course(const stewart_law *law, real *memory)
 {
     const stewart_layout *l = &law->layout;
-    const real h = law->period, eta = outlook->eta, acts = eta - (real)1e-6 * h;
-    const real *geometry = law->machine.geometry, *last_times = memory + l->times.at;
-    const real *followed = memory + l->followed.at;
-    real *way = stewart_take(&scratch, ROW * c->number), wanted[ROW], reached[ROW] = {0};
-    int last = 0;
-    while (last < law->rows && isfinite(last_times[last]))
-        last++;
-    const stewart_preview reference = {c->number, c->times, c->reference};
-    const stewart_preview given_before = {last, last_times, memory + l->reference.at};
-    const stewart_preview followed_before = {last, last_times, followed};
-    const int known = last > 0 && stewart_all_finite(ROW, followed + ROW * (last - 1));
-    const int early = ended || 2 * (real)back->holds * h >= CATCH_UP;
-    const int predicted = !known || (early && !c->missing && is_quiet(law, memory));
-    if (!predicted) {
-        stewart_complete(geometry, h, eta, &reference, acts, &followed_before, way);
-        if (ended) { /* without a step in what is followed */
-            real *continued = stewart_take(&scratch, ROW * c->number);
-            const stewart_preview went_on = {c->number, c->times, continued};
-            stewart_add_offset(*back, h, 0, reached);
-            stewart_complete(geometry, h, eta, &reference, (real)HUGE_VAL, &given_before, continued);
-            stewart_interpolate(&went_on, eta, wanted);
-            for (int i = 0; i < X; i++)
-                reached[i] += wanted[i];
-        }
-    } else if (stewart_all_finite(X, outlook->state)) {
-        predict_way(law, outlook, c, way, reached, scratch);
-    } else { /* nothing else to go on with */
-        back->holds = back->samples = 0;
-        return;
-    }
-    if (ended || predicted) {
-        stewart_interpolate(&reference, eta, wanted);
-        for (int i = 0; i < X; i++)
-            reached[i] -= wanted[i];
-        if (ended || !known)
-            stewart_begin_way_back(reached, h, stewart_queue_length(law), back);
-        else
-            stewart_copy(X, reached, back->offset);
-    }
-    for (int i = 0; i < c->number; i++) {
-        real *row = c->followed + ROW * i;
-        if (c->times[i] < acts)
-            stewart_copy(ROW, way + ROW * i, row);
-        else
-            stewart_add_offset(*back, h, c->times[i] - eta, row);
-    }
+    stewart_course last = {
+        .times = memory + l->times.at,
+        .reference = memory + l->reference.at,
+        .followed = memory + l->followed.at,
+        .gap = memory[l->gap.at] > 0,
+        .back = {.holds = (int)memory[l->way_back.at], .samples = (int)memory[l->way_back.at + 1]},
+    };
+    while (last.number < law->rows && isfinite(last.times[last.number]))
+        last.number++;
+    stewart_copy(X, memory + l->offset.at, last.back.offset);
+    return last;
 }
 
-/* Asks for the reference and finds what is followed. */
-static int follow(const stewart_law *law, real *memory, const stewart_sample *sample,
-                  const stewart_outlook *outlook, course *c, stewart_scratch *scratch)
+/* Asks for the reference and finds the course to follow. */
+static void follow(const stewart_law *law, real *memory, const stewart_sample *sample,
+                   const stewart_outlook *outlook, stewart_course *c, stewart_scratch *scratch)
 {
     const stewart_layout *l = &law->layout;
+    const stewart_course last = last_course(law, memory);
+    const stewart_course_input motion = {&law->machine,  law->period,    stewart_queue_length(law),
+                                   outlook->eta,   outlook->state, outlook->theta,
+                                   outlook->until, is_quiet(law, memory)};
     real *given = stewart_take(scratch, ROW * law->rows);
     c->times = stewart_take(scratch, law->rows);
     c->reference = stewart_take(scratch, ROW * law->rows);
@@ -305,39 +234,21 @@ static int follow(const stewart_law *law, real *memory, const stewart_sample *sa
         law->planner->look(law, memory + l->planner.at, sample, c->number, c->times, given);
     else
         sample->reference(sample->about, c->number, c->times, given);
-    int last = 0;
-    while (last < law->rows && isfinite(memory[l->times.at + last]))
-        last++;
-    const stewart_preview now = {c->number, c->times, given};
-    const stewart_preview before = {last, memory + l->times.at, memory + l->reference.at};
-    stewart_complete(law->machine.geometry, law->period, outlook->eta, &now, -(real)HUGE_VAL, &before,
-                     c->reference);
-    c->missing = !stewart_all_finite(ROW * c->number, given);
-    stewart_copy(ROW * c->number, c->reference, c->followed);
-    const int gap = !stewart_all_finite(ROW, given + ROW * (c->number - 1));
-    const int ended = memory[l->gap.at] > 0 && !gap;
-    stewart_way_back back;
-    stewart_copy(X, memory + l->offset.at, back.offset);
-    back.holds = (int)memory[l->way_back.at];
-    back.samples = (int)memory[l->way_back.at + 1];
-    stewart_go_on_way_back(&back, law->period);
-    if (ended || back.holds + back.samples > 0)
-        return_after_gap(law, memory, outlook, ended, &back, c, *scratch);
-    memory[l->gap.at] = (real)gap;
-    memory[l->way_back.at] = (real)back.holds;
-    memory[l->way_back.at + 1] = (real)back.samples;
-    stewart_copy(X, back.offset, memory + l->offset.at);
-    return gap;
+    stewart_follow(&motion, &last, given, c, *scratch);
 }
 
-/* Keeps what was asked for and followed, for the next sample. */
-static void remember_course(const stewart_law *law, real *memory, const course *c)
+/* Keeps the course for the next sample. */
+static void remember_course(const stewart_law *law, real *memory, const stewart_course *c)
 {
     const stewart_layout *l = &law->layout;
     stewart_fill(law->rows, (real)NAN, memory + l->times.at);
     stewart_copy(c->number, c->times, memory + l->times.at);
     stewart_copy(ROW * c->number, c->reference, memory + l->reference.at);
     stewart_copy(ROW * c->number, c->followed, memory + l->followed.at);
+    memory[l->gap.at] = (real)c->gap;
+    memory[l->way_back.at] = (real)c->back.holds;
+    memory[l->way_back.at + 1] = (real)c->back.samples;
+    stewart_copy(X, c->back.offset, memory + l->offset.at);
 }
 
 /* ---- feedback --------------------------------------------------------------------------------- */
@@ -415,7 +326,7 @@ static int feed_back(const stewart_law *law, real *memory, const stewart_outlook
 /* ---- a sample --------------------------------------------------------------------------------- */
 
 /* A torque for what is followed, and what went wrong. */
-static int respond(const stewart_law *law, real *memory, const stewart_outlook *outlook, const course *c,
+static int respond(const stewart_law *law, real *memory, const stewart_outlook *outlook, const stewart_course *c,
                    int waiting, const real *weights, stewart_ahead *a, real *torque,
                    stewart_scratch scratch)
 {
@@ -474,7 +385,7 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
     real *in_flight = memory + l->in_flight.at, *sent = memory + l->channel.at;
     stewart_outlook outlook;
     stewart_ahead ahead;
-    course c;
+    stewart_course c;
     if (law->channel)
         law->channel->update(law, sent, sample->report, in_flight, scratch);
     estimate(law, memory, sample, &outlook, &scratch);
@@ -483,11 +394,11 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
         stewart_fill(6, 0, memory + l->error.at); /* there is none left to feed back */
         stewart_fill(6, 0, memory + l->integral.at);
     }
-    const int gap = follow(law, memory, sample, &outlook, &c, &scratch);
+    follow(law, memory, sample, &outlook, &c, &scratch);
     int status = outlook.status | (c.missing ? STEWART_REFERENCE_MISSING : 0);
     const real *nodes = c.followed + ROW * (1 + outlook.samples);
     const int waiting = !stewart_all_finite(ROW * 2 * (3 + outlook.pending), nodes);
-    if (c.missing && !gap && !waiting) /* which spoils the plan as a limit does */
+    if (c.missing && !c.gap && !waiting) /* which spoils the plan as a limit does */
         memory[l->silence.at] = 0;
     if (!stewart_all_finite(X, outlook.state)) { /* nothing else to go on with */
         stewart_copy(X, c.followed, outlook.state);

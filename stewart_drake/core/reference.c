@@ -185,3 +185,97 @@ void stewart_add_offset(stewart_way_back way, real period, real time, real *row)
     for (int i = 0; i < 6; i++)
         row[X + i] += a[i];
 }
+
+/* Rows of the predicted motion, and the state (12) where the next torque acts. */
+static void predict_way(const stewart_course_input *m, const stewart_course *c, real *way, real *state,
+                        stewart_scratch scratch)
+{
+    const stewart_schedule *until = &m->until;
+    real *states = stewart_take(&scratch, X * (until->number + 1)), ends[2][ROW], begin = 0;
+    stewart_belief belief;
+    stewart_believe(m->machine, m->theta, &belief);
+    stewart_copy(X, m->state, states);
+    stewart_predict(m->machine, m->theta, until, states, states + X);
+    stewart_copy(X, states + X * until->number, state);
+    for (int i = 0; i < c->number; i++) {
+        stewart_copy(X, state, way + ROW * i);
+        stewart_fill(6, 0, way + ROW * i + X);
+    }
+    for (int k = 0; k < until->number; k++) {
+        const real h = until->durations[k], *torque = until->torques + U * k;
+        for (int end = 0; end < 2; end++) {
+            stewart_copy(X, states + X * (k + end), ends[end]);
+            stewart_accelerate(&belief, ends[end], torque, ends[end] + X);
+        }
+        for (int i = 0; i < c->number; i++)
+            if (c->times[i] >= begin && c->times[i] < begin + h)
+                stewart_between(ends[0], ends[1], h, (c->times[i] - begin) / h, way + ROW * i);
+        begin += h;
+    }
+}
+
+/* Follows a way back, which may begin now. */
+static void return_after_gap(const stewart_course_input *m, const stewart_course *last, int ended,
+                             const real *geometry, stewart_course *c, stewart_scratch scratch)
+{
+    const real h = m->period, eta = m->eta, acts = eta - (real)1e-6 * h;
+    real *way = stewart_take(&scratch, ROW * c->number), wanted[ROW], reached[ROW] = {0};
+    stewart_way_back *back = &c->back;
+    const stewart_preview reference = {c->number, c->times, c->reference};
+    const stewart_preview given_before = {last->number, last->times, last->reference};
+    const stewart_preview followed_before = {last->number, last->times, last->followed};
+    const int known =
+        last->number > 0 && stewart_all_finite(ROW, last->followed + ROW * (last->number - 1));
+    const int early = ended || 2 * (real)back->holds * h >= CATCH_UP;
+    const int predicted = !known || (early && !c->missing && m->quiet);
+    if (!predicted) {
+        stewart_complete(geometry, h, eta, &reference, acts, &followed_before, way);
+        if (ended) { /* without a step in what is followed */
+            real *continued = stewart_take(&scratch, ROW * c->number);
+            const stewart_preview went_on = {c->number, c->times, continued};
+            stewart_add_offset(*back, h, 0, reached);
+            stewart_complete(geometry, h, eta, &reference, (real)HUGE_VAL, &given_before, continued);
+            stewart_interpolate(&went_on, eta, wanted);
+            for (int i = 0; i < X; i++)
+                reached[i] += wanted[i];
+        }
+    } else if (stewart_all_finite(X, m->state)) {
+        predict_way(m, c, way, reached, scratch);
+    } else { /* nothing else to go on with */
+        back->holds = back->samples = 0;
+        return;
+    }
+    if (ended || predicted) {
+        stewart_interpolate(&reference, eta, wanted);
+        for (int i = 0; i < X; i++)
+            reached[i] -= wanted[i];
+        if (ended || !known)
+            stewart_begin_way_back(reached, h, m->queue, back);
+        else
+            stewart_copy(X, reached, back->offset);
+    }
+    for (int i = 0; i < c->number; i++) {
+        real *row = c->followed + ROW * i;
+        if (c->times[i] < acts)
+            stewart_copy(ROW, way + ROW * i, row);
+        else
+            stewart_add_offset(*back, h, c->times[i] - eta, row);
+    }
+}
+
+void stewart_follow(const stewart_course_input *m, const stewart_course *last, const real *given,
+                    stewart_course *c, stewart_scratch scratch)
+{
+    const real *geometry = m->machine->map ? NULL : m->machine->geometry;
+    const stewart_preview now = {c->number, c->times, given};
+    const stewart_preview before = {last->number, last->times, last->reference};
+    stewart_complete(geometry, m->period, m->eta, &now, -(real)HUGE_VAL, &before, c->reference);
+    stewart_copy(ROW * c->number, c->reference, c->followed);
+    c->missing = !stewart_all_finite(ROW * c->number, given);
+    c->gap = !stewart_all_finite(ROW, given + ROW * (c->number - 1));
+    c->back = last->back;
+    stewart_go_on_way_back(&c->back, m->period);
+    const int ended = last->gap && !c->gap;
+    if (ended || c->back.holds + c->back.samples > 0)
+        return_after_gap(m, last, ended, geometry, c, scratch);
+}

@@ -41,3 +41,32 @@ void stewart_go_on_way_back(stewart_way_back *way, real period);
 
 /* Add the offset at `time` s from the beginning to a row. */
 void stewart_add_offset(stewart_way_back way, real period, real time, real *row);
+
+/* The preview of a sample, and the rows that are followed. */
+typedef struct {
+    int number;
+    real *times, *reference, *followed; /* (number), (number, 18); with numbers for what is missing */
+    int missing; /* whether anything was missing */
+    int gap;     /* whether the last row was */
+    stewart_way_back back;
+} stewart_course;
+
+/* The motion of the plate until the next torque acts. */
+typedef struct {
+    const stewart_machine *machine;
+    real period;
+    int queue;               /* torques in flight */
+    real eta;                /* s until the next torque acts */
+    const real *state;       /* (12) now, NaN if unknown */
+    const real *theta;       /* estimated parameters */
+    stewart_schedule until;  /* torques that act until then */
+    int quiet;               /* whether nothing is fed back yet */
+} stewart_course_input;
+
+/* Fills in a course of which `number` and `times` are set, from the rows `given` at its times and the
+   course of the last sample. After a gap in the reference the way back leads onto it. Up to the instant
+   at which the next torque acts, the course is that of the last sample; at the first preview ever, and
+   as long as nothing is fed back, it is the predicted motion. Scratch: 2 * 18 numbers for each row, and
+   12 for each torque of `until` and one. */
+void stewart_follow(const stewart_course_input *motion, const stewart_course *last, const real *given,
+                    stewart_course *course, stewart_scratch scratch);
