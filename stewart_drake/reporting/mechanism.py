@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.reporting.document import Document, Section, Values, number
+from stewart_drake.reporting.document import Document, from_template, number
 from stewart_drake.reporting.panels import Panel, draw
 from stewart_drake.reporting.style import Line, write_figures
 from stewart_drake.reporting.workspace import travel_text
@@ -21,74 +21,54 @@ from stewart_drake.scenario.signals import LEGS
 from stewart_drake.studies.new_machine import MechanismCheck
 from stewart_drake.types import Array
 
-# Told apart by width and darkness too, for grey print.
+# Distinct by width and darkness too, for grey print.
 CRANK: Final = Line("#D55E00", "-", 4.5)
 ROD: Final = Line("#7A828C", "-", 2.0)
 PLATE: Final = Line("#0072B2", "-", 1.6)
 BASE: Final = Line("#9AA1AA", "--", 1.0)
 _LABEL_GAP: Final = 0.13
-"""Of the drawn radius, between a shaft and its number."""
+"""Distance of a shaft's number, as a share of the drawn radius."""
 _VIEWS: Final = {"top view": (0, 1), "front view": (0, 2)}
 
 
 def document(check: MechanismCheck) -> Document:
-    """Return what `model check` prints."""
-    mechanism, measures = check.mechanism, check.measures
-    cranks, rods = _lengths(mechanism.crank_lengths), _lengths(mechanism.rod_lengths)
-    entries = {
-        "name": mechanism.name,
-        "lengths": f"cranks {cranks} mm, rods {rods} mm",
-        "inertias": _inertias(mechanism),
-        "crank angles": _six(np.rad2deg(check.crank_angles), "deg"),
-        "reach margin": _six(1e3 * measures.reach, "mm"),
-        "sine off dead centre": _six(measures.sines, ""),
-        "singularity measure": f"{number(measures.parallel)} (parallel; a simulation stops at "
-        f"{SINGULARITY_LIMIT:g})",
-    }
-    if check.failure is None:
-        limit = mechanism.effort_limit
-        entries |= {
-            "condition number": f"{number(measures.condition)}; 1 mrad of crank error moves the "
-            f"plate by {number(1e3 * measures.play * 1e-3)} mm at most",
-            "torque to hold": _six(check.torque, "N m")
-            + ("" if limit is None else f" (limit {limit:g})"),
-            "open-loop poles": _poles(check.poles),
-            "from home alone": travel_text(check.travel),
-        }
-    return Document(mechanism.name, check.verdict, [Section("", Values(entries))])
+    """Return the description that `model check` prints."""
+    mechanism = check.mechanism
+    bodies = {"plate": "disc", "crank": "bar", "rod": "bar"}
+    return from_template(
+        "mechanism",
+        check=check,
+        mechanism=mechanism,
+        measures=check.measures,
+        six=_six,
+        deg=np.rad2deg(check.crank_angles),
+        cranks=_lengths(mechanism.crank_lengths),
+        rods=_lengths(mechanism.rod_lengths),
+        bodies=[(name, shape, getattr(mechanism, name)) for name, shape in bodies.items()],
+        limit=SINGULARITY_LIMIT,
+        regular=check.failure is None,
+        poles=check.failure is None and _poles(check.poles),
+        travel=check.failure is None and travel_text(check.travel),
+    )
 
 
-def _inertias(mechanism: Mechanism) -> str:
-    """Return principal moments of the moving bodies, and which are estimated."""
-    parts = []
-    for name, shape in (("plate", "disc"), ("crank", "bar"), ("rod", "bar")):
-        body = getattr(mechanism, name)
-        moments = ", ".join(f"{value:.3g}" for value in body.inertia)
-        note = f" (estimated: uniform {shape})" if body.estimated else ""
-        parts.append(f"{name} {moments}{note}")
-    return "; ".join(parts) + " kg m^2"
-
-
-def _six(values: Array, unit: str) -> str:
-    return (", ".join(number(value) for value in values) + f" {unit}").rstrip()
+def _six(values: Array) -> str:
+    return ", ".join(map(number, values))
 
 
 def _lengths(values: Array) -> str:
-    """One number where all are alike."""
-    alike = bool(np.ptp(values) < 1e-12)
-    return ", ".join(number(1e3 * value) for value in (values[:1] if alike else values))
+    """Return lengths in mm, one number if all are equal."""
+    equal = bool(np.ptp(values) < 1e-12)
+    return _six(1e3 * (values[:1] if equal else values))
 
 
 def _poles(poles: NDArray[np.complex128]) -> str:
-    """Growing, oscillating and resting ones; a frictionless machine has each with its mirror."""
+    """Return growing and oscillating poles; each has its mirror image in a frictionless machine."""
     fastest = np.abs(poles).max()
     grow = [pole.real for pole in poles if pole.real > 1e-6 * fastest]
     swing = [pole.imag for pole in poles if abs(pole.real) <= 1e-6 * fastest < pole.imag]
-    parts = []
-    if grow:
-        parts.append("unstable " + ", ".join(map(number, grow)) + " /s")
-    if swing:
-        parts.append("oscillating " + ", ".join(map(number, swing)) + " rad/s")
+    parts = [f"unstable {_six(np.array(grow))} /s"] if grow else []
+    parts += [f"oscillating {_six(np.array(swing))} rad/s"] if swing else []
     return "; ".join(parts) or "all zero"
 
 
@@ -121,18 +101,14 @@ def mechanism_figure(mechanism: Mechanism) -> Figure:
 
 
 def write_mechanism_figure(mechanism: Mechanism, directory: Path) -> list[Path]:
-    """Write mechanism.png and mechanism.svg.
-
-    Raises:
-        OSError: the directory cannot be written to.
-    """
+    """Write mechanism.png and mechanism.svg."""
     return write_figures({"mechanism": mechanism_figure(mechanism)}, directory)
 
 
 def _view(ax: Axes, points: dict[str, Array], axes: tuple[int, int], centre: Array) -> None:
     shaft, tip, joint = (points[name][:, axes] for name in ("shaft", "tip", "joint"))
     seen_from_above = axes == (0, 1)
-    # What is nearer to the viewer is drawn later: height seen from above, -y seen from the front.
+    # Parts nearer to the viewer are drawn later: by z from above, by -y from the front.
     depth = points["joint"][:, 2] if seen_from_above else -points["shaft"][:, 1]
     hull = joint[_around(points["joint"])]
     ax.add_patch(
@@ -164,13 +140,13 @@ def _view(ax: Axes, points: dict[str, Array], axes: tuple[int, int], centre: Arr
 
 
 def _around(points: Array) -> NDArray[np.intp]:
-    """Indices of points in the order of their azimuth about their mean."""
+    """Return indices of points by their azimuth about the mean."""
     offsets = points - points.mean(axis=0)
     return np.argsort(np.arctan2(offsets[:, 1], offsets[:, 0]))
 
 
 def _number(ax: Axes, shaft: Array, seen_from_above: bool) -> None:
-    """Leg numbers next to the shafts, moved apart where they would cover each other."""
+    """Write leg numbers next to the shafts, without overlap."""
     gap = _LABEL_GAP * np.ptp(shaft, axis=0).max() / 2
     if seen_from_above:
         outwards = shaft - shaft.mean(axis=0)

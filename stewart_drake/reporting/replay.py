@@ -1,9 +1,8 @@
-"""A finished run shown again in Meshcat, through the SDFormat model, beside its reference."""
+"""Animation of a finished run and its reference in Meshcat, with the SDFormat model."""
 
 import logging
-from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import xarray as xr
@@ -21,26 +20,21 @@ from stewart_drake.reporting.page import environment
 from stewart_drake.scenario.signals import ANGLES, LEGS, POSITION
 from stewart_drake.types import Array
 
-if TYPE_CHECKING:
-    from jinja2 import Template
-
-
 _PATH_COLORS: Final = {"reference": Rgba(0.0, 0.62, 0.45), "plate": Rgba(0.0, 0.45, 0.70)}
 _VIEWPORT: Final = '<meta name="viewport" content="width=device-width, initial-scale=1">'
 _MAX_FRAMES: Final = 1500
-"""A long run is thinned out to this many frames; Meshcat interpolates between them."""
+"""Largest number of frames; Meshcat interpolates between them."""
 
 
 def replay(signals: xr.Dataset, mechanism: Mechanism, meshcat: Meshcat | None = None) -> Meshcat:
-    """Put the animation of a run, of either plant, into Meshcat, with its play bar.
+    """Put the animation of a run into Meshcat and return it.
+
+    `StaticHtml()` of the Meshcat plays without a server.
 
     Args:
         signals: of a `SimulationResult`; poses and references over time.
-        mechanism: the machine that was run.
-        meshcat: where to; a new one, on any free local port, if None.
-
-    Returns:
-        The Meshcat; `StaticHtml()` of it is a file that plays without a server.
+        mechanism: the machine.
+        meshcat: target; a new one on a free local port if None.
     """
     meshcat = meshcat or _quiet_meshcat()
     scene, shown = Scene(mechanism, meshcat), _thinned(signals)
@@ -49,7 +43,7 @@ def replay(signals: xr.Dataset, mechanism: Mechanism, meshcat: Meshcat | None = 
     meshcat.StartRecording(1 / period, set_visualizations_while_recording=False)
     frames = zip(shown.time.values, shown.pose.values, shown.reference.values, strict=True)
     for t, pose, wanted in frames:
-        # Meshcat rounds down to a frame; a hair later, rounding does not lose one.
+        # Slightly late, because Meshcat rounds down to a frame.
         if not scene.show(pose, wanted, t + 1e-3 * period):
             break
     meshcat.StopRecording()
@@ -59,16 +53,9 @@ def replay(signals: xr.Dataset, mechanism: Mechanism, meshcat: Meshcat | None = 
 
 
 def replay_html(result: SimulationResult, mechanism: Mechanism, title: str) -> str:
-    """A run as one HTML page that plays without a server or a network.
-
-    Args:
-        result: the run.
-        mechanism: the machine that was run.
-        title: what the page is called.
-    """
+    """Return a run as one HTML page that plays without a server or a network."""
     meshcat = replay(result.signals, mechanism)
     shown = _thinned(result.signals)
-    e = shown.error.values
     torque = shown.torque_applied.values
     largest = np.abs(torque).max(axis=1, initial=0.0)
     full = full_color(largest)
@@ -79,20 +66,26 @@ def replay_html(result: SimulationResult, mechanism: Mechanism, title: str) -> s
         outcome += f", E_ac {number(result.accumulated_error)} % s"
     data = {
         "time": np.round(shown.time.values, 4).tolist(),
-        "position": np.round(1e3 * np.linalg.norm(e[:, POSITION], axis=1), 4).tolist(),
+        "position": np.round(
+            1e3 * np.linalg.norm(shown.error.values[:, POSITION], axis=1), 4
+        ).tolist(),
         "angle": np.round(np.rad2deg(_turns(shown)), 4).tolist(),
         "share": np.round(torque_shares(torque, full), 3).tolist(),
         "cranks": crank_paths(mechanism.name),
     }
-    overlay = _template().render(
-        title=title,
-        outcome=outcome,
-        full=number(full, 2),
-        peak=number(float(largest.max(initial=0.0)), 2),
-        data=data,
-        legs=LEGS,
-        colors=TORQUE_COLORS,
-        drake=versions()["drake"],
+    overlay = (
+        environment()
+        .get_template("replay.html.j2")
+        .render(
+            title=title,
+            outcome=outcome,
+            full=number(full, 2),
+            peak=number(float(largest.max(initial=0.0)), 2),
+            data=data,
+            legs=LEGS,
+            colors=TORQUE_COLORS,
+            drake=versions()["drake"],
+        )
     )
     page = meshcat.StaticHtml()
     before, end, after = page.rpartition("</body>")
@@ -102,17 +95,13 @@ def replay_html(result: SimulationResult, mechanism: Mechanism, title: str) -> s
 
 
 def write_replay(result: SimulationResult, mechanism: Mechanism, path: Path, title: str) -> Path:
-    """Write `replay_html` whole or not at all.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write `replay_html` to a file and return its path."""
     write_whole(path, replay_html(result, mechanism, title))
     return path
 
 
 def _quiet_meshcat() -> Meshcat:
-    """A Meshcat that nobody visits, so that its address is not told either."""
+    """Return a Meshcat without printing its address."""
     log = logging.getLogger("drake")
     level = log.level
     log.setLevel(logging.WARNING)
@@ -127,7 +116,7 @@ def _thinned(signals: xr.Dataset) -> xr.Dataset:
 
 
 def _period(signals: xr.Dataset) -> float:
-    """s between two frames: the least, because samples may lie between the steps of the grid."""
+    """Return the shortest time between two frames, s; samples may lie between grid steps."""
     steps = np.diff(signals.time.values)
     return float(steps.min()) if len(steps) else 1.0
 
@@ -140,7 +129,7 @@ def _draw_paths(meshcat: Meshcat, signals: xr.Dataset) -> None:
 
 
 def _turns(signals: xr.Dataset) -> Array:
-    """(n,) rad, the angle by which the plate is turned against its reference."""
+    """Return the rotation angles (n,) of the plate against its reference, rad."""
     pairs = zip(signals.pose.values, signals.reference.values, strict=True)
     return np.array(
         [
@@ -148,8 +137,3 @@ def _turns(signals: xr.Dataset) -> Array:
             for p, q in pairs
         ]
     )
-
-
-@lru_cache(maxsize=1)
-def _template() -> "Template":
-    return environment().get_template("replay.html.j2")

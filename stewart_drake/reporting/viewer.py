@@ -1,8 +1,9 @@
-"""A mechanism in Meshcat, put anywhere by six sliders; poses out of reach are shown as such."""
+"""A mechanism in Meshcat at any pose, set by six sliders; unreachable poses are shown in red."""
 
 import time
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,30 +23,30 @@ from stewart_drake.types import Array
 SLIDERS: Final = ("roll [deg]", "pitch [deg]", "yaw [deg]", "x [mm]", "y [mm]", "z [mm]")
 STOP: Final = "Stop viewing"
 _BEYOND: Final = 1.25
-"""Sliders go beyond the travel by this factor, so that one sees where it ends."""
+"""Range of the sliders, as a factor on the travel."""
 _NARROW: Final = 0.15
-"""Of the crank: a leg with a smaller margin is marked."""
+"""Reach margin of a marked leg, as a share of the crank."""
 _GOOD, _CLOSE, _SHORT = (
     Rgba(0.0, 0.62, 0.45, 1.0),
     Rgba(0.90, 0.62, 0.0, 1.0),
     Rgba(0.80, 0.10, 0.10, 1.0),
 )
 _GHOST: Final = Rgba(0.80, 0.10, 0.10, 0.35)
-_PERIOD: Final = 0.03
-"""s"""
-_VIEW: Final = (2.0, -1.6, 0.6)
-"""From the machine to the camera, in its radii."""
 
 
-class Placement(NamedTuple):
-    """What slider values mean for a mechanism."""
+@dataclass(frozen=True)
+class Placement:
+    """A pose set by the sliders.
+
+    Attributes:
+        pose: (6,) rad and m.
+        reach: reach margins (6,) in m, negative where a leg is short.
+        failure: why the pose is impossible, or None.
+    """
 
     pose: Array
-    """(6,) rad and m."""
     reach: Array
-    """(6,) m, negative where a leg is short."""
     failure: Failure | None
-    """Why it cannot be there, or None."""
 
     def __str__(self) -> str:
         short = [
@@ -62,21 +63,21 @@ class Placement(NamedTuple):
 
 
 def place(mechanism: Mechanism, values: ArrayLike) -> Placement:
-    """Slider values (6,) in degrees and mm as a pose, with its reach margins."""
+    """Return the pose of slider values (6,) in degrees and mm."""
     pose = np.asarray(values, dtype=np.float64) / FACTORS
     return Placement(pose, mechanism.reach_margins(pose), diagnose(mechanism, 0.0, pose))
 
 
 class PoseViewer:
-    """Shows a mechanism in Meshcat, first at home.
+    """Viewer of a mechanism in Meshcat, first at home.
 
-    The machine follows the sliders as far as it can; where it cannot be, it stays at the last pose
-    where it could, and a translucent red plate shows what was asked for. The plate joints are
-    green, orange where less than 15 % of a crank is left, red where the leg is short.
+    The machine follows the sliders to every possible pose. For an impossible one it stays at the
+    last possible pose, and a translucent red plate shows the pose of the sliders. The plate joints
+    are green, orange with a reach margin below 15 % of a crank, red with a short leg.
 
     Args:
-        mechanism: what to show.
-        meshcat: where; sliders and a button to stop are added.
+        mechanism: to show.
+        meshcat: gets sliders and a button to stop.
     """
 
     def __init__(self, mechanism: Mechanism, meshcat: Meshcat) -> None:
@@ -98,15 +99,15 @@ class PoseViewer:
         self.step(home)
 
     def close(self) -> None:
-        """See `loop.scene.Scene.close`."""
+        """Free the diagram."""
         let_go(self._diagram)
 
     def values(self) -> Array:
-        """The sliders' values (6,) in degrees and mm."""
+        """Return the values of the sliders (6,) in degrees and mm."""
         return np.array([self.meshcat.GetSliderValue(name) for name in SLIDERS])
 
     def step(self, values: ArrayLike) -> Placement:
-        """Show the machine, or that it cannot be there, at values (6,) in degrees and mm."""
+        """Show the machine at slider values (6,) in degrees and mm."""
         placement = place(self._mechanism, values)
         possible = placement.failure is None
         if possible:
@@ -115,7 +116,8 @@ class PoseViewer:
         self._diagram.ForcedPublish(self._context)
         R_WP, p_WP = rotation(placement.pose[:3]), placement.pose[3:]
         joints: Any = p_WP + self._mechanism.p_PQ @ R_WP.T
-        self.meshcat.SetTransform("wanted", _transform(R_WP, p_WP + R_WP @ self._deck))
+        deck: Any = p_WP + R_WP @ self._deck
+        self.meshcat.SetTransform("wanted", RigidTransform(RotationMatrix(R_WP), deck))
         self.meshcat.SetProperty("wanted", "visible", not possible)
         narrow = _NARROW * self._mechanism.crank_lengths
         for i, leg in enumerate(LEGS):
@@ -124,22 +126,19 @@ class PoseViewer:
             color = _SHORT if margin < 0 else _CLOSE if margin < narrow[i] else _GOOD
             self.meshcat.SetTransform(path, RigidTransform(joints[i]))
             self.meshcat.SetProperty(path, "color", [color.r(), color.g(), color.b(), color.a()])
-        self._show(str(placement))
-        return placement
-
-    def _show(self, text: str) -> None:
-        # Meshcat's panel has no text; a button without effect carries it.
-        if text != self._label:
+        # Meshcat's panel has no text: a button without effect shows it.
+        if (text := str(placement)) != self._label:
             if self._label:
                 self.meshcat.DeleteButton(self._label)
             self.meshcat.AddButton(text)
             self._label = text
+        return placement
 
     def run(self, say: Callable[[str], None]) -> None:
-        """Follow the sliders until the button (or Escape in the browser) stops it.
+        """Follow the sliders until the stop button or Escape in the browser.
 
         Args:
-            say: called with the placement in words whenever it changes.
+            say: called with a description of each new pose.
         """
         shown = np.full(6, np.nan)
         while self.meshcat.GetButtonClicks(STOP) == 0:
@@ -147,17 +146,17 @@ class PoseViewer:
             if not np.array_equal(values, shown):
                 say(str(self.step(values)))
                 shown = values
-            time.sleep(_PERIOD)
+            time.sleep(0.03)
 
 
 def aim_camera(meshcat: Meshcat, mechanism: Mechanism) -> None:
-    """Look at a machine of any size so that it fills most of the window, over a fitting grid."""
+    """Show a machine of any size in most of the window, over a grid of its scale."""
     joints = mechanism.home[3:] + mechanism.p_PQ
     target = np.array([0.0, 0.0, (joints[:, 2].mean() + mechanism.p_WS[:, 2].mean()) / 2])
     radius = np.linalg.norm(np.vstack([joints, mechanism.p_WS]) - target, axis=1).max()
-    eye: Any = target + radius * np.array(_VIEW)
+    eye: Any = target + radius * np.array([2.0, -1.6, 0.6])
     meshcat.SetCameraPose(eye, target)  # type: ignore[arg-type]
-    # Meshcat's own grid has squares of a metre: of a small machine one sees a bar at the horizon.
+    # Meshcat's grid has squares of a metre, too large for a small machine.
     meshcat.SetProperty("/Grid", "scale", [10.0 ** np.floor(np.log10(radius))] * 3)
     meshcat.SetProperty("/Grid", "position", [0.0, 0.0, -0.06 * radius])
     meshcat.SetProperty("/Grid", "opacity", 0.25)
@@ -165,12 +164,8 @@ def aim_camera(meshcat: Meshcat, mechanism: Mechanism) -> None:
     meshcat.SetProperty("/Background", "bottom_color", [0.86, 0.88, 0.91])
 
 
-def _transform(R: Any, p: Any) -> RigidTransform:
-    return RigidTransform(RotationMatrix(R), p)
-
-
 def slider_range(mechanism: Mechanism) -> tuple[Array, Array]:
-    """Lowest and highest slider values (6,) in degrees and mm, somewhat beyond the travel."""
+    """Return lowest and highest slider values (6,) in degrees and mm, beyond the travel."""
     spans = [(t.low, t.high) for t in travel(mechanism)]
     if not spans:  # of a singular home pose
         rod = float(mechanism.rod_lengths.min())
