@@ -538,8 +538,8 @@ def test_influences_are_found():
         assert found[name].error_p > 0.05
         assert found[name].failure_p > 0.05
     told = document(study).plain().replace("\n  ", " ")
-    assert "What matters for completing: delay error." in told
-    assert "of those that completed: noise of the sensor, delay error." in told
+    assert "Significant for completing: delay error." in told
+    assert "of completed runs: noise of the sensor, delay error." in told
 
 
 def with_failures(failing, n=300):
@@ -584,8 +584,8 @@ def test_one_cause_of_failing_is_found_and_counted():
     assert cause.auc.value == pytest.approx(wins.mean())
     assert 0.75 < cause.auc.low < cause.auc.value < cause.auc.high < 1
     told = told_of(study)
-    assert "What matters for completing: torque bias, rms." in told
-    assert "What matters for E_ac, of those that completed: noise of the sensor." in told
+    assert "Significant for completing: torque bias, rms." in told
+    assert "Significant for E_ac of completed runs: noise of the sensor." in told
     counts = f"of which {cause.failing} of the {found.failing} have the outer third"
     assert counts in told
     page = html(document(study), Provenance("command"))
@@ -616,7 +616,7 @@ def test_two_causes_that_only_work_together_are_found_as_a_pair(opposite):
     if opposite:
         assert study.explanation.found == []
         assert "No single quantity separates" in told
-        assert "For completing no single quantity matters beyond chance." in told
+        assert "No single quantity is significant for completing." in told
 
 
 @pytest.mark.slow
@@ -632,7 +632,7 @@ def test_failures_by_chance_are_explained_by_nothing():
     told = told_of(study)
     total = f"the {found.failing} failing runs from the other {found.others}"
     assert f"No single quantity separates {total}. Nor does a pair of them." in told
-    assert "What matters for completing" not in told
+    assert "Significant for completing" not in told
 
 
 def test_the_auc_interval_covers_the_truth():

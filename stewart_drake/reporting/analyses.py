@@ -92,8 +92,8 @@ ANALYSES: Final = {
         second="directory",
     ),
 }
-"""By name: `studies.NAME.study_NAME` makes the result, `studies.study_options.NameOptions` has its
-options, `reporting.NAME.document` describes it."""
+"""By name. Each has a module in `studies` with a function `study_...`, a module in this room with a
+function `document`, and a class `...Options` in `studies.study_options`."""
 
 
 def words_of(name: str) -> tuple[str, ...]:

@@ -19,9 +19,9 @@ from stewart_drake.studies.verdict import HARDLY, NO, loop_verdict, milliseconds
 
 _TONES: Final[dict[str, Tone]] = {"yes": "good", "hardly": "fair", "no": "bad"}
 _BANDWIDTH: Final = 10.0
-"""Bandwidth in Hz of the servos that torques are compared with."""
+"""Bandwidth of the servos in the comparison, Hz."""
 FRAGILE: Final = 0.05
-"""Tolerable error of the delay, as a share of it, from which a stable loop is called good."""
+"""Smallest tolerable error of a good loop, as a share of the delay."""
 _MAP_WORDS: Final = {"out_of_reach": "no reach", "left_workspace": "left", "not_run": "not run"}
 _CELL_WORDS: Final = {"out_of_reach": "out of reach", "left_workspace": "leaves workspace"}
 
@@ -203,7 +203,7 @@ def _draw_cell(ax: Axes, cell: Cell, x: int, y: int, floor: float) -> None:
     else:
         word = _CELL_WORDS.get(cell.status, cell.status.replace("_", " "))
         text = f"{word}\nat {cell.time:.2f} s"
-    # Height above the floor, on a scale on which 30 % s is dark; text stays readable on it.
+    # 30 % s above the floor is the darkest shade, on which text is still readable.
     shade = 0.55 * min(1.0, np.sqrt(max(0.0, cell.error - floor) / 30)) if done else 0.0
     color = (1 - shade, 1 - 0.55 * shade, 1 - 0.3 * shade) if shade > 0 else DATA_PAPER
     hatch = None if done else "////"

@@ -15,11 +15,11 @@ from stewart_drake.studies.hautus import QUESTIONS, HautusStudy, System
 
 _CHAINS: Final = ("minimal chain", "paper's chain", "chain under gravity")
 _SMALLEST: Final = 1e-18
-"""Smaller margins are rounding, and are drawn here."""
+"""Margin at which smaller ones, which are rounding errors, are drawn."""
 
 
 def document(study: HautusStudy) -> Document:
-    """Return the models that matter, what fails, and folded, every model and mode."""
+    """Return the main models and failures, then all models and modes."""
     sc = study.assessment.experiment.scenario
     chains = [system for name in _CHAINS for system in study.family(name)]
     shown = [s for name in _CHAINS for s in _landmarks(study.family(name), sc.true_delay.steps)]
@@ -57,7 +57,7 @@ def document(study: HautusStudy) -> Document:
 
 
 def _typical_plants(study: HautusStudy) -> list[System]:
-    """Return without and under gravity the plant at home, which comes first, and the worst."""
+    """Return the plant at home and the worst plant, without and under gravity."""
     shown: dict[int, System] = {}
     for where in ("without", "under"):
         some = [s for s in study.family("plant") if s.name.startswith(f"plant {where} gravity")]
@@ -73,7 +73,7 @@ def _landmarks(chains: list[System], own: int) -> list[System]:
 
 
 def _deficiencies(systems: Sequence[System]) -> list[Paragraph]:
-    """Return a sentence for each family and test that fails, with the last model as example."""
+    """Return a sentence for each family and failed test, with the last model as example."""
     found = []
     for family, group in groupby(systems, key=lambda system: system.family):
         some = list(group)

@@ -1,9 +1,9 @@
-"""Documents and figures of a machine that was identified, and of a planned log."""
+"""Documents and figures of an identified machine, and of a planned log."""
 
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -34,7 +34,7 @@ _UNITS: Final = {
     "rad": ("mrad", 1e3),
     "s": ("ms", 1e3),
 }
-"""In which unit an unknown is shown, by its SI unit, and the factor."""
+"""Unit in which an unknown is shown, and the factor, by its SI unit."""
 _OF_KIND: Final = {
     "angles": [f"leg {leg}" for leg in LEGS],
     "pose": list(COORDINATE_NAMES),
@@ -43,7 +43,7 @@ _OF_KIND: Final = {
 
 
 def document(found: Identification) -> Document:
-    """Return the fit, what was found, what was not."""
+    """Return the identified values, their accuracy, and the fit."""
     interval = number(1e3 * found.std[DELAY], 2)
     digits = len(interval.partition(".")[2])
     exact = f"{1e3 * found.values[DELAY]:.6g}"
@@ -57,44 +57,47 @@ def document(found: Identification) -> Document:
         interval=interval,
         wrong=WRONG,
         logs=names,
-        mechanism=found.unknowns.mechanism.name,
         segments=len(found.problem.segments),
         cautions=cautions,
         found=_table(found, geometry=False),
         geometry=_table(found, geometry=True),
-        unseen=found.unseen[0] > 0,
-        directions=found.unseen,
         chi2=found.chi2,
         fits=found.chi2.items(),
         residuals=[
             Picture(
                 partial(residual_figure, found, i),
-                f"{name}: what the fit leaves, in standard deviations of a measurement.",
+                f"{name}: residuals of the fit, in standard deviations of a measurement.",
             )
             for i, name in enumerate(names)
         ],
         poses=found.pose_uncertainty if right else None,
         outside=right and found.pose_uncertainty is None,
-        pair=_pair,
+        **_shared(found, plan=None, reduced=False, motion=None),
     )
 
 
 def plan_document(plan: Plan) -> Document:
-    """Return the motion, and what its log will tell."""
-    std = plan.std
+    """Return the motion, and the accuracy that its log will allow."""
     free = [k for k in plan.unknowns.free if not _of_geometry(k)]
+    columns = {"now ±": plan.unknowns.std, "after ±": plan.std}
     return from_template(
-        "identification_plan",
-        plan=plan,
-        delay=number(1e3 * std[DELAY], 2),
+        "identification",
+        interval=number(1e3 * plan.std[DELAY], 2),
         file=MOTION,
         motion=partial(motion_figure, plan),
-        found=_unknowns(free, {"now ±": plan.unknowns.std, "after ±": std}, brief=True),
-        unseen=plan.unseen[0] > 0,
-        directions=plan.unseen,
+        found=_unknowns(free, columns, brief=True),
         poses=plan.pose_uncertainty,
-        pair=_pair,
+        reduced=plan.share < 1,
+        logs=(),
+        segments="",
+        **dict.fromkeys(("cautions", "outside", "fits", "residuals", "geometry")),
+        **_shared(plan, plan=plan),
     )
+
+
+def _shared(of: Identification | Plan, **more: Any) -> dict[str, Any]:
+    name, unseen = of.unknowns.mechanism.name, of.unseen
+    return {"mechanism": name, "unseen": unseen[0] > 0, "directions": unseen, "pair": _pair, **more}
 
 
 def _pair(values: tuple[float, float], unit: str) -> str:
@@ -103,7 +106,7 @@ def _pair(values: tuple[float, float], unit: str) -> str:
 
 
 def file_names(logs: Sequence[Log]) -> list[str]:
-    """Return the logs' files, with as many of their folders as tell them from each other."""
+    """Return the files of the logs, with as many folders as make them distinct."""
     paths = [Path(log.name).resolve().parts for log in logs]
     depth, different = 1, len(set(paths))
     while len({parts[-depth:] for parts in paths}) < different:
@@ -112,18 +115,15 @@ def file_names(logs: Sequence[Log]) -> list[str]:
 
 
 def _cautions(found: Identification) -> list[str]:
-    told = []
-    left_out = found.solution.left_out
-    if left_out:
-        stretches = "stretch" if left_out == 1 else "stretches"
-        told.append(
-            f"{left_out} {stretches} of the logs left out, where no trajectory could be followed"
-        )
+    cautions = []
+    if left_out := found.solution.left_out:
+        stretches = "1 stretch" if left_out == 1 else f"{left_out} stretches"
+        cautions.append(f"{stretches} of the logs left out: no trajectory fits there")
     beyond = np.abs(found.fit.residuals.prior) > 4
     if beyond.any():
         names = ", ".join(NAMES[k] for k in found.unknowns.free[beyond][:5])
-        told.append(f"more than four tolerances off: {names}; is the drawing right?")
-    return told
+        cautions.append(f"more than four tolerances off: {names}; is the drawing right?")
+    return cautions
 
 
 def _of_geometry(k: int) -> bool:
@@ -150,7 +150,7 @@ def _unknowns(free: Sequence[int], columns: dict[str, Array], brief: bool) -> Ta
 
 
 def residual_figure(found: Identification, log: int) -> Figure:
-    """Draw what the fit leaves of a log's measurements, by kind, in standard deviations."""
+    """Draw the residuals of a log by kind of measurement, in standard deviations."""
     times, residuals = residuals_of(found, log)
     panels = []
     for kind, part in KINDS.items():
@@ -182,7 +182,7 @@ def residuals_of(found: Identification, log: int) -> tuple[Array, Array]:
 
 
 def motion_figure(plan: Plan) -> Figure:
-    """Draw the motion that is proposed, degrees and mm from its middle."""
+    """Draw the planned motion, in degrees and mm from its middle."""
     moved = FACTORS * (plan.poses - np.median(plan.poses, axis=0))
     curves = [
         Curve(plan.times, moved[:, k], name, LEG_LINES[k % 3])

@@ -12,7 +12,6 @@ from stewart_drake.reporting.document import (
     Section,
     Table,
     Tone,
-    Values,
     from_template,
     number,
 )
@@ -25,16 +24,9 @@ _TONES: Final[dict[str, Tone]] = {"yes": "good", "partly": "fair"}
 
 
 def document(study: LayoutStudy) -> Document:
-    """Return what was found beside the machine that the search began from."""
+    """Return a comparison of the layouts found with the first machine."""
     machines = [study.before, *study.layouts]
     goal = study.problem.requirements.goal
-    near = {
-        one.name: f"{one.nearest.pair}, {number(1e3 * one.nearest.distance)} mm at "
-        f"t = {one.nearest.time:.2f} s" + (", they cross" if one.nearest.distance < 0 else "")
-        for one in machines
-        if one.nearest is not None
-    }
-    missed = {one.name: _missed(one.missed) for one in machines if one.missed}
     found = from_template(
         "layout",
         _TONES.get(study.verdict.split(":")[0], "bad"),
@@ -43,12 +35,12 @@ def document(study: LayoutStudy) -> Document:
         goal=MEASURES[goal].text,
         goal_name=goal,
         compared=_compared(study, machines),
-        near=Values(near) if near else None,
-        missed=Values(missed, brief=False) if missed else None,
+        near=[one for one in machines if one.nearest is not None],
+        missed=[one for one in machines if one.missed],
         numbers=_numbers(study, machines),
         searches=study.searches.items(),
         reached=lambda one: MEASURES[goal].factor * one.measures.get(goal, np.nan),
-        told=_missed,
+        shares=_shares,
     )
     for one in machines:
         figure = partial(mechanism_figure, one.mechanism)
@@ -57,14 +49,14 @@ def document(study: LayoutStudy) -> Document:
     return found
 
 
-def _beside(
+def _by_machine(
     names: Sequence[str],
     head: str,
     rows: Sequence[tuple[str, str, Callable[[Layout], str]]],
     machines: Sequence[Layout],
     brief: bool = False,
 ) -> Table:
-    """Return a table with a column per machine; a row is a name, a text, and its cells."""
+    """Return a table with a column per machine; a row has a name, a text, and a function."""
     cells = [(name, text, *map(cell, machines)) for name, text, cell in rows]
     return Table(("", head, *names), cells, brief=brief)
 
@@ -85,7 +77,7 @@ def _compared(study: LayoutStudy, machines: list[Layout]) -> Table:
         ("E_ac [% s]", "", lambda one: number(one.outcome.error)),
         ("largest torque [N\u00a0m]", "", lambda one: number(one.outcome.peak_torque)),
     ]
-    return _beside([one.name for one in machines], "limit", rows, machines, brief=True)
+    return _by_machine([one.name for one in machines], "limit", rows, machines, brief=True)
 
 
 def _run(one: Layout) -> str:
@@ -95,7 +87,7 @@ def _run(one: Layout) -> str:
     return f"left at {outcome.time:.2f} s" if status == "left_workspace" else status
 
 
-def _missed(shares: dict[str, float]) -> str:
+def _shares(shares: dict[str, float]) -> str:
     return ", ".join(f"{name} by {100 * share:.2g} %" for name, share in shares.items())
 
 
@@ -111,4 +103,4 @@ def _numbers(study: LayoutStudy, machines: list[Layout]) -> Table:
         rows.append((name, between if low < high else "kept", partial(value, k)))
     signs = ("branches", "", lambda one: "".join("-+"[int(b > 0)] for b in one.mechanism.branches))
     order = ("plate_order", "", lambda one: "".join(map(str, one.order)))
-    return _beside([one.name for one in machines], "between", [*rows, signs, order], machines)
+    return _by_machine([one.name for one in machines], "between", [*rows, signs, order], machines)

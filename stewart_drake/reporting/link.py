@@ -14,7 +14,7 @@ from stewart_drake.studies.link import Cell, LinkStudy
 from stewart_drake.studies.statistics import CONFIDENCE
 
 _ASSURED: Final = 0.9
-"""Share of runs for which the verdict says how many have to be simulated."""
+"""Share of runs for which the verdict states the number of simulations."""
 
 
 def _mean(cell: Cell) -> float:

@@ -46,22 +46,22 @@ TITLES: Final = {
     "loss": "lost on the way",
 }
 SIGNIFICANT: Final = 0.05
-"""Adjusted p-value below which an influence counts as found."""
+"""Adjusted p-value of a significant influence."""
 _GOOD, _FAIR = 0.99, 0.9
-"""Lower end of the success rate for these tones."""
+"""Smallest lower bound of the success rate for these tones."""
 _WORST: Final = 10
 """Runs listed one by one."""
 _NAMED: Final = 3
-"""Quantities, and pairs, that a sentence names."""
+"""Number of quantities, or pairs, in a sentence."""
 _ABREAST: Final = 4
-"""Panels in a row."""
+"""Panels per row."""
 _SOFT: Final = "#666666"
-# Of many points, which are a bitmap that a dark page cannot change: readable on both.
+# Colours of points in a bitmap, readable on light and dark pages.
 _SUCCESS, _ABOVE, _FAILED = "#2F86C6", "#E69F00", "#C4502A"
 
 
 def document(study: RobustnessStudy) -> Document:
-    """Return success rate, quantiles, what matters, failures, and the worst runs."""
+    """Return success rate, quantiles, influences, failures, and the worst runs."""
     influences, found, low = study.influences(), study.explanation, study.success.low
     failed = bool(study.failed.any())
     early = any(one.status != "completed" for one in study.outcomes)
@@ -86,7 +86,7 @@ def document(study: RobustnessStudy) -> Document:
         kept=lambda one: int(np.sum(~one.failed)),
         strong=[title(one.factor) for one in found.found],
         for_error=list(dict.fromkeys(title(one.factor.strip("|")) for one in errors)),
-        beside=study.also and list({"as asked": study, **study.others}.items()),
+        others=study.also and list({"as asked": study, **study.others}.items()),
         quantiles=[(q, study.quantile(q)) for q in QUANTILES],
         distribution_figure=partial(distribution_figure, study),
         influences=influences,
@@ -122,7 +122,7 @@ def _failed(error: float) -> str:
 
 
 def _reason(study: RobustnessStudy, reason: str, runs: int) -> dict[str, Any]:
-    """Return how often, when and at which legs runs failed for a reason."""
+    """Return number, time and legs of the failures for a reason."""
     own = [one for one in study.outcomes if study.reason_of(one) == reason]
     times = [one.time for one in own if math.isfinite(one.time)]
     legs = sorted(one.leg for one in own if one.leg is not None)
@@ -146,10 +146,10 @@ def _where(one: Pair) -> str:
 
 
 def _spans(study: RobustnessStudy) -> dict[str, str]:
-    """Return the drawn values of each factor, from least to most; nothing for sizes."""
-    values, told = factor_values(study.draws), factors(study.draws)
+    """Return the range of the drawn values of each factor; empty for sizes."""
+    values, units = factor_values(study.draws), factors(study.draws)
     return {
-        name: f"{_span(float(x.min()), float(x.max()))} {told[name]}" if name in told else ""
+        name: f"{_span(float(x.min()), float(x.max()))} {units[name]}" if name in units else ""
         for name, x in values.items()
     }
 
@@ -164,7 +164,7 @@ def _span(low: float, high: float) -> str:
 
 
 def _worst_table(study: RobustnessStudy) -> Table:
-    values, told = factor_values(study.draws), factors(study.draws)
+    values, units = factor_values(study.draws), factors(study.draws)
     order = np.argsort(np.where(np.isnan(study.errors), np.inf, study.errors), kind="stable")[::-1]
 
     def outcome(i: int) -> str:
@@ -174,13 +174,13 @@ def _worst_table(study: RobustnessStudy) -> Table:
     def drawn(name: str, i: int) -> str:
         return f"{values[name][i]:.3g}"
 
-    heads = ("run", "E_ac, % s", *(f"{TITLES[name]}, {unit}" for name, unit in told.items()))
+    heads = ("run", "E_ac, % s", *(f"{TITLES[name]}, {unit}" for name, unit in units.items()))
     shown = order[:_WORST].tolist()
-    return Table(heads, [(str(i), outcome(i), *(drawn(name, i) for name in told)) for i in shown])
+    return Table(heads, [(str(i), outcome(i), *(drawn(name, i) for name in units)) for i in shown])
 
 
 def distribution_figure(study: RobustnessStudy) -> Figure:
-    """Draw the share of all runs with E_ac at most so large, with its interval."""
+    """Draw the share of all runs below each E_ac, with its interval."""
     errors, total = np.sort(study.errors[np.isfinite(study.errors)]), len(study.outcomes)
     counts = np.arange(1, len(errors) + 1)
     bounds = [wilson_interval(int(n), total) for n in counts]
@@ -190,7 +190,7 @@ def distribution_figure(study: RobustnessStudy) -> Figure:
         if len(errors) < total:
             share = 100 * len(errors) / total
             text = f"{total - len(errors)} of {total} runs did not complete"
-            limit(ax, share, text, below=share > 50)  # where there is room for the words
+            limit(ax, share, text, below=share > 50)
         if np.isfinite(study.undisturbed.error):
             ax.axvline(study.undisturbed.error, label="undisturbed run", **TRUTH._asdict())
         if study.limit is not None:
@@ -214,7 +214,7 @@ def distribution_figure(study: RobustnessStudy) -> Figure:
 
 
 def influence_figure(influences: Sequence[Influence]) -> Figure:
-    """Draw rank correlations with their intervals; hollow where chance explains them."""
+    """Draw rank correlations with their intervals, hollow if not significant."""
     shown = {
         "rank correlation with E_ac, completed runs": [(i.error, i.error_p) for i in influences]
     }
@@ -251,11 +251,11 @@ def _dots(ax: Axes, found: Sequence[tuple[Correlation, float]], names: Sequence[
 
 
 def runs_figure(study: RobustnessStudy) -> Figure:
-    """Draw E_ac of every run over every drawn quantity, failures in a strip of their own on top."""
-    told, done = factors(study.draws), np.isfinite(study.errors)
+    """Draw E_ac of every run over every drawn quantity, with failures in a strip on top."""
+    units, done = factors(study.draws), np.isfinite(study.errors)
     low, high = _log_range(study.errors[done])
     strip, top = high * (high / low) ** 0.06, high * (high / low) ** 0.18
-    # Spread over the strip by the number of the run, so that marks do not hide each other.
+    # Marks are spread over the strip by the number of the run.
     spread = (np.arange(len(done)) * 0.618034) % 1 * 0.8 + 0.1
     y = np.where(done, study.errors, strip * (top / strip) ** spread)
     groups = {
@@ -271,7 +271,7 @@ def runs_figure(study: RobustnessStudy) -> Figure:
                 look: Any = {"s": 11, "marker": marker, "color": color, "alpha": 0.75, **edge}
                 ax.scatter(x[some], y[some], label=label, rasterized=True, **look)
         ax.axhspan(strip, top, color="#F1EAE6", zorder=0)
-        ax.xaxis.set_major_locator(MaxNLocator(3))  # room between neighbours' labels
+        ax.xaxis.set_major_locator(MaxNLocator(3))
         if not np.isfinite(x).all():
             ax.text(0.5, 0.5, "none", transform=ax.transAxes, ha="center", color=_SOFT)
 
@@ -285,7 +285,7 @@ def runs_figure(study: RobustnessStudy) -> Figure:
             height=1.9,
             paint=partial(paint, x=values[name]),
         )
-        for name, unit in told.items()
+        for name, unit in units.items()
     ]
     return draw(panels, _ABREAST, sharey=True)
 
