@@ -586,7 +586,9 @@ def test_one_cause_of_failing_is_found_and_counted():
     told = told_of(study)
     assert "Significant for completing: torque bias, rms." in told
     assert "Significant for E_ac of completed runs: noise of the sensor." in told
-    counts = f"of which {cause.failing} of the {found.failing} have the outer third"
+    counts = (
+        f"for {cause.failing} of the {found.failing} against {cause.others} of the {found.others}"
+    )
     assert counts in told
     page = html(document(study), Provenance("command"))
     assert counts in " ".join(page.split())

@@ -134,7 +134,7 @@ def _remove_empty(directories: list[Path]) -> None:
 
 @contextlib.contextmanager
 def stopping(text: str) -> Iterator[None]:
-    """On Ctrl-C print `text` and end the command."""
+    """Print `text` and end the command on Ctrl-C."""
     try:
         yield
     except KeyboardInterrupt:

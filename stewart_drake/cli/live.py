@@ -89,7 +89,7 @@ def live(
         ready = prepare_session(loaded, address_of(where), read_key(options.key))
         delivery.say_wrapped(*plans(ready, span, name))
         check_armed(ready, options.armed)
-        # The demo's machine is simulated, so nobody is asked.
+        # The demo's machine is simulated and needs no consent.
         problem = None if options.accept_jitter or demo else ready.jitter_problem
         check_jitter(ready, problem is None or _agreed(problem))
         if viewer is not None:

@@ -155,7 +155,7 @@ def _ask(question: str) -> float:
 
 
 def _name_of(folder: Path) -> str:
-    """Return the name of a machine from its folder, or `machine` if that is no valid name."""
+    """Return the name of a machine from its folder, or `machine` if its name is not valid."""
     from stewart_drake.mechanism.geometry import RESERVED_NAMES
 
     name = re.sub("[^A-Za-z0-9_-]", "_", folder.resolve().name)

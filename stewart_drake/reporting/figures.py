@@ -229,7 +229,7 @@ def _delay(run: SimulationResult) -> Figure:
     """Draw the delay with its band, and how far that is from the truth."""
     signals, panels = run.signals, []
     time, true, width = signals.time.values, signals.delay_true.values, 2 * signals.delay_std.values
-    # The band at the end, and an error that is some times as large, can be told apart.
+    # Both the final band and an error several times as large are visible on this axis.
     last = 1e4 * float(np.nanmin(width))
     for name, origin, factor, ylim in (
         ("delay  [s]", 0.0, 1.0, None),

@@ -98,7 +98,7 @@ class ReportData:
 
     Attributes:
         scenario: as asked for.
-        failure: where the reference leaves the workspace; then there are no runs.
+        failure: where the reference leaves the workspace; None with runs.
         run: of the scenario; None with a `failure`.
         comparison: runs of the shipped controllers, by name.
         tuned: runs of the delay-aware controllers with the tuner's weights; none without a network.
