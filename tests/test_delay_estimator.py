@@ -203,7 +203,7 @@ class Guess(NamedTuple):
 def guesses_of(belief):
     """Hypotheses: that nothing has arrived, then the cells; or the only one."""
     c, n, found = core(), 22, []
-    memory = c.ffi.cast("stewart_delay_memory *", c.at(belief.memory))
+    memory = c.ffi.cast("stewart_delay_memory *", c.at(belief.memory[12:]))
     flights = OBSERVER.kept(DT) + 1
     for place in range(1 + int(memory.cells)):
         g, root = c.lib.stewart_delay_guess(8, 12, flights, memory, place), np.zeros((n, n))

@@ -26,7 +26,7 @@ PLANT = NominalPlant(DYNAMICS, 20, 1.0, TorqueLimit())
 SETTINGS = replace(
     filter_settings(AMPLITUDES, 4.0, 0.02, None, DT), model_std=np.full(12, 1e-7), timing_std=1e-6
 )
-LONGEST = 10  # gap in periods, as in core/gap_observer.c
+LONGEST = 10  # gap in periods, as in core/filter_observers.c
 NOISE = 1e-3 * np.tile(AMPLITUDES, 2)
 SENSING = StateSensing(NOISE, AMPLITUDES)
 HOME = np.concatenate([PAPER.home, np.zeros(6)])

@@ -1,9 +1,9 @@
-/* See delay_observer.h. The memory has the belief about the delay, the last measurement (of one sample),
-   and the state, which is set from outside before the first measurement. */
+/* See delay_observer.h. The memory has the state, the belief about the delay, and the last measurement
+   (of one sample). */
 
 #include <stdint.h>
 
-#include "delay_observing.h"
+#include "delay_observer.h"
 #include "short.h"
 
 typedef struct {
@@ -41,7 +41,7 @@ int stewart_delayed_scratch(const stewart_law *law)
 /* Arrivals as estimated at the last sample. */
 static stewart_arrivals arrivals_of(const stewart_law *law, const real *memory)
 {
-    const stewart_delay_memory *m = (const stewart_delay_memory *)memory;
+    const stewart_delay_memory *m = (const stewart_delay_memory *)(memory + X);
     Sizes s;
     sizes_of(law, &s);
     return (stewart_arrivals){law->period, m->eta, m->rate, (int)m->sent,
@@ -53,13 +53,13 @@ void stewart_delayed_start(const stewart_law *law, real *memory)
     Sizes s;
     sizes_of(law, &s);
     stewart_fill(s.numbers + s.m + X, (real)NAN, memory);
-    stewart_delay_start(&s.delay, s.flights, (stewart_delay_memory *)memory);
+    stewart_delay_start(&s.delay, s.flights, (stewart_delay_memory *)(memory + X));
 }
 
 /* Mean of the most probable hypothesis, followed by the root; NULL before the first measurement. */
 static const real *best_of(const Sizes *s, const real *memory)
 {
-    stewart_delay_memory *m = (stewart_delay_memory *)(uintptr_t)memory;
+    stewart_delay_memory *m = (stewart_delay_memory *)(uintptr_t)(memory + X);
     if (!(m->known > 0))
         return NULL;
     return stewart_delay_guess(s->p, s->m, s->flights, m, (int)m->best)->numbers;
@@ -70,8 +70,8 @@ int stewart_delayed_observe(const stewart_law *law, real *memory, int number, co
 {
     Sizes s;
     sizes_of(law, &s);
-    real *last = memory + s.numbers, *state = last + s.m;
-    stewart_delay_memory *believed = (stewart_delay_memory *)memory;
+    real *state = memory, *last = memory + X + s.numbers;
+    stewart_delay_memory *believed = (stewart_delay_memory *)(memory + X);
     values += law->measured - s.m;
     int fault = s.sensing.fault(&s.sensing, law->machine.geometry, law->period, values, last);
     if (!fault && !stewart_all_finite(s.m, values))
@@ -99,16 +99,14 @@ void stewart_delayed_parameters(const stewart_law *law, const real *memory, real
             std[i - X] = stewart_norm(i + 1, row);
 }
 
-void stewart_delayed_tell(const stewart_law *law, const real *memory, int number,
-                          const real *torques, stewart_outlook *outlook, stewart_scratch *scratch)
+void stewart_delayed_outlook(const stewart_law *law, const real *memory, int number,
+                             const real *torques, stewart_outlook *outlook, stewart_scratch *scratch)
 {
-    const stewart_delay_memory *m = (const stewart_delay_memory *)memory;
+    const stewart_delay_memory *m = (const stewart_delay_memory *)(memory + X);
     const stewart_arrivals arrivals = arrivals_of(law, memory);
     const int most = ((const stewart_delay_settings *)law->estimation)->most;
     real *each = stewart_take(scratch, U * most), *durations = stewart_take(scratch, most);
-    real *times = stewart_take(scratch, most), std[STEWART_MAX_ESTIMATED];
-    stewart_copy(X, memory + stewart_delayed_memory(law) - X, outlook->state);
-    stewart_delayed_parameters(law, memory, outlook->theta, std);
+    real *times = stewart_take(scratch, most);
     outlook->feeds_back = m->feeds_back > 0;
     outlook->settled = m->settled > 0;
     outlook->found = m->found > 0;
@@ -144,14 +142,8 @@ void stewart_delayed_last_period(const stewart_law *law, const real *memory, int
     }
 }
 
-void stewart_delayed_assume(const stewart_law *law, real *memory, const real *state)
-{
-    stewart_copy(X, state, memory + stewart_delayed_memory(law) - X);
-}
-
 const stewart_observer stewart_delay_observer = {
-    stewart_delayed_memory,  stewart_delayed_scratch,    stewart_delayed_start,
-    stewart_delayed_observe, stewart_delayed_tell,       stewart_delayed_assume,
-    stewart_delayed_start,   stewart_delayed_parameters, stewart_delayed_last_period,
-    0,                       stewart_state_sensing,
+    stewart_delayed_memory,  stewart_delayed_scratch, stewart_delayed_start,
+    stewart_delayed_observe, stewart_delayed_start,   stewart_delayed_parameters,
+    stewart_state_sensing, stewart_delayed_outlook, stewart_delayed_last_period,
 };

@@ -1,7 +1,8 @@
-/* See encoder_filter.h. */
+/* The filter for encoders: legs at several instants of a period, see filter_attempt.h. */
 
-#include "encoder_filter.h"
+#include "encoders.h"
 #include "filter_attempt.h"
+#include "filter_observers.h"
 #include "short.h"
 
 #define MAX_ROWS 18 /* six legs at three nodes */
@@ -267,3 +268,16 @@ static void count_still(const stewart_sensing *sensing, const real *values, cons
 
 const stewart_legs stewart_encoder_legs = {attempt, attempt_scratch, moved, start_scratch,
                                            count_still};
+
+static stewart_sensing sensing_with_legs(const void *sensor)
+{
+    stewart_sensing sensing = stewart_encoder_sensing(sensor);
+    sensing.legs = &stewart_encoder_legs;
+    return sensing;
+}
+
+const stewart_observer stewart_encoder_observer = {
+    stewart_filtered_memory,  stewart_filtered_scratch, stewart_filtered_start,
+    stewart_filtered_observe, stewart_filtered_restart, stewart_filtered_parameters,
+    sensing_with_legs,        NULL,                     NULL,
+};

@@ -157,9 +157,13 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
     outlook->feeds_back = outlook->settled = 1;
     outlook->found = 0;
     outlook->caution = 1;
-    if (observer->fixed)
+    if (observer->outlook)
+        observer->outlook(law, observed, length, in_flight, outlook, scratch);
+    else
         fixed_delay_outlook(law, in_flight, outlook, scratch);
-    observer->tell(law, observed, length, in_flight, outlook, scratch);
+    real std[STEWART_MAX_ESTIMATED];
+    stewart_copy(X, observed, outlook->state);
+    observer->parameters(law, observed, outlook->theta, std);
     if (behind > 0 && stewart_all_finite(X, outlook->state)) {
         stewart_schedule schedule;
         stewart_last_periods(law, length, in_flight, behind, &schedule, NULL, scratch);
@@ -372,7 +376,7 @@ int stewart_step_scratch(const stewart_law *law)
     const int holding = 3 * rows + law->rows + (used > channelled ? used : channelled);
     const int observing = law->observer->scratch(law);
     /* An estimated delay has its own instants and torques, of the preview and of the last period. */
-    const int outlook = law->observer->fixed ? telling : (U + 2) * law->rows + 2 * (U + 1) * 8;
+    const int outlook = law->observer->outlook ? (U + 2) * law->rows + 2 * (U + 1) * 8 : telling;
     return law->measured + outlook + behind + (holding > observing ? holding : observing);
 }
 
@@ -403,7 +407,7 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
     if (!stewart_all_finite(X, outlook.state)) { /* nothing else to go on with */
         stewart_copy(X, c.followed, outlook.state);
         if (law->longest_wait == 0)
-            law->observer->assume(law, memory + l->observer.at, outlook.state);
+            stewart_copy(X, outlook.state, memory + l->observer.at);
     }
     status |= respond(law, memory, &outlook, &c, waiting, sample->weights, &ahead, torque, scratch);
     if (!stewart_all_finite(U, torque)) {

@@ -14,7 +14,7 @@ from stewart_drake.files.errors import ConfigError
 
 PRIVATE: Final = (
     *("real.h", "equations.h", "dop853.h", "dop853_table.h"),
-    *("filter_attempt.h", "observing.h", "delay_observing.h", "short.h"),
+    *("filter_attempt.h", "short.h"),
 )
 """Headers that Python does not use."""
 

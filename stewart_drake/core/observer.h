@@ -39,7 +39,7 @@ typedef struct {
     int limited;            /* whether a torque since the last sample was at the limit */
 } stewart_outlook;
 
-/* A kind of observer. Its memory is a vector of numbers within the law's. */
+/* A kind of observer. Its memory, a part of the law's, begins with the state (12), which may be set. */
 typedef struct {
     int (*memory)(const stewart_law *law);  /* numbers of memory */
     int (*scratch)(const stewart_law *law); /* numbers of scratch memory for `observe` */
@@ -48,21 +48,18 @@ typedef struct {
        `torques` (number, 6) in flight, the oldest first. Returns bits of `stewart_status`. */
     int (*observe)(const stewart_law *law, real *memory, int number, const real *torques,
                    const real *measurement, stewart_scratch scratch);
-    /* Fill in `state` and `theta`, and for an estimated delay all that follows from it, with torques
-       (number, 6) in flight now. */
-    void (*tell)(const stewart_law *law, const real *memory, int number, const real *torques,
-                 stewart_outlook *outlook, stewart_scratch *scratch);
-    /* Set the state (12), for want of an estimate. */
-    void (*assume)(const stewart_law *law, real *memory, const real *state);
     /* Begin again, with the estimated parameters and the last measurement. */
     void (*restart)(const stewart_law *law, real *memory);
     /* Parameters (p) and their standard deviations (p), NaN where nothing is estimated. */
     void (*parameters)(const stewart_law *law, const real *memory, real *theta, real *std);
-    /* Torques since the last sample of torques (number, 6) in flight, and the next torque. */
+    stewart_sensing (*sensing)(const void *sensor); /* model of the law's sensor */
+    /* NULL if the delay is the assumed one. Fill in all that follows from the estimated delay, with
+       torques (number, 6) in flight now. */
+    void (*outlook)(const stewart_law *law, const real *memory, int number, const real *torques,
+                    stewart_outlook *outlook, stewart_scratch *scratch);
+    /* The same: torques since the last sample, and the next torque. */
     void (*last_period)(const stewart_law *law, const real *memory, int number, const real *torques,
                         stewart_schedule *schedule, const real **following, stewart_scratch *scratch);
-    int fixed; /* whether the delay is the assumed one; the law then fills in what follows from it */
-    stewart_sensing (*sensing)(const void *sensor); /* model of the law's sensor */
 } stewart_observer;
 
 /* The sensor of the law: `described`, else `sensing` as its observer reads it. */

@@ -1,22 +1,22 @@
-/* Observers of a plate whose delay is known. What they assume is `sensing` and `estimation` of the law:
-   `stewart_state_sensor` or `stewart_encoders`, and `stewart_filter_settings`. */
+/* Observers without a filter, of a plate with a known delay. Their memory is a state and the last
+   measurement. */
 
 #pragma once
 
-#include "filter.h"
 #include "law.h"
 
-/* `filter` without machine, sensing and legs, which are the law's. */
-typedef struct {
-    stewart_filter filter;
-    const real *prior; /* (p) of the parameters */
-} stewart_filter_settings;
+extern const stewart_observer stewart_state_observer;       /* of the measured state */
+extern const stewart_observer stewart_differences_observer; /* of encoders */
 
-/* Of the measured state. */
-extern const stewart_observer stewart_state_observer; /* without a filter */
-extern const stewart_observer stewart_filter_observer;
-extern const stewart_observer stewart_gap_observer; /* a filter for measurements that get lost */
+/* Predict the state (12) a period later with the known parameters; and scratch memory for it. */
+void stewart_move_on(const stewart_law *law, int number, const real *torques, real *state,
+                     stewart_scratch scratch);
+int stewart_moving_scratch(const stewart_law *law);
 
-/* Of encoders. */
-extern const stewart_observer stewart_differences_observer; /* without a filter */
-extern const stewart_observer stewart_encoder_observer;
+/* Keep the finite values. */
+void stewart_keep_last(int number, const real *values, real *last);
+
+int stewart_plain_memory(const stewart_law *law);
+void stewart_plain_start(const stewart_law *law, real *memory);
+void stewart_plain_restart(const stewart_law *law, real *memory);
+void stewart_plain_parameters(const stewart_law *law, const real *memory, real *theta, real *std);

@@ -43,10 +43,9 @@ static void take_estimate(const stewart_servo *servo, real *memory)
 {
     const stewart_law *law = &servo->law;
     const stewart_servo_layout *l = &servo->layout;
-    stewart_outlook outlook;
-    law->observer->tell(law, memory + l->observer.at, 0, NULL, &outlook, NULL);
-    stewart_copy(X, outlook.state, memory + l->state.at);
-    stewart_copy(law->machine.estimated, outlook.theta, memory + l->parameters.at);
+    real std[STEWART_MAX_ESTIMATED];
+    stewart_copy(X, memory + l->observer.at, memory + l->state.at);
+    law->observer->parameters(law, memory + l->observer.at, memory + l->parameters.at, std);
 }
 
 void stewart_servo_start(const stewart_servo *servo, real *memory, const real *command)

@@ -399,8 +399,13 @@ int stewart_tuned_step(const stewart_law *law, const stewart_tuner *t, real *mem
         .feedforward = {memory + l->feedforward.at, before + l->feedforward.at},
         .std = std,
     };
-    law->observer->last_period(law, before + l->observer.at, l->in_flight.rows,
-                               before + l->in_flight.at, &input.schedule, &input.following, &scratch);
+    if (law->observer->last_period)
+        law->observer->last_period(law, before + l->observer.at, l->in_flight.rows,
+                                   before + l->in_flight.at, &input.schedule, &input.following,
+                                   &scratch);
+    else
+        stewart_last_periods(law, l->in_flight.rows, before + l->in_flight.at, 1, &input.schedule,
+                             &input.following, &scratch);
     law->observer->parameters(law, memory + l->observer.at, theta, std);
     stewart_tuner_observe(t, tuner_memory, &input, wanted, sample->weights, fell_back, scratch);
     return status;

@@ -6,7 +6,7 @@ sensor and by what is to be estimated:
 | settings | delay | sensor of the state | encoders |
 | --- | --- | --- | --- |
 | None | None | the measurement as it comes | forward kinematics and differences |
-| given | None | filter of filter.h; with `gaps` that of gap_observer.c | encoder_filter.c |
+| given | None | filter of filter.h; with `gaps` one over gaps | encoder_filter.c |
 | given | given | delay.h and delay_search.c | the same, of the last sample of a period |
 """
 
@@ -163,7 +163,7 @@ class CoreObserver:
         else:
             if len(in_flight) != 1 + law.it.kept:
                 raise ValueError(f"in_flight: got {len(in_flight)}; expected {1 + law.it.kept}")
-            observer.assume(law.it, c.at(memory), c.at(numbers(belief.state)))
+            memory[:NUM_STATE] = belief.state
         values, torques = measurement.known(sensing.size), numbers(in_flight)
         given = c.at(memory), len(torques), c.at(torques), c.at(values)
         status = observer.observe(law.it, *given, c.scratch(observer.scratch(law.it)))
@@ -204,14 +204,17 @@ class Part(NamedTuple):
             law.estimation = self.estimation.it
 
 
-_STATE: Final = ("instant", "kalman", "sensing")
-_ENCODERS: Final = ("encoders", "kinematics")
-_KNOWN: Final = ("observers", "observing.h", "filter", "filter_attempt.h", *_STATE)
-_UNKNOWN: Final = (
-    *("delay_observer", "delay_observing.h", "delay", "delay_search.c", "arrivals"),
-    *_STATE,
-)
-"""Sources for a known and for an unknown delay."""
+_KALMAN: Final = ("sensing", "instant", "kalman")
+_SOURCES: Final[dict[str, tuple[str, ...]]] = {
+    "state": ("observers", "sensing"),
+    "differences": ("observers", "sensing", "encoders", "differences_observer.c"),
+    "filter": ("observers", "filter_observers", "filter", "filter_attempt.h", *_KALMAN),
+    "delay": ("delay_observer", "delay", "delay_search.c", "arrivals", *_KALMAN),
+}
+_SOURCES["gap"] = _SOURCES["filter"]
+_SOURCES["encoder"] = (*_SOURCES["filter"], "encoders", "encoder_filter.c")
+_SOURCES["encoder_delay"] = (*_SOURCES["delay"], "encoders", "encoder_delay_observer.c")
+"""Files of the core for each kind of observer."""
 
 
 def part_of(observer: CoreObserver, sensing: Sensing, plant: NominalPlant, period: float) -> Part:
@@ -221,24 +224,18 @@ def part_of(observer: CoreObserver, sensing: Sensing, plant: NominalPlant, perio
         sensor, own = encoders_of(sensing), False
     else:
         sensor = described(sensing, plant.mechanism) if own else state_sensor(sensing)
-    sources: tuple[str, ...] = (*_KNOWN, *_ENCODERS) if within else _KNOWN
     kind, estimation, settings = "differences" if within else "state", None, observer.settings
     if settings is not None and settings.parameters.names != tuple(plant.dynamics.free):
         free = ", ".join(plant.dynamics.free)
         raise ValueError(f"settings.parameters: got other names than those of the plant: {free}")
     if settings is not None and observer.delay is not None:
         kind = "encoder_delay" if within else "delay"
-        sources = (*_UNKNOWN, *_ENCODERS, "encoder_delay_observer.c") if within else _UNKNOWN
         size = NUM_LEGS if within else sensing.size
         estimation = _delay_settings_of(observer, settings, size, period)
     elif settings is not None:
         kind = "encoder" if within else "gap" if observer.gaps else "filter"
         estimation = filter_settings_of(settings, sensing.size)
-        if kind == "gap":
-            sources += ("gap_observer.c",)
-    if within and observer.delay is None:
-        sources += ("encoder_observers.c", "encoder_filter")
-    return Part(f"stewart_{kind}_observer", sensor, own, estimation, sources)
+    return Part(f"stewart_{kind}_observer", sensor, own, estimation, _SOURCES[kind])
 
 
 @Once
@@ -348,9 +345,9 @@ def belief_of(
 def _delay_belief(law: Any, memory: Array, timeline: Timeline, faults: tuple[str, ...]) -> Belief:
     c, p, flights = core(), law.machine.estimated, 1 + law.kept
     settings = c.ffi.cast("stewart_delay_settings *", law.estimation)
-    m, n, first = settings.values, NUM_STATE + p + 2, c.lib.STEWART_DELAY_NUMBERS
-    it = c.ffi.cast("stewart_delay_memory *", c.at(memory))
-    last, state = memory[-NUM_STATE - m : -NUM_STATE], memory[-NUM_STATE:]
+    m, n, first = settings.values, NUM_STATE + p + 2, NUM_STATE + c.lib.STEWART_DELAY_NUMBERS
+    it = c.ffi.cast("stewart_delay_memory *", c.at(memory[NUM_STATE:]))
+    state, last = memory[:NUM_STATE], memory[-m:]
     belief = Belief.nothing(timeline, m, np.array(c.ffi.unpack(settings.delay.prior, p)))
     if it.known:
         best, L = c.lib.stewart_delay_guess(p, m, flights, it, int(it.best)), np.zeros((n, n))

@@ -1,12 +1,11 @@
-/* Observers of encoders with a known delay, with a filter and without: see observers.h. */
+/* The observer of encoders without a filter: q_k by forward kinematics, v_k = (q_k - q_{k-1}) / dt. The
+   rates are those of half a period ago, and quantisation is divided by the period. The model predicts
+   if a leg is silent, or if no pose has the angles. */
 
-#include "encoder_filter.h"
-#include "observing.h"
+#include "encoders.h"
+#include "observers.h"
 #include "short.h"
 
-/* Differences of encoders: q_k by forward kinematics, v_k = (q_k - q_{k-1}) / dt. The rates are those of
-   half a period ago, and quantisation is divided by the period. The model predicts where a leg is
-   silent, or where no pose has the angles. */
 static int differences_observe(const stewart_law *law, real *memory, int number,
                                const real *torques, const real *values, stewart_scratch scratch)
 {
@@ -32,22 +31,6 @@ static int differences_scratch(const stewart_law *law)
 }
 
 const stewart_observer stewart_differences_observer = {
-    stewart_plain_memory,  differences_scratch,      stewart_plain_start,
-    differences_observe,   stewart_plain_tell,       stewart_plain_assume,
-    stewart_plain_restart, stewart_plain_parameters, stewart_known_last_period,
-    1,                     stewart_encoder_sensing,
-};
-
-static stewart_sensing sensing_with_legs(const void *sensor)
-{
-    stewart_sensing sensing = stewart_encoder_sensing(sensor);
-    sensing.legs = &stewart_encoder_legs;
-    return sensing;
-}
-
-const stewart_observer stewart_encoder_observer = {
-    stewart_filtered_memory,  stewart_filtered_scratch,    stewart_filtered_start,
-    stewart_filtered_observe, stewart_filtered_tell,       stewart_plain_assume,
-    stewart_filtered_restart, stewart_filtered_parameters, stewart_known_last_period,
-    1,                        sensing_with_legs,
+    stewart_plain_memory,  differences_scratch,      stewart_plain_start,     differences_observe,
+    stewart_plain_restart, stewart_plain_parameters, stewart_encoder_sensing, NULL, NULL,
 };

@@ -1,0 +1,213 @@
+/* See filter_observers.h. */
+
+#include "filter_attempt.h"
+#include "filter_observers.h"
+#include "short.h"
+
+static int estimated(const stewart_law *law) { return law->machine.estimated; }
+
+static int estimate_numbers(const stewart_law *law)
+{
+    return stewart_posterior_size(X + estimated(law), law->measured);
+}
+
+int stewart_filtered_memory(const stewart_law *law)
+{
+    return estimate_numbers(law) + law->measured + LEGS;
+}
+
+void stewart_filtered_restart(const stewart_law *law, real *memory)
+{
+    const int n = X + estimated(law);
+    const stewart_posterior e = stewart_posterior_at(memory, n, law->measured);
+    stewart_fill(X, (real)NAN, e.mean);
+    stewart_fill(n * n, (real)NAN, e.root);
+    stewart_fill(law->measured, (real)NAN, e.outlier);
+    *e.outliers = *e.unseen = *e.left_out = 0;
+    stewart_fill(LEGS, 0, memory + stewart_filtered_memory(law) - LEGS);
+}
+
+void stewart_filtered_start(const stewart_law *law, real *memory)
+{
+    const stewart_filter_settings *settings = law->estimation;
+    stewart_fill(stewart_filtered_memory(law), (real)NAN, memory);
+    stewart_filtered_restart(law, memory);
+    stewart_copy(estimated(law), settings->prior, memory + X);
+}
+
+void stewart_filtered_parameters(const stewart_law *law, const real *memory, real *theta, real *std)
+{
+    const int n = X + estimated(law);
+    stewart_copy(estimated(law), memory + X, theta);
+    for (int i = X; i < n; i++)
+        std[i - X] = stewart_norm(n, memory + n + n * i);
+}
+
+static stewart_filter filter_of(const stewart_law *law, const stewart_sensing *sensing)
+{
+    stewart_filter filter = ((const stewart_filter_settings *)law->estimation)->filter;
+    filter.machine = &law->machine;
+    filter.sensing = sensing;
+    filter.legs = sensing->legs;
+    return filter;
+}
+
+static stewart_interval last_interval(const stewart_law *law, int number, const real *torques,
+                                       stewart_scratch *scratch)
+{
+    stewart_interval period;
+    stewart_last_periods(law, number, torques, 1, &period.schedule, &period.following, scratch);
+    period.schedule.substeps =
+        stewart_substeps(&law->machine, period.schedule.number, period.schedule.torques);
+    return period;
+}
+
+int stewart_filtered_observe(const stewart_law *law, real *memory, int number, const real *torques,
+                             const real *values, stewart_scratch scratch)
+{
+    const int n = X + estimated(law), m = law->measured;
+    const stewart_sensing sensing = stewart_sensing_of(law);
+    const stewart_filter filter = filter_of(law, &sensing);
+    const stewart_posterior e = stewart_posterior_at(memory, n, m);
+    real *kept = memory + estimate_numbers(law), *last = stewart_take(&scratch, m);
+    const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, kept);
+    const stewart_interval period = last_interval(law, number, torques, &scratch);
+    const stewart_history history = {last, kept + m};
+    int same = 1;
+    if (sensing.legs)
+        sensing.legs->count_still(&sensing, values, kept, kept + m);
+    stewart_copy(m, kept, last);
+    stewart_keep_last(m, values, kept);
+    for (int i = 0; i < m; i++)
+        same &= values[i] == last[i];
+    if (isnan(e.root[0])) {
+        const int had_state = stewart_all_finite(X, e.mean);
+        real *theta = stewart_take(&scratch, n);
+        stewart_copy(estimated(law), e.mean + X, theta);
+        if (!fault && stewart_filter_start(&filter, values, theta, had_state ? e.mean : NULL, memory,
+                                           scratch))
+            return 0;
+        if (had_state)
+            stewart_move_on(law, number, torques, e.mean, scratch);
+        return fault << STEWART_CAUSES_AT;
+    }
+    stewart_filter_advance(&filter, &period, fault ? NULL : values, &history, memory, scratch);
+    if (*e.outliers > 0 && same) { /* a repeated outlier does not confirm the one before */
+        *e.outliers = 0;
+        return STEWART_MEASUREMENT_FROZEN;
+    }
+    return *e.outliers > 0 ? STEWART_MEASUREMENT_REJECTED
+                           : (fault | (int)*e.left_out) << STEWART_CAUSES_AT;
+}
+
+int stewart_filtered_scratch(const stewart_law *law)
+{
+    const stewart_sensing sensing = stewart_sensing_of(law);
+    const stewart_filter filter = filter_of(law, &sensing);
+    const int parts = law->parts > 0 ? law->parts * STEWART_REPORTED : 2;
+    return law->measured + X + estimated(law) + (U + 1) * parts + stewart_moving_scratch(law) +
+           stewart_filter_scratch(&filter, parts);
+}
+
+const stewart_observer stewart_filter_observer = {
+    stewart_filtered_memory,  stewart_filtered_scratch,    stewart_filtered_start,
+    stewart_filtered_observe, stewart_filtered_restart,    stewart_filtered_parameters,
+    stewart_state_sensing,    NULL,                        NULL,
+};
+
+/* ---- over gaps -----------------------------------------------------------------------------------
+
+   An observer that corrects the estimate before a gap. Its memory has that estimate too, and the torques
+   since.
+
+   A filter without measurements linearises along a guessed path: while the parameters are uncertain, its
+   covariance is then wrong. So the estimate of the last measurement is kept, and the next measurement
+   corrects it, over all n periods at once:
+
+       y_k = h(f(x_{k-n}, T_{k-n} ... T_{k-1}, theta)) + noise,
+
+   linearised along the corrected path. With q_p and q_v the standard deviations of the model's error in
+   pose and rates over one step, n steps have
+
+       q_p^2 n + q_v^2 dt^2 (0^2 + 1^2 + ... + (n - 1)^2)   and   q_v^2 n. */
+
+#define LONGEST_GAP 10 /* periods; after more the filter continues from its prediction */
+
+enum { GAP_TORQUES = 2 * (LONGEST_GAP + 1) };
+
+/* The anchor, then torques and durations, how many, and of how many periods. */
+static int gap_memory(const stewart_law *law)
+{
+    return stewart_filtered_memory(law) + estimate_numbers(law) + (U + 1) * GAP_TORQUES + 2;
+}
+
+static void gap_start(const stewart_law *law, real *memory)
+{
+    stewart_fill(gap_memory(law), 0, memory);
+    stewart_filtered_start(law, memory);
+}
+
+static int gap_observe(const stewart_law *law, real *memory, int number, const real *torques,
+                       const real *values, stewart_scratch scratch)
+{
+    const int size = estimate_numbers(law), n = X + estimated(law), m = law->measured;
+    const stewart_filter_settings *settings = law->estimation;
+    const stewart_posterior now = stewart_posterior_at(memory, n, m);
+    real *anchor = memory + stewart_filtered_memory(law), *since = anchor + size;
+    real *durations = since + U * GAP_TORQUES, *pieces = durations + GAP_TORQUES, *periods = pieces + 1;
+    real *known = stewart_take(&scratch, size), *last = stewart_take(&scratch, m);
+    real longer[X];
+    const stewart_sensing sensing = stewart_sensing_of(law);
+    stewart_filter filter = filter_of(law, &sensing);
+    stewart_copy(size, memory, known);
+    stewart_copy(m, memory + size, last);
+    const stewart_posterior before = stewart_posterior_at(known, n, m);
+    const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, last);
+    const int status = stewart_filtered_observe(law, memory, number, torques, values, scratch);
+    const int had_anchor = *periods > 0, parts = (int)*pieces;
+    stewart_interval period = last_interval(law, number, torques, &scratch);
+    const stewart_history history = {last, NULL};
+    const int gone = isnan(before.root[0]) || *before.outliers > 0 || *periods >= LONGEST_GAP;
+    const int unseen = *now.unseen > *before.unseen && !(*now.outliers > 0);
+    if (!gone && (unseen || had_anchor)) {
+        if (!had_anchor)
+            stewart_copy(size, known, anchor);
+        stewart_copy(U * period.schedule.number, period.schedule.torques, since + U * parts);
+        stewart_copy(period.schedule.number, period.schedule.durations, durations + parts);
+        *pieces += (real)period.schedule.number;
+        *periods += 1;
+    }
+    if (!gone && unseen)
+        return status;
+    const real passed = *periods, h = law->period;
+    period.schedule = (stewart_schedule){(int)*pieces, since, durations, 0};
+    *periods = *pieces = 0;
+    if (gone || !had_anchor || fault)
+        return status;
+    period.schedule.substeps = stewart_substeps(&law->machine, period.schedule.number, since);
+    for (int i = 0; i < 6; i++) {
+        const real pose = settings->filter.model_std[i], rate = settings->filter.model_std[6 + i];
+        const real drifts = (passed - 1) * passed * (2 * passed - 1) / 6 * h * h;
+        longer[i] = REAL(sqrt)(passed * pose * pose + drifts * rate * rate);
+        longer[6 + i] = REAL(sqrt)(passed * rate * rate);
+    }
+    filter.model_std = longer;
+    stewart_filter_advance(&filter, &period, values, &history, anchor, scratch);
+    if (*stewart_posterior_at(anchor, n, m).outliers > 0)
+        return status;
+    stewart_copy(size, anchor, memory);
+    return 0;
+}
+
+static int gap_scratch(const stewart_law *law)
+{
+    const stewart_sensing sensing = stewart_sensing_of(law);
+    const stewart_filter filter = filter_of(law, &sensing);
+    return stewart_filtered_scratch(law) + estimate_numbers(law) + law->measured +
+           (U + 1) * 2 + stewart_filter_scratch(&filter, GAP_TORQUES);
+}
+
+const stewart_observer stewart_gap_observer = {
+    gap_memory,               gap_scratch,                 gap_start,             gap_observe,
+    stewart_filtered_restart, stewart_filtered_parameters, stewart_state_sensing, NULL, NULL,
+};
