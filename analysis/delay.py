@@ -1,4 +1,4 @@
-"""How much delay can a scenario bear: open loop, closed loop, and in simulations?
+"""Delay that a scenario tolerates: open loop, closed loop, and in simulations.
 
 python analysis/delay.py [SCENARIO] [section.field=value ...]
 """
@@ -11,7 +11,7 @@ import stewart_drake as sd
 def main(
     scenario: str = "paper", *settings: str, out: str = "out/delay", simulations: bool = True
 ) -> sd.AnalysisResult:
-    """Print the answer, and write it as a page."""
+    """Print the result, and write it as a page."""
     answer = sd.analyze_delay(sd.load_scenario(scenario, settings=settings), simulations)
     print(answer)
     print("written to", answer.save(out))

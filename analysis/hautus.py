@@ -1,4 +1,4 @@
-"""Which modes of a scenario's models can torques reach, and which does the sensor see?
+"""Controllability and observability of a scenario's models, by mode.
 
 python analysis/hautus.py [SCENARIO] [section.field=value ...]
 """
@@ -9,7 +9,7 @@ import stewart_drake as sd
 
 
 def main(scenario: str = "paper", *settings: str, out: str = "out/hautus") -> sd.AnalysisResult:
-    """Print the answer, and write it as a page."""
+    """Print the result, and write it as a page."""
     answer = sd.analyze_hautus(sd.load_scenario(scenario, settings=settings))
     print(answer)
     print("written to", answer.save(out))

@@ -1,4 +1,4 @@
-"""A computed-torque controller of one's own on the paper's machine, judged like the shipped."""
+"""A user's computed-torque controller on the paper's machine, judged like the shipped ones."""
 
 import sys
 
@@ -18,14 +18,13 @@ class ComputedTorque(LeafSystem):
         self.DeclareVectorOutputPort("torque", 6, self.calc_torque)
 
     def calc_torque(self, context, output) -> None:
-        """The port `torque`."""
         x, r = (self.GetInputPort(n).Eval(context) for n in ("measurement", "reference"))
         wanted = r[12:] - 20 * (x[6:] - r[6:12]) - 100 * (x[:6] - r[:6])
         output.SetFromVector(self.dynamics.inverse_dynamics(x[:6], x[6:], wanted))
 
 
 def main(out: str = "out/own_controller", *settings: str) -> sd.SimulationResult:
-    """Without delay and every 10 ms; table, figures and replay."""
+    """Run it without delay, every 10 ms; write table, figures and replay."""
     fast = ("delay.steps=0", "controller.period=0.01", "start=on_reference")
     scenario = sd.load_scenario("paper", settings=[*fast, *settings])
     dynamics = sd.StewartDynamics(sd.load_mechanism(scenario.mechanism), scenario.plant.gravity)

@@ -1,4 +1,4 @@
-"""A kick against the plate at 3 s, and how the shipped controller gets over it 0.8 s late."""
+"""Response of the shipped controller, with 0.8 s of delay, to a kick of the plate at 3 s."""
 
 import sys
 
@@ -16,13 +16,12 @@ class Kick(LeafSystem):
         self.DeclareVectorOutputPort("wrench", 6, self.calc_wrench)
 
     def calc_wrench(self, context, output) -> None:
-        """The port `wrench`: moment, then force."""
         pushed = self.time <= context.get_time() < self.time + 0.1
         output.SetFromVector(self.wrench if pushed else [0.0] * 6)
 
 
 def main(*settings: str) -> dict[str, sd.SimulationResult]:
-    """The predictor with and without the kick."""
+    """Run the predictor with and without the kick."""
     scenario = sd.load_scenario("paper", "predictor_lqi", settings)
     results = {"calm": sd.simulate(scenario), "kicked": sd.simulate(scenario, disturbance=Kick)}
     for name, result in results.items():

@@ -1,4 +1,4 @@
-"""How well does the paper's experiment bear what is not known of the machine, from either start?
+"""Robustness of the paper's experiment to unknown quantities of the machine, from both starts.
 
 python analysis/robustness.py [RUNS] [section.field=value ...]
 """
@@ -13,7 +13,7 @@ STARTS = {"rest": (), "on_reference": ("start=on_reference", "queue=reference")}
 def main(
     runs: str = "200", *settings: str, out: str = "out/robustness"
 ) -> dict[str, sd.AnalysisResult]:
-    """Print the answers, and write them as pages."""
+    """Print the results, and write them as pages."""
     answers = {}
     for name, start in STARTS.items():
         scenario = sd.load_scenario("paper", settings=[*start, *settings])

@@ -1,1 +1,1 @@
-"""What runs or judges many simulations."""
+"""Studies of many simulations, and analyses before them."""

@@ -402,7 +402,7 @@ def search(
     space = problem.space
     low, high = np.array(space.ranges(arrangement)).T
     free = low < high
-    # The machine itself is the first trial of its own arrangement, so that no worse one is found.
+    # The first trial of the machine's arrangement is the machine, so that the result is no worse.
     own = own_values(space.spec)
     is_own = list(arrangement.order) == space.pattern.plate_order
     is_own &= list(arrangement.branches) == space.pattern.branches

@@ -44,7 +44,7 @@ class Ranges:
             uniform from 0.
         coulomb: Coulomb friction of a crank, uniform from 0.
         payload_position: error of the coordinates of the payload, rms over the three, uniform
-            from 0; without effect if there is no payload.
+            from 0; without effect on a plate without payload.
         jitter: standard deviation of the delay from torque to torque, uniform from 0; over a wire.
         loss: share of the measurements that are lost, uniform from 0; over a network of packets.
     """

@@ -32,7 +32,7 @@ from stewart_drake.studies.study_options import Ranges
 from stewart_drake.studies.workspace import rms, size_motors
 
 Draw = dict[str, Any]
-"""Drawn values by name of the quantity, SI units: a number, a tuple of them, or None. An empty draw
+"""Values by name of the quantity, SI units: a number, a tuple of them, or None. An empty draw
 changes nothing."""
 
 

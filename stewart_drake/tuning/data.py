@@ -308,7 +308,7 @@ def _problem(data: xr.Dataset) -> str | None:
             return f"{name} is {data[name].dtype} over {data[name].dims}"
     sizes = data.sizes
     if not (sizes["run"] and sizes["sample"]) or "run" not in data.coords:
-        return "there are no runs"
+        return "runs are missing"
     if (sizes["input"], sizes["weight"]) != (len(TUNER_INPUTS), len(WEIGHTS)):
         return f"a sample has {sizes['input']} values and {sizes['weight']} weights"
     if sizes.get("feature", NUM_INPUTS) != NUM_INPUTS:

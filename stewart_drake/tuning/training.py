@@ -17,7 +17,7 @@ r = log10(w_Q / w_R), known at 13 ratios and linear in between, f minimises by A
 
 If any ratio will do, a label is noise, but a regret is not. Rows are first those of the runs with
 fixed ratios. A network leads to features that no fixed ratio does: in a second round half of the
-rows are of runs with the network. Held-out conditions, and with them motions, decide when to stop,
+rows are of runs with the network. Excluded conditions, and with them motions, decide when to stop,
 and which round was better, in the loop.
 """
 
