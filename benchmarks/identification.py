@@ -1,25 +1,23 @@
-"""Machines found from their logs: `python benchmarks/identification.py [section ...]`.
+"""Machines identified from their logs.
 
-Writes benchmarks/results/identification.md; MACHINES of the environment is their number. Sections:
-ranges, drawing. All logs are of the exact plant with a delay that is believed to be 0.8 s and is
-130 ms longer, logged while `adaptive_lqi` had the measured state: a multisine of 20 s around half
-the paper's amplitude, crank angles in 14 bit at 50 Hz, whose zero within a step is random. "With
-pose" is a pose beside them, off by 0.1 mrad and 20 um, and encoder offsets of 2 mrad nobody knows.
-Times are the CPU's.
+MACHINES of the environment is their number. All logs are of the exact plant with a delay that is
+believed to be 0.8 s and is 130 ms longer, logged while `adaptive_lqi` measured the state: a
+multisine of 20 s around half the paper's amplitude, crank angles in 14 bit at 50 Hz, with a random
+phase of the codes. "With pose" adds a pose with errors of 0.1 mrad and 20 um, and unknown encoder
+offsets of 2 mrad. Times are the CPU's.
 
 `ranges` draws machines as `analyze robustness` does; the tolerances of lengths and joints are the
-root mean square of what it draws. `drawing` draws lengths and joints with a standard deviation of
+root mean square of the draws. `drawing` draws lengths and joints with a standard deviation of
 0.2 mm, the default tolerance.
 
-The next run of each machine is the paper's at full amplitude, its state measured without noise and
-nothing limiting its torques but the motors, of a controller that goes by what was found
-(`mechanism.yaml`, `calibration.yaml`); beside it one that knows the truth, and one that has the
-drawing and the delay that was found.
+The next run of each machine is the paper's at full amplitude, its state measured without noise,
+torques limited by the motors only. Its controller uses the identified machine (`mechanism.yaml`,
+`calibration.yaml`). For comparison one uses the true values, and one the drawing with the
+identified delay.
 """
 
 import dataclasses
 import os
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -27,11 +25,19 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from _bench import RESULTS, size
-from joblib import Parallel, delayed
+from _bench import (
+    AMPLITUDE,
+    EXACT,
+    ON,
+    delay_settings,
+    in_parallel,
+    run_sections,
+    section,
+    size,
+    table,
+)
 
 import stewart_drake as sd
-from stewart_drake.files.versions import versions
 from stewart_drake.identification.identify import Identification, identify
 from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log, Precision
 from stewart_drake.identification.plan import fitted_multisine
@@ -52,14 +58,13 @@ from stewart_drake.types import Array
 
 MACHINES = size("MACHINES", 50)
 FRESH = int(os.environ.get("FRESH", "1000"))
-"""The first seed; those below were looked at while this was made."""
-AMPLITUDE = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
+"""First seed; lower ones were used during development."""
 LATE = 0.13
 STEP = 2 * np.pi / 2**14
 PRECISION = Precision()
 TOLERANCE = 2e-4
 OFFSET = 2e-3
-STARTS = {"on the reference": ("start=on_reference", "queue=reference"), "from rest": ()}
+STARTS = {"on the reference": ON, "from rest": ()}
 PLANT = (
     "torque_bias",
     "payload_mass",
@@ -68,12 +73,12 @@ PLANT = (
     "coulomb_speed",
     "payload_position",
 )
-"""Fields of the plant that a draw changes."""
-GOES_BY = ("what was found", "the truth", "the drawing, and the delay that was found")
+"""Fields of the plant that a draw changes, in the order of the unknowns."""
+KNOWLEDGE = ("the identified machine", "the truth", "the drawing and the identified delay")
 
 
 def excitation(folder: Path) -> Path:
-    """A multisine of 20 s as a CSV motion."""
+    """Write a multisine of 20 s as a CSV motion."""
     path = folder / "multisine.csv"
     mechanism = sd.load_mechanism("paper")
     times, poses, _ = fitted_multisine(mechanism, mechanism.home, AMPLITUDE / 2, 20.0)
@@ -85,15 +90,24 @@ def excitation(folder: Path) -> Path:
 
 
 class Truth(NamedTuple):
-    """A machine, the scenario of its log, and what of the unknowns is true (NaN: not drawn)."""
+    """A machine, the scenario of its log, and true values of the unknowns (NaN: not drawn)."""
 
     mechanism: Mechanism
     scenario: Scenario
     values: Array
 
 
+def log_scenario(motion: Path, *more: str, late: float = LATE) -> Scenario:
+    """Return the scenario of a log."""
+    settings = (
+        *(EXACT, *delay_settings(0.8 + late), "controller.delay_steps=8"),
+        *("reference.kind=csv", f"reference.file={motion}", "duration=20"),
+    )
+    return load_scenario("paper", "adaptive_lqi", (*settings, *more))
+
+
 def of_ranges(seed: int, motion: Path, calm: float) -> Truth:
-    """A draw of the robustness study; `calm` is of `calm_torque`."""
+    """Return a draw of the robustness study; `calm` is of `calm_torque`."""
     scenario = log_scenario(motion)
     experiment = prepare(scenario)
     scales = uncertainty.scales_of(experiment, calm)
@@ -106,67 +120,35 @@ def of_ranges(seed: int, motion: Path, calm: float) -> Truth:
 
 
 def calm_torque(motion: Path) -> float:
-    """Largest that the undisturbed run commands, N m."""
-    scenario = load_scenario("paper", "adaptive_lqi", _settings(motion, late=0.0))
+    """Return the largest torque that the undisturbed run commands, N m."""
+    scenario = log_scenario(motion, late=0.0)
     return simulate(scenario, judge_stability=False).summary["peak_torque"]
 
 
 def of_drawing(seed: int, motion: Path) -> Truth:
-    """A machine built with the default tolerances, with bias, payload and friction."""
+    """Return a machine within the default tolerances, with bias, payload and friction."""
     rng, m = np.random.default_rng(FRESH + seed), sd.load_mechanism("paper")
-
-    def off(value: Array) -> Array:
-        return value + TOLERANCE * rng.standard_normal(value.shape)
-
-    machine = dataclasses.replace(
-        m,
-        crank_lengths=off(m.crank_lengths),
-        rod_lengths=off(m.rod_lengths),
-        p_WS=off(m.p_WS),
-        p_PQ=off(m.p_PQ),
-    )
+    names = ("crank_lengths", "rod_lengths", "p_WS", "p_PQ")
+    arrays = {name: getattr(m, name) for name in names}
+    off = {name: a + TOLERANCE * rng.standard_normal(a.shape) for name, a in arrays.items()}
+    machine = dataclasses.replace(m, **off)
     bias = ",".join(f"{x:.6g}" for x in 3e-4 * rng.standard_normal(6))
     place = ",".join(f"{x:.6g}" for x in 0.02 * rng.standard_normal(3))
-    extra = (
+    scenario = log_scenario(
+        motion,
         f"plant.torque_bias=[{bias}]",
         f"plant.payload_mass={0.4 * rng.uniform():.6g}",
         f"plant.payload_position=[{place}]",
         f"plant.joint_damping={1e-3 * rng.uniform():.6g}",
         f"plant.coulomb_friction={3e-4 * rng.uniform():.6g}",
     )
-    scenario = load_scenario("paper", "adaptive_lqi", (*_settings(motion), *extra))
     return Truth(machine, scenario, truth_of(machine, scenario))
 
 
-def _settings(motion: Path, late: float = LATE) -> tuple[str, ...]:
-    steps, rest = divmod(round(0.8 + late, 9), 0.1)
-    return (
-        "plant.kind=exact",
-        f"delay.steps={int(steps + 1e-9)}",
-        f"delay.fraction={round(rest / 0.1, 9) % 1:.9g}",
-        "controller.delay_steps=8",
-        "reference.kind=csv",
-        f"reference.file={motion}",
-        "duration=20",
-    )
-
-
-def log_scenario(motion: Path) -> Scenario:
-    """The run that is logged."""
-    return load_scenario("paper", "adaptive_lqi", _settings(motion))
-
-
 def truth_of(machine: Mechanism, scenario: Scenario) -> Array:
-    """True values of the unknowns, without offsets."""
-    values, plant = np.zeros(len(NAMES)), scenario.plant
-    values[DYNAMIC] = [
-        *plant.torque_bias,
-        plant.payload_mass,
-        plant.joint_damping,
-        plant.coulomb_friction,
-        plant.coulomb_speed,
-        *plant.payload_position,
-    ]
+    """Return true values of the unknowns, without offsets."""
+    values = np.zeros(len(NAMES))
+    values[DYNAMIC] = np.hstack([getattr(scenario.plant, name) for name in PLANT])
     legs = [machine.crank_lengths, machine.rod_lengths, machine.p_PQ, machine.p_WS]
     values[GEOMETRY] = np.column_stack(legs).ravel()
     values[DELAY] = scenario.eta
@@ -174,7 +156,7 @@ def truth_of(machine: Mechanism, scenario: Scenario) -> Array:
 
 
 def log_of(run: SimulationResult, machine: Mechanism, seed: int, poses: bool) -> tuple[Log, Array]:
-    """What encoders and, where asked for, a sensor of poses saw of a run; and the offsets."""
+    """Return the log of a run by encoders, on request with a sensor of poses; and the offsets."""
     rng, signals, period = np.random.default_rng(seed), run.signals, run.scenario.controller.period
     time = signals.time.values
     sent = period * np.arange(int(time[-1] / period + 1e-9) + 1)
@@ -187,8 +169,7 @@ def log_of(run: SimulationResult, machine: Mechanism, seed: int, poses: bool) ->
     values = np.full((len(pose), NUM_MEASURED), np.nan)
     values[:, ANGLES] = STEP * np.round((angles + phase) / STEP) - phase
     if poses:
-        noise = PRECISION.std[POSE] * rng.standard_normal(pose.shape)
-        values[:, POSE] = pose + noise
+        values[:, POSE] = pose + PRECISION.std[POSE] * rng.standard_normal(pose.shape)
     limit = run.scenario.actuator.torque_limit or machine.effort_limit
     torques = np.clip(signals.torque_commanded.values[rows], -limit, limit)
     gravity = 9.81 if run.scenario.plant.gravity else 0.0
@@ -197,23 +178,29 @@ def log_of(run: SimulationResult, machine: Mechanism, seed: int, poses: bool) ->
 
 
 class Found(NamedTuple):
-    """Of one machine."""
+    """Identification of one machine.
+
+    Attributes:
+        status: of the logged run.
+        late: s, error of the delay.
+        chi2: per measurement.
+        seconds: CPU time.
+        inside: (unknowns,) whether the 95 % interval holds the truth; NaN for fixed ones.
+        away: (unknowns,) error.
+        next_runs: (3, 2) E_ac by KNOWLEDGE and STARTS; NaN for a run that did not complete.
+    """
 
     status: str
     late: float
-    """s, error of the delay."""
     chi2: float
     seconds: float
     inside: Array
-    """(unknowns,) whether the 95 % interval holds the truth; NaN where nothing was sought."""
     away: Array
-    """(unknowns,) error."""
     next_runs: Array
-    """(3, 2) E_ac by GOES_BY and STARTS; NaN for a run that did not complete."""
 
 
 def find(kind: str, seed: int, motion: Path, calm: float, poses: bool) -> Found:
-    """Draw a machine, log it, find it."""
+    """Draw a machine, log it, identify it."""
     truth = of_ranges(seed, motion, calm) if kind == "ranges" else of_drawing(seed, motion)
     run = simulate(truth.scenario, true_mechanism=truth.mechanism, judge_stability=False)
     log, offsets = log_of(run, truth.mechanism, FRESH + seed, poses)
@@ -223,43 +210,42 @@ def find(kind: str, seed: int, motion: Path, calm: float, poses: bool) -> Found:
     values, std = found.fit.guess.values, found.std
     away = np.where(std > 0, values - true, np.nan)
     inside = np.where(std > 0, np.abs(away) <= 1.96 * std, np.nan)
-    if true[6] == 0:  # where no payload is, it is nowhere
+    if true[6] == 0:  # the position of no payload
         inside[COULOMB_SPEED + 1 : DYNAMIC.stop] = np.nan
     following = next_runs(truth, found, true)
-    late, chi2 = float(away[DELAY]), found.chi2["all"]
-    return Found(run.status, late, chi2, seconds, inside, away, following)
+    return Found(
+        run.status, float(away[DELAY]), found.chi2["all"], seconds, inside, away, following
+    )
 
 
 def next_runs(truth: Truth, found: Identification, true: Array) -> Array:
-    """(3, 2) as of `Found.next_runs`; `true` values of the unknowns."""
+    """Return (3, 2) as of `Found.next_runs`; `true` values of the unknowns."""
     unknowns = found.unknowns
     drawn = unknowns.mean.copy()
     drawn[DELAY] = found.values[DELAY]
     return np.array(
         [
-            runs_by(truth, found.mechanism, found.calibration),
-            runs_by(truth, unknowns.machine(true), lambda m: surely(m, true, CALIBRATED)),
-            runs_by(truth, unknowns.mechanism, lambda m: surely(m, drawn, (NAMES[DELAY],))),
+            runs_with(truth, found.mechanism, found.calibration),
+            runs_with(truth, unknowns.machine(true), lambda m: exactly(m, true, CALIBRATED)),
+            runs_with(truth, unknowns.mechanism, lambda m: exactly(m, drawn, (NAMES[DELAY],))),
         ]
     )
 
 
-def runs_by(
-    truth: Truth, machine: Mechanism, known: Callable[[Mechanism], Calibration]
+def runs_with(
+    truth: Truth, machine: Mechanism, calibration: Callable[[Mechanism], Calibration]
 ) -> tuple[float, ...]:
-    """E_ac by STARTS of a controller that goes by a machine and what is known of it."""
+    """Return E_ac by STARTS with a machine and a calibration in the controller."""
     plant, delay = truth.scenario.plant, truth.scenario.delay
     with TemporaryDirectory() as folder:
         mechanism, file = Path(folder) / "mechanism.yaml", Path(folder) / "calibration.yaml"
         mechanism.write_text(mechanism_yaml(machine))
-        save_calibration(file, known(load_mechanism(mechanism)))
+        save_calibration(file, calibration(load_mechanism(mechanism)))
         settings = (
-            "plant.kind=exact",
+            EXACT,
             *(f"plant.{name}={getattr(plant, name)}" for name in PLANT),
-            f"delay.steps={delay.steps}",
-            f"delay.fraction={delay.fraction}",
-            f"mechanism={mechanism}",
-            f"controller.calibration={file}",
+            *(f"delay.steps={delay.steps}", f"delay.fraction={delay.fraction}"),
+            *(f"mechanism={mechanism}", f"controller.calibration={file}"),
         )
         runs = (
             simulate(
@@ -272,14 +258,14 @@ def runs_by(
         return tuple(run.accumulated_error for run in runs)
 
 
-def surely(machine: Mechanism, values: Array, names: tuple[str, ...]) -> Calibration:
-    """Of the unknowns' values, those of names, without a doubt."""
+def exactly(machine: Mechanism, values: Array, names: tuple[str, ...]) -> Calibration:
+    """Return some of the unknowns as a calibration without uncertainty."""
     mean = values[[NAMES.index(name) for name in names]]
     return Calibration(fingerprint(machine), names, mean, np.zeros((len(names), len(names))))
 
 
 def identified(log: Log, kind: str, poses: bool) -> tuple[Identification, float]:
-    """The machine of a log, and the CPU's seconds."""
+    """Return the machine of a log, and the CPU time in s."""
     mechanism, tolerances = sd.load_mechanism("paper"), Tolerances(offsets=OFFSET if poses else 0.0)
     if kind == "ranges":
         drawn = Ranges().lengths * float(mechanism.crank_lengths.mean()) / np.sqrt(3)
@@ -304,73 +290,62 @@ GROUPS: dict[str, Any] = {
 
 
 def machines(kind: str) -> str:
-    """The tables of so many machines."""
-    jobs = Parallel(n_jobs=int(os.environ.get("JOBS", "-1")))
+    """Return the tables of a kind of machines, without and with poses."""
     with TemporaryDirectory() as folder:
         motion = excitation(Path(folder))
         calm = calm_torque(motion)
-        return "\n".join(
-            table(
-                f"{kind}, {'with pose' if poses else 'encoders alone'}",
-                jobs(delayed(find)(kind, seed, motion, calm, poses) for seed in range(MACHINES)),
-            )
-            for poses in (False, True)
-        )
+        found = {
+            name: in_parallel(find, [(kind, k, motion, calm, poses) for k in range(MACHINES)])
+            for name, poses in (("encoders alone", False), ("with pose", True))
+        }
+    return "\n".join(summary(f"{kind}, {name}", some) for name, some in found.items())
 
 
-def table(title: str, found: list[Found]) -> str:
-    """Errors and coverage by kind of unknown."""
+def summary(title: str, found: list[Found]) -> str:
+    """Return errors and coverage by kind of unknown, and the next runs."""
     late = 1e3 * np.abs([one.late for one in found])
     chi2, seconds = [one.chi2 for one in found], [one.seconds for one in found]
     lost = sum(one.status != "completed" for one in found)
-    text = (
-        f"## {title}: {len(found)} machines, {lost} of the runs lost\n\n"
+    words = (
         f"error of the delay: rms {np.sqrt(np.mean(late**2)):.3g} ms, largest {late.max():.3g} ms; "
         f"chi2/n {min(chi2):.3g} to {max(chi2):.3g}; CPU {np.mean(seconds):.3g} s, at most "
-        f"{max(seconds):.3g} s\n\n| unknown | rms error | 95 % intervals that hold the truth |\n"
-        "| --- | --- | --- |\n"
+        f"{max(seconds):.3g} s"
     )
     inside, away = (np.array([getattr(one, name) for one in found]) for name in ("inside", "away"))
+    rows = []
     for name, part in GROUPS.items():
         if np.isfinite(inside[:, part]).any():
-            size = np.sqrt(np.nanmean(away[:, part] ** 2))
-            shown = "" if name == "all" else f"{size:.2g}"
-            text += f"| {name} | {shown} | {100 * np.nanmean(inside[:, part]):.1f} % |\n"
-    return text + next_table(np.array([one.next_runs for one in found]))
+            rms = "" if name == "all" else f"{np.sqrt(np.nanmean(away[:, part] ** 2)):.2g}"
+            rows.append((name, rms, f"{100 * np.nanmean(inside[:, part]):.1f} %"))
+    heads = ("unknown", "rms error", "95 % intervals that hold the truth")
+    return section(
+        f"{title}: {len(found)} machines, {lost} of the runs lost",
+        words,
+        table(heads, rows),
+        *next_table(np.array([one.next_runs for one in found])),
+    )
 
 
-def next_table(errors: Array) -> str:
-    """Of (machines, 3, 2): mean E_ac of the next runs, and the largest, by what is gone by."""
-    heads = ("the next run goes by", *(f"{start}: mean, largest" for start in STARTS))
-    text = f"\n| {' | '.join(heads)} |\n| {' | '.join(['---'] * len(heads))} |\n"
-    for row, name in enumerate(GOES_BY):
+def next_table(errors: Array) -> tuple[str, str]:
+    """Return mean and largest E_ac of the next runs (machines, 3, 2), and their excess."""
+    rows = []
+    for row, name in enumerate(KNOWLEDGE):
         cells = [name]
         for one in errors[:, row].T:
             done = one[np.isfinite(one)]
             lost = "" if len(done) == len(one) else f", {len(one) - len(done)} lost"
             cells.append((f"{done.mean():.3g}, {done.max():.3g}" if len(done) else "-") + lost)
-        text += f"| {' | '.join(cells)} |\n"
+        rows.append(cells)
     extra = errors[:, 0] - errors[:, 1]
     worst = ", ".join(
         f"{np.nanmean(one):.3g} and {np.nanmax(one):.3g} {start}"
         for start, one in zip(STARTS, extra.T, strict=True)
         if np.isfinite(one).any()
     )
-    return f"{text}\nFound less truth, mean and largest: {worst}.\n"
-
-
-SECTIONS = {"ranges": lambda: machines("ranges"), "drawing": lambda: machines("drawing")}
-
-
-def main() -> None:
-    """Write the results of the sections that are asked for, all of them by default."""
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    names = sys.argv[1:] or list(SECTIONS)
-    text = "\n".join(SECTIONS[name]() for name in names)
-    made = ", ".join(f"{name} {version}" for name, version in versions().items())
-    print(text)
-    (RESULTS / "identification.md").write_text(f"# Machines from their logs\n\n{made}\n\n{text}")
+    heads = ("the next run uses", *(f"{start}: mean, largest" for start in STARTS))
+    return table(heads, rows), f"Identified minus truth, mean and largest: {worst}."
 
 
 if __name__ == "__main__":
-    main()
+    sections = {kind: lambda kind=kind: machines(kind) for kind in ("ranges", "drawing")}
+    run_sections(__file__, "Machines from their logs", sections)

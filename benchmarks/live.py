@@ -1,10 +1,10 @@
 """The loop in real time, in two processes: `python benchmarks/live.py [section ...]`.
 
-Writes benchmarks/results/live.md. Sections: minutes (ten, or MINUTES of the environment), c (the
-same with the controller of export-c, needs a C compiler and make), kills (KILLS of them), pauses
-(PAUSES of either side), page (needs chromium). The machine is that of `paper` on the exact plant,
-behind a link of 0.28 to 0.32 s each way that loses 2 % of the packets; every process shares this
-computer's cores with whatever else runs on it, so that the load is told beside the figures.
+A named section replaces its part of the page. Sections: minutes (ten, or MINUTES of the
+environment), c (the same with the controller of export-c, needs a C compiler and make), kills
+(KILLS of them), pauses (PAUSES of either side), page (needs chromium). The machine is that of
+`paper` on the exact plant, behind a link of 0.28 to 0.32 s each way that loses 2 % of the packets.
+All processes share the cores of one computer, so that the load is given with the figures.
 """
 
 import itertools
@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from _bench import QUICK, RESULTS, size
+from _bench import AMPLITUDE, EXACT, QUICK, RESULTS, section, size, table
 
 import stewart_drake as sd
 from stewart_drake.files.versions import versions
@@ -35,7 +35,7 @@ from stewart_drake.scenario.trajectories import evaluate
 ROOT = Path(__file__).parents[1]
 MINUTES = float(os.environ.get("MINUTES", "1" if QUICK else "10"))
 SIMULATED = float(os.environ.get("SIMULATED", "1"))
-"""Of them, min; one ten seconds is as another after the first."""
+"""Simulated minutes; after the first ten seconds all are alike."""
 KILLS = size("KILLS", 20)
 PAUSES = size("PAUSES", 3)
 SEED = 29
@@ -46,12 +46,12 @@ WINDOW = 10.0
 """s"""
 PERIOD = 0.1
 """s, of the controller."""
-SCALE = 2 * np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
-"""How far the motion goes, rad and m."""
+SCALE = 2 * AMPLITUDE
+"""Peak to peak of the motion, rad and m."""
 
 
 class Command:
-    """A command in a process of its own; `lines` are what it printed, with the time of day."""
+    """Command in another process; `lines` are its output, with the time of each."""
 
     def __init__(self, *words: str) -> None:
         self.lines: list[tuple[float, str]] = []
@@ -74,10 +74,10 @@ class Command:
     def wait_for(
         self, pattern: str, patience: float = 120.0, after: float = 0.0
     ) -> tuple[float, str]:
-        """When a line came, not before `after`, that has the pattern, and what it has in brackets.
+        """Return the time of a line with the pattern, not before `after`, and its first group.
 
         Raises:
-            TimeoutError: it did not.
+            TimeoutError: there was none.
         """
         end = time.monotonic() + patience
         while time.monotonic() < end:
@@ -86,21 +86,21 @@ class Command:
                 if found and at >= after:
                     return at, found.group(1) if found.groups() else line
             time.sleep(0.01)
-        told = "\n".join(line for _, line in self.lines)
-        raise TimeoutError(f"{pattern!r} is not in:\n{told}")
+        text = "\n".join(line for _, line in self.lines)
+        raise TimeoutError(f"{pattern!r} is not in:\n{text}")
 
     def has(self, pattern: str, after: float) -> bool:
-        """Whether such a line came after that."""
+        """Return whether a line with the pattern came after a time."""
         return any(re.search(pattern, line) for at, line in list(self.lines) if at >= after)
 
     def kill(self) -> float:
-        """At once; when."""
+        """Kill the process; return the time."""
         self.process.kill()
         self.process.wait()
         return time.monotonic()
 
     def end(self) -> None:
-        """As by Ctrl-C, which a process in the background may not hear."""
+        """End the process as by Ctrl-C, which a process in the background may not receive."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
             try:
@@ -111,19 +111,19 @@ class Command:
 
 
 def machine(*more: str) -> tuple[Command, str]:
-    """A machine, and where it listens."""
-    started = Command("machine", "paper", "--port", "0", "--set", "plant.kind=exact", *more)
+    """Start a machine; return it and its address."""
+    started = Command("machine", "paper", "--port", "0", "--set", EXACT, *more)
     _, where = started.wait_for(r" at (127\.0\.0\.1:\d+)")
     return started, where
 
 
 def live(where: str, *more: str) -> Command:
-    """A controller without a page."""
+    """Start a controller without a page."""
     return Command("live", "paper", "--machine", where, "--no-browser", *more)
 
 
 def before_others(process: subprocess.Popen[str]) -> bool:
-    """Put it in real time, as `live` does itself; whether the system permits it."""
+    """Return whether the process got real-time priority, as `live` gives itself."""
     try:
         os.sched_setscheduler(process.pid, os.SCHED_RR, os.sched_param(1))
     except (AttributeError, OSError):
@@ -132,7 +132,7 @@ def before_others(process: subprocess.Popen[str]) -> bool:
 
 
 def windows(times: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """E_ac of each WINDOW, % s, on the controller's samples.
+    """Return E_ac of each WINDOW, % s, on the controller's samples.
 
     Args:
         times: (n,) s.
@@ -148,27 +148,29 @@ def windows(times: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def simulated(*settings: str) -> tuple[str, np.ndarray]:
-    """How the simulation of `paper` under some settings ended, and its `windows`."""
+    """Simulate `paper` with some settings; return its status and its `windows`."""
     shorter = f"duration={min(60 * MINUTES, 60 * SIMULATED):g}"
-    run = sd.simulate(sd.load_scenario("paper", settings=("plant.kind=exact", *settings, shorter)))
+    run = sd.simulate(sd.load_scenario("paper", settings=(EXACT, *settings, shorter)))
     return run.status, windows(run.signals.time.values, run.signals.error.values)
 
 
-def table(rows: dict[str, np.ndarray]) -> list[str]:
-    """Lines of what the `windows` of runs come to."""
-    lines = [
-        "| E_ac of 10 s, % s | first | median of the others | second worst | worst |",
-        "| --- | --- | --- | --- | --- |",
-    ]
+def windows_table(rows: dict[str, np.ndarray]) -> str:
+    """Return a table of the `windows` of runs."""
+    lines = []
     for name, each in rows.items():
         rest = np.sort(each[1:])
         cells = (each[0], np.median(rest), rest[-2], rest[-1])
-        lines.append(f"| {name} | " + " | ".join(f"{cell:.4g}" for cell in cells) + " |")
-    return lines
+        lines.append([name, *(f"{cell:.4g}" for cell in cells)])
+    heads = ["E_ac of 10 s, % s", "first", "median of the others", "second worst", "worst"]
+    return table(heads, lines)
+
+
+def load() -> str:
+    return f"Load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores."
 
 
 def loads_until(ended: Callable[[], bool]) -> str:
-    """Wait, and tell the load of the computer meanwhile."""
+    """Wait; return the load of the computer during this time."""
     loads = [os.getloadavg()[0]]
     while not ended():
         time.sleep(1.0)
@@ -179,13 +181,13 @@ def loads_until(ended: Callable[[], bool]) -> str:
 # ---------------------------------------------------------------- ten minutes
 
 
-def minutes() -> list[str]:
-    """E_ac of every ten seconds beside that of the simulation under the same link."""
+def minutes() -> str:
+    """Return E_ac of every ten seconds, compared with simulations under the same link."""
     with tempfile.TemporaryDirectory() as folder:
         began, where = machine("--set", LINK)
         before_others(began.process)
         run = live(where, "--duration", f"{60 * MINUTES:g}", "--out", folder)
-        load = loads_until(lambda: run.process.poll() is not None)
+        loads = loads_until(lambda: run.process.poll() is not None)
         began.end()
         for each in (run, began):
             print("\n".join(line for _, line in each.lines[-4:]))
@@ -205,36 +207,33 @@ def minutes() -> list[str]:
         "simulated, the same link each way": as_injected,
         "simulated, as the controller sees the link": as_seen,
     }
-    told, s = summary["live"], summary["controller_step_ms"]
-    late = told["sent_after_due_ms"]
-    return [
-        f"## {MINUTES:g} minutes",
-        "",
+    counts, s = summary["live"], summary["controller_step_ms"]
+    late = counts["sent_after_due_ms"]
+    return section(
+        f"{MINUTES:g} minutes",
         f"Ended: {summary['status']}; simulated for {SIMULATED:g} min: {status}, "
-        f"{status_seen}. Both processes ran in {told['scheduled']}. "
-        f"{told['samples']} samples, {told['deadlines_missed']} deadlines missed, "
-        f"{summary['counts']['measurements_missing']} measurements missing, {told['periods_dry']} "
-        f"periods dry, {told['recoveries']} ways planned anew. Torques went out "
+        f"{status_seen}. Both processes ran in {counts['scheduled']}. "
+        f"{counts['samples']} samples, {counts['deadlines_missed']} deadlines missed, "
+        f"{summary['counts']['measurements_missing']} measurements missing, "
+        f"{counts['periods_dry']} periods dry, {counts['recoveries']} ways planned anew. Torques went out "
         f"{late['median']:.0f} ms after the soonest measurement (99 %: {late['p99']:.0f}, worst "
         f"{late['worst']:.0f}), the law's step took {s['median']:.1f} ms (worst {s['worst']:.0f}); "
-        f"{load}.",
-        "",
-        *table(rows),
-        "",
+        f"{loads}.",
+        windows_table(rows),
         "The like-for-like simulation is the one as the controller sees the link: a measurement "
         "comes before the torque that rests on it leaves, and what is under way counts there and "
         "back. In the other one the first torque leaves at t = 0, before any measurement can have "
         "come, and acts at 0.5 s instead of 0.8 s: its first ten seconds are easier.",
-    ]
+    )
 
 
 # ---------------------------------------------------------------- ten minutes, in C
 
 
 def exported(folder: Path, duration: float) -> Path:
-    """The controller of `paper` in C, for torques 0.5 s ahead and measurements 0.4 s late."""
+    """Export the controller of `paper` for torques 0.5 s ahead and measurements 0.4 s late."""
     late = f"sensor.delay={4 * PERIOD:g}"
-    settings = ("plant.kind=exact", f"duration={duration:g}", "delay.steps=5", late)
+    settings = (EXACT, f"duration={duration:g}", "delay.steps=5", late)
     said = [word for setting in settings for word in ("--set", setting)]
     export = Command("export-c", "paper", "--out", str(folder), *said)
     assert export.process.wait() == 0, export.lines
@@ -242,8 +241,8 @@ def exported(folder: Path, duration: float) -> Path:
     return folder / "stewart_udp"
 
 
-def minutes_in_c() -> list[str]:
-    """The same with the controller of export-c; the machine is the one in Python."""
+def minutes_in_c() -> str:
+    """Return the same with the controller of export-c; the machine is the one in Python."""
     duration = 60 * MINUTES
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -252,14 +251,14 @@ def minutes_in_c() -> list[str]:
         words = [str(program), *where.split(":"), f"seconds={duration:g}", f"log={log}"]
         run = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
         scheduled = before_others(began.process) and before_others(run)
-        load = loads_until(lambda: run.poll() is not None)
+        loads = loads_until(lambda: run.poll() is not None)
         assert run.stdout is not None
-        told = run.stdout.read().splitlines()
+        output = run.stdout.read().splitlines()
         began.end()
-        print("\n".join([*told, *(line for _, line in began.lines[-4:])]))
+        print("\n".join([*output, *(line for _, line in began.lines[-4:])]))
         rows = np.loadtxt(log, delimiter=",")
-    reference = prepare(sd.load_scenario("paper", settings=("plant.kind=exact",))).reference
-    # The last column is how many periods ago it was measured; what did not come is not there.
+    reference = prepare(sd.load_scenario("paper", settings=(EXACT,))).reference
+    # The last column is the age of the measurement in periods; missing ones are NaN.
     measured = rows[np.isfinite(rows[:, 1:7]).all(axis=1)]
     times = measured[:, 0] - PERIOD * measured[:, -1]
     wanted = np.array([evaluate(reference, time)[POSE] for time in times])
@@ -270,25 +269,22 @@ def minutes_in_c() -> list[str]:
     }
     each, typical = found["C over the link"], np.median(as_injected[1:])
     dry = next(line for _, line in began.lines if "periods dry" in line)
-    return [
-        f"## {MINUTES:g} minutes in C",
-        "",
-        f"The C controller on the Python machine: {told[-2]}; {dry}; both with "
-        f"{'real-time' if scheduled else 'usual'} priority; {load}. Simulated in Python "
+    return section(
+        f"{MINUTES:g} minutes in C",
+        f"The C controller on the Python machine: {output[-2]}; {dry}; both with "
+        f"{'real-time' if scheduled else 'usual'} priority; {loads}. Simulated in Python "
         f"for {SIMULATED:g} min: {status}. {np.sum(each[1:] > 2 * typical)} of the "
         f"{len(each) - 1} windows after the first are over twice the simulated median.",
-        "",
-        *table(found),
-        "",
+        windows_table(found),
         "E_ac of each ten seconds in C: " + ", ".join(f"{one:.4g}" for one in each) + ".",
-    ]
+    )
 
 
 # ---------------------------------------------------------------- kills
 
 
-def kills() -> list[str]:
-    """Either side is killed at random; what the other one does, and who takes over."""
+def kills() -> str:
+    """Kill either side at random; return the reaction of the other one, and who takes over."""
     draw = random.Random(SEED)
     found: dict[str, list[Any]] = {"safe": [], "taken": [], "refused": [], "lost": []}
     number = void = 0
@@ -301,10 +297,10 @@ def kills() -> list[str]:
         began.wait_for("the run began")
         spare = live(where) if side == "controller" else None
         if spare is not None:
-            spare.wait_for("^motion:")  # it waits for its turn, for five seconds
+            spare.wait_for("^motion:")  # it waits for five seconds
             wait = min(wait, 3.0)
         time.sleep(wait)
-        if first.process.poll() is not None:  # the load was too much before anybody was killed
+        if first.process.poll() is not None:  # the load was too high before the kill
             void += 1
             for each in (first, began, *([] if spare is None else [spare])):
                 each.end()
@@ -321,23 +317,26 @@ def kills() -> list[str]:
             number, side, restart, {name: len(those) for name, those in found.items()}, flush=True
         )
     safe, taken, refused = found["safe"], found["taken"], found["refused"]
-    return [
-        f"## {KILLS} kills",
-        "",
+    return section(
+        f"{KILLS} kills",
         f"The controller was killed {len(safe)} times, the machine {len(found['lost'])} times, at "
-        f"random; {void} runs had ended before that. Load {os.getloadavg()[0]:.1f} on "
-        f"{os.cpu_count()} cores.",
-        "",
-        f"- The machine was at its safe torque after {min(safe):.2f} to {max(safe):.2f} s; it "
-        "promises 1 s after the last word, which is up to 0.32 s on its way.",
-        f"- A controller that waited took over {len(taken)} times: "
-        + ", ".join(f"{sum(t == kind for t in taken)} {kind}" for kind in ("at rest", "in motion"))
-        + f"; refused {len(refused)} times"
-        + (f" ({'; '.join(refused)})" if refused else "")
-        + ".",
-        f"- Without its machine a controller stopped after {min(found['lost']):.1f} to "
-        f"{max(found['lost']):.1f} s.",
-    ]
+        f"random; {void} runs had ended before that. {load()}",
+        "\n".join(
+            [
+                f"- The machine was at its safe torque after {min(safe):.2f} to {max(safe):.2f} s; it "
+                "promises 1 s after the last word, which is up to 0.32 s on its way.",
+                f"- A controller that waited took over {len(taken)} times: "
+                + ", ".join(
+                    f"{sum(t == kind for t in taken)} {kind}" for kind in ("at rest", "in motion")
+                )
+                + f"; refused {len(refused)} times"
+                + (f" ({'; '.join(refused)})" if refused else "")
+                + ".",
+                f"- Without its machine a controller stopped after {min(found['lost']):.1f} to "
+                f"{max(found['lost']):.1f} s.",
+            ]
+        ),
+    )
 
 
 def _controller_killed(
@@ -370,9 +369,9 @@ def _machine_killed(first: Command, killed: float, found: dict[str, list[Any]]) 
 # ---------------------------------------------------------------- pauses
 
 
-def pauses() -> list[str]:
-    """Either process is suspended for a second, as by SIGSTOP; what it says, and how it ends."""
-    told = []
+def pauses() -> str:
+    """Suspend either process for a second by SIGSTOP; return its message and the end."""
+    items = []
     for side in ("controller", "machine"):
         ends, lines = [], list[str]()
         for _ in range(PAUSES):
@@ -395,22 +394,20 @@ def pauses() -> list[str]:
             run.end()
             began.end()
             print(side, lines[-1], ends[-1], flush=True)
-        told += [f"- The {side}: {line}; {end}." for line, end in zip(lines, ends, strict=True)]
-    return [
-        f"## {PAUSES} pauses of each side",
-        "",
-        f"Suspended for 1 s each, 5 s after the run began. Load {os.getloadavg()[0]:.1f} on "
-        f"{os.cpu_count()} cores. E_ac in % s of the first ten seconds, which is 21.0 undisturbed.",
-        "",
-        *told,
-    ]
+        items += [f"- The {side}: {line}; {end}." for line, end in zip(lines, ends, strict=True)]
+    return section(
+        f"{PAUSES} pauses of each side",
+        f"Suspended for 1 s each, 5 s after the run began. {load()} E_ac in % s of the first ten "
+        "seconds, which is 21.0 undisturbed.",
+        "\n".join(items),
+    )
 
 
 # ---------------------------------------------------------------- the page
 
 
-def page() -> list[str]:
-    """What a browser makes of it: frames per second, and how long a slider waits."""
+def page() -> str:
+    """Return frames per second in a browser, and the latency of a slider."""
     sys.path.insert(0, str(ROOT / "tests"))
     from browser import browser
 
@@ -431,12 +428,7 @@ def page() -> list[str]:
     )
     run = Command("live", "--demo", "--duration", "300")
     _, url = run.wait_for(r"page: (\S+)", 180)
-    lines = [
-        "## The page",
-        "",
-        "| width, px | colours | frames per second | slider to loop, ms | ring at the target, ms |",
-        "| --- | --- | --- | --- | --- |",
-    ]
+    rows = []
     try:
         with browser() as b:
             for width, scheme in itertools.product((1280, 400), ("light", "dark")):
@@ -455,17 +447,14 @@ def page() -> list[str]:
                 fps, (hand, there) = b.evaluate(frames), b.evaluate(moved)
                 b.evaluate("document.getElementById('motion').click()")
                 time.sleep(4.0)
-                lines.append(f"| {width} | {scheme} | {fps:.0f} | {hand:.0f} | {there:.0f} |")
+                rows.append([width, scheme, f"{fps:.0f}", f"{hand:.0f}", f"{there:.0f}"])
                 assert b.evaluate("document.documentElement.scrollWidth") <= width
             errors = b.errors
     finally:
         run.end()
-    load = os.getloadavg()[0]
-    return [
-        *lines,
-        "",
-        f"Errors in the browser: {len(errors)}. Drawn in software, load {load:.1f}.",
-    ]
+    heads = ["width, px", "colours", "frames per second", "slider to loop, ms"]
+    words = f"Errors in the browser: {len(errors)}. Rendered in software. {load()}"
+    return section("The page", table([*heads, "ring at the target, ms"], rows), words)
 
 
 SECTIONS = {
@@ -475,25 +464,24 @@ SECTIONS = {
     "pauses": ("of each side", pauses),
     "page": ("page", page),
 }
-"""By name: what the heading of a section ends with, and what finds it out."""
+"""By name: end of the heading of a section, and the function that makes it."""
 
 
 def main() -> None:
-    """Run the sections that are asked for, and write those anew."""
     path = RESULTS / "live.md"
     for name in sys.argv[1:] or list(SECTIONS):
-        ending, section = SECTIONS[name]
-        lines = section()
-        print("\n".join(lines))
+        ending, make = SECTIONS[name]
+        made = make()
+        print(made)
         text = path.read_text() if path.exists() else ""
         found = re.split(r"(?m)^(?=## )", text)[1:]
         parts = {part.splitlines()[0]: part.strip() for part in found}
         parts = {head: part for head, part in parts.items() if not head.endswith(ending)}
-        parts[lines[0]] = "\n".join(lines)
+        parts[made.splitlines()[0]] = made.strip()
         head = f"Written by `python benchmarks/live.py`, with Drake {versions()['drake']}."
         RESULTS.mkdir(parents=True, exist_ok=True)
-        told = "\n\n".join(["# The loop in real time", head, *parts.values()])
-        path.write_text(told + "\n")
+        pieces = ["# The loop in real time", head, *parts.values()]
+        path.write_text("\n\n".join(pieces) + "\n")
 
 
 if __name__ == "__main__":

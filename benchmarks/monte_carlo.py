@@ -23,25 +23,20 @@ from stewart_drake.studies.study_options import Ranges
 from stewart_drake.studies.uncertainty import MACHINE, Draw, apply_draw, draw, run_draw, scales_of
 
 TIMED: Final = 5
-"""Every so many runs, one is timed in Drake."""
+"""Interval of the runs that are timed in Drake."""
 
 
 def timed(call: Callable[[], Any]) -> tuple[float, Any]:
-    """Processor time in s, and what is returned."""
+    """Return the processor time in s, and the result of a call."""
     started = time.process_time()
     found = call()
     return time.process_time() - started, found
 
 
 def in_drake(scenario: Scenario, one: Draw) -> sd.SimulationResult:
-    """A run as a simulation."""
+    """Simulate a run."""
     changed = apply_draw(MACHINE, scenario, sd.load_mechanism(scenario.mechanism), one)
     return simulate(changed.as_scenario(), true_mechanism=changed.machine(), judge_stability=False)
-
-
-def seconds_in_drake(scenario: Scenario, one: Draw) -> float:
-    """Processor time of a run as a simulation."""
-    return timed(lambda: in_drake(scenario, one))[0]
 
 
 def measure(scenario: Scenario, runs: int, seed: int) -> dict[str, str]:
@@ -58,7 +53,7 @@ def measure(scenario: Scenario, runs: int, seed: int) -> dict[str, str]:
         native.append(seconds)
         loops.add(found["loop"])
         if index % TIMED == 0:
-            drake.append(seconds_in_drake(scenario, one) / seconds)
+            drake.append(timed(lambda one=one: in_drake(scenario, one))[0] / seconds)
         same += found["status"] == expected.status
         if expected.stopped is None and found["error"] is not None:
             errors.append(abs(found["error"] / expected.accumulated_error - 1))

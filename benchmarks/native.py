@@ -1,15 +1,14 @@
 """The law's step in C and in Python, and the Riccati equation by doubling and by Drake, in turns.
 
-A time is the least of its repeats. Writes benchmarks/results/native.md.
+A time is the least of its repeats.
 """
 
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from _bench import write
+from _bench import table, write
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 
 import stewart_drake as sd
@@ -27,7 +26,7 @@ MECHANISM = sd.load_mechanism("paper")
 
 
 def repeated(call: Callable[[], object], number: int) -> float:
-    """Seconds of CPU time that one call takes."""
+    """Return the CPU time of one call, s."""
     started = time.process_time()
     for _ in range(number):
         call()
@@ -35,9 +34,9 @@ def repeated(call: Callable[[], object], number: int) -> float:
 
 
 def replayed_steps(name: str, samples: int = 60, repeats: int = 8) -> dict[str, list[float]]:
-    """Seconds of each step of a scenario's law, in Python and in C, least of the repeats.
+    """Return the time in s of each step of a law in Python and in C, least of the repeats.
 
-    Both are given what happened in a run, in turns, and use the compiled dynamics.
+    Both repeat the steps of one run, in turns, and use the compiled dynamics.
     """
     scenario = sd.load_scenario(name, settings=["plant.kind=exact", f"duration={samples / 10}"])
     recorded = record(scenario)
@@ -57,7 +56,7 @@ def replayed_steps(name: str, samples: int = 60, repeats: int = 8) -> dict[str, 
 
 
 def riccati_times(fraction: float) -> tuple[int, float, float]:
-    """States, and seconds of Drake's solver and of doubling, in turns, at home under gravity."""
+    """Return the number of states, and times in s of Drake's solver and of doubling, in turns."""
     dynamics = sd.StewartDynamics(MECHANISM)
     model = delayed_model(
         linear_model(*dynamics.linearize(MECHANISM.home)), 0.1, 8, fraction, integral=True
@@ -77,33 +76,28 @@ def riccati_times(fraction: float) -> tuple[int, float, float]:
     return len(given[0]), float(drake), float(ours)
 
 
-def controller_lines() -> list[str]:
-    """Rows of the law's step and of the Riccati equation."""
-    lines = [
-        "| step of the law | Python, median us | C, median us | ratio | C, worst / median |",
-        "| --- | --- | --- | --- | --- |",
-    ]
+def steps() -> str:
+    """Return rows of the law's step."""
+    rows = []
     for name in ("paper", "gravity"):
         python, c = replayed_steps(name).values()
-        fed = [k for k, seconds in enumerate(c) if k >= 8]  # before, nothing is fed back
+        fed = [k for k, seconds in enumerate(c) if k >= 8]  # before, there is no feedback
         mid = [float(np.median([times[k] for k in fed])) for times in (python, c)]
         worst = max(c[k] for k in fed) / mid[1]
-        lines.append(
-            f"| `{name}` | {1e6 * mid[0]:.4g} | {1e6 * mid[1]:.4g} | {mid[0] / mid[1]:.1f} | "
-            f"{worst:.2f} |"
-        )
-    lines += ["", "| Riccati equation, states | Drake, us | doubling, us | ratio |"]
-    lines += ["| --- | --- | --- | --- |"]
+        medians = [f"{1e6 * one:.4g}" for one in mid]
+        rows.append([f"`{name}`", *medians, f"{mid[0] / mid[1]:.1f}", f"{worst:.2f}"])
+    heads = ["step of the law", "Python, median us", "C, median us", "ratio", "C, worst / median"]
+    return table(heads, rows)
+
+
+def equations() -> str:
+    """Return rows of the Riccati equation."""
+    rows = []
     for fraction in (0.0, 0.5):
         order, drake, ours = riccati_times(fraction)
-        lines.append(f"| {order} | {1e6 * drake:.4g} | {1e6 * ours:.4g} | {drake / ours:.1f} |")
-    return lines
-
-
-def main() -> None:
-    """Measure, print and write."""
-    write(__file__, "The law and the Riccati equation in C", controller_lines())
+        rows.append([order, f"{1e6 * drake:.4g}", f"{1e6 * ours:.4g}", f"{drake / ours:.1f}"])
+    return table(["Riccati equation, states", "Drake, us", "doubling, us", "ratio"], rows)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    write(__file__, "The law and the Riccati equation in C", [steps(), equations()])

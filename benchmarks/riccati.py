@@ -1,7 +1,7 @@
 """The Riccati gain of the whole delay chain against the same gain by the delay reduction.
 
 The paper's model at home, sampled at 0.1 s, identity weights. Times are the least of several
-interleaved repeats. Writes benchmarks/results/riccati.md.
+interleaved repeats.
 """
 
 import time
@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from _bench import table, write
+from _bench import section, table, write
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 from scipy.linalg import solve_discrete_are
 
@@ -27,17 +27,17 @@ Q, R = np.eye(12), np.eye(6)
 
 
 def model(steps: int, fraction: float) -> DelayedModel:
-    """The paper's model at home, with integral states."""
+    """Return the paper's model at home, with integral states."""
     mechanism = sd.load_mechanism("paper")
     continuous = double_integrators(torque_map(mechanism, mechanism.home, "virtual_work"))
     return delayed_model(continuous, PERIOD, steps, fraction, integral=True)
 
 
 def least_ms(calls: Sequence[Callable[[], object]], budget: float) -> list[float]:
-    """Least time of each call, in ms; they take turns for `budget` seconds, three at least.
+    """Return the least time of each call, in ms; they take turns for `budget` seconds.
 
-    In each turn a call is made three times in a row: after another's large matrices a short one
-    finds none of its own in the cache.
+    There are three turns at least. In each a call is made three times in a row: after the large
+    matrices of another call the cache is cold.
     """
     least, started, turns = [np.inf] * len(calls), time.perf_counter(), 0
     while turns < 3 or time.perf_counter() - started < budget:
@@ -51,24 +51,24 @@ def least_ms(calls: Sequence[Callable[[], object]], budget: float) -> list[float
 
 
 def drake_only(system: ChainModel) -> Callable[[], Array]:
-    """Drake's solver on a chain, without the checks of its arguments and its result."""
+    """Return a call of Drake's solver, without checks of its arguments and its result."""
     matrices = (system.A, system.B, system.C.T @ Q @ system.C, R)
     A, B, Q_x, R_x = (np.asfortranarray(matrix) for matrix in matrices)
     return lambda: DiscreteAlgebraicRiccatiEquation(A, B, Q_x, R_x)
 
 
 def gain(system: ChainModel, P: Array) -> Array:
-    """(44)."""
+    """Return (44)."""
     return np.linalg.solve(R + system.B.T @ P @ system.B, system.B.T @ P @ system.A)
 
 
 def difference(K: Array, expected: Array) -> float:
-    """The largest, relative to the largest entry."""
+    """Return the largest difference, relative to the largest entry."""
     return float(np.abs(K - expected).max() / np.abs(expected).max())
 
 
 def comparison(fraction: float) -> tuple[list[str], list[list[str]]]:
-    """The gain of the whole chain, by our checked call and by scipy, against the reduced one."""
+    """Return rows of the gain of the whole chain, checked and by scipy, and of the reduced one."""
     header = ["mu", "states", "full, ms", "scipy, ms", "reduced, ms", "full / reduced",
               "gains differ by", "scipy's by"]  # fmt: skip
     rows = []
@@ -76,42 +76,32 @@ def comparison(fraction: float) -> tuple[list[str], list[list[str]]]:
         delayed = model(steps, fraction)
         system = chain(delayed)
         weight = system.C.T @ Q @ system.C
-
-        def by_scipy(system: ChainModel = system, weight: Array = weight) -> Array:
-            return gain(system, solve_discrete_are(system.A, system.B, weight, R))
-
-        def full(delayed: DelayedModel = delayed) -> Array:
-            return full_gain(delayed, Q, R)[0]
-
-        def reduced(delayed: DelayedModel = delayed) -> Array:
-            return augmented_gain(delayed, Q, R)
-
-        times = least_ms([full, by_scipy, reduced], 2.0)
-        K = full()
+        calls: list[Callable[[], Array]] = [
+            lambda delayed=delayed: full_gain(delayed, Q, R)[0],
+            lambda s=system, w=weight: gain(s, solve_discrete_are(s.A, s.B, w, R)),
+            lambda delayed=delayed: augmented_gain(delayed, Q, R),
+        ]
+        full, by_scipy, reduced = least_ms(calls, 2.0)
+        K, other, ours = (call() for call in calls)
         rows.append(
-            [str(steps), str(len(system.A)), *(f"{t:.3g}" for t in times)]
-            + [f"{times[0] / times[2]:.3g}"]
-            + [f"{difference(other, K):.0e}" for other in (reduced(), by_scipy())]
+            [str(steps), str(len(system.A)), *(f"{t:.3g}" for t in (full, by_scipy, reduced))]
+            + [f"{full / reduced:.3g}", f"{difference(ours, K):.0e}", f"{difference(other, K):.0e}"]
         )
     return header, rows
 
 
 def checks(fraction: float) -> list[str]:
-    """What the checks add to Drake's solver in `reduced_gain`."""
+    """Return the time of the checks in `reduced_gain`, compared with Drake's solver."""
     delayed = replace(model(8, fraction), steps=0)
     bare, checked = least_ms([drake_only(chain(delayed)), lambda: reduced_gain(delayed, Q, R)], 2.0)
     return [f"{fraction:g}", f"{bare:.3g}", f"{checked:.3g}", f"{checked / bare:.3g}"]
 
 
 def main() -> None:
-    """Print the tables and write them."""
-    parts = [
-        f"## eta0 = {fraction:g} dt\n\n{table(*comparison(fraction), '---:')}"
-        for fraction in FRACTIONS
-    ]
+    parts = [section(f"eta0 = {f:g} dt", table(*comparison(f), "---:")) for f in FRACTIONS]
     header = ["eta0 / dt", "Drake's solver, ms", "reduced_gain, ms", "ratio"]
     cost = table(header, [checks(f) for f in FRACTIONS], "---:")
-    write(__file__, "The delay reduction", [*parts, f"## Cost of the checks\n\n{cost}"])
+    write(__file__, "The delay reduction", [*parts, section("Cost of the checks", cost)])
 
 
 if __name__ == "__main__":

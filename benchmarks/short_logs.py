@@ -1,6 +1,6 @@
-"""Delays from short logs of lost runs: `python benchmarks/short_logs.py`, LOGS of them a row.
+"""Delays identified from short logs of lost runs, LOGS of them a row.
 
-A controller from rest that knows of no delay loses the plate after some 1.5 s. Payload and biases
+A delay-blind controller from rest loses the plate after some 1.5 s. Payload and biases
 are unknown to `identify`, which has the drawing and the default tolerances.
 """
 
@@ -11,8 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
-from _bench import QUICK, size, table, write
-from joblib import Parallel, delayed
+from _bench import AMPLITUDE, EXACT, QUICK, delay_settings, in_parallel, noise, size, table, write
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
@@ -24,7 +23,7 @@ from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_scenario
 
 FRESH = int(os.environ.get("FRESH", "6000"))
-"""The first seed; 3000 to 5009 were looked at while this was made."""
+"""First seed; 3000 to 5009 were used during development."""
 LOGS = size("LOGS", 10)
 CASES = [
     (machine, delay, noise)
@@ -34,20 +33,20 @@ CASES = [
 ]
 """Scenario, delay in s, and noise as a share of the amplitudes."""
 AMPLITUDES = {
-    "paper": np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08]),
+    "paper": AMPLITUDE,
     "desktop": np.array([0.18, 0.12, 0.35, 0.012, 0.012, 0.008]),
 }
 """Amplitudes of the references, rad and m."""
 ENDS = (1.3, 1.7)
-"""s between which a plate is lost."""
+"""Earliest and latest loss of the plate, s."""
 HEAD = (
     *("scenario", "delay [s]", "noise", "within 1 ms", "refused", "wrong"),
     *("rms error [ms]", "stated, rms [ms]"),
 )
 
 
-def short_run(machine: str, delay: float, noise: float, seed: int) -> SimulationResult:
-    """Lose the plate within ENDS, by an LQR from rest that knows of no delay.
+def short_run(machine: str, delay: float, share: float, seed: int) -> SimulationResult:
+    """Lose the plate within ENDS, by a delay-blind LQR from rest.
 
     Payload up to a fifth of the plate, biases of 0.1 to 0.3 mN m of random signs and the weight of
     the torques are drawn until the plate is lost in time. Without gravity: under it such a
@@ -56,25 +55,22 @@ def short_run(machine: str, delay: float, noise: float, seed: int) -> Simulation
     Args:
         machine: a shipped scenario.
         delay: true one, s.
-        noise: standard deviation as a share of the reference's amplitudes, per second for rates.
+        share: of the noise in the reference's amplitudes, per second for rates.
         seed: of the draw.
     """
-    rng = np.random.default_rng([seed, machine == "paper", round(1e3 * delay), noise > 0])
+    rng = np.random.default_rng([seed, machine == "paper", round(1e3 * delay), share > 0])
     period = load_scenario(machine).controller.period
     plate = sd.load_mechanism(machine).plate.mass
-    steps, rest = divmod(round(delay / period, 9), 1)
-    std = ",".join(f"{x:.6g}" for x in noise * np.tile(AMPLITUDES[machine], 2))
     while True:
         payload = 0.2 * plate * rng.uniform()
         bias = 3e-4 * rng.uniform(0.3, 1, 6) * rng.choice([-1, 1], 6)
         settings = (
-            *("plant.kind=exact", "plant.gravity=false", "start=rest", "queue=zero", "duration=2"),
-            f"delay.steps={int(steps)}",
-            f"delay.fraction={round(rest, 9):.9g}",
+            *(EXACT, "plant.gravity=false", "start=rest", "queue=zero", "duration=2"),
+            *delay_settings(delay, period),
             f"controller.w_R={10 ** rng.uniform(0, 2):.6g}",
             f"plant.payload_mass={payload:.6g}",
             f"plant.torque_bias=[{','.join(f'{x:.6g}' for x in bias)}]",
-            f"sensor.noise_std=[{std}]",
+            noise(share, AMPLITUDES[machine]),
             f"sensor.seed={seed}",
         )
         run = simulate(load_scenario(machine, "lqr", settings), judge_stability=False)
@@ -83,14 +79,11 @@ def short_run(machine: str, delay: float, noise: float, seed: int) -> Simulation
 
 
 class Found(NamedTuple):
-    """Delay of a short log."""
+    """Error of an identified delay and its stated standard deviation, s; NaN for a refused log."""
 
     late: float
-    """Error, s; NaN where the log was refused,"""
     std: float
-    """stated standard deviation, s,"""
     refusal: str
-    """and why."""
 
 
 def find(machine: str, delay: float, noise: float, seed: int, end: float = np.inf) -> Found:
@@ -109,25 +102,23 @@ def find(machine: str, delay: float, noise: float, seed: int, end: float = np.in
 
 
 def row(case: tuple[str, float, float], found: list[Found]) -> list[str]:
-    """Numbers of a case; wrong is off by more than 1 ms and 2.6 standard deviations."""
+    """Return a row; wrong is an error above 1 ms and 2.6 standard deviations."""
     machine, delay, noise = case
     late, std = (1e3 * np.array([getattr(one, name) for one in found]) for name in ("late", "std"))
-    told = np.isfinite(late)
+    known = np.isfinite(late)
     wrong = np.abs(late) > np.maximum(1.0, 2.6 * std)
-    counts = np.abs(late) <= 1.0, ~told, wrong
+    counts = np.abs(late) <= 1.0, ~known, wrong
     sizes = (
-        f"{np.sqrt(np.mean(one[told] ** 2)):.2g}" if told.any() else "-" for one in (late, std)
+        f"{np.sqrt(np.mean(one[known] ** 2)):.2g}" if known.any() else "-" for one in (late, std)
     )
     numbers = (str(int(one.sum())) for one in counts)
     return [machine, f"{delay:g}", f"{100 * noise:g} %", *numbers, *sizes]
 
 
 def main() -> None:
-    """Write the table, and why logs were refused."""
-    jobs = Parallel(n_jobs=int(os.environ.get("JOBS", "-1")))
     rows, refusals = [], list[str]()
     for case in CASES[:1] if QUICK else CASES:
-        found = jobs(delayed(find)(*case, FRESH + seed) for seed in range(LOGS))
+        found = in_parallel(find, [(*case, FRESH + seed) for seed in range(LOGS)])
         rows.append(row(case, found))
         print(*rows[-1], flush=True)
         refusals += [f"- {one.refusal}\n" for one in found if one.refusal]

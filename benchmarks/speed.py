@@ -1,7 +1,7 @@
-"""What a user can expect, in one table: ratios taken in one run, and how times grow.
+"""Speed in one table: ratios taken in one run, and the growth of times.
 
 The plants' full curves are in plants.md, the parts of a controller step in controller_step.md and
-all gains in riccati.md. Writes benchmarks/results/speed.md.
+all gains in riccati.md.
 """
 
 import tempfile

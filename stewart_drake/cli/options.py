@@ -68,9 +68,9 @@ class Given:
 
     def _value(self, one: Option, load: Any) -> Any:
         typed = self._typed[_name(one)]
-        if one.flag is None or one.flag.read is None:
+        if one.read is None:
             return typed
-        return one.flag.read(typed, load) if typed else one.default
+        return one.read(typed, load) if typed else one.default
 
 
 def with_options(
@@ -109,16 +109,15 @@ def _offered(kind: type[Options], recorded: bool = False) -> list[Option]:
 
 def _parameter(one: Option) -> inspect.Parameter:
     """Return the command line's parameter."""
-    assert one.flag is not None
     annotation, default, name = one.annotation, one.default, _dashed(one)
-    if one.flag.read:
+    if one.read:
         annotation, default = list[str] | None, None
     elif one.required:
         annotation, default = annotation | None, None
     option = typer.Option(
         f"--{name}/--no-{name}" if default is True else f"--{name}",
-        metavar=one.flag.metavar,
-        help=one.help + " Repeatable." * bool(one.flag.read),
+        metavar=one.metavar,
+        help=one.help + " Repeatable." * bool(one.read),
     )
     return inspect.Parameter(
         _name(one),
@@ -129,7 +128,7 @@ def _parameter(one: Option) -> inspect.Parameter:
 
 
 def _name(one: Option) -> str:
-    return (one.flag and one.flag.name) or one.name
+    return one.flag or one.name
 
 
 def _dashed(one: Option) -> str:

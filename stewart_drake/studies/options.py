@@ -7,7 +7,6 @@ import functools
 import inspect
 import textwrap
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -19,24 +18,6 @@ if TYPE_CHECKING:
     from stewart_drake.scenario.config import Scenario
 
 _R = TypeVar("_R")
-
-
-@dataclass(frozen=True)
-class Flag:
-    """Command-line form of an option. An option without one exists in Python only.
-
-    Attributes:
-        metavar: shown in place of the value.
-        name: without dashes, if it differs from the field's.
-        read: makes the value from the texts of a repeatable option. Its second argument loads the
-            scenario with another controller.
-        recorded: whether the command on a page contains the option.
-    """
-
-    metavar: str | None = None
-    name: str = ""
-    read: "Callable[[list[str], Callable[[str], Scenario]], Any] | None" = None
-    recorded: bool = True
 
 
 def option(
@@ -53,11 +34,11 @@ def option(
 
     Args:
         default: `...` for none.
-        help: unit and meaning.
-        metavar, name, read, recorded: see `Flag`.
+        help, metavar, read, recorded: see `Option`.
+        name: on the command line, if it differs from the field's.
         bounds: as `pydantic.Field` takes them.
     """
-    extra = {"flag": Flag(metavar, name, read, recorded)}
+    extra = {"flag": name, "metavar": metavar, "read": read, "recorded": recorded}
     more: dict[str, Any] = {"description": help, "json_schema_extra": extra, **bounds}
     return Field(default, **more)
 
@@ -70,24 +51,26 @@ class Option(NamedTuple):
         annotation: of the Python argument.
         default: in both; `inspect.Parameter.empty` for none.
         help: unit and meaning.
-        flag: or None.
+        flag: name on the command line, without dashes; None for an option of Python only.
+        metavar: shown there in place of the value.
+        read: makes the value from the texts of a repeatable option. Its second argument loads the
+            scenario with another controller.
+        recorded: whether the command on a page contains the option.
     """
 
     name: str
     annotation: Any
     default: Any
     help: str
-    flag: Flag | None
+    flag: str | None = None
+    metavar: str | None = None
+    read: "Callable[[list[str], Callable[[str], Scenario]], Any] | None" = None
+    recorded: bool = True
 
     @property
     def required(self) -> bool:
         """Whether a value must be given."""
         return self.default is inspect.Parameter.empty
-
-    @property
-    def recorded(self) -> bool:
-        """Whether the command on a page contains the option."""
-        return self.flag is None or self.flag.recorded
 
 
 class Options(BaseModel):
@@ -106,10 +89,11 @@ class Options(BaseModel):
         """Yield all options; those that pages do not record come last."""
         found = []
         for name, field in cls.model_fields.items():
-            extra = field.json_schema_extra
-            flag: Any = extra.get("flag") if isinstance(extra, dict) else None
+            extra: Any = dict(field.json_schema_extra or {})  # type: ignore[arg-type]
+            if extra:
+                extra["flag"] = extra["flag"] or name
             default = inspect.Parameter.empty if field.is_required() else field.default
-            found.append(Option(name, field.annotation, default, field.description or "", flag))
+            found.append(Option(name, field.annotation, default, field.description or "", **extra))
         yield from sorted(found, key=lambda option: not option.recorded)
 
     @classmethod
@@ -147,22 +131,22 @@ def takes(kind: type[Options]) -> Callable[[Callable[..., _R]], Callable[..., _R
             return function(**given, options=options)
 
         call.__signature__ = shown  # type: ignore[attr-defined]
-        told = argument_lines({one.name: one.help for one in kind.described()})
-        call.__doc__ = (function.__doc__ or "").replace("    OPTIONS", "\n".join(told).lstrip())
+        lines = argument_lines({one.name: one.help for one in kind.described()})
+        call.__doc__ = (function.__doc__ or "").replace("    OPTIONS", "\n".join(lines).lstrip())
         return call
 
     return decorate
 
 
 def refuse(options: Mapping[str, object], why: str) -> None:
-    """Refuse what would be ignored; None and an empty list were not given.
+    """Refuse options that would be ignored, unless they are None or an empty list.
 
     Args:
         options: by name.
-        why: what follows the value, with what is expected.
+        why: end of the message, after the value.
 
     Raises:
-        ConfigError: one line, about the first that was given.
+        ConfigError: one line, about the first of them.
     """
     for name, value in options.items():
         if value is not None and value != []:
@@ -181,5 +165,5 @@ class JobOptions(Options):
 
     @property
     def jobs(self) -> dict[str, Any]:
-        """Return where the runs go, as `run_jobs` takes it."""
+        """Arguments of `run_jobs`."""
         return {"workers": self.workers, "scheduler": self.scheduler}

@@ -241,7 +241,12 @@ def study_robustness(
     undisturbed = {}
     for name, one in controllers.items():
         (undisturbed[name],) = run(name, one, {"undisturbed": {}})
-        _check_undisturbed(name, undisturbed[name])
+        if (first := undisturbed[name]).status != "completed":
+            raise ConfigError(
+                f"robustness{f' with {name}' if name else ''}: the undisturbed run fails at "
+                f"{first.time:.2f} s ({first.reason}), so no machine was drawn; expected a "
+                "scenario and a controller that complete undisturbed"
+            )
     scales = scales_of(experiment, undisturbed[""].peak_torque)
     draws = [draw(ranges, scales, scenario, seed, index) for index in range(options.runs)]
     named = {f"run{i:06d}": one for i, one in enumerate(draws)}
@@ -260,15 +265,6 @@ def study_robustness(
     remove_partials(directory)
     write_whole(directory / "runs.csv", table(study))
     return study
-
-
-def _check_undisturbed(name: str, one: Outcome) -> None:
-    if one.status != "completed":
-        raise ConfigError(
-            f"robustness{f' with {name}' if name else ''}: the undisturbed run fails at "
-            f"{one.time:.2f} s ({one.reason}), so no machine was drawn; expected a scenario and a "
-            "controller that complete undisturbed"
-        )
 
 
 def unit_of(factor: str) -> str:

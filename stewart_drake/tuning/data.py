@@ -50,24 +50,16 @@ LEAST: Final = 1e-3
 _NUMBERS: Final = ("accumulated_error", "cost", "rms_torque", "peak_torque", "torque_variation")
 _EXPECTED: Final = "a data set that `tune dataset --out` has written"
 _SAMPLE: Final = ("run", "sample", "input")
-_VARIABLES: Final[dict[str, tuple[tuple[str, ...], str]]] = {
-    "samples": (_SAMPLE, "f"),
-    "density": (_SAMPLE, "f"),
-    "valid": (("run", "sample"), "b"),
-    "weights": (("run", "weight"), "f"),
-    "delay_steps": (("run",), "iu"),
-    "frequency": (("run",), "f"),
-    "disturbance": (("run",), "iu"),
-    "status": (("run",), "OUT"),
-    "stopped": (("run",), "f"),
-    **dict.fromkeys(_NUMBERS, (("run",), "f")),
+_VARIABLES: Final = {
+    "samples": _SAMPLE,
+    "density": _SAMPLE,
+    "valid": ("run", "sample"),
+    "weights": ("run", "weight"),
+    **dict.fromkeys(
+        ("delay_steps", "frequency", "disturbance", "status", "stopped", *_NUMBERS), ("run",)
+    ),
 }
-"""Dimensions and kind of number of the variables of a data set."""
-_SINCE_0_3: Final[dict[str, tuple[tuple[str, ...], str]]] = {
-    "J": (("run",), "f"),
-    "health": (("run", "sample", "feature"), "f"),
-}
-"""The same of variables that a file of 0.2 lacks."""
+"""Dimensions of the variables of a data set; since 0.3 it also has `J`, with faults `health`."""
 
 Gains = tuple[tuple[float, float], ...]
 """w_Q and w_R of each run of a condition."""
@@ -292,52 +284,32 @@ def load_data(path: str | Path) -> xr.Dataset:
     if not path.exists():
         raise ConfigError(f"data: no file {str(path)!r}; expected {_EXPECTED}")
     data = load_netcdf(path, _EXPECTED)
-    problem = _problem(data)
-    if problem:
+    wrong = [
+        name for name, dims in _VARIABLES.items() if name not in data or data[name].dims != dims
+    ]
+    settings = data.attrs.get("settings")
+    if wrong or "run" not in data.coords or not isinstance(settings, str):
+        problem = (
+            f"no {wrong[0]} over {_VARIABLES[wrong[0]]}" if wrong else "no runs or no settings"
+        )
         raise ConfigError(f"{path}: is not a data set ({problem}); expected {_EXPECTED}")
     return data
 
 
-def _problem(data: xr.Dataset) -> str | None:
-    """Return what distinguishes a file from one that `make_data` has written, or None."""
-    known = _VARIABLES | {name: one for name, one in _SINCE_0_3.items() if name in data.data_vars}
-    for name, (dimensions, kinds) in known.items():
-        if name not in data.data_vars:
-            return f"{name} is missing"
-        if data[name].dims != dimensions or data[name].dtype.kind not in kinds:
-            return f"{name} is {data[name].dtype} over {data[name].dims}"
-    sizes = data.sizes
-    if not (sizes["run"] and sizes["sample"]) or "run" not in data.coords:
-        return "runs are missing"
-    if (sizes["input"], sizes["weight"]) != (len(TUNER_INPUTS), len(WEIGHTS)):
-        return f"a sample has {sizes['input']} values and {sizes['weight']} weights"
-    if sizes.get("feature", NUM_INPUTS) != NUM_INPUTS:
-        return f"health has {sizes['feature']} values"
-    samples, valid, weights = data.samples.values, data.valid.values, data.weights.values
-    if not np.array_equal(np.isfinite(samples).all(axis=2), valid) or np.isinf(samples).any():
-        return "valid does not match the finite samples"
-    if not np.all((weights > 0) & np.isfinite(weights)):
-        return "a weight is not a positive number"
-    if "J" in data and not np.all(np.isfinite(data.J.values) & (data.J.values >= 0)):
-        return "a J is negative or not finite"
-    done, error = data.status.values == "completed", data.accumulated_error.values
-    if not np.array_equal(np.isfinite(error), done) or np.any(error[done] < 0):
-        return "E_ac does not match the completed runs"
-    try:
-        settings = json.loads(data.attrs["settings"])
-        return None if isinstance(settings["data"], str) else "its settings are damaged"
-    except (KeyError, TypeError, ValueError, RecursionError):
-        return "its settings are damaged"
+def hash_of(*arrays: Any) -> str:
+    """Return the SHA-256 of the values of arrays."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        values = np.ascontiguousarray(array, dtype="<f8")
+        # One bit pattern for missing values.
+        digest.update(np.where(np.isnan(values), np.nan, values).tobytes())
+    return digest.hexdigest()
 
 
 def data_hash(data: xr.Dataset) -> str:
     """Return the SHA-256 of the values that training uses: samples, weights, conditions, costs."""
-    digest = hashlib.sha256()
-    for name in ("samples", "weights", "delay_steps", "frequency", "disturbance", *_NUMBERS):
-        values = np.ascontiguousarray(data[name].values, dtype="<f8")
-        # One bit pattern for missing values.
-        digest.update(np.where(np.isnan(values), np.nan, values).tobytes())
-    return digest.hexdigest()
+    names = ("samples", "weights", "delay_steps", "frequency", "disturbance", *_NUMBERS)
+    return hash_of(*(data[name].values for name in names))
 
 
 def log_cost(J: Array) -> Array:

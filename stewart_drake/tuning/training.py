@@ -21,7 +21,6 @@ rows are of runs with the network. Excluded conditions, and with them motions, d
 and which round was better, in the loop.
 """
 
-import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -50,6 +49,7 @@ from stewart_drake.tuning.data import (
     WATCHED,
     cells,
     data_hash,
+    hash_of,
     log_cost,
     read_condition,
     roll_out,
@@ -144,34 +144,32 @@ def standard(inputs: Array) -> tuple[Array, Array]:
 
 
 class TorchModel:
-    """f of rows of inputs and its Jacobian by torch, in double precision.
+    """f and its Jacobian over rows of inputs, by torch in double precision.
+
+    `outputs` is f (N, 2) of theta and inputs u (N, n), `jacobian` df/dtheta (N, 2, len(theta)).
 
     Raises:
         ConfigError: torch is not installed.
     """
 
     def __init__(self, inputs: int, hidden: int) -> None:
-        self._torch = torch = require_torch()
+        torch = require_torch()
 
         def forward(theta: Any, u: Any) -> Any:
             W1, b1, W2, b2 = unpack(theta, inputs, hidden)
             return W2 @ torch.sigmoid(W1 @ u + b1) + b2
 
-        self._forward = torch.func.vmap(forward, in_dims=(None, 0))
-        self._jacobian = torch.func.vmap(torch.func.jacrev(forward), in_dims=(None, 0))
+        def of_arrays(function: Any) -> Callable[[Array, Array], Array]:
+            over_rows = torch.func.vmap(function, in_dims=(None, 0))
 
-    def _call(self, function: Callable[[Any, Any], Any], theta: Array, u: Array) -> Array:
-        with self._torch.no_grad():
-            tensors = (self._torch.from_numpy(np.ascontiguousarray(x)) for x in (theta, u))
-            return np.asarray(function(*tensors).numpy())
+            def call(theta: Array, u: Array) -> Array:
+                with torch.no_grad():
+                    tensors = (torch.from_numpy(np.ascontiguousarray(x)) for x in (theta, u))
+                    return np.asarray(over_rows(*tensors).numpy())
 
-    def outputs(self, theta: Array, u: Array) -> Array:
-        """Return f (N, 2) of inputs u (N, n)."""
-        return self._call(self._forward, theta, u)
+            return call
 
-    def jacobian(self, theta: Array, u: Array) -> Array:
-        """Return df/dtheta (N, 2, len(theta))."""
-        return self._call(self._jacobian, theta, u)
+        self.outputs, self.jacobian = map(of_arrays, (forward, torch.func.jacrev(forward)))
 
 
 def _card(seed: int, **more: Any) -> dict[str, Any]:
@@ -615,13 +613,12 @@ class RegretTrainer:
         W1, b1, W2, b2 = unpack(theta, NUM_INPUTS, HIDDEN)
         half = np.array([[0.5, -0.5], [-0.5, 0.5]])
         ends = np.array([weights_of(RATIOS[0]), weights_of(RATIOS[-1])])
-        costs = np.maximum(self._curves.J, LEAST).astype("<f8").tobytes()
         card = _card(
             self._seed,
             **about,
             held_out=int(self.held.sum()),
             loss="regret",
-            costs_sha256=hashlib.sha256(costs).hexdigest(),
+            costs_sha256=hash_of(np.maximum(self._curves.J, LEAST)),
         )
         return Network(
             input_mean=self.mean,
@@ -640,10 +637,8 @@ class RegretTrainer:
 
 def _key(network: Network) -> str:
     """Return the SHA-256 of the parameters of a network."""
-    digest = hashlib.sha256()
-    for name in ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds", "start"):
-        digest.update(np.ascontiguousarray(getattr(network, name), "<f8").tobytes())
-    return digest.hexdigest()
+    names = ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds", "start")
+    return hash_of(*(getattr(network, name) for name in names))
 
 
 def summarize(training: Training) -> dict[str, Any]:
