@@ -1,20 +1,17 @@
 """Compare the law with 0.2 under drawn conditions that were used for no tuning.
 
-`python benchmarks/fresh.py [JOBS]` writes benchmarks/results/fresh.json and fresh.md. A condition is a machine, a
-motion, a delay, a period, a sensor, a link and unknown parameters, drawn from SEED. Each runs with
-three seeds of its noise and signs, on the exact plant. fresh_0.2.json has the same runs of 0.2's law,
-made by the same command before the filter's noise changed.
+`python benchmarks/fresh.py [JOBS]` writes benchmarks/results/fresh.json and fresh.md. A condition
+is a machine, a motion, a delay, a period, a sensor, a link and unknown parameters, drawn from SEED.
+Each runs with three seeds of its noise and signs, on the exact plant. fresh_0.2.json has the same
+runs of 0.2's law, made by the same command before the filter's noise changed.
 """
 
 import json
-import os
 import sys
 from typing import Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import numpy as np
-from _page import RESULTS
+from _bench import RESULTS
 from joblib import Parallel, delayed
 
 import stewart_drake as sd
@@ -80,7 +77,8 @@ def run(number: int, seed: int) -> dict[str, Any]:
     kinds = rng.random(5) < 0.5
     experiment = prepare(sd.load_scenario(name, controller, chosen))
     motion = experiment.motion_scale
-    torque = reference_torque(experiment.nominal, experiment.reference, experiment.scenario.duration)
+    duration = experiment.scenario.duration
+    torque = reference_torque(experiment.nominal, experiment.reference, duration)
     signs = np.random.Generator(np.random.Philox([SEED, 2000 + number, seed]))
     bias = kinds[0] * 0.05 * sizes[0] * torque * signs.choice([-1.0, 1.0], 6)
     plate = experiment.mechanism.plate.mass

@@ -215,7 +215,7 @@ def minutes() -> str:
         f"{status_seen}. Both processes ran in {counts['scheduled']}. "
         f"{counts['samples']} samples, {counts['deadlines_missed']} deadlines missed, "
         f"{summary['counts']['measurements_missing']} measurements missing, "
-        f"{counts['periods_dry']} periods dry, {counts['recoveries']} ways planned anew. Torques went out "
+        f"{counts['periods_dry']} periods dry, {counts['recoveries']} plans. Torques went out "
         f"{late['median']:.0f} ms after the soonest measurement (99 %: {late['p99']:.0f}, worst "
         f"{late['worst']:.0f}), the law's step took {s['median']:.1f} ms (worst {s['worst']:.0f}); "
         f"{loads}.",
@@ -323,8 +323,8 @@ def kills() -> str:
         f"random; {void} runs had ended before that. {load()}",
         "\n".join(
             [
-                f"- The machine was at its safe torque after {min(safe):.2f} to {max(safe):.2f} s; it "
-                "promises 1 s after the last word, which is up to 0.32 s on its way.",
+                f"- The machine was at its safe torque after {min(safe):.2f} to {max(safe):.2f} s; "
+                "its limit is 1 s after the last packet, which takes up to 0.32 s.",
                 f"- A controller that waited took over {len(taken)} times: "
                 + ", ".join(
                     f"{sum(t == kind for t in taken)} {kind}" for kind in ("at rest", "in motion")
