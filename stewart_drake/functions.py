@@ -314,7 +314,7 @@ def train_tuner(
 
     Args:
         data: folder or file of `make_tuner_data`.
-        out: file of the network; with `regret` its own runs are kept beside it.
+        out: file of the network; with `regret` its runs are kept in the same folder.
         progress: called with the number of the network's finished runs and of all.
         OPTIONS
 

@@ -1,4 +1,4 @@
-"""Drake systems of the loop, for diagrams of one's own."""
+"""Drake systems of the loop, for user diagrams."""
 
 from stewart_drake.loop.controller import DelayLqiController, Reference, ServoController
 from stewart_drake.loop.exact import ExactPlant

@@ -265,7 +265,7 @@ def test_a_reachable_height_is_named(z, load):
 
 def test_that_no_height_is_reachable_is_said(load):
     for sideways in (0.4, 50.0):
-        with pytest.raises(ConfigError, match="within reach, of which there is none at this x, y"):
+        with pytest.raises(ConfigError, match="within reach, but none exists at this x, y"):
             load(paper_with({"home": [0, 0, 0, sideways, 0, 0.38]}))
 
 

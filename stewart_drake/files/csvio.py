@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import read_bytes
@@ -43,7 +44,7 @@ class Table:
     header: str
     labels: dict[str, str]
     scales: dict[str, float]
-    lines: Array
+    lines: NDArray[np.intp]
     columns: dict[str, Array]
 
     def place(self, row: int, name: str | None = None) -> str:

@@ -11,8 +11,7 @@ from typing import Final
 
 from stewart_drake.files.errors import ConfigError
 
-_NAME: Final = 40
-"""Letters of a file's name in its temporary name; a name has at most 255 bytes."""
+_NAME: Final = 40  # letters of a file's name in its temporary name; a name has at most 255 bytes
 
 
 def read_bytes(path: Path, most: int, expected: str) -> bytes:

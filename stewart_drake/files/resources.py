@@ -1,4 +1,4 @@
-"""Where the shipped mechanisms, scenarios, controllers and tuner weights are found.
+"""Paths of the shipped mechanisms, scenarios, controllers and tuner weights.
 
 A word is a shipped name; anything with a slash, or ending in `.yaml`, `.yml` or `.json`, is a path.
 """
@@ -18,7 +18,7 @@ KINDS: Final[dict[Kind, str]] = {
     "overlay": "overlays",
     "weights": "tuner weights",
 }
-"""What there is of shipped data, and its plural."""
+"""Kinds of shipped data, with plurals."""
 
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
 _PLACES: Final[dict[Kind, tuple[str, str]]] = {
@@ -31,23 +31,23 @@ _PLACES: Final[dict[Kind, tuple[str, str]]] = {
 
 
 def data_root() -> Path:
-    """The folder that holds `models/` and `diagrams/`.
+    """Return the folder that holds `models/` and `diagrams/`.
 
-    A wheel carries the data inside the package; a checkout or an editable install has them beside
-    it. The package is looked at first, since a neighbour in site-packages may also be `models`.
+    It is inside the package in a wheel, and the parent folder in a checkout. The package comes
+    first, since site-packages may hold another folder `models`.
     """
     packaged = _PACKAGE / "_data"
     return packaged if packaged.is_dir() else _PACKAGE.parent
 
 
 def shipped(kind: Kind) -> list[str]:
-    """The sorted names that `resolve` accepts as a bare word for this kind."""
+    """Return the sorted names that `resolve` accepts as a bare word for this kind."""
     folder, suffix = _PLACES[kind]
     return sorted(path.stem for path in (data_root() / folder).glob(f"*{suffix}"))
 
 
 def is_path(name_or_path: str | Path) -> bool:
-    """Whether this is a path; otherwise it is a shipped name."""
+    """Return whether this is a path; otherwise it is a shipped name."""
     text = str(name_or_path)
     return (
         isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml", ".json"))
@@ -55,20 +55,17 @@ def is_path(name_or_path: str | Path) -> bool:
 
 
 def absolute_path(path: str | Path, relative_to: Path | None = None) -> Path:
-    """`path` made absolute against the folder `relative_to` (default: the working directory)."""
+    """Return an absolute path, relative to a folder (default: the working directory)."""
     return Path(os.path.abspath((relative_to or Path.cwd()) / path))
 
 
 def resolve(kind: Kind, name_or_path: str | Path, relative_to: Path | None = None) -> Path:
-    """Finds a data file.
+    """Return the absolute path of an existing data file.
 
     Args:
-        kind: what is asked for.
+        kind: of the data.
         name_or_path: a shipped name or a path.
-        relative_to: the folder that relative paths start from; the working directory by default.
-
-    Returns:
-        The absolute path of something that exists.
+        relative_to: folder that relative paths start from; the working directory by default.
 
     Raises:
         ConfigError: no such name or file; the message lists what is shipped, nearest first.
@@ -89,7 +86,7 @@ def resolve(kind: Kind, name_or_path: str | Path, relative_to: Path | None = Non
 
 
 def _nearest(kind: Kind, name: str) -> str:
-    """The shipped names, those that resemble `name` first."""
+    """Return the shipped names, those that resemble `name` first."""
     names = shipped(kind)
     alike = resembling(name, names)
     return ", ".join([*alike, *(n for n in names if n not in alike)]) or "none"

@@ -1,4 +1,4 @@
-"""What a result depends on beside its scenario."""
+"""Versions that a result depends on."""
 
 import platform
 from functools import cache
@@ -8,6 +8,6 @@ _version = cache(version)  # read from files, which takes ms
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
+    """Return the versions that a result depends on."""
     packages = ("stewart-drake", "drake", "casadi", "numpy", "scipy")
     return {"python": platform.python_version()} | {name: _version(name) for name in packages}

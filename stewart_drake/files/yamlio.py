@@ -29,8 +29,7 @@ from stewart_drake.files.schema import dotted_names
 
 _MAX_BYTES: Final = 100_000
 _MAX_DEPTH: Final = 20
-_MOST_PROBLEMS: Final = 5
-"""Largest number of problems in one message."""
+_MOST_PROBLEMS: Final = 5  # largest number of problems in one message
 _UNKNOWN: Final = ("extra_forbidden", "unexpected_keyword_argument")
 
 _T = TypeVar("_T")

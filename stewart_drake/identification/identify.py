@@ -38,8 +38,7 @@ from stewart_drake.mechanism.geometry import Mechanism, fingerprint
 from stewart_drake.scenario.calibration import Calibration
 from stewart_drake.types import Array
 
-WRONG: Final = 1.5
-"""chi^2 per value above which a fit is wrong and its intervals have no meaning."""
+WRONG: Final = 1.5  # chi^2 per value above which a fit is wrong and its intervals have no meaning
 USUAL_DELAY: Final = 0.1  # believed delay without any other information, s
 _FEW: Final = 15  # iterations over the segments that are fitted first
 _COARSE: Final = 0.1  # error of the coarse delay, s

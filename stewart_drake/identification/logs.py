@@ -151,7 +151,7 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
     if problem := _run_problem(scenario):
         raise ConfigError(f"{path}: {problem}; expected {EXPECTED}")
     period = scenario.controller.period
-    # Held signals show a sample's value from its instant on, and every sample has a row.
+    # Signals show a sample's value from its instant on, and every sample has a row.
     count = int(min(time[-1] / period + 1e-9, len(time))) + 1
     samples: Array = period * np.arange(count, dtype=np.float64)
     rows = np.minimum(np.searchsorted(time, samples - 1e-9), len(time) - 1)

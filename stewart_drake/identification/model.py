@@ -35,8 +35,7 @@ LEG_PLACES: Final = (0, 1, 12, 13, 14, 15, 16, 17)
 """In a leg's numbers (`mechanism.geometry.geometry_of`): crank, rod, plate joint, shaft; m."""
 PER_LEG: Final = len(LEG_PLACES)
 NUM_GEOMETRY: Final = NUM_LEGS * PER_LEG
-NUM_DYNAMIC: Final = SHAPES["parameters"][0]
-"""Parameters of the dynamics."""
+NUM_DYNAMIC: Final = SHAPES["parameters"][0]  # parameters of the dynamics
 
 
 class Numbers(NamedTuple):

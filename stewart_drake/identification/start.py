@@ -19,8 +19,7 @@ from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES
 from stewart_drake.scenario.signals import RATES as STATE_RATES
 from stewart_drake.types import Array
 
-Pair = tuple[Log, Array]
-"""A log, and the poses (n, 6) at its instants."""
+Pair = tuple[Log, Array]  # a log, and the poses (n, 6) at its instants
 
 LONGEST: Final = 2.0  # length of a segment, s
 SHORTEST: Final = 0.2

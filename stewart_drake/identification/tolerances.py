@@ -41,8 +41,7 @@ class Tolerances:
     coulomb: Annotated[_Std | None, Field(description="N m, of a crank")] = None
 
 
-TOLERANCE_UNITS: Final = units_of(Tolerances)
-"""Unit and meaning of each field."""
+TOLERANCE_UNITS: Final = units_of(Tolerances)  # unit and meaning of each field
 
 
 def read_tolerances(settings: Iterable[str]) -> Tolerances:

@@ -48,8 +48,7 @@ NAMES: Final = (
     "delay",
 )
 UNITS: Final = (*PLANT_PARAMETER_UNITS, *("m",) * NUM_GEOMETRY, *("rad",) * NUM_LEGS, "s")
-ONE_SIDED: Final = (DAMPING, COULOMB)
-"""Unknowns that are not negative."""
+ONE_SIDED: Final = (DAMPING, COULOMB)  # unknowns that are not negative
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The assembled machine: where every body is, and what the torques of the cranks do to the plate.
+"""The assembled machine: placement of every body, and the map of torques to accelerations.
 
 Link frames: crank link C at the shaft centre with x along the crank and z along the motor axis; rod
 link D at the crank tip with x along the rod and y along the universal joint's second axis, which is
@@ -13,7 +13,7 @@ import numpy as np
 
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, levers, rotation
-from stewart_drake.scenario.signals import ANGLES, NUM_LEGS, POSITION
+from stewart_drake.scenario.signals import ANGLES, POSITION
 from stewart_drake.types import Array
 
 TorqueMap = Literal["virtual_work", "printed"]
@@ -31,7 +31,7 @@ class Assembly:
 
 
 def assemble(mechanism: Mechanism, pose: Array) -> Assembly:
-    """Link frames at a pose (6,).
+    """Return the link frames at a pose (6,).
 
     Raises:
         UnreachablePoseError: the pose is out of reach.
@@ -60,7 +60,7 @@ class JointState:
 
 
 def joint_state(mechanism: Mechanism, pose: Array, rates: Array) -> JointState:
-    """Joint angles and rates of the tree that close all loops at a pose (6,) with rates (6,).
+    """Return joint angles and rates that close all loops at a pose (6,) with rates (6,).
 
     Raises:
         UnreachablePoseError: the pose is out of reach.
@@ -70,13 +70,10 @@ def joint_state(mechanism: Mechanism, pose: Array, rates: Array) -> JointState:
     axes = mechanism.R_WS[:, :, 2]
     # The cross-piece turns about the motor axis n with the crank and by theta_1 against it; its
     # axis y then carries the rod, at the angle atan2(x.n, x.(n x y)) about y.
-    first, second = np.zeros(NUM_LEGS), np.zeros(NUM_LEGS)
-    for leg in range(NUM_LEGS):
-        n = axes[leg]
-        y_of_crank = now.R_WC[leg] @ home.R_WC[leg].T @ home.R_WD[leg][:, 1]
-        y = now.R_WD[leg][:, 1]
-        first[leg] = np.arctan2(np.cross(y_of_crank, y) @ n, y_of_crank @ y)
-        second[leg] = _elevation(now.R_WD[leg], n) - _elevation(home.R_WD[leg], n)
+    y_of_crank = (now.R_WC @ home.R_WC.swapaxes(1, 2) @ home.R_WD[:, :, 1, None])[..., 0]
+    y = now.R_WD[:, :, 1]
+    first = np.arctan2(_dot(np.cross(y_of_crank, y), axes), _dot(y_of_crank, y))
+    second = _elevation(now.R_WD, axes) - _elevation(home.R_WD, axes)
     turn = (now.crank_angles - home.crank_angles + np.pi) % (2 * np.pi) - np.pi
 
     # Rates: alpha_dot from the rod's length; the rod's angular velocity without spin r x d / l,
@@ -84,15 +81,15 @@ def joint_state(mechanism: Mechanism, pose: Array, rates: Array) -> JointState:
     legs = leg_geometry(mechanism, pose)
     w_WP = angle_rate_map(pose[ANGLES]) @ rates[ANGLES]
     v_WQ = rates[POSITION] + np.cross(w_WP, legs.p_PQ_W)
-    along = np.einsum("li,li->l", legs.rod, v_WQ)
+    along = _dot(legs.rod, v_WQ)
     # At rest a dead centre is a pose like any other; moving, it takes levers that are not zero.
     alpha_dot = along / levers(mechanism, legs) if along.any() else along
     v_WT = (mechanism.crank_lengths * alpha_dot)[:, None] * legs.tangent
     swing = np.cross(legs.rod, v_WQ - v_WT) / mechanism.rod_lengths[:, None]
-    swing_n, rod_n = np.einsum("li,li->l", swing, axes), np.einsum("li,li->l", legs.rod, axes)
+    swing_n, rod_n = _dot(swing, axes), _dot(legs.rod, axes)
     w_WD = swing + (swing_n * rod_n / (1 - rod_n**2))[:, None] * legs.rod
-    first_rate = np.einsum("li,li->l", w_WD, axes) - alpha_dot
-    second_rate = np.einsum("li,li->l", w_WD, now.R_WD[:, :, 1])
+    first_rate = _dot(w_WD, axes) - alpha_dot
+    second_rate = _dot(w_WD, now.R_WD[:, :, 1])
     return JointState(
         crank=turn,
         universal=np.column_stack([first, second]),
@@ -101,13 +98,17 @@ def joint_state(mechanism: Mechanism, pose: Array, rates: Array) -> JointState:
     )
 
 
-def _elevation(R_WD: Array, axis: Array) -> float:
-    x, y = R_WD[:, 0], R_WD[:, 1]
-    return float(np.arctan2(x @ axis, x @ np.cross(axis, y)))
+def _elevation(R_WD: Array, axes: Array) -> Array:
+    x, y = R_WD[:, :, 0], R_WD[:, :, 1]
+    return np.asarray(np.arctan2(_dot(x, axes), _dot(x, np.cross(axes, y))), dtype=np.float64)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.einsum("li,li->l", a, b)
 
 
 def torque_map(mechanism: Mechanism, pose: Array, form: TorqueMap = "virtual_work") -> Array:
-    """Return tau_tot (6, 6), equation (19): d accelerations / d torque at rest, in SI units.
+    """Return tau_tot (6, 6), equation (19): d accelerations / d torque at rest, SI units.
 
     Each rod pushes the plate with a force F_i along itself, so that (11)-(14)
 

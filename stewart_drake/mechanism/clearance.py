@@ -1,9 +1,9 @@
-"""How thick the parts are, and how far cranks and rods are apart at least, for many poses at once.
+"""Sizes of the parts, and least distances of cranks and rods, for many poses at once.
 
-Each link is held in a capsule, what is within a radius of its centre line: a rod of the SDFormat
-model with the rod's own radius, a crank, a bar of width w and thickness h, with hypot(w, h) / 2.
-Two capsules are apart by the distance of the lines less both radii, and the links inside them by
-that at least. `loop.clearance` measures the shapes themselves, and plate and base too.
+Each link lies in a capsule, the points within a radius of its centre line: hypot(w, h) / 2 for a
+crank, a bar of width w and thickness h, and its own radius for a rod. The distance of two lines
+less both radii is a lower bound of the links' distance. `loop.clearance` measures the shapes
+themselves, with plate and base.
 """
 
 from itertools import combinations
@@ -18,14 +18,13 @@ from stewart_drake.types import Array
 LINKS: Final = tuple(f"{kind} {leg}" for kind in ("crank", "rod") for leg in LEGS)
 """Names of the links, in the order of `center_lines`."""
 APART: Final = tuple((i, j) for i, j in combinations(range(2 * NUM_LEGS), 2) if j - i != NUM_LEGS)
-"""Pairs (60) of links that no joint holds together: all but a crank and its own rod."""
+"""Pairs (60) of links without a common joint: all but a crank and its own rod."""
 
 
 class Proportions(NamedTuple):
     """Sizes of the shapes that are drawn and that collide, in m."""
 
-    crank_thickness: float
-    """Along the motor axis."""
+    crank_thickness: float  # along the motor axis
     crank_width: float
     motor_radius: float
     motor_length: float
@@ -34,30 +33,21 @@ class Proportions(NamedTuple):
 
 
 def proportions(mechanism: Legs) -> Proportions:
-    """Return them by the shortest crank and rod: a machine's file does not tell them."""
+    """Return sizes by the shortest crank and rod, as a machine's file has none."""
     u, rod = float(mechanism.crank_lengths.min()), float(mechanism.rod_lengths.min())
-    thickness = 0.10 * u
-    return Proportions(
-        crank_thickness=thickness,
-        crank_width=1.6 * thickness,
-        motor_radius=0.22 * u,
-        motor_length=0.40 * u,
-        rod_radius=0.012 * rod,
-        plate_thickness=0.03 * rod,
-    )
+    crank = 0.10 * u
+    return Proportions(crank, 1.6 * crank, 0.22 * u, 0.40 * u, 0.012 * rod, 0.03 * rod)
 
 
 class Lines(NamedTuple):
     """Centre lines of the links at n poses."""
 
-    start: Array
-    """(n, 12, 3) in m, W."""
-    along: Array
-    """(n, 12, 3), from one end to the other."""
+    start: Array  # (n, 12, 3) in m, W
+    along: Array  # (n, 12, 3), from one end to the other
 
 
 def center_lines(mechanism: Legs, poses: Array, legs: LegGeometry) -> Lines:
-    """Of cranks, then rods; `legs` are those of `kinematics.legs_along` at the poses (n, 6)."""
+    """Return the lines of cranks, then rods; `legs` are those of the poses (n, 6)."""
     cranks = mechanism.crank_lengths[:, None] * legs.crank
     rods = mechanism.rod_lengths[:, None] * legs.rod
     joints = poses[:, None, POSITION] + legs.p_PQ_W
@@ -66,13 +56,13 @@ def center_lines(mechanism: Legs, poses: Array, legs: LegGeometry) -> Lines:
 
 
 def segment_distances(p: Array, u: Array, q: Array, v: Array) -> Array:
-    """Distances (...) of the segments p + s u and q + t v, 0 <= s, t <= 1; arrays (..., 3).
+    """Return distances (...) of the segments p + s u and q + t v, 0 <= s, t <= 1; arrays (..., 3).
 
     |r + s u - t v|^2, r = p - q, is convex in (s, t). Over all s and t it is least where
     s (u.u v.v - (u.v)^2) = (u.v)(v.r) - (u.r)(v.v). That s is cut to the segment, then the best t
     for it, and then the best s for that t: if one of the three was cut, the minimum over the
-    square lies on its border, and these steps end there. Parallel lines have many minima, of which
-    s = 0 leads to one. Lengths are not zero.
+    square lies on its border, and these steps end there. Parallel lines have many minima, and s = 0
+    leads to one. Lengths are not zero.
     """
     r = p - q
     uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)
@@ -86,7 +76,7 @@ def segment_distances(p: Array, u: Array, q: Array, v: Array) -> Array:
 
 
 def clearances(mechanism: Legs, poses: Array, legs: LegGeometry) -> Array:
-    """Distances (n, 60) in m that the pairs `APART` have at least; negative where none is known."""
+    """Return lower bounds (n, 60) of the distances of the pairs `APART`, m; may be negative."""
     first, second = np.array(APART).T
     start, along = center_lines(mechanism, poses, legs)
     lines = start[:, first], along[:, first], start[:, second], along[:, second]
@@ -95,7 +85,7 @@ def clearances(mechanism: Legs, poses: Array, legs: LegGeometry) -> Array:
 
 
 def capsule_radii(mechanism: Legs) -> Array:
-    """(12,) m, of the capsules that hold the links."""
+    """Return the radii (12,) of the links' capsules, m."""
     size = proportions(mechanism)
     crank = float(np.hypot(size.crank_width, size.crank_thickness)) / 2
     return np.repeat([crank, size.rod_radius], NUM_LEGS)

@@ -22,10 +22,8 @@ _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 # Limits far beyond any platform keep squares and products finite.
 _SHORTEST, _LONGEST = 1e-6, 1e3
-_MOST_LEAN = 2e-3
-"""rad; directions written with three decimals are off the right angle by less."""
-_PAPER = 0.1
-"""kg/m^2, a sheet of paper; a lighter plate has its lengths in millimetres."""
+_MOST_LEAN = 2e-3  # rad; directions written with three decimals are off the right angle by less
+_PAPER = 0.1  # kg/m^2, a sheet of paper; a lighter plate has its lengths in millimetres
 
 
 def _in_metres(value: float) -> float:
@@ -176,8 +174,9 @@ def load_mechanism(name_or_path: str | Path) -> Mechanism:
 @lru_cache(maxsize=16)
 def _load(path: Path, *unchanged: int) -> Mechanism:
     """Read a file once until its time or size changes: a Monte Carlo run takes milliseconds."""
+    spec = mechanism_spec(path)
     try:
-        return build_mechanism(mechanism_spec(path))
+        return build_mechanism(spec)
     except (UnreachablePoseError, ConfigError) as error:
         raise ConfigError(f"{path}: {error}") from None
 

@@ -28,10 +28,8 @@ from stewart_drake.types import Array
 
 RESERVED_NAMES: Final = ("world", "WorldModelInstance", "DefaultModelInstance")
 """Names that SDFormat and Drake keep for themselves."""
-THINNESS: Final = 20.0
-"""Length over diameter of an estimated crank or rod."""
-_BRANCHES: Final = slice(2 * NUM_LEGS, 3 * NUM_LEGS)
-"""Place of the crank branches in `geometry_of`."""
+THINNESS: Final = 20.0  # length over diameter of an estimated crank or rod
+_BRANCHES: Final = slice(2 * NUM_LEGS, 3 * NUM_LEGS)  # place of the crank branches in `geometry_of`
 
 
 @dataclass(frozen=True)
@@ -193,7 +191,7 @@ class Mechanism(kinematics.Legs):
             heights = kinematics.reachable_heights(self, self.home)
             where = "at this x, y and orientation"
             if heights is None:
-                accepted = f"of which there is none {where}"
+                accepted = f"but none exists {where}"
             else:
                 low, high = heights
                 middle = (low + high) / 2

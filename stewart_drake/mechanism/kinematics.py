@@ -20,8 +20,7 @@ from stewart_drake.types import Array
 DEAD_CENTRE_TRANSMISSION = 1e-7
 """|rod . tangent| that counts as zero. Next to a dead centre acos resolves the crank angle to the
 square root of the rounding, 1.5e-8 rad: quotients by less than this have no correct digit."""
-_HEIGHTS = 1000
-"""Number of heights that `reachable_heights` evaluates."""
+_HEIGHTS = 1000  # number of heights that `reachable_heights` evaluates
 
 
 @dataclass(frozen=True, eq=False)

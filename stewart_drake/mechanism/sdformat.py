@@ -1,4 +1,4 @@
-"""Writes a `Mechanism` as SDFormat for Drake: links, joints, shapes, a ball constraint per leg."""
+"""SDFormat of a `Mechanism` for Drake: links, joints, shapes, a ball constraint per leg."""
 
 from collections.abc import Iterable
 from xml.etree import ElementTree as ET
@@ -20,17 +20,17 @@ PLATE_COLOR = (0.13, 0.42, 0.70, 1.0)
 
 
 def to_sdformat(mechanism: Mechanism, *, collision: bool = True, weld: bool = True) -> str:
-    """The mechanism as an SDFormat 1.9 document, assembled at its home pose.
+    """Return the mechanism as an SDFormat 1.9 document, assembled at its home pose.
 
     Links: `base`, `plate`, `crank_i`, `rod_i`; joints: `base_weld`, `motor_i` (revolute, actuated),
     `universal_i`; a frame at every joint: `shaft_i`, `tip_i`, `rod_end_i`, `plate_joint_i`. Legs i
     count from 1.
     The loops are closed by `drake:ball_constraint` between `rod_i` and `plate`.
 
-    Discs, motors, posts, crank arms and rod tubes collide with whatever else is in the scene, the
-    collision filter group `machine` with nothing of the same machine: cranks and rods of a pair may
-    cross, and joints overlap. Without collisions (`collision` false) shapes are only drawn. Without
-    `weld` there is no `base_weld`, which fixes the base in the world: the base is free.
+    Discs, motors, posts, crank arms and rod tubes collide with other objects in the scene. The
+    collision filter group `machine` excludes collisions within the machine, whose joints overlap.
+    Without `collision` shapes are only drawn. Without `weld` the base is free, else `base_weld`
+    fixes it in the world.
     """
     home = assemble(mechanism, mechanism.home)
     sdf = ET.Element("sdf", {"version": "1.9", "xmlns:drake": "http://drake.mit.edu"})
@@ -201,7 +201,7 @@ def _axis(joint: ET.Element, tag: str, xyz: Array) -> ET.Element:
 def _solid(
     link: ET.Element, name: str, pose: str, geometry: ET.Element, color: tuple[float, ...]
 ) -> None:
-    """A shape that is seen and collides."""
+    """Add a shape for display and collisions."""
     _visual(link, name, pose, geometry, color)
     collision = _add(link, "collision", name=name)
     _add(collision, "pose", pose)

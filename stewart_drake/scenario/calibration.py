@@ -17,14 +17,12 @@ from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.scenario.signals import COULOMB_SPEED, LEGS, PLANT_PARAMETERS
 from stewart_drake.types import Array
 
-DELAY: Final = "delay"
-"""Name of the delay of a torque, s."""
+DELAY: Final = "delay"  # name of the delay of a torque, s
 OFFSETS: Final = tuple(f"offset_A{leg}" for leg in LEGS)
 """Names of the encoders' offsets: reading minus crank angle, rad."""
 CALIBRATED: Final = (*PLANT_PARAMETERS, DELAY, *OFFSETS)
 """Names of all parameters that a calibration can have."""
-ROUNDING: Final = 1e-9
-"""Relative error of a covariance that counts as rounding."""
+ROUNDING: Final = 1e-9  # relative error of a covariance that counts as rounding
 
 
 @dataclass(frozen=True)
@@ -58,9 +56,9 @@ class Calibration:
         self._check_covariance(P)
         least = {PLANT_PARAMETERS[COULOMB_SPEED]: (1e-300, "above 0"), DELAY: (0.0, "0 or more")}
         for name, (low, accepted) in least.items():
-            value = self.value(name)
-            if value is not None and value < low:
-                raise ConfigError(f"mean: got a {name} of {value:g}; expected {accepted}")
+            found = self.value(name)
+            if found is not None and found < low:
+                raise ConfigError(f"mean: got a {name} of {found:g}; expected {accepted}")
 
     def _check_covariance(self, P: Array) -> None:
         variances = np.diag(P)

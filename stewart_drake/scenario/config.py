@@ -161,8 +161,7 @@ class PriorConfig:
     offsets: Positive | None = None
 
 
-ESTIMATED: Final = ["torque_bias", "payload", "damping"]
-"""Parameters that are estimated by default."""
+ESTIMATED: Final = ["torque_bias", "payload", "damping"]  # parameters that are estimated by default
 
 
 def _check_estimate(names: list[str]) -> list[str]:
@@ -530,8 +529,8 @@ class Scenario:
         low, high = ASSUMED_TIMES
         return (
             f"link.low: got null with a delay that is {'0' if zero else 'not constant'}; expected "
-            f"link.low and link.high in s, or a constant delay, of which null is {low:g} and "
-            f"{high:g} times"
+            f"link.low and link.high in s, or a constant delay; null is {low:g} and {high:g} "
+            "times that"
         )
 
     def _network_problem(self) -> str | None:

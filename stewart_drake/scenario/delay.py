@@ -46,5 +46,5 @@ class Delay:
 
     @property
     def queue_length(self) -> int:
-        """Number of torques of earlier samples in flight or acting: mu, one more for eta0 > 0."""
+        """Number of earlier torques in flight or at the plant: mu, one more for eta0 > 0."""
         return self.steps + (1 if self.fraction > 0 else 0)

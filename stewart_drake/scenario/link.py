@@ -14,8 +14,7 @@ from stewart_drake.scenario.link_config import ASSUMED_TIMES, PacketsConfig
 from stewart_drake.scenario.packets import BACK, SENSOR, packet_times
 from stewart_drake.types import Array
 
-SIMULTANEOUS: Final = 1e-9
-"""Of a period; events closer to each other have no order."""
+SIMULTANEOUS: Final = 1e-9  # of a period; events closer to each other have no order
 
 
 def number_sent(duration: float, period: float) -> int:

@@ -25,8 +25,7 @@ from stewart_drake.scenario.config import (
 from stewart_drake.scenario.dependencies import Idle, idle_fields, reset
 
 _SETTINGS = "settings"
-_FILES = ("file", "calibration")
-"""Fields that are always a path; others may be a shipped name."""
+_FILES = ("file", "calibration")  # fields that are always a path; others may be a shipped name
 _OVERLAY = "overlay"
 _KINDS = sections(Scenario)
 

@@ -15,12 +15,9 @@ from stewart_drake.scenario.field_types import MOST_PERIODS
 from stewart_drake.scenario.link_config import PacketsConfig
 from stewart_drake.types import Array
 
-FORWARD, BACK, SENSOR = range(3)
-"""Streams of random numbers of one seed."""
-RARE: Final = 1.5
-"""Accepted share of missing torques, relative to that without late packets."""
-ALMOST_NONE: Final = 1e-3
-"""Accepted share of late torques where no packet is lost."""
+FORWARD, BACK, SENSOR = range(3)  # streams of random numbers of one seed
+RARE: Final = 1.5  # accepted share of missing torques, relative to that without late packets
+ALMOST_NONE: Final = 1e-3  # accepted share of late torques where no packet is lost
 
 
 def times_under_way(config: PacketsConfig) -> Any:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
@@ -20,26 +21,20 @@ from stewart_drake.scenario.reference_config import WaypointsConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.types import Array
 
-_POSE: Final = "pose_"
-"""Prefix of a coordinate's name in the files that `export` writes."""
+_POSE: Final = "pose_"  # prefix of a coordinate's name in the files that `export` writes
 _UNITS: Final = {
     "time": {"s": 1.0},
     **dict.fromkeys(COORDINATE_NAMES[:3], ANGLE_UNITS),
     **dict.fromkeys(COORDINATE_NAMES[3:], LENGTH_UNITS),
 }
 _HEADER: Final = "time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m] (or deg, mm)"
-_MIN_ROWS: Final = 4
-"""Least number for a cubic with free ends."""
-_MIN_STEP: Final = 1e-6
-"""s."""
-_MAX_GAP: Final = 10
-"""Largest step over the median step."""
-_MAX_SIZE: Final = 1e3
-"""rad or m."""
+_MIN_ROWS: Final = 4  # least number for a cubic with free ends
+_MIN_STEP: Final = 1e-6  # s
+_MAX_GAP: Final = 10  # largest step over the median step
+_MAX_SIZE: Final = 1e3  # rad or m
 _MAX_KINK: Final = 0.05
 """Largest kink, as a share of the largest peak to peak of the angles, or of the positions."""
-_LEAST_KINK: Final = 1e-3
-"""rad, m; less is noise of a sensor, not a jump."""
+_LEAST_KINK: Final = 1e-3  # rad, m; less is noise of a sensor, not a jump
 
 
 @dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
@@ -151,7 +146,9 @@ def _check_samples(
         ConfigError: the first sample that breaks a rule.
     """
 
-    def check(bad: Array, problem: str, limit: float = 0.0, before: bool = False) -> None:
+    def check(
+        bad: NDArray[np.bool_], problem: str, limit: float = 0.0, before: bool = False
+    ) -> None:
         for row, axis in np.argwhere(bad)[:1]:
             row, name = int(row) + before, COORDINATE_NAMES[axis]
             scale = scales[name]

@@ -10,30 +10,24 @@ COORDINATE_NAMES: Final = ("roll", "pitch", "yaw", "x", "y", "z")
 """Names of the coordinates for users and in their files."""
 COORDINATE_UNITS: Final = ("rad", "rad", "rad", "m", "m", "m")
 RATE_UNITS: Final = ("rad/s", "rad/s", "rad/s", "m/s", "m/s", "m/s")
-LEGS: Final = (1, 2, 3, 4, 5, 6)
-"""Numbers of the legs, from one."""
+LEGS: Final = (1, 2, 3, 4, 5, 6)  # numbers of the legs, from one
 
 NUM_LEGS: Final = 6
 NUM_COORDINATES: Final = 6
 NUM_TORQUES: Final = NUM_LEGS
-NUM_STATE: Final = 2 * NUM_COORDINATES
-"""`state` = [pose(6); rates(6)]."""
-NUM_REFERENCE: Final = 3 * NUM_COORDINATES
-"""`reference` = [pose(6); rates(6); accelerations(6)]."""
+NUM_STATE: Final = 2 * NUM_COORDINATES  # `state` = [pose(6); rates(6)]
+NUM_REFERENCE: Final = 3 * NUM_COORDINATES  # `reference` = [pose(6); rates(6); accelerations(6)]
 
 POSE: Final = slice(0, 6)
 RATES: Final = slice(6, 12)
 ACCELERATIONS: Final = slice(12, 18)
 
-ANGLES: Final = slice(0, 3)
-"""Roll, pitch, yaw inside a pose."""
-POSITION: Final = slice(3, 6)
-"""xyz inside a pose."""
+ANGLES: Final = slice(0, 3)  # roll, pitch, yaw inside a pose
+POSITION: Final = slice(3, 6)  # xyz inside a pose
 
 SETPOINT: Final = slice(0, 12)
 """Crank angles (6) and rates (6) inside a command to servos, which has the size of a reference."""
-MODEL_TORQUE: Final = slice(12, 18)
-"""Torques (6) inside such a command."""
+MODEL_TORQUE: Final = slice(12, 18)  # torques (6) inside such a command
 Carried = Literal["torque", "command"]
 CARRIED: Final[dict[Carried, int]] = {"torque": NUM_TORQUES, "command": NUM_REFERENCE}
 """Size of each kind of command to the motors."""
@@ -58,8 +52,7 @@ NUM_PLANT_PARAMETERS: Final = len(PLANT_PARAMETERS)
 COULOMB: Final = 8
 COULOMB_SPEED: Final = 9
 PAYLOAD_POSITION: Final = slice(10, 13)
-DEFAULT_COULOMB_SPEED: Final = 0.02
-"""rad/s."""
+DEFAULT_COULOMB_SPEED: Final = 0.02  # rad/s
 
 WEIGHTS: Final = ("w_Q", "w_R")
 
@@ -74,8 +67,7 @@ TUNER_INPUTS: Final = (
 )
 """Inputs of densities: `sample` = [state error(12); commanded torque(6)]."""
 
-STATE: Final = (*COORDINATES, *(f"{name}_dot" for name in COORDINATES))
-"""Labels of a state."""
+STATE: Final = (*COORDINATES, *(f"{name}_dot" for name in COORDINATES))  # labels of a state
 
 
 class Dimension(NamedTuple):
@@ -195,7 +187,7 @@ _TABLE: Final = (
     Signal("packets", _PACKETS, "counts of packets, NaN without any", "delay_chain"),
 )
 SIGNALS: Final[dict[str, Signal]] = {signal.name: signal for signal in _TABLE}
-"""By name, in the order of the record. Held signals show the value from an instant on.
+"""By name, in the order of the record. Sampled signals show the value from an instant on.
 
 The ports of the closed loop, the record, and names, units and labels in `signals.nc` and CSV follow
 from it. A new signal is one row, and a port of its source; for the controller that is an entry in

@@ -9,8 +9,7 @@ METRIC_PERIOD: Final = 0.02
 MOST_INSTANTS: Final = 5_000_000
 """Largest number of instants in a log with its own period; each takes 1 kB of memory."""
 
-SERVO_RATE: Final = 1000.0
-"""Least rate at which servos compute their torques, Hz."""
+SERVO_RATE: Final = 1000.0  # least rate at which servos compute their torques, Hz
 
 LEAST_FRACTION: Final = 1e-9
 """Of a period. A delay's part below it is 0: events so close to each other lose their order."""

@@ -40,14 +40,12 @@ from stewart_drake.types import Array
 
 _CONSTANT: Final = 1e-9
 """Range in rad, or relative to the largest position, below which a coordinate is constant."""
-_GRID: Final = 1e-3
-"""Step at which the peak-to-peak of a sampled reference is read, s."""
+_GRID: Final = 1e-3  # step at which the peak-to-peak of a sampled reference is read, s
 _INSTANT: Final = 1e-6
 """Least length of a piece, s; derivatives of a shorter one would be rounding errors."""
 _STOP_SPEED: Final = 1e-3
 """rad/s or m/s; a motion that ends slower than this, or than the share below, is at rest."""
-_STOP_SHARE: Final = 0.05
-"""Of the coordinate's largest speed at a sample."""
+_STOP_SHARE: Final = 0.05  # of the coordinate's largest speed at a sample
 _GOLDEN: Final = (math.sqrt(5) - 1) / 2
 
 
