@@ -37,6 +37,7 @@ from stewart_drake.loop.law_design import (
     sizing_of,
     way_onto,
 )
+from stewart_drake.loop.link import buffer_places, measurement_link
 from stewart_drake.loop.preparation import Experiment, assemble, network_of, prepare
 from stewart_drake.loop.results import Figures, SimulationResult, accumulated_error, figures
 from stewart_drake.loop.sensor import white_noises
@@ -490,9 +491,7 @@ def run_loop(
     if sensor.delay or sensor.loss or sc.link.back is not None:
         late = np.append(measurement_times(sc), np.full(number, np.inf))[:number]
     size = NUM_STATE + (1 + NUM_TORQUES) * reports
-    longest = int(late.max(initial=0.0, where=np.isfinite(late)) / sc.controller.period) + 2
-    together = SIMULTANEOUS * sc.controller.period
-    back = Link(size, longest, sc.controller.period, wire=True, together=together)
+    back = measurement_link(sc.controller.period, late, size)
     back_memory = back.start()
     rows, repeats = (1, 0) if packets is None else (_rows(packets), packets.repeats)
     scratch = np.empty(size + NUM_TORQUES * rows)
@@ -558,7 +557,7 @@ def _motor_link(
         transit = np.append(forward_times(sc, number), np.full(number, np.inf))[:number]
         history, holds = 1 if law is None else reported(law.kept), config.dry == "hold"
         rows = 1 if packets is None else _rows(packets)
-        kept = (delay.steps + rows + 2) * rows + delay.queue_length
+        kept = buffer_places(delay, rows)
     else:
         if not sc.delay.constant:
             drawn = torque_delays(sc)

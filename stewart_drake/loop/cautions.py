@@ -1,7 +1,6 @@
-"""What to say of a result that may not be trusted: one line each, collected here and only here.
+"""Warnings about results that may be wrong: the only place where they are made, one line each.
 
-They are printed before a run as far as they are known then, and stand in `summary.json` as
-`warnings`.
+Those known before a run are printed then. All are in `summary.json` as `warnings`.
 """
 
 from collections.abc import Iterator
@@ -15,16 +14,16 @@ from stewart_drake.loop.servos import quickest_crank
 from stewart_drake.scenario.config import Scenario
 
 TOLERABLE: Final = 1e5
-"""Growth of an error along the motion, by a step of the plant, up to which nothing is said.
+"""Growth of an error along the motion, by a step of the plant, above which there is a warning.
 
-An engine's step is wrong by some 1e-5 of the motion. Measured with the paper's machine under
+The error of an engine's step is some 1e-5 of the motion. Measured with the paper's machine under
 gravity at full, a third and a tenth of its size: up to a growth of 5e4 runs complete as they
 should, from 5e6 on they are lost or wrong by a hundred times the exact plant's error.
 """
 
 
 def cautions_before(experiment: Experiment, margin: ControllerMargin | None) -> list[str]:
-    """What can be said before the run; `margin` is None where the loop was not judged."""
+    """Return the warnings before a run; `margin` is None for a loop that was not judged."""
     said = (stiff_friction(experiment), _of_loop(experiment, margin))
     return [line for line in said if line is not None]
 
@@ -40,15 +39,15 @@ def _of_loop(experiment: Experiment, margin: ControllerMargin | None) -> str | N
 
 
 def stiff_friction(experiment: Experiment) -> str | None:
-    """What is wrong with Coulomb friction in the step of a multibody plant, and which would do.
+    """Return a warning about a time step too long for Coulomb friction, with a step that suits.
 
-    Friction c tanh(rate / s) acts on the rates that a step h begins with. Near rest that is a
-    damper of c / s: with H^-1 the accelerations of the cranks per torque, rates go
+    Friction c tanh(rate / s) acts on the rates at the beginning of a step h. Near rest it is a
+    damper of c / s: with H^-1 the accelerations of the cranks per torque, rates follow
 
         rates_{k+1} = (1 - h c / s H^-1) rates_k,
 
-    which grow, up to h c H^-1, where h c / s exceeds 2 over the largest eigenvalue of H^-1. Then a
-    crank that should creep trembles.
+    which grow, up to h c H^-1, if h c / s exceeds 2 over the largest eigenvalue of H^-1. A crank
+    that should creep then trembles.
     """
     plant = experiment.scenario.plant
     if plant.kind != "multibody" or plant.coulomb_friction == 0:
@@ -67,12 +66,12 @@ def stiff_friction(experiment: Experiment) -> str | None:
 
 
 def coarse_step(experiment: Experiment, margin: ControllerMargin) -> str | None:
-    """What is wrong with the step of a multibody plant, and which would do, or None.
+    """Return a warning about a time step too long for the loop, with a step that suits, or None.
 
-    The engine moves the plate by semi-implicit Euler, whose error of first order acts like a delay
-    that is wrong by h/2 in the pose: a loop that bears less is unstable with the plant in the
-    simulation though not on the machine. Its ball joints are closed by constraints whose gaps are
-    of second order in h and are no part of this. See `ControllerMargin.growth_in_steps`.
+    The engine uses semi-implicit Euler. Its error of first order acts like a delay error of h/2 in
+    the pose: a loop with a smaller margin is unstable in the simulation though not on the machine.
+    The gaps of its ball joints, of second order in h, are neglected. See
+    `ControllerMargin.growth_in_steps`.
     """
     sc = experiment.scenario
     step = sc.plant.time_step
@@ -91,7 +90,7 @@ def coarse_step(experiment: Experiment, margin: ControllerMargin) -> str | None:
 
 
 def _finer(scenario: Scenario) -> Iterator[float]:
-    """Smaller steps of one digit that suit the scenario's periods, s, the largest first."""
+    """Yield smaller steps of one digit that suit the scenario's periods, s, the largest first."""
     for exponent, digit in product(range(-2, -7, -1), (5, 2, 1)):
         step = float(f"{digit}e{exponent}")
         if step < scenario.plant.time_step and not scenario.step_problem(step):
@@ -99,10 +98,10 @@ def _finer(scenario: Scenario) -> Iterator[float]:
 
 
 def cautions_after(experiment: Experiment, summary: RunSummary) -> list[str]:
-    """What the run has shown."""
+    """Return the warnings after a run."""
     found, period = [], 1e3 * experiment.scenario.controller.period
     median, worst = (summary["controller_step_ms"][which] for which in ("median", "worst"))
-    if median > period:  # one slow step is the machine's doing, the median is not
+    if median > period:  # a single slow step may be due to the computer
         found.append(
             f"the controller's step took {median:.3g} ms at the median, longer than its period of "
             f"{period:.3g} ms: on this computer it would not keep up with a real machine"

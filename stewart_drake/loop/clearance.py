@@ -1,12 +1,10 @@
-"""How far the parts of a machine are from each other: Drake's distances between its shapes.
+"""Distances between the parts of a machine: Drake's distances between the shapes of its model.
 
-The shapes are those of the SDFormat model, which collide with nothing of their own machine in a
-simulation. Here the machine is alone in a scene, and pairs are asked for one by one, which no
-collision filter hides. Rods have round ends here, those of the joints at them: between the flat
-ends of two long cylinders Drake's iteration stops early, at distances of 1 mm that are 0.6 mm too
-large, and still 0.09 mm between round ones. So the distance of two rods is that of their centre
-lines in closed form less two radii, exact for capsules. Of a rod and a crank it is Drake's,
-which may be some tenths of a percent too large.
+The machine is alone in a scene, and pairs are queried one by one, without collision filters. Rods
+have round ends here, like the joints at them. Drake's iteration for two long cylinders stops early,
+with errors of 0.6 mm at 1 mm between flat ends and 0.09 mm between round ones. The distance of two
+rods is therefore that of their centre lines in closed form less two radii, exact for capsules. The
+distance of a rod and a crank is Drake's, some tenths of a percent too large at most.
 """
 
 import re
@@ -29,14 +27,14 @@ _AT_REST: Final = np.zeros(6)
 
 
 class Pair(NamedTuple):
-    """Two parts that no joint holds together, such as `crank 2` and `rod 1`."""
+    """Two parts without a common joint, such as `crank 2` and `rod 1`."""
 
     first: str
     second: str
 
     @property
     def fixed(self) -> bool:
-        """Whether one of them is of the base, which stands where the drawing puts it."""
+        """Whether one of them belongs to the base."""
         return any(name.split()[0] in ("base", "motor", "post") for name in self)
 
     def __str__(self) -> str:
@@ -44,14 +42,14 @@ class Pair(NamedTuple):
 
 
 class ClearanceScene:
-    """A machine alone, whose parts are looked at pair by pair.
+    """A machine alone in a scene, for distances between its parts.
 
     Args:
         mechanism: the machine.
-        base: whether its base, motors and posts are looked at too.
+        base: whether to include its base, motors and posts.
 
     Attributes:
-        pairs: what `distances` tells of, in that order.
+        pairs: pairs of parts in the order of `distances`.
     """
 
     def __init__(self, mechanism: Mechanism, base: bool = True) -> None:
@@ -77,7 +75,7 @@ class ClearanceScene:
         self._rods = np.array([[rods[name] for name in self.pairs[k]] for k in known]).T
 
     def distances(self, pose: Array) -> Array:
-        """Of all pairs (p,), in m, at a pose (6,); negative by how far they are in each other.
+        """Return the distances of all pairs (p,), in m, at a pose (6,); negative for an overlap.
 
         Raises:
             UnreachablePoseError: the pose is out of reach.
@@ -99,7 +97,7 @@ class ClearanceScene:
 
 
 def _round_off(scene_graph: SceneGraph, plant: MultibodyPlant) -> None:
-    """Make capsules of the rods."""
+    """Replace the cylinders of the rods by capsules."""
     for shape in scene_graph.model_inspector().GetAllGeometryIds(Role.kProximity):
         inspector = scene_graph.model_inspector()
         if inspector.GetName(shape).endswith("tube"):
@@ -109,7 +107,7 @@ def _round_off(scene_graph: SceneGraph, plant: MultibodyPlant) -> None:
 
 
 def _parts(scene_graph: SceneGraph) -> dict[str, GeometryId]:
-    """The shapes by their names: `base`, `motor 1`, `post 1`, `plate`, `crank 1`, `rod 1`."""
+    """Return the shapes by name: `base`, `motor 1`, `post 1`, `plate`, `crank 1`, `rod 1`."""
     inspector, found = scene_graph.model_inspector(), {}
     for shape in inspector.GetAllGeometryIds(Role.kProximity):
         body = inspector.GetName(inspector.GetFrameId(shape)).split("::")[-1]
@@ -125,7 +123,7 @@ def _place(name: str) -> tuple[int, str]:
 
 
 def _joined(first: str, second: str) -> bool:
-    """Whether two parts are of one body, or meet in a joint."""
+    """Return whether two parts belong to one body or meet in a joint."""
     kinds = {name.split()[0] for name in (first, second)}
     if kinds <= {"base", "motor", "post"} or kinds == {"plate", "rod"}:
         return True

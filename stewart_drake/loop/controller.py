@@ -35,7 +35,7 @@ from stewart_drake.types import Array
 
 
 class Reference(LeafSystem):
-    """What the plate shall do: now, and ahead for a controller that looks ahead.
+    """The reference at present, and ahead for a controller with preview.
 
     Output:  reference(t) = [pose; rates; accelerations] of `true_motion`,
              preview(t)   = the same of `planned_motion` at t + each of `preview_times`.
@@ -46,8 +46,8 @@ class Reference(LeafSystem):
     | preview | output | 18 len(preview_times) | the same | continuous |
 
     Args:
-        true_motion: what tracking is judged by, a trajectory (6, 1).
-        planned_motion: what the controller follows; it may approach the true motion smoothly.
+        true_motion: trajectory (6, 1) for the tracking error.
+        planned_motion: trajectory that the controller follows, a smooth way onto the true motion.
         preview_times: (p,) in s from now.
     """
 
@@ -82,13 +82,13 @@ HELD: Final[dict[str, Callable[[AnyMemory], Array]]] = {
     "delay_estimate": lambda memory: memory.belief.delay,
     "delay_std": lambda memory: np.array([memory.belief.delay_std]),
 }
-"""Signal of the table `scenario.signals.SIGNALS` -> what the controller's memory has of it."""
+"""Signal of the table `scenario.signals.SIGNALS` -> its value in the controller's memory."""
 
 
 def held_by(dynamics: StewartDynamics) -> dict[str, Callable[[AnyMemory], Array]]:
     """Return HELD for the law of a plant, with its parameters at their places in the record.
 
-    A parameter that is not estimated is recorded as it is known, without a standard deviation.
+    A parameter that is not estimated is recorded with its assumed value, without a deviation.
     """
     place = np.array([_place(name, dynamics.free) for name in PARAMETERS])
     known, unknown = dynamics.plant_parameters[:NUM_PARAMETERS], np.full(NUM_PARAMETERS, np.nan)
@@ -105,19 +105,19 @@ def _place(name: str, names: Sequence[str]) -> int:
 
 
 def reported(kept: int) -> int:
-    """Periods that a report tells of, for a law that keeps so many torques beyond its delay."""
+    """Return the periods of a report for a law that keeps `kept` torques beyond its delay."""
     return kept + 1
 
 
 class DelayLqiController(SteppedLaw):
-    """Predictive LQI, whatever parts its law is made of; in C if the core has all of them.
+    """Predictive LQI with any parts of the law, in C if the core has all of them.
 
     With m the memory (`law.memory.Memory`) and `step` the law (`law.predictive_lqi.PredictiveLqi`):
 
     Initialise: m holds the torques in flight at t = 0 and nothing else.
     Update:     every period m <- step(m, measurement, preview, weights), and the time it took
-    Output:     torque        = step(m, measurement, preview, weights).torque, to be taken at the
-                samples, where the update happens too: one step serves both.
+    Output:     torque        = step(m, measurement, preview, weights).torque, to be read at the
+                samples; the step is shared with the update.
                 the others    = parts of m, as of the last sample.
 
     | port | direction | size | unit | rate |
@@ -129,23 +129,23 @@ class DelayLqiController(SteppedLaw):
     | report | input | 7 h | as of `PlayoutBuffer`, NaN is lost | only with a channel of packets |
     | plan | output | 6 (r + N) | N m, the packet to be sent | the same; direct feedthrough |
     | torque | output | 6 | N m | direct feedthrough |
-    | estimate | output | 12 | rad, m, rad/s, m/s | direct feedthrough; what T_k rests on |
-    | memory | output | abstract, `Sample` | - | direct feedthrough; what this sample leaves |
+    | estimate | output | 12 | rad, m, rad/s, m/s | direct feedthrough; the state for T_k |
+    | memory | output | abstract, `Sample` | - | direct feedthrough; after this sample |
     | torque_commanded | output | 6 | N m | held |
     | integral | output | 6 | rad s, m s | held |
     | weights_used | output | 2 | - | held, NaN before the first sample |
     | measurement_used | output | as measurement | the same | held, NaN before the first sample |
     | state_estimate | output | 12 | rad, m, rad/s, m/s | held, NaN before the first sample |
-    | parameters | output | 8 | N m, kg, N m s/rad | held; as the law believes |
+    | parameters | output | 8 | N m, kg, N m s/rad | held; as assumed by the law |
     | parameter_std | output | 8 | the same | held; NaN without estimator |
-    | delay_estimate | output | 1 | s | held; as the law believes |
+    | delay_estimate | output | 1 | s | held; as assumed by the law |
     | delay_std | output | 1 | s | held; NaN without delay estimator |
 
     Args:
         law: the control law.
-        queue: (L, 6) torques in flight at t = 0 in N m, oldest first, as the controller believes.
-        motion: what it follows, and the reference, for a law that asks for other instants of it
-            than it did at the start; without it what it follows is `preview`.
+        queue: (L, 6) assumed torques in flight at t = 0 in N m, oldest first.
+        motion: the planned motion and the reference, for a law that reads them at any instant;
+            otherwise it follows `preview`.
     """
 
     def __init__(
@@ -178,11 +178,11 @@ class DelayLqiController(SteppedLaw):
             self._put_out("plan", size, lambda m: m.sent.packets[-1].ravel(), now=True)
         held = held_by(law.plant.dynamics)
         for port, signal in ports_of("controller").items():
-            part = held[signal.name]  # whose size is the law's: what it senses
+            part = held[signal.name]
             self._put_out(port, len(part(first)), part)
 
     def memory(self, context: Context) -> AnyMemory:
-        """The memory in a context of this system."""
+        """Return the memory in a context of this system."""
         return self.sample(context).memory
 
     def _prepared(self, context: Context) -> Callable[[], AnyMemory]:
@@ -216,12 +216,12 @@ class DelayLqiController(SteppedLaw):
 
 
 class ServoController(SteppedLaw):
-    """Sends crank angles ahead, in the place of `loop.controller.DelayLqiController`.
+    """Controller for servos: sends crank angles ahead of time.
 
     With m the memory and `step` the law (`law.servo_preview.ServoPreview`):
 
     Update:  every period m <- step(m, measurement, preview, report), and the time it took
-    Output:  command = step(m, measurement, preview, report).command, to be taken at the samples;
+    Output:  command = step(m, measurement, preview, report).command, to be read at the samples;
              the others = parts of m, as of the last sample.
 
     | port | direction | size | unit | rate |
@@ -232,14 +232,14 @@ class ServoController(SteppedLaw):
     | age | input | 1 | s, whole periods | of measurement and report; 0 where unconnected |
     | command | output | 18 | rad, rad/s, N m | direct feedthrough |
     | estimate | output | 12 | rad, m, rad/s, m/s | direct feedthrough |
-    | torque | output | 6 | N m, that servos asked for | held |
+    | torque | output | 6 | N m, wanted by the servos | held |
     | torque_commanded | output | 6 | the same | held |
     | integral, weights_used | output | 6, 2 | | NaN |
     | the others | output | as of `DelayLqiController` | | held |
 
     Args:
         law: the control law.
-        command: (18,) that was sent before t = 0.
+        command: (18,) sent before t = 0.
     """
 
     def __init__(self, law: ServoPreview, command: Array) -> None:
@@ -270,14 +270,14 @@ class ServoController(SteppedLaw):
 
 
 _KNOWN: Final = ("torque_commanded", "measurement")
-"""Signals that a controller has whose inside is not known."""
+"""Signals of any controller."""
 
 
 class OwnMemory(NamedTuple):
-    """The last sample, in the words of the shipped controller's memory.
+    """The last sample, with the names of the shipped controller's memory.
 
-    `torque` (6,) as asked for, `in_flight` (1, 6) what the limit let through of it, `measurement`
-    (12,) that was read, NaN before the first, `counts` of what is seen from outside.
+    `torque` (6,) without limit, `in_flight` (1, 6) the same within the limit, `measurement` (12,),
+    NaN before the first, `counts` of problems that are visible from outside.
     """
 
     torque: Array
@@ -287,11 +287,11 @@ class OwnMemory(NamedTuple):
 
 
 class SampledController(SteppedLaw):
-    """Reads a controller's torque every period, in the place of `DelayLqiController`.
+    """Reads the torque of the user's controller every period and has the ports for the record.
 
-    Update:  every period  s <- [T_k; measurement], T_k the torque that the controller puts out
-             then, or the last one where that is no number.
-    Output:  torque = T_k, to be taken at the samples; the others as of the last sample.
+    Update:  every period  s <- [T_k; measurement], T_k the controller's torque, or the last one
+             where that is not finite.
+    Output:  torque = T_k, to be read at the samples; the others as of the last sample.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |

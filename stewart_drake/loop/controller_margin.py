@@ -67,8 +67,8 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 INSTANTS: Final = 30
-"""Number of instants along the reference. A round number of steps may be in step with the motion,
-so there are 29, a prime. Twice as many change the margins of the shipped scenarios by less than a
+"""Number of instants along the reference. A prime number of steps, 29, avoids the same phases
+of a periodic motion. Twice as many change the margins of the shipped scenarios by less than a
 tenth."""
 _COSTLY: Final = 150
 """Rows of a loop above which fewer instants are judged: an eigenvalue problem costs rows^3."""
@@ -248,7 +248,7 @@ def loop_at(experiment: Experiment, time: float) -> LinearLoop:
 
 
 def _law_at_last(experiment: Experiment) -> PredictiveLqi:
-    """Return the law, with the true delay if it estimates that."""
+    """Return the law, with the true delay if it estimates the delay."""
     law = compose_law(experiment)
     if not law.finds_delay:
         return law
@@ -262,7 +262,7 @@ def _loops(
     states = 12 + 6 * integrates
     gain = np.zeros((NUM_TORQUES, states + NUM_TORQUES * law.timeline.queue_length))
     for t in times:
-        # Without a new gain the law keeps its last one, and has none before the first.
+        # The law keeps its last gain where there is no new one.
         with suppress(RiccatiError, np.linalg.LinAlgError, ArithmeticError):
             gain = _gain(experiment, truth, law, t)
         plant = true_model(experiment, truth, t)
@@ -277,10 +277,10 @@ def _gain(experiment: Experiment, truth: StewartDynamics, law: PredictiveLqi, ti
     theta = known.free_of(truth.plant_parameters) if law.estimates else known.parameters
     x = evaluate(experiment.reference, time)
     # The torques in flight move the true plant; the model's torque is the feedforward.
-    acting = truth.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
+    current = truth.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
     forward = law.feedforward.at(x, plant.dynamics, theta)
     design = law.model.about(x, forward, theta, plant)
-    predictor = law.predictor.model(design, x, acting, theta, plant)
+    predictor = law.predictor.model(design, x, current, theta, plant)
     weights = law.cost.matrices(np.array([c.w_Q, c.w_R]))
     return law_gain(design, predictor, timeline.period, timeline.delay, weights)
 
@@ -327,7 +327,7 @@ class LinearModels(NamedTuple):
 
 
 def linear_models(scenario: Scenario | str | Path, time: float | None = None) -> LinearModels:
-    """Return the loop of a scenario, linearised about its moving reference as if that stood still.
+    """Return the loop of a scenario, linearised about its moving reference ("frozen").
 
     An estimator, a tuner and torque limits are left out, see `controller_margin`.
 

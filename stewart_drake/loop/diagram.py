@@ -1,4 +1,4 @@
-"""The closed loop as a Drake diagram, built from a scenario. Here its systems are connected."""
+"""The closed loop of a scenario as a Drake diagram."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Final
@@ -50,35 +50,33 @@ from stewart_drake.scenario.signals import (
 from stewart_drake.tuner.source import DensityFeatures, PaperPolicy
 
 _TOLD: Final = ("density", "reference")
-"""Inputs that a tuner may have: outputs of the systems of the same name."""
+"""Optional inputs of a tuner; each is connected to the same output of the same-named system."""
 
 
 class ClosedLoop(Diagram):
-    """The whole loop; output ports are named after the signals.
+    """The closed loop; output ports are named after the signals.
 
     Subsystems: `reference`, `sensor`, `weights` or `tuner`, `controller`, `saturation`,
     `delay_chain`, `torque_bias`, `plant`, `density`; with servos `servos`, without `weights` and
     `saturation`; with the user's own `own_controller`, `disturbance`, `disturbed_torque`. Output
-    ports: `state`, `reference`, `torque_commanded` (what the law asks for, or the servos did),
-    `torque_applied` (what acts of it: within the motors' limit, late, before the bias),
-    `integral`, `weights_used`, `parameters`, `parameter_std`, `density`, `measurement` (held, as
-    the controller read it), `state_estimate`, `delay_estimate`, `delay_std`, `delay_true` (of the
-    torque sent last), `packets`.
+    ports: `state`, `reference`, `torque_commanded` (of law or servos, without limit),
+    `torque_applied` (limited and delayed, before the bias), `integral`, `weights_used`,
+    `parameters`, `parameter_std`, `density`, `measurement` (held, as the controller read it),
+    `state_estimate`, `delay_estimate`, `delay_std`, `delay_true` (of the newest torque), `packets`.
 
     Attributes:
-        experiment: what it was built from.
-        catch_up: s, length of the blend onto the reference, 0 if there is none.
+        experiment: the experiment.
+        catch_up: length of the blend onto the reference, s; 0 without one.
     """
 
     experiment: Experiment
     catch_up: float
 
     def CreateDefaultContext(self) -> Context:
-        """A root context at t = 0 in the scenario's start state, all loops closed.
+        """Return a root context at t = 0 in the scenario's start state, all loops closed.
 
-        A `Simulator` that makes its own context has the start's pose too, but where the plant is
-        the multibody one it begins at rest: Drake knows no default of velocities. It says so, see
-        `StartCheck`.
+        A `Simulator` without a context starts a multibody plant at rest, since Drake has no default
+        velocities. `StartCheck` warns about this.
         """
         context = super().CreateDefaultContext()
         plant: Any = self.GetSubsystemByName("plant")
@@ -92,17 +90,17 @@ def build_closed_loop(
     meshcat: Meshcat | None = None,
     **own: Any,
 ) -> ClosedLoop:
-    """The diagram of a scenario: reference, controller, limit, delay chain, plant, sensor.
+    """Build the diagram of a scenario: reference, controller, limit, link, plant, sensor.
 
     Args:
-        scenario: what to build, or what `prepare` made of it.
-        meshcat: where the multibody plant is shown while it is simulated, or None.
+        scenario: a scenario, or a prepared one.
+        meshcat: shows the multibody plant during the simulation, or None.
         **own: controller, reference, disturbance, modify_law, sensor, link, tuner, true_mechanism,
             as of `simulate`.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
-        TypeError: systems of the user with an Experiment, which already has them.
+        TypeError: systems of the user with a prepared scenario, which has its own.
     """
     experiment = concrete(scenario, **own)
     experiment.own.claim(experiment.scenario)
@@ -118,11 +116,11 @@ def build_closed_loop(
 
 
 def build_machine(experiment: Experiment) -> Diagram:
-    """Plant and sensor alone, for torques that come from elsewhere.
+    """Build plant and sensor alone, for torques from elsewhere.
 
     | port | direction | size | unit |
     | --- | --- | --- | --- |
-    | torque | input | 6 | N m, at the shafts: what acts, and the bias |
+    | torque | input | 6 | N m, at the shafts, with the bias |
     | state | output | 12 | rad, m, rad/s, m/s |
     | measurement | output | 12, or 6 N of encoders | the same; rad |
 
@@ -142,7 +140,7 @@ def build_machine(experiment: Experiment) -> Diagram:
 
 
 def _add_torques(builder: DiagramBuilder, experiment: Experiment) -> float:
-    """A controller that sends torques, their limit and their delay; the law's catch-up, s."""
+    """Add a controller of torques, their limit and link; return its catch-up, s."""
     channel: Channel = Wire()
     reports, catch_up = 1, 0.0
     if "controller" in experiment.own.systems:
@@ -199,7 +197,7 @@ _ACTUATORS: Final[Mapping[type, Callable[[DiagramBuilder, Experiment], float]]] 
 def _add_surroundings(
     builder: DiagramBuilder, experiment: Experiment, meshcat: Meshcat | None
 ) -> None:
-    """Everything but reference and controller."""
+    """Add sensor, bias, plant and density window."""
     sc = experiment.scenario
     period = sc.controller.period
     builder.AddNamedSystem("sensor", _sensor(experiment))
@@ -244,7 +242,7 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
     builder.Connect(out("reference", "reference"), into("density", "reference"))
     builder.Connect(out("controller", "torque"), into("density", "torque"))
     if builder.HasSubsystemNamed("tuner"):
-        # Weights come before the estimate of their sample, so that theirs is of the one before.
+        # Weights precede the estimate of their sample, so that a tuner reads the one before.
         told = ("sensor", "measurement") if measured_state else ("controller", "state_estimate")
         state = out(*told)
         _connect_tuner(builder, builder.GetSubsystemByName("tuner"), state)
@@ -255,7 +253,7 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
         system = motors if name == "torque_applied" else builder.GetSubsystemByName(source)
         if system.HasOutputPort(port):
             builder.ExportOutput(system.GetOutputPort(port), name)
-        else:  # of a system of one's own
+        else:  # a system of the user lacks the port
             size = sum(s.size for s in SIGNALS.values() if s.exported == name)
             unknown = ConstantVectorSource(np.full(size, np.nan))
             builder.AddNamedSystem(f"no_{name}", unknown)
@@ -352,7 +350,7 @@ def _weights(builder: DiagramBuilder, experiment: Experiment, law: PredictiveLqi
 
 
 def _tuner(builder: DiagramBuilder, experiment: Experiment, law: PredictiveLqi) -> System:
-    """The scenario's, that of a network of the paper's kind by the densities in the diagram."""
+    """Return the scenario's tuner; a network of the paper's kind reads the diagram's densities."""
     c, source = experiment.scenario.controller, weights_source(experiment, law)
     assert source is not None
     if isinstance(source.policy, PaperPolicy) and isinstance(source.features, DensityFeatures):

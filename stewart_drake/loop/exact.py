@@ -29,8 +29,8 @@ def ExactPlant_(T):
     class Impl(LeafSystem_[T]):
         """A mechanism's plate under motor torques, loops closed exactly.
 
-        Dynamics:  d[pose; rates]/dt = [rates; accelerations(pose, rates, torque)], and what a
-                   wrench adds to that, `StewartDynamics.wrench_accelerations`.
+        Dynamics:  d[pose; rates]/dt = [rates; accelerations(pose, rates, torque)], plus those of a
+                   wrench, `StewartDynamics.wrench_accelerations`.
         Witness:   the margin of its limits, of a machine the least of `dynamics.workspace.margin`;
                    the simulation ends where it passes zero: a leg at a dead centre, a parallel
                    singularity, a pitch of 85 degrees.
@@ -41,15 +41,15 @@ def ExactPlant_(T):
         | wrench | input | 6 | N m, N, in W at the plate's COM | continuous, only if asked for |
         | state | output | 12 | rad, m, rad/s, m/s | continuous |
 
-        In a diagram of your own, call `set_accuracy` on its simulator: Drake finds out when the
-        plate leaves only where the accuracy is set on the context too, and stops with an error
-        otherwise. With AutoDiffXd, derivatives are exact and end at first order.
+        In a diagram of your own, call `set_accuracy` on its simulator. Drake isolates the witness
+        only if the accuracy is set on the context too, and stops with an error otherwise. With
+        AutoDiffXd, derivatives are exact and end at first order.
 
         Args:
             dynamics: equations of motion, with gravity and the true parameters.
             initial_state: (12,) default of the continuous state; at home and at rest if None.
             wrench: whether there is an input for a wrench on the plate; unconnected it is zero.
-            limits: where the plate may be; its machine's workspace if None.
+            limits: limits of the plate's motion; its machine's workspace if None.
         """
 
         def _construct(
@@ -69,8 +69,7 @@ def ExactPlant_(T):
             default = BasicVector_[T]([T(value) for value in self._initial])
             state = self.DeclareContinuousState(default, 6, 6, 0)
             self._torque = self.DeclareVectorInputPort("torque", NUM_TORQUES)
-            # Without the port nothing is paid for it: asking an input whether it has a value costs
-            # a tenth of the derivatives.
+            # Only if needed: `HasValue` of an input costs a tenth of the derivatives.
             self._wrench = self.DeclareVectorInputPort("wrench", 6) if wrench else None
             self.DeclareStateOutputPort("state", state)
             if T is float:
@@ -102,7 +101,7 @@ def ExactPlant_(T):
             derivatives.SetFromVector(change)
 
         def _with_gradient(self, x, torque, wrench):
-            """d(x_dot) = A dx + B dT + (M N)^-1 dF, F the wrench."""
+            """Return d(x_dot) = A dx + B dT + (M N)^-1 dF, F the wrench."""
             value, tau, d = ExtractValue(x).ravel(), ExtractValue(torque).ravel(), self.dynamics
             pose, rates = value[POSE], value[RATES]
             force = None if wrench is None else ExtractValue(wrench).ravel()
@@ -122,11 +121,11 @@ def ExactPlant_(T):
             context.SetContinuousState(state)
 
         def margin(self, context) -> float:
-            """Positive inside the permitted region, see `dynamics.workspace.margin`."""
+            """Return a margin, positive inside the limits."""
             return self.limits.margin(context.get_time(), self._pose(context))
 
         def diagnose(self, context) -> Failure | None:
-            """Why the plate is not inside it, or None."""
+            """Return why the plate is outside its limits, or None."""
             return self.limits.diagnose(context.get_time(), self._pose(context))
 
         def _pose(self, context):
@@ -145,12 +144,11 @@ ExactPlant = ExactPlant_[None]
 
 
 def set_accuracy(simulator: Simulator, accuracy: float = 1e-8) -> None:
-    """Make the simulator of any diagram with exact plants in it integrate as these need it.
+    """Configure the simulator of a diagram with exact plants.
 
-    That is a Runge-Kutta method of fifth order with error control, steps of at most 20 ms, and the
-    accuracy set on the integrator and on the context, so that the simulation ends, with
-    `kReachedTerminationCondition`, where a plate leaves its workspace. The simulator's other
-    settings stay.
+    Sets a Runge-Kutta method of fifth order with error control, steps of at most 20 ms, and the
+    accuracy of integrator and context. The simulation then ends, with
+    `kReachedTerminationCondition`, where a plate leaves its workspace.
 
     Args:
         simulator: before it starts, or between two calls of `AdvanceTo`.

@@ -1,7 +1,7 @@
-"""Kinds of a scenario's sections: a row per class of configuration, with what a loop makes of it.
+"""Kinds of a scenario's sections: a row of factories per class of configuration.
 
-Whoever builds a loop or a law looks its parts up here. What bulk runs and live machines have of all
-this they say themselves, in tables of accepted values (`scenario.dependencies.Accepted`).
+Bulk runs and live machines state the values that they cover in tables of their own
+(`scenario.dependencies.Accepted`).
 """
 
 from collections.abc import Callable, Mapping
@@ -32,7 +32,7 @@ from stewart_drake.scenario.signals import PACKETS, POSE, Carried
 from stewart_drake.types import Array
 
 REPORTS: Final = 10
-"""Reports in a row that may be lost without losing what they said."""
+"""Number of consecutive lost reports without a loss of information."""
 
 
 class SensorKind(NamedTuple):
@@ -40,7 +40,7 @@ class SensorKind(NamedTuple):
 
     Attributes:
         system: the sensor, a Drake system with the ports `state` and `measurement`.
-        sensing: part of the law that knows what is measured.
+        sensing: part of the law that models the measurement.
     """
 
     system: Callable[[Any, Experiment], System]
@@ -52,9 +52,9 @@ class LinkKind(NamedTuple):
 
     Attributes:
         system: the link, a Drake system with the ports `commanded` and `torque`, for a channel of
-            the law and reports of so many periods.
-        channel: part of the law that knows what is sent, for measurements that are waited for so
-            many periods.
+            the law and a number of periods in a report.
+        channel: part of the law that models the link, for the longest wait for a measurement in
+            periods.
     """
 
     system: Callable[[Any, Experiment, Channel, int], System]
@@ -99,13 +99,13 @@ SENSORS: Final[Mapping[type, SensorKind]] = {
 
 
 def wire(experiment: Experiment, queue: Array, carries: Carried) -> System:
-    """Make the delay of a wire, with what is under way on it at t = 0, (L, n)."""
+    """Make the link of a wire with the commands (L, n) in flight at t = 0."""
     sc, delay = experiment.scenario, experiment.scenario.true_delay
     period = sc.controller.period
     if not sc.delay.constant:
         return VaryingDelay(period, torque_delays(sc), delay, queue, carries)
     chain = DelayChain(period, delay.steps, delay.fraction, queue, carries)
-    declare_constant(chain, "delay", np.array([sc.eta]))  # for the record alone
+    declare_constant(chain, "delay", np.array([sc.eta]))  # for the record
     declare_constant(chain, "packets", np.full(len(PACKETS), np.nan))
     return chain
 
@@ -157,7 +157,7 @@ LINKS: Final[Mapping[type, LinkKind]] = {
 
 def _multibody(experiment: Experiment, wrench: bool, meshcat: Meshcat | None) -> MultibodyStewart:
     fields, start = asdict(experiment.scenario.plant), experiment.start[POSE]
-    del fields["mechanism"], fields["torque_bias"]  # which is added before the record of torques
+    del fields["mechanism"], fields["torque_bias"]  # the diagram adds the bias
     return MultibodyStewart(experiment.truth, meshcat=meshcat, start=start, wrench=wrench, **fields)
 
 
@@ -167,7 +167,7 @@ def _exact(experiment: Experiment, wrench: bool, meshcat: Meshcat | None) -> Exa
 
 
 MakePlant = Callable[[Experiment, bool, Meshcat | None], ExactPlant | MultibodyStewart]
-"""Makes a plant, with an input for a wrench or without, shown in Meshcat or not."""
+"""Makes a plant: (experiment, whether it has an input for a wrench, Meshcat or None)."""
 PLANTS: Final[Mapping[str, MakePlant]] = {
     "multibody": _multibody,
     "exact": _exact,

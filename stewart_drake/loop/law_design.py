@@ -1,4 +1,4 @@
-"""The control law: of a scenario, composed of parts, and for a diagram of the user."""
+"""The control law of a scenario, composed of parts, and for a diagram of the user."""
 
 import dataclasses
 import math
@@ -74,11 +74,11 @@ from stewart_drake.scenario.trajectories import evaluate, motion_range
 from stewart_drake.types import Array
 
 GENTLE = 3.0
-"""Largest torque predicted with the usual steps, over that of the reference."""
+"""Largest torque predicted with the default substeps, over that of the reference."""
 _MOST = 0.999
-"""Share of the measurements that are waited for."""
+"""Share of the measurements that arrive within the wait."""
 _PATIENCE = 10
-"""Periods by which a measurement may be later than that, or lost, before the model goes on."""
+"""Further periods of waiting for a measurement before the model replaces it."""
 
 
 def quadratic_cost(experiment: Experiment, peak_torque: float) -> QuadraticCost:
@@ -128,14 +128,14 @@ _FEEDFORWARDS: Final[Mapping[str, Feedforward]] = {
 
 
 def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> PredictiveLqi:
-    """Compose the law of a scenario; only here and in `loop.kinds` are words turned into parts.
+    """Compose the law of a scenario from parts, with the factories of `loop.kinds`.
 
     Args:
         experiment: of the scenario.
-        sizing: `sizing_of` it, where that is known.
+        sizing: `sizing_of` the experiment, computed if None.
 
     Raises:
-        ConfigError: the scenario asks for no law that sends torques; see `loop.servos`.
+        ConfigError: the scenario has servos; see `loop.servos`.
     """
     sc, nominal = experiment.scenario, experiment.nominal
     if found := differing(sc, {"controller.command": "torque"}):
@@ -201,30 +201,30 @@ def estimated_parameters(experiment: Experiment, torque_scale: float) -> Paramet
         except ValueError as error:
             raise ConfigError(f"controller.calibration: {error}") from None
     prior = sc.controller.prior
-    said = {
+    stds = {
         **dict.fromkeys(PARAMETERS[BIAS], prior.torque_bias),
         PARAMETERS[PAYLOAD]: prior.payload,
         PARAMETERS[DAMPING]: prior.damping,
         **dict.fromkeys(OFFSETS, prior.offsets),
     }
-    return found.trusting({name: std for name, std in said.items() if std is not None})
+    return found.trusting({name: std for name, std in stds.items() if std is not None})
 
 
 def _until_seen(delay: Delay, waits: int) -> int:
-    """Samples until a whole hold of the first own torque has been seen.
+    """Return the samples until the first torque of the law has acted for a whole hold.
 
-    Before that the measurements are of a plate on which nothing but its bias acts: what they make
-    of payload and friction is noise, and feedback through them puts it on the motors for eta.
+    Until then only the torque bias moves the plate. Estimates of payload and friction are noise,
+    and feedback through them would act for eta.
     """
     late = max(waits - _PATIENCE, 0)
     return math.ceil(delay.periods + 1 - 1e-9) + late
 
 
 def longest_wait(scenario: Scenario) -> int:
-    """Periods for which the law waits for a late measurement; 0 where none comes late.
+    """Return the periods for which the law waits for a late measurement; 0 if none is late.
 
     Raises:
-        ConfigError: they are more than any delay may have.
+        ConfigError: they exceed the bound of all delays.
     """
     sc, period, back = scenario, scenario.controller.period, scenario.link.back
     if sc.sensor.delay == 0 and back is None:
@@ -240,7 +240,7 @@ def longest_wait(scenario: Scenario) -> int:
 
 
 def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, float]:
-    """The control law, the motion it follows, and the length of the blend onto the reference."""
+    """Return the law, the motion that it follows, and the length of the blend, s."""
     sc, law = experiment.scenario, compose_law(experiment)
     way = way_onto(experiment, law)
     if way is None:
@@ -249,7 +249,7 @@ def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, floa
 
 
 def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
-    """The ways onto the reference after a start from rest, or None where there is none."""
+    """Return the plans onto the reference after a start from rest, or None without them."""
     sc, nominal, timeline = experiment.scenario, experiment.nominal, law.timeline
     if sc.start != "rest" or sc.controller.catch_up == 0:
         return None
@@ -260,10 +260,9 @@ def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
 
 
 def first_queue(experiment: Experiment, law: PredictiveLqi) -> Array:
-    """The torques in flight at t = 0 that a law begins with.
+    """Return the torques in flight at t = 0 that a law assumes.
 
-    One that does not know the delay has more: what acts in each period until its own do, up to the
-    longest delay.
+    A law that estimates the delay has one for each period up to the longest delay.
     """
     delay = Delay(law.queue_length) if law.finds_delay else law.timeline.delay
     return experiment.torques_in_flight(delay)
@@ -277,7 +276,7 @@ def followed_motion(
 
 
 _HORIZON = 10.0
-"""s of a reference without an end that weights and steps are chosen by."""
+"""Part of an endless reference for the choice of weights and steps, s."""
 
 
 @dataclass(eq=False)
@@ -286,9 +285,9 @@ class DesignedLaw:
 
     Attributes:
         law: the control law as a pure function, memory in, memory out.
-        reference: what it was designed for, a trajectory (6, 1).
-        planned: what it follows: the reference, or the way onto it and then the reference.
-        queue: (L, 6) torques in flight at t = 0 in N m, oldest first, as it believes.
+        reference: trajectory (6, 1).
+        planned: trajectory that it follows: the reference, or a way onto it and the reference.
+        queue: (L, 6) assumed torques in flight at t = 0 in N m, oldest first.
         weights: (2,) w_Q and w_R.
     """
 
@@ -303,21 +302,21 @@ class DesignedLaw:
         return f"DesignedLaw(every {timeline.period:g} s, delay {timeline.eta:g} s, {dynamics})"
 
     def controller(self) -> DelayLqiController:
-        """The law alone as a LeafSystem, whose `preview` and `weights` are the caller's."""
+        """Return the law as a LeafSystem with unconnected `preview` and `weights`."""
         motion = followed_motion(self.law, self.planned, self.reference)
         return DelayLqiController(self.law, self.queue, motion)
 
     def AddToBuilder(self, builder: DiagramBuilder, name: str = "delay_lqi") -> DelayLqiController:
-        """Add the law with its reference and weights, which are connected.
+        """Add the law, connected with its reference and weights.
 
         Args:
             builder: of the diagram.
             name: of the controller; its reference is `NAME_reference`, its weights `NAME_weights`.
 
         Returns:
-            The controller. Connect its `measurement` (12) and its `torque` (6), which is to be read
-            at its samples: by what holds and delays it, at multiples of its period
-            (`scenario.timing.event_time`) and not later.
+            The controller. Connect its `measurement` (12) and its `torque` (6). The system that
+            holds and delays the torque must read it at the samples, multiples of the period less
+            the lead of `scenario.timing.event_time`.
         """
         controller = builder.AddNamedSystem(name, self.controller())
         reference = builder.AddNamedSystem(
@@ -342,22 +341,23 @@ def design_law(
     horizon: float | None = None,
     options: ControllerConfig | None = None,
 ) -> DesignedLaw:
-    """The delayed LQI law for a machine and a motion.
+    """Design the delayed LQI law for a machine and a motion.
 
     Args:
-        dynamics: the machine as the law knows it.
-        reference: 6 x 1 trajectory of the pose, rad and m, with derivatives of order 1 and 2. It is
-            held where it ends.
-        period: between two torques, s.
-        delay: between computing a torque and feeling it, s, as the law believes.
-        start: (12,) pose and rates at t = 0 from which a way onto the reference is planned; None is
-            on the reference.
-        queue: torques in flight at t = 0, as a scenario's `queue`; None is `zero` without gravity
-            and `equilibrium` with it, where the plate would otherwise fall during the first delay.
+        dynamics: the machine that the law assumes.
+        reference: 6 x 1 trajectory of the pose, rad and m, with derivatives of order 1 and 2; held
+            after its end.
+        period: of the controller, s.
+        delay: assumed time from the computation of a torque to its action, s.
+        start: (12,) pose and rates at t = 0, from which a way onto the reference is planned; on the
+            reference if None.
+        queue: torques in flight at t = 0, as a scenario's `queue`; by default `zero` without
+            gravity and `equilibrium` with it.
         noise_std: (12,) of the measurement, rad, m and per s.
         torque_limit: of each motor, N m; None is the mechanism's, if it has one.
-        horizon: s of the reference that weights and steps are chosen by; None is its end, or 10 s.
-        options: all others, as a scenario's `controller`; its period and delay are not used.
+        horizon: part of the reference for the choice of weights and steps, s; by default all of it,
+            or 10 s of an endless one.
+        options: other options, as a scenario's `controller`; its period and delay are ignored.
 
     Raises:
         ConfigError: one line.
@@ -388,7 +388,7 @@ def design_law(
     at = first if start is None else np.array(start, dtype=np.float64)
     if at.shape != (NUM_STATE,):
         raise ConfigError(f"start: got shape {at.shape}; expected ({NUM_STATE},), pose and rates")
-    dynamics.equilibrium_torque(at[POSE])  # or it is out of reach
+    dynamics.equilibrium_torque(at[POSE])  # raises if out of reach
     experiment = Experiment(
         scenario=scenario,
         mechanism=dynamics.mechanism,

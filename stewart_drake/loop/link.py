@@ -1,65 +1,58 @@
-"""The links of a loop as Drake systems: a constant or varying delay, packets, late measurements."""
+"""Links as Drake systems: constant and varying delay, packets, late measurements (core/link.h).
+
+Updates of one instant read the values from before it. A multibody plant's step is such an update.
+Those of a link come slightly earlier (`scenario.timing.event_time`), the first at initialisation: a
+plant that steps at t feels the torque released at t.
+"""
 
 from abc import abstractmethod
 from typing import Final, Literal
 
 import numpy as np
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    LeafSystem,
-    State,
-)
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.core.link import FULL, Link
 from stewart_drake.loop.sampling import declare_constant, update_every, weak
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import SIMULTANEOUS, releases
-from stewart_drake.scenario.signals import (
-    CARRIED,
-    NUM_TORQUES,
-    PACKETS,
-    Carried,
-)
+from stewart_drake.scenario.signals import CARRIED, NUM_TORQUES, PACKETS, Carried
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
 
+_ONCE: Final = 1e9
+"""Period of an event that occurs once, s: longer than any run."""
+
 
 class LinkSystem(LeafSystem):
-    """A link of core/link.h as a system: its memory is the state, its commands come at samples."""
+    """A link with its memory as discrete state, which takes a command at each sample."""
 
     def _begin(self, link: Link, period: float, rows: int, delay: Delay, queue: Array) -> None:
-        """Declare input, state and samples. `queue` (L, size) is what is under way at t = 0.
+        """Declare input, state and samples; `queue` (L, size) is in flight at t = 0.
 
         Raises:
             ValueError: a queue of the wrong shape.
         """
-        queue, size = np.asarray(queue, np.float64), link.size
-        if queue.shape != (delay.queue_length, size):
-            raise ValueError(
-                f"queue: got shape {queue.shape}; expected {(delay.queue_length, size)}"
-            )
+        queue, shape = np.asarray(queue, np.float64), (delay.queue_length, link.size)
+        if queue.shape != shape:
+            raise ValueError(f"queue: got shape {queue.shape}; expected {shape}")
         self._link, self._period = link, period
-        self._commanded = self.DeclareVectorInputPort("commanded", rows * size)
+        self._commanded = self.DeclareVectorInputPort("commanded", rows * link.size)
         memory, first = link.start(), (delay.periods - len(queue)) * period
-        if len(queue):
-            link.assume(memory, first, queue[0])
-            link.begin(memory, first, queue)
-        else:
-            link.assume(memory, np.nan, np.zeros(size))
+        link.assume(memory, *((first, queue[0]) if len(queue) else (np.nan, np.zeros(link.size))))
+        link.begin(memory, first, queue)
         self._memory = self.DeclareDiscreteState(memory)
         update_every(self, period, self._take)
 
     @abstractmethod
     def _send(self, memory: Array, number: int, command: Array) -> int:
-        """Let the link take the command of a sample, and return what it says."""
+        """Pass the command of a sample to the link; return the result of `Link.take`."""
 
     def _take(self, context: Context, state: State) -> None:
-        # Of what another event of this instant has left: it may be an arrival.
+        # From `state`, which another event of this instant, an arrival, may have changed.
         memory = self._of(state)
         number = self._taken(memory)
-        said = self._send(memory, number, self._commanded.Eval(context))
-        assert said != FULL, "more commands are under way than there is place for"
+        result = self._send(memory, number, self._commanded.Eval(context))
+        assert result != FULL, "more commands are in flight than the link has places for"
         self._change(memory, number * self._period)
 
     def _change(self, memory: Array, time: float) -> None:
@@ -75,7 +68,7 @@ class LinkSystem(LeafSystem):
         return int(self._link.number(memory, "taken"))
 
     def _put_out(self, name: str, columns: slice) -> None:
-        """Declare an output of what acts: of [when it began to; command]."""
+        """Declare an output: columns of [begin of its action; command] that acts."""
         size = len(range(*columns.indices(1 + self._link.size)))
         ticket = self.discrete_state_ticket(self._memory)
         self.DeclareVectorOutputPort(name, size, weak(self._output, columns), {ticket})
@@ -88,7 +81,7 @@ class Wire(LinkSystem):
     """A link on which every command acts when it arrives."""
 
     def _lay(self, period: float, kept: int, delay: Delay, queue: Array, carries: Carried) -> None:
-        """Declare all, with place for so many commands under way beyond the queue."""
+        """Declare ports and state, with places for `kept` commands beyond the queue."""
         kept += delay.queue_length
         link = Link(CARRIED[carries], kept, period, wire=True, together=SIMULTANEOUS * period)
         self._begin(link, period, 1, delay, queue)
@@ -98,7 +91,7 @@ class Wire(LinkSystem):
 
     @abstractmethod
     def _arrival(self, number: int) -> float:
-        """Return when the command of a sample arrives, s."""
+        """Return the arrival of the command of a sample, s."""
 
     def _send(self, memory: Array, number: int, command: Array) -> int:
         now, at = number * self._period, self._arrival(number)
@@ -106,33 +99,28 @@ class Wire(LinkSystem):
 
 
 class DelayChain(Wire):
-    """Holds torques back for eta = mu dt + eta0.
+    """Delays torques by eta = mu dt + eta0.
 
     With T_k the input at t = k dt:
 
     Initialise: queue = [T_{-mu}, ..., T_{-1}], preceded by T_{-mu-1} when eta0 > 0; the oldest
                 acts first.
-    Update:     at k dt        T_k is under way,
+    Update:     at k dt        T_k is in flight,
                 at k dt + eta0 applied <- T_{k-mu}.
     Output:     torque = applied, hence T_k during [(k + mu) dt + eta0, (k + 1 + mu) dt + eta0).
-
-    Updates of one instant all read what was there before, and a multibody plant's step is one of
-    them. So these come slightly earlier (`scenario.timing.event_time`), the first at
-    initialisation: a plant
-    that steps at t feels the torque released at t.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
     | commanded | input | 6, or n | N m | read every period |
     | torque, or `carries` | output | the same | N m | piecewise constant |
-    | arrived | output | 1, with commands | s, when that arrived; NaN for nothing yet | the same |
+    | arrived | output | 1, with commands | s, arrival of the command; NaN before the first | same |
 
     Args:
         period: dt in s.
         steps: mu.
         fraction: eta0 / dt, in [0, 1).
         queue: (L, n) torques in flight at t = 0, oldest first, L = mu, or mu + 1 when eta0 > 0.
-        carries: what it delays: torques, of six motors, or commands to servos.
+        carries: torques of six motors, or commands to servos.
 
     Raises:
         ValueError: a queue of the wrong shape.
@@ -157,41 +145,36 @@ class DelayChain(Wire):
         self._change(memory, (self._taken(memory) - 1 + self._delay.fraction) * self._period)
 
 
-_ONCE: Final = 1e9
-"""s, the period of an event that comes once: longer than any run."""
-
-
 class VaryingDelay(Wire):
-    """Holds torque k back for eta_k, each for a time of its own.
+    """Delays torque k by eta_k.
 
     With T_k the input at t = k dt, which arrives at a_k = k dt + eta_k:
 
-    Initialise: T_{-L}, ..., T_{-1} are under way and arrive at (k + mu) dt + eta0.
-    Update:     at k dt        T_k is under way,
+    Initialise: T_{-L}, ..., T_{-1} are in flight and arrive at (k + mu) dt + eta0.
+    Update:     at k dt        T_k is in flight,
                 at a_k         applied <- T_k, unless a newer one has arrived before.
     Output:     torque = applied.
 
-    The order of arrival is not kept: a torque that was overtaken never acts
-    (`scenario.link.takes_effect`). All arrivals are known beforehand. Each is a separate event, so
-    that an integrator stops there. As in `DelayChain` they come slightly early.
+    A torque that was overtaken never acts (`scenario.link.takes_effect`). All arrivals are known
+    beforehand. Each is a separate event, so that an integrator stops there.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
     | commanded | input | 6, or n | N m | read every period |
     | torque, or `carries` | output | the same | N m | piecewise constant |
-    | arrived | output | 1, with commands | s, when that arrived; NaN for nothing yet | the same |
-    | delay | output | 1 | s, of the torque sent last | held |
-    | packets | output | 5 | 1, NaN: nothing is sent in packets | constant |
+    | arrived | output | 1, with commands | s, arrival of the command; NaN before the first | same |
+    | delay | output | 1 | s, of the newest torque | held |
+    | packets | output | 5 | 1, NaN: without packets | constant |
 
     Args:
         period: dt in s.
-        delays: (n,) eta_k of T_0 to T_{n-1}, s; the last of them stays.
-        delay: mu and eta0, those of the torques sent before t = 0.
+        delays: (n,) eta_k of T_0 to T_{n-1}, s; the last one holds for all later torques.
+        delay: mu and eta0, of the torques sent before t = 0.
         queue: (L, n) torques in flight at t = 0, oldest first, L = mu, or mu + 1 when eta0 > 0.
         carries: as of `DelayChain`.
 
     Raises:
-        ValueError: a queue of the wrong shape, a delay that is negative or no number.
+        ValueError: a queue of the wrong shape, a delay that is negative or NaN.
     """
 
     def __init__(
@@ -213,7 +196,7 @@ class VaryingDelay(Wire):
         self.DeclareVectorOutputPort("delay", 1, weak(self._delay), {ticket})
         declare_constant(self, "packets", np.full(len(PACKETS), np.nan))
         numbers, times = releases(period, delays, delay)
-        # Where a torque arrives as it is sent, its sample is the event.
+        # The sample itself is the event of a torque that arrives as it is sent.
         for time in times[(times > 0) & (times != period * numbers)].tolist():
             arrive = weak(self._arrive, time)
             self.DeclarePeriodicUnrestrictedUpdateEvent(_ONCE, event_time(time), arrive)
@@ -230,14 +213,14 @@ class VaryingDelay(Wire):
 
 
 class PlayoutBuffer(LinkSystem):
-    """Plays torques from packets at their times, whatever the packets' own delays.
+    """Plays torques from packets at fixed times, independent of the packets' delays.
 
-    Packet k, sent at t = k dt, arrives d_k later or never. Its row c is T_{k-r+c}, which shall act
-    from (k - r + c) dt + eta on, for a period, eta = mu dt + eta0. With j = s - mu:
+    Packet k, sent at t = k dt, arrives d_k later or never. Its row c is T_{k-r+c}, which acts from
+    (k - r + c) dt + eta on, for a period, eta = mu dt + eta0. With j = s - mu:
 
-    Update:  at k dt        packet k is under way,
+    Update:  at k dt        packet k is in flight,
              at s dt + eta0 applied <- T_j of the newest packet with a row for it that has arrived;
-                            queue, for j < 0; else what a dry buffer does.
+                            queue, for j < 0; else the last torque or zero, see `dry`.
     Output:  torque = applied.
 
     | port | direction | size | unit | rate |
@@ -246,18 +229,18 @@ class PlayoutBuffer(LinkSystem):
     | torque | output | 6 | N m | piecewise constant |
     | delay | output | 1 | s, eta | constant |
     | packets | output | 5 | counts, `scenario.signals.PACKETS` | piecewise constant |
-    | report | output | history (1 + 6) | which of the last packets have arrived, then the torques
-      that acted in the last periods, each the newest first | meant to be read at samples |
+    | report | output | history (1 + 6) | arrival of each of the last packets, 1 or 0, then the
+      torques of the last periods, the newest first | to be read at samples |
 
     Args:
         period: dt in s.
-        times: (n,) d_k in s, infinite for a packet that is lost; further ones are lost.
+        times: (n,) d_k in s, infinite for a lost packet; further ones are lost.
         delay: mu and eta0.
         queue: (L, 6) torques for j = -L to -1, L = mu, or mu + 1 when eta0 > 0.
-        rows: in a packet.
+        rows: torques in a packet.
         repeats: r.
         dry: `hold` the last torque or put out `zero`.
-        history: how far back a report goes, in periods.
+        history: periods in a report.
 
     Raises:
         ValueError: a queue of the wrong shape.
@@ -278,14 +261,16 @@ class PlayoutBuffer(LinkSystem):
         super().__init__()
         self._delay, self._rows, self._repeats = delay, rows, repeats
         self._arrivals = period * np.arange(len(times)) + np.asarray(times, dtype=np.float64)
-        # A packet is of use from when it is sent until its last row was due.
-        kept = (delay.steps + rows + 2) * rows + delay.queue_length
-        holds, together = dry == "hold", SIMULTANEOUS * period
-        given = NUM_TORQUES, kept, period
-        link = Link(*given, wire=False, holds=holds, history=history, together=together)
+        link = Link(
+            *(NUM_TORQUES, buffer_places(delay, rows), period),
+            wire=False,
+            holds=dry == "hold",
+            history=history,
+            together=SIMULTANEOUS * period,
+        )
         self._begin(link, period, rows, delay, queue)
         self._put_out("torque", slice(1, None))
-        self.DeclareVectorOutputPort("delay", 1, weak(self._eta), {self.nothing_ticket()})
+        declare_constant(self, "delay", np.array([delay.eta(period)]))
         memory, timed = self.discrete_state_ticket(self._memory), self.time_ticket()
         self.DeclareVectorOutputPort("packets", len(PACKETS), weak(self._count), {memory})
         size = history * (1 + NUM_TORQUES)
@@ -311,15 +296,12 @@ class PlayoutBuffer(LinkSystem):
         period = self._taken(memory) - 1 + self._delay.fraction
         self._link.change(memory, period * self._period)
 
-    def _eta(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([self._delay.eta(self._period)])
-
     def _count(self, context: Context, output: BasicVector) -> None:
         memory, period = self._of(context), self._period
         taken, last = self._taken(memory), self._link.number(memory, "last")
         begun = 0 if np.isinf(last) else round(last / period - self._delay.fraction) + 1
         lost = ~np.isfinite(self._arrivals[:taken])
-        # Packets whose first row's time has come: of this period and those before.
+        # Packets with a first row that is due in this period or before.
         due = max(0, min(begun - self._delay.steps + self._repeats, taken))
         wanted = period * (np.arange(due) + self._delay.periods - self._repeats + SIMULTANEOUS)
         arrived = self._arrivals[:due]
@@ -337,34 +319,37 @@ class PlayoutBuffer(LinkSystem):
         output.SetFromVector(np.concatenate([flags, past.ravel()]))
 
 
-class LateMeasurements(LeafSystem):
-    """Hands on, at each sample, the newest measurement that has arrived since the one before.
+def buffer_places(delay: Delay, rows: int) -> int:
+    """Return the places of a play-out buffer: a packet counts until its last row was due."""
+    return (delay.steps + rows + 2) * rows + delay.queue_length
 
-    With y_j what is measured at j dt, which takes tau_j, and n_k the newest j with
+
+class LateMeasurements(LeafSystem):
+    """Passes on, at each sample, the newest measurement that has arrived since the one before.
+
+    With y_j measured at j dt, of transit time tau_j, and n_k the newest j with
     j dt + tau_j <= k dt:
 
-    Update:  at k dt  y_k is under way.
+    Update:  at k dt  y_k is in flight.
     Output:  measurement = y_{n_k}, age = (k - n_k) dt, where n_k is newer than n_{k-1}; else all
-             NaN and age = 0. One that was overtaken is dropped.
+             NaN and age = 0. A measurement that was overtaken is dropped.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
     | measured | input | size | as measured | read every period |
-    | measurement | output | size | the same | meant to be read at samples |
+    | measurement | output | size | the same | to be read at samples |
     | age | output | 1 | s | the same |
 
     Args:
         period: dt in s.
-        times: (n,) tau_j in s, infinite for one that is lost; further ones are lost.
+        times: (n,) tau_j in s, infinite for a lost one; further ones are lost.
         size: of the measurement.
     """
 
     def __init__(self, period: float, times: Array, size: int) -> None:
         super().__init__()
         self._times, self._period = np.asarray(times, dtype=np.float64), period
-        longest = self._times.max(initial=0.0, where=np.isfinite(self._times))
-        kept, together = int(longest / period) + 2, SIMULTANEOUS * period
-        self._link = Link(size, kept, period, wire=True, together=together)
+        self._link = measurement_link(period, self._times, size)
         self._memory = self.DeclareDiscreteState(self._link.start())
         self._measured = self.DeclareVectorInputPort("measured", size)
         self.DeclareVectorOutputPort("measurement", size, weak(self._measurement))
@@ -372,7 +357,7 @@ class LateMeasurements(LeafSystem):
         update_every(self, period, self._take)
 
     def _now(self, context: Context) -> Array:
-        """Return the memory of the link, with what is measured now whether or not it is taken."""
+        """Return the memory of the link with the present measurement, whether taken or not."""
         memory = np.array(context.get_discrete_state(self._memory).value())
         k = round(context.get_time() / self._period)
         if self._link.number(memory, "taken") == k:
@@ -387,7 +372,7 @@ class LateMeasurements(LeafSystem):
         state.get_mutable_discrete_state(self._memory).SetFromVector(self._now(context))
 
     def _given(self, memory: Array) -> Array | None:
-        """Return what arrived in the last period, or None."""
+        """Return the measurement that arrived in the last period, or None."""
         arrived, begun = self._link.acted(memory)[0], self._link.number(memory, "taken") - 2
         there = self._link.number(memory, "acted") > 0
         new = arrived[0] > (begun + SIMULTANEOUS) * self._period
@@ -401,3 +386,10 @@ class LateMeasurements(LeafSystem):
         memory = self._now(context)
         behind = self._link.number(memory, "taken") - self._link.number(memory, "newest")
         output.SetFromVector([0.0 if self._given(memory) is None else behind * self._period])
+
+
+def measurement_link(period: float, times: Array, size: int) -> Link:
+    """Return the link for measurements (size,) with transit times in s."""
+    longest = times.max(initial=0.0, where=np.isfinite(times))
+    together = SIMULTANEOUS * period
+    return Link(size, int(longest / period) + 2, period, wire=True, together=together)

@@ -1,4 +1,4 @@
-"""Systems, trajectory and law of the user in a loop, checked before they are used."""
+"""Systems, trajectory and law of the user, with checks before a run."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -30,17 +30,17 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 _REST: Final = 1e-6
-"""rad/s or m/s; a trajectory that ends slower than this goes on at rest."""
+"""Largest rates at the end of a trajectory that is held after its end, rad/s or m/s."""
 _APART: Final = 1e-9
 """s before and after a joint of two pieces."""
 _CHECKS: Final = 200
-"""Instants at which a trajectory is looked at."""
+"""Number of instants at which a trajectory is checked."""
 OwnSystem = System | Callable[[], System]
-"""A system, which serves one run, or what makes one, such as its class."""
+"""A system for one run, or a function that makes one, such as its class."""
 OwnReference = Trajectory | Callable[[], Trajectory]
 OwnLaw = Callable[[Any], Any]
-"""Takes the law that the scenario asks for, a `PredictiveLqi`, or `ServoPreview` for servos;
-returns the one to be used, of that class."""
+"""Takes the scenario's law, a `PredictiveLqi`, or `ServoPreview` for servos; returns a law of that
+class."""
 AnyLaw = TypeVar("AnyLaw", PredictiveLqi, ServoPreview)
 
 
@@ -92,13 +92,13 @@ _used: "WeakSet[Any]" = WeakSet()
 
 
 class Own(NamedTuple):
-    """Systems, reference and law of the user; all else is the scenario's.
+    """Systems, reference and law of the user that replace the scenario's.
 
     Attributes:
         systems: by their ROLES.
         reference: a 6 x 1 trajectory of the pose with two derivatives.
-        law: makes another law of the scenario's.
-        instances: those of the systems that were given as such, and stay the user's.
+        law: changes the scenario's law.
+        instances: systems given as instances, which remain the user's.
     """
 
     systems: Mapping[str, System] = MappingProxyType({})
@@ -108,7 +108,7 @@ class Own(NamedTuple):
 
     @property
     def names(self) -> dict[str, str]:
-        """Class of each, as in `summary.json`."""
+        """Classes by role, as in `summary.json`."""
         found = {role: type(system).__name__ for role, system in self.systems.items()}
         if self.reference is not None:
             found["reference"] = type(self.reference).__name__
@@ -124,10 +124,10 @@ class Own(NamedTuple):
         )
 
     def claim(self, scenario: Scenario) -> None:
-        """Note that the systems now belong to a loop of a scenario.
+        """Reserve the systems for one loop of a scenario.
 
         Raises:
-            ConfigError: one of them belongs to another loop, or does not go with the scenario.
+            ConfigError: one of them was in another loop, or contradicts the scenario.
         """
         for role in self.systems:
             if found := differing(scenario, ROLES[role].accepted):
@@ -158,14 +158,14 @@ class Own(NamedTuple):
 
 
 NOTHING: Final = Own()
-"""Nothing of the user."""
+"""Nothing replaced."""
 
 
 def take(given: Mapping[str, Any]) -> Own:
-    """Make and check what a user gave for one run, except the reference's motion.
+    """Make and check the systems of a user for one run, except the motion of the reference.
 
     Args:
-        given: by the name of its argument in `simulate`; None is nothing.
+        given: values by the names of the arguments of `simulate`, None if not given.
 
     Raises:
         ConfigError: one line.
@@ -203,7 +203,7 @@ def _make(what: str, given: Any, kind: type) -> Any:
 
 
 def _check(role: str, system: System) -> None:
-    """Refuse a system whose ports do not fit its place in the loop."""
+    """Check the ports of a system for its role."""
     needed = ROLES[role]
     inputs = _sizes(map(system.get_input_port, range(system.num_input_ports())))
     outputs = _sizes(map(system.get_output_port, range(system.num_output_ports())))
@@ -222,7 +222,7 @@ def _check(role: str, system: System) -> None:
 
 
 def _sizes(ports: Iterable[InputPort | OutputPort]) -> dict[str, int]:
-    """Sizes of ports by name, 0 of an abstract one."""
+    """Return the sizes of ports by name, 0 for an abstract one."""
     return {port.get_name(): port.size() for port in ports}
 
 
@@ -231,14 +231,14 @@ def _listed(sizes: Mapping[str, int], between: str = ", ") -> str:
 
 
 def own_motion(reference: Trajectory, duration: float) -> Trajectory:
-    """A trajectory of the user's own, checked, and at rest after its end.
+    """Check a trajectory of the user and hold it after its end.
 
     Args:
         reference: 6 x 1, rad and m, with derivatives of order 1 and 2.
         duration: of the simulation, s.
 
     Returns:
-        The same, defined for t >= 0: the controller looks ahead of the end.
+        The trajectory, defined for t >= 0: the preview passes the end.
 
     Raises:
         ConfigError: one line.
@@ -255,7 +255,7 @@ def own_motion(reference: Trajectory, duration: float) -> Trajectory:
     for t in np.linspace(0.0, min(duration, end), _CHECKS):
         try:
             values = evaluate(reference, float(t))
-        except (Exception, SystemExit) as error:  # Drake ends the process where it has none
+        except (Exception, SystemExit) as error:  # Drake raises SystemExit without a derivative
             raise ConfigError(
                 f"{name}: got no pose, rates and accelerations at {t:.4g} s "
                 f"({' '.join(str(error).split())}); expected derivatives of order 1 and 2"
@@ -268,14 +268,14 @@ def own_motion(reference: Trajectory, duration: float) -> Trajectory:
     rates = evaluate(reference, end)[RATES]
     if end < duration and np.abs(rates).max() > _REST:
         raise ConfigError(
-            f"{name}: got an end at {end:g} s with rates {rates}; expected it to come to rest, or "
+            f"{name}: got an end at {end:g} s with rates {rates}; expected rest at the end, or "
             f"duration <= {end:g}"
         )
     return _held_after(reference, end)
 
 
 def _check_joints(name: str, reference: Trajectory, until: float) -> None:
-    """Refuse pieces that do not fit, such as straight lines: nothing with a mass follows a jump."""
+    """Check that pose and rates have no jumps between pieces, as straight lines would."""
     if not hasattr(reference, "get_segment_times"):
         return
     joints = [t for t in reference.get_segment_times() if 0 < t < until]

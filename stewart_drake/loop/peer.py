@@ -1,4 +1,4 @@
-"""What a machine and its controller say of themselves: identity and faults (docs/protocol.md)."""
+"""Identity and faults of a machine and its controller (docs/protocol.md)."""
 
 import hashlib
 from enum import IntEnum
@@ -9,16 +9,16 @@ from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.scenario.config import EncoderSensorConfig, Scenario, StateSensorConfig
 
 DIGEST: Final = 8
-"""Bytes of SHA-256 that stand for a part of an identity."""
+"""Bytes of the SHA-256 of a part of an identity."""
 NAME: Final = 32
-"""Bytes of its name, zeros after the last letter."""
+"""Bytes of a part's name, padded with zeros."""
 MOST_BITS: Final = 30
-"""Of an encoder's turn, in a datagram."""
+"""Largest number of bits of a turn in a datagram."""
 SECOND: Final = 10**9
 
 
 class Fault(IntEnum):
-    """What kept a machine from going on. `FAULTS` has the words."""
+    """Reason of a machine's stop; `FAULTS` has the texts."""
 
     NONE = 0
     REACH = 1
@@ -46,12 +46,11 @@ FAULTS: Final = {
     Fault.ENDED: "the machine was ended",
     Fault.DRIVE: "a drive of the machine failed",
 }
-"""The words of each fault, for `live`, its page and `machine`; C prints them too. The number in
-them is the leg, or the duration in s."""
+"""Texts of the faults, for `live`, its page, `machine` and C. The number is the leg or s."""
 
 
 class Reason(NamedTuple):
-    """A fault, the leg from 1 on or 0, and how long it lasted, ns."""
+    """A fault, its leg (from 1, or 0) and its duration, ns."""
 
     fault: Fault = Fault.NONE
     leg: int = 0
@@ -70,14 +69,14 @@ NO_FAULT: Final = Reason()
 
 
 class Part(NamedTuple):
-    """First bytes of the SHA-256 of one thing that both sides must agree on, and its name."""
+    """First bytes of the SHA-256 of a property, and its name."""
 
     digest: bytes
     name: str
 
 
 class Identity(NamedTuple):
-    """What a machine and the controller designed for it must agree on."""
+    """Properties on which a machine and its controller must agree."""
 
     mechanism: Part
     period: Part
@@ -85,7 +84,7 @@ class Identity(NamedTuple):
     actuator: Part
 
     def differing(self, other: "Identity") -> tuple[str, str] | None:
-        """Names of the parts that differ, of this side and of the other; None if all agree."""
+        """Return the parts that differ, of this side and of the other; None if all agree."""
         pairs = zip(self._fields, self, other, strict=True)
         found = [(field, a, b) for field, a, b in pairs if a.digest != b.digest]
         if not found:
@@ -102,7 +101,7 @@ class Identity(NamedTuple):
 
 
 def identity_of(scenario: Scenario) -> Identity:
-    """Return the identity of a scenario's machine as it is drawn.
+    """Return the identity of a scenario's machine as drawn.
 
     The calibration (`controller.calibration`) and the simulated machine (`plant.mechanism`) are not
     part of it.

@@ -1,10 +1,10 @@
 """Base of Drake systems in Python: callbacks, disposal, updates at samples, laws as systems.
 
-Drake keeps a system written in Python for ever, and with it the diagram that it is in (Drake's
-issues 22515, 23930 and 24162): in C++, where Python's garbage collector does not look, a system
-holds its callbacks, which as bound methods hold the system; and a diagram holds its systems, whose
-attributes hold the diagram. A thousand runs would leave up to a gigabyte behind. `weak` makes
-callbacks that hold nothing, `let_go` opens the other circle where a diagram is no longer needed.
+Drake never frees a system written in Python, nor its diagram (Drake's issues 22515, 23930 and
+24162). Two reference circles in C++ are invisible to Python's garbage collector: a system holds its
+callbacks, bound methods that hold the system; a diagram holds its systems, whose attributes hold
+it. A thousand runs would leak up to a gigabyte. `weak` makes callbacks without references,
+`dispose` breaks the other circle of a diagram that is no longer needed.
 """
 
 import time
@@ -30,30 +30,27 @@ _NOTES: Final = "_pydrake_internal_ref_cycle_peers"
 
 
 def weak(method: Callable[..., Any], *first: Any) -> Callable[..., Any]:
-    """A function that calls a bound method with `first` before its own arguments.
+    """Return a function that calls a bound method with `first` before its own arguments.
 
-    It does not keep the method's object alive, which must still be there when it is called.
+    It does not keep the method's object alive.
     """
     reference = weakref.WeakMethod(method)
 
     def call(*arguments: Any) -> Any:
         target = reference()
-        assert target is not None, "called for a system that is gone"
+        assert target is not None, "called for a system that was deleted"
         return target(*first, *arguments)
 
     return call
 
 
-def let_go(diagram: Any, kept: Sequence[Any] = (), made: Sequence[Any] = ()) -> None:
+def dispose(diagram: Any, kept: Sequence[Any] = (), made: Sequence[Any] = ()) -> None:
     """Remove all attributes of a diagram and its subsystems, which are unusable afterwards.
 
-    Among them is what Drake notes there about builders and ports. In C++ nothing changes.
-
     Args:
-        diagram: that is no longer needed.
-        kept: systems in it that somebody else goes on using: they lose nothing, and keep the
-            diagram.
-        made: systems of somebody else's that lose Drake's notes only.
+        diagram: a diagram that is no longer needed.
+        kept: systems in it that are still used; they lose nothing and keep the diagram.
+        made: systems of the user that lose Drake's references to builders and ports only.
     """
     if any(diagram is system for system in kept):
         return
@@ -61,7 +58,7 @@ def let_go(diagram: Any, kept: Sequence[Any] = (), made: Sequence[Any] = ()) -> 
         vars(diagram).pop(_NOTES, None)
         return
     for system in diagram.GetSystems() if hasattr(diagram, "GetSystems") else ():
-        let_go(system, kept, made)
+        dispose(system, kept, made)
     vars(diagram).clear()
 
 
@@ -71,17 +68,17 @@ def update_every(
     update: Callable[[Context, Any], None],
     when: Callable[[float], float] = event_time,
 ) -> None:
-    """Call a method of `system` at t = 0 and every `period` s, before a plant steps out of there.
+    """Call a method of `system` at t = 0 and every `period` s, before a plant's step from there.
 
-    The first call is at initialisation, ahead of all periodic events: nothing else is earlier than
-    a plant's first step. The later ones come slightly early (`scenario.timing.event_time`). Updates
-    of one instant all read what was there before.
+    The first call is at initialisation, before all periodic events and a plant's first step. Later
+    calls come slightly early (`scenario.timing.event_time`). Updates of one instant read the values
+    from before it.
 
     Args:
-        system: in its constructor.
+        system: the system, in its constructor.
         period: s.
         update: takes a Context and the State to be changed.
-        when: how early, of the functions in `scenario.timing`.
+        when: the lead, a function in `scenario.timing`.
     """
     call, early = weak(update), when(period)
 
@@ -98,20 +95,20 @@ class Sample(NamedTuple):
 
     memory: Any
     seconds: float
-    """Time that it took to compute; 0 before the first."""
+    """Computing time; 0 before the first step."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Sample":
-        """Return the sample itself: a memory is never changed."""
+        """Return the same object: a memory is never changed."""
         return self
 
 
 class SteppedLaw(LeafSystem):
-    """A law that a system takes from sample to sample.
+    """A law as a system.
 
-    Initialise: s = [m, 0], m what the law remembers before the first sample.
-    Update:     every period s <- [step(m, inputs), the time it took].
-    Output:     of s, held; or of what the step of now leaves, to be taken at the samples, where the
-                update happens too: one step serves both.
+    Initialise: s = [m, 0], m the memory of the law before the first sample.
+    Update:     every period s <- [step(m, inputs), computing time].
+    Output:     of s, held; or of the present step, to be read at the samples. Output and update
+                share one step.
     """
 
     def _begin(self, memory: Any, period: float) -> None:
@@ -128,7 +125,7 @@ class SteppedLaw(LeafSystem):
 
     @abstractmethod
     def _prepared(self, context: Context) -> Callable[[], Any]:
-        """The step to the next memory, its inputs read: the time that it takes is the law's."""
+        """Read the inputs and return the step, a function that returns the next memory."""
 
     def sample(self, context: Context) -> Sample:
         """Return the result of the last step in a context of this system."""
@@ -138,7 +135,7 @@ class SteppedLaw(LeafSystem):
     def _put_out(
         self, port: str, size: int, part: Callable[[Any], Array], *, now: bool = False
     ) -> None:
-        """Declare an output (size,) of the memory: that of the last sample, or of `now`."""
+        """Declare an output (size,) of the memory, of the last sample or of `now`."""
         ticket = {self._step.ticket()} if now else self._held
         self.DeclareVectorOutputPort(port, size, weak(self._show, part, now), ticket)
 
@@ -159,7 +156,7 @@ class SteppedLaw(LeafSystem):
 
 
 def declare_constant(system: LeafSystem, name: str, value: Array) -> None:
-    """Declare an output port (n,) of a system that never changes."""
+    """Declare a constant output port (n,) of a system."""
 
     def put_out(context: Context, output: BasicVector) -> None:
         output.SetFromVector(value)

@@ -1,7 +1,7 @@
-"""A machine in Meshcat beside its reference: where it is, where it should be, what its motors do.
+"""A machine in Meshcat with its reference and its torques.
 
-The reference is a ring with a pointer along its x axis: where the ring is, the plate should be.
-Each crank takes the colour of its motor's torque, blue or orange by its sign.
+The reference is a ring with a pointer along its x axis, at the plate's wanted place. Each crank has
+the colour of its motor's torque, blue or orange by its sign.
 """
 
 from typing import Any, Final, cast
@@ -15,44 +15,44 @@ from pydrake.systems.framework import Context, Diagram
 
 from stewart_drake.loop.diagram import ClosedLoop
 from stewart_drake.loop.platforms import build_viewer, set_pose
-from stewart_drake.loop.sampling import let_go
+from stewart_drake.loop.sampling import dispose
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, rotation
 from stewart_drake.scenario.signals import ANGLES, LEGS, POSE, POSITION
 from stewart_drake.types import Array
 
 CRANK_PARTS: Final = ("arm", "hub")
-"""Of the SDFormat model, what takes the torque's colour."""
+"""Parts of the SDFormat model in the torque's colour."""
 TORQUE_COLORS: Final = ("#0072b2", "#dadada", "#d55e00")
-"""Of a large negative torque, of none, of a large positive one."""
+"""Colours of a large negative torque, none, and a large positive one."""
 _VISUALIZER: Final = ("drake", "visualizer")
-"""Where Drake's MeshcatVisualizer puts a model."""
+"""Path of a model of Drake's MeshcatVisualizer."""
 _GHOST: Final = "/reference"
 _GHOST_COLOR: Final = Rgba(0.0, 0.62, 0.45, 0.55)
 _USUAL: Final = 95
-"""Percentile, over time, of the largest torque that takes the full colour: a short peak, such as a
-catch-up's, would leave nothing of the colours for the rest."""
+"""Percentile, over time, of the largest torque, for the full colour: with the maximum a short peak,
+such as a catch-up's, would fade all others."""
 _VIEW: Final = np.array([0.62, -0.70, 0.36])
-"""Where the camera stands as seen from the machine."""
+"""Direction from the machine to the camera."""
 _DISTANCE: Final = 1.3
-"""Of the camera, in units of the machine's extent."""
+"""Distance of the camera in units of the machine's extent."""
 _FLOOR: Final = -0.06
-"""Height of the floor's lines in the same units, below what is drawn of the base."""
+"""Height of the floor's lines in the same units, below the base."""
 _RING: Final = (1.14, 0.022)
 """Radius of the ring and of its wire, in units of the drawn plate's radius."""
 
 
 class Scene:
-    """The SDFormat model of a mechanism, at home at first, and the ring of its reference.
+    """The SDFormat model of a mechanism and the ring of its reference.
 
     Args:
-        mechanism: what to show.
-        meshcat: where; its camera is turned to the machine.
+        mechanism: the machine.
+        meshcat: shows it; the camera is turned to the machine.
     """
 
     def __init__(self, mechanism: Mechanism, meshcat: Meshcat) -> None:
         self._mechanism, self._meshcat = mechanism, meshcat
-        meshcat.Delete("/" + "/".join(_VISUALIZER))  # an earlier scene's colours stay otherwise
+        meshcat.Delete("/" + "/".join(_VISUALIZER))  # removes the colours of an earlier scene
         self._diagram, self._plant, _ = build_viewer(mechanism, meshcat)
         self._context = self._diagram.CreateDefaultContext()
         self._tree = self._plant.GetMyMutableContextFromRoot(self._context)
@@ -64,16 +64,16 @@ class Scene:
             meshcat.SetTriangleMesh(f"{_GHOST}/{name}", vertices, faces, _GHOST_COLOR)
 
     def show(self, pose: Array, wanted: Array, time: float = 0.0) -> bool:
-        """Put the plate at a pose (6,) and the ring at another; False if it cannot be there.
+        """Put the plate at a pose (6,) and the ring at another; return False if out of reach.
 
         Args:
             pose, wanted: rad and m.
-            time: s, of the frame while Meshcat records.
+            time: s, of the frame of a Meshcat recording.
         """
         try:
             set_pose(self._plant, self._tree, self._mechanism, pose, np.zeros(6))
         except UnreachablePoseError:
-            return False  # a multibody run may end a hair outside
+            return False  # a multibody run may end slightly outside
         self._context.SetTime(time)
         self._diagram.ForcedPublish(self._context)
         angles, position = cast(Any, wanted[ANGLES]), cast(Any, wanted[POSITION])
@@ -82,15 +82,14 @@ class Scene:
         return True
 
     def close(self) -> None:
-        """Let go of the machine's diagram, after which the scene is of no more use.
+        """Dispose of the diagram; the scene is unusable afterwards.
 
-        It would keep Meshcat until Python collects garbage, in whichever thread runs then; and
-        Drake ends the process where a Meshcat goes in another thread than its own.
+        Otherwise garbage collection may free Meshcat in another thread, which ends the process.
         """
-        let_go(self._diagram)
+        dispose(self._diagram)
 
     def paint(self, shares: Array) -> None:
-        """Colour the cranks by their torques (6,) as shares of the full colour, -1 to 1."""
+        """Set the colours of the cranks by torques (6,) as shares of the full colour, -1 to 1."""
         for share, parts in zip(shares, crank_paths(self._mechanism.name), strict=True):
             color = [*_linear(torque_color(share)), 1.0]
             for part in parts:
@@ -98,12 +97,7 @@ class Scene:
 
 
 class Live:
-    """Shows a closed loop, with either plant, while it runs.
-
-    Args:
-        loop: that is simulated.
-        meshcat: where.
-    """
+    """Shows a closed loop, with either plant, while it runs."""
 
     def __init__(self, loop: ClosedLoop, meshcat: Meshcat) -> None:
         self._scene = Scene(loop.experiment.truth, meshcat)
@@ -113,30 +107,29 @@ class Live:
         self._largest: list[float] = []
 
     def show(self, context: Context) -> None:
-        """Show the loop as it is in its context."""
+        """Show the loop in its context."""
         state, reference, torque = (np.asarray(port.Eval(context)) for port in self._ports)
         self._largest.append(float(np.abs(torque).max()))
         self._scene.show(state[POSE], reference[POSE], context.get_time())
         self._scene.paint(torque_shares(torque, full_color(np.array(self._largest))))
 
     def close(self) -> None:
-        """See `Scene.close`."""
         self._scene.close()
 
 
 def full_color(largest: Array) -> float:
-    """N m that take the full colour, of the largest torques (n,) of some instants."""
+    """Return the torque of the full colour, N m, for the largest torques (n,) at some instants."""
     usual = np.percentile(largest, _USUAL) if len(largest) else 0.0
     return float(usual or largest.max(initial=0.0) or 1.0)
 
 
 def torque_shares(torque: Array, full: float) -> Array:
-    """Torques in N m, of any shape, as shares of the full colour; larger ones take all of it."""
+    """Return torques in N m, of any shape, as shares of the full colour, -1 to 1."""
     return np.clip(torque / full, -1, 1)
 
 
 def torque_color(share: float) -> Array:
-    """(3,) sRGB, 0 to 1."""
+    """Return the colour (3,) of a share, sRGB, 0 to 1."""
     negative, none, positive = (
         np.array([int(color[k : k + 2], 16) for k in (1, 3, 5)]) / 255 for color in TORQUE_COLORS
     )
@@ -144,14 +137,14 @@ def torque_color(share: float) -> Array:
 
 
 def crank_paths(name: str) -> list[list[list[str]]]:
-    """Of every leg the parts of the crank in Meshcat's tree, each as the names that lead there."""
+    """Return for each leg the paths of the crank's parts in Meshcat's tree."""
     return [
         [[*_VISUALIZER, name, f"crank_{leg}", name, part] for part in CRANK_PARTS] for leg in LEGS
     ]
 
 
 def ring(radius: float, around: int = 72, across: int = 8) -> tuple[Array, NDArray[np.int32]]:
-    """Vertices (3, n) and triangles (3, m) of a torus in the plate's plane."""
+    """Return vertices (3, n) and triangles (3, m) of a torus in the plate's plane."""
     reach, wire = (factor * radius for factor in _RING)
     a, b = np.meshgrid(
         2 * np.pi * np.arange(around) / around, 2 * np.pi * np.arange(across) / across
@@ -170,7 +163,7 @@ def ring(radius: float, around: int = 72, across: int = 8) -> tuple[Array, NDArr
 
 
 def pointer(radius: float) -> tuple[Array, NDArray[np.int32]]:
-    """An arrowhead outside the ring, where the plate's x axis points."""
+    """Return an arrowhead outside the ring, along the plate's x axis."""
     reach, wire = (factor * radius for factor in _RING)
     base, tip = reach + wire, 1.3 * reach
     corners = [(base, y, z) for y in (-4 * wire, 4 * wire) for z in (-wire, wire)]
@@ -180,12 +173,12 @@ def pointer(radius: float) -> tuple[Array, NDArray[np.int32]]:
 
 
 def _linear(color: Array) -> list[float]:
-    """Of sRGB; the browser's material counts light."""
+    """Return the linear colour of sRGB, as the browser's material expects."""
     return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4).tolist()
 
 
 def _arrange(meshcat: Meshcat, mechanism: Mechanism) -> None:
-    """A camera that sees the whole machine, whatever its size, over a floor of round squares."""
+    """Set a camera that sees the whole machine, and a floor with squares of a round size."""
     joints = mechanism.p_PQ @ rotation(mechanism.home[ANGLES]).T + mechanism.home[POSITION]
     points = np.vstack([mechanism.p_WS, joints])
     low, high = points.min(axis=0), points.max(axis=0)
@@ -201,7 +194,7 @@ def _arrange(meshcat: Meshcat, mechanism: Mechanism) -> None:
 
 
 def _drawn_plate(diagram: Diagram, plant: MultibodyPlant) -> tuple[RigidTransform, float]:
-    """Where in the plate's frame its disc is drawn, and the disc's radius in m."""
+    """Return the pose of the drawn disc in the plate's frame, and its radius in m."""
     scene_graph = cast(SceneGraph, diagram.GetSubsystemByName("scene_graph"))
     inspector = scene_graph.model_inspector()
     frame = plant.GetBodyFrameIdOrThrow(plant.GetBodyByName("plate").index())

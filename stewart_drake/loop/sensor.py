@@ -1,4 +1,4 @@
-"""The sensors of a machine, their faults, and the way of measurements to the controller."""
+"""The sensors of a machine as Drake systems, and their faults."""
 
 from collections.abc import Sequence
 from typing import Any, Final
@@ -23,25 +23,25 @@ from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
 
 _EARLY = 1e-9
-"""s by which a sample may come before an instant and still be at it."""
+"""Tolerance of the instants of a fault, s."""
 SPIKES: Final = 1
-"""Stream of random numbers."""
+"""Stream of random numbers of spikes."""
 _STRIKES: Final = 16
-"""The first of those that say what faults strike, one for each."""
+"""First of the streams that select the values with a fault, one per fault."""
 
 
 def draws(seed: int, stream: int, k: int) -> np.random.Generator:
-    """Random numbers of sample k."""
+    """Return the random numbers of sample k."""
     return np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, stream, k]))
 
 
 def acts(fault: Any, time: float) -> bool:
-    """Whether a fault of a scenario is there at a time, s."""
+    """Return whether a fault of a scenario is active at a time, s."""
     return bool(fault["from"] <= time + _EARLY < fault["to"])
 
 
 def strikes(fault: Any, seed: int, place: int, k: int, size: int) -> NDArray[np.bool_]:
-    """(size,) whether a fault, of this place in the list, strikes each value of sample k."""
+    """Return whether fault number `place` affects each value (size,) of sample k."""
     share = fault.get("share")
     if share is None:
         return np.ones(size, dtype=bool)
@@ -51,18 +51,18 @@ def strikes(fault: Any, seed: int, place: int, k: int, size: int) -> NDArray[np.
 def faulty(
     faults: Sequence[Any], y: Array, last: Array, time: float, seed: int, k: int, motion: Array
 ) -> Array:
-    """Return what a sensor with faults reads; of several at a time the first one counts.
+    """Return the values of a sensor with faults; the first of simultaneous faults counts.
 
     Args:
         faults: see `scenario.fault_config.SensorFault`.
         y: (n,) without faults.
-        last: (n,) what it read before, NaN for nothing.
+        last: (n,) at the sample before, NaN for none.
         time: s.
-        seed: of spikes and of what faults strike.
+        seed: of spikes and of the affected values.
         k: number of the sample.
-        motion: (n,) how far each value moves.
+        motion: (n,) scale of each value.
     """
-    legs = len(y) if len(y) == NUM_LEGS else 1  # a state is struck as a whole
+    legs = len(y) if len(y) == NUM_LEGS else 1  # a fault affects a whole state
     read, left = y.copy(), np.ones(legs, dtype=bool)
     for i, fault in enumerate(faults):
         if not acts(fault, time):
@@ -84,15 +84,15 @@ def faulty(
 
 
 def white_noise(seed: int, k: int, stream: int = 0) -> Array:
-    """Normal numbers (12,) of sample k, a function of (seed, k)."""
+    """Return normal numbers (12,) of sample k, a function of (seed, k)."""
     return draws(seed, stream, k).standard_normal(NUM_STATE)
 
 
 def white_noises(seed: int, number: int) -> Array:
-    """`white_noise` of the first samples, (number, 12), in a seventh of the time."""
+    """Return `white_noise` of the first samples, (number, 12), in a seventh of the time."""
     bits = np.random.Philox(key=seed)
     generator, state, rows = np.random.Generator(bits), bits.state, np.empty((number, NUM_STATE))
-    for k in range(number):  # each begins a block of random numbers of its own
+    for k in range(number):  # each begins a new block of random numbers
         state["state"]["counter"][:] = 0, 0, 0, k
         bits.state = state
         rows[k] = generator.standard_normal(NUM_STATE)
@@ -100,29 +100,29 @@ def white_noises(seed: int, number: int) -> Array:
 
 
 class Sensor(LeafSystem):
-    """Adds white Gaussian noise, new at every sample of the controller, and has faults.
+    """Sensor of pose and rates with white Gaussian noise at each sample, and with faults.
 
     Output:  y(t) = x(t) + noise_std * n_k,   k = round(t / period),   n_k ~ N(0, 1),
-             but while there is a fault
+             except during a fault
              frozen:   the y of the last sample before,
              missing:  NaN,
              spike:    y(t) + size * motion * s_k,   s_k ~ N(0, 1).
     Update:  every period, and at initialisation, the state is y; only where there are faults.
 
     The k-th random vectors are functions of (seed, k) by a counter-based generator, so that the
-    same seed gives the same run. A sensor frozen from the start repeats its first measurement.
+    same seed gives the same run. A sensor frozen at the start repeats its first measurement.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
     | state | input | 12 | rad, m, rad/s, m/s | continuous |
-    | measurement | output | 12 | the same | meant to be read at the controller's samples |
+    | measurement | output | 12 | the same | to be read at the controller's samples |
 
     Args:
         noise_std: (12,) in the units of the state.
         seed: of noise and spikes.
         period: of the controller, s.
-        faults: see `scenario.fault_config.SensorFault`; of several at a time the first one counts.
-        motion: (6,) how far each coordinate moves, rad and m; the same per s for the rates.
+        faults: see `scenario.fault_config.SensorFault`; the first of simultaneous faults counts.
+        motion: (6,) scale of each coordinate, rad and m; the same per s for the rates.
     """
 
     def __init__(
@@ -145,7 +145,7 @@ class Sensor(LeafSystem):
         self.DeclareVectorOutputPort("measurement", NUM_STATE, weak(self._measure))
 
     def noise(self, k: int) -> Array:
-        """The noise (12,) of sample k."""
+        """Return the noise (12,) of sample k."""
         return self._std * white_noise(self._seed, k)
 
     def _measure(self, context: Context, output: BasicVector) -> None:
@@ -171,10 +171,10 @@ _PHASES: Final = 7
 
 
 class Encoders(LeafSystem):
-    """Reads the crank angles N times a period, in codes of 2^bits to a turn.
+    """Encoders of the crank angles, read N times a period, with codes of 2^bits per turn.
 
-    With a(t) the crank angles of the pose, o where the encoders stand on their shafts, q the width
-    of a code and p their phases, uniform from -1/2 to 1/2 and drawn once per seed,
+    With a(t) the crank angles of the pose, o the offsets of the encoders on their shafts, q the
+    width of a code and p their phases, uniform from -1/2 to 1/2 and drawn once per seed,
 
         y(t) = q (round((a(t) + o) / q + p) - p),   or a(t) + o of exact ones.
 
@@ -185,25 +185,25 @@ class Encoders(LeafSystem):
 
     Initialise: window = [N samples of t = 0], as from a burst.
     Update:     at n dt / N   window <- [window without its oldest; y(n dt / N)].
-    Output:     measurement = window, with the sample of now whether or not its update has been.
+    Output:     measurement = window with the present sample, also before its update.
 
-    The window is sample by sample, the oldest first. Random numbers are functions of (seed, number
+    The window is sample by sample, oldest first. Random numbers are functions of (seed, number
     of the sample) by a counter-based generator.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
     | state | input | 12 | rad, m, rad/s, m/s | continuous |
-    | measurement | output | 6 N | rad | meant to be read at the controller's samples |
+    | measurement | output | 6 N | rad | to be read at the controller's samples |
 
     Args:
         mechanism: the true machine.
         bits: of a turn; None is exact.
         samples: N, per period; the last one is at the controller's sample.
         offset: (6,) rad.
-        seed: of phases, spikes and what a fault strikes.
+        seed: of phases, spikes and the values affected by a fault.
         period: dt, of the controller, s.
-        faults: see `scenario.fault_config.SensorFault`; of several at a time the first one counts.
-        motion: (6,) how far each crank moves, rad.
+        faults: see `scenario.fault_config.SensorFault`; the first of simultaneous faults counts.
+        motion: (6,) scale of each crank angle, rad.
     """
 
     def __init__(
@@ -239,7 +239,7 @@ class Encoders(LeafSystem):
         state.get_mutable_discrete_state(self._window).SetFromVector(window.ravel())
 
     def _taken(self, context: Context) -> tuple[int, Array]:
-        """Number of the sample of now, and the window (N, 6) with it."""
+        """Return the number of the present sample, and the window (N, 6) with it."""
         time = context.get_time()
         number = round(time / self._step)
         last = int(context.get_discrete_state(self._last).value()[0])

@@ -51,58 +51,57 @@ from stewart_drake.types import Array
 
 
 class ServoState(NamedTuple):
-    """What servos remember."""
+    """Memory of servos."""
 
     segment: Segment
-    """The way of the setpoint to the command that arrived last."""
+    """Path of the setpoint to the newest command."""
     arrived: float
-    """When that did, s; NaN before any has."""
+    """Arrival of that command, s; NaN before the first."""
     setpoint: Array
-    """(12,) that was followed last."""
+    """(12,) last setpoint."""
     asked: Array
     """(6,) torque before the limit, N m."""
     put_out: Array
-    """(n, 6) torques of the periods that are reported, the oldest first; NaN before the start."""
+    """(n, 6) torques of the reported periods, oldest first; NaN before the start."""
 
     @property
     def torque(self) -> Array:
-        """(6,) what acts, N m."""
+        """Torque (6,) that acts, N m."""
         return np.nan_to_num(self.put_out[-1])
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "ServoState":
-        """Drake copies what it keeps; nobody changes this, so that itself will do."""
+        """Return the same object: a memory is never changed."""
         return self
 
 
 class Servos(LeafSystem):
-    """Follows the crank angles that arrive, with a local loop at each motor (`law.servos`).
+    """Servos that follow arriving crank angles, with a local loop at each motor (`law.servos`).
 
-    With h the period of the loops, x the state, c the command that has arrived, at t_c:
+    With h the period of the loops, x the state, c the newest command, arrived at t_c:
 
-    Update:  every h  segment  <- on to c, from where the setpoint was at t_c, if c is new;
-                      setpoint <- segment(t), as fast as the speed limit allows;
+    Update:  every h  segment  <- from the setpoint at t_c to c, if c is new;
+                      setpoint <- segment(t) within the speed limit;
                       asked    <- J (w^2 (a_r - a(x)) + 2 d w (a_r' - a'(x))) + tau_model.
-    Output:  torque = asked within the limit, held; report = what the last periods' torques were.
+    Output:  torque = asked within the limit, held; report = torques of the last periods.
 
-    It ticks after the events of an instant and before a discrete plant's step (`servo_time`): a
-    torque acts that knows the state of now. A command that is no number is not followed. Where the
-    pose has no crank angles, at the workspace's edge, where the plant ends the run, the torque is
-    held.
+    Updates come after the other events of an instant and before a discrete plant's step
+    (`servo_time`), so that the torque follows from the present state. A command that is not finite
+    is ignored. At the edge of the workspace, where a pose has no crank angles, the torque is held.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
     | command | input | 18 | rad, rad/s, N m | read every h |
-    | arrived | input | 1 | s, when the command arrived | the same |
+    | arrived | input | 1 | s, arrival of the command | the same |
     | state | input | 12 | rad, m, rad/s, m/s | the same |
     | torque | output | 6 | N m | held for h |
-    | report | output | of `law.servos.ReportLayout` | N m | meant to be read at samples |
+    | report | output | of `law.servos.ReportLayout` | N m | to be read at samples |
 
     Args:
         loop: of each motor.
-        dynamics: of the machine as it is: kinematics, and the limit at the crank.
-        command: (18,) to be held until one arrives.
-        period: of the commands, s, a whole number of the loops'.
-        reports: what the report tells of.
+        dynamics: of the true machine, for kinematics and the limit at the crank.
+        command: (18,) held until the first one arrives.
+        period: of the commands, s, a multiple of that of the loops.
+        reports: layout of the report.
     """
 
     def __init__(
@@ -128,7 +127,7 @@ class Servos(LeafSystem):
         update_every(self, loop.period, self._tick, servo_time)
 
     def remembered(self, context: Context) -> ServoState:
-        """What is remembered in a context of this system."""
+        """Return the memory in a context of this system."""
         value: Any = context.get_abstract_state(int(self._memory))
         return value.get_value()
 
@@ -154,7 +153,7 @@ class Servos(LeafSystem):
         return before.segment.then(command, begin, arrived + self._period, self._period), arrived
 
     def _cranks(self, state: Array) -> Array:
-        """Crank angles and rates (12,) of pose and rates (12,)."""
+        """Return crank angles and rates (12,) of pose and rates (12,)."""
         angles = self._dynamics.mechanism.crank_angles(state[POSE])
         rates = self._dynamics.actuation_map(state[POSE]).T @ state[RATES]
         return np.concatenate([angles, rates])
@@ -169,16 +168,16 @@ class Servos(LeafSystem):
 
 
 _PART: Final = 0.005
-"""s, about as long as the parts of a period over which servos report mean torques."""
+"""Approximate length of the parts of a period with a reported mean torque, s."""
 _REPORTED: Final = 10
 """Periods in a report."""
 
 
 def servo_loop(experiment: Experiment) -> ServoLoop:
-    """What runs at each motor, tuned by the machine as it is known.
+    """Design the loop at each motor for the assumed machine.
 
     Raises:
-        ConfigError: sampled, it would be unstable at home or along the reference.
+        ConfigError: the sampled loop is unstable at home or along the reference.
     """
     sc, nominal = experiment.scenario, experiment.nominal
     actuator = sc.actuator
@@ -202,9 +201,9 @@ def servo_loop(experiment: Experiment) -> ServoLoop:
 
 
 def quickest_crank(dynamics: StewartDynamics, experiment: Experiment) -> float:
-    """Largest acceleration per torque, rad/s^2 per N m, at home and along the reference.
+    """Return the largest acceleration per torque, rad/s^2 per N m, at home and along the reference.
 
-    Of `crank_mobility`, whatever motors push together: one over the least inertia of a mode.
+    It is the largest eigenvalue of `crank_mobility`: one over the least inertia of a mode.
     """
     instants = spread_instants(experiment.scenario.duration, INSTANTS)
     along = (experiment.reference.value(t)[:, 0] for t in instants)
@@ -217,7 +216,7 @@ def _ticks(scenario: Scenario) -> int:
 
 
 def compose_servo_law(experiment: Experiment) -> ServoPreview:
-    """The parts that a scenario with servos asks for: those of the law for torques, where alike."""
+    """Compose the law for servos; it shares most parts with the law for torques."""
     like = _law_for_torques(experiment)
     period, ticks = like.timeline.period, _ticks(experiment.scenario)
     wanted = max(1, round(period / _PART))
@@ -246,7 +245,7 @@ def _law_for_torques(experiment: Experiment) -> PredictiveLqi:
 
 
 def servo_law(experiment: Experiment) -> tuple[ServoPreview, Trajectory, float]:
-    """The law, the motion that it follows, and the length of the blend onto the reference."""
+    """Return the law, the motion that it follows, and the length of the blend, s."""
     sc, law = experiment.scenario, compose_servo_law(experiment)
     period, eta, reference = law.timeline.period, law.timeline.eta, experiment.reference
     if sc.start != "rest" or sc.controller.catch_up == 0:
@@ -274,9 +273,9 @@ def servo_law(experiment: Experiment) -> tuple[ServoPreview, Trajectory, float]:
 def commands_in_flight(
     experiment: Experiment, law: ServoPreview, delay: Delay
 ) -> tuple[Array, Array]:
-    """What servos begin with (18,), and the commands (L, 18) under way at t = 0, oldest first.
+    """Return the first command (18,), and those in flight at t = 0 (L, 18), oldest first.
 
-    The oldest is reached at t = dt, or eta0 where that is above 0.
+    The oldest in flight is reached at t = dt, or eta0 if that is above 0.
     """
     sc, length = experiment.scenario, delay.queue_length
     wanted = np.zeros((length + 1, NUM_REFERENCE))
@@ -284,7 +283,7 @@ def commands_in_flight(
     wanted[0, RATES] = experiment.start[RATES]
     if sc.queue == "reference":
         ends = delay.eta(law.timeline.period) - law.timeline.period * np.arange(length)[::-1]
-        moving = 1 if sc.start == "rest" else 0  # a plate at rest is not on the reference yet
+        moving = 1 if sc.start == "rest" else 0  # at rest the plate is not yet on the reference
         for row, t in zip(wanted[moving:], [0.0, *ends][moving:], strict=True):
             row[:] = evaluate(experiment.reference, t)
     commands = np.array([law.command(x, law.plant.dynamics.parameters) for x in wanted])

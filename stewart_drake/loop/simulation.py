@@ -21,7 +21,7 @@ from stewart_drake.loop.own import OwnLaw, OwnReference, OwnSystem
 from stewart_drake.loop.preparation import Experiment, concrete
 from stewart_drake.loop.recording import Recorder, summarize
 from stewart_drake.loop.results import SimulationResult
-from stewart_drake.loop.sampling import let_go
+from stewart_drake.loop.sampling import dispose
 from stewart_drake.loop.scene import Live
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
@@ -140,7 +140,7 @@ def _run(
     finally:
         if live is not None:
             live.close()
-        let_go(loop, experiment.own.instances, tuple(experiment.own.systems.values()))
+        dispose(loop, experiment.own.instances, tuple(experiment.own.systems.values()))
     summary = summarize(experiment, recorder, status, stopped, wall, margin)
     summary["warnings"] = cautions_before(experiment, margin) + cautions_after(experiment, summary)
     return SimulationResult(

@@ -1,4 +1,4 @@
-"""The tuner of the weights: features and policy, and the Drake systems that they decide in."""
+"""The tuner of the weights: its features, its policy, and its Drake systems."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -40,19 +40,18 @@ from stewart_drake.types import Array
 
 
 class DensityWindow(LeafSystem):
-    """Keeps the last 31 samples and takes the densities (45) of the newest.
+    """Window of the last 31 samples, with the densities (45) of the newest.
 
-    With s_k = [y_k - r_k; T_k], y the measured state, or where it is not measured the estimate, r
-    the reference's pose and rates, T_k the torque computed at t = k dt:
+    With s_k = [y_k - r_k; T_k], y the measured or else the estimated state, r the reference's pose
+    and rates, T_k the torque computed at t = k dt:
 
     Initialise: window = [unknown, ..., unknown], then the update of k = 0.
     Update:     at k dt   window <- [window without its oldest; s_k].
     Output:     density = `tuner.network.density`(window), hence of samples up to k from k dt on.
 
-    What is not finite in s_k is unknown and left out of the window's mean, so that a missed
-    measurement spoils nothing. While the window fills, the mean is over the samples there are.
-    The update is an early, unrestricted one, like the controller's: T_k is then the torque of the
-    same step that the delay chain takes.
+    Values of s_k that are not finite are left out of the window's mean. While the window fills, the
+    mean is over the samples so far. The update is early and unrestricted like the controller's, so
+    that T_k is the torque of the same step that the link takes.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
@@ -79,7 +78,7 @@ class DensityWindow(LeafSystem):
         update_every(self, period, self._update)
 
     def window(self, context: Context) -> Array:
-        """(31, 18) samples in a context of this system, the newest last, NaN where unknown."""
+        """Return the samples (31, 18) in a context, the newest last, NaN where unknown."""
         return np.reshape(context.get_discrete_state(self._window).value(), (WINDOW, NUM_INPUTS))
 
     def _update(self, context: Context, state: State) -> None:
@@ -103,12 +102,12 @@ class AnnTuner(LeafSystem):
 
     Initialise: w unknown, n = 0, then the update of k = 0.
     Update:     at k dt   (w, n) <- (w_k, n + fallback_k).
-    Output:     weights = w_k, (w_k, fallback_k) = tune(rho, w), to be taken at the samples, before
+    Output:     weights = w_k, (w_k, fallback_k) = tune(rho, w), to be read at the samples, before
                 their updates; w_0 = fixed.
 
-    Not finite in, or not finite out of the network: the weights go back towards `fixed`, and n
-    counts it. The weights of sample k rest on data of samples up to k - 1, since the window takes
-    in sample k, of which T_k is a part, in its update: there is no algebraic loop.
+    If input or output of the network is not finite, the weights return towards `fixed`, and n
+    counts it. The weights of sample k depend on samples up to k - 1: the window takes sample k and
+    T_k in its update, so that there is no algebraic loop.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
@@ -116,10 +115,10 @@ class AnnTuner(LeafSystem):
     | weights | output | 2 | w_Q, w_R | direct feedthrough |
 
     Args:
-        network: what decides.
-        fixed: (2,) w_Q and w_R at the first sample, and to fall back to.
+        network: the network.
+        fixed: (2,) w_Q and w_R at the first sample and after fallbacks.
         period: dt in s.
-        factor: by which a weight changes at most from one sample to the next.
+        factor: largest factor on a weight from one sample to the next.
     """
 
     def __init__(
@@ -142,7 +141,7 @@ class AnnTuner(LeafSystem):
         update_every(self, period, self._update)
 
     def fallbacks(self, context: Context) -> int:
-        """Samples so far at which the network had to be passed over."""
+        """Return the number of fallbacks so far."""
         return int(context.get_discrete_state(self._count).value()[0])
 
     def _calc_step(self, context: Context, result: AbstractValue) -> None:
@@ -213,7 +212,7 @@ class LawTuner(LeafSystem):
         return value.get_value().memory
 
     def fallbacks(self, context: Context) -> int:
-        """Samples so far at which who decides had to be passed over."""
+        """Return the number of fallbacks so far."""
         return self.memory(context).fallbacks
 
     def _weights(self, context: Context, output: BasicVector) -> None:
@@ -229,14 +228,14 @@ class LawTuner(LeafSystem):
 
 
 RULES: Final = {True: Rule(-1.77, 2.35, 0.41), False: Rule(-0.82, 1.37, 0.33)}
-"""Usual rule of a controller with an estimator, and of one without."""
+"""Default rule of a controller with an estimator, and without."""
 
 
 def weights_source(experiment: Experiment, law: PredictiveLqi) -> WeightsSource | None:
-    """Make features and policy of a scenario's tuner, None where weights are fixed.
+    """Make features and policy of a scenario's tuner, None for fixed weights.
 
     Raises:
-        ConfigError: what it decides by takes a state that is measured, without delay.
+        ConfigError: the features need a measured state without delay.
     """
     config = experiment.scenario.tuner
     return TUNERS[type(config)](config, experiment, law)
@@ -269,22 +268,22 @@ TUNERS: Final[Mapping[type, Callable[[Any, Experiment, PredictiveLqi], WeightsSo
     AnnTunerConfig: _ann,
     RuleTunerConfig: _rule,
 }
-"""Functions that make features and policy, by the kind of tuner."""
+"""Factories of features and policy, by the kind of tuner."""
 
 
 def health_of(experiment: Experiment, law: PredictiveLqi) -> HealthFeatures:
-    """The features `health` of a law.
+    """Return the features `health` of a law.
 
     Raises:
-        ConfigError: it does not measure the state, or late.
+        ConfigError: the state is not measured, or late.
     """
     sc = experiment.scenario
     sensing = law.sensing
     if not isinstance(sensing, StateSensing) or law.longest_wait:
         raise ConfigError(
-            f"tuner.kind: got {sc.tuner.kind!r}, which goes by the law's predictions, with "
+            f"tuner.kind: got {sc.tuner.kind!r}, which uses the law's predictions, with "
             f"sensor.kind {sc.sensor.kind!r} and a sensor.delay of {sc.sensor.delay:g} s; expected "
-            "'fixed', or measurements of the state, of now"
+            "'fixed', or measurements of the present state"
         )
     motion = np.tile(experiment.motion_scale, 2)
     nominal, reference = experiment.nominal, experiment.reference
@@ -303,7 +302,7 @@ def health_of(experiment: Experiment, law: PredictiveLqi) -> HealthFeatures:
 
 
 def angular_frequency(experiment: Experiment) -> float:
-    """rad/s, of the reference: its largest rate over half its peak to peak; of a sine its own."""
+    """Return the largest rate of the reference over half its peak to peak, rad/s."""
     times = spread_instants(experiment.scenario.duration, INSTANTS)
     rates = np.array([evaluate(experiment.reference, t)[RATES] for t in times])
     return float((np.abs(rates).max(axis=0) / experiment.motion_scale).max())

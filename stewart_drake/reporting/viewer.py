@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.loop.platforms import build_viewer, set_pose
-from stewart_drake.loop.sampling import let_go
+from stewart_drake.loop.sampling import dispose
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.reporting.style import FACTORS
@@ -100,7 +100,7 @@ class PoseViewer:
 
     def close(self) -> None:
         """Free the diagram."""
-        let_go(self._diagram)
+        dispose(self._diagram)
 
     def values(self) -> Array:
         """Return the values of the sliders (6,) in degrees and mm."""
