@@ -17,6 +17,7 @@ from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.clearance import (
     APART,
     LINKS,
+    center_lines,
     clearances,
     proportions,
     segment_distances,
@@ -106,6 +107,11 @@ def test_rods_are_as_far_apart_as_least_squares_says(seed):
     scene, home = ClearanceScene(mechanism, base=False), assemble(mechanism, pose)
     radius = proportions(mechanism).rod_radius
     along = mechanism.rod_lengths[:, None] * home.R_WD[:, :, 0]
+    start, line = (
+        x[0] for x in center_lines(mechanism, pose[None], legs_along(mechanism, pose[None]))
+    )
+    np.testing.assert_allclose(start, np.vstack([mechanism.p_WS, home.p_WT]), atol=1e-12)
+    np.testing.assert_allclose(line, np.vstack([home.p_WT - mechanism.p_WS, along]), atol=1e-12)
     found = dict(zip(scene.pairs, scene.distances(pose), strict=True))
     for i, j in combinations(range(6), 2):
         ends = home.p_WT[i], along[i], home.p_WT[j], along[j]

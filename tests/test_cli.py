@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import joblib
 import numpy as np
@@ -15,10 +16,9 @@ import xarray as xr
 
 from stewart_drake.cli import main
 from stewart_drake.files.resources import KINDS, shipped
-from stewart_drake.loop.preparation import assemble, prepare
-from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
+from stewart_drake.reporting import terminal
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 from tests.screen import too_long
 
@@ -44,27 +44,6 @@ def files(folder):
 
 
 # ---------------------------------------------------------------- bad input
-
-
-@pytest.mark.slow
-def test_a_scenario_is_prepared_once(tmp_path, monkeypatch):
-    """Its reference is looked at over all of its duration, and its mechanism is read."""
-    prepared = []
-
-    def counted(scenario, *more):
-        prepared.append(scenario)
-        return assemble(scenario, *more)
-
-    monkeypatch.setattr("stewart_drake.loop.preparation.assemble", counted)
-    assert main(["simulate", *SHORT, "--quiet", "--out", str(tmp_path)]) == 0
-    assert len(prepared) == 1
-    experiment = prepare(prepared[0])
-    once, twice = simulate(experiment), simulate(experiment)  # it has no memory of a run
-    assert once.signals.identical(twice.signals)
-    saved = xr.load_dataset(tmp_path / "signals.nc")
-    assert saved.equals(once.signals)
-    with pytest.raises(TypeError, match="true_mechanism: got one with an Experiment"):
-        simulate(experiment, true_mechanism=experiment.mechanism)
 
 
 # ---------------------------------------------------------------- simulate and compare
@@ -250,3 +229,61 @@ def test_meshcat_replays_an_exact_run_and_leaves_a_file(tmp_path, capsys):
     settings = ("--set", "duration=0.2", "--quiet", "--meshcat", "--out", str(tmp_path))
     assert main(["simulate", *EXACT, *settings]) == 0
     assert (tmp_path / "replay.html").stat().st_size > 500_000  # the viewer itself is inside
+
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def often(monkeypatch):
+    monkeypatch.setattr(terminal, "EVERY", 0.05)
+
+
+@pytest.mark.usefixtures("often")
+def test_a_pipe_gets_a_line_now_and_then(capsys):
+    with terminal.count_bar("runs", False) as show:
+        time.sleep(0.12)
+        show(40, 200)
+        time.sleep(0.2)
+        show(60, 200)
+        time.sleep(0.2)
+    said = capsys.readouterr().err
+    lines = said.splitlines()
+    assert lines[0] == "runs: preparing, after 0 s"
+    assert any(re.fullmatch(r"runs: 40 of 200, after 0 s", line) for line in lines)
+    # Twenty in 0.2 to 0.4 s leaves 1.4 to 2.8 s for 140; the forty of an earlier start took none.
+    assert re.fullmatch(r"runs: 60 of 200, about [1-9] s left, after \d s", lines[-1]), said
+    assert "\r" not in said and "\x1b" not in said
+
+
+@pytest.mark.usefixtures("often")
+def test_simulations_tell_their_time(capsys):
+    with terminal.progress_bars(["lqr", "lqi"], 20.0, False) as show:
+        time.sleep(0.12)
+        show["lqr"](1.5, 0.1)
+        time.sleep(0.12)
+        show["lqi"](2.0, 0.1)
+        time.sleep(0.12)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "lqr, lqi: preparing, after 0 s"
+    assert "lqr 1.5 of 20 s, after 0 s" in lines and "lqr 1.5, lqi 2.0 of 20 s" in lines[-1]
+
+
+@pytest.mark.usefixtures("often")
+def test_quiet_is_quiet(capsys):
+    with terminal.count_bar("a", True), terminal.progress_bars(["a"], 1.0, True):
+        time.sleep(0.3)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.usefixtures("often")
+def test_a_closed_stderr_costs_nothing():
+    script = "with t.count_bar('runs', False) as show:\n    show(0, 3)\n    time.sleep(0.3)\n"
+    lines = (
+        f"import time\nfrom stewart_drake.reporting import terminal as t\nt.EVERY = 0.05\n{script}"
+    )
+    shell = f'{sys.executable} -c "$0" 2>&-'
+    done = subprocess.run(
+        ["bash", "-c", shell, lines + "print('done')"], capture_output=True, cwd=ROOT
+    )
+    assert (done.returncode, done.stdout) == (0, b"done\n")

@@ -24,7 +24,6 @@ from stewart_drake.law.timeline import Arrivals, Timeline
 from stewart_drake.loop.controller_margin import controller_margin
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.reporting.figures import draw_run
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import ADAPTIVE, CONTROLLERS, shown
@@ -470,17 +469,6 @@ def test_a_jump_is_followed():
     assert result.summary["delay"]["estimated_s"] == pytest.approx(0.9, abs=1e-4)
     estimates, time = result.signals.delay_estimate.values, result.signals.time.values
     assert np.all(np.abs(estimates[(time > 1) & (time < 2.8)] - 0.8) < 1e-3)
-
-
-def test_the_figure_has_the_estimate_its_band_and_the_truth():
-    result = looped("duration=1.5", "controller.delay_steps=6")
-    figure = draw_run(result)["delay"]
-    whole, fine = figure.axes
-    lines = {str(line.get_label()): line for line in whole.lines}
-    assert np.array_equal(lines["estimate"].get_ydata(), result.signals.delay_estimate.values)
-    assert np.all(np.asarray(lines["true value"].get_ydata()) == pytest.approx(0.8))
-    assert len(whole.collections) == len(fine.collections) == 1  # the bands
-    assert "delay" not in draw_run(looped("duration=0.3", kind="none"))
 
 
 def test_nothing_is_fed_back_before_the_first_torque_has_acted_for_a_period():

@@ -9,14 +9,13 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.loop.bulk import samples_of
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.sensor import Encoders
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.reporting.csv_file import read_signals, signals_csv
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.scenario.signals import LEGS, POSE
+from stewart_drake.scenario.signals import LEGS
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import make_reference
 from tests.mechanisms import PAPER
@@ -183,14 +182,14 @@ def test_what_is_not_known_is_found():
     [
         ("[{kind: missing, leg: 2, from: 4, to: 5}]", (11, 0, 0)),
         ("[{kind: missing, from: 4, to: 4.5}]", (6, 0, 0)),
-        ("[{kind: spike, share: 0.01, from: 0, to: 100}]", (0, 0, 100)),
-        ("[{kind: missing, share: 0.05, from: 0, to: 100}]", (101, 0, 0)),
+        ("[{kind: spike, share: 0.01, from: 0, to: 100}]", (0, 0, 60)),
+        ("[{kind: missing, share: 0.05, from: 0, to: 100}]", (61, 0, 0)),
     ],
 )
 def test_faults_do_little_and_are_counted(faults, counted):
     """Windows of 0.1 s, of which one more than the fault lasts has a part of it."""
-    clean = run(*ON_REFERENCE, *FINE)
-    result = run(*ON_REFERENCE, *FINE, f"sensor.faults={faults}")
+    usual = (*ON_REFERENCE, *FINE, "duration=6")
+    clean, result = run(*usual), run(*usual, f"sensor.faults={faults}")
     assert result.accumulated_error < 1.2 * clean.accumulated_error
     assert bad(clean) == (0, 0, 0)
     assert np.abs(np.subtract(bad(result), counted)).max() <= 1
@@ -267,17 +266,6 @@ def test_the_record_has_angles_with_labels(tmp_path):
     back = read_signals(tmp_path / "signals.nc")
     header = signals_csv(back).partition("\n")[0]
     assert "measurement_A1[0][rad],measurement_A2[0][rad]" in header
-
-
-def test_densities_and_data_sets_are_of_the_estimate():
-    result = run(*ON_REFERENCE, "duration=4")
-    rows = samples_of(result)
-    kept = result.signals.sel(time=1.5)
-    assert rows[15, :6] == pytest.approx(kept.state_estimate.values[POSE] - kept.reference.values)
-    assert np.isfinite(result.signals.density.values[-1]).all()
-    tuned = run(*ON_REFERENCE, "tuner.kind=ann", "duration=4")
-    assert tuned.status == "completed"
-    assert tuned.summary["counts"]["tuner_fallbacks"] == 0
 
 
 @pytest.mark.parametrize("role", ["controller", "sensor"])

@@ -13,14 +13,14 @@ from scipy.stats import chi2
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.compiled import machine_of
-from stewart_drake.law.filter_settings import FilterSettings, ParameterSet, filter_settings
+from stewart_drake.law.filter_settings import FilterSettings, ParameterSet
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.signals import BIAS, DAMPING, PARAMETER_UNITS, PARAMETERS, PAYLOAD
+from stewart_drake.scenario.signals import PARAMETER_UNITS, PARAMETERS, PAYLOAD
 from stewart_drake.types import Array
 from tests.filters import Filter, FilterEstimate, Period
 from tests.mechanisms import PAPER
@@ -319,17 +319,6 @@ def test_errors_of_the_parameters_are_as_large_as_the_filter_says(draw):
     assert (low if draw is inside else 0.0) < sums < high
 
 
-def test_without_noise_all_parameters_are_found():
-    known = filter_settings(AMPLITUDE, PAPER.plate.mass, 0.1, None, PERIOD)
-    assumed = filter_of(np.zeros(12), known)
-    for fraction in (0.0, 0.3):
-        result = run(inside(np.random.default_rng(3)), 3, assumed, fraction)
-        error = np.abs(result.estimates[-1].parameters - result.truth)
-        assert error[BIAS].max() < 1e-5
-        assert error[PAYLOAD] < 1e-3
-        assert error[DAMPING] < 1e-5
-
-
 def test_the_first_estimate_is_measurement_and_prior():
     y = np.arange(12.0)
     first = start(y)
@@ -392,17 +381,6 @@ def test_bounds_are_kept_by_the_nearest_mean_there_is(seed, width):
     expected = lsq_linear(metric, metric @ mean, limits, method="bvls", tol=1e-14).x
     assert np.abs(found - expected).max() < 1e-9
     assert np.all((lower <= found[12:]) & (found[12:] <= upper))
-
-
-def test_what_was_learnt_about_combinations_survives_a_bound():
-    """A payload that seems negative: the rest moves to what it is with the payload at zero."""
-    covariance = np.diag(np.full(20, 1e-6))
-    covariance[12, 18] = covariance[18, 12] = -0.9e-6
-    mean = np.zeros(20)
-    mean[12], mean[18] = 1e-3, -2e-3
-    found = within_bounds(mean, covariance, KNOWN)
-    assert found[18] == 0
-    assert found[12] == pytest.approx(1e-3 - 0.9 * 2e-3, rel=1e-12)
 
 
 # Outliers.

@@ -33,9 +33,6 @@ from stewart_drake.scenario.timing import look_time
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.oracles import relative, size
 
-Scheme = tuple[str, float, float, bool]
-"""Integrator, accuracy, largest step in s, error control."""
-
 TIGHT = ("runge_kutta5", 1e-10, 0.005, True)
 USUAL = ("runge_kutta5", 1e-8, 0.02, True)
 ENDED = SimulatorStatus.ReturnReason.kReachedTerminationCondition
@@ -302,11 +299,7 @@ def test_under_gravity_and_strong_torques_the_simulation_ends_too(seed):
     ids=lambda s: f"{s[0]}-{s[1]:g}-{s[2]:g}",
 )
 def test_coarse_integration_stays_finite_and_comes_to_an_end(scheme):
-    """Whatever else: no NaN, no endless halving of steps, and a reason where it ended.
-
-    That it ends at the first dead centre is not shown, nor true: a step may go over it, see
-    `test_a_step_over_a_dead_centre_does_not_go_unnoticed`.
-    """
+    """No NaN, no endless halving of steps; a coarse step may pass a dead centre unnoticed."""
     for seed in range(12):
         plant = ExactPlant(Counting(20_000))
         torque = (NO_TORQUE, PRESSING)[seed % 2]
@@ -316,22 +309,6 @@ def test_coarse_integration_stays_finite_and_comes_to_an_end(scheme):
         assert np.all(np.isfinite(x))
         failure = diagnose(PAPER, context.get_time(), x[:6])
         assert (status.reason() == ENDED) == (failure is not None)
-
-
-@pytest.mark.xfail(reason="witnesses are looked at between steps only", strict=True)
-@pytest.mark.parametrize(
-    ("scheme", "seed"),
-    [(("runge_kutta2", 0.0, 0.05, False), 5), (("runge_kutta3", 1e-2, 0.1, True), 7)],
-    ids=["fixed", "loose"],
-)
-def test_a_step_over_a_dead_centre_does_not_go_unnoticed(scheme, seed):
-    """What is known not to hold. In pose coordinates a plate touches the end of its reach and turns
-    back, on the other branch of the crank; when both ends of a step are within reach, and no stage
-    was bad enough for the error control, that looks like a motion on the same branch.
-    """
-    expected, _, _ = end_of(approach(seed), TIGHT, 20_000, NO_TORQUE)
-    found, _, _ = end_of(approach(seed), scheme, 5_000, NO_TORQUE)
-    assert found.time < expected.time + scheme[2]
 
 
 def test_absurd_speeds_end_in_the_first_step():

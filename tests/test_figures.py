@@ -1,18 +1,20 @@
 """Figures: which there are, what they show, that they are whole and always the same."""
 
 import dataclasses
+import re
 from xml.etree import ElementTree
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.reporting import figures
 from stewart_drake.reporting.figures import comparison_figures, run_figures
-from stewart_drake.reporting.style import controller_lines
+from stewart_drake.reporting.style import controller_lines, figure_style, plain_log_ticks
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 
@@ -136,3 +138,20 @@ def test_any_number_of_controllers_is_told_apart_and_named_on_the_figure(run, dr
     comparison_figures(dict.fromkeys(names, run), "unused")
     box = drawn["states"].legends[0].get_window_extent()
     assert 0 <= box.x0 < box.x1 <= drawn["states"].bbox.x1
+
+
+@pytest.mark.parametrize(("low", "high"), [(19.5, 37), (0.4, 300), (8, 12), (20, 55), (1e-3, 2e-3)])
+def test_ticks_of_a_logarithmic_axis_are_plain_numbers(low, high):
+    with figure_style():
+        figure = Figure()
+        ax = figure.subplots()
+        ax.plot([low, high], [1, 2])
+        ax.set(xscale="log", xlim=(low, high))
+        plain_log_ticks(ax.xaxis)
+        places = [place for place in ax.xaxis.get_majorticklocs() if low <= place <= high]
+        texts = ax.xaxis.get_major_formatter().format_ticks(places)
+        minor = ax.xaxis.get_minor_formatter().format_ticks(ax.xaxis.get_minorticklocs())
+    assert 3 <= len(texts) <= 12 and not any(minor)
+    for text, place in zip(texts, places, strict=True):
+        assert re.fullmatch(r"[\d.]+(e-0\d)?", text)
+        assert float(text) == pytest.approx(place), "not what stands there"

@@ -1,7 +1,5 @@
 """`plant.kind: paper`: the paper's torque map frozen at home, taken for the machine."""
 
-import copy
-
 import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
@@ -89,16 +87,6 @@ def test_the_plate_gets_the_power_of_the_motors(plant):
     if plant.mechanism is PAPER:  # at home, of the machine itself too: legs without mass do no work
         true = StewartDynamics(PAPER, gravity=False)
         np.testing.assert_allclose(plant.actuation_map(pose), true.actuation_map(PAPER.home))
-
-
-def test_a_copy_is_of_the_same_kind(plant):
-    again, assumed = copy.deepcopy(plant), plant.assuming(plant.parameters)
-    pose, rates, torque = somewhere(6)
-    for other in (again, assumed):
-        assert type(other) is FrozenDynamics
-        np.testing.assert_array_equal(
-            other.accelerations(pose, rates, torque), plant.accelerations(pose, rates, torque)
-        )
 
 
 def test_the_band_is_ten_peak_to_peaks_about_the_moving_reference():

@@ -35,7 +35,14 @@ from stewart_drake.loop.peer import FAULTS, Fault, Part, Reason, identity_of, in
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.loading import load_scenario
 from tests.live_driver import Driver
-from tests.test_live import FROM_REST, OVER_A_NETWORK, Running, quiet_machine, scenario_of
+from tests.test_live import (
+    FROM_REST,
+    OVER_A_NETWORK,
+    Running,
+    driven,
+    quiet_machine,
+    scenario_of,
+)
 from tests.test_machine import begun, messages, together
 from tests.test_protocol import HEAD, IDENTITY, KEY, OFFER, PLAN, changed
 
@@ -283,8 +290,7 @@ def test_a_machine_that_reports_a_period_too_late_is_refused(quiet_machine, monk
 
     monkeypatch.setattr(Machine, "_message", off)
     with Running(OVER_A_NETWORK, *FROM_REST) as running:
-        ready = prepare_session(scenario_of(*FROM_REST), running.address)
-        result = drive(ready, 6.0, accept_jitter=True, say=lambda line: None)
+        result = driven(running, 6.0, *FROM_REST)
     assert result.status == "refused" and result.stopped is not None
     assert "acted_from in the machine's datagrams is one period late" in result.stopped.reason
 
@@ -390,15 +396,8 @@ def test_live_and_machine_say_a_loss_in_the_same_words(quiet_machine):
     """A machine under gravity, of which the controller knows nothing, falls."""
     watching = Watching()
     with Running("plant.gravity=true") as running:
-        ready = prepare_session(scenario_of(), running.address)
         # Outliers alone would end the run before the plate has fallen.
-        result = drive(
-            *(ready, 6.0),
-            viewer=watching,
-            accept_jitter=True,
-            max_missing=5.0,
-            say=lambda line: None,
-        )
+        result = driven(running, 6.0, viewer=watching, max_missing=5.0)
         machine = running.machine
     assert result.status == "left_workspace" and result.stopped is not None
     why = in_words(machine.reason, machine.before)

@@ -17,7 +17,6 @@ from stewart_drake.identification.fit import (
     Guess,
     Problem,
     chi2_per_value,
-    covariance,
     finer,
     solve,
 )
@@ -29,7 +28,7 @@ from stewart_drake.identification.judgement import (
     unseen,
     workspace_poses,
 )
-from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log, Precision, read_log
+from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, Log, Precision, read_log
 from stewart_drake.identification.model import (
     NUM_DYNAMIC,
     NUM_GEOMETRY,
@@ -38,7 +37,7 @@ from stewart_drake.identification.model import (
 )
 from stewart_drake.identification.plan import fitted_multisine, multisine
 from stewart_drake.identification.shooting import Segment, integrate, plan_steps
-from stewart_drake.identification.start import coarse_delay, measured_poses, segments_of
+from stewart_drake.identification.start import coarse_delay, measured_poses
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import (
     DELAY,
@@ -479,14 +478,6 @@ def test_two_logs_tell_more_than_one(log_and_truth):
     assert abs(both.values[DELAY] - true[DELAY]) < 4 * both.std[DELAY]
 
 
-def test_segments_hold_all_samples_once(log_and_truth):
-    log, _ = log_and_truth
-    segments = segments_of(log, 1.0, 0.7)
-    rows = np.concatenate([segment.rows for segment in segments])
-    np.testing.assert_array_equal(rows, np.flatnonzero(log.times >= 1.0))
-    assert all(log.times[s.rows[-1]] - s.start < 0.9 for s in segments)
-
-
 # ---------------------------------------------------------------- short logs of lost runs
 
 
@@ -512,10 +503,6 @@ def short_run_log(tmp_path_factory):
 def up_to(log, end):
     kept = log.times <= end + 1e-9
     return dataclasses.replace(log, times=log.times[kept], values=log.values[kept])
-
-
-def test_the_queue_of_a_run_is_known(short_run_log):
-    np.testing.assert_array_equal(short_run_log.before, np.zeros(6))
 
 
 @pytest.mark.slow
@@ -553,15 +540,6 @@ def test_a_mechanism_s_file_is_read_back(tmp_path):
     np.testing.assert_allclose(read.R_WS, machine.R_WS, atol=1e-15)
     assert (read.plate.mass, read.rod.center) == (machine.plate.mass, machine.rod.center)
     assert read.effort_limit == machine.effort_limit
-
-
-def test_pose_covariance_shrinks_with_the_information():
-    problem, guess = few_unknowns()
-    normal = Evaluator(problem).normal(guess)[1]
-    once = covariance(normal)
-    twice = covariance(normal._replace(of_segments=2 * normal.of_segments))
-    assert np.all(np.diag(twice) <= np.diag(once)) and np.all(np.linalg.eigvalsh(once) > 0)
-    assert POSE.start == 6
 
 
 def test_steps_are_halved_until_they_do_not_matter():

@@ -1,16 +1,20 @@
 """The resumable parallel runner: nothing that has finished is lost, nothing is done twice."""
 
 import errno
+import itertools
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+import stewart_drake as sd
+from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.studies import jobs as module
 from stewart_drake.studies.jobs import (
@@ -31,10 +35,6 @@ def noted(folder, *parts):
     with open(folder, "a") as file:
         file.write(f"{parts[0]}\n")
     return text(*parts)
-
-
-def environment(name):
-    return os.environ[name].encode()
 
 
 def process(number):
@@ -111,12 +111,6 @@ def test_bad_keys_and_numbers_of_workers_are_refused(tmp_path):
 def test_a_refused_job_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"^job0: delay\.steps: got 0$"):
         run_jobs(numbered(1), refuse, tmp_path, settings=SETTINGS, workers=1)
-
-
-def test_workers_are_processes_with_one_thread(tmp_path):
-    variables = {key: (key,) for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
-    paths = run_jobs(variables, environment, tmp_path, settings=SETTINGS, workers=2)
-    assert [path.read_text() for path in paths.values()] == ["1", "1"]
 
 
 # ---------------------------------------------------------------- settings and locks
@@ -305,3 +299,42 @@ def test_an_address_without_a_scheduler_is_refused(tmp_path, monkeypatch):
             run_jobs(numbered(1), text, tmp_path, settings=SETTINGS, scheduler=address)
         assert "\n" not in str(caught.value)
     assert not set(threading.enumerate()) - before, "an event loop is left running"
+
+
+ON_REFERENCE = ("start=on_reference", "queue=reference")
+
+
+def variants(duration):
+    """Both plants, delays of whole periods and parts, with and without noise, four gains."""
+    delays = (("delay.steps=2",), ("delay.steps=1", "delay.fraction=0.5"))
+    noises = ((), ("sensor.noise_std=[1e-4,1e-4,1e-4,1e-5,1e-5,1e-5,0,0,0,0,0,0]",))
+    plants = (("plant.kind=exact",), ("plant.kind=multibody",))
+    # The plants turn over first: neighbours, which run at the same time, are as unlike as can be.
+    for w_R, delay, noise, plant in itertools.product(range(1, 6), delays, noises, plants):
+        own = (f"duration={duration}", f"controller.w_R={w_R}", f"sensor.seed={w_R}")
+        yield (*plant, *delay, *noise, *own, *ON_REFERENCE)
+
+
+def run(settings):
+    return sd.simulate(sd.load_scenario("paper", settings=settings), judge_stability=False).signals
+
+
+def differing(settings, threads):
+    """Of the runs, those whose signals are not the same in threads as alone."""
+    functions_of.cache_clear()  # so that the threads also make them at the same time
+    with ThreadPoolExecutor(threads) as pool:
+        together = list(pool.map(run, settings))
+    alone = [run(one) for one in settings]
+    pairs = zip(settings, alone, together, strict=True)
+    return [one for one, a, b in pairs if not a.identical(b)]
+
+
+def test_runs_in_threads_are_those_alone():
+    assert differing(list(itertools.islice(variants(0.4), 6)), threads=3) == []
+
+
+@pytest.mark.soak
+def test_forty_runs_in_eight_threads_are_those_alone():
+    settings = list(variants(1.0))
+    assert len(settings) == 40
+    assert differing(settings, threads=8) == []

@@ -1,18 +1,13 @@
 """The parts of the control law, each alone, and parts of one's own put in from outside."""
 
-import dataclasses
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import Belief
-from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.design_models import MultibodyModel, PaperModel
-from stewart_drake.law.error_model import double_integrators
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
     InverseDynamicsFeedforward,
@@ -20,21 +15,16 @@ from stewart_drake.law.feedforward import (
 )
 from stewart_drake.law.holds import held_torques, means_and_changes
 from stewart_drake.law.measurement import Measurement
-from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.nominal import FINE_SUBSTEP_FACTOR, NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver
+from stewart_drake.law.return_path import ReturnPath
 from stewart_drake.law.sensing import FirstState, StateSensing
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.loop.controller import DelayLqiController
-from stewart_drake.loop.law_design import control_law
-from stewart_drake.loop.preparation import prepare
-from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.signals import ACCELERATIONS, NUM_STATE
 from stewart_drake.types import Array
-from tests.backends import stepped_in_python
 from tests.mechanisms import PAPER
 from tests.oracles import relative
 from tests.test_control_law import HOME, WEIGHTS, Loop, law_of, nominal_queue, sine
@@ -291,62 +281,7 @@ def test_a_model_is_refused_where_the_plate_cannot_be():
         kind.at(HOME[:12], np.zeros(6), ZERO, PLANT)
 
 
-def test_the_papers_model_is_made_of_its_torque_map():
-    x = HOME[:12] + 1e-2
-    for form in ("virtual_work", "printed"):
-        expected = double_integrators(torque_map(PAPER, x[:6], form))
-        found = PaperModel(form).at(x, np.ones(6), ZERO, PLANT)
-        assert np.array_equal(found.A, expected.A) and np.array_equal(found.B, expected.B)
-
-
-def test_the_cost_has_an_integral_or_not():
-    both = QuadraticCost(np.arange(1.0, 7), np.arange(7.0, 13), np.full(6, 2.0))
-    Q, R = both.matrices(np.array([3.0, 5.0]))
-    assert np.array_equal(Q, np.diag(3 * np.arange(1.0, 13)))
-    assert np.array_equal(R, 10 * np.eye(6))
-    errors = replace(both, integrals=None)
-    assert np.array_equal(errors.matrices(np.array([3.0, 5.0]))[0], Q[:6, :6])
-    z, model = np.ones(6), PaperModel().at(HOME[:12], np.zeros(6), ZERO, PLANT)
-    timeline = Timeline(0.1, Delay(3, 0.5))
-    for cost, rows in ((both, 6), (errors, 0)):
-        assert cost.integrates == (rows > 0)
-        assert len(cost.sees(z)) == rows
-        gain = cost.gain(cost.sampled(model, timeline), np.ones(2))
-        assert gain.shape == (6, 12 + rows + 6)  # a fraction: the last torque is still to act
-
-
 # Memory.
-
-
-def arrays(value, name="memory"):
-    """Shapes of all that a memory is made of, by name; numbers have none."""
-    if isinstance(value, np.ndarray):
-        return {name: value.shape}
-    if isinstance(value, Timeline | str | None) or type(value) is tuple:
-        return {}
-    parts = value._asdict() if hasattr(value, "_asdict") else getattr(value, "__dict__", None)
-    if parts is None:
-        return {name: np.shape(value)}
-    return {k: v for p, inner in parts.items() for k, v in arrays(inner, f"{name}.{p}").items()}
-
-
-@pytest.mark.parametrize("settings", [(), ("delay.fraction=0.4",), ("controller.integral=false",)])
-@pytest.mark.parametrize("controller", ["lqr", "delay_lqi", "predictor_lqi"])
-def test_shapes_never_change_whatever_happens(controller, settings):
-    law = law_of("delay.steps=2", *settings, controller=controller)
-    reference = sine(0.3)
-
-    def seen(k, x):
-        return {0: np.full(12, np.nan), 3: x + 0.01, 4: x + 100.0}.get(k, x)
-
-    loop = Loop(law, reference, queue=nominal_queue(law, reference))
-    first = arrays(loop.memory)
-    assert first["memory.gain"][0] == 6 and "memory.belief.estimate.covariance" in first
-    loop.run(8, seen)
-    assert all(arrays(memory) == first for memory in loop.memories)
-    assert loop.memory.counts.bad_measurements >= 2
-    names = {field.name for field in dataclasses.fields(Memory)}
-    assert not names & {"seconds", "time", "clock"}
 
 
 def test_a_preview_of_other_instants_is_a_mistake():
@@ -396,30 +331,6 @@ def test_a_fourth_observer_needs_no_change_of_the_package():
         errors[observer] = np.std(believed[10:] - loop.states[10:-1])
         assert np.abs(loop.states[-1][:6] - reference(4.0)[:6]).max() < 2e-3
     assert errors[Blend(0.2)] < 0.5 * errors[CoreObserver()]
-
-
-def test_a_fourth_observer_in_a_diagram():
-    settings = ["start=on_reference", "duration=1.0", "delay.steps=2"]
-    law = control_law(prepare(load_scenario("paper", settings=settings)))[0]
-    assert isinstance(law.observer, CoreObserver)
-    mine = replace(law, observer=Blend(0.5))
-    system = DelayLqiController(mine, np.zeros((2, 6)))
-    context = system.CreateDefaultContext()
-    preview = np.tile(HOME, (len(law.preview_times), 1))
-    values = {"measurement": HOME[:12] + 1e-3, "preview": preview.ravel(), "weights": WEIGHTS}
-    for name, value in values.items():
-        system.GetInputPort(name).FixValue(context, value)
-    expected, at = mine.initial_memory(np.zeros((2, 6))), Preview(law.preview_times, preview)
-    simulator = Simulator(system, context)
-    for k in range(4):
-        expected = mine.step(expected, Measurement.of(values["measurement"]), at, WEIGHTS)
-        simulator.AdvanceTo(0.1 * k + 0.05)
-        found = system.GetOutputPort("state_estimate").Eval(context)
-        assert np.array_equal(found, expected.belief.state)
-        assert np.array_equal(
-            system.GetOutputPort("torque_commanded").Eval(context), expected.torque
-        )
-        assert system.sample(context).seconds > 0
 
 
 @dataclass(frozen=True)
@@ -483,41 +394,41 @@ def test_a_delay_longer_than_what_is_kept_is_refused():
         Loop(law, lambda t: HOME).run(1)
 
 
-class Cautious(LeafSystem):
-    """A source of weights: the errors count less the larger they are."""
-
-    def __init__(self):
-        super().__init__()
-        self._measurement = self.DeclareVectorInputPort("measurement", 12)
-        self.DeclareVectorOutputPort("weights", 2, self._weigh)
-
-    def _weigh(self, context, output):
-        error = np.abs(self._measurement.Eval(context) - HOME[:12]).max()
-        output.SetFromVector([1 / (1 + 1e3 * error), 1.0])
+def path(period, seed=1):
+    offset = np.random.default_rng(seed).normal(0, 1, NUM_STATE)
+    return ReturnPath.of(offset, Timeline(period, Delay(8, 0.0)))
 
 
-def test_a_source_of_weights_needs_no_change_of_the_package(monkeypatch):
-    stepped_in_python(monkeypatch)  # compared to the last bit with the law itself
-    law = law_of("delay.steps=2")
-    builder = DiagramBuilder()
-    controller = builder.AddSystem(DelayLqiController(law, np.zeros((2, 6))))
-    weights = builder.AddSystem(Cautious())
-    builder.Connect(weights.get_output_port(), controller.GetInputPort("weights"))
-    builder.ExportInput(controller.GetInputPort("preview"), "preview")
-    measured = builder.ExportInput(controller.GetInputPort("measurement"), "measurement")
-    builder.ConnectInput(measured, weights.GetInputPort("measurement"))
-    diagram = builder.Build()
-    simulator = Simulator(diagram)
-    root = simulator.get_mutable_context()
-    rows = np.tile(HOME, (len(law.preview_times), 1))
-    diagram.GetInputPort("preview").FixValue(root, rows.ravel())
-    memory, preview = law.initial_memory(np.zeros((2, 6))), Preview(law.preview_times, rows)
-    for k, error in enumerate((1e-3, 3e-3, 0.5e-3)):
-        y = HOME[:12] + error * np.linspace(0.1, 1, 12)
-        diagram.GetInputPort("measurement").FixValue(root, y)
-        simulator.AdvanceTo(0.1 * k + 0.05)
-        wanted = np.array([1 / (1 + 1e3 * np.abs(y - HOME[:12]).max()), 1.0])
-        memory = law.step(memory, Measurement.of(y), preview, wanted)
-        found = controller.memory(controller.GetMyContextFromRoot(root))
-        assert np.array_equal(found.weights, wanted)
-        assert np.array_equal(found.torque, memory.torque)
+@pytest.mark.parametrize(("period", "holds"), [(0.1, 3), (0.02, 15), (0.15, 2), (0.5, 2)])
+def test_it_takes_the_time_of_a_catch_up_or_two_holds(period, holds):
+    assert path(period).holds == holds
+
+
+@pytest.mark.parametrize("period", [0.02, 0.1, 0.5])
+def test_it_ends_at_rest_relative_to_the_reference(period):
+    back, size = path(period), np.abs(path(period).offset).max()
+    n = back.holds
+    assert np.abs(back.at(n * period, period)[:NUM_STATE]).max() < 1e-12 * size / period
+    assert not np.any(back.at((n + 0.01) * period, period))
+    for _ in range(n + back.samples):
+        assert back.active
+        back = back.after(period)
+    assert not back.active
+
+
+@pytest.mark.parametrize("period", [0.02, 0.1])
+def test_its_accelerations_are_the_least(period):
+    """The solution of least norm of the 2 equations per coordinate, by lstsq."""
+    back, h = path(period), period
+    n = back.holds
+    A = np.array([h * h * (n - np.arange(n) - 0.5), np.full(n, h)])
+    pose, rates = back.offset[:6], back.offset[6:]
+    least = np.linalg.lstsq(A, -np.array([pose + n * h * rates, rates]))[0]
+    found = [back.at((i + 0.5) * h, h)[ACCELERATIONS] for i in range(n)]
+    assert np.allclose(found, least, rtol=1e-9)
+
+
+def test_the_rest_of_a_path_is_the_same_path():
+    back, h = path(0.1), 0.1
+    for time in (0.0, 0.03, 0.1, 0.17):
+        assert np.allclose(back.after(h).at(time, h)[:12], back.at(time + h, h)[:12], atol=1e-12)

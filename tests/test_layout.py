@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.preparation import assemble, check_instants, prepare
@@ -306,25 +305,6 @@ def test_the_command_writes_machines_that_run_and_goes_on(tmp_path, capsys, in_p
     assert (tmp_path / "layout_1.yaml").read_bytes() == kept
     assert main([*command, "--seed", "3"]) == 2
     assert "belongs to other settings (seed: 2 there, 3 now)" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("in_process")
-def test_a_search_from_python_is_that_of_the_command(tmp_path, in_process):
-    keep = [name for name in PARAMETERS if name not in ("crank", "rod")] + ["branches"]
-    found = sd.layout(
-        load_scenario("paper", None, QUICK),
-        tmp_path,
-        limits={"clearance": -1.0},
-        keep=[*keep, "plate_order"],
-        best=1,
-        generations=1,
-    )
-    assert (
-        found.verdict.startswith("yes: of ") and found.summary["layouts"][0]["name"] == "layout_1"
-    )
-    assert (tmp_path / "layout_1.yaml").exists() and len(in_process) == 2
-    found.save(tmp_path / "page")
-    assert "layout_1" in (tmp_path / "page" / "report.html").read_text()
 
 
 def test_limits_that_nothing_keeps_are_told_and_no_machine_is_written(tmp_path, capsys):

@@ -81,6 +81,12 @@ class Running:
         self.endpoint.close()
 
 
+def driven(running, seconds, *settings, **how):
+    """Return the result of a run on this machine, whatever the jitter."""
+    ready = prepare_session(scenario_of(*settings), running.address)
+    return drive(ready, seconds, accept_jitter=True, say=lambda line: None, **how)
+
+
 @pytest.fixture
 def quiet_machine(monkeypatch):
     """`Machine.run` in slices does not stop the machine between two of them."""
@@ -156,13 +162,7 @@ def test_a_hand_leads_and_a_target_beyond_reach_is_told(quiet_machine):
     target = load_mechanism("paper").home + [0, 0, 0, 0, 0, 0.3]
     hand = Hand(target)
     with Running() as running:
-        result = drive(
-            prepare_session(scenario_of(), running.address),
-            7.0,
-            accept_jitter=True,
-            viewer=hand,
-            say=lambda line: None,
-        )
+        result = driven(running, 7.0, viewer=hand)
     assert result.status == "completed"
     last = hand.seen[69]  # then it comes to rest
     assert last.by_hand and "leg" in last.limit
@@ -230,8 +230,7 @@ class Halves(Machine):
 @pytest.mark.parametrize(("kind", "missing"), [(Misnumbers, None), (Blind, None), (Blind, 0.35)])
 def test_a_run_ends_where_measurements_stay_away(quiet_machine, kind, missing):
     with Running(kind=kind) as running:
-        ready = prepare_session(scenario_of(), running.address)
-        result = drive(ready, 5.0, accept_jitter=True, say=lambda line: None, max_missing=missing)
+        result = driven(running, 5.0, max_missing=missing)
         time.sleep(0.1)
         assert "the controller said stop" in " ".join(running.lines)
         assert not running.machine._motors.torque.any()  # the safe torque
@@ -246,12 +245,7 @@ def test_a_run_ends_where_measurements_stay_away(quiet_machine, kind, missing):
 @pytest.mark.slow
 def test_an_error_of_which_half_was_measured_is_none(quiet_machine):
     with Running(kind=Halves) as running:
-        result = drive(
-            prepare_session(scenario_of(), running.address),
-            3.0,
-            accept_jitter=True,
-            say=lambda line: None,
-        )
+        result = driven(running, 3.0)
     assert result.status == "completed" and math.isnan(result.accumulated_error)
     assert result.summary["measured_share"] == pytest.approx(0.5, abs=0.1)
     share = f"measured at {100 * result.summary['measured_share']:.3g} %"

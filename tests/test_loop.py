@@ -3,12 +3,17 @@
 import functools
 import json
 import time
+import warnings
 
 import numpy as np
 import pytest
 import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+from pydrake.systems.analysis import Simulator
 from scipy.integrate import quad_vec
 
+import stewart_drake as sd
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop import results as metrics
@@ -16,6 +21,8 @@ from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
+from stewart_drake.scenario.config import ControllerConfig, DelayConfig, Scenario
+from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.scenario.trajectories import evaluate, make_reference
@@ -399,3 +406,71 @@ def test_only_a_leg_is_short_by_millimetres():
     high = "reference.offset=[0, 0, 0, 0, 0, 0.6]"
     with pytest.raises(ConfigError, match=r"reached the end of its reach .*, short by [\d.]+ mm"):
         prepare(load_scenario("paper", settings=["reference.kind=hold", high]))
+
+
+MOVING = ("start=on_reference", "queue=reference")
+
+
+def loop_of(*settings):
+    return sd.build_closed_loop(sd.load_scenario("paper", settings=settings))
+
+
+def state(loop, context):
+    return loop.GetOutputPort("state").Eval(context)
+
+
+@pytest.mark.parametrize("kind", ["exact", "multibody"])
+@pytest.mark.parametrize("start", [(), MOVING])
+def test_default_context_is_the_start_of_the_scenario(kind, start):
+    loop = loop_of(f"plant.kind={kind}", *start)
+    context = loop.CreateDefaultContext()
+    np.testing.assert_allclose(state(loop, context), loop.experiment.start, atol=1e-13)
+    assert bool(loop.experiment.start[6:].any()) == bool(start)
+
+
+@pytest.mark.parametrize("settings", [("plant.kind=exact", *MOVING), ("plant.kind=multibody",)])
+def test_a_simulator_of_the_loop_alone_starts_there_too(settings):
+    loop = loop_of(*settings)
+    simulator = Simulator(loop)
+    np.testing.assert_allclose(
+        state(loop, simulator.get_context()), loop.experiment.start, atol=1e-13
+    )
+
+
+def test_a_moving_start_that_a_simulator_cannot_know_of_is_told():
+    loop = loop_of("plant.kind=multibody", *MOVING)
+    with pytest.warns(UserWarning, match="loop.CreateDefaultContext"):
+        Simulator(loop).Initialize()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Simulator(loop, loop.CreateDefaultContext()).Initialize()
+
+
+@given(
+    steps=st.integers(0, 1000),
+    parts=st.integers(0, 15),
+    period=st.sampled_from([0.5, 0.25, 0.0625]),
+)
+def test_torques_in_flight_are_those_that_still_have_to_act(steps, parts, period):
+    # Sixteenths and powers of two: every instant is exact.
+    delay = Delay(steps, parts / 16)
+    eta = delay.eta(period)
+    assert eta == sum([period] * steps) + parts / 16 * period
+    # The torque of sample -k acts for one period from eta - k dt on. In flight at 0 are those of
+    # earlier samples that still act then, or will.
+    waiting = [k for k in range(1, steps + 3) if eta - k * period + period > 0]
+    assert delay.queue_length == len(waiting)
+
+
+@pytest.mark.parametrize("wrong", [(-1, 0.0), (2, -0.1), (2, 1.0)])
+def test_what_is_no_delay_is_refused(wrong):
+    with pytest.raises(ValueError, match="0 <= fraction < 1"):
+        Delay(*wrong)
+
+
+def test_the_true_delay_of_a_scenario():
+    scenario = Scenario(
+        delay=DelayConfig(steps=3, fraction=0.5), controller=ControllerConfig(period=0.25)
+    )
+    assert scenario.true_delay == Delay(3, 0.5)
+    assert scenario.eta == 0.875

@@ -360,18 +360,19 @@ def test_paper_bodies_are_those_of_table_1(body, mass, inertia):
     assert PAPER.crank.center == PAPER.rod.center == 0.5
 
 
+def legs_of(directions):
+    """Return the paper's legs, listed; `directions` gives axis and crank of a motor's frame."""
+    found = []
+    for i, (axis, crank) in enumerate(map(directions, PAPER.R_WS)):
+        joints = {"shaft": PAPER.p_WS[i].tolist(), "plate_joint": PAPER.p_PQ[i].tolist()}
+        frame = {"motor_axis": axis.tolist(), "crank_zero": crank.tolist()}
+        found.append(joints | frame | {"branch": int(PAPER.branches[i])})
+    return found
+
+
 def test_explicit_legs_give_the_geometry_of_the_pattern(load):
     """Directions may have any length; the crank's may lean a rounding error off the right angle."""
-    legs = [
-        {
-            "shaft": PAPER.p_WS[i].tolist(),
-            "motor_axis": (3.0 * PAPER.R_WS[i][:, 2]).tolist(),
-            "crank_zero": (0.1 * PAPER.R_WS[i][:, 0] + 1e-9 * PAPER.R_WS[i][:, 2]).tolist(),
-            "plate_joint": PAPER.p_PQ[i].tolist(),
-            "branch": int(PAPER.branches[i]),
-        }
-        for i in range(6)
-    ]
+    legs = legs_of(lambda R: (3.0 * R[:, 2], 0.1 * R[:, 0] + 1e-9 * R[:, 2]))
     explicit = load(paper_with({"pattern": ABSENT, "legs": legs}))
     for field in dataclasses.fields(Mechanism):
         given, expected = getattr(explicit, field.name), getattr(PAPER, field.name)
@@ -382,16 +383,7 @@ def test_explicit_legs_give_the_geometry_of_the_pattern(load):
 
 
 def test_directions_may_be_written_with_three_decimals(load):
-    legs = [
-        {
-            "shaft": PAPER.p_WS[i].tolist(),
-            "motor_axis": PAPER.R_WS[i][:, 2].round(3).tolist(),
-            "crank_zero": PAPER.R_WS[i][:, 0].round(3).tolist(),
-            "plate_joint": PAPER.p_PQ[i].tolist(),
-            "branch": int(PAPER.branches[i]),
-        }
-        for i in range(6)
-    ]
+    legs = legs_of(lambda R: (R[:, 2].round(3), R[:, 0].round(3)))
     rounded = load(paper_with({"pattern": ABSENT, "legs": legs}))
     np.testing.assert_allclose(rounded.R_WS, PAPER.R_WS, atol=2e-3)
     right = np.einsum("kji,kjl->kil", rounded.R_WS, rounded.R_WS)

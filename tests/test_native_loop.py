@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import LeafSystem
 
 import stewart_drake as sd
 from stewart_drake.dynamics.open_loop import IntegrationError
@@ -18,7 +16,6 @@ from stewart_drake.loop import bulk
 from stewart_drake.loop.bulk import (
     PythonController,
     ending_of,
-    instants_of,
     preparation_of,
     run_in_bulk,
     run_loop,
@@ -27,12 +24,10 @@ from stewart_drake.loop.bulk import (
 )
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.preparation import prepare
-from stewart_drake.loop.sampling import update_every
 from stewart_drake.loop.sensor import Sensor, white_noise, white_noises
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.mechanism.geometry import Body
-from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.study_options import Ranges
 from stewart_drake.studies.uncertainty import MACHINE, apply_draw, draw, scales_of
@@ -220,30 +215,6 @@ def test_noise_is_drakes_to_the_last_bit():
 @pytest.mark.parametrize("seed", [0, 1, 2**31 - 1])
 def test_noise_of_many_samples_is_that_of_each(seed):
     assert np.array_equal(white_noises(seed, 9), [white_noise(seed, k) for k in range(9)])
-
-
-class Clock(LeafSystem):
-    """Keeps the times of its samples."""
-
-    def __init__(self, period):
-        super().__init__()
-        self.times: list[float] = []
-        update_every(self, period, self._keep)
-
-    def _keep(self, context, state):
-        self.times.append(context.get_time())
-
-
-@pytest.mark.parametrize(("duration", "period"), [(10.0, 0.1), (1.01, 0.03), (2.0, 1 / 30)])
-def test_samples_are_taken_when_drake_takes_them(duration, period):
-    clock = Clock(period)
-    simulator = Simulator(clock)
-    simulator.Initialize()
-    simulator.AdvanceTo(look_time(duration))
-    when = instants_of(duration, period)
-    assert when.samples.tolist() == clock.times
-    assert when.sampled.sum() == len(clock.times)
-    assert np.all(when.looks <= when.nominal) and np.all(np.diff(when.looks) > 0)
 
 
 def test_what_a_law_raises_comes_through():

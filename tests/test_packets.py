@@ -229,13 +229,6 @@ def test_a_delay_of_the_sensor_that_is_no_whole_period_waits_for_the_sample():
     assert np.array_equal(first.pose.values, second.pose.values)
 
 
-def test_lost_measurements_are_counted_and_borne():
-    result = run("sensor.loss=0.5", "sensor.seed=1", "duration=5")
-    missing = result.summary["counts"]["measurements_missing"]
-    assert result.status == "completed" and 10 < missing < 41
-    assert np.isnan(result.signals.measurement.values).any()
-
-
 # The law.
 
 
@@ -500,12 +493,6 @@ def test_half_periods_that_a_plant_cannot_have_are_left_out(known_outcomes):
     assert [cell.bound for cell in study.bounds] == pytest.approx([0.3, 0.4, 0.5, 0.6])
     assert study.left_out == pytest.approx((0.35, 0.45))
     assert "Not tried: 0.35 s and 0.45 s" in document(study).plain()
-
-
-def test_a_network_runs_with_a_bound_of_half_a_period():
-    result = run(*NETWORK, "link.playout=0.85", "duration=3")
-    assert result.status == "completed" and result.summary["link"]["playout"] == 0.85
-    assert result.summary["delay"]["true_s"] == pytest.approx(0.95)
 
 
 @pytest.mark.parametrize("completes", [1.0, 0.97, 0.8])

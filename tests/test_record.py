@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import tracemalloc
 import typing
 
 import numpy as np
@@ -13,19 +12,15 @@ import stewart_drake as sd
 from stewart_drake.files.jsonio import jsonable
 from stewart_drake.loop.controller import HELD
 from stewart_drake.loop.diagram import build_closed_loop
-from stewart_drake.loop.recording import Table
 from stewart_drake.loop.results import DelaySummary, MarginSummary, RunSummary, StepTimes
 from stewart_drake.loop.sensor import Sensor
-from stewart_drake.reporting.csv_file import read_signals, signals_csv
+from stewart_drake.reporting.csv_file import read_signals
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.scenario.signals import (
     COORDINATE_UNITS,
     DIMENSIONS,
-    LEGS,
     RATE_UNITS,
     SIGNALS,
-    Quantity,
-    Signal,
     exported_ports,
     ports_of,
 )
@@ -183,38 +178,6 @@ def test_labels_of_the_file_are_those_of_the_first_release():
 # The table of signals.
 
 
-NEW = (
-    Signal("effort", Quantity("leg", ("N^2 m^2",) * 6), "squared torque", "controller"),
-    Signal("effort_sum", Quantity(None, ("N^2 m^2",)), "all of it", "controller", "effort_now"),
-)
-
-
-def test_a_new_signal_is_a_line_of_the_table_and_where_it_comes_from(tmp_path, monkeypatch):
-    """It is a port of controller and loop, in the record, the file and the CSV with its unit."""
-    before = run("duration=0.3").signals
-    for signal in NEW:
-        monkeypatch.setitem(SIGNALS, signal.name, signal)
-    monkeypatch.setitem(HELD, "effort", lambda memory: memory.torque**2)
-    monkeypatch.setitem(HELD, "effort_sum", lambda memory: [sum(memory.torque**2)])
-    loop = build_closed_loop(scenario("duration=0.3"))
-    assert loop.GetOutputPort("effort").size() == 6
-    assert loop.GetOutputPort("effort_now").size() == 1
-    result = run("duration=0.3")
-    squares = result.signals.torque_commanded.values**2
-    assert np.array_equal(result.signals.effort.values, squares) and squares.max() > 0
-    assert result.signals.effort_sum.dims == ("time",)
-    np.testing.assert_allclose(result.signals.effort_sum, squares.sum(axis=1), rtol=1e-12)
-    assert result.signals.effort_sum.attrs == {"units": "N^2 m^2", "long_name": "all of it"}
-    assert result.signals.drop_vars(["effort", "effort_sum"]).equals(before)
-    result.save(tmp_path)
-    saved = read_signals(tmp_path / "signals.nc")
-    assert saved.identical(result.signals)
-    header, first, *_ = signals_csv(saved).splitlines()
-    columns = header.split(",")
-    assert columns[-7:] == [*(f"effort_{leg}[N^2 m^2]" for leg in LEGS), "effort_sum[N^2 m^2]"]
-    assert first.split(",")[-1] == f"{squares[0].sum():.12g}"
-
-
 def test_every_signal_of_the_controller_has_a_value_and_no_other():
     assert set(HELD) == {signal.name for signal in ports_of("controller").values()}
     assert all(signal.size == (len(signal.labels) or 1) for signal in SIGNALS.values())
@@ -257,17 +220,3 @@ def test_the_summary_has_the_keys_and_kinds_that_its_type_tells(settings):
             elif typing.get_origin(hint) is list:
                 (inner,) = typing.get_args(hint)
                 assert all(type(value) is inner for value in part[name]), name
-
-
-def test_a_table_grows_without_being_copied():
-    """A row of 100 numbers takes 800 bytes and little more, also at the peak."""
-    tracemalloc.start()
-    table = Table(100)
-    for number in range(10_000):
-        table.append(np.full(99, float(number)), 1.0)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 1.2 * 8e6
-    assert len(table) == 10_000 and table.columns(slice(0, 2)).shape == (10_000, 2)
-    np.testing.assert_array_equal(table.column(0), np.arange(10_000.0))
-    assert table.columns(slice(0, 3)).flags.c_contiguous

@@ -290,21 +290,18 @@ def test_what_the_link_does_is_drawn_too():
 
 @pytest.mark.slow
 def test_other_controllers_run_the_same_machines(tmp_path, capsys):
-    out = tmp_path / "out"
-    words = ["analyze", "robustness", "paper", "--controller", "predictor_lqi", "--runs", "2"]
-    words += ["--set", "duration=0.2", "--vary", "delay=1", "--out", str(out)]
-    assert main([*words, "--also", "adaptive_lqi"]) == 0
-    assert "With adaptive_lqi, on the same machines: 2 of 2" in " ".join(
-        capsys.readouterr().out.split()
-    )
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["beside"]["adaptive_lqi"]["success"]["runs"] == 2
-    assert "adaptive_lqi" in (out / "report.html").read_text()
-    # Alone it has the same draws and the same outcomes.
-    words[4], words[-1] = "adaptive_lqi", str(tmp_path / "alone")
-    assert main(words) == 0
-    alone = json.loads((tmp_path / "alone" / "summary.json").read_text())
-    assert alone["E_ac_of_all"] == summary["beside"]["adaptive_lqi"]["E_ac_of_all"]
+    options = ["--runs", "2", "--set", "duration=0.2", "--vary", "delay=1", "--json"]
+
+    def summary(controller, *more):
+        words = ["analyze", "robustness", "paper", "--controller", controller, *options, *more]
+        assert main(words) == 0
+        return json.loads(capsys.readouterr().out)
+
+    both = summary("predictor_lqi", "--also", "adaptive_lqi", "--out", str(tmp_path))
+    assert both["beside"]["adaptive_lqi"]["success"]["runs"] == 2
+    assert "adaptive_lqi, on the same machines: 2 of 2" in (tmp_path / "report.html").read_text()
+    alone = summary("adaptive_lqi")  # with the same draws and the same outcomes
+    assert alone["E_ac_of_all"] == both["beside"]["adaptive_lqi"]["E_ac_of_all"]
     assert alone["beside"] == {}
 
 

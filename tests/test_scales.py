@@ -12,12 +12,9 @@ from ruamel.yaml import YAML
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.resources import data_root
-from stewart_drake.law.observers import CoreObserver
-from stewart_drake.law.riccati import full_gain, lqr
+from stewart_drake.law.riccati import full_gain
 from stewart_drake.law.startup import machine_torque
 from stewart_drake.loop import preparation as experiment_module
-from stewart_drake.loop.law_design import control_law
-from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Body, Link
@@ -174,22 +171,3 @@ def test_units_change_no_gain(name, steps, fraction):
     chain = np.concatenate([x, np.full(6 * model.queue_length, u)])
     assert relative(found * chain / u, K) < 1e-8
     assert relative(cost * np.outer(chain, chain), P) < 1e-8
-
-
-def test_the_gain_of_scaled_states_is_drakes_own():
-    """Where the units are sensible already, nothing but rounding comes of the scaling."""
-    for name in ("paper", "gravity"):
-        model, (Q, R) = delayed(name, 0, 0.0), UNIT
-        K, P = lqr(model.A, model.B_new, model.C.T @ Q @ model.C, R)
-        found, cost = full_gain(model, Q, R)
-        assert relative(found, K) < 1e-9
-        assert relative(cost, P) < 1e-9
-
-
-def test_what_the_law_believes_of_the_paper_is_in_its_order_of_magnitude():
-    """The torque of the reference is 0.013 N m, of the catch-up 0.66."""
-    law, _, _ = control_law(prepare(load_scenario("paper")))
-    machine = machine_torque(law.plant.dynamics)
-    assert 0.03 < machine < 0.1
-    assert isinstance(law.observer, CoreObserver)
-    assert law.plant.coarse_torque_limit == pytest.approx(3 * machine)

@@ -30,7 +30,6 @@ from stewart_drake.loop.servos import compose_servo_law, servo_loop
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.mechanism.geometry import with_rotors
 from stewart_drake.scenario.config import ServoActuatorConfig, TorqueActuatorConfig
-from stewart_drake.scenario.link import measurement_times
 from stewart_drake.scenario.loading import load_comparison
 from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
 from stewart_drake.scenario.timing import look_time, servo_ticks
@@ -262,21 +261,6 @@ def test_the_setpoint_is_the_reference_at_every_sample(delay, kind):
     assert np.abs(servos.setpoint[POSE] - angles).max() < 0.1**4 / 384 * 5
 
 
-def test_with_jitter_the_setpoint_still_moves_smoothly():
-    more = ("delay.jitter_std=0.03", "delay.seed=4", *ON, "duration=3")
-    loop = build_closed_loop(scenario(*more))
-    simulator, servos = make_simulator(loop), loop.GetSubsystemByName("servos")
-    simulator.Initialize()
-    seen = []
-    for k in range(1, 2001):
-        simulator.AdvanceTo(look_time(k * 1e-3))
-        context = servos.GetMyContextFromRoot(simulator.get_context())
-        seen.append(servos.remembered(context).setpoint)
-    setpoints = np.array(seen)
-    jumps = np.diff(setpoints[:, POSE], axis=0) - 1e-3 * setpoints[1:, RATES]
-    assert np.abs(jumps).max() < 2e-5  # h^2 / 2 times the acceleration
-
-
 # On the machine.
 
 
@@ -394,16 +378,6 @@ def test_lost_and_late_measurements_cost_little():
     assert result.summary["counts"]["measurements_missing"] > 10
     clean = run(*more, controller="servo_feedforward")
     assert result.accumulated_error < 4 * clean.accumulated_error < 0.05
-
-
-def test_more_lost_reports_than_there_are_periods_in_one_are_borne():
-    """What acted is not known then: the observer begins anew with what it had found."""
-    lossy = scenario(
-        *ON, "sensor.loss=0.85", "sensor.seed=4", "duration=4", controller="servo_feedforward"
-    )
-    there = np.flatnonzero(np.isfinite(measurement_times(lossy)))
-    assert np.diff(there).max() == 18 > compose_servo_law(prepare(lossy)).reports.periods
-    assert sd.simulate(lossy).status == "completed"
 
 
 def law_and_memory(**fields):

@@ -220,3 +220,18 @@ def test_drawn_limits_are_never_above_the_motors(tmp_path):
     scales = scales_of(assemble(sc), 0.6559)
     limits = [draw(Ranges(), scales, sc, 0, i)["torque_limit"] for i in range(50)]
     assert 0.8 < max(limits) < 3 * 0.6559
+
+
+def test_motors_at_their_limit_for_a_second():
+    """From rest, with a limit unknown to the catch-up: the plate is caught in the end."""
+    small = "reference.amplitude=[0.01, 0.01, 0.01, 0.001, 0.001, 0.004]"
+    sc = scenario("duration=8", "delay.steps=2", small)
+    free = simulate(sc, judge_stability=False)
+    sc.actuator.torque_limit = limit = free.summary["peak_torque"] / 3
+    sc.controller.catch_up = 0.3
+    run = simulate(sc, judge_stability=False)
+    assert run.summary["counts"]["saturated_steps"] >= 10
+    assert run.summary["peak_torque_applied"] == limit < run.summary["peak_torque"]
+    assert run.status == "completed"
+    late = np.abs(run.signals.error.sel(time=slice(7, None)).values).mean(axis=0)
+    assert (late / np.ptp(run.signals.reference.values, axis=0)).mean() < 1e-3

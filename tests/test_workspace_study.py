@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from stewart_drake.cli import main
 from stewart_drake.core.layout import DEAD_CENTRE_SINE
-from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, margin, measures_at
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
@@ -259,19 +258,6 @@ def test_factors_at_the_ends_of_what_can_be():
 
 
 # ------------------------------------------------------------------ motors
-
-
-def test_motors_at_rest_hold_the_equilibrium():
-    dynamics = StewartDynamics(PAPER, gravity=True)
-    still = make_reference(HoldConfig(offset=list(PAPER.home)), 1.0)
-    sizing = size_motors(dynamics, still, check_instants(0.1))
-    np.testing.assert_allclose(
-        sizing.torque, dynamics.equilibrium_torque(PAPER.home)[None] + 0 * sizing.torque
-    )
-    assert not sizing.speed.any() and not sizing.power.any()
-    limited = sizing.summary(2.0)[0]
-    assert limited["use_of_limit"] == pytest.approx(limited["peak_torque"] / 2.0)
-    assert math.isnan(sizing.summary(None)[0]["use_of_limit"])
 
 
 def test_the_motors_work_is_the_machine_s_energy():
