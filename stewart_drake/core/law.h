@@ -137,9 +137,6 @@ int stewart_step_scratch(const stewart_law *law);
 /* Torques in flight at a sample, by the assumed delay. */
 int stewart_queue_length(const stewart_law *law);
 
-/* Instants (s from now) at which the reference is asked for under the assumed delay; how many. */
-int stewart_preview_times(const stewart_law *law, real *times);
-
 /* Before the first step; `queue` (number, 6) has the torques that are under way, the oldest first. */
 void stewart_start(const stewart_law *law, real *memory, int number, const real *queue);
 

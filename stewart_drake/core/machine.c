@@ -34,7 +34,7 @@ void stewart_accelerate(const stewart_belief *belief, const real *state, const r
 int stewart_substeps(const stewart_machine *machine, int number, const real *torques)
 {
     for (int i = 0; i < U * number; i++)
-        if (REAL(fabs)(torques[i]) > machine->gentle_torque)
+        if (REAL(fabs)(torques[i]) > machine->coarse_torque_limit)
             return FINER * machine->substeps;
     return machine->substeps;
 }
@@ -47,9 +47,23 @@ int stewart_at_limit(const stewart_machine *machine, int number, const real *tor
     return 0;
 }
 
-/* Advance a state by one torque. */
-static void move(const stewart_belief *belief, const real *torque, real duration, int substeps,
-                 real *state)
+void stewart_required_torque(const stewart_belief *belief, const real *row, real *torque)
+{
+    real map[36];
+    if (!belief->map) {
+        stewart_inverse_dynamics(&belief->plant, row, row + 6, row + 12, torque);
+        return;
+    }
+    stewart_copy(36, belief->map, map);
+    stewart_copy(U, row + 12, torque);
+    if (!stewart_solve(6, 1, map, torque))
+        stewart_fill(U, (real)NAN, torque);
+    for (int i = 0; i < U; i++)
+        torque[i] -= belief->parameters[i];
+}
+
+void stewart_advance(const stewart_belief *belief, const real *torque, real duration, int substeps,
+                     real *state)
 {
     real a[6];
     if (!belief->map) {
@@ -79,7 +93,7 @@ void stewart_predict(const stewart_machine *machine, const real *theta, const st
     stewart_believe(machine, theta, &belief);
     for (int k = 0; k < schedule->number; k++, state = states, states += X) {
         stewart_copy(X, state, states);
-        move(&belief, schedule->torques + U * k, schedule->durations[k], substeps, states);
+        stewart_advance(&belief, schedule->torques + U * k, schedule->durations[k], substeps, states);
     }
 }
 
@@ -141,7 +155,8 @@ int stewart_derivatives(const stewart_machine *machine, const stewart_belief *be
     return 1;
 }
 
-void stewart_within_hold(const real *start, const real *end, real h, real s, real *state)
+/* The state when the share s of h seconds is over: the cubic through both ends. */
+static void within_hold(const real *start, const real *end, real h, real s, real *state)
 {
     real left = 1 - s;
     for (int i = 0; i < 6; i++) {
@@ -162,7 +177,7 @@ static int transition_of_hold(const stewart_machine *machine, const stewart_beli
     real *omega = stewart_take(&scratch, X * X), *turned = stewart_take(&scratch, X * p);
     real *B = stewart_take(&scratch, X * U), state[X];
     for (int node = 0; node < nodes; node++) {
-        stewart_within_hold(start, end, h, exact ? GAUSS_NODES[node] : (real)0.5, state);
+        within_hold(start, end, h, exact ? GAUSS_NODES[node] : (real)0.5, state);
         if (!stewart_derivatives(machine, belief, state, torque, A + X * X * node, B,
                                  G + X * p * node, scratch))
             return 0;

@@ -16,7 +16,7 @@ typedef struct {
     real parameters[STEWART_PARAMETERS]; /* as they are known beforehand */
     real gravity;                        /* m/s^2 */
     real torque_limit;                   /* of each motor, N m; infinite for none */
-    real gentle_torque;                  /* N m, limit beyond which substeps are twice as many */
+    real coarse_torque_limit;            /* N m, limit beyond which substeps are twice as many */
     int substeps;                        /* Runge-Kutta steps per torque */
     int estimated;                       /* p */
     int place[STEWART_MAX_ESTIMATED];    /* of each in `parameters`, or -1 */
@@ -50,6 +50,13 @@ int stewart_at_limit(const stewart_machine *machine, int number, const real *tor
 void stewart_accelerate(const stewart_belief *belief, const real *state, const real *torque,
                         real *accelerations);
 
+/* Torque (6) for a row of 18 numbers: pose, rates and accelerations. */
+void stewart_required_torque(const stewart_belief *belief, const real *row, real *torque);
+
+/* Advance a state (12) by a torque of some duration, s. */
+void stewart_advance(const stewart_belief *belief, const real *torque, real duration, int substeps,
+                     real *state);
+
 /* States (number, 12) after each of the torques, from a state (12). */
 void stewart_predict(const stewart_machine *machine, const real *theta, const stewart_schedule *schedule,
                      const real *state, real *states);
@@ -59,9 +66,6 @@ void stewart_predict(const stewart_machine *machine, const real *theta, const st
 int stewart_derivatives(const stewart_machine *machine, const stewart_belief *belief,
                         const real *state, const real *torque, real *A, real *B, real *G,
                         stewart_scratch scratch);
-
-/* The state when the share s of h seconds is over: the cubic through both ends. */
-void stewart_within_hold(const real *start, const real *end, real h, real s, real *state);
 
 /* States (number, 12) after each of the torques, and the first 12 rows H (number, 12, 12 + p) of
    F = [Phi S; 0 1] from xi = [state; theta] to there. `exact`: Magnus steps of fourth order, else the

@@ -19,46 +19,6 @@
 /* Share of the motion by which a prediction is off, when the delay was just found and else. */
 #define SURPRISE ((real)0.02)
 #define OFF ((real)0.08)
-/* ---- the model ---------------------------------------------------------------------------------- */
-
-static void move(const void *about, const real *torque, real h, real *state)
-{
-    stewart_move(about, torque, h, state);
-}
-
-static void accelerations(const void *about, const real *state, const real *torque, real *result)
-{
-    stewart_accelerations(about, state, state + 6, torque, result);
-}
-
-static void inverse_dynamics(const void *about, const real *row, real *torque)
-{
-    stewart_inverse_dynamics(about, row, row + 6, row + 12, torque);
-}
-
-static int derivatives(const void *about, const real *state, const real *torque, real *A, real *B,
-                       real *work)
-{
-    const stewart_scratch scratch = {work};
-    const stewart_belief belief = {.plant = *(const stewart_plant *)about};
-    return stewart_derivatives(NULL, &belief, state, torque, A, B, NULL, scratch);
-}
-
-void stewart_plant_model(const stewart_plant *plant, real sign, stewart_model *model)
-{
-    const stewart_model made = {plant, plant->geometry,  sign,       move,
-                                accelerations, inverse_dynamics, derivatives};
-    *model = made;
-}
-
-static int is_inside(const stewart_model *model, const real *pose)
-{
-    static const real least[STEWART_MEASURES] = { /* dynamics/workspace.py */
-        (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)1e-3,
-        (real)-1.4835298641951802};
-    return stewart_margin(model->geometry, pose, model->sign, least) > 0;
-}
-
 /* The longest that a leg reaches, crank and rod in line, m. */
 static real reach(const real *geometry)
 {
@@ -91,22 +51,22 @@ int stewart_along(int number, const real *pieces, real time, real *row)
     return 0;
 }
 
-static void end_row(const stewart_model *model, const real *state, const real *torque, real *row)
+static void end_row(const stewart_belief *belief, const real *state, const real *torque, real *row)
 {
     stewart_copy(X, state, row);
-    model->accelerations(model->about, state, torque, row + X);
+    stewart_accelerate(belief, state, torque, row + X);
 }
 
-static void add_piece(const stewart_model *model, real begin, real end, const real *states,
+static void add_piece(const stewart_belief *belief, real begin, real end, const real *states,
                       const real *torque, real *piece)
 {
     piece[0] = begin;
     piece[1] = end;
-    end_row(model, states, torque, piece + 2);
-    end_row(model, states + X, torque, piece + 2 + ROW);
+    end_row(belief, states, torque, piece + 2);
+    end_row(belief, states + X, torque, piece + 2 + ROW);
 }
 
-int stewart_predicted_pieces(const stewart_model *model, const stewart_schedule *schedule,
+int stewart_predicted_pieces(const stewart_belief *belief, const stewart_schedule *schedule,
                              const real *states, real begin, real *pieces)
 {
     int number = 0;
@@ -115,7 +75,7 @@ int stewart_predicted_pieces(const stewart_model *model, const stewart_schedule 
         const real from = begin + passed, h = schedule->durations[k];
         passed += h;
         if (h > SHORTEST)
-            add_piece(model, from, begin + passed, states + X * k, schedule->torques + U * k,
+            add_piece(belief, from, begin + passed, states + X * k, schedule->torques + U * k,
                       pieces + STEWART_PIECE * number++);
     }
     return number;
@@ -147,6 +107,8 @@ int stewart_is_off(const real *size, const real *state, const real *wanted, int 
    the number of periods. */
 
 typedef struct {
+    const stewart_belief *belief;
+    real sign;
     int number, pieces; /* holds, and equal pieces of each */
     real *edges;        /* (number + 1) s from the beginning */
     real *torques;      /* (number, 6) */
@@ -184,7 +146,7 @@ int stewart_plan_pieces(real period, int periods)
 int stewart_plan_scratch(real period, int periods)
 {
     const int holds = holds_of(periods), states = stewart_plan_pieces(period, periods) + 1;
-    return holds * (1 + U + U * X) + 1 + X * states + 9 * X * X + 6 * X * U + STEWART_MODEL_WORK + X;
+    return holds * (1 + U + U * X) + 1 + X * states + 9 * X * X + 6 * X * U + 6 * (X + 13 + X + U) + X;
 }
 
 void stewart_plan_times(real begin, real period, int periods, real times[3])
@@ -197,16 +159,16 @@ void stewart_plan_times(real begin, real period, int periods, real times[3])
 
 /* State (12) at which held torques take the reference over: with a change s of the torque over the
    hold, rates are off by -dt/24 B s at its beginning (law/holds.py). */
-static int target(const stewart_model *model, real period, const real *rows, real *state,
+static int target(const stewart_belief *belief, real period, const real *rows, real *state,
                   stewart_scratch scratch)
 {
     real *A = stewart_take(&scratch, X * X), *B = stewart_take(&scratch, X * U), torques[2][U], mean[U];
     for (int node = 0; node < 2; node++)
-        model->inverse_dynamics(model->about, rows + ROW * (1 + node), torques[node]);
+        stewart_required_torque(belief, rows + ROW * (1 + node), torques[node]);
     for (int j = 0; j < U; j++)
         mean[j] = (torques[0][j] + torques[1][j]) / 2;
     stewart_copy(X, rows, state);
-    if (!model->derivatives(model->about, rows, mean, A, B, scratch.next))
+    if (!stewart_derivatives(NULL, belief, rows, mean, A, B, NULL, scratch))
         return 0;
     for (int i = 0; i < 6; i++)
         for (int j = 0; j < U; j++)
@@ -216,7 +178,7 @@ static int target(const stewart_model *model, real period, const real *rows, rea
 }
 
 /* Mean torques along the quintic from the start, without acceleration, to a row. */
-static void guess(const stewart_model *model, const real *start, const real *end, plan *p)
+static void guess(const real *start, const real *end, plan *p)
 {
     const real duration = p->edges[p->number];
     real from[ROW], row[ROW], torques[2][U];
@@ -226,32 +188,39 @@ static void guess(const stewart_model *model, const real *start, const real *end
         for (int node = 0; node < 2; node++) {
             const real time = p->edges[k] + (p->edges[k + 1] - p->edges[k]) * GAUSS_NODES[node];
             stewart_between(from, end, duration, time / duration, row);
-            model->inverse_dynamics(model->about, row, torques[node]);
+            stewart_required_torque(p->belief, row, torques[node]);
         }
         for (int j = 0; j < U; j++)
             p->torques[U * k + j] = (torques[0][j] + torques[1][j]) / 2;
     }
 }
 
+static int is_inside(const plan *p, const real *pose)
+{
+    static const real least[STEWART_MEASURES] = { /* dynamics/workspace.py */
+        (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)1e-3,
+        (real)-1.4835298641951802};
+    return stewart_margin(p->belief->plant.geometry, pose, p->sign, least) > 0;
+}
+
 /* States under the torques. Returns 0 where one of them is out of the workspace. */
-static int respond(const stewart_model *model, plan *p)
+static int respond(plan *p)
 {
     for (int i = 0; i < p->number * p->pieces; i++) {
         const int k = i / p->pieces;
         real *state = p->states + X * (i + 1);
         stewart_copy(X, state - X, state);
-        model->move(model->about, p->torques + U * k,
-                    (p->edges[k + 1] - p->edges[k]) / (real)p->pieces, state);
+        stewart_advance(p->belief, p->torques + U * k,
+                        (p->edges[k + 1] - p->edges[k]) / (real)p->pieces, 1, state);
     }
     for (int i = 0; i <= p->number * p->pieces; i++)
-        if (!is_inside(model, p->states + X * i))
+        if (!is_inside(p, p->states + X * i))
             return 0;
     return 1;
 }
 
 /* J, its rows divided by `size`, linearised half-way through each hold. */
-static int differentiate(const stewart_model *model, const real *size, plan *p,
-                         stewart_scratch scratch)
+static int differentiate(const real *size, plan *p, stewart_scratch scratch)
 {
     real *A = stewart_take(&scratch, X * X), *B = stewart_take(&scratch, X * U);
     real *Phi = stewart_take(&scratch, X * X), *Gamma = stewart_take(&scratch, X * U);
@@ -265,7 +234,7 @@ static int differentiate(const stewart_model *model, const real *size, plan *p,
         real middle[X];
         for (int i = 0; i < X; i++)
             middle[i] = (start[i] + end[i]) / 2;
-        if (!model->derivatives(model->about, middle, p->torques + U * k, A, B, scratch.next))
+        if (!stewart_derivatives(NULL, p->belief, middle, p->torques + U * k, A, B, NULL, scratch))
             return 0;
         for (int i = 0; i < X * X; i++)
             A[i] *= h;
@@ -322,13 +291,13 @@ static int add_least_norm(int m, int n, real *A, real *b, real *x, stewart_scrat
     return stewart_all_finite(m, d);
 }
 
-static int solve(const stewart_model *model, const real *goal, plan *p, stewart_scratch scratch)
+static int solve(const real *goal, plan *p, stewart_scratch scratch)
 {
-    const real longest = reach(model->geometry), size[6] = {1, 1, 1, longest, longest, longest};
+    const real longest = reach(p->belief->plant.geometry), size[6] = {1, 1, 1, longest, longest, longest};
     const real *last = p->states + X * p->number * p->pieces;
     for (int round = 0; round < ROUNDS; round++) {
         real miss[X], most = 0;
-        if (!respond(model, p))
+        if (!respond(p))
             return 0;
         for (int i = 0; i < X; i++) {
             miss[i] = (goal[i] - last[i]) / size[i % 6];
@@ -336,7 +305,7 @@ static int solve(const stewart_model *model, const real *goal, plan *p, stewart_
         }
         if (most <= TOLERANCE)
             return stewart_all_finite(X, miss);
-        if (!differentiate(model, size, p, scratch) ||
+        if (!differentiate(size, p, scratch) ||
             !add_least_norm(U * p->number, X, p->J, miss, p->torques, scratch))
             return 0;
     }
@@ -352,10 +321,11 @@ static real time_of(const plan *p, int state)
     return p->edges[k] + (p->edges[k + 1] - p->edges[k]) / (real)p->pieces * (real)part;
 }
 
-int stewart_plan_way(const stewart_model *model, const real *start, real begin, real period, int periods,
-                 const real *rows, real *pieces, real *peak, stewart_scratch scratch)
+int stewart_plan_way(const stewart_belief *belief, real sign, const real *start, real begin,
+                     real period, int periods, const real *rows, real *pieces, real *peak,
+                     stewart_scratch scratch)
 {
-    plan p = {holds_of(periods), pieces_per_hold(period, periods), NULL, NULL, NULL, NULL};
+    plan p = {belief, sign, holds_of(periods), pieces_per_hold(period, periods), NULL, NULL, NULL, NULL};
     real goal[X];
     p.edges = stewart_take(&scratch, p.number + 1);
     p.torques = stewart_take(&scratch, U * p.number);
@@ -364,17 +334,17 @@ int stewart_plan_way(const stewart_model *model, const real *start, real begin, 
     for (int k = 0; k <= p.number; k++)
         p.edges[k] = period * sample_of(periods, k);
     stewart_copy(X, start, p.states);
-    if (!target(model, period, rows, goal, scratch))
+    if (!target(belief, period, rows, goal, scratch))
         return 0;
-    guess(model, start, rows, &p);
-    if (!solve(model, goal, &p, scratch))
+    guess(start, rows, &p);
+    if (!solve(goal, &p, scratch))
         return 0;
     *peak = 0;
     for (int i = 0; i < U * p.number; i++)
         if (REAL(fabs)(p.torques[i]) > *peak)
             *peak = REAL(fabs)(p.torques[i]);
     for (int i = 0; i < p.number * p.pieces; i++)
-        add_piece(model, begin + time_of(&p, i), begin + time_of(&p, i + 1), p.states + X * i,
+        add_piece(belief, begin + time_of(&p, i), begin + time_of(&p, i + 1), p.states + X * i,
                   p.torques + U * (i / p.pieces), pieces + STEWART_PIECE * i);
     return p.number * p.pieces;
 }

@@ -7,29 +7,8 @@
 
 enum {
     STEWART_PIECE = 2 + 2 * 18, /* numbers of a piece: begin and end in s, the row at both */
-    STEWART_MOST_HOLDS = 100,   /* torques in a plan */
-    STEWART_MODEL_WORK = 6 * (12 + 13 + 18)
+    STEWART_MOST_HOLDS = 100    /* torques in a plan */
 };
-
-/* The motion of a plate, as far as a plan needs it. `stewart_plant_model` has it from the equations. */
-typedef struct {
-    const void *about;
-    const real *geometry; /* of the machine */
-    real sign;            /* of its parallel measure at home */
-    /* A step of h seconds, of a state (12) in its place. */
-    void (*move)(const void *about, const real *torque, real h, real *state);
-    void (*accelerations)(const void *about, const real *state, const real *torque,
-                          real *accelerations);
-    /* The torque that a row takes. */
-    void (*inverse_dynamics)(const void *about, const real *row, real *torque);
-    /* A (12, 12), B (12, 6) of d state/dt; `work` has place for STEWART_MODEL_WORK numbers. Returns 0
-       where they do not exist. */
-    int (*derivatives)(const void *about, const real *state, const real *torque, real *A, real *B,
-                       real *work);
-} stewart_model;
-
-/* The model of a plant, to which it points. */
-void stewart_plant_model(const stewart_plant *plant, real sign, stewart_model *model);
 
 /* Where a plan that begins at an instant needs the reference: its end, and two nodes of the period
    after it. */
@@ -40,13 +19,15 @@ int stewart_plan_pieces(real period, int periods);
 int stewart_plan_scratch(real period, int periods);
 
 /* Plan from a state (12) onto the reference, with its rows (3, 18) at `stewart_plan_times`. Returns the
-   number of pieces, 0 without a plan; `peak` is the largest torque. */
-int stewart_plan_way(const stewart_model *model, const real *start, real begin, real period, int periods,
-                 const real *rows, real *pieces, real *peak, stewart_scratch scratch);
+   number of pieces, 0 without a plan; `peak` is the largest torque, `sign` that of the parallel measure at
+   home. */
+int stewart_plan_way(const stewart_belief *belief, real sign, const real *start, real begin,
+                     real period, int periods, const real *rows, real *pieces, real *peak,
+                     stewart_scratch scratch);
 
 /* Pieces of the motion through `states` (1 + schedule->number, 12) under torques from `begin` s on;
    their number. */
-int stewart_predicted_pieces(const stewart_model *model, const stewart_schedule *schedule,
+int stewart_predicted_pieces(const stewart_belief *belief, const stewart_schedule *schedule,
                              const real *states, real begin, real *pieces);
 
 /* Whether a predicted state (12) is far enough off the wanted one for a new plan; `size` (6) is that of

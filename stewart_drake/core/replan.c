@@ -49,14 +49,12 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
     real times[3], rows[3 * ROW], peak, *pieces = stewart_take(&scratch, PIECE * most_pieces(law));
     const real *last = states + X * outlook->until.number;
     stewart_belief belief;
-    stewart_model model;
     stewart_believe(&law->machine, outlook->theta, &belief);
-    stewart_plant_model(&belief.plant, replan->sign, &model);
     stewart_plan_times(outlook->eta, law->period, replan->periods, times);
     sample->goal(sample->about, 3, times, rows);
-    int number = stewart_predicted_pieces(&model, &outlook->until, states, 0, pieces);
-    int further = stewart_plan_way(&model, last, outlook->eta, law->period, replan->periods, rows,
-                               pieces + PIECE * number, &peak, scratch);
+    int number = stewart_predicted_pieces(&belief, &outlook->until, states, 0, pieces);
+    int further = stewart_plan_way(&belief, replan->sign, last, outlook->eta, law->period,
+                                   replan->periods, rows, pieces + PIECE * number, &peak, scratch);
     if (further == 0)
         return 0;
     memory[0] = 0;

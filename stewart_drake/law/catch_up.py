@@ -5,7 +5,7 @@ The plan itself is made in C, see core/planning.h. Here is how long it takes, an
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pydrake.trajectories import Trajectory
@@ -14,15 +14,11 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.compiled import machine_of
+from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.timeline import TorqueSchedule
-from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.scenario.signals import (
-    ACCELERATIONS,
     NUM_REFERENCE,
-    NUM_STATE,
-    NUM_TORQUES,
-    POSE,
-    RATES,
 )
 from stewart_drake.scenario.trajectories import evaluate, through_states
 from stewart_drake.types import Array
@@ -166,53 +162,13 @@ def periods_of(duration: float, period: float) -> int:
 
 
 class Model:
-    """The `stewart_model` of core/planning.h of a calculator, and what it points to.
-
-    Args:
-        dynamics: the plant; methods of one that is written in Python are called back.
-    """
+    """The `stewart_belief` of a plant for the functions of core/planning.h."""
 
     def __init__(self, dynamics: StewartDynamics) -> None:
         c = core()
-        numbers = geometry_of(dynamics.mechanism), dynamics.plant_parameters.copy()
-        gravity = np.array([dynamics.gravity])
-        plant = c.ffi.new("stewart_plant *", [*map(c.at, numbers), c.at(gravity)])
-        self.data = c.ffi.new("stewart_model *")
-        c.lib.stewart_plant_model(plant, home_sign(dynamics.mechanism), self.data)
-        self._kept = [*numbers, gravity, plant]
-        if type(dynamics) is not StewartDynamics:
-            self._call_back(dynamics)
-
-    def _call_back(self, dynamics: StewartDynamics) -> None:
-        ffi, d = core().ffi, dynamics
-
-        def at(place: Any, *shape: int) -> Array:
-            return np.frombuffer(ffi.buffer(place, 8 * math.prod(shape))).reshape(shape)
-
-        def move(_: Any, torque: Any, h: float, state: Any) -> None:
-            x = at(state, NUM_STATE)
-            x[:] = d.predict(x.copy(), at(torque, NUM_TORQUES), h)[-1]
-
-        def accelerations(_: Any, state: Any, torque: Any, result: Any) -> None:
-            x = at(state, NUM_STATE)
-            at(result, 6)[:] = d.accelerations(x[POSE], x[RATES], at(torque, NUM_TORQUES))
-
-        def inverse_dynamics(_: Any, row: Any, torque: Any) -> None:
-            x = at(row, NUM_REFERENCE)
-            found = d.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
-            at(torque, NUM_TORQUES)[:] = found
-
-        def derivatives(_: Any, state: Any, torque: Any, A: Any, B: Any, work: Any) -> int:
-            x = at(state, NUM_STATE)
-            found = d.derivatives(x[POSE], x[RATES], at(torque, NUM_TORQUES))
-            at(A, NUM_STATE, NUM_STATE)[:], at(B, NUM_STATE, NUM_TORQUES)[:] = found.A, found.B
-            return 1
-
-        for function in (move, accelerations, inverse_dynamics, derivatives):
-            kind = ffi.typeof(getattr(self.data, function.__name__))
-            called = ffi.callback(kind, function)
-            setattr(self.data, function.__name__, called)
-            self._kept.append(called)
+        self._machine = machine_of(NominalPlant(dynamics, 1, math.inf, TorqueLimit()))
+        self._sign, self.data = home_sign(dynamics.mechanism), c.ffi.new("stewart_belief *")
+        c.lib.stewart_believe(self._machine.it, c.ffi.NULL, self.data)
 
     def plan(
         self, reference: Trajectory, start: Array, begin: float, period: float, periods: int
@@ -229,10 +185,10 @@ class Model:
         c.lib.stewart_plan_times(begin, period, periods, c.at(times))
         rows = np.array([evaluate(reference, t) for t in times])
         pieces = np.empty((c.lib.stewart_plan_pieces(period, periods), c.lib.STEWART_PIECE))
-        number = c.lib.stewart_plan_way(
-            *(self.data, c.at(np.array(start, np.float64)), begin, period, periods, c.at(rows)),
-            *(c.at(pieces), c.at(peak), c.scratch(c.lib.stewart_plan_scratch(period, periods))),
-        )
+        scratch = c.scratch(c.lib.stewart_plan_scratch(period, periods))
+        given = c.at(np.array(start, np.float64)), begin, period, periods, c.at(rows)
+        results = c.at(pieces), c.at(peak), scratch
+        number = c.lib.stewart_plan_way(self.data, self._sign, *given, *results)
         return Plan(pieces, float(peak[0])) if number else None
 
     def way(self, schedule: TorqueSchedule, states: Array, begin: float) -> Array:

@@ -104,7 +104,7 @@ def machine_of(plant: NominalPlant) -> Compiled:
     machine.geometry = list(geometry(dynamics.mechanism))
     machine.parameters = list(dynamics.plant_parameters)
     machine.gravity, machine.torque_limit = dynamics.gravity, plant.motors.limit
-    machine.gentle_torque, machine.substeps = plant.coarse_torque_limit, plant.substeps
+    machine.coarse_torque_limit, machine.substeps = plant.coarse_torque_limit, plant.substeps
     machine.estimated = len(dynamics.free)
     for i, name in enumerate(dynamics.free):
         machine.place[i] = PLANT_PARAMETERS.index(name) if name in PLANT_PARAMETERS else -1
