@@ -10,7 +10,6 @@ import pytest
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.endpoint import Endpoint
 from stewart_drake.live.machine import Settings, check_scenario
-from stewart_drake.live.motors import Motors, Plan
 from stewart_drake.live.protocol import (
     MISSING,
     NEVER,
@@ -22,6 +21,7 @@ from stewart_drake.live.protocol import (
     Refusal,
     encode,
 )
+from stewart_drake.live.simulated import Motors, Plan
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_scenario
 from tests.live_driver import Driver, Together

@@ -295,22 +295,31 @@ def test_either_side_of_a_network_may_stand_still_for_a_second(side):
     assert re.search(told, driving.said), driving.lines
 
 
+def longest_delay(began, until_kill, line, took):
+    """Largest time from a kill to the safe torque, s: by this clock, or by the machine's.
+
+    Either is too long if this process is late on a busy computer: the first at the last line, the
+    second at the line of the begin.
+    """
+    times = [float(re.search(r"(\d+\.\d{3}) s", text)[1]) for text in (began, line)]
+    return min(took, times[1] - times[0] - until_kill)
+
+
 def kills(folder, number, rng):
     """Kill the controller at random times; the next one takes over from rest."""
     with machine("--watchdog", "0.4") as (running, port):
         for k in range(number):
             with process(c_controller(folder, port)) as driving:
-                began = running.until("the run began")
+                began, read = running.until("the run began"), time.monotonic()
                 wait = rng.uniform(0, 2)
                 time.sleep(wait)
                 driving.popen.kill()
                 killed = time.monotonic()
                 line = running.until("nothing was heard|left its workspace")
-                took = time.monotonic() - killed
+                took = longest_delay(began, killed - read, line, time.monotonic() - killed)
             assert "nothing was heard from the controller for 0.4 s" in line, line
             # It is heard once a period; scheduling of two busy cores is in it, too.
             assert took < 0.4 + 0.25, (k, wait, took)
-            assert began
         assert running.end(signal.SIGINT) == 130
     assert f"{number} sessions, {number} runs" in running.said
 
@@ -345,12 +354,13 @@ def test_the_machine_in_c_is_safe_without_its_controller_and_the_next_one_takes_
     with process([str(folder / "stewart_machine"), str(port)]) as running:
         running.until("a simulated machine at port")
         with process(c_controller(folder, port)) as driving:
-            running.until("the run began")
+            began, read = running.until("the run began"), time.monotonic()
             time.sleep(1.5)
             driving.popen.kill()
             killed = time.monotonic()
-        running.until("nothing was heard from the controller for 1 s: the safe torque acts")
-        assert time.monotonic() - killed < 1.0 + 0.25
+        line = running.until("nothing was heard from the controller for 1 s: the safe torque acts")
+        took = longest_delay(began, killed - read, line, time.monotonic() - killed)
+        assert took < 1.0 + 0.25
         with process(c_controller(folder, port, "seconds=1")) as second:
             assert second.end() == 0, second.lines
         assert running.end(signal.SIGINT) == 0

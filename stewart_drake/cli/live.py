@@ -247,8 +247,8 @@ def machine(
         before = signal.signal(signal.SIGTERM, interrupt)
         try:
             delivery.say(
-                f"machine {scenario} at {address[0]}:{address[1]}: simulated by {running.goes_by}, "
-                f"every {1e-6 * running.period:g} ms\nwaits for a controller; Ctrl-C ends it"
+                f"machine {scenario} at {address[0]}:{address[1]}: simulated by "
+                f"{running.simulated_by}, every {1e-6 * running.period:g} ms\nwaits for a controller; Ctrl-C ends it"
             )
             running.run(options.duration or math.inf)
         except KeyboardInterrupt:

@@ -1,9 +1,9 @@
-"""The machine's end: a simulated one in real time, behind the link of its scenario.
+"""The machine's end: a simulated machine in real time, behind the link of its scenario.
 
-Everything happens at an instant of the machine's clock: datagrams arrive, measurements are taken,
-torques change, silence is noticed. `Machine.advance` goes through what is due by now, in this
-order, and the plate follows exactly, however late the process gets to it. Nothing waits but in
-`select`.
+All events have a time of the machine's clock: arrivals of datagrams, measurements, changes of the
+torque, the watchdog. `Machine.advance` processes those that are due, in order of time, and
+integrates the plate exactly up to each. A process that runs late thus simulates the same motion.
+The only wait is in `select`.
 """
 
 import heapq
@@ -13,18 +13,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.live.body import Body, body_of
 from stewart_drake.live.endpoint import STALL, Address, Endpoint, Offers, Session, now, read_key
-from stewart_drake.live.motors import Motors, Plan
 from stewart_drake.live.options import MachineOptions, Settings
 from stewart_drake.live.protocol import (
-    MISSING,
     MOST_SAMPLES,
     NEVER,
     SECOND,
@@ -36,60 +33,29 @@ from stewart_drake.live.protocol import (
     MachineMessage,
     Refusal,
 )
-from stewart_drake.loop.peer import FAULTS, Fault, Reason, code_bits, identity_of, in_words
+from stewart_drake.live.simulated import Body, MeasurementFields, Motors, Plan, body_of, link_times
+from stewart_drake.loop.peer import FAULTS, Fault, Reason, identity_of, in_words
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing
-from stewart_drake.scenario.link import (
-    forward_times,
-    return_times,
-    sensor_times,
-    torque_delays,
-)
-from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
-from stewart_drake.types import Array
+from stewart_drake.scenario.signals import NUM_TORQUES
 
-DRAWN: Final = 1 << 17
-"""Datagrams each way for which times and losses are drawn; then they begin anew, but for a wire,
-which from then on takes what it took last."""
 RECENT: Final = 10 * SECOND
-"""ns for which a fault that is over counts as what came before the next one."""
-LAST_WORDS: Final = 3
-"""Datagrams at the end, which say that it is one: some may be lost."""
+"""Time for which a past fault counts as preceding the next one, ns."""
+LAST_DATAGRAMS: Final = 3
+"""Number of datagrams that announce the end."""
 FURTHEST: Final = 3600 * SECOND
-"""ns ahead that a run may begin, or torques be planned."""
-
-
-class Drawn(NamedTuple):
-    """What happens to what is sent, by its number: ns, or None for what is lost."""
-
-    forward: Callable[[int], int | None]
-    back: Callable[[int], int | None]
-    sensor: Callable[[int], int | None]
-
-
-def drawn(scenario: Scenario) -> Drawn:
-    """As the scenario's simulation has it, sample by sample."""
-    every = (forward_times, return_times, sensor_times)
-    return Drawn(*(_by_number(times(scenario, DRAWN)) for times in every))
-
-
-def _by_number(times: Array) -> Callable[[int], int | None]:
-    def time(number: int) -> int | None:
-        seconds = times[number % len(times)]
-        return round(seconds * SECOND) if np.isfinite(seconds) else None
-
-    return time
+"""Longest time ahead for a begin or a plan, ns."""
 
 
 def check_scenario(scenario: Scenario) -> None:
-    """That the protocol can say what the machine does.
+    """Refuse a scenario that the protocol does not cover.
 
     Raises:
-        ConfigError: servos, too many samples of encoders.
+        ConfigError: servos, or too many samples of encoders.
     """
     if found := differing(scenario, {"actuator.kind": "torque"}):
-        raise ConfigError(found.problem("for a machine", ", which is what a controller sends"))
+        raise ConfigError(found.problem("for a machine", ", which a controller sends"))
     samples = scenario.sensor.samples
     if samples is not None and samples > MOST_SAMPLES:
         raise ConfigError(
@@ -102,88 +68,49 @@ def check_scenario(scenario: Scenario) -> None:
 def open_machine(
     scenario: Scenario, options: MachineOptions, say: Callable[[str], None] = print
 ) -> "Iterator[tuple[Machine, Address]]":
-    """Yield a machine that listens, and where.
+    """Yield a machine and the address at which it listens.
 
     Raises:
         ConfigError: a scenario that the protocol does not cover, or an address in use.
     """
     check_scenario(scenario)
     experiment = prepare(scenario)
-    key = read_key(options.key)
-    endpoint = Endpoint(ControllerMessage, options.host, options.port, key)
+    endpoint = Endpoint(ControllerMessage, options.host, options.port, read_key(options.key))
     try:
         yield Machine(experiment, endpoint, options, say), endpoint.address
     finally:
         endpoint.close()
 
 
-def motors_of(experiment: Experiment) -> Motors:
-    """What the link makes of torques: a buffer behind a network, or the end of a wire."""
-    sc, limit = experiment.scenario, experiment.torque_limit
-    period = round(sc.controller.period * SECOND)
-    if sc.link.kind == "network":
-        return Motors(limit, period, sc.link.dry == "hold")
-    longer = replace(sc, duration=DRAWN * sc.controller.period)
-    delays = torque_delays(longer)
-    last = len(delays) - 1
-    return Motors(limit, period, delay_of=lambda k: round(delays[min(k, last)] * SECOND))
-
-
 def reason_of(failure: Failure) -> Reason:
-    """Return how a plate left its workspace as a datagram says it."""
+    """Return the reason in a datagram for a plate that has left its workspace."""
     if failure.leg is not None:
         return Reason(Fault.REACH, failure.leg)
     known = (fault for fault, words in FAULTS.items() if words == failure.reason)
     return Reason(next(known, Fault.LEFT))
 
 
-class Measured:
-    """What a sensor has read, as a datagram says it."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self.bits = code_bits(scenario.sensor)
-        self._zeros: Array = np.full(NUM_LEGS, np.nan)
-
-    def said(self, values: Array) -> dict[str, Any]:
-        """The fields of a `MachineMessage`.
-
-        A code of the simulated encoders is a whole number of quanta from any other, so that the
-        first one says where code 0 is.
-        """
-        if not self.bits:
-            return {"state": values}
-        quantum = 2 * np.pi / 2**self.bits
-        angles = values.reshape(-1, NUM_LEGS)
-        for leg in np.flatnonzero(np.isnan(self._zeros)):
-            there = angles[np.isfinite(angles[:, leg]), leg]
-            if len(there):
-                self._zeros[leg] = there[0] - quantum * np.round(there[0] / quantum)
-        zeros = np.nan_to_num(self._zeros)
-        codes = np.nan_to_num(np.round((angles - zeros) / quantum), nan=MISSING)
-        codes = np.clip(codes, MISSING, -MISSING - 1).astype(np.int32)
-        return {"codes": codes, "bits": self.bits, "zeros": zeros}
-
-
 class Machine:
-    """A simulated machine and who drives it.
+    """A simulated machine and its session.
 
     Args:
-        experiment: whose scenario passes `check_scenario`.
-        endpoint: where it is heard.
+        experiment: prepared scenario that passes `check_scenario`.
+        endpoint: socket.
         settings: see `Settings`.
-        say: is told in a line what happens.
-        clock: ns, monotonic.
+        say: prints a line.
+        clock: monotonic clock, ns.
 
     Attributes:
-        session: of the controller that drives, or did last.
-        begin: ns, when the run began or will begin, or NEVER.
+        session: present or last session.
+        begin: time at which the run began or will begin, ns, or NEVER.
         failure: how the plate left its workspace, or None.
-        identity: what a controller must be designed for.
-        offers: of sessions.
-        reason: why torques do not act any more, and `before`, what preceded it.
-        counts: what happened, by name.
-        goes_by: what computes the plate, see `live.body.body_of`.
-        longest_lag: ns by which something was done late while the plate moved.
+        identity: identity that a controller must be designed for.
+        offers: offers of sessions.
+        reason: why torques do not act, or no fault.
+        before: fault that preceded it.
+        counts: number of events by name.
+        simulated_by: name of the integrator, see `live.simulated.body_of`.
+        longest_lag: longest delay of an event while the plate moved, ns.
     """
 
     def __init__(
@@ -200,23 +127,23 @@ class Machine:
         sc = experiment.scenario
         self.period = round(sc.controller.period * SECOND)
         self.watchdog = round(self._settings.watchdog * SECOND)
-        self._drawn, self._measured = drawn(sc), Measured(sc)
-        self._make, self.goes_by = body_of(experiment)
+        self._times, self._fields = link_times(sc), MeasurementFields(sc)
+        self._make, self.simulated_by = body_of(experiment)
         self.session: Session | None = None
         self.identity, self.offers = identity_of(sc), Offers()
-        self._told_refusal = 0
+        self._refusal_said = 0
         self._due: list[tuple[int, int, int, Callable[[int], None]]] = []
         self._number = self.sample = 0
         self.counts: Counter[str] = Counter()
-        self.longest_lag, self._told_until = 0, -1
+        self.longest_lag, self._stalled_until = 0, -1
         self._safe = self._stopped = False
         self._at_rest()
         self._at(0, 1, self._take_sample)
 
     def _at_rest(self) -> None:
-        """The plate at the scenario's start, brakes on."""
+        """Reset the plate to the scenario's start, with brakes on."""
         self._body: Body = self._make()
-        self._motors: Motors = motors_of(self._experiment)
+        self._motors: Motors = Motors.of(self._experiment)
         self.begin = self._origin = NEVER
         self.failure: Failure | None = None
         self._running = False
@@ -226,7 +153,7 @@ class Machine:
     # -------------------------------------------------------------- time
 
     def time(self) -> int:
-        """ns of the machine's clock."""
+        """Return the machine's clock, ns."""
         return round((self._clock() - self._started) * self._settings.rate)
 
     def _at(self, time: int, order: int, do: Callable[[int], None]) -> None:
@@ -234,7 +161,7 @@ class Machine:
         heapq.heappush(self._due, (time, order, self._number, do))
 
     def run(self, duration: float = float("inf")) -> None:
-        """Go on for so many s of the machine's clock, or until Ctrl-C, which is raised."""
+        """Run for `duration` s of the machine's clock, or until Ctrl-C, which is raised."""
         end = duration * SECOND
         try:
             while (time := self.time()) < end:
@@ -246,7 +173,7 @@ class Machine:
             self.stop()
 
     def stop(self) -> None:
-        """The safe torque, and a last datagram that says so."""
+        """Go to the safe torque, and announce the end."""
         time = self.time()
         if self._running and not self._safe:
             self._go_safe(time)
@@ -254,17 +181,17 @@ class Machine:
             return
         if self.failure is None:
             self._fail(Reason(Fault.ENDED), time)
-        for _ in range(LAST_WORDS):
+        for _ in range(LAST_DATAGRAMS):
             self._endpoint.send(self._message(time, time, {}), self.session.address)
 
     def poll(self, time: int) -> None:
-        """Read what has come; it arrives when the link says."""
+        """Read the datagrams that have come; each arrives after its transit time."""
         for message, address in self._endpoint.receive():
             assert isinstance(message, ControllerMessage)
             number = message.head.sequence
             if self.begin != NEVER and len(message.torques):
                 number = max(0, round((message.sampled - self.begin) / self.period))
-            under_way = self._drawn.forward(number)
+            under_way = self._times.forward(number)
             self.counts["received"] += 1
             if under_way is None:
                 self.counts["lost"] += 1
@@ -282,12 +209,12 @@ class Machine:
         self._endpoint.versions = []
 
     def _refuse_aloud(self, session: int, line: str) -> None:
-        if session != self._told_refusal:
-            self._told_refusal = session
+        if session != self._refusal_said:
+            self._refusal_said = session
             self._say(line)
 
     def advance(self, time: int) -> int:
-        """Do all that is due by a time; when there is something next."""
+        """Process all events due by a time, ns; return the time of the next one."""
         while True:
             when, do = self._next()
             if when > time:
@@ -296,7 +223,7 @@ class Machine:
             if self._running:
                 self.longest_lag = max(lag, self.longest_lag)
                 if lag > STALL and do != self._silence:
-                    self._tell_lag(lag, when)
+                    self._report_stall(lag, when)
             do(when)
 
     def _next(self) -> tuple[int, Callable[[int], None]]:
@@ -311,17 +238,17 @@ class Machine:
     def _pop(self, time: int) -> None:
         heapq.heappop(self._due)[3](time)
 
-    def _tell_lag(self, lag: int, when: int) -> None:
-        if when > self._told_until:
+    def _report_stall(self, lag: int, when: int) -> None:
+        if when > self._stalled_until:
             self.counts["stood still"] += 1
             self._precede(Reason(Fault.STOOD, lasted=lag), when)
             self._say(f"{when / SECOND:.3f} s: {self.before}; the plate went on by its buffer")
-        self._told_until = when + lag
+        self._stalled_until = when + lag
 
     # -------------------------------------------------------------- the plate
 
     def _follow(self, time: int) -> None:
-        """Take the plate to a time, under the torque that acts."""
+        """Advance the plate to a time under the torque that acts."""
         if not self._running or self.failure is not None:
             return
         failure = self._body.advance((time - self._origin) / SECOND, self._motors.torque)
@@ -340,7 +267,7 @@ class Machine:
         )
 
     def _fail(self, reason: Reason, time: int) -> None:
-        """Note why torques do not act any more."""
+        """Set the reason why torques do not act."""
         if self.reason.fault:
             self._precede(self.reason, time)
         if time - self._preceded > RECENT:
@@ -355,7 +282,7 @@ class Machine:
             return
         if not self._alive(time):
             self.begin = NEVER
-            self._say("nobody was heard when the run should have begun: still parked")
+            self._say("no controller was heard at the begin of the run: still parked")
             return
         sc, delay = self._experiment.scenario, self._experiment.scenario.true_delay
         queue = self._experiment.torques_in_flight(delay)
@@ -380,12 +307,12 @@ class Machine:
         number = 0
         if self._running:
             number = max(0, round((time - self._origin) / self.period))
-        waits = self._drawn.sensor(number)
-        said = {} if waits is None else self._measured.said(values)
-        self._at(time + (waits or 0), 1, lambda t: self._answer(t, time, said, number))
+        waits = self._times.sensor(number)
+        fields = {} if waits is None else self._fields.of(values)
+        self._at(time + (waits or 0), 1, lambda _: self._answer(time, fields, number))
         self._at(time + self.period, 1, self._take_sample)
 
-    # -------------------------------------------------------------- who drives
+    # -------------------------------------------------------------- session
 
     def _alive(self, time: int) -> bool:
         return (
@@ -435,11 +362,11 @@ class Machine:
             self._obey(message, time)
 
     def _greet(self, request: ControllerMessage, address: Address, time: int) -> None:
-        """Answer a request for a session; nothing is remembered of it."""
+        """Answer a request for a session, without keeping state of it."""
         head, nonce = request.head, self.offers.nonce(request.head.session, address)
         assert request.identity is not None
         if self.session is not None and head.session == self.session.number:
-            self._refuse(Refusal.LATE)  # it was overtaken, or is replayed
+            self._refuse(Refusal.LATE)  # overtaken or replayed
             return
         if head.nonce != nonce and not self.offers.may_answer(self._clock()):
             self._refuse(Refusal.RATE)
@@ -452,8 +379,8 @@ class Machine:
                 f"refused a controller at {host}:{port}, which is designed for {differs[1]}; this "
                 f"machine has {differs[0]}",
             )
-        said = {"identity": self.identity}
-        offer = self._message(time, time, said, Session(head.session, address))
+        fields = {"identity": self.identity}
+        offer = self._message(time, time, fields, Session(head.session, address))
         answer = Head(
             *(head.session, 0 if differs else nonce, head.sequence, head.sequence),
             *(time, head.time, 0),
@@ -503,28 +430,28 @@ class Machine:
             plan = Plan(message.head.sequence, message.sampled, sample, message.playout, rows)
             self._refuse(self._motors.take(plan, time))
 
-    # -------------------------------------------------------------- what is said
+    # -------------------------------------------------------------- messages
 
-    def _answer(self, time: int, sampled: int, said: dict[str, Any], number: int) -> None:
-        """To who drives; `number` is that of the sample."""
+    def _answer(self, sampled: int, fields: dict[str, Any], number: int) -> None:
+        """Send the measurement of sample `number` to the controller."""
         if self.session is not None:
-            message = self._message(self.time(), sampled, said)
+            message = self._message(self.time(), sampled, fields)
             self._send(message, self.session.address, number)
 
     def _send(self, message: MachineMessage, to: Address, number: int | None = None) -> None:
-        under_way = self._drawn.back(message.head.sequence if number is None else number)
+        under_way = self._times.back(message.head.sequence if number is None else number)
         if under_way is None:
             self.counts["measurements lost"] += 1
         else:
             self.counts["sent"] += 1
             self._at(message.head.time + under_way, 3, lambda _: self._put(message, to))
 
-    def _put(self, message: MachineMessage, address: Address) -> None:
-        self._endpoint.send(message, address)
+    def _put(self, message: MachineMessage, to: Address) -> None:
+        self._endpoint.send(message, to)
 
     def _flags(self) -> MachineFlags:
-        flags = MachineFlags.SIMULATION
         states = {
+            MachineFlags.SIMULATION: True,
             MachineFlags.PARKED: not self._running,
             MachineFlags.RUNNING: self._running,
             MachineFlags.SAFE: self._safe,
@@ -534,22 +461,19 @@ class Machine:
             MachineFlags.RESETS: self._settings.restart == "rest",
             MachineFlags.SAFE_HOLDS: self._settings.safe == "hold",
         }
-        for flag, there in states.items():
-            if there:
-                flags |= flag
-        return flags
+        return MachineFlags(sum(flag for flag, there in states.items() if there))
 
     def _message(
         self,
         time: int,
         sampled: int,
-        said: dict[str, Any],
+        fields: dict[str, Any],
         offered: Session | None = None,
     ) -> MachineMessage:
         to = offered or self.session
         assert to is not None
-        told = not offered and self._experiment.scenario.link.acknowledged
-        acted = self._motors.acted if told else []
+        acknowledged = not offered and self._experiment.scenario.link.acknowledged
+        acted = self._motors.acted if acknowledged else []
         rows = [torque for _, torque in acted]
         seen = to.window.seen if to.window.newest else 0
         return MachineMessage(
@@ -569,15 +493,15 @@ class Machine:
             refused=sum(self._endpoint.refused.values()),
             reason=self.reason,
             before=self.before,
-            **said,
+            **fields,
         )
 
     def summary(self) -> dict[str, Any]:
-        """What happened, for the end."""
+        """Return the counts of the whole run."""
         counted = ("sessions", "runs", "received", "lost", "sent", "measurements lost", "silences")
         return {
             "machine": self._experiment.truth.name,
-            "goes_by": self.goes_by,
+            "goes_by": self.simulated_by,
             "time_s": self.time() / SECOND,
             **{name.replace(" ", "_"): self.counts[name] for name in counted},
             "unsent": self._endpoint.unsent,

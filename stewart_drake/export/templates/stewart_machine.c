@@ -386,7 +386,7 @@ static uint64_t advance(machine *m, uint64_t now)
             m->silences++;
             go_safe(m, silent);
             fail(m, STEWART_SILENCE, 0, WATCHDOG, silent);
-            printf("%s: the safe torque acts\n", why(m));
+            printf("%s: the safe torque acts at %.3f s\n", why(m), 1e-9 * (double)silent);
         } else if (next == starts) {
             begin(m);
         } else if (next == m->sample) {

@@ -1,0 +1,319 @@
+"""The simulated part of a machine: link, motors, plant and sensor. Times are ns of its clock.
+
+The exact plant is integrated by DOP853 (docs/theory.md, section 32), without Drake, if the sensor
+measures pose and rates without faults. Any other machine is the plant and sensor of the diagram.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
+from pydrake.systems.analysis import Simulator, SimulatorStatus
+
+from stewart_drake.core.link import Link
+from stewart_drake.dynamics.open_loop import Drive, IntegrationError, integrate
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.live.protocol import MISSING, MOST_HISTORY, NEVER, SECOND, Refusal
+from stewart_drake.loop.bulk import LONGEST_STEP, SHARE
+from stewart_drake.loop.diagram import build_machine
+from stewart_drake.loop.exact import set_accuracy
+from stewart_drake.loop.peer import code_bits
+from stewart_drake.loop.preparation import Experiment
+from stewart_drake.loop.sensor import white_noise
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.dependencies import Accepted, differing
+from stewart_drake.scenario.link import forward_times, return_times, sensor_times, torque_delays
+from stewart_drake.scenario.signals import BIAS, NUM_LEGS, NUM_TORQUES, POSE
+from stewart_drake.scenario.timing import look_time
+from stewart_drake.types import Array
+
+_TIMES: Final = 1 << 17
+"""Number of transit times and losses each way; then they repeat."""
+MOST_WAITING: Final = 1 << 12
+"""Largest number of torques that wait; a plan that exceeds it is refused."""
+_REFUSALS: Final = (None, Refusal.MALFORMED, Refusal.LATE)
+_WITHOUT_DRAKE: Final[Accepted] = {
+    "plant.kind": "exact",
+    "sensor.kind": "state",
+    "sensor.faults": [],
+}
+"""Values of the fields that `NativeBody` supports."""
+
+
+# ---------------------------------------------------------------- link
+
+
+class LinkTimes(NamedTuple):
+    """Transit times by the number of a datagram, ns, or None for a lost one."""
+
+    forward: Callable[[int], int | None]
+    back: Callable[[int], int | None]
+    sensor: Callable[[int], int | None]
+
+
+def link_times(scenario: Scenario) -> LinkTimes:
+    """Return the transit times of a scenario, the same as in its simulation."""
+    every = (forward_times, return_times, sensor_times)
+    return LinkTimes(*(_by_number(times(scenario, _TIMES)) for times in every))
+
+
+def _by_number(times: Array) -> Callable[[int], int | None]:
+    def time(number: int) -> int | None:
+        seconds = times[number % len(times)]
+        return round(seconds * SECOND) if np.isfinite(seconds) else None
+
+    return time
+
+
+# ---------------------------------------------------------------- motors
+
+
+class Plan(NamedTuple):
+    """Torques of a datagram.
+
+    Attributes:
+        sequence: sequence of the datagram; 0 for torques in flight at the begin.
+        sampled: time of the sample that they were computed for.
+        sample: number of that sample, from the begin on.
+        playout: time at which the first row acts.
+        torques: torques (n, 6), N m.
+    """
+
+    sequence: int
+    sampled: int
+    sample: int
+    playout: int
+    torques: Array
+
+
+class Motors:
+    """Motors behind a link of core/link.h.
+
+    In a play-out buffer, row i of a plan is for the period from playout + i dt on. On a wire only
+    the first row counts, and acts when it arrives.
+
+    Args:
+        limit: torque limit, N m.
+        period: dt.
+        holds: whether a dry buffer holds the last torque; otherwise it outputs zero.
+        delay_of: delay of the torque of sample k on a wire; None for a buffer.
+    """
+
+    def __init__(
+        self,
+        limit: float,
+        period: int,
+        holds: bool = True,
+        delay_of: Callable[[int], int] | None = None,
+    ) -> None:
+        self.holds, self.is_wire, self._delay_of = holds, delay_of is not None, delay_of
+        given, history = (NUM_TORQUES, MOST_WAITING, period), MOST_HISTORY
+        self._link = Link(*given, wire=self.is_wire, holds=holds, history=history, limit=limit)
+        self._memory, self._begun = self._link.start(), False
+
+    @classmethod
+    def of(cls, experiment: Experiment) -> "Motors":
+        """Return the motors of a scenario: a buffer over a network, otherwise a wire."""
+        sc, limit = experiment.scenario, experiment.torque_limit
+        period = round(sc.controller.period * SECOND)
+        if sc.link.kind == "network":
+            return cls(limit, period, sc.link.dry == "hold")
+        delays = torque_delays(replace(sc, duration=_TIMES * sc.controller.period))
+        last = len(delays) - 1
+        return cls(limit, period, delay_of=lambda k: round(delays[min(k, last)] * SECOND))
+
+    @property
+    def torque(self) -> Array:
+        """Torque (6,) that acts, N m."""
+        return self._link.acted(self._memory)[0, 1:].copy()
+
+    @property
+    def acted(self) -> list[tuple[int, Array]]:
+        """Times at which the last torques began to act, and these, the newest first."""
+        rows = self._link.acted(self._memory)[: self._number("acted")]
+        return [(int(row[0]), row[1:].copy()) for row in rows]
+
+    @property
+    def played(self) -> int:
+        """Number of periods with a torque of a plan."""
+        return self._number("played")
+
+    @property
+    def dry(self) -> int:
+        """Number of periods without one."""
+        return self._number("dry")
+
+    @property
+    def fed(self) -> bool:
+        """Whether the torque that acts is from a plan."""
+        return self._number("fed") > 0
+
+    def _number(self, name: str) -> int:
+        return int(self._link.number(self._memory, name))
+
+    def begin(self, queue: Plan) -> None:
+        """Begin with the torques in flight."""
+        self._begun = True
+        self._link.begin(self._memory, queue.playout, queue.torques)
+
+    def take(self, plan: Plan, time: int) -> Refusal | None:
+        """Take a plan that has arrived; return why it is refused, or None."""
+        first = plan.playout
+        if self._delay_of is not None:
+            first = max(time, plan.sampled + self._delay_of(plan.sample))
+        return _REFUSALS[self._link.take(self._memory, time, plan.sequence, first, plan.torques)]
+
+    @property
+    def next_change(self) -> int:
+        """Time of the next call of `change`, or NEVER."""
+        there = self._link.next_change(self._memory) if self._begun else math.inf
+        return NEVER if math.isinf(there) else int(there)
+
+    def change(self, time: int) -> None:
+        """Change the torque at `next_change`."""
+        self._link.change(self._memory, time)
+
+    def safe(self, time: int, holds: bool) -> None:
+        """Drop what waits; hold the torque, or output zero, until the next plan."""
+        self._link.safe(self._memory, time, holds)
+
+
+# ---------------------------------------------------------------- plant and sensor
+
+
+class Body(Protocol):
+    """Plant and sensor, `time` s after the start."""
+
+    time: float
+
+    @property
+    def state(self) -> Array:
+        """Pose and rates (12,)."""
+        ...
+
+    def advance(self, time: float, torque: Array) -> Failure | None:
+        """Advance to `time` s under a torque (6,), N m; return why the plate left, or None."""
+        ...
+
+    def measurement(self) -> Array:
+        """Return a state (12,) or crank angles (6 N,), NaN for missing values."""
+        ...
+
+
+class NativeBody:
+    """The exact plant by DOP853, and a sensor of pose and rates with white noise."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        sc, sensor = experiment.scenario, experiment.scenario.sensor
+        assert sensor.kind == "state"
+        parameters = np.array(sc.plant.parameters)
+        self._bias = parameters[BIAS].copy()
+        parameters[BIAS] = 0.0  # added to the torque that acts, as in the diagram
+        self._dynamics = StewartDynamics(experiment.truth, sc.plant.gravity, parameters)
+        self._accuracy = SHARE * sc.plant.accuracy
+        self._noise, self._seed = np.array(sensor.noise_std), sensor.seed
+        self._period, self.state, self.time = sc.controller.period, experiment.start.copy(), 0.0
+
+    def advance(self, time: float, torque: Array) -> Failure | None:
+        if time <= self.time:
+            return None
+        drives, span = (Drive(torque + self._bias),), (time - self.time,)
+        try:
+            course = integrate(
+                self._dynamics, self.state, drives, span, self._accuracy, LONGEST_STEP
+            )
+        except IntegrationError as error:
+            return Failure(self.time, None, np.nan, str(error))
+        self.state, began, self.time = course.final, self.time, self.time + course.end
+        left = course.failure
+        return None if left is None else left._replace(time=began + left.time)
+
+    def measurement(self) -> Array:
+        if not self._noise.any():
+            return self.state
+        return self.state + self._noise * white_noise(self._seed, round(self.time / self._period))
+
+
+class DrakeBody:
+    """Plant and sensor of the scenario's diagram."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        self._experiment, self.time = experiment, 0.0
+        self._bias = np.array(experiment.scenario.plant.torque_bias)
+        self._diagram: Any = build_machine(experiment)
+        context = self._diagram.CreateDefaultContext()
+        plant: Any = self._diagram.GetSubsystemByName("plant")
+        plant.set_state(plant.GetMyMutableContextFromRoot(context), experiment.start)
+        self._plant = plant
+        self._torque = self._diagram.GetInputPort("torque")
+        self._torque.FixValue(context, self._bias)
+        self._simulator = Simulator(self._diagram, context)
+        if experiment.scenario.plant.kind == "exact":
+            set_accuracy(self._simulator, experiment.scenario.plant.accuracy)
+        self._simulator.Initialize()
+
+    @property
+    def state(self) -> Array:
+        return np.array(self._diagram.GetOutputPort("state").Eval(self._simulator.get_context()))
+
+    def advance(self, time: float, torque: Array) -> Failure | None:
+        context = self._simulator.get_mutable_context()
+        if time <= self.time:
+            return None
+        self._torque.FixValue(context, torque + self._bias)
+        try:
+            outcome = self._simulator.AdvanceTo(look_time(time))
+        except RuntimeError as error:  # Drake's solver: constraints contradict the dynamics
+            return Failure(context.get_time(), None, np.nan, " ".join(str(error).split()))
+        self.time = time
+        if outcome.reason() != SimulatorStatus.ReturnReason.kReachedTerminationCondition:
+            return None
+        self.time = context.get_time()
+        cranks = None
+        if self._plant.HasOutputPort("crank_angles"):
+            own = self._plant.GetMyContextFromRoot(context)
+            cranks = self._plant.GetOutputPort("crank_angles").Eval(own)
+        found = diagnose(self._experiment.truth, self.time, self.state[POSE], cranks)
+        assert found is not None, "the simulation ended inside the workspace"
+        return found
+
+    def measurement(self) -> Array:
+        context = self._simulator.get_context()
+        return np.array(self._diagram.GetOutputPort("measurement").Eval(context))
+
+
+def body_of(experiment: Experiment) -> tuple[Callable[[], Body], str]:
+    """Return a factory of the plant and sensor of an experiment, and the integrator's name."""
+    found = differing(experiment.scenario, _WITHOUT_DRAKE)
+    if found is None:
+        return lambda: NativeBody(experiment), "DOP853"
+    return lambda: DrakeBody(experiment), f"Drake ({found.field})"
+
+
+class MeasurementFields:
+    """Converts measurements to the fields of a `MachineMessage`."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._bits = code_bits(scenario.sensor)
+        self._zeros: Array = np.full(NUM_LEGS, np.nan)
+
+    def of(self, values: Array) -> dict[str, Any]:
+        """Return the fields of a measurement.
+
+        Codes of the simulated encoders are whole quanta apart: the first one defines code 0.
+        """
+        if not self._bits:
+            return {"state": values}
+        quantum = 2 * np.pi / 2**self._bits
+        angles = values.reshape(-1, NUM_LEGS)
+        for leg in np.flatnonzero(np.isnan(self._zeros)):
+            there = angles[np.isfinite(angles[:, leg]), leg]
+            if len(there):
+                self._zeros[leg] = there[0] - quantum * np.round(there[0] / quantum)
+        zeros = np.nan_to_num(self._zeros)
+        codes = np.nan_to_num(np.round((angles - zeros) / quantum), nan=MISSING)
+        codes = np.clip(codes, MISSING, -MISSING - 1).astype(np.int32)
+        return {"codes": codes, "bits": self._bits, "zeros": zeros}
