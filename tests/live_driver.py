@@ -1,5 +1,6 @@
 """The least controller that a machine can be tried with, and a clock that tests turn themselves."""
 
+import functools
 import select
 from dataclasses import dataclass, field
 
@@ -24,6 +25,24 @@ from stewart_drake.loop.law_design import control_law, first_queue
 from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.config import Scenario
+
+
+def in_real_time(test):
+    """Repeat a test that fails, at most twice.
+
+    A busy computer may suspend any process for longer than a period, which loses measurements.
+    """
+
+    @functools.wraps(test)
+    def repeated(*args, **kwargs):
+        for _ in range(2):
+            try:
+                return test(*args, **kwargs)
+            except AssertionError:
+                pass
+        return test(*args, **kwargs)
+
+    return repeated
 
 
 @dataclass
@@ -190,7 +209,7 @@ def drive_in_real_time(driver: Driver, samples: int) -> np.ndarray:
         hear(now() + period // 2)
     for k in range(samples):
         time = driver.begin + k * period
-        while machine() < time + period // 3:
+        while machine() < time + 2 * period // 3:
             if driver.got[-1].sampled >= time:
                 break
             hear(now() + period // 50)

@@ -49,6 +49,7 @@ from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
 from stewart_drake.scenario.trajectories import make_reference
 from tests.browser import browser, needs_chromium
+from tests.live_driver import in_real_time
 
 WAY = "low: 0.1, high: 0.12, loss: 0.02"
 OVER_A_NETWORK = f"link={{kind: network, {WAY}, return: {{{WAY}}}}}"
@@ -109,6 +110,7 @@ def jumping_clock(monkeypatch):
 
 
 @pytest.mark.slow
+@in_real_time
 def test_on_a_wire_it_does_what_the_simulation_does(quiet_machine, jumping_clock):
     with Running() as running:
         ready = prepare_session(scenario_of(), running.address)
@@ -124,6 +126,7 @@ def test_on_a_wire_it_does_what_the_simulation_does(quiet_machine, jumping_clock
 
 
 @pytest.mark.slow
+@in_real_time
 def test_over_a_network_packets_bridge_what_is_lost(quiet_machine, tmp_path):
     with Running(OVER_A_NETWORK, *FROM_REST) as running:
         ready = prepare_session(scenario_of(*FROM_REST), running.address)
@@ -158,6 +161,7 @@ class Hand(Viewer):
 
 
 @pytest.mark.slow
+@in_real_time
 def test_a_hand_leads_and_a_target_beyond_reach_is_told(quiet_machine):
     target = load_mechanism("paper").home + [0, 0, 0, 0, 0, 0.3]
     hand = Hand(target)
@@ -172,6 +176,7 @@ def test_a_hand_leads_and_a_target_beyond_reach_is_told(quiet_machine):
 
 
 @pytest.mark.slow
+@in_real_time
 def test_a_second_controller_takes_over_in_motion(quiet_machine):
     said = []
     with Running(restart="motion", watchdog=0.3) as running:
@@ -228,6 +233,7 @@ class Halves(Machine):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "missing"), [(Misnumbers, None), (Blind, None), (Blind, 0.35)])
+@in_real_time
 def test_a_run_ends_where_measurements_stay_away(quiet_machine, kind, missing):
     with Running(kind=kind) as running:
         result = driven(running, 5.0, max_missing=missing)
@@ -243,6 +249,7 @@ def test_a_run_ends_where_measurements_stay_away(quiet_machine, kind, missing):
 
 
 @pytest.mark.slow
+@in_real_time
 def test_an_error_of_which_half_was_measured_is_none(quiet_machine):
     with Running(kind=Halves) as running:
         result = driven(running, 3.0)
@@ -427,6 +434,7 @@ def test_the_tighter_torque_limit_counts(offer):
 
 
 @pytest.mark.slow
+@in_real_time
 def test_a_law_that_is_too_slow_for_its_period_says_so_before_it_starts(quiet_machine):
     with Running(OVER_A_NETWORK) as running:
         ready = prepare_session(scenario_of(), running.address)
@@ -460,6 +468,7 @@ def test_the_advised_queue_holds_the_plate(offer, gravity, better):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("settings", "said"), [((), True), (FROM_REST, False)])
+@in_real_time
 def test_torques_in_flight_that_end_too_soon_are_told(quiet_machine, settings, said):
     with Running(OVER_A_NETWORK, *settings) as running:
         ready = prepare_session(scenario_of(*settings), running.address)
@@ -594,6 +603,7 @@ def test_beyond_loopback_a_key_is_needed():
 
 
 @pytest.mark.slow
+@in_real_time
 def test_what_came_while_nobody_looked_is_not_lost(quiet_machine):
     with Running(OVER_A_NETWORK.replace("loss: 0.02", "loss: 0")) as running:
         endpoint = open_endpoint(running.address, None)

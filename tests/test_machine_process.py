@@ -19,9 +19,11 @@ from stewart_drake.export import controller as export_c
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_scenario
 from tests.building import SANITIZED, c_compiler, make
-from tests.live_driver import Driver, drive_in_real_time
+from tests.live_driver import Driver, drive_in_real_time, in_real_time
 
 SETTINGS = ("plant.kind=exact", "duration=4.0")
+SLOW = 0.4
+"""Rate of the machine's clock at which a busy computer still delivers measurements in time."""
 COMMAND = [sys.executable, "-m", "stewart_drake"]
 PATIENCE = 120.0
 """s in which a process must say what is waited for, on a busy computer."""
@@ -151,9 +153,10 @@ def over(folder, settings, log, rate=1.0):
 # ---------------------------------------------------------------- the three pairs with C
 
 
+@in_real_time
 def test_the_controller_in_c_drives_the_machine_in_python(folder, tmp_path):
     log = tmp_path / "log"
-    with machine() as (running, port):
+    with machine("--rate", f"{SLOW}") as (running, port):
         with process(c_controller(folder, port, f"log={log}")) as driving:
             assert driving.end() == 0, driving.lines
         assert running.end(signal.SIGINT) == 130
@@ -166,6 +169,7 @@ def test_the_controller_in_c_drives_the_machine_in_python(folder, tmp_path):
 
 
 @pytest.mark.slow
+@in_real_time
 def test_a_lost_datagram_of_the_controller_in_c_costs_nothing(folder, tmp_path):
     """Where a buffer waits, those that follow say its torque again: the run without a loss."""
     lossy = "link={kind: network, low: 0.0, high: 0.02, loss: 0.3, playout: 0.8}"
@@ -174,10 +178,6 @@ def test_a_lost_datagram_of_the_controller_in_c_costs_nothing(folder, tmp_path):
     lost = int(re.search(r"(\d+) lost by", said)[1])
     assert lost >= 5 and "32 played, 0 periods dry" in said
     np.testing.assert_allclose(states, simulated(40), atol=1e-6)
-
-
-SLOW = 0.4
-"""Of the machine's clock, where a measurement is soon too late for a busy computer."""
 
 
 def in_a_row(number, loss, seed):
@@ -191,6 +191,7 @@ MOTION = np.tile([0.26, 0.26, 0.26, 0.02, 0.02, 0.08], 2)
 
 
 @pytest.mark.slow
+@in_real_time
 def test_what_the_controller_in_c_plans_ahead_acts_in_the_place_of_what_is_lost(soon, tmp_path):
     """Too late to be said again, where 3 or 7 in a row are lost: as the law in Python under the
     same losses. Without plans the plate leaves its workspace."""
@@ -202,6 +203,7 @@ def test_what_the_controller_in_c_plans_ahead_acts_in_the_place_of_what_is_lost(
 
 
 @pytest.mark.slow
+@in_real_time
 def test_the_controller_in_c_hears_what_has_acted(soon, tmp_path):
     """Ten in a row are lost, so that the last torque is held: without being told, the filter would
     take that for a torque bias, which takes the plate four amplitudes away."""
@@ -215,6 +217,7 @@ def test_the_controller_in_c_hears_what_has_acted(soon, tmp_path):
 
 
 @pytest.mark.slow
+@in_real_time
 def test_the_controller_in_python_drives_the_machine_in_c(folder):
     port = free_port()
     with process([str(folder / "stewart_machine"), str(port)]) as running:
@@ -228,6 +231,7 @@ def test_the_controller_in_python_drives_the_machine_in_c(folder):
 
 
 @pytest.mark.slow
+@in_real_time
 def test_both_ends_in_c(folder, tmp_path):
     log, port, key = tmp_path / "log", free_port(), tmp_path / "key"
     key.write_bytes(b"a key of some length\n")
@@ -325,6 +329,7 @@ def kills(folder, number, rng):
 
 
 @pytest.mark.slow
+@in_real_time
 def test_a_killed_controller_ends_in_the_safe_torque_and_the_next_one_takes_over(folder):
     kills(folder, 2, random.Random(3))
 
@@ -349,6 +354,7 @@ def test_a_killed_machine_in_c_ends_its_controller_and_the_next_one_drives_its_s
 
 
 @pytest.mark.slow
+@in_real_time
 def test_the_machine_in_c_is_safe_without_its_controller_and_the_next_one_takes_over(folder):
     port = free_port()
     with process([str(folder / "stewart_machine"), str(port)]) as running:

@@ -315,6 +315,7 @@ static const char *drive(controller *c)
 {
     unsigned number = (unsigned)(c->seconds / (double)stewart_configuration.period + 0.5);
     int waits = stewart_configuration.longest_wait == 0;
+    uint64_t longest = !waits ? 0 : c->last.period / (eta(c) > c->last.period ? 2 : 4);
     for (uint64_t t = own_time(&c->clock, c->begin); udp_now() + SECOND / 20 < t;) {
         say(c, 0, 0, 0, NULL, 0); /* still here */
         udp_wait(c->socket, udp_now() + SECOND / 20);
@@ -322,7 +323,7 @@ static const char *drive(controller *c)
     }
     for (unsigned k = 0; k < number; k++) {
         uint64_t sampled = c->begin + k * c->last.period;
-        uint64_t patience = own_time(&c->clock, sampled + (waits ? c->last.period / 4 : 0));
+        uint64_t patience = own_time(&c->clock, sampled + longest);
         for (receive(c); udp_now() < patience && !(waits && c->last.sampled >= sampled); receive(c))
             udp_wait(c->socket, patience);
         if (udp_interrupted())
