@@ -248,7 +248,8 @@ def machine(
         try:
             delivery.say(
                 f"machine {scenario} at {address[0]}:{address[1]}: simulated by "
-                f"{running.simulated_by}, every {1e-6 * running.period:g} ms\nwaits for a controller; Ctrl-C ends it"
+                f"{running.simulated_by}, every {1e-6 * running.period:g} ms\n"
+                "waits for a controller; Ctrl-C ends it"
             )
             running.run(options.duration or math.inf)
         except KeyboardInterrupt:
