@@ -14,6 +14,7 @@ from stewart_drake.live.protocol import (
     MISSING,
     NEVER,
     SECOND,
+    VERSION,
     ControllerFlags,
     ControllerMessage,
     MachineFlags,
@@ -366,7 +367,7 @@ def attack(rng, run, attacker, recorded):
         data = encode(plan, rng.choice([None, b"another key, as long"]))
     elif kind == 2:
         data = bytearray(encode(plan, KEY))
-        data[4] = rng.randrange(2, 256)
+        data[4] = rng.randrange(VERSION + 1, 256)
         data = bytes(data)
     else:
         data = damaged(rng, encode(plan, KEY))
