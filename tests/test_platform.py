@@ -153,13 +153,13 @@ def own_plant(builder, finalized):
             lambda b: sd.AddStewartPlatform(
                 b, PAPER, sd.PlantConfig(kind="exact"), plant=own_plant(b, False)
             ),
-            "plant: got it for plant.kind exact",
+            "plant: got one for plant.kind exact",
         ),
         (
             lambda b: sd.AddStewartPlatform(b, PAPER, plant=own_plant(b, False)).GetOutputPort(
                 "state"
             ),
-            "not finalized; expected its ports to be asked for after plant.Finalize()",
+            "not finalized; expected GetInputPort and GetOutputPort after plant.Finalize()",
         ),
         (lambda b: sd.AddStewartPlatform(b, PAPER).GetInputPort("force"), "expected torque or wre"),
         (lambda b: sd.AddStewartPlatform(b, PAPER, start=[0.0]), "start: got shape (1,)"),

@@ -70,7 +70,7 @@ SHARE: Final = 0.1
 """Tolerance of an integration step over the scenario's accuracy. Steps of order 8 are long: one
 digit more costs a sixth."""
 LONGEST_STEP: Final = np.inf
-"""s; the state is looked at every 20 ms whatever the steps."""
+"""s; the state is recorded every 20 ms for steps of any length."""
 COVERED: Final[Accepted] = {
     "plant.kind": "exact",
     "actuator.kind": "torque",
@@ -416,7 +416,7 @@ Controller = Callable[[int, Measurement, Report | None], tuple[Array, Array]]
 
 
 class PythonController:
-    """Law and tuner of which at least one has a part in Python, a `Controller`.
+    """Law and tuner with a part in Python, a `Controller`.
 
     Attributes:
         weights: (2,) of each sample.

@@ -262,7 +262,7 @@ def _loops(
     states = 12 + 6 * integrates
     gain = np.zeros((NUM_TORQUES, states + NUM_TORQUES * law.timeline.queue_length))
     for t in times:
-        # The law keeps its last gain where there is no new one.
+        # On failure the law keeps its last gain.
         with suppress(RiccatiError, np.linalg.LinAlgError, ArithmeticError):
             gain = _gain(experiment, truth, law, t)
         plant = true_model(experiment, truth, t)

@@ -1,6 +1,6 @@
 """Kinds of a scenario's sections: a row of factories per class of configuration.
 
-Bulk runs and live machines state the values that they cover in tables of their own
+Bulk runs and live machines have tables of the values that they cover
 (`scenario.dependencies.Accepted`).
 """
 

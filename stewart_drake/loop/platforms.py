@@ -70,7 +70,7 @@ def add_mechanism(
     gravity: bool = True,
     collision: bool = False,
 ) -> ModelInstanceIndex:
-    """`add_model` to a `plant` that holds nothing else, and finalize it."""
+    """Add the mechanism to an otherwise empty `plant`, and finalize it."""
     model = add_model(plant, mechanism, collision=collision)
     if not gravity:
         plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
@@ -90,20 +90,20 @@ def add_model(
     X_PB: RigidTransform | None = None,
     start: Array | None = None,
 ) -> ModelInstanceIndex:
-    """Add the mechanism's SDFormat to `plant`, which is not finalized yet.
+    """Add the mechanism's SDFormat to a `plant` that is not finalized.
 
-    The plate floats on a roll-pitch-yaw joint, so that positions of that joint are the pose.
+    The plate floats on a roll-pitch-yaw joint with the pose as its positions.
 
     Args:
-        plant: where to.
-        mechanism: the machine; a second one of its name gets a number.
+        plant: the plant.
+        mechanism: the machine; the name of a second one gets a number.
         payload_mass: kg, a point mass.
         payload_position: m, in the plate's frame, from its COM.
         joint_damping: N m s/rad on the six crank shafts.
-        collision: whether its shapes can touch other bodies of `plant`; alone it has nothing to
-            touch, and looking for contacts would take a fifth of the time.
-        parent: the frame that the base is welded to, the world's if None.
-        X_PB: pose of the base in that frame, none if None.
+        collision: whether its shapes collide with other bodies of `plant`; the search for contacts
+            takes a fifth of the time.
+        parent: frame of the base's weld, the world's if None.
+        X_PB: pose of the base in that frame, identity if None.
         start: (6,) pose of the plate by default, home if None.
     """
     welded = parent is not None or X_PB is not None
@@ -113,7 +113,7 @@ def add_model(
     (model,) = parser.AddModelsFromString(document, "sdf")
     plate, under = plant.GetBodyByName("plate", model), plant.world_frame()
     if welded:
-        # Relative to the base, as everything that the mechanism knows of its plate.
+        # The pose of the plate is relative to the base.
         under = plant.GetBodyByName("base", model).body_frame()
         plant.WeldFrames(parent or plant.world_frame(), under, X_PB or RigidTransform())
     joint = plant.AddJoint(RpyFloatingJoint("plate", under, plate.body_frame()))
@@ -147,7 +147,7 @@ def set_pose(
 ) -> None:
     """Set all positions and velocities of the tree so that every loop is closed.
 
-    `model` is needed where the plant holds several machines.
+    `model` is needed for a plant with several machines.
 
     Raises:
         UnreachablePoseError: the pose is out of reach.
@@ -169,12 +169,11 @@ def set_pose(
 
 
 class PlateState(LeafSystem):
-    """Picks pose and rates of the plate out of the tree's state, and watches the workspace.
+    """Pose and rates of the plate from the tree's state, with a check of the workspace.
 
     Output:  state = [pose; rates], rates of the angles from the angular velocity, E^-1 w.
-    Publish: after every step the crank angles and the pose are looked at; the simulation ends when
-             a crank passes its dead centre, the cranks no longer hold the plate, or the pitch
-             passes 85 degrees (`dynamics.workspace`).
+    Publish: after every step; the simulation ends when a crank passes its dead centre, the cranks
+             no longer hold the plate, or the pitch passes 85 degrees (`dynamics.workspace`).
 
     | port | direction | size | unit |
     | --- | --- | --- | --- |
@@ -221,10 +220,10 @@ class PlateState(LeafSystem):
 
 
 class CoulombFriction(LeafSystem):
-    """What reaches the shafts: the torque less friction tanh(crank rate / speed).
+    """Coulomb friction: actuation = torque - friction tanh(crank rate / speed).
 
-    A discrete plant reads it at its steps' beginnings, which is stable near rest as long as
-    friction / speed times the step is less than twice the least inertia of the cranks; beyond that
+    A discrete plant reads it at the beginning of a step, which is stable near rest if
+    friction / speed times the step is less than twice the least inertia of the cranks. Otherwise
     `loop.cautions.stiff_friction` warns.
 
     | port | direction | size | unit |
@@ -235,7 +234,7 @@ class CoulombFriction(LeafSystem):
 
     Args:
         plant: finalized.
-        model: the machine in it, needed where there are several.
+        model: the machine in it, needed for several.
         friction: N m.
         speed: rad/s.
     """
@@ -262,7 +261,7 @@ class CoulombFriction(LeafSystem):
 
 
 class PlateWrench(LeafSystem):
-    """A wrench on the plate as MultibodyPlant takes it, a list of forces on bodies.
+    """A wrench on the plate as a list of forces on bodies for MultibodyPlant.
 
     The plate's frame has its origin at the COM, where the wrench acts.
 
@@ -300,7 +299,7 @@ _CRANKS: Final = "crank_angles"
 
 
 class StewartPlatform:
-    """A platform that `AddStewartPlatform` added to a diagram, by its ports.
+    """Ports of a platform that `AddStewartPlatform` added to a diagram.
 
     | port | direction | size | unit |
     | --- | --- | --- | --- |
@@ -309,14 +308,14 @@ class StewartPlatform:
     | state | output | 12, pose and rates relative to the base | rad, m, rad/s, m/s |
     | crank_angles | output | 6, of a multibody plant only | rad |
 
-    The wrench may stay unconnected, and is zero then. A multibody plant ends the simulation where
-    the plate leaves its workspace, as the exact one does, once one of the outputs was asked for.
+    An unconnected wrench is zero. A multibody plant ends the simulation where the plate leaves its
+    workspace, as the exact one does, if one of the outputs is used.
 
     Attributes:
         mechanism: the machine.
-        plant: the system that moves it, an `ExactPlant` or a `MultibodyPlant`.
-        model: which model of the MultibodyPlant it is; None of the exact plant.
-        scene_graph: that came with a MultibodyPlant that was added too, else None.
+        plant: an `ExactPlant` or a `MultibodyPlant`.
+        model: its model in the MultibodyPlant, None for an exact plant.
+        scene_graph: added with a MultibodyPlant, else None.
     """
 
     def __init__(
@@ -338,10 +337,10 @@ class StewartPlatform:
         return f"StewartPlatform({self.mechanism}, {engine})"
 
     def GetInputPort(self, name: str) -> InputPort:
-        """`torque` or `wrench`.
+        """Return the port `torque` or `wrench`.
 
         Raises:
-            ConfigError: another name, or a MultibodyPlant that is not finalized yet.
+            ConfigError: another name, or a MultibodyPlant that is not finalized.
         """
         if name not in _INPUTS:
             raise ConfigError(f"input port: got {name!r}; expected {' or '.join(_INPUTS)}")
@@ -361,10 +360,10 @@ class StewartPlatform:
         return port
 
     def GetOutputPort(self, name: str) -> OutputPort:
-        """`state`, or `crank_angles` of a multibody plant.
+        """Return the port `state`, or `crank_angles` of a multibody plant.
 
         Raises:
-            ConfigError: another name, or a MultibodyPlant that is not finalized yet.
+            ConfigError: another name, or a MultibodyPlant that is not finalized.
         """
         names = (_STATE,) if self.model is None else (_STATE, _CRANKS)
         if name not in names:
@@ -391,8 +390,8 @@ class StewartPlatform:
     def _check_finalized(self) -> None:
         if not self.plant.is_finalized():
             raise ConfigError(
-                "plant: got one that is not finalized; expected its ports to be asked for after "
-                "plant.Finalize()"
+                "plant: got one that is not finalized; expected GetInputPort and GetOutputPort "
+                "after plant.Finalize()"
             )
 
     def _add(self, name: str, make: Callable[[], System]) -> Any:
@@ -412,7 +411,7 @@ class StewartPlatform:
         return self._added[name]
 
     def _before(self, port: InputPort, name: str, make: Callable[[], System]) -> InputPort:
-        """The input of a system, made once, whose output is connected to `port`."""
+        """Return the input of a system, made once, with its output connected to `port`."""
         if name not in self._added:
             if self._builder.IsConnectedOrExported(port):
                 raise ConfigError(
@@ -425,7 +424,7 @@ class StewartPlatform:
 
 
 def add_to_torque(bias: Array) -> AffineSystem:
-    """y = u + bias (6,), in Drake's words y = C x + D u + y0 without a state x."""
+    """Return the system y = u + bias (6,), Drake's y = C x + D u + y0 without a state x."""
     nothing = np.empty((0, 0)), np.empty((0, NUM_TORQUES)), np.empty(0)
     return AffineSystem(*nothing, np.empty((NUM_TORQUES, 0)), np.eye(NUM_TORQUES), bias)
 
@@ -441,25 +440,24 @@ def AddStewartPlatform(
     collision: bool = True,
     start: ArrayLike | None = None,
 ) -> StewartPlatform:
-    """Add a platform to a diagram of one's own.
+    """Add a platform to a diagram.
 
-    With a `plant` of one's own the machine becomes a model in it, among other bodies; it is added
-    before `plant.Finalize()`, which stays the caller's, and its ports are asked for after that.
-    Otherwise a plant is added: an `ExactPlant`, or a MultibodyPlant with a SceneGraph, finalized.
-    The simulator of a diagram with exact plants needs `sd.set_accuracy`.
+    With a `plant` the machine becomes a model in it, among other bodies. The caller calls
+    `plant.Finalize()` afterwards, and then the methods for its ports. Without a `plant` one is
+    added: an `ExactPlant`, or a finalized MultibodyPlant with a SceneGraph. The simulator of a
+    diagram with exact plants needs `sd.set_accuracy`.
 
     Args:
-        builder: of the diagram, to which systems may still be added.
-        mechanism: the machine, or what `load_mechanism` takes.
-        config: kind, gravity, time step and what loads the machine, as a scenario's `plant`; of a
-            plant of one's own `time_step` is that plant's, and gravity is switched off for the
-            machine alone; `mechanism` has no meaning. By default as `PlantConfig()`, which is
-            without gravity.
+        builder: builder of the diagram.
+        mechanism: the machine, or a name or path for `load_mechanism`.
+        config: kind, gravity, time step and loads, as a scenario's `plant`, by default without
+            gravity; with a `plant`, `time_step` is that plant's, and gravity is switched off for
+            the machine only. `mechanism` is ignored.
         plant: a MultibodyPlant that is not finalized, registered with a SceneGraph.
-        parent: frame of `plant` that the base is welded to, the world's if None.
-        X_PB: pose of the base in that frame, none if None.
-        collision: whether plate, base, cranks and rods touch other bodies of a `plant` of one's
-            own; never each other.
+        parent: frame of `plant` for the weld of the base, the world's if None.
+        X_PB: pose of the base in that frame, identity if None.
+        collision: whether plate, base, cranks and rods collide with other bodies of a given
+            `plant`; never with each other.
         start: (6,) pose by default, home if None.
 
     Raises:
@@ -471,17 +469,17 @@ def AddStewartPlatform(
     pose = machine.home if start is None else np.asarray(start, dtype=np.float64)
     if pose.shape != (6,):
         raise ConfigError(f"start: got shape {pose.shape}; expected (6,), a pose")
-    machine.crank_angles(pose)  # or it is out of reach
+    machine.crank_angles(pose)  # raises if out of reach
     if config.kind == "paper":
         raise ConfigError(
-            "plant.kind: got 'paper', which is no machine; expected 'multibody' or 'exact'"
+            "plant.kind: got 'paper', a model without legs; expected 'multibody' or 'exact'"
         )
     if config.kind == "exact":
         for name, given in (("plant", plant), ("parent", parent), ("X_PB", X_PB)):
             if given is not None:
                 raise ConfigError(
-                    f"{name}: got it for plant.kind exact; expected kind multibody, which alone "
-                    "can be among other bodies"
+                    f"{name}: got one for plant.kind exact; expected kind multibody, which can be "
+                    "among other bodies"
                 )
         dynamics = StewartDynamics(machine, config.gravity, config.parameters)
         exact = ExactPlant(dynamics, np.concatenate([pose, np.zeros(6)]), wrench=True)
@@ -489,9 +487,7 @@ def AddStewartPlatform(
         return StewartPlatform(builder, machine, builder.AddSystem(exact))
     scene_graph = None
     if plant is not None and plant.is_finalized():
-        raise ConfigError(
-            "plant: got one that is finalized; expected one to which a machine can be added"
-        )
+        raise ConfigError("plant: got one that is finalized; expected one before plant.Finalize()")
     own = plant is None
     if plant is None:
         plant, scene_graph = AddMultibodyPlant(
@@ -519,12 +515,12 @@ def AddStewartPlatform(
 class MultibodyStewart(Diagram):
     """The machine in Drake's multibody engine (SAP), with the ports of `ExactPlant`.
 
-    Like `ExactPlant` it takes every torque as it is: what motors can do is decided before it.
+    Like `ExactPlant` it has no torque limit; the limit acts before it.
 
     | port | direction | size | unit |
     | --- | --- | --- | --- |
     | torque | input | 6 | N m |
-    | wrench | input | 6, only if asked for | N m, N, in W at the plate's COM |
+    | wrench | input | 6, optional | N m, N, in W at the plate's COM |
     | state | output | 12 | rad, m, rad/s, m/s |
     | crank_angles | output | 6 | rad |
     | query | output | SceneGraph query object | - |
@@ -532,10 +528,10 @@ class MultibodyStewart(Diagram):
     Args:
         mechanism: the machine.
         time_step: s.
-        meshcat: where to show it, or None.
+        meshcat: shows it, or None.
         start: (6,) pose by default, home if None.
         wrench: whether there is an input for a wrench on the plate; unconnected it is zero.
-        **fields: others of `PlantConfig`; with gravity unless they say otherwise.
+        **fields: other fields of `PlantConfig`; with gravity by default.
     """
 
     def __init__(
@@ -573,7 +569,7 @@ class MultibodyStewart(Diagram):
         set_pose(self.tree, tree_context, self.mechanism, state[POSE], state[RATES])
 
     def diagnose(self, context: Context) -> Failure | None:
-        """Why the plate, in its own context, is not inside its workspace, or None."""
+        """Return why the plate is outside its workspace, or None."""
         state, cranks = (
             np.asarray(self.GetOutputPort(name).Eval(context)) for name in ("state", "crank_angles")
         )
@@ -583,7 +579,7 @@ class MultibodyStewart(Diagram):
 def build_viewer(
     mechanism: Mechanism, meshcat: Meshcat
 ) -> tuple[Diagram, MultibodyPlant, MeshcatVisualizer]:
-    """The SDFormat model alone, shown in Meshcat wherever its context puts it."""
+    """Build a diagram that shows the SDFormat model in Meshcat."""
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(time_step=1e-3, discrete_contact_approximation="sap")
     plant, scene_graph = AddMultibodyPlant(config, builder)
@@ -593,17 +589,17 @@ def build_viewer(
 
 
 class StartCheck(LeafSystem):
-    """Warns at initialisation if a plate that shall start in motion is there at rest.
+    """Warns at initialisation if a plate with a start in motion is at rest.
 
-    A MultibodyPlant has default positions, but no default velocities: a context that C++ makes,
-    such as that of `Simulator(loop)`, is at rest.
+    A MultibodyPlant has default positions, but no default velocities: a context made in C++, such
+    as that of `Simulator(loop)`, is at rest.
 
     | port | direction | size | unit |
     | --- | --- | --- | --- |
     | state | input | 12 | rad, m, rad/s, m/s |
 
     Args:
-        start: (12,) pose and rates that the plate shall start with.
+        start: (12,) pose and rates at the start.
     """
 
     def __init__(self, start: Array) -> None:

@@ -1,6 +1,7 @@
-"""Collecting the signals of a running loop, and summing them up."""
+"""The record of a running loop, and the summary of a run."""
 
 import json
+from array import array
 from collections.abc import Mapping
 from typing import Any
 
@@ -30,62 +31,56 @@ from stewart_drake.scenario.signals import (
 from stewart_drake.scenario.timing import Instant
 from stewart_drake.types import Array
 
-_CHUNK = 1024
 _HELD_BY = ("controller", "density")
 """Systems whose signals change at the controller's samples only."""
 
 
 class Table:
-    """Rows of numbers, 8 bytes each, that grow without being copied."""
+    """Rows of numbers, 8 bytes each."""
 
     def __init__(self, width: int) -> None:
-        self._width, self._chunks, self._used = width, list[Array](), _CHUNK
+        self._width, self._numbers = width, array("d")
 
     @classmethod
     def of(cls, rows: Array) -> "Table":
-        """Return a table of rows (n, width), to which nothing is appended."""
+        """Return a table with rows (n, width)."""
         table = cls(rows.shape[1])
-        table._chunks, table._used = [rows], len(rows)
+        table._numbers.frombytes(np.ascontiguousarray(rows, np.float64).tobytes())
         return table
 
     def __len__(self) -> int:
-        return _CHUNK * (len(self._chunks) - 1) + self._used
+        return len(self._numbers) // self._width
 
     def append(self, *parts: Array | float) -> None:
         """Add a row that consists of these parts."""
-        if self._used == _CHUNK:
-            self._chunks.append(np.empty((_CHUNK, self._width)))
-            self._used = 0
-        arrays = [part if isinstance(part, np.ndarray) else np.array([part]) for part in parts]
-        np.concatenate(arrays, out=self._chunks[-1][self._used])
-        self._used += 1
+        row = np.concatenate([np.atleast_1d(part) for part in parts])
+        self._numbers.frombytes(row.astype(np.float64, copy=False).tobytes())
 
     def columns(self, part: slice) -> Array:
-        """(rows, columns), contiguous."""
-        rows = [chunk[:, part] for chunk in self._chunks]
-        return np.concatenate([np.empty((0, self._width))[:, part], *rows])[: len(self)]
+        """Return a copy of columns (rows, columns)."""
+        return np.array(np.reshape(self._numbers, (-1, self._width))[:, part], order="C")
 
     def column(self, place: int) -> Array:
-        """(rows,)."""
+        """Return a column (rows,)."""
         return self.columns(slice(place, place + 1))[:, 0]
 
 
 class Record:
-    """What is kept of a run, wherever the signals come from.
+    """Record of a run, in simulation or in real time.
 
     Args:
-        experiment: that is run.
+        experiment: the experiment.
 
     Attributes:
-        on_grid: time, pose error (6) and reference (6) on the metric's grid, and where a run ended.
-        samples: at each of the controller's samples: pose error (6), the torque that the law asks
-            for (6), what the limit lets through of it (6), computing time.
+        on_grid: time, pose error (6) and reference (6) on the metric's grid and at the end.
+        samples: at each of the controller's samples: pose error (6), torque of the law (6), the
+            same within the limit (6), computing time.
         peak_applied: largest torque that acted, N m.
-        counts: what went wrong and was survived, as of the last sample.
+        counts: survived problems up to the last sample.
         sampled: number of the controller's samples.
-        measured: number of those whose measurement it could use.
-        tuner_fallbacks: samples at which the tuner passed its network over.
-        delay: at the last sample, s: true, as it is believed in or estimated, standard deviation.
+        measured: number of samples with a usable measurement.
+        tuner_fallbacks: number of fallbacks of the tuner.
+        delay: at the last sample, s: true, assumed or estimated, standard deviation.
     """
 
     def __init__(self, experiment: Experiment) -> None:
@@ -102,7 +97,7 @@ class Record:
         self.delay: DelaySummary = {"true_s": nan, "estimated_s": nan, "std_s": nan}
 
     def log(self, time: float, seen: Mapping[str, Array]) -> None:
-        """Add a row to the log: at a time in s, by port what is exported there."""
+        """Add a row to the log: a time in s, and the value of each exported port."""
         row = [seen[signal.exported][signal.part] for signal in self._recorded]
         self._log.append(time, *row)
 
@@ -114,7 +109,7 @@ class Record:
         return usable
 
     def dataset(self) -> xr.Dataset:
-        """The log, see `SimulationResult.signals`."""
+        """Return the log, see `SimulationResult.signals`."""
         values, start = {}, 1
         for signal in self._recorded:
             stop = start + signal.size
@@ -138,7 +133,7 @@ class Record:
 
 
 class Recorder(Record):
-    """Collects signals of the loop: `look` at the plant, then `keep` that and the held signals."""
+    """Record of a simulated loop: `look` reads the plant, `keep` adds it and the held signals."""
 
     def __init__(self, loop: ClosedLoop) -> None:
         controller: Any = loop.GetSubsystemByName("controller")
@@ -166,7 +161,7 @@ class Recorder(Record):
         self._error = self._state[POSE] - self._wanted[POSE]
 
     def keep(self, context: Context, instant: Instant) -> None:
-        """Add what was seen to the log, the metric's grid or the controller's samples."""
+        """Add the values of `look` to the log, the metric's grid or the controller's samples."""
         applied = self._port(context, "torque_applied")
         self.peak_applied = max(self.peak_applied, float(np.abs(applied).max()))
         if instant.sampled:
@@ -187,31 +182,31 @@ class Recorder(Record):
         if instant.on_grid:
             self.on_grid.append(self._instant, self._error, self._wanted[POSE])
         if instant.logged:
-            # Plant and reference as they were looked at: the plant may have gone on since.
+            # Plant and reference as of `look`: the plant may have moved since.
             seen = self._held | {"state": self._state, "reference": self._wanted}
             seen |= {n: self._port(context, n) for n in self._systems if n not in seen}
             self.log(self._instant, seen)
 
     def current_error(self) -> float:
-        """Mean pose error in % of peak to peak."""
+        """Return the mean pose error in % of peak to peak."""
         return float(100 * np.mean(np.abs(self._error) / self._scale))
 
 
 def has_measured(memory: Any, before: Counts) -> bool:
-    """Return whether the controller could use its last measurement, or a part of it.
+    """Return whether the last measurement was usable by the controller, at least in part.
 
     Args:
         memory: of the controller after that sample.
         before: its counts at the sample before.
     """
-    belief = getattr(memory, "belief", None)  # a controller of the user's own has none
+    belief = getattr(memory, "belief", None)  # missing in a controller of the user
     partial = 0 if belief is None else belief.partial
     more: int = memory.counts.bad_measurements - before.bad_measurements
     return more <= partial
 
 
 def _variable(signal: Signal, values: Array) -> tuple[tuple[str, ...], Array, dict[str, str]]:
-    """Dimensions, values and attributes of a signal in the record."""
+    """Return dimensions, values and attributes of a signal in the record."""
     dimension = signal.quantity.dimension
     attributes = {"units": signal.unit, "long_name": signal.long_name}
     if dimension is None:
@@ -227,17 +222,18 @@ def summarize(
     wall: float,
     margin: ControllerMargin | None,
 ) -> RunSummary:
-    """How a run went, without warnings yet."""
+    """Return the summary of a run, without its warnings."""
     sc, nan = experiment.scenario, float("nan")
-    # Not from the log, whose instants are the scenario's choice.
     time, error = recorder.on_grid.column(0), recorder.on_grid.columns(slice(1, 7))
     reference = recorder.on_grid.columns(slice(7, 13))
     errors, torques, sent = (recorder.samples.columns(slice(n, n + 6)) for n in (0, 6, 12))
-    seconds = recorder.samples.column(18)
-    some, scale = len(torques) > 0, experiment.scale
-    done, c = status == "completed", sc.controller
-    found = metrics.figures(time, error, scale, errors, torques, sent, c, done)
+    seconds, some, scale = recorder.samples.column(18), len(recorder.samples) > 0, experiment.scale
+    completed = status == "completed"
+    found = metrics.figures(*(time, error, scale, errors, torques, sent), sc.controller, completed)
     peaks = metrics.peak_error(error, scale).tolist() if len(error) else [nan] * 6
+    floor = 0.0
+    if waits_at_rest(sc) and len(time):
+        floor = metrics.delay_floor(time, reference, scale, sc.eta)
     return {
         "status": status,
         "accumulated_error": found.accumulated_error,
@@ -249,7 +245,7 @@ def summarize(
         "rms_torque": found.rms_torque,
         "torque_variation": found.torque_variation,
         "peak_error": peaks,
-        "delay_floor": _floor(experiment, time, reference),
+        "delay_floor": floor,
         "controller_step_ms": {
             "median": float(1e3 * np.median(seconds)) if some else nan,
             "worst": float(1e3 * seconds.max()) if some else nan,
@@ -264,10 +260,3 @@ def summarize(
         "controller_margin": None if margin is None else margin.summary,
         "warnings": [],
     }
-
-
-def _floor(experiment: Experiment, time: Array, reference: Array) -> float:
-    sc = experiment.scenario
-    if not waits_at_rest(sc) or not len(time):
-        return 0.0
-    return metrics.delay_floor(time, reference, experiment.scale, sc.eta)

@@ -19,7 +19,7 @@ from stewart_drake.types import Array
 
 
 class Figures(NamedTuple):
-    """What a run comes to, see `loop.results.RunSummary`; NaN where it has no value."""
+    """Figures of merit of a run, see `RunSummary`; NaN without a value."""
 
     accumulated_error: float
     cost: float
@@ -38,16 +38,16 @@ def figures(
     controller: ControllerConfig,
     completed: bool,
 ) -> Figures:
-    """The figures of merit of a run.
+    """Compute the figures of merit of a run.
 
     Args:
         time, error: on the metric's grid, as of `accumulated_error`.
         scale: (6,) as of `accumulated_error`.
         errors: (k, 6) pose error at the controller's samples.
-        asked: (k, 6) torques that the law asked for there, N m.
-        sent: (k, 6) what the limit let through, N m.
-        controller: of the scenario.
-        completed: whether the run did; otherwise it has no error and no cost.
+        asked: (k, 6) torques of the law there, N m.
+        sent: (k, 6) the same within the limit, N m.
+        controller: section of the scenario.
+        completed: whether the run completed; error and cost are NaN otherwise.
     """
     c, nan, some = controller, float("nan"), len(asked) > 0
     cost = quadratic_cost(errors, sent, c.period, c.w_Q, c.w_R, c.integral) if completed else nan
@@ -61,10 +61,10 @@ def figures(
 
 
 def accumulated_error(time: Array, error: Array, scale: Array) -> float:
-    """E_ac in % s, equation (47): mean over the coordinates of integral |e_i| / A_i * 100 dt.
+    """Return E_ac in % s, (47): mean over the coordinates of integral |e_i| / A_i * 100 dt.
 
     Args:
-        time: (n,) s; the trapezoid rule runs on it.
+        time: (n,) s, for the trapezoid rule.
         error: (n, 6) pose error against the true reference.
         scale: (6,) A_i, peak to peak of the reference, 1 where it is constant.
     """
@@ -74,14 +74,14 @@ def accumulated_error(time: Array, error: Array, scale: Array) -> float:
 def quadratic_cost(
     error: Array, torque: Array, period: float, w_Q: float, w_R: float, integral: bool
 ) -> float:
-    """Equation (40) on samples: sum of w_Q (|e|^2 + |z|^2) + w_R |T|^2, unscaled as in (41).
+    """Return (40) on samples: sum of w_Q (|e|^2 + |z|^2) + w_R |T|^2, unscaled as in (41).
 
     Args:
         error: (n, 6) pose error at the controller's samples.
-        torque: (n, 6) sent there, within the motors' limit, N m.
+        torque: (n, 6) within the motors' limit, N m.
         period: s; z follows from the errors by the trapezoid rule.
         w_Q, w_R: the weights.
-        integral: whether the cost sees z, (28).
+        integral: whether the cost includes z, (28).
     """
     cost = w_Q * float(np.sum(error**2)) + w_R * float(np.sum(torque**2))
     if integral:
@@ -91,17 +91,17 @@ def quadratic_cost(
 
 
 def total_variation(torque: Array) -> float:
-    """Mean over the motors of sum |T_{k+1} - T_k| in N m: the paper's trembling."""
+    """Return the mean over the motors of sum |T_{k+1} - T_k|, N m: the paper's trembling."""
     return float(np.mean(np.abs(np.diff(torque, axis=0)).sum(axis=0)))
 
 
 def peak_error(error: Array, scale: Array) -> Array:
-    """(6,) largest |error| in percent of peak to peak."""
+    """Return the largest |error| (6,) in percent of peak to peak."""
     return 100 * np.abs(error).max(axis=0) / scale
 
 
 def delay_floor(time: Array, reference: Array, scale: Array, eta: float) -> float:
-    """E_ac in % s that a plate which waits at rest collects before any torque acts.
+    """Return E_ac in % s of a plate that waits at rest until a torque acts.
 
     Args:
         time: (n,) s.
@@ -114,10 +114,7 @@ def delay_floor(time: Array, reference: Array, scale: Array, eta: float) -> floa
 
 
 def waits_at_rest(scenario: Scenario) -> bool:
-    """Whether the nominal plate stays where it is until the first torque of the controller acts.
-
-    The floor of E_ac (`loop.results.delay_floor`) supposes that.
-    """
+    """Return whether the nominal plate rests until the first torque acts, as for `delay_floor`."""
     held = scenario.queue == "equilibrium"
     return scenario.start == "rest" and (
         held or (scenario.queue == "zero" and not scenario.plant.gravity)
@@ -125,25 +122,25 @@ def waits_at_rest(scenario: Scenario) -> bool:
 
 
 class StepTimes(TypedDict):
-    """Computing time of the controller's step, ms; NaN where there was none."""
+    """Computing time of the controller's step, ms; NaN without steps."""
 
     median: float
     worst: float
 
 
 class MarginSummary(TypedDict):
-    """Whether the loop is stable, linearised along the reference, and what it bears."""
+    """Stability and margins of the loop, linearised along the reference."""
 
     stable: bool | None
-    """None where it could not be judged."""
+    """None if not judged."""
     spectral_radius: float
-    """The largest along the reference; errors grow with it per period where it is above 1."""
+    """Largest along the reference; above 1 it is the growth of errors per period."""
     delay_margin_s: list[float]
-    """By which the true delay may be shorter, and longer, s."""
+    """Stable for a true delay shorter, and longer, by less than this, s."""
     gain_margin: list[float]
-    """Factors by which the motors may be weaker, and stronger."""
+    """Stable for factors of the motor torques between these."""
     growth: float
-    """Of an error of the prediction within the delay, e^(p eta), a factor."""
+    """Growth of a prediction error over the delay, e^(p eta)."""
 
 
 class DelaySummary(TypedDict):
@@ -151,66 +148,66 @@ class DelaySummary(TypedDict):
 
     true_s: float
     estimated_s: float
-    """What the law goes by."""
+    """Delay assumed by the law."""
     std_s: float
-    """Its standard deviation, measured 1.6 to 2.6 times too large; NaN without an estimator."""
+    """Standard deviation, 1.6 to 2.6 times too large in tests; NaN without an estimator."""
 
 
 class RunSummary(TypedDict):
-    """How a run went: what its `summary.json` holds, with null for NaN.
+    """Summary of a run: the content of `summary.json`, with null for NaN.
 
-    NaN where a run that did not complete has no value.
+    NaN is a figure that a run which did not complete lacks.
     """
 
     status: str
     """`completed`, `left_workspace`, `solver_failed` or `interrupted`; in real time also
-    `lost_machine`, which fell silent, `lost_contact`, where datagrams came but no usable
-    measurements, or `refused`, where there was no way to take it over."""
+    `lost_machine` (no datagrams), `lost_contact` (datagrams without usable measurements) or
+    `refused` (the machine could not be taken over)."""
     accumulated_error: float
     """E_ac in % s, equation (47). NaN for a run in real time with a `measured_share` below 0.9."""
     measured_share: float
-    """Share of the controller's samples whose measurement it could use, or a part of it."""
+    """Share of the controller's samples with a usable measurement, at least in part."""
     failure: dict[str, Any] | None
-    """What stopped it: `time` in s, `leg`, `margin`, `reason`."""
+    """Reason of an early end: `time` in s, `leg`, `margin`, `reason`."""
     cost: float
-    """Equation (40) on the samples, of the torques that the limit let through."""
+    """Equation (40) on the samples, for torques within the limit."""
     peak_torque: float
-    """Largest that the law asked for, N m."""
+    """Largest torque of the law, before the limit, N m."""
     peak_torque_applied: float
-    """Largest that acted, N m."""
+    """Largest torque that acted, N m."""
     rms_torque: float
-    """Of what the law asked for, over all motors, N m."""
+    """Of the law's torques over all motors, N m."""
     torque_variation: float
-    """Mean over the motors of sum |T_{k+1} - T_k| of the same, N m."""
+    """Mean over the motors of sum |T_{k+1} - T_k| of the law's torques, N m."""
     peak_error: list[float]
     """(6,) of the pose, % of peak to peak."""
     delay_floor: float
-    """E_ac in % s that a plate at rest collects before any torque acts; 0 where it is not."""
+    """E_ac in % s of a plate that rests until a torque acts; 0 without rest."""
     controller_step_ms: StepTimes
     delay: DelaySummary
     wall_s: float
-    """Time that the run took, s."""
+    """Computing time of the run, s."""
     counts: dict[str, int]
-    """What went wrong and was survived, by name (`law.memory.Counts`, `tuner_fallbacks`)."""
+    """Number of survived problems by name (`law.memory.Counts`, `tuner_fallbacks`)."""
     link: dict[str, Any]
     """The assumed link with all its numbers (`Scenario.assumed_link`)."""
     own: dict[str, str]
-    """The user's own systems in the loop, by their part in it."""
+    """Classes of the user's systems by role."""
     scenario: dict[str, Any]
     """As run."""
     versions: dict[str, str]
-    """What the numbers depend on beside the scenario."""
+    """Releases of the software."""
     controller_margin: MarginSummary | None
-    """None where it was not asked for."""
+    """None if not requested."""
     warnings: list[str]
-    """What the user should know of this run, a sentence each."""
+    """Warnings about this run, a sentence each."""
 
 
 class LiveSummary(RunSummary):
-    """The same of a run in real time."""
+    """Summary of a run in real time."""
 
     live: dict[str, Any]
-    """How periodic it was, what the link did, and what was done about it."""
+    """Periodicity, link, and reactions to its faults."""
 
 
 @dataclass(frozen=True)
@@ -223,12 +220,11 @@ class SimulationResult:
         stopped: when and why a run did not complete, or None.
         signals: over `time` (every 20 ms and every sample of the controller, or the scenario's
             `log_period`): pose, rates, reference, reference_rates, error, integral,
-            torque_commanded (what the law asked for), torque_applied (what acted of it: within the
-            limit, late), weights, parameters and parameter_std (estimated), density (45),
-            measurement (12, or 6 crank angles per sample of encoders) and state_estimate (12) of
-            the controller. Held signals show the value from that instant on. Units, long names, the
-            scenario and versions are attributes.
-        summary: what `summary.json` holds.
+            torque_commanded (of the law), torque_applied (limited and delayed), weights, parameters
+            and parameter_std (estimated), density (45), measurement (12, or 6 crank angles per
+            sample of encoders) and state_estimate (12) of the controller. A held value is that
+            from the instant on. Units, long names, the scenario and versions are attributes.
+        summary: content of `summary.json`.
     """
 
     scenario: Scenario
@@ -248,11 +244,11 @@ class SimulationResult:
 
     @property
     def failure(self) -> str | None:
-        """Why the run ended early, with the time, or None."""
+        """Reason of an early end, with the time, or None."""
         return None if self.stopped is None else str(self.stopped)
 
     def save(self, directory: str | Path) -> None:
-        """Write signals.nc and summary.json into a directory, which is made; each whole or not.
+        """Write signals.nc and summary.json into a directory, made if missing.
 
         Raises:
             OSError: the directory cannot be written to.

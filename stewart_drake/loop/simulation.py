@@ -1,4 +1,4 @@
-"""Running a scenario."""
+"""Simulation of a scenario."""
 
 import time as clock
 from collections.abc import Callable
@@ -50,47 +50,45 @@ def simulate(
 ) -> SimulationResult:
     """Run a scenario from t = 0 to its duration, or until the plate leaves its workspace.
 
-    Ctrl-C ends the run with what has been computed, status `interrupted`.
+    Ctrl-C ends the run with the results so far, status `interrupted`.
 
-    Systems of your own are given as an instance, which serves one run, or as what makes one, such
-    as their class. `own` of the summary names them. What only the shipped controller has, estimates
-    and weights among it, is then NaN on record, its counts are 0, and the loop is not judged.
+    A system of your own is an instance for one run, or a function that makes one, such as its
+    class. `own` of the summary names them. With a controller of your own, estimates and weights are
+    NaN in the record, counts are 0, and the loop is not judged.
 
     Args:
-        scenario: what to run, or what `prepare` made of it, or a shipped name or file as
-            `load_scenario` takes it.
-        controller: a Drake system in the place of the shipped controller, with the inputs
-            `measurement` (12: pose and rates as the sensor has them, rad, m and per s) and, if it
-            wants, `reference` (18: pose, rates, accelerations that the plate shall have now), and
-            the output `torque` (6, N m), which is read every `controller.period`, held, limited and
-            delayed like any other.
-        reference: a 6 x 1 Drake Trajectory of the pose with derivatives of order 1 and 2, in the
-            place of the scenario's. It is held where it ends.
+        scenario: a scenario, prepared or not, or a shipped name or file as for `load_scenario`.
+        controller: a Drake system that replaces the shipped controller, with the inputs
+            `measurement` (12: measured pose and rates, rad, m and per s) and optionally `reference`
+            (18: present pose, rates, accelerations), and the output `torque` (6, N m), which is
+            read every `controller.period`, held, limited and delayed.
+        reference: a 6 x 1 Drake Trajectory of the pose with derivatives of order 1 and 2, held
+            after its end.
         disturbance: a Drake system with the output `torque` (6, N m), added at the shafts, or
-            `wrench` (6: moment in N m, force in N, in the world, at the plate's COM), or both.
-            Nobody is told of it.
+            `wrench` (6: moment in N m, force in N, in the world, at the plate's COM), or both,
+            unknown to the controller.
         modify_law: a function that takes the scenario's law, a `law.predictive_lqi.PredictiveLqi`,
-            and returns the one to use, such as `dataclasses.replace(law, observer=Mine())`.
+            and returns another, such as `dataclasses.replace(law, observer=Mine())`.
         sensor: a Drake system with the input `state` (12) and the output `measurement` (12; NaN is
-            lost), read every `controller.period`; the scenario's noise and faults are its affair.
-            Neither this nor a controller goes with the scenario's encoders.
-        link: a Drake system with the input `commanded` (6, N m, as it was limited) and the output
-            `torque` (6, what arrives now); the law goes on believing what the scenario says.
+            lost), read every `controller.period`, without the scenario's noise and faults. Neither
+            this nor a controller is possible with encoders.
+        link: a Drake system with the input `commanded` (6, N m, limited) and the output `torque`
+            (6, arriving now); the law still assumes the scenario's link.
         tuner: a Drake system with the output `weights` (2: w_Q, w_R), read every
             `controller.period`, and of the inputs `density` (18), `measurement` (12) and
-            `reference` (18) those that it wants. With encoders `measurement` is the estimate of the
+            `reference` (18) those that it needs. With encoders `measurement` is the estimate of the
             sample before.
-        progress: called every 20 ms of simulated time; what it raises reaches the caller.
-        meshcat: where the machine, its reference and the torques are shown live, or None; the run
-            then takes at least as long as its duration.
+        progress: called every 20 ms of simulated time; its exceptions reach the caller.
+        meshcat: shows the machine, its reference and the torques live, at most in real time, or
+            None.
         true_mechanism: the machine to simulate; by default that of the scenario's plant.
         judge_stability: whether to judge the loop before the run, in some tenths of a second, for
-            `controller_margin` and `warnings` of the summary; or the `controller_margin` that is
-            known already. With false, for many runs, `controller_margin` of the summary is None.
+            `controller_margin` (else None) and `warnings` of the summary; or its known
+            `controller_margin`.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
-        TypeError: what is no scenario at all, or a `true_mechanism` beside an `Experiment`.
+        TypeError: another type of scenario, or systems of your own with an `Experiment`.
     """
     if isinstance(scenario, str | Path):
         scenario = load_scenario(scenario)
@@ -99,7 +97,7 @@ def simulate(
             f"scenario: got a {type(scenario).__name__}; expected a Scenario, or the name or path "
             "of one"
         )
-    # Matrices of twenty rows are slower on several threads, fifty times so where cores are busy.
+    # Matrices of twenty rows are slower on several threads, up to fifty times on busy cores.
     with one_blas_thread:
         experiment = concrete(
             scenario,
@@ -155,18 +153,18 @@ def _run(
 def _advance(
     simulator: Simulator, recorder: Recorder, loop: ClosedLoop, progress: Progress | None
 ) -> tuple[str, Failure | None]:
-    """Run to the end and record; how it ended, and what stopped it before."""
+    """Run to the end and record; return status and the reason of an early end."""
     sc, context = loop.experiment.scenario, simulator.get_context()
     try:
         for instant in instants(sc.duration, sc.controller.period, sc.log_period):
             t = instant.time
-            # Only here: a RuntimeError of `progress` is not one of Drake's.
+            # Without `progress`, whose RuntimeError is not Drake's.
             try:
                 left = _advance_to(t, simulator, recorder)
             except RuntimeError as error:
                 if _raised_elsewhere(error):
                     raise
-                # Drake's solver gives up where constraints and dynamics contradict each other.
+                # Drake's solver fails where constraints and dynamics contradict each other.
                 return "solver_failed", Failure(context.get_time(), None, np.nan, _one_line(error))
             if left:
                 return "left_workspace", _failure(loop, context)
@@ -179,13 +177,13 @@ def _advance(
 
 
 def _raised_elsewhere(error: Exception) -> bool:
-    """Whether it came through Python code that is not ours, that of a user's own system."""
+    """Return whether an error comes from Python code of the user."""
     frames = walk_tb(error.__traceback__)
     return any(not str(f.f_globals.get("__name__")).startswith(_PACKAGE) for f, _ in frames)
 
 
 def _advance_to(t: float, simulator: Simulator, recorder: Recorder) -> bool:
-    """Simulate to t in s and look at the plant there; true if the plate left before."""
+    """Simulate to t in s and read the plant; return True if the plate left before."""
     if t == 0:
         simulator.Initialize()
     else:
@@ -193,13 +191,13 @@ def _advance_to(t: float, simulator: Simulator, recorder: Recorder) -> bool:
         if outcome.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition:
             return True
     recorder.look(simulator.get_context(), t)
-    if t == 0:  # only here are the events of the instant still to come
+    if t == 0:  # the events of this instant are still pending
         simulator.AdvancePendingEvents()
     return False
 
 
 def _shown(simulator: Simulator, live: Live, progress: Progress | None) -> Progress:
-    """Progress that also shows the loop, of a simulator that now keeps to real time."""
+    """Return a progress function that also shows the loop, and slow the run to real time."""
     context = simulator.get_context()
     simulator.set_target_realtime_rate(1.0)
 
@@ -212,7 +210,7 @@ def _shown(simulator: Simulator, live: Live, progress: Progress | None) -> Progr
 
 
 def make_simulator(loop: ClosedLoop) -> Simulator:
-    """A simulator of the loop at its initial context, integrating as the scenario says."""
+    """Return a simulator of the loop at its initial context, with the scenario's accuracy."""
     plant = loop.experiment.scenario.plant
     context = loop.CreateDefaultContext()
     simulator = Simulator(loop, context)

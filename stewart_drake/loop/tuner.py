@@ -107,7 +107,7 @@ class AnnTuner(LeafSystem):
 
     If input or output of the network is not finite, the weights return towards `fixed`, and n
     counts it. The weights of sample k depend on samples up to k - 1: the window takes sample k and
-    T_k in its update, so that there is no algebraic loop.
+    T_k in its update, without an algebraic loop.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
