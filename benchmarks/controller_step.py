@@ -35,7 +35,7 @@ SCENARIOS = {"paper": ["duration=10.0"], "gravity": ["duration=2.0"]}
 ESTIMATORS = {"parameters": "[torque_bias,payload,damping]", "none": "[]"}
 PARTS = {
     "observe": (CoreObserver, "observe"),
-    "predict": (NonlinearPredictor, "ahead"),
+    "predict": (NonlinearPredictor, "predict"),
     "feedforward": (Feedforward, "held"),
     "linear model": (DesignModel, "at"),
     "sample": (QuadraticCost, "sampled"),

@@ -430,8 +430,8 @@ def test_predicted_integral_waits_in_the_same_periods(fraction):
     predicted = []
 
     class Spy(NonlinearPredictor):
-        def ahead(self, *arguments):
-            result = super().ahead(*arguments)
+        def predict(self, *arguments):
+            result = super().predict(*arguments)
             predicted.append(result.integral)
             return result
 

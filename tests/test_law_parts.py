@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.design_models import MultibodyModel, PaperModel
@@ -18,7 +19,6 @@ from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.nominal import FINE_SUBSTEP_FACTOR, NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver
-from stewart_drake.law.return_path import ReturnPath
 from stewart_drake.law.sensing import FirstState, StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
@@ -394,9 +394,33 @@ def test_a_delay_longer_than_what_is_kept_is_refused():
         Loop(law, lambda t: HOME).run(1)
 
 
+class ReturnPath:
+    """A `stewart_way_back`."""
+
+    def __init__(self, way):
+        self._way = way
+        self.offset, self.holds, self.samples = np.array(list(way.offset)), way.holds, way.samples
+
+    @property
+    def active(self):
+        return self.holds + self.samples > 0
+
+    def after(self, h):
+        way = core().ffi.new("stewart_way_back *", self._way[0])
+        core().lib.stewart_go_on_way_back(way, h)
+        return ReturnPath(way)
+
+    def at(self, time, h):
+        row = np.zeros(18)
+        core().lib.stewart_add_offset(self._way[0], h, time, core().at(row))
+        return row
+
+
 def path(period, seed=1):
     offset = np.random.default_rng(seed).normal(0, 1, NUM_STATE)
-    return ReturnPath.of(offset, Timeline(period, Delay(8, 0.0)))
+    way = core().ffi.new("stewart_way_back *")
+    core().lib.stewart_begin_way_back(core().at(offset), period, 8, way)
+    return ReturnPath(way)
 
 
 @pytest.mark.parametrize(("period", "holds"), [(0.1, 3), (0.02, 15), (0.15, 2), (0.5, 2)])

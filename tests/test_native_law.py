@@ -307,8 +307,8 @@ def test_after_a_gap_the_way_back_is_that_of_python(case, first, number):
         one, other = pair.one, pair.other
         peak = max(peak, float(np.abs(one.torque).max()))
         assert one.counts == other.counts, k
-        back = one.back
-        assert [one.gap, back.holds, back.samples] == [*other.gap, *other.way_back], k
+        back = one.course
+        assert [back.gap, back.holds, back.samples] == [*other.gap, *other.way_back], k
         if back.holds:
             assert np.allclose(back.offset, other.offset, rtol=1e-6, atol=1e-8), k
     assert max(gaps) <= 1e-8 * peak

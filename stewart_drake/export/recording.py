@@ -16,7 +16,7 @@ from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import KnownMotion, Motion
 from stewart_drake.law.observers import CoreObserver
-from stewart_drake.law.planner import Rejoin
+from stewart_drake.law.planner import Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
 from stewart_drake.loop.simulation import simulate
@@ -77,7 +77,7 @@ class Recorded:
         """Whether the law asks for the reference at instants that it finds itself."""
         law = self.law
         return isinstance(law, PredictiveLqi) and (
-            law.finds_delay or isinstance(law.planner, Rejoin)
+            law.finds_delay or isinstance(law.planner, Replan)
         )
 
     def tabulated(self, motion: Motion, duration: float) -> Motion:
@@ -101,7 +101,7 @@ class Recorded:
         if law.finds_delay:
             assert isinstance(law.observer, CoreObserver)
             most = law.observer.max_schedule_length(period)
-        plan = law.planner.duration if isinstance(law.planner, Rejoin) else 0.0
+        plan = law.planner.duration if isinstance(law.planner, Replan) else 0.0
         return plan + (most + 4) * period
 
 

@@ -15,7 +15,7 @@ from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver, DelaySettings, Observer
-from stewart_drake.law.planner import NoPlanner, Planner, Rejoin
+from stewart_drake.law.planner import NoPlanner, Planner, Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.predictors import (
     ArrivalPredictor,
@@ -54,7 +54,7 @@ __all__ = [
     "PredictiveLqi",
     "Predictor",
     "QuadraticCost",
-    "Rejoin",
+    "Replan",
     "Sensing",
     "ServoPreview",
     "StateSensing",

@@ -31,7 +31,7 @@ from stewart_drake.law.memory import Counts, Memory
 from stewart_drake.law.motion import KnownMotion, Motion
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver, belief_of, part_of
-from stewart_drake.law.planner import NoPlanner, Rejoin
+from stewart_drake.law.planner import NoPlanner, Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.predictors import ArrivalPredictor, NonlinearPredictor
 from stewart_drake.law.sensing import StateSensing
@@ -72,7 +72,7 @@ def uncovered(law: PredictiveLqi | ServoPreview) -> str | None:
     if isinstance(law, PredictiveLqi):
         covered |= {
             "controller.delay_steps": type(law.timeline) is Timeline,
-            "controller.replan": type(law.planner) in (NoPlanner, Rejoin),
+            "controller.replan": type(law.planner) in (NoPlanner, Replan),
             "controller.prediction": type(law.predictor) is _predictor(law),
             "controller.model": type(law.model) is MultibodyModel,
             "controller.integral": type(law.cost) is QuadraticCost,
@@ -156,10 +156,10 @@ class CompiledLaw:
             self.tables[address_of(d.channel)] = "stewart_network"
             self.keep += [d.packets, *arrays]
             self.sources += ("network.c", "packets.c")
-        if isinstance(law.planner, Rejoin):
+        if isinstance(law.planner, Replan):
             self._plans(law.planner)
 
-    def _plans(self, planner: Rejoin) -> None:
+    def _plans(self, planner: Replan) -> None:
         c, d, law = core(), self.data, self.law
         plan, until = c.ffi.new("stewart_replan *"), law.timeline.queue_length
         if law.finds_delay:

@@ -1,4 +1,4 @@
-"""The cost that the gain minimises, and the gain."""
+"""Cost that the gain minimises, and the gain."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +18,7 @@ class QuadraticCost:
 
     Attributes:
         errors: (6,) scale of the pose error, 1 / s^2.
-        integrals: (6,) scale of its integral, or None for a law that does not integrate.
+        integrals: (6,) scale of its integral, or None for a law without one.
         torques: (6,) scale of the torques.
     """
 
@@ -31,12 +31,12 @@ class QuadraticCost:
         """Whether the law has an integral."""
         return self.integrals is not None
 
-    def sees(self, integral: Array) -> Array:
-        """What the gain multiplies of an integral (6,): all or nothing."""
+    def regulated(self, integral: Array) -> Array:
+        """Return the part of an integral (6,) that the gain multiplies: all or nothing."""
         return integral if self.integrates else np.empty(0)
 
     def matrices(self, weights: Array) -> tuple[Array, Array]:
-        """w_Q Q and w_R R, of w_Q and w_R (2,)."""
+        """Return w_Q Q and w_R R for w_Q and w_R (2,)."""
         Q, R = self._unweighted
         return weights[0] * Q, weights[1] * R
 
@@ -46,7 +46,7 @@ class QuadraticCost:
         return np.diag(np.concatenate(scales)), np.diag(self.torques)
 
     def sampled(self, model: ContinuousModel, timeline: Timeline) -> DelayedModel:
-        """`law.delay_model.delayed_model`, with the integral if there is one.
+        """Return `law.delay_model.delayed_model`, with the integral if there is one.
 
         Raises:
             FloatingPointError: the model cannot be sampled.
@@ -55,7 +55,7 @@ class QuadraticCost:
         return delayed_model(model, period, steps, fraction, integral=self.integrates)
 
     def gain(self, model: DelayedModel, weights: Array) -> Array:
-        """`law.riccati.reduced_gain` of what `sampled` returned.
+        """Return `law.riccati.reduced_gain` of a model from `sampled`.
 
         Raises:
             RiccatiError: there is no gain.

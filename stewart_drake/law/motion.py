@@ -1,16 +1,18 @@
-"""The motion that a law is to follow, as a function of the time from now."""
+"""The motion that a law follows, as a function of the time from now."""
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.core.library import core
-from stewart_drake.law.timeline import Timeline
-from stewart_drake.scenario.signals import NUM_REFERENCE
+from stewart_drake.law.belief import Belief
+from stewart_drake.law.compiled import machine_of, numbers
+from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.timeline import TorqueSchedule
+from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
@@ -21,18 +23,18 @@ them may be negative."""
 
 @dataclass(frozen=True)
 class Preview:
-    """A motion that is known at some instants only, those that a law asks for.
+    """A motion that is known at the instants that a law asks for.
 
     Attributes:
         times: (p,) s from now.
-        reference: (p, 18) there.
+        reference: (p, 18).
     """
 
     times: Array
     reference: Array
 
     def __call__(self, times: Array) -> Array:
-        """The reference at all of `times`.
+        """Return the reference at all of `times`.
 
         Raises:
             ValueError: at other instants than those.
@@ -51,11 +53,11 @@ class KnownMotion:
     """A motion that is known at all times.
 
     Attributes:
-        planned: what is followed, a trajectory (6, 1): the way onto the reference, then that.
-        reference: what there is to come back to.
+        planned: trajectory (6, 1) to follow: the way onto the reference, then the reference.
+        reference: trajectory that a new plan leads back to.
         now: s, on the clock of both.
-        pieces: (n, 38) of what was planned in flight, see core/planning.h, in the place of
-            `planned`; then comes the reference.
+        pieces: (n, 38) of a plan made in flight, see core/planning.h, which replaces `planned`
+            until its end; then the reference follows.
     """
 
     planned: Trajectory
@@ -80,39 +82,78 @@ class KnownMotion:
         return evaluate(self.reference, time)
 
 
-class Previewed(NamedTuple):
-    """A reference as it was followed: instants (p,) in s from its sample, rows (p, 18) there."""
+@dataclass(frozen=True)
+class Course:
+    """Preview of a sample, and the rows that the law followed, see core/reference.h.
+
+    Attributes:
+        times: (p,) s from the sample.
+        reference: (p, 18), with numbers for what was missing; NaN before the first preview.
+        followed: (p, 18) the same with the way back after a gap.
+        missing: whether anything was missing in the preview.
+        gap: whether its last row was.
+        offset: (12,) from the reference where the next torque acts, after a gap.
+        holds: number of holds until the offset is zero.
+        samples: number of samples after that until no torque of the way back is in flight.
+    """
 
     times: Array
     reference: Array
+    followed: Array
+    missing: bool = False
+    gap: bool = False
+    offset: Array = field(default_factory=lambda: np.zeros(NUM_STATE))
+    holds: int = 0
+    samples: int = 0
 
     @classmethod
-    def nothing(cls, times: Array) -> "Previewed":
-        """Return one that is not known at any of the instants."""
-        return cls(times, np.full((len(times), NUM_REFERENCE), np.nan))
+    def unknown(cls, times: Array) -> "Course":
+        """Return the course before the first preview."""
+        nothing = np.full((len(times), NUM_REFERENCE), np.nan)
+        return cls(times, nothing, nothing)
 
+    def following(
+        self,
+        times: Array,
+        given: Array,
+        belief: Belief,
+        schedule: TorqueSchedule,
+        plant: NominalPlant,
+        quiet: bool,
+    ) -> "Course":
+        """Return the course of the next sample.
 
-def completed(
-    given: Previewed, last: Previewed, timeline: Timeline, geometry: Array | None
-) -> Array:
-    """Return the reference (p, 18), with numbers for what is NaN or infinite in the given one.
+        Args:
+            times: (p,) of its preview, s.
+            given: (p, 18) its preview, NaN or infinite where it is missing.
+            belief: now.
+            schedule: torques until the next one acts.
+            plant: model of the plant.
+            quiet: whether nothing is fed back yet.
+        """
+        c, rows, timeline = core(), (len(times), NUM_REFERENCE), belief.timeline
+        course, asked = Course(times, np.empty(rows), np.empty(rows)), numbers(given, *rows)
+        state, theta, *torques = map(numbers, (belief.state, belief.parameters, *schedule))
+        delay = timeline.period, timeline.queue_length, timeline.eta
+        until = [len(torques[0]), *map(c.at, torques), 0]
+        motion = c.ffi.new(
+            "stewart_course_input *",
+            [machine_of(plant).it, *delay, c.at(state), c.at(theta), until, quiet],
+        )
+        last, found = self._compiled(), course._compiled()
+        scratch = c.scratch(2 * NUM_REFERENCE * len(times) + NUM_STATE * (len(torques[0]) + 1))
+        c.lib.stewart_follow(motion, last, c.at(asked), found, scratch)
+        back = found.back
+        way = {"offset": np.array(list(back.offset)), "holds": back.holds, "samples": back.samples}
+        return replace(course, missing=bool(found.missing), gap=bool(found.gap), **way)
 
-    They lie between the rows next to them in time, of this preview or of the last one, or continue
-    one of them. Without any complete row, which is at the start only, they stay missing.
-
-    Args:
-        given: for this sample.
-        last: what `completed` returned for the sample before, with its instants.
-        timeline: period and delay.
-        geometry: of the machine, or None where any pose is within reach.
-    """
-    if np.all(np.isfinite(given.reference)):
-        return given.reference
-    c, rows = core(), np.empty((len(given.times), NUM_REFERENCE))
-    previews, where = (_preview(given), _preview(last)), c.at(geometry)
-    times = timeline.period, timeline.eta
-    c.lib.stewart_complete(where, *times, previews[0][0], -math.inf, previews[1][0], c.at(rows))
-    return rows
+    def _compiled(self) -> Any:
+        """Return the `stewart_course`."""
+        c = core()
+        arrays = map(c.at, (self.times, self.reference, self.followed))
+        back = [self.offset.tolist(), self.holds, self.samples]
+        given = [len(self.times), *arrays, self.missing, self.gap, back]
+        return c.ffi.new("stewart_course *", given)
 
 
 def between(a: Array, b: Array, h: float, s: float) -> Array:
@@ -123,18 +164,3 @@ def between(a: Array, b: Array, h: float, s: float) -> Array:
     c, row = core(), np.empty(NUM_REFERENCE)
     c.lib.stewart_between(c.at(a), c.at(b), h, s, c.at(row))
     return row
-
-
-def interpolated(times: Array, reference: Array, time: float) -> Array:
-    """Return the reference (18,) at `time`, between the rows before and after it."""
-    c, row = core(), np.empty(NUM_REFERENCE)
-    known = _preview(Previewed(times, reference))
-    c.lib.stewart_interpolate(known[0], time, c.at(row))
-    return row
-
-
-def _preview(known: Previewed) -> tuple[Any, ...]:
-    """Return the `stewart_preview` of core/reference.h, and what it points to."""
-    c = core()
-    kept = [np.ascontiguousarray(a, np.float64) for a in known]
-    return c.ffi.new("stewart_preview *", [len(kept[0]), *map(c.at, kept)]), kept

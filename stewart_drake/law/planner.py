@@ -1,10 +1,10 @@
-"""The way back onto the reference, planned in flight.
+"""Planning of the way back onto the reference, in flight.
 
-When the prediction is far off the reference, as where the delay has just been found or has jumped,
-feedback of a large error through a long delay is no good way back. What the torques in flight do
-cannot be changed; from the instant on from which the next one acts, `law.catch_up` plans a way that
-held torques can follow without error. What is followed from now on is the predicted way, then the
-plan, then the reference: there is no error left to feed back, and the integral begins anew.
+Where the prediction is far off the reference, as where the delay has just been found or has
+changed, feedback of a large error through a long delay gives a poor way back. The torques in flight
+cannot be changed. From the instant on at which the next one acts, `law.catch_up` plans a motion
+that held torques follow without error. The law then follows the predicted motion, the plan, and the
+reference: no error is left to feed back, and the integral begins anew.
 """
 
 from dataclasses import dataclass, replace
@@ -21,14 +21,18 @@ from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array
 
 
-class Followed(NamedTuple):
-    """What the law is to follow."""
+class FollowedMotion(NamedTuple):
+    """Motion to follow.
+
+    Attributes:
+        motion: as a function of the time from now.
+        path: (n, 38) pieces that were planned in flight, see core/planning.h, or None.
+        replanned: whether they were planned at this sample.
+    """
 
     motion: Motion
     path: Array | None
-    """(n, 38) pieces of what was planned in flight, see core/planning.h, or None."""
-    anew: bool
-    """Whether it was planned now."""
+    replanned: bool
 
 
 class Planner(Protocol):
@@ -41,22 +45,22 @@ class Planner(Protocol):
         in_flight: Array,
         motion: Motion,
         plant: NominalPlant,
-    ) -> Followed:
-        """What to follow from now on.
+    ) -> FollowedMotion:
+        """Return the motion to follow from now on.
 
         Args:
             path: pieces (n, 38) planned before, or None.
-            belief: of now.
+            belief: now.
             in_flight: (n, 6) torques, before this sample's.
             motion: that is asked for.
-            plant: as it is known.
+            plant: model of the plant.
         """
         ...
 
 
 @dataclass(frozen=True)
 class NoPlanner:
-    """Follows what is asked for."""
+    """Follows the motion that is asked for."""
 
     def follow(
         self,
@@ -65,14 +69,13 @@ class NoPlanner:
         in_flight: Array,
         motion: Motion,
         plant: NominalPlant,
-    ) -> Followed:
-        """See `Planner.follow`."""
-        return Followed(motion, None, False)
+    ) -> FollowedMotion:
+        return FollowedMotion(motion, None, False)
 
 
 @dataclass(frozen=True)
-class Rejoin:
-    """Plans a way back where the prediction is off.
+class Replan:
+    """Plans a way back where the prediction is off the reference.
 
     Attributes:
         duration: of the plan, s.
@@ -89,12 +92,12 @@ class Rejoin:
         in_flight: Array,
         motion: Motion,
         plant: NominalPlant,
-    ) -> Followed:
-        """See `Planner.follow`; only a `KnownMotion` can be left and come back to."""
+    ) -> FollowedMotion:
+        """Return the motion to follow; a plan takes a `KnownMotion`."""
         if not isinstance(motion, KnownMotion):
-            return Followed(motion, path, False)
+            return FollowedMotion(motion, path, False)
         followed = motion if path is None else replace(motion, pieces=path)
-        before = Followed(followed, path, False)
+        before = FollowedMotion(followed, path, False)
         if not (belief.has_state and belief.settled):
             return before
         timeline, c = belief.timeline, core()
@@ -108,6 +111,6 @@ class Rejoin:
         begin, periods = motion.now + timeline.eta, periods_of(self.duration, timeline.period)
         plan = model.plan(motion.reference, states[-1], begin, timeline.period, periods)
         if plan is None:
-            return before  # there is none from here; the next sample may see another
+            return before  # there is none from here; the next sample may find one
         pieces = np.vstack([model.way(schedule, states, motion.now), plan.pieces])
-        return Followed(replace(motion, pieces=pieces), pieces, True)
+        return FollowedMotion(replace(motion, pieces=pieces), pieces, True)

@@ -1,4 +1,4 @@
-"""Error and integral at the instant from which the next torque acts."""
+"""Prediction of error and integral at the instant at which the next torque begins to act."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -15,44 +15,41 @@ from stewart_drake.scenario.signals import POSE, RATES
 from stewart_drake.types import Array
 
 
-class Ahead(NamedTuple):
-    """What the gain multiplies, and where it is designed."""
+class PredictedState(NamedTuple):
+    """State (12,) to linearise at, its error (12,), and the integral (6,) of the pose error."""
 
-    point: Array
-    """(12,) state to linearise at."""
+    state: Array
     error: Array
-    """(12,) of the state."""
     integral: Array
-    """(6,) of the pose error."""
 
 
 class Predictor(Protocol):
     """A kind of prediction. Instances are immutable."""
 
     def samples(self, timeline: Timeline) -> Array:
-        """(s,) instants, s from now, at which it compares with the reference, beside now."""
+        """Return the instants (s,), s from now, of comparisons with the reference, beside now."""
         ...
 
     def pending(self, timeline: Timeline) -> int:
-        """How many of the newest torques in flight enter linearly, by the gain."""
+        """Return the number of newest torques in flight that enter linearly, by the gain."""
         ...
 
-    def ahead(
+    def predict(
         self, belief: Belief, integral: Array, queue: Array, wanted: Array, plant: NominalPlant
-    ) -> Ahead:
-        """Go ahead as far as the gain does not.
+    ) -> PredictedState:
+        """Predict, except for the part that is left to the gain.
 
         Args:
-            belief: of now.
+            belief: now.
             integral: (6,) of the pose error, now.
-            queue: (L, 6) torques in flight, the oldest first.
+            queue: (L, 6) torques in flight, oldest first.
             wanted: (1 + s, 12) reference now and at `samples`.
-            plant: as it is known.
+            plant: model of the plant.
         """
         ...
 
     def gain(self, K: Array, model: DelayedModel) -> Array:
-        """(6, n) on [error; integral; pending torques], of the `reduced_gain` K of a model."""
+        """Return the gain (6, n) on [error; integral; pending torques] for a `reduced_gain` K."""
         ...
 
     def model(
@@ -63,7 +60,7 @@ class Predictor(Protocol):
         parameters: Array,
         plant: NominalPlant,
     ) -> ContinuousModel:
-        """What it comes to where errors are small, about a state (12,) under a torque (6,).
+        """Return the linearisation of the prediction about a state (12,) under a torque (6,).
 
         `design` is the model of the gain there.
         """
@@ -72,24 +69,21 @@ class Predictor(Protocol):
 
 @dataclass(frozen=True)
 class LinearPredictor:
-    """Leaves it to the gain: that of the whole queue, K_aug, which is the paper's."""
+    """Prediction by the gain of the whole queue, K_aug, as in the paper."""
 
     def samples(self, timeline: Timeline) -> Array:
-        """None."""
         return np.empty(0)
 
     def pending(self, timeline: Timeline) -> int:
-        """All."""
         return timeline.queue_length
 
-    def ahead(
+    def predict(
         self, belief: Belief, integral: Array, queue: Array, wanted: Array, plant: NominalPlant
-    ) -> Ahead:
-        """What is now."""
-        return Ahead(belief.state, belief.state - wanted[0], integral)
+    ) -> PredictedState:
+        return PredictedState(belief.state, belief.state - wanted[0], integral)
 
     def gain(self, K: Array, model: DelayedModel) -> Array:
-        """K_aug = K times the prediction by the model of the gain."""
+        """Return K_aug, K times the prediction by the model of the gain."""
         return K @ prediction_matrix(model)
 
     def model(
@@ -100,42 +94,36 @@ class LinearPredictor:
         parameters: Array,
         plant: NominalPlant,
     ) -> ContinuousModel:
-        """That of the gain."""
         return design
 
 
 @dataclass(frozen=True)
 class NonlinearPredictor:
-    """Integrates the exact equations over mu periods, through the torques in flight."""
+    """Integration of the exact equations over mu periods, with the torques in flight.
+
+    A torque that still acts for eta0 by then is left to the gain.
+    """
 
     def samples(self, timeline: Timeline) -> Array:
-        """Every sample until the torque acts."""
         return timeline.samples
 
     def pending(self, timeline: Timeline) -> int:
-        """The one that is still to act for eta0 by then, if any."""
         return timeline.queue_length - timeline.steps
 
-    def ahead(
+    def predict(
         self, belief: Belief, integral: Array, queue: Array, wanted: Array, plant: NominalPlant
-    ) -> Ahead:
-        """The integral waits in every period in which a motor is at its limit."""
+    ) -> PredictedState:
+        """Predict; the integral waits in every period with a motor at its limit."""
         x, timeline = belief.state, belief.timeline
         if timeline.steps == 0:
-            return Ahead(x, x - wanted[0], integral)
-        # The queue ends with the torque that is still to act for eta0 after the last sample.
-        schedule = timeline.schedule(queue)
-        each = timeline.per_period
+            return PredictedState(x, x - wanted[0], integral)
+        schedule, each = timeline.schedule(queue), timeline.per_period
         ends = plant.predict(x, schedule, belief.parameters)[each - 1 :: each]
-        states = np.vstack([x, ends])
-        errors = states - wanted
-        added = timeline.period / 2 * (errors[:-1, POSE] + errors[1:, POSE])
-        held = [plant.motors.reached(t) for t in schedule.torques.reshape(timeline.steps, -1)]
-        integral = integral + added[~np.array(held)].sum(axis=0)
-        return Ahead(states[-1], errors[-1], integral)
+        durations = np.full(timeline.steps, timeline.period)
+        torques = schedule.torques.reshape(timeline.steps, -1)
+        return _compared(np.vstack([x, ends]), wanted, durations, torques, integral, plant)
 
     def gain(self, K: Array, model: DelayedModel) -> Array:
-        """K: the prediction is made."""
         return K
 
     def model(
@@ -146,26 +134,36 @@ class NonlinearPredictor:
         parameters: Array,
         plant: NominalPlant,
     ) -> ContinuousModel:
-        """The equations that it integrates."""
         derivatives = plant.dynamics.derivatives(state[POSE], state[RATES], torque, parameters)
         return linear_model(derivatives.A, derivatives.B)
 
 
 @dataclass(frozen=True)
 class ArrivalPredictor(NonlinearPredictor):
-    """Integrates to the very instant from which the next torque acts, whatever part of a period."""
+    """Integration to the exact instant at which the next torque acts, for an estimated delay."""
 
     def pending(self, timeline: Timeline) -> int:
-        """None: by then all have acted."""
         return 0
 
-    def ahead(
+    def predict(
         self, belief: Belief, integral: Array, queue: Array, wanted: Array, plant: NominalPlant
-    ) -> Ahead:
-        """The integral goes on from one change of torque to the next."""
+    ) -> PredictedState:
+        """Predict; the integral continues from one change of torque to the next."""
         schedule = belief.timeline.until_next(queue)
         states = np.vstack([belief.state, plant.predict(belief.state, schedule, belief.parameters)])
-        errors = states - wanted
-        added = schedule.durations[:, None] / 2 * (errors[:-1, POSE] + errors[1:, POSE])
-        held = [plant.motors.reached(torque) for torque in schedule.torques]
-        return Ahead(states[-1], errors[-1], integral + added[~np.array(held)].sum(axis=0))
+        return _compared(states, wanted, schedule.durations, schedule.torques, integral, plant)
+
+
+def _compared(
+    states: Array,
+    wanted: Array,
+    durations: Array,
+    torques: Array,
+    integral: Array,
+    plant: NominalPlant,
+) -> PredictedState:
+    """Return the last of states (1 + n, 12), with the integral over n intervals with torques."""
+    errors = states - wanted
+    added = durations[:, None] / 2 * (errors[:-1, POSE] + errors[1:, POSE])
+    free = np.array([not plant.motors.reached(torque) for torque in torques], bool)
+    return PredictedState(states[-1], errors[-1], integral + added[free].sum(axis=0))

@@ -32,7 +32,7 @@ from stewart_drake.law.filter_settings import (
 )
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver, DelaySettings
-from stewart_drake.law.planner import NoPlanner, Rejoin
+from stewart_drake.law.planner import NoPlanner, Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.predictors import (
     ArrivalPredictor,
@@ -175,7 +175,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
             law,
             observer=CoreObserver(settings, delay),
             predictor=ArrivalPredictor(),
-            planner=Rejoin(c.replan, experiment.scale) if c.replan > 0 else NoPlanner(),
+            planner=Replan(c.replan, experiment.scale) if c.replan > 0 else NoPlanner(),
             silence=0,  # until the delay is found
         )
     return experiment.own.revised(law)
