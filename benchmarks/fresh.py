@@ -1,17 +1,15 @@
 """Compare the law with 0.2 under drawn conditions that were used for no tuning.
 
-`python benchmarks/fresh.py [JOBS]` prints E_ac of each condition, and its ratio to 0.2's. A condition
-is a machine, a motion, a delay, a period, a sensor, a link and unknown parameters, drawn from SEED.
-Each runs with three seeds of its noise and signs, on the exact plant. fresh_0.2.json has the same
+`python benchmarks/fresh.py` prints E_ac of each condition, and its ratio to 0.2's. A condition is
+a machine, a motion, a delay, a period, a sensor, a link and unknown parameters, drawn from SEED. Each runs with three seeds of its noise and signs, on the exact plant. fresh_0.2.json has the same
 runs of 0.2's law: condition, seed, E_ac.
 """
 
 import json
-import sys
+from pathlib import Path
 
 import numpy as np
-from _bench import RESULTS
-from joblib import Parallel, delayed
+from _bench import in_parallel, size
 
 import stewart_drake as sd
 from stewart_drake.law.startup import reference_torque
@@ -97,9 +95,9 @@ def run(number: int, seed: int) -> tuple[int, int, float | None]:
 
 
 if __name__ == "__main__":
-    jobs = int(sys.argv[1]) if len(sys.argv) > 1 else 2
-    before = json.loads((RESULTS / "fresh_0.2.json").read_text(encoding="utf-8"))
-    rows = Parallel(n_jobs=jobs)(delayed(run)(number, seed) for number, seed, _ in before)
+    kept = Path(__file__).parent / "results" / "fresh_0.2.json"
+    before = json.loads(kept.read_text(encoding="utf-8"))[: size("FRESH", 120, SEEDS)]
+    rows = in_parallel(run, [(number, seed) for number, seed, _ in before])
     old, new = (
         np.array([np.inf if e is None else e for _, _, e in each]).reshape(-1, SEEDS).mean(1)
         for each in (before, rows)
