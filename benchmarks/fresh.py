@@ -1,8 +1,9 @@
-"""Compare the law with 0.2 under drawn conditions that were used for no tuning.
+"""Compare the law with 0.2 under drawn conditions that no tuning used.
 
-`python benchmarks/fresh.py` prints E_ac of each condition, and its ratio to 0.2's. A condition is
-a machine, a motion, a delay, a period, a sensor, a link and unknown parameters, drawn from SEED. Each runs with three seeds of its noise and signs, on the exact plant. fresh_0.2.json has the same
-runs of 0.2's law: condition, seed, E_ac.
+`python benchmarks/fresh.py` prints E_ac of each condition, and its ratio to 0.2's. A condition is a
+machine, a motion, a delay, a period, a sensor, a link and unknown parameters, drawn from SEED. Each
+runs with three seeds of its noise and signs, on the exact plant. fresh_0.2.json has the same runs of
+0.2's law: condition, seed, E_ac.
 """
 
 import json
