@@ -107,7 +107,7 @@ class Browser:
             time.sleep(0.1)
 
     def screenshot(self, path: Path | None = None, whole: bool = False) -> NDArray[np.float64]:
-        """What is seen, or the whole page, as an image of values 0 to 1; written too if asked."""
+        """Return the window, or the whole page, as an image of values 0 to 1; write it if asked."""
         taken = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
         data = base64.b64decode(taken["data"])
         if path is not None:

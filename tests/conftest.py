@@ -1,4 +1,4 @@
-"""What all tests need of the process they run in."""
+"""Fixtures and settings that all tests share."""
 
 import signal
 from collections.abc import Iterator

@@ -44,7 +44,7 @@ class _Wire:
 
 
 def exchange() -> list[Message]:
-    """From a request for a session to the first torques."""
+    """Return the datagrams from a request for a session to the first torques."""
     scenario = load_scenario("paper", settings=("plant.kind=exact",))
     wire, clock = _Wire(), Clock()
     machine: Any = Machine(prepare(scenario), wire, say=lambda line: None, clock=clock)  # type: ignore[arg-type]

@@ -73,7 +73,7 @@ class Driver:
         self.torques: list[np.ndarray] = []
 
     def receive(self, time: int) -> list[MachineMessage]:
-        """What has come; a first nonce is taken."""
+        """Return the messages that have arrived; keep the first nonce."""
         found = []
         for message, address in self.endpoint.receive():
             assert isinstance(message, MachineMessage)
@@ -133,7 +133,7 @@ class Driver:
         return message
 
     def report(self, message: MachineMessage, age: int) -> Report | None:
-        """Of the packets that were sent before the sample of a measurement."""
+        """Return the report on the packets sent before the sample of a measurement."""
         if not isinstance(self.law.channel, Packets) or message.acted_from == NEVER:
             return None
         sample = (message.sampled - self.begin) // self.period
@@ -184,7 +184,7 @@ class OtherClock:
 
 
 def drive_in_real_time(driver: Driver, samples: int) -> np.ndarray:
-    """From a request for a session to a stop; (samples, 12) what was measured, NaN what was not."""
+    """Drive from the request for a session to the stop; return measured states, NaN where lost."""
     clock, period = OtherClock(), driver.period
 
     def hear(until: int) -> None:
@@ -250,7 +250,7 @@ class Together:
         self.machine.advance(time)
 
     def greet(self, time: int, begin: int) -> None:
-        """From nothing to a session that will begin its run."""
+        """Open a session whose run will begin at `begin`."""
         self.at(time)
         for _ in range(50):
             if self.driver.session.nonce:
@@ -274,7 +274,7 @@ class Together:
         return driving and self.machine.begin == begin
 
     def drive(self, samples: int) -> list[np.ndarray]:
-        """So many samples; the machine's state at each."""
+        """Drive for this number of samples; return the machine's state at each."""
         states = []
         begin, period = self.driver.begin, self.driver.period
         now = self.machine.time()

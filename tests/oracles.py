@@ -99,7 +99,7 @@ class PartitionedTree:
         self._branches = np.sign(np.linalg.det(self._leg_blocks(self._phi)))
 
     def _leg_indices(self, leg: int) -> list[int]:
-        """Of crank and universal joint in v, and in q, where these joints have q_dot = v."""
+        """Return the indices of crank and universal joint, in v and in q, where q_dot = v."""
         crank = self.plant.GetJointByName(f"motor_{leg}")
         universal = self.plant.GetJointByName(f"universal_{leg}")
         assert all(j.position_start() == j.velocity_start() for j in (crank, universal))

@@ -1,4 +1,4 @@
-"""A terminal of 80 columns."""
+"""Check that output fits a terminal of 80 columns."""
 
 NAMES_A_FILE = ("written to ", "next: ")
 

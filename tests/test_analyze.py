@@ -181,7 +181,7 @@ def test_json_and_quiet(capsys):
 
 
 def test_cells_are_simulations(monkeypatch):
-    """On a short run: one that completes, one that leaves, one that is out of reach."""
+    """One run completes, one leaves the workspace, one begins out of reach."""
     monkeypatch.setattr(delay, "FACTORS", (0.5, 1.25))
     monkeypatch.setattr(delay, "map_delays", lambda _: [0, 8])
     scenario = sd.load_scenario("paper", settings=("duration=1.1", "controller.estimate=[]"))

@@ -67,7 +67,7 @@ def test_what_scripts_send_to_workers_can_be_read_there(monkeypatch, tmp_path):
 
 
 def test_every_part_of_a_step_is_timed(monkeypatch):
-    """By the law in Python."""
+    """The law runs in Python."""
     steps = script("controller_step", monkeypatch)
     monkeypatch.setattr(steps, "RUNS", 1)
     monkeypatch.setattr(steps, "SCENARIOS", {"paper": ["duration=1.5"]})

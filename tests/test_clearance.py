@@ -39,7 +39,7 @@ LEG = ("1", "2", "3", "4", "5", "6")
 
 
 def distance(p, u, q, v):
-    """Of two segments: least squares between bounds."""
+    """Return the distance of two segments by bounded least squares."""
     found = lsq_linear(np.column_stack([u, -v]), q - p, (0.0, 1.0), tol=1e-14)
     return float(np.linalg.norm(p + found.x[0] * u - q - found.x[1] * v))
 
@@ -226,7 +226,7 @@ def test_paper_clear_has_what_the_paper_publishes():
 
 
 def sorted_gaps(points):
-    """What does not change as a pattern is turned: radii, and distances of all pairs."""
+    """Return the invariants of a turned pattern: radii and distances of all pairs."""
     radii = np.hypot(points[:, 0], points[:, 1])
     gaps = np.linalg.norm(points[:, None] - points[None], axis=2)
     return [*np.sort(radii), *np.sort(gaps.ravel())]

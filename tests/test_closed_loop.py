@@ -70,7 +70,7 @@ def test_torques_arrive_after_the_delay_and_not_before(plant):
     ],
 )
 def test_the_tuner_does_not_save_the_faithful_controllers(controller, start, seconds):
-    """As docs/figures.md says beside the paper's figures, which were reached with a tuner."""
+    """docs/figures.md says so of the paper's figures, which were reached with a tuner."""
     result = run(*start, "tuner.kind=ann", "duration=2.0", controller=controller)
     assert result.status == "left_workspace" and result.stopped is not None
     assert result.stopped.time == pytest.approx(seconds, abs=0.0051)
@@ -89,7 +89,7 @@ def test_theory_tells_what_corrected_holds_reach():
 
 
 def test_nonlinear_prediction_previews_the_reference():
-    """Without feedforward, with true dynamics: the figures of docs/theory.md, section 11."""
+    """The figures of docs/theory.md, section 11: no feedforward, true dynamics."""
     law = (EXACT, *ON_REFERENCE, "controller.model=multibody")
     small = ",".join(f"{0.05 * a}" for a in [np.pi / 12] * 3 + [0.02, 0.02, 0.08])
     gentle = (*law, "controller.w_Q=2.5", f"reference.amplitude=[{small}]")

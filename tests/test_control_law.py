@@ -226,7 +226,7 @@ def test_nonlinear_law_is_the_linear_one_where_errors_are_small(steps, fraction,
 
 @pytest.mark.parametrize("feedforward", ["none", "inverse_dynamics"])
 def test_only_feedforward_makes_the_linear_law_see_a_moving_reference(feedforward):
-    """Without it the laws differ by K [x_d(t + eta) - x_d - eta x_d'; x_d'(t + eta) - x_d'].
+    """The laws then differ by K [x_d(t + eta) - x_d - eta x_d'; x_d'(t + eta) - x_d'].
 
     Motion and errors are small, so that both are linear; the plate is on the reference, with the
     torques that keep it there in flight.
@@ -267,7 +267,7 @@ def test_only_feedforward_makes_the_linear_law_see_a_moving_reference(feedforwar
 
 @pytest.mark.parametrize(("steps", "fraction"), [(0, 0.0), (8, 0.0), (3, 0.5), (1, 0.3), (0, 0.3)])
 def test_state_is_predicted_through_the_torques_in_flight(steps, fraction):
-    """What the gain is designed for at sample k is where the plant is at sample k + mu."""
+    """The gain at sample k is designed for the state of the plant at sample k + mu."""
     law = law_of(f"delay.steps={steps}", f"delay.fraction={fraction}", "controller.estimate=[]")
     points = []
 
@@ -346,7 +346,7 @@ def test_held_torques_meet_a_sine_at_fourth_order(passed):
 @pytest.mark.parametrize("prediction", ["nonlinear", "linear"])
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 0.5])
 def test_a_known_reference_is_followed_at_a_high_order_of_the_period(fraction, prediction):
-    """On the reference, with its torques in flight, feedback has next to nothing to do."""
+    """Feedback does next to nothing on the reference, with its torques in flight."""
 
     def worst(period):
         law = law_of(
@@ -420,7 +420,7 @@ def test_integral_waits_while_a_motor_is_at_its_limit(fraction):
 
 @pytest.mark.parametrize("fraction", [0.0, 0.5])
 def test_predicted_integral_waits_in_the_same_periods(fraction):
-    """What the law predicts now is what it will have integrated when the torque acts."""
+    """The predicted integral is the integral at the sample at which the torque acts."""
     law = law_of(
         *PLAIN,
         "delay.steps=3",
@@ -534,7 +534,7 @@ def test_a_failed_riccati_equation_keeps_the_last_good_gain(monkeypatch):
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3])
 def test_the_last_good_gain_sees_the_same_errors(fraction):
-    """What held torques leave of the rates is no error to it either."""
+    """The last good gain, too, does not see the rates that held torques leave."""
     law = law_of("delay.steps=2", f"delay.fraction={fraction}", "controller.estimate=[]")
     preview = np.array([sine(1.0)(max(0.0, 0.3 + t)) for t in law.preview_times])
     memory, x = sampled(law), preview[0, :12] + 1e-3

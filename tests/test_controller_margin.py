@@ -140,7 +140,7 @@ def test_the_linear_loop_is_what_the_law_itself_does(controller, settings, perio
     ],
 )
 def test_the_radius_is_how_the_law_itself_grows(controller, settings, periods, last):
-    """Of loops whose eigenvalue does not beat."""
+    """The dominant eigenvalue of these loops is real."""
     sc = scenario(*ALONE, *settings, controller=controller)
     assert growth(sc, periods, last) == pytest.approx(judged(sc).radius, rel=0.03)
 
@@ -159,7 +159,7 @@ def test_the_delay_margin_is_where_the_law_itself_begins_to_grow(later, share, s
 
 
 def apart(loop, longer, gain, periods):
-    """What the linear loop has made of an error of 1, by its recurrence, not by its matrix."""
+    """Return the growth of an error of 1 by the recurrence of the loop, not by its matrix."""
     plant, K = loop.sampled(longer), loop.K
     e = np.ones(len(plant.A))
     known = (K.shape[1] - len(e)) // NUM_TORQUES
@@ -270,7 +270,7 @@ def test_an_unstable_loop_that_completes_is_warned_about():
     ],
 )
 def test_steps_longer_than_the_period_are_told(kind, median, worst, told):
-    """Of a search for the delay the slowest counts; the period is 10 ms."""
+    """The slowest step of a search for the delay counts; the period is 10 ms."""
     experiment = prepare(scenario(f"controller.delay_estimator={kind}", name="gravity"))
     summary = {
         "controller_step_ms": {"median": median, "worst": worst},
@@ -282,7 +282,7 @@ def test_steps_longer_than_the_period_are_told(kind, median, worst, told):
 
 
 def test_the_fastest_pole_is_told_where_it_is(tmp_path):
-    """On the way to a side that the true machine does not reach, and then up, where it falls."""
+    """The true machine does not reach one side; on the way up it falls."""
     path = tmp_path / "short.yaml"
     path.write_text(mechanism_yaml(replace(PAPER, crank_lengths=0.6 * PAPER.crank_lengths)))
     way = ((0.0, 0.38), (0.12, 0.38), (0.0, 0.38), (0.0, 0.43), (0.0, 0.38))

@@ -59,7 +59,7 @@ def test_every_number_of_every_signal_is_there(run):
 
 
 def test_a_run_comes_back_as_a_motion(run, tmp_path):
-    """What a plate has done, exported, is what the next one is asked for."""
+    """An exported run is the reference of the next run."""
     path = write_csv(run.signals, tmp_path / "run.csv")
     settings = ("plant.kind=exact", "duration=0.3", "reference.kind=csv", f"reference.file={path}")
     reference = prepare(sd.load_scenario("paper", settings=settings)).reference

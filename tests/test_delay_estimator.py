@@ -47,7 +47,7 @@ THETA = np.concatenate([1e-3 * np.array([1, -1, 2, 0, -2, 1.0]), [0.5, 0.002]])
 
 
 def acting_at(arrivals, torques, t, newest):
-    """By definition: the own torque that arrived last, else what acts in that period."""
+    """Return the own torque that arrived last, else the torque of `before`, by definition."""
     arrived = [
         i
         for i in range(newest - arrivals.sent + 1, newest + 1)
@@ -256,7 +256,7 @@ def test_how_early_or_late_single_torques_come_is_found(jitter, least, most):
 
 
 def test_the_first_torques_that_jitter_are_believed():
-    """Of ten, each some 3 ms off, hardly one is an outlier, and the delay is as sure as is said.
+    """Ten torques, each some 3 ms off: hardly an outlier, and the stated deviation is right.
 
     Taken to be on time, two or three of them were outliers, and the deviation was eight times too
     small.
@@ -457,7 +457,7 @@ def test_no_delay_may_be_believed_in(true):
 
 @pytest.mark.parametrize("fraction", [0.1, 0.37, 0.5, 0.63])
 def test_a_right_belief_of_a_part_of_a_period_is_kept(fraction):
-    """What was in flight at t = 0 was held from instants that the controller does not know."""
+    """The holds in flight at t = 0 began at instants unknown to the controller."""
     run = looped(*ON_REFERENCE, f"delay.fraction={fraction}", "duration=6")
     assert run.stopped is None and run.accumulated_error < 0.5
     assert run.signals.delay_estimate[-1] == pytest.approx(0.8 + 0.1 * fraction, abs=2e-4)
@@ -472,7 +472,7 @@ def test_a_jump_is_followed():
 
 
 def test_nothing_is_fed_back_before_the_first_torque_has_acted_for_a_period():
-    """From rest the first torques do not depend on what was measured; then they do."""
+    """The first torques from rest do not depend on the measurements; later ones do."""
     noisy = "sensor.noise_std=[" + ",".join(f"{n:g}" for n in 1e-3 * np.tile(AMPLITUDES, 2)) + "]"
 
     def first(*settings):

@@ -1,4 +1,4 @@
-"""What the documents say exists, runs, loads and is true.
+"""Names, commands, code and figures in the documents agree with the project.
 
 Conventions of README, CHANGELOG (without what is before 0.2), CONTRIBUTING, `docs/` and
 `benchmarks/results/`, so that names can be checked:
@@ -144,7 +144,7 @@ def files():
 
 @functools.cache
 def gone():
-    """What 0.1 and 0.2 had and today's has not, by docs/upgrading.md and the table of renames."""
+    """Return names of 0.1 and 0.2 that no longer exist, by docs/upgrading.md and the renames."""
     table = prose(ROOT / "docs" / "upgrading.md").split("| before | now |")[1]
     modules = re.findall(r"^\| `(?:stewart_drake\.)?([\w.]+)`", table, re.MULTILINE)
     return frozenset([*modules, *(f"controller.{name}" for name in CONTROLLER)])
@@ -169,7 +169,7 @@ def commands():
 
 
 def problem_with_command(code):
-    """What is wrong with a command whose `stewart-drake` may be left out, or with its options."""
+    """Return the problem with a command or its options; `stewart-drake` may be left out."""
     words, known = code.removeprefix("stewart-drake ").split(), commands()
     name = ""
     while words and f"{name} {words[0]}".strip() in known:
@@ -242,13 +242,13 @@ def modules():
 
 @functools.cache
 def shell():
-    """What the blocks for a shell, the Makefile and the site's settings say."""
+    """Return the text of the shell blocks, the Makefile and the site's settings."""
     told = "".join(block.text for block in blocks("sh", "bash", "shell", "console"))
     return told + sources()
 
 
 def problem_at_a_shell(program, rest):
-    """What is wrong with `stewart-drake ...`, `make ...` or `python ...`."""
+    """Return the problem with `stewart-drake ...`, `make ...` or `python ...`."""
     if program == "stewart-drake":
         return problem_with_command(rest)
     words = [word for word in rest.split() if "=" not in word and word != "..."]
@@ -267,7 +267,7 @@ def problem_at_a_shell(program, rest):
 
 
 def problem_with(code):
-    """What is wrong with a piece of code type; None where nothing is, or nothing can be told."""
+    """Return the problem with a piece of code type, None where none is found."""
     code = code.strip()
     if code in gone():
         return None
@@ -322,7 +322,7 @@ def test_names_for_the_reference_exist(path):
 
 
 def docstrings(path):
-    """Of a module, and of what is in it."""
+    """Yield the docstrings of a module, its classes and functions."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
             yield ast.get_docstring(node) or ""
@@ -343,7 +343,7 @@ def test_dotted_names_in_docstrings_exist():
 
 
 def anchors(path):
-    """Of the headings of a document, as GitHub and the site make them."""
+    """Return the anchors of a document's headings, as GitHub and the site make them."""
     titles = re.findall(r"^#+ (.*)$", FENCE.sub("", path.read_text("utf-8")), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 

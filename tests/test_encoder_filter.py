@@ -103,7 +103,7 @@ def test_few_samples_are_their_own_nodes(samples):
 
 
 class Reading(NamedTuple):
-    """What the core reads from a measurement beside a motion."""
+    """Quantities that the core reads from a measurement near a motion."""
 
     angles: Array
     """(N, 6) rad, NaN where they are left out."""
@@ -116,7 +116,7 @@ class Reading(NamedTuple):
 
 
 def reading(sensing, said, shown, last, still):
-    """Of 6 N values beside the angles (N, 6) that a motion shows."""
+    """Return the reading of 6 N values near the angles (N, 6) of a motion."""
     c, encoders, nodes = core(), encoders_of(sensing), len(node_shares(sensing.samples))
     angles, onto = np.empty((sensing.samples, 6)), np.empty((6, nodes, nodes))
     variance, residuals = np.empty((nodes, 6)), np.empty((nodes, 6))

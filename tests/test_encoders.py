@@ -55,7 +55,7 @@ class Moving(LeafSystem):
 
 
 def seen(times, *arguments, moves=True, **more):
-    """What encoders measure at times in s, of a plate on the paper's motion or at its start."""
+    """Return the codes at times in s, of a plate on the paper's motion or at its start."""
     builder = DiagramBuilder()
     start = np.concatenate([Moving().reference.value(0.0)[:, 0], np.zeros(6)])
     plate = builder.AddSystem(Moving() if moves else ConstantVectorSource(start))
@@ -161,7 +161,7 @@ def test_the_error_on_the_reference(settings, bound):
 
 @pytest.mark.slow
 def test_from_rest():
-    """With the state 21.08."""
+    """The error is 21.08 with the state as measurement."""
     assert run(*ENCODERS, "sensor.bits=14", *FINE).accumulated_error < 21.5
 
 
@@ -243,7 +243,7 @@ def test_offsets_are_found():
 
 
 def test_without_an_estimator_rates_are_differences():
-    """Without a delay, which they would not survive."""
+    """These controllers need a loop without delay."""
     settings = ("controller.estimate=[]", "delay.steps=0", "controller.period=0.02")
     result = run(*ON_REFERENCE, "sensor.bits=17", *settings)
     assert result.status == "completed"

@@ -48,7 +48,7 @@ PATIENCE = core().lib.STEWART_PATIENCE
 
 
 def filter_of(noise_std, settings=SETTINGS):
-    """Of pose and rates, measured with that noise (12,)."""
+    """Return a filter of pose and rates measured with this noise (12,)."""
     return Filter(PLANT, StateSensing(noise_std, AMPLITUDE), settings)
 
 
@@ -56,7 +56,7 @@ ASSUMED = filter_of(NOISE)
 
 
 def start(y, assumed=ASSUMED):
-    """From a measurement (12,) alone."""
+    """Return the estimate from one measurement (12,)."""
     return assumed.start(y, np.zeros(8))
 
 

@@ -191,7 +191,7 @@ def test_drake_linearises_it_exactly(index, gravity):
 
 
 def approach(seed):
-    """From home in a random direction, at a random speed, on to some dead centre within 2 s."""
+    """Return a state at home whose rates lead to a dead centre within 2 s."""
     rng = np.random.default_rng(seed)
     direction = rng.normal(0, 1, 6)
     scale = np.array([1, 1, 1, 0.1, 0.1, 0.1])
@@ -231,7 +231,7 @@ NO_TORQUE, PRESSING = np.zeros(6), 0.5 * np.array([1.0, -1, 1, -1, 1, -1])
 
 @functools.cache
 def true_end(seed):
-    """Of `approach`, every second one under torque."""
+    """Return the true end of `approach`; every second run has torques."""
     return end_of(approach(seed), TIGHT, 20_000, (NO_TORQUE, PRESSING)[seed % 2])[0]
 
 
@@ -268,7 +268,7 @@ def test_at_a_dead_centre_the_simulation_ends_in_time_and_names_the_leg(scheme):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_under_gravity_and_strong_torques_the_simulation_ends_too(seed):
-    """Where motors press a leg into its dead centre, whatever the integrator."""
+    """Motors press a leg into its dead centre, with each integrator."""
     rng = np.random.default_rng(seed)
     start = np.concatenate([PAPER.home, rng.normal(0, [1, 1, 1, 0.2, 0.2, 0.2])])
     held = StewartDynamics(PAPER).equilibrium_torque(PAPER.home)
@@ -347,7 +347,7 @@ def crossing(mechanism, seed):
 
 @pytest.mark.parametrize("index", [-1, 0, 1])
 def test_at_a_parallel_singularity_the_simulation_ends(index):
-    """Where the determinant of the rods' wrenches changes sign, cranks no longer hold the plate."""
+    """The cranks do not hold the plate where the determinant of the rods' wrenches changes sign."""
     mechanism = PAPER if index < 0 else random_mechanism(np.random.default_rng(index))
     pose, direction = crossing(mechanism, 2)
     sign = home_sign(mechanism)

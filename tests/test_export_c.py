@@ -58,14 +58,14 @@ def compiler():
 
 
 def exported(folder, name, settings, single=False):
-    """Of a short run, without what is measured for the README."""
+    """Export a short run without the sizes of the README; return the folder."""
     scenario = load_scenario(name, settings=(*SHORT, *settings))
     export_c.write(export_c.exported(scenario, single, measured=False), folder)
     return folder
 
 
 def sources(folder):
-    """Of the controller in an export."""
+    """Return the sources of the controller in an export."""
     makefile = {"Makefile": (folder / "Makefile").read_text()}
     return [name.replace(".o", ".c") for name in export_c.objects(makefile)]
 
@@ -113,7 +113,7 @@ def test_gravity_is_exported_as_it_is_shipped(tmp_path):
 
 @pytest.mark.parametrize("option", ["-ffast-math", "-ffinite-math-only"])
 def test_compiling_without_checks_for_nan_is_refused(option, tmp_path, compiler, monkeypatch):
-    """Of every source of the controller, and of the package's own library."""
+    """Every source of the controller and the package's library refuse the option."""
     for source in ("matrix.c", "dynamics.c", "riccati.c", "law.c", "filter.c", "servo.c"):
         done = subprocess.run(
             [*compiler, "-std=c99", option, "-fsyntax-only", str(build.FOLDER / source)],
@@ -142,7 +142,7 @@ def test_other_compilers_and_processors(compiler, tmp_path):
 
 @pytest.mark.slow
 def test_a_controller_that_is_off_is_told(tmp_path):
-    """What the replay says to a change of one weight, and to another fault."""
+    """The replay reports a changed period and a changed status."""
     folder = exported(tmp_path, "paper", ("duration=2.0",))
     config, test = folder / "stewart_config.c", folder / "stewart_test.c"
     right = config.read_text(), test.read_text()
@@ -181,7 +181,7 @@ def test_single_precision_is_close(name, settings, tmp_path):
 
 @pytest.mark.slow
 def test_the_sizes_are_told_and_kept_to(tmp_path):
-    """For `paper`: text of 180 kB at the most, state of 10.4 kB."""
+    """The text of `paper` is at most 180 kB, its state 10.4 kB."""
     files = export_c.exported(load_scenario("paper", settings=(*SHORT, "duration=1.0")))
     readme = files["README.md"]
     text = int(readme.split("(TOTALS)")[0].splitlines()[-1].split()[0])

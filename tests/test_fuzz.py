@@ -279,7 +279,7 @@ def test_a_sound_outcome_is_read(tmp_path):
 
 
 def test_no_file_with_a_changed_digit_is_read_as_sound(tmp_path):
-    """Without a checksum 146 of 500 were."""
+    """146 of 500 damaged files were read before there was a checksum."""
     study_robustness(short(), tmp_path, RobustnessOptions(runs=1, workers=1))
     path, dice = tmp_path / "runs" / "run000000.json", random.Random(0)
     good = path.read_text()

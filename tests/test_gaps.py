@@ -89,7 +89,7 @@ def test_a_gap_that_is_too_long_is_left_to_the_filter():
 
 @pytest.mark.parametrize("seed", [0, 7])
 def test_half_of_the_measurements_suffice(seed):
-    """With noise, bias and payload; without looking back these two runs have 4.6 and 3.6."""
+    """E_ac of these two runs with noise, bias and payload is 4.6 and 3.6 without looking back."""
     settings = ("plant.kind=exact", "start=on_reference", "queue=reference", "overlay=dirty")
     settings += ("sensor.loss=0.5", f"sensor.seed={seed}")
     scenario = sd.load_scenario("paper", "predictor_lqi", settings)

@@ -122,7 +122,7 @@ def test_answers_to_unknown_addresses_have_a_rate_and_are_no_longer_than_request
 
 
 def test_an_offer_ends_with_the_next_session():
-    """What was recorded of a confirmation does not begin a session a second time."""
+    """A recorded confirmation does not begin a second session."""
     run = begun(samples=3)
     driver, time = run.driver, run.machine.time()
     session = run.machine.session

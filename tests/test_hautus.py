@@ -36,7 +36,7 @@ def test_an_uncontrollable_mode_is_named_with_its_direction():
 
 
 def test_an_unobservable_mode_is_found_by_transposition():
-    """Of a rotation that only its decaying companion's output shows nothing is seen."""
+    """The output shows a decaying mode only, and nothing of the rotation."""
     A = block_diag([[0.0, 1.0], [-4.0, 0.0]], [[-1.0]])
     C = np.array([[0.0, 0.0, 1.0]])
     test = hautus(A.T, C.T, discrete=False)
@@ -120,7 +120,7 @@ def test_powers_of_the_matrix_are_wrong_where_the_margin_is_right():
 
 @pytest.mark.parametrize("steps", [0, 1, 8, 30])
 def test_only_the_papers_chain_has_modes_that_no_output_shows(steps):
-    """Without a fraction T(k-mu-1) acts on nothing: six zero modes, gone after one step."""
+    """T(k-mu-1) acts on nothing without a fraction: six zero modes, gone after one step."""
     model = delayed_model(PAPER_MODEL, 0.1, steps, 0.0, integral=True)
     minimal, extra = chain(model), chain(model, always_extra=True)
     assert hautus(minimal.A.T, minimal.C.T, discrete=True).complete

@@ -1,4 +1,4 @@
-"""What a tuner decides by of what the law remembers; rule, networks of both kinds, limits."""
+"""Health features of the law's memory; the rule, networks of both kinds, limits."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What the command tells those who ask: help with examples, completion, 80 columns."""
+"""Help with examples, shell completion, 80 columns."""
 
 import dataclasses
 

@@ -467,10 +467,10 @@ def test_a_drawing_that_is_trusted_too_much_is_refused(log_and_truth):
 @pytest.mark.slow
 def test_two_logs_tell_more_than_one(log_and_truth):
     log, true = log_and_truth
-    half = len(log.times) // 2
+    half = len(log.times) // 4
     parts = [
         dataclasses.replace(log, times=log.times[rows], values=log.values[rows])
-        for rows in (slice(None, half), slice(half, None))
+        for rows in (slice(None, half), slice(half, 2 * half))
     ]  # of one name
     both = identify(parts, PAPER, Tolerances(offsets=0.0))
     one = identify(parts[1:], PAPER, Tolerances(offsets=0.0))

@@ -320,7 +320,7 @@ def run(settings):
 
 
 def differing(settings, threads):
-    """Of the runs, those whose signals are not the same in threads as alone."""
+    """Return the runs whose signals in threads differ from those alone."""
     functions_of.cache_clear()  # so that the threads also make them at the same time
     with ThreadPoolExecutor(threads) as pool:
         together = list(pool.map(run, settings))

@@ -161,7 +161,7 @@ def test_poses_of_any_mechanism_survive_the_round_trip(seed):
 @seeded
 @given(seeds)
 def test_forward_kinematics_returns_an_assembly_or_raises(seed):
-    """From any guess and any crank angles; what it returns closes all loops on its branches."""
+    """Any guess and crank angles: a returned pose closes all loops on its branches."""
     rng = np.random.default_rng(seed)
     angles = PAPER.crank_angles(PAPER.home) + rng.uniform(-1.5, 1.5, 6)
     guess = PAPER.home + rng.uniform(-1, 1, 6) * [1.5, 1.5, 3, 0.5, 0.5, 0.5]
@@ -241,7 +241,7 @@ def distance_to_crank_circle(mechanism, leg, p_WQ):
 @settings(seeded, max_examples=20)
 @given(seeds)
 def test_reach_margins_are_what_a_search_over_the_crank_circle_finds(seed):
-    """For poses within reach, out of reach, and too close to the base for the rod."""
+    """Poses are within reach, out of reach, and too close to the base for the rod."""
     rng = np.random.default_rng(seed)
     mechanism = random_machine(rng)
     pose = mechanism.home + rng.uniform(-1, 1, 6) * [1, 1, 1, 0.3, 0.3, 0.6]

@@ -64,7 +64,7 @@ def test_it_is_the_law_of_the_scenario(fraction):
 
 @pytest.mark.parametrize("gravity", [False, True])
 def test_the_plate_stays_where_it_is_until_the_first_torque_acts(gravity):
-    """Without a word about the queue, with gravity too."""
+    """The default queue holds the plate, with gravity too."""
     dynamics = sd.StewartDynamics(PAPER, gravity)
     motion = PiecewisePolynomial(PAPER.home.reshape(6, 1))
     law = sd.design_law(dynamics, motion, period=0.01, delay=0.05)

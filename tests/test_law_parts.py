@@ -346,7 +346,7 @@ class Told(CoreObserver):
 @pytest.mark.parametrize("assumed", [0, 1, 4])
 @pytest.mark.parametrize("prediction", ["linear", "nonlinear"])
 def test_the_law_believes_in_the_delay_that_its_observer_believes_in(prediction, assumed):
-    """With torques kept for the longest delay, it is the law that knew it from the start."""
+    """The law equals the one that knew the delay, with torques kept for the longest delay."""
     known = law_of("delay.steps=2", "controller.estimate=[]", f"controller.prediction={prediction}")
     reference = sine(0.5)
     queue = nominal_queue(known, reference)

@@ -139,7 +139,7 @@ def test_at_the_centre_the_legs_of_a_pair_are_mirror_images(order, signs):
 
 
 def test_links_of_the_same_section_keep_a_uniform_bar_s_inertia():
-    """That of a thin bar, m l^2 / 12, grows with the cube of its length."""
+    """The moment of a thin bar, m l^2 / 12, grows with the cube of its length."""
     moments = bar_inertia(0.08, 0.404).tolist()
     spec = dataclasses.replace(SPEC, rod=dataclasses.replace(SPEC.rod, inertia=moments))
     values = own_values(spec)

@@ -90,18 +90,6 @@ def test_gain_margin_of_the_models_is_that_of_the_summary():
     assert max(found) > 1, "some loop on the way is the one whose margin that is"
 
 
-def test_disk_margins_are_one_line():
-    models = sd.linear_models("paper", 2.0)
-    grid = np.geomspace(0.05, np.pi / 0.1, 400)
-    for leg in (1, 4):
-        disk, gain, phase = control.disk_margins(models.one_motor(leg), grid)
-        S = np.array([at(models.S, omega, 0.1)[leg - 1, leg - 1] for omega in grid])
-        assert disk == pytest.approx(1 / np.abs(S - 1 / 2).max(), rel=1e-6)
-        assert gain > 0 and phase > 0
-    with pytest.raises(ConfigError, match="leg: got 7; expected 1 to 6"):
-        models.one_motor(7)
-
-
 def test_names_and_period():
     models = sd.linear_models("paper", 1.0)
     assert models.plant.input_labels == [f"torque_{leg}" for leg in range(1, 7)]

@@ -62,7 +62,7 @@ def bare(delays, before):
 
 
 def newest(arrivals, t):
-    """What has arrived by t and was sent last; 0 for nothing."""
+    """Return the newest torque that has arrived by t, 0 if none."""
     return max((k for k, arrival in arrivals.items() if arrival <= t), default=0)
 
 

@@ -114,13 +114,13 @@ def jumping_clock(monkeypatch):
 def test_on_a_wire_it_does_what_the_simulation_does(quiet_machine, jumping_clock):
     with Running() as running:
         ready = prepare_session(scenario_of(), running.address)
-        told = "\n".join(plans(ready, 4.0, "paper"))
+        told = "\n".join(plans(ready, 2.5, "paper"))
         assert "a simulation" in told and "0.8 s after the measurement" in told
-        result = drive(ready, 4.0, accept_jitter=True, say=lambda line: None)
-    simulated = sd.simulate(scenario_of("duration=3.9"))
-    assert result.status == "completed" and result.signals.sizes["time"] == 40
+        result = drive(ready, 2.5, accept_jitter=True, say=lambda line: None)
+    simulated = sd.simulate(scenario_of("duration=2.4"))
+    assert result.status == "completed" and result.signals.sizes["time"] == 25
     assert result.accumulated_error < simulated.accumulated_error + 0.05
-    assert result.summary["live"]["samples"] >= 40
+    assert result.summary["live"]["samples"] >= 25
     assert result.summary["delay"]["estimated_s"] == pytest.approx(0.8)
     assert set(result.signals.data_vars) == set(simulated.signals.data_vars)
 
@@ -268,7 +268,7 @@ def test_the_share_that_was_measured_of_a_simulation_leaves_its_error():
 
 
 def test_a_leg_that_is_silent_leaves_measurements(tmp_path):
-    """What is left out of a measurement is counted; the rest is used."""
+    """Missing parts of a measurement are counted; the rest is used."""
     encoders = "sensor={kind: encoders, faults: [{kind: missing, leg: 2, from: 0, to: 2}]}"
     result = sd.simulate(
         scenario_of(encoders, "duration=1", "plant.kind=exact"), judge_stability=False
@@ -492,7 +492,7 @@ def test_a_real_machine_wants_to_be_armed(quiet_machine):
     ("settings", "asks"), [((), True), ((OVER_A_NETWORK,), False), (None, True)]
 )
 def test_the_jitter_stands_beside_the_margin_and_asks(quiet_machine, settings, asks):
-    """On a wire what arrives late acts late; a play-out buffer absorbs it. None is unstable."""
+    """Late torques act late on a wire; a play-out buffer absorbs jitter. None: an unstable loop."""
     with Running(*(settings or ())) as running:
         ready = prepare_session(scenario_of(*FROM_REST), running.address)
         trips = deque([0.001] * 50 + [0.012])

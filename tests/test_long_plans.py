@@ -70,7 +70,7 @@ def test_the_shortest_plan_within_a_limit_is_found_in_a_few_steps(monkeypatch):
 
 
 def test_a_way_planned_in_flight_is_what_drake_makes_of_its_pieces():
-    """Of two plans one after the other: before, within, between and after their pieces."""
+    """Two plans in sequence: before, within, between and after their pieces."""
     experiment = prepare(load_scenario("paper"))
     reference, start = experiment.reference, np.zeros(12)
     start[:6] = experiment.mechanism.home

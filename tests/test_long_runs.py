@@ -25,7 +25,7 @@ MB = 1e6
 
 
 def memory():
-    """What this process holds in bytes, after tidying up."""
+    """Return the resident memory of this process in bytes, after a garbage collection."""
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return float(pages * os.sysconf("SC_PAGE_SIZE"))
@@ -125,7 +125,7 @@ def test_the_second_half_is_as_good_as_the_first(kind, duration, settings, error
 @pytest.mark.soak
 @needs_proc
 def test_an_hour_is_recorded():
-    """All of it at once, as a user gets it: the record grows in proportion, and comes out whole."""
+    """The record of an hour grows in proportion and is complete."""
     began, before = time.perf_counter(), memory()
     sc = load_scenario("paper", None, ("plant.kind=exact", "duration=3600", *STEADY))
     run = simulate(sc)

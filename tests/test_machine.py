@@ -43,7 +43,7 @@ def together(*settings, name="paper", key=None, **own):
 
 
 def begun(*settings, samples=0, **own):
-    """With a run that began at 2 s, on the exact plant."""
+    """Return a machine whose run began at 2 s, on the exact plant."""
     found = together(EXACT, *settings, **own)
     period = found.driver.period
     found.greet(3 * period, -(-2 * SECOND // period) * period)
@@ -90,7 +90,7 @@ def test_a_run_over_the_socket_is_the_simulated_one(name, settings, samples):
 
 
 def test_counts_are_those_of_the_simulation():
-    """Of torques that were played and periods that were dry."""
+    """The counts of played torques and dry periods agree."""
     settings = (EXACT, "link={kind: network, loss: 0.6, burst: 6}", "controller.packet_torques=2")
     scenario = load_scenario("paper", settings=("duration=3.1", *settings))
     run = Together(scenario, Settings(watchdog=5))
@@ -309,7 +309,7 @@ def test_a_new_session_begins_where_it_is_said(restart):
 
 
 def test_what_was_recorded_of_an_earlier_session_is_foreign():
-    """With a key and without: every datagram of a session, once it is over and another drives."""
+    """Replay every datagram of a session after its end, while another session drives."""
     run = together(EXACT, key=KEY)
     period = run.driver.period
     recorded = []

@@ -47,7 +47,7 @@ class Process:
 
     @property
     def said(self):
-        """All of it, in one line."""
+        """Return all output as one line."""
         return " ".join(" ".join(self.lines).split())
 
     def until(self, pattern):
@@ -171,7 +171,7 @@ def test_the_controller_in_c_drives_the_machine_in_python(folder, tmp_path):
 @pytest.mark.slow
 @in_real_time
 def test_a_lost_datagram_of_the_controller_in_c_costs_nothing(folder, tmp_path):
-    """Where a buffer waits, those that follow say its torque again: the run without a loss."""
+    """The following datagrams repeat its torque in time: the run equals one without loss."""
     lossy = "link={kind: network, low: 0.0, high: 0.02, loss: 0.3, playout: 0.8}"
     settings = (*SETTINGS, lossy, "controller.packet_repeats=0")
     states, said = over(folder, settings, tmp_path / "log")

@@ -238,7 +238,7 @@ def test_a_file_in_millimetres_is_asked_for_metres(name, masses, load):
 @pytest.mark.parametrize("name", ["paper", "desktop", "motion_base"])
 @pytest.mark.parametrize("factor", [1e-3, 0.01, 0.1, 1, 5])
 def test_machines_of_any_size_in_metres_are_taken(name, factor, load):
-    """From a tenth of a millimetre to ten metres, masses grown by as little as the square."""
+    """Sizes from a tenth of a millimetre to ten metres, masses growing at least by the square."""
     masses = factor**2 if factor > 1 else factor**3
     load(enlarged(name, factor, masses, masses * factor**2))
 

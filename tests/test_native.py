@@ -48,7 +48,7 @@ def arguments(rng, mechanism):
 
 
 def parameters(rng):
-    """Of the plant, any: but of a payload that leaves the plate its mass, so that it can move."""
+    """Return random parameters of the plant; the payload leaves the plate a positive mass."""
     found = rng.normal(0, 0.1, NUM_PLANT_PARAMETERS)
     found[PAYLOAD] = abs(found[PAYLOAD])
     return found
@@ -66,7 +66,7 @@ def _listed(results):
 
 @functools.cache
 def machine(seed):
-    """Of a random mechanism; what is built of it stays."""
+    """Return the dynamics of a random mechanism, cached."""
     return VirtualMachine(random_mechanism(np.random.default_rng(seed)))
 
 
@@ -120,7 +120,7 @@ PAPER_HOLD = sd.StewartDynamics(PAPER).equilibrium_torque(PAPER.home)
 
 
 def test_far_out_of_reach_and_without_numbers_they_agree_too():
-    """Where squares are held above zero, and where NaN must stay NaN."""
+    """Squares are held above zero, and NaN stays NaN."""
     rng = np.random.default_rng(5)
     one, other = NativeFunctions(PAPER), VirtualMachine(PAPER)
     for distance in (0.1, 0.3, 1.0, 1e3):

@@ -224,7 +224,7 @@ class Pair:
         self.weights = np.array([sc.controller.w_Q, sc.controller.w_R])
 
     def step(self, k, noise, spoil, lose=None):
-        """By how much the torques differ; `lose` spoils the reference."""
+        """Return the difference of the torques; `lose` spoils the reference."""
         law, period = self.law, self.law.timeline.period
         age = min(self.late, k)
         y = self.states[-1 - age] + noise
@@ -299,7 +299,7 @@ def lost_in_a_row(first, number):
 @pytest.mark.parametrize("case", ["paper", "a fraction of a period", "no delay", "gravity"])
 @pytest.mark.parametrize(("first", "number"), [(0, 1), (0, 3), (1, 5), (2, 5), (0, 10), (8, 10)])
 def test_after_a_gap_the_way_back_is_that_of_python(case, first, number):
-    """From rest; the same torques, counts and memory."""
+    """Torques, counts and memory are the same, from rest."""
     name, settings, _ = CASES[case]
     pair, gaps, peak = Pair(name, settings), [], 0.0
     for k in range(32):

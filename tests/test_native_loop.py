@@ -46,7 +46,7 @@ DIRTY = (
 
 
 def scenario(name="paper", *settings, controller=None):
-    """On the exact plant, as tight as it can be."""
+    """Return a scenario on the exact plant, at its tightest accuracy."""
     tight = ["plant.kind=exact", "plant.accuracy=1e-12"]
     return sd.load_scenario(name, controller, [*tight, *settings])
 
@@ -187,7 +187,7 @@ def test_states_torques_and_measurements_are_drakes():
 
 
 def test_noise_is_drakes_to_the_last_bit():
-    """What a measurement has beyond the state, which is known exactly where a plate stays."""
+    """The noise is the measurement less the state of a plate at rest."""
     one = LOOPS["dirty"]
     preparation = preparation_of(one)
     experiment = preparation.experiment(one)
@@ -348,7 +348,7 @@ def samples(number):
 @pytest.mark.parametrize("number", [5, pytest.param(40, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("start", START)
 def test_a_number_that_is_missing_in_the_reference_costs_next_to_nothing(start, number):
-    """From rest within 1 % of the run without it, on the reference at most 0.05 % s."""
+    """E_ac stays within 1 % from rest, and at most 0.05 % s on the reference."""
     rng, (before, nothing) = np.random.default_rng(number), error_without(start, {})
     assert nothing == 0
     for sample in samples(number):
@@ -409,7 +409,7 @@ def test_without_the_first_accelerations_the_run_begins_a_sample_later():
     "first", [1, 2, 3, *(pytest.param(k, marks=pytest.mark.slow) for k in range(4, 80))]
 )
 def test_a_longer_gap_does_not_lose_the_plate(first, number):
-    """From rest, where the whole run has 21 % s, and on the reference."""
+    """The whole run from rest has 21 % s; the same gaps on the reference."""
     gap = dict.fromkeys(range(first, first + number), slice(None))
     error, counted = error_without("rest", gap)
     assert counted == number and error < (31 if number == 5 else 55)

@@ -111,7 +111,7 @@ def test_errors_are_of_the_size_of_the_accuracy():
 
 
 def falling():
-    """With hardly any torque the platform falls out of its workspace."""
+    """The platform falls out of its workspace with hardly any torque."""
     return StewartDynamics(PAPER), [Drive(PUSH - HOLD)]
 
 
@@ -171,7 +171,7 @@ def test_torques_beyond_all_bounds_end_in_an_error():
 
 
 def test_where_there_is_no_number_steps_are_cut_to_a_fifth():
-    """As scipy does: ln(0.1 / 16 eps) / ln 5 steps of eleven evaluations at the most."""
+    """Like scipy: at most ln(0.1 / 16 eps) / ln 5 steps of eleven evaluations."""
     plant = NativePlant(HEAVY, AT_HOME, np.array([0.1]), 1e-9, math.inf)
     ended = plant.call("open_loop", *in_c([Drive(np.full(6, np.nan))]))
     assert ended == Ended.TOO_SHORT_STEPS

@@ -7,7 +7,6 @@ import sys
 import pytest
 from pydrake.systems.framework import LeafSystem
 
-from stewart_drake.files.errors import ConfigError
 from stewart_drake.studies.jobs import run_jobs
 from tests.test_jobs import ROOT, SETTINGS, contents
 
@@ -54,7 +53,7 @@ except KeyError as error:
 
 
 def run(workers, *arguments, folder):
-    """What another Python prints, on so many cores."""
+    """Return the output of another Python process on this number of cores."""
     surroundings = os.environ | {"LOKY_MAX_CPU_COUNT": str(workers), "PYTHONPATH": str(ROOT)}
     command = [sys.executable, *arguments]
     done = subprocess.run(command, cwd=folder, env=surroundings, capture_output=True, text=True)
@@ -148,10 +147,3 @@ def test_an_exception_of_a_job_is_told_as_it_is(how, kind, message, workers, tmp
     jobs = {"first": (0, how), "second": (1, how)}
     with pytest.raises(kind, match=rf"^{message}\nraised by the job (first|second)$"):
         run_jobs(jobs, fails, tmp_path, settings=SETTINGS, workers=workers)
-
-
-def test_a_refused_own_controller_is_named(tmp_path):
-    with pytest.raises(ConfigError, match="controllers"):
-        import stewart_drake as sd
-
-        sd.compare("paper", controllers={"lqr": LeafSystem})

@@ -210,7 +210,7 @@ def test_the_newest_measurement_is_handed_on_once(seed):
 
 
 def test_a_sensor_that_is_late_is_borne_like_a_longer_delay():
-    """On a plant without faults 0.6 and 0.2 s leave what 0.8 and 0 do, or less: 0.03 % s."""
+    """Delays of 0.6 and 0.2 s leave no more error than 0.8 and 0 s: 0.03 % s."""
     late = run("delay.steps=6", "sensor.delay=0.2")
     assert late.status == "completed" and late.accumulated_error < 0.03
     assert late.summary["counts"]["measurements_missing"] == 2
@@ -258,7 +258,7 @@ def test_a_network_without_losses_is_a_wire(time, delay, torques, controller):
 
 
 def test_plans_say_what_the_law_will_say():
-    """Where everything arrives, the next sample's plan is this one's, but for what was learnt."""
+    """If everything arrives, successive plans agree up to what was learnt."""
     loop = build_closed_loop(scenario(*IDEAL, "link.playout=0.9", "duration=4"))
     simulator, controller = make_simulator(loop), loop.GetSubsystemByName("controller")
     plans = []
@@ -337,7 +337,7 @@ def test_the_most_probable_content_is_believed():
 
 
 def test_packets_that_come_later_than_reports_tell_of_are_borne():
-    """Of a packet that was not there when it was last told of, nobody knows whether it is."""
+    """The state of a packet that was missing in the last report is unknown."""
     channel = Packets(1, 0, (0.5,), (0.0, 0.2, 0.4, 1.0, 1.0, 1.0), told=2)
     sent = channel.start()
     for k in range(6):
@@ -497,7 +497,7 @@ def test_half_periods_that_a_plant_cannot_have_are_left_out(known_outcomes):
 
 @pytest.mark.parametrize("completes", [1.0, 0.97, 0.8])
 def test_statements_on_the_worst_run_are_wrong_in_five_percent_at_most(completes):
-    """Of 20,000 studies: a run's error is uniform, runs beyond `completes` are lost."""
+    """20,000 studies: errors are uniform, runs beyond `completes` are lost."""
     rng, studies = np.random.default_rng(4), 20_000
     for n in (5, 29):
         stated = np.array(

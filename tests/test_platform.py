@@ -40,7 +40,7 @@ def test_a_box_stays_on_the_plate_while_it_moves(X_WB, capsys):
 
 
 def deck_height(mechanism):
-    """Of the plate's upper side above its COM, read from the model's own disc."""
+    """Return the height of the plate's upper side above its COM, from the model's disc."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 1e-3)
     sd.AddStewartPlatform(builder, mechanism, plant=plant)

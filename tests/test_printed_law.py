@@ -24,7 +24,7 @@ B = torque_map(PAPER, PAPER.home)
 
 
 def sampled_as_printed(model):
-    """With (35): z is sampled like any other state of (24), from its differential equation."""
+    """By (35), z is sampled like any other state of (24)."""
     A = np.zeros((24, 24))
     A[:6, 6:12] = A[12:18, :6] = np.eye(6)
     A[6:12, 18:] = B

@@ -441,7 +441,7 @@ def codec(tmp_path_factory):
 
 
 def through_c(codec, datagrams, key):
-    """Of each why C refuses it, as a number, and what it writes of it."""
+    """Yield the cause of refusal in C, as a number, and the datagram written again."""
     lines = "".join(data.hex() + "\n" for data in datagrams)
     done = subprocess.run(
         [codec, key.decode()], input=lines, capture_output=True, text=True, check=True
@@ -461,7 +461,7 @@ IN_C = {None: 0, Refusal.MALFORMED: 1, Refusal.VERSION: 2, Refusal.KEY: 3}
 
 
 def damaged(rng, data):
-    """What a bad link, or somebody, makes of a datagram."""
+    """Return a datagram damaged at random."""
     kind = rng.randrange(6)
     if kind == 0:
         return data[: rng.randrange(len(data) + 1)]

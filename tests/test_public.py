@@ -1,4 +1,4 @@
-"""What somebody meets at a prompt: public names, and objects that say in a line what they are."""
+"""The public interface: names, signatures, representations, functions of the commands."""
 
 import ast
 import importlib.metadata

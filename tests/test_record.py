@@ -129,7 +129,7 @@ def test_measurement_and_estimate_are_the_controllers():
 
 
 def test_measurements_are_held_between_samples_and_kept_where_they_are_missing():
-    """With a bad reading, the log shows it as it came, and the model's state beside it."""
+    """The log shows a bad reading as received, and the state of the model."""
     loop = build_closed_loop(scenario("duration=0.5"))
     port = loop.GetOutputPort("measurement")
     assert np.isnan(port.Eval(loop.CreateDefaultContext())).all(), "nothing was measured yet"
@@ -201,7 +201,7 @@ def test_the_ports_are_those_of_the_table():
     [("duration=0.3",), ("duration=2", "start=rest", "queue=zero", "plant.gravity=true")],
 )
 def test_the_summary_has_the_keys_and_kinds_that_its_type_tells(settings):
-    """Of a run that completes, and of one that leaves the workspace."""
+    """One run completes, one leaves the workspace."""
     summary = sd.simulate(scenario(*settings)).summary
     assert (summary["status"] == "completed") == (len(settings) == 1)
     margin = summary["controller_margin"]

@@ -24,7 +24,7 @@ def run():
 
 
 def data_of(html):
-    """What the page's own script works with."""
+    """Return the data of the page's script."""
     return json.loads(re.search(r"const run = (\{.*\});", html)[1])
 
 

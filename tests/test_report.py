@@ -56,7 +56,7 @@ def summary(report):
 
 
 def text_of(html):
-    """What a reader sees, roughly: without tags, styles and the replay inside."""
+    """Return the visible text, without tags, styles and the replay."""
 
     class Reader(HTMLParser):
         def __init__(self):
@@ -137,7 +137,7 @@ def test_the_mean_error_leaves_out_the_time_in_which_nothing_can_act(summary):
 
 
 def collect_of(scenario, **changes):
-    """What a report is made of, with one run and without the analyses' work."""
+    """Return the parts of a report with one run and no analyses."""
     parts = {
         "scenario": scenario,
         "failure": None,

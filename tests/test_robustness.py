@@ -128,7 +128,7 @@ def test_too_few_pairs_have_no_correlation():
 @pytest.mark.parametrize("q", [0.5, 0.9])
 @pytest.mark.parametrize("n", [20, 200])
 def test_quantiles_are_covered(n, q):
-    """Of uniform numbers, whose q-quantile is q; infinite ones are the worst there are."""
+    """Uniform numbers, whose q-quantile is q; some are infinite."""
     rng, hits, trials = np.random.default_rng(2), 0, 1500
     for _ in range(trials):
         values = rng.uniform(size=n)
@@ -379,7 +379,7 @@ def test_lacking_mass_is_a_negative_payload():
 
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
 def test_the_loop_simulates_the_true_machine(kind):
-    """For 0.4 s only the torques in flight act, which move a plate ten times as heavy less."""
+    """Only the torques in flight act for 0.4 s; they move a plate ten times as heavy less."""
     scenario = short(start="rest", queue="reference", duration=0.4)
     scenario.plant.kind = kind
     scenario.delay.steps, scenario.controller.catch_up = 8, 0.0
@@ -635,7 +635,7 @@ def test_failures_by_chance_are_explained_by_nothing():
 
 
 def test_the_auc_interval_covers_the_truth():
-    """Of two shifted normal samples AUC is Phi(d / sqrt 2), missed by 5 % of the intervals."""
+    """AUC of two shifted normal samples is Phi(d / sqrt 2); 5 % of the intervals miss it."""
     rng, shift = np.random.default_rng(4), 1.0
     truth = scipy.stats.norm.cdf(shift / np.sqrt(2))
     misses = 0

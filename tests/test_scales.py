@@ -51,7 +51,7 @@ def scaled(s, m):
 
 
 def run(monkeypatch, s, m, *settings):
-    """On the exact plant; and the torques in units of m s^2."""
+    """Run on the exact plant; return the torques in units of m s^2, too."""
     sc = load_scenario("paper", None, ("plant.kind=exact", *settings))
     for field in {"amplitude", "offset"} & set(vars(sc.reference)):  # a hold has one of them
         values = np.array(getattr(sc.reference, field)) * np.repeat([1, s], 3)

@@ -26,7 +26,7 @@ def meshcat():
 
 
 def transform(meshcat, path):
-    """What a browser is told of a path, 4 x 4."""
+    """Return the transform (4, 4) of a path in the browser."""
     return np.reshape(msgpack.unpackb(meshcat._GetPackedTransform(path))["matrix"], (4, 4)).T
 
 

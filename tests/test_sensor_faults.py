@@ -73,7 +73,7 @@ def test_spikes_of_all_sizes_are_told_from_motion(size):
 @pytest.mark.slow
 @pytest.mark.parametrize("controller", CONTROLLERS[:4])
 def test_the_papers_controllers_count_them_too(controller):
-    """Without a delay, where they keep the plate."""
+    """They keep the plate without a delay."""
     slow = ("delay.steps=0", "reference.amplitude=[0.02, 0.02, 0.02, 0.002, 0.002, 0.008]")
     for kind in COUNT:
         far = {"size": 1e3} if kind == "spike" else {}  # without a filter, out of reach only
@@ -145,7 +145,7 @@ def test_a_sensor_that_comes_back_is_believed_again():
 
 
 def test_a_plate_that_was_put_elsewhere_is_believed_in_the_end():
-    """By hand, 1 mm away: outliers that follow from one another are no broken sensor."""
+    """The plate is moved by 1 mm: consistent outliers are not a broken sensor."""
     law, reference = law_of("delay.steps=2"), sine(0.3)
     loop = Loop(law, reference, queue=nominal_queue(law, reference)).run(8)
     loop.states[-1] = loop.states[-1] + 1e-3 * np.eye(12)[3]
@@ -258,7 +258,7 @@ def take_a_sample(law):
 
 
 def seven(observer):
-    """Without the last parameter of the equations of motion."""
+    """Return settings without the last parameter of the equations of motion."""
     known = observer.settings.parameters
     columns = {f.name: getattr(known, f.name) for f in dataclasses.fields(known)}
     fewer = {name: column[:7] for name, column in columns.items() if column is not None}

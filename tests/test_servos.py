@@ -59,7 +59,7 @@ def run(*more, controller="servo_preview", kind="exact"):
 
 
 def crank_rates(pose, rates):
-    """By differences of the crank angles."""
+    """Return crank rates by differences of the crank angles."""
     h, angles = 1e-6, DYNAMICS.mechanism.crank_angles
     return (angles(pose + h * rates) - angles(pose - h * rates)) / (2 * h)
 

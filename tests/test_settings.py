@@ -218,7 +218,7 @@ def setting_of(name, value):
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """What makes a file for a field: another machine, a known one, another motion."""
+    """Return a function that writes a file for a field: a machine, a calibration, a motion."""
     folder = tmp_path_factory.mktemp("files")
 
     def make(name, scenario):

@@ -1,4 +1,4 @@
-"""What is shipped works: every scenario completes on both plants, within its motors' limits."""
+"""Every shipped scenario completes on both plants, within its motors' limits."""
 
 import dataclasses
 
@@ -49,7 +49,7 @@ def test_paper_clear_completes_the_papers_scenario_at_full_amplitude(controller)
 
 @pytest.mark.parametrize("name", OWN)
 def test_own_scenarios_are_tracked_within_the_motors_limit(name):
-    """With the controller predictor_lqi, which says nothing that a scenario's default does not."""
+    """The controller predictor_lqi equals the default of a scenario."""
     middle = load_scenario(name, "predictor_lqi", ("plant.kind=exact", "duration=3.0"))
     result = simulate(middle)
     assert result.status == "completed"
@@ -70,7 +70,7 @@ def test_every_scenario_s_delay_can_be_beaten(name):
 
 @pytest.mark.parametrize("name", shipped("mechanism"))
 def test_cranks_of_a_pair_of_the_own_mechanisms_cannot_touch(name):
-    """Of the paper's lengths they can, see docs/errata.md; ours have them further apart."""
+    """Cranks of the paper's lengths can, see docs/errata.md; ours are further apart."""
     mechanism = load_mechanism(name)
     distance = np.linalg.norm(mechanism.p_WS[:, None] - mechanism.p_WS[None], axis=2)
     nearest = np.min(distance + np.diag(np.full(6, np.inf)))

@@ -150,7 +150,7 @@ Update = Callable[[Context, State], None]
 
 
 def carry_out(update, context):
-    """What a simulator does with an unrestricted update."""
+    """Apply an unrestricted update as a simulator does."""
     after = context.Clone()
     update(context, after.get_mutable_state())
     context.SetTimeStateAndParametersFrom(after)

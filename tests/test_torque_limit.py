@@ -223,7 +223,7 @@ def test_drawn_limits_are_never_above_the_motors(tmp_path):
 
 
 def test_motors_at_their_limit_for_a_second():
-    """From rest, with a limit unknown to the catch-up: the plate is caught in the end."""
+    """The catch-up from rest does not know the limit; the plate is caught in the end."""
     small = "reference.amplitude=[0.01, 0.01, 0.01, 0.001, 0.001, 0.004]"
     sc = scenario("duration=8", "delay.steps=2", small)
     free = simulate(sc, judge_stability=False)

@@ -81,7 +81,7 @@ def test_a_step_in_which_friction_makes_cranks_tremble_is_told():
 @pytest.mark.slow
 @pytest.mark.parametrize("controller", ["predictor_lqi", "adaptive_lqi"])
 def test_friction_is_found_where_it_is_asked_for(controller):
-    """Without it is taken for bias and damping, which it is not, and the run is lost or bad."""
+    """Otherwise friction is taken for bias and damping, and the run is lost or bad."""
     settings = ("plant.kind=exact", "duration=6", "plant.coulomb_friction=1e-3", *ON_REFERENCE)
     asked = "controller.estimate=[torque_bias,payload,damping,coulomb]"
     loop = build_closed_loop(sd.load_scenario("paper", controller, (*settings, asked)))
@@ -127,7 +127,7 @@ def machine(tmp_path):
 
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
 def test_the_plant_is_the_machine_that_the_scenario_says(machine, kind):
-    """As with `true_mechanism`; the controller knows the other one."""
+    """The result equals `true_mechanism`; the controller knows the other machine."""
     settings = (f"plant.kind={kind}", "duration=0.5")
     found = run(*settings, f"plant.mechanism={machine}")
     truth = dataclasses.replace(PAPER, rod_lengths=PAPER.rod_lengths + 3e-4)
@@ -172,7 +172,7 @@ def test_a_machine_that_is_not_there_names_the_field(name, message):
 
 
 def test_a_payload_is_found_alone_and_recorded_at_its_place():
-    """What is not estimated is recorded as it is known, without a standard deviation."""
+    """Parameters that are not estimated are recorded as known, without a standard deviation."""
     settings = ("plant.kind=exact", "duration=3", "plant.payload_mass=0.02", *ON_REFERENCE)
     last = run(*settings, "controller.estimate=[payload]").signals.isel(time=-1)
     others = [i for i in range(NUM_PARAMETERS) if i != PAYLOAD]

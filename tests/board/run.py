@@ -93,7 +93,7 @@ ROWS: Final = (
 
 @dataclass(frozen=True)
 class Counted:
-    """What a replay on a board took."""
+    """Measurements of a replay on a board."""
 
     flash: int
     state: int

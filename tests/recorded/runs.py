@@ -53,7 +53,7 @@ def closed_loop(row: str) -> ClosedLoop:
 
 
 def _run_servos(loop: ClosedLoop) -> tuple[Array, Array]:
-    """As `run`, for controllers that send commands to servos."""
+    """Run as `run` does, for controllers that send commands to servos."""
     simulator = make_simulator(loop)
     context = simulator.get_context()
     period = loop.experiment.scenario.controller.period
@@ -134,7 +134,7 @@ def answers(loop: ClosedLoop, measurements: Array) -> Array:
 
 
 def made_with() -> str:
-    """What rounding depends on: releases, and how libraries round on this processor.
+    """Return a key of everything that rounding depends on: releases and processor.
 
     Sines, products and factorisations choose their code by the processor, which need not show in
     its name: their own last bits are the witness, and those of the compiled core.
