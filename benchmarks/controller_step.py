@@ -1,8 +1,7 @@
-"""Where the computing time of a closed loop goes: one controller step, one run, one process.
+"""Computing time of a closed loop: one controller step, one run, one process.
 
 The parts of a step are those of the law in Python, which the law in C does not call.
-Times of steps are medians over a run and its worst step, each the least of several runs. Writes
-benchmarks/results/controller_step.md.
+Times of steps are medians over a run and its worst step, each the least of several runs.
 """
 
 import subprocess
@@ -41,12 +40,12 @@ PARTS = {
     "sample": (QuadraticCost, "sampled"),
     "Riccati gain": (QuadraticCost, "gain"),
 }
-"""What a step of `predictor_lqi` calls, in order; the rest of it is arithmetic on short vectors."""
+"""Calls of a step of `predictor_lqi`, in order; the rest is arithmetic on short vectors."""
 
 
 @contextmanager
 def timed_parts() -> Iterator[dict[str, list[float]]]:
-    """Within it the law is Python's, and every call of PARTS appends its ms under its name."""
+    """Time the parts of the law in Python: every call of PARTS appends its ms under its name."""
     spent: dict[str, list[float]] = defaultdict(list)
     originals = {name: getattr(*place) for name, place in PARTS.items()}
 
@@ -73,7 +72,7 @@ def timed_parts() -> Iterator[dict[str, list[float]]]:
 
 
 def steps() -> tuple[list[list[str]], list[list[str]]]:
-    """Rows of the step times as `summary` reports them, and of their parts' medians."""
+    """Return rows of the step times as `summary` reports them, and of their parts' medians."""
     totals, parts = [], []
     for name, settings in SCENARIOS.items():
         for estimator, estimate in ESTIMATORS.items():
@@ -97,7 +96,7 @@ def steps() -> tuple[list[list[str]], list[list[str]]]:
 
 
 def in_fresh_processes(code: str, times: int = 5) -> list[float]:
-    """The numbers that `code` prints, least of several processes each."""
+    """Return the numbers that `code` prints, each the least of several processes."""
     runs = [
         [float(word) for word in subprocess.check_output([sys.executable, "-c", code]).split()]
         for _ in range(times)
@@ -106,7 +105,7 @@ def in_fresh_processes(code: str, times: int = 5) -> list[float]:
 
 
 def walls() -> list[list[str]]:
-    """Wall time of ten simulated seconds of `paper`."""
+    """Return the wall time of ten simulated seconds of `paper`."""
     rows = []
     for kind in ("exact", "multibody"):
         code = f"""
@@ -135,7 +134,7 @@ for _ in range(4):
 
 
 def evaluations() -> list[list[str]]:
-    """One evaluation of the accelerations, and how long the first one takes."""
+    """Return the time of an evaluation of the accelerations, and of the first one."""
     mechanism = sd.load_mechanism("paper")
     dynamics, pose, rates, torque = sd.StewartDynamics(mechanism), mechanism.home, *np.ones((2, 6))
     dynamics.accelerations(pose, rates, torque)
@@ -161,7 +160,6 @@ print(time.perf_counter() - started)
 
 
 def main() -> None:
-    """Measure, print and write."""
     totals, parts = steps()
     write(
         __file__,

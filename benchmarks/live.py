@@ -346,8 +346,12 @@ def _controller_killed(
     found["safe"].append(at - killed)
     end = time.monotonic() + 60
     while time.monotonic() < end:
-        if spare.has("there is no way|^refused|error", killed):
-            line = next(t for _, t in spare.lines if re.search("there is no way|^refused|error", t))
+        if spare.has("no reference from the present pose|^refused|error", killed):
+            line = next(
+                t
+                for _, t in spare.lines
+                if re.search("no reference from the present pose|^refused|error", t)
+            )
             found["refused"].append(line)
             return
         if began.has("torques act again|the run began", killed):

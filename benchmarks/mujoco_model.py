@@ -49,7 +49,7 @@ class Closure(NamedTuple):
 
 
 def to_mjcf(mechanism: Mechanism, gravity: bool, closure: Closure) -> str:
-    """The mechanism as an MJCF document, its legs assembled at the home pose."""
+    """Return the mechanism as an MJCF document, its legs assembled at the home pose."""
     home = assemble(mechanism, mechanism.home)
     root = ET.Element("mujoco", model=mechanism.name)
     ET.SubElement(root, "compiler", angle="radian")
@@ -171,7 +171,7 @@ class MujocoStewart:
 
 
 def largest_difference(mechanism: Mechanism, hardening: float) -> float:
-    """Of the accelerations of MuJoCo and `StewartDynamics`, relative, at twenty random states."""
+    """Return the relative difference of the accelerations from the exact ones, at random states."""
     rng, worst = np.random.default_rng(46), 0.0
     for gravity in (True, False):
         exact = sd.StewartDynamics(mechanism, gravity)

@@ -81,7 +81,7 @@ def steps() -> str:
     rows = []
     for name in ("paper", "gravity"):
         python, c = replayed_steps(name).values()
-        fed = [k for k, seconds in enumerate(c) if k >= 8]  # before, there is no feedback
+        fed = [k for k, seconds in enumerate(c) if k >= 8]  # earlier ones are without feedback
         mid = [float(np.median([times[k] for k in fed])) for times in (python, c)]
         worst = max(c[k] for k in fed) / mid[1]
         medians = [f"{1e6 * one:.4g}" for one in mid]

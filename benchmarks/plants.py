@@ -40,7 +40,7 @@ START = np.concatenate([MECHANISM.home, np.zeros(6)])
 
 
 class Motion(NamedTuple):
-    """What drives the motors: amplitude (6,) N m * sin(frequency t + phase (6,)), in rad/s."""
+    """Motor torques amplitude (6,) N m * sin(frequency t + phase (6,)), frequency in rad/s."""
 
     title: str
     gravity: bool
@@ -69,7 +69,7 @@ def motions() -> tuple[Motion, Motion]:
 
 
 def reference(motion: Motion) -> Array:
-    """Final state (12,) by scipy's eighth-order method."""
+    """Return the final state (12,) by scipy's eighth-order method."""
     dynamics = sd.StewartDynamics(MECHANISM, motion.gravity)
 
     def change(t: float, x: Array) -> Array:
@@ -110,7 +110,7 @@ def drake_run(motion: Motion, plant: Any, scheme: str | None, accuracy: float) -
 
 
 def dop853_run(motion: Motion, accuracy: float) -> Run:
-    """The compiled DOP853."""
+    """Return a run by the compiled DOP853."""
     dynamics = sd.StewartDynamics(MECHANISM, motion.gravity)
     drive = Drive(amplitude=motion.amplitude, frequency=motion.frequency, phase=motion.phase)
     end = np.array([motion.duration])
@@ -161,7 +161,7 @@ def candidates(motion: Motion) -> dict[tuple[str, str], Run]:
 
 
 class Curve(NamedTuple):
-    """What the settings of a family reach: errors in rad or m, times in ms per simulated second."""
+    """Errors of the settings of a family in rad or m, and times in ms per simulated second."""
 
     settings: list[str]
     error: Array
@@ -176,7 +176,7 @@ class Curve(NamedTuple):
 
 
 def measure(motion: Motion) -> dict[str, Curve]:
-    """The curve of each family."""
+    """Return the curve of each family."""
     expected, runs = reference(motion), candidates(motion)
     errors: dict[tuple[str, str], float] = {}
     times: dict[tuple[str, str], list[float]] = {key: [] for key in runs}
@@ -198,7 +198,7 @@ def measure(motion: Motion) -> dict[str, Curve]:
 
 
 def claims(curves: Sequence[dict[str, Curve]]) -> list[list[str]]:
-    """What docs/figures.md says about the plants."""
+    """Return the rows that docs/figures.md quotes."""
     rows = []
     for motion, families in zip(motions(), curves, strict=True):
         exact, sap = families["exact, runge_kutta5"], families["SAP"]
@@ -236,7 +236,6 @@ def figure(curves: Sequence[dict[str, Curve]]) -> Figure:
 
 
 def main() -> None:
-    """Measure, print, and write table and figure."""
     curves = [measure(motion) for motion in motions()]
     parts = ["## Claims\n\n" + table(["what", "motion", "value"], claims(curves))]
     for motion, families in zip(motions(), curves, strict=True):

@@ -34,7 +34,7 @@ RUNS = (100, 400, 1600)
 
 
 def plants() -> Rows:
-    """The exact plant, no less accurate than SAP at its smallest step, against that."""
+    """Compare the exact plant with SAP at its smallest step, at no larger error."""
     rows, mechanism = [], load_mechanism("paper")
     for motion in motions():
         expected = plant_reference(motion)
@@ -58,7 +58,7 @@ def plants() -> Rows:
 
 
 def gains() -> Rows:
-    """The whole chain's Riccati equation, by Drake and by scipy, against the reduced one."""
+    """Compare the whole chain's Riccati equation, by Drake and by scipy, with the reduced one."""
     rows = []
     header, lines = comparison(0.0)
     for line in lines:
@@ -72,7 +72,7 @@ def gains() -> Rows:
 
 
 def run(*settings: str, scenario: str = "paper") -> tuple[float, float, float]:
-    """Wall time in s, median and worst step in ms, each the least of several runs."""
+    """Return wall time in s, median and worst step in ms, each the least of several runs."""
     loaded = sd.load_scenario(scenario, settings=["plant.kind=exact", *settings])
     summaries = [sd.simulate(loaded).summary for _ in range(REPEATS)]
     steps = [summary["controller_step_ms"] for summary in summaries]
@@ -84,7 +84,7 @@ def run(*settings: str, scenario: str = "paper") -> tuple[float, float, float]:
 
 
 def steps() -> Rows:
-    """One step of `predictor_lqi`, everything included."""
+    """Time a complete step of `predictor_lqi`."""
     rows = []
     for name, settings in {"paper": (), "gravity": ("duration=2.0",)}.items():
         _, median, worst = run(*settings, scenario=name)
@@ -95,7 +95,7 @@ def steps() -> Rows:
 
 
 def growth(field: str, values: Sequence[float]) -> Rows:
-    """A run of 5 s and its steps over a field, and against the first value."""
+    """Time a run of 5 s and its steps over a field, also relative to the first value."""
     settings = ["duration=5.0", "start=on_reference", "queue=reference"]
     measured = [run(f"{field}={value}", *settings)[:2] for value in values]
     first_wall, first_median = measured[0]
@@ -107,7 +107,7 @@ def growth(field: str, values: Sequence[float]) -> Rows:
 
 
 def studies() -> Rows:
-    """Numbers of runs, in one process and on all cores, as data set and Monte Carlo make them."""
+    """Time many runs, in one process and on all cores."""
     cores = joblib.cpu_count()
     scenario = sd.load_scenario("paper", settings=["plant.kind=exact"])
     rows = []
@@ -125,7 +125,6 @@ def studies() -> Rows:
 
 
 def main() -> None:
-    """Measure, print and write."""
     again = [[what, f"{value} s", ""] for what, value in walls()]
     one = [[f"accelerations, {what}", value, ""] for what, value in evaluations()]
     cores = joblib.cpu_count()

@@ -1,4 +1,4 @@
-"""What is left for a tuner with the delay estimator: fresh conditions of family T.
+"""Gain of a tuner in addition to the delay estimator: fresh conditions of family T.
 
 `tune evaluate --family T` compares all candidates without the delay estimator. The runs are kept in
 the folder of the first argument, out/tuner-families by default, so that a second start continues.

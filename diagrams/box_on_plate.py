@@ -1,4 +1,4 @@
-"""A platform and a loose box in a MultibodyPlant of one's own: the box stays on the moving plate.
+"""A platform and a loose box in a user's MultibodyPlant: the box stays on the moving plate.
 
 python diagrams/box_on_plate.py
 """
@@ -16,7 +16,7 @@ import stewart_drake as sd
 MASS, SIDE = 0.1, 0.05
 """Of the box, kg and m."""
 DECK = 0.02
-"""m above the plate's COM from where the box is dropped; the upper side of its disc is below."""
+"""Height in m above the plate's COM from which the box is dropped onto its disc."""
 
 
 class Sway(LeafSystem):
@@ -30,7 +30,6 @@ class Sway(LeafSystem):
         self.DeclareVectorOutputPort("torque", 6, self.calc_torque)
 
     def calc_torque(self, context, output) -> None:
-        """The port `torque`."""
         x, t = self.get_input_port().Eval(context), context.get_time()
         size, w = np.array([0.1, 0.08, 0.3, 0.02, 0.02, 0.02]), 3.0
         pose, rates = self.home + size * (1 - np.cos(w * t)) / 2, size * w * np.sin(w * t) / 2
@@ -39,7 +38,7 @@ class Sway(LeafSystem):
 
 
 def build(mechanism: sd.Mechanism, X_WB: RigidTransform | None = None):
-    """The diagram, its plant, the platform and the box; the base at X_WB in the world."""
+    """Return diagram, plant and box; the base of the platform is at X_WB in the world."""
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, 1e-3)
     config = sd.PlantConfig(gravity=True)
@@ -58,7 +57,7 @@ def build(mechanism: sd.Mechanism, X_WB: RigidTransform | None = None):
 
 
 def main(X_WB: RigidTransform | None = None) -> np.ndarray:
-    """Positions (20, 3) of the box in the plate, and print them; rows are tenths of a second."""
+    """Print and return positions (20, 3) of the box in the plate, every tenth of a second."""
     diagram, plant, box = build(sd.load_mechanism("paper"), X_WB)
     simulator = Simulator(diagram)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())

@@ -11,7 +11,6 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import System
 from pydrake.trajectories import Trajectory
 
@@ -100,10 +99,12 @@ def compare(
         for name in scenarios
     }
     with TemporaryDirectory() as folder, ThreadPoolExecutor(1) as thread:
-        board = _Board(Path(folder) / "board", len(scenarios), new=True)
+        # A row with time and error for each run; a 1 in the last row stops all of them.
+        path = Path(folder) / "board"
+        board = np.memmap(path, np.float64, "w+", shape=(len(scenarios) + 1, 2))
         keys = [f"run{i}_{_NO_KEY.sub('_', name)[:99]}" for i, name in enumerate(scenarios)]
         jobs = {
-            key: (name, scenarios[name], given[name], board.path, i, len(scenarios))
+            key: (name, scenarios[name], given[name], path, i)
             for i, (key, name) in enumerate(zip(keys, scenarios, strict=True))
         }
         # Own controllers first: what runs in this process does so while workers do the others.
@@ -118,13 +119,13 @@ def compare(
                 try:
                     wait([runs], timeout=_POLL)
                     if progress is not None:
-                        for name, time, error in zip(scenarios, *board.news(), strict=True):
+                        for name, (time, error) in zip(scenarios, board[:-1], strict=True):
                             if time > 0:
                                 progress(name, time, error)
                 except KeyboardInterrupt:
-                    board.stop()
+                    board[-1] = 1.0
         finally:
-            board.stop()
+            board[-1] = 1.0
         results = {name: runs.result()[key] for name, key in zip(scenarios, keys, strict=True)}
     return {name: one for name, one in results.items() if one is not None}
 
@@ -218,41 +219,18 @@ def comparison_summary(results: Mapping[str, SimulationResult]) -> dict[str, Any
     return {"controllers": {name: result.summary for name, result in results.items()}}
 
 
-class _Board:
-    """File in which each run notes its time and error, and reads whether to stop."""
-
-    def __init__(self, path: Path, runs: int, new: bool = False) -> None:
-        self.path = path
-        shape = (runs + 1, 2)
-        self._rows = np.memmap(path, np.float64, "w+" if new else "r+", shape=shape)
-
-    @property
-    def stopped(self) -> bool:
-        return bool(self._rows[-1, 0])
-
-    def stop(self) -> None:
-        self._rows[-1, 0] = 1.0
-
-    def note(self, run: int, time: float, error: float) -> None:
-        self._rows[run] = time, error
-
-    def news(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return self._rows[:-1, 0], self._rows[:-1, 1]
-
-
-def _run(
-    name: str, scenario: Scenario, own: dict[str, Any], path: Path, run: int, runs: int
-) -> bytes:
+def _run(name: str, scenario: Scenario, own: dict[str, Any], board: Path, run: int) -> bytes:
     """Return the pickled result: None if it was stopped before, or an error if it is refused."""
-    board = _Board(path, runs)
+    rows = np.memmap(board, np.float64, "r+").reshape(-1, 2)
 
     def progress(time: float, error: float) -> None:
-        board.note(run, time, error)
-        if board.stopped:
+        rows[run] = time, error
+        if rows[-1, 0]:
             raise KeyboardInterrupt
 
     try:
-        return pickle.dumps(None if board.stopped else simulate(scenario, progress=progress, **own))
+        stopped = rows[-1, 0]
+        return pickle.dumps(None if stopped else simulate(scenario, progress=progress, **own))
     except ConfigError as error:
         return pickle.dumps(ConfigError(f"{name}: {error}"))
 

@@ -267,7 +267,7 @@ class Space:
         named = dict(zip(PARAMETERS, map(float, values), strict=True))
         crank, rod = named.pop("crank"), named.pop("rod")
         order, branches = list(arrangement.order), list(arrangement.branches)
-        pattern = replace(self.pattern, plate_order=order, branches=branches, **named)  # type: ignore[arg-type]
+        pattern = replace(self.pattern, plate_order=order, branches=branches, **named)
         return pattern, crank, rod
 
     def legs(self, values: Sequence[float] | Array, arrangement: Arrangement) -> Legs:

@@ -18,8 +18,8 @@ _TORQUE_SHARE: Final = "share of the reference's largest torque"
 _CRANK_SHARE: Final = "share of the mean crank length"
 
 
-def _share(unit: str, **bounds: float) -> Any:
-    return Field(ge=0, description=unit, **bounds)  # type: ignore[arg-type]
+def _share(unit: str, **bounds: Any) -> Any:
+    return Field(ge=0, description=unit, **bounds)
 
 
 @dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))

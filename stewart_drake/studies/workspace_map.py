@@ -87,7 +87,7 @@ def wrenches(mechanism: Legs, legs: LegGeometry) -> Array:
 def rate_gains(mechanism: Legs, legs: LegGeometry, W: Array) -> Array:
     """Return the singular values (..., 6) of A, the largest first."""
     A = W.swapaxes(-1, -2) / (mechanism.crank_lengths * legs.transmission)[..., None]
-    return np.linalg.svd(A, compute_uv=False)
+    return np.asarray(np.linalg.svd(A, compute_uv=False), dtype=np.float64)
 
 
 def measure(mechanism: Mechanism, pose: Array) -> Measures:

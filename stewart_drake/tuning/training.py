@@ -462,12 +462,31 @@ def train_by_regret(
     best = first = trainer.network(theta, features, about)
     more: dict[str, Any] = {}
     if features == "health":
+        base = validate(Scenario, with_new_names(settings["scenario"]), "data")
+        samples = data.sizes["sample"]
 
         def own_runs(network: Network, chosen: Indices, number: int) -> Curves:
-            folder = Path(directory) / f"round{number}-{_key(network)[:8]}"
-            return roll_outs(
-                settings, data.sizes["sample"], chosen, network, folder, workers, progress
-            )
+            """Run some of the conditions with a network."""
+            key = _key(network)
+            found = run_jobs(
+                {
+                    f"{i:05d}": (vary(FAULTY, base, settings["draws"][i]), network, samples)
+                    for i in chosen
+                },
+                roll_out,
+                Path(directory) / f"round{number}-{key[:8]}",
+                settings={
+                    "family": settings["family"],
+                    "scenario": scenario_to_dict(base),
+                    "network": key,
+                },
+                suffix=".npz",
+                read=partial(read_condition, samples=samples),
+                workers=workers,
+                progress=progress,
+            ).values()
+            J, health = (np.array([one[name] for one in found]) for name in ("J", "health"))
+            return Curves(J, health)
 
         held, some = np.flatnonzero(trainer.held), np.flatnonzero(~trainer.held)[:: round(1 / OWN)]
         chosen = np.sort(np.concatenate([held, some]))
@@ -492,45 +511,6 @@ def train_by_regret(
     network = replace(best, start=weights_of(begin), card=dict(best.card) | more)
     nothing = np.empty((0, NUM_OUTPUTS))
     return Training(network, np.array(trainer.curve), nothing, nothing)
-
-
-def roll_outs(
-    settings: dict[str, Any],
-    samples: int,
-    chosen: Indices,
-    network: Network,
-    directory: Path,
-    workers: int | None = None,
-    progress: Progress | None = None,
-) -> Curves:
-    """Run some of the conditions with a network, or continue.
-
-    Args:
-        settings: of the data set.
-        samples: number of samples of a run.
-        chosen: numbers of the conditions.
-        network: sets the weights.
-        directory: of the runs.
-        workers, progress: as `run_jobs` takes them.
-    """
-    base = validate(Scenario, with_new_names(settings["scenario"]), "data")
-    draws = settings["draws"]
-    kept = run_jobs(
-        {f"{i:05d}": (vary(FAULTY, base, draws[i]), network, samples) for i in chosen},
-        roll_out,
-        directory,
-        settings={
-            "family": settings["family"],
-            "scenario": scenario_to_dict(base),
-            "network": _key(network),
-        },
-        suffix=".npz",
-        read=partial(read_condition, samples=samples),
-        workers=workers,
-        progress=progress,
-    )
-    found = kept.values()
-    return Curves(np.array([one["J"] for one in found]), np.array([one["health"] for one in found]))
 
 
 class RegretTrainer:
