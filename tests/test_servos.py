@@ -238,7 +238,7 @@ def loop_at(*more, until, **which):
     simulator.AdvanceTo(look_time(until))
     context = simulator.get_context()
     servos = loop.GetSubsystemByName("servos")
-    return loop, context, servos.remembered(servos.GetMyContextFromRoot(context))
+    return loop, context, servos.sample(servos.GetMyContextFromRoot(context)).memory
 
 
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
@@ -437,7 +437,7 @@ def test_servos_do_not_follow_what_is_no_number():
     simulator = Simulator(servos, alone)
     simulator.get_mutable_integrator().set_maximum_step_size(1e-3)
     simulator.AdvanceTo(0.365)
-    after = servos.remembered(alone)
+    after = servos.sample(alone).memory
     assert after.segment.end == before.segment.end and np.all(np.isfinite(after.torque))
     assert np.all(np.isfinite(after.setpoint)) and after.arrived == before.arrived
 

@@ -111,7 +111,9 @@ class SteppedLaw(LeafSystem):
                 share one step.
     """
 
-    def _begin(self, memory: Any, period: float) -> None:
+    def _begin(
+        self, memory: Any, period: float, when: Callable[[float], float] = event_time
+    ) -> None:
         """Declare the state and its update, after the input ports."""
         first = Sample(memory, 0.0)
         self._last = self.DeclareAbstractState(Value(first))
@@ -121,7 +123,7 @@ class SteppedLaw(LeafSystem):
             ValueProducer(allocate=lambda: Value(first), calc=weak(self._calc_step)),
             {self.all_input_ports_ticket(), *self._held},
         )
-        update_every(self, period, self._update)
+        update_every(self, period, self._update, when)
 
     @abstractmethod
     def _prepared(self, context: Context) -> Callable[[], Any]:

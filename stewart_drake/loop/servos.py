@@ -1,13 +1,13 @@
 """Servos: the local loops at the motors as a Drake system, and the design of their law."""
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
-from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.framework import Context
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -31,7 +31,7 @@ from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.own import NOTHING
 from stewart_drake.loop.preparation import Experiment
-from stewart_drake.loop.sampling import update_every, weak
+from stewart_drake.loop.sampling import SteppedLaw
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.config import Scenario, compatible_actuator
 from stewart_drake.scenario.delay import Delay
@@ -69,12 +69,8 @@ class ServoState(NamedTuple):
         """Torque (6,) that acts, N m."""
         return np.nan_to_num(self.put_out[-1])
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "ServoState":
-        """Return the same object: a memory is never changed."""
-        return self
 
-
-class Servos(LeafSystem):
+class Servos(SteppedLaw):
     """Servos that follow arriving crank angles, with a local loop at each motor (`law.servos`).
 
     With h the period of the loops, x the state, c the newest command, arrived at t_c:
@@ -116,33 +112,30 @@ class Servos(LeafSystem):
         self._loop, self._dynamics, self._period, self.reports = loop, dynamics, period, reports
         nothing = np.full((reports.periods * round(period / loop.period), NUM_TORQUES), np.nan)
         setpoint, asked = command[SETPOINT], np.zeros(NUM_TORQUES)
-        first = ServoState(still(command, 0.0), np.nan, setpoint, asked, nothing)
-        self._memory = self.DeclareAbstractState(Value(first))
         self._command = self.DeclareVectorInputPort("command", NUM_REFERENCE)
         self._arrived = self.DeclareVectorInputPort("arrived", 1)
         self._state = self.DeclareVectorInputPort("state", NUM_STATE)
-        ticket = {self.abstract_state_ticket(self._memory)}
-        self.DeclareVectorOutputPort("torque", NUM_TORQUES, weak(self._torque), ticket)
-        self.DeclareVectorOutputPort("report", reports.size, weak(self._report), ticket)
-        update_every(self, loop.period, self._tick, servo_time)
+        first = ServoState(still(command, 0.0), np.nan, setpoint, asked, nothing)
+        self._begin(first, loop.period, servo_time)
+        self._put_out("torque", NUM_TORQUES, lambda memory: memory.torque)
+        self._put_out(
+            "report", reports.size, lambda m: reports.written(m.put_out, m.asked, loop.motors)
+        )
 
-    def remembered(self, context: Context) -> ServoState:
-        """Return the memory in a context of this system."""
-        value: Any = context.get_abstract_state(int(self._memory))
-        return value.get_value()
-
-    def _tick(self, context: Context, state: State) -> None:
-        before, now = self.remembered(context), context.get_time()
+    def _prepared(self, context: Context) -> Callable[[], ServoState]:
+        before, now = self.sample(context).memory, context.get_time()
         segment, arrived = self._segment(before, context)
-        wanted = segment.at(now, self._period)
-        setpoint = self._loop.limited(wanted[SETPOINT], before.setpoint[POSE])
-        asked = before.asked
-        with suppress(UnreachablePoseError):
-            cranks = self._cranks(np.asarray(self._state.Eval(context)))
-            asked = self._loop.torque(setpoint, wanted[MODEL_TORQUE], cranks)
-        put_out = np.vstack([before.put_out[1:], self._loop.motors.saturate(asked)])
-        after = ServoState(segment, arrived, setpoint, asked, put_out)
-        state.get_mutable_abstract_state(int(self._memory)).set_value(after)
+        state = np.asarray(self._state.Eval(context))
+
+        def step() -> ServoState:
+            wanted, asked = segment.at(now, self._period), before.asked
+            setpoint = self._loop.limited(wanted[SETPOINT], before.setpoint[POSE])
+            with suppress(UnreachablePoseError):
+                asked = self._loop.torque(setpoint, wanted[MODEL_TORQUE], self._cranks(state))
+            put_out = np.vstack([before.put_out[1:], self._loop.motors.saturate(asked)])
+            return ServoState(segment, arrived, setpoint, asked, put_out)
+
+        return step
 
     def _segment(self, before: ServoState, context: Context) -> tuple[Segment, float]:
         arrived = float(np.asarray(self._arrived.Eval(context))[0])
@@ -157,14 +150,6 @@ class Servos(LeafSystem):
         angles = self._dynamics.mechanism.crank_angles(state[POSE])
         rates = self._dynamics.actuation_map(state[POSE]).T @ state[RATES]
         return np.concatenate([angles, rates])
-
-    def _torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self.remembered(context).torque)
-
-    def _report(self, context: Context, output: BasicVector) -> None:
-        memory = self.remembered(context)
-        report = self.reports.written(memory.put_out, memory.asked, self._loop.motors)
-        output.SetFromVector(report)
 
 
 _PART: Final = 0.005

@@ -2,16 +2,12 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
-from pydrake.common.value import AbstractValue, Value
+from pydrake.common.value import Value
 from pydrake.systems.framework import (
-    BasicVector,
     Context,
-    LeafSystem,
-    State,
-    ValueProducer,
 )
 
 from stewart_drake.files.errors import ConfigError
@@ -20,7 +16,7 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.startup import INSTANTS, TOLERANCE, least_torque, reference_torque
 from stewart_drake.loop.preparation import Experiment
-from stewart_drake.loop.sampling import Sample, update_every, weak
+from stewart_drake.loop.sampling import Sample, SteppedLaw
 from stewart_drake.scenario.config import AnnTunerConfig, FixedTunerConfig, RuleTunerConfig
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES, RATES, WEIGHTS
 from stewart_drake.scenario.trajectories import evaluate, spread_instants
@@ -39,7 +35,7 @@ from stewart_drake.tuner.source import (
 from stewart_drake.types import Array
 
 
-class DensityWindow(LeafSystem):
+class DensityWindow(SteppedLaw):
     """Window of the last 31 samples, with the densities (45) of the newest.
 
     With s_k = [y_k - r_k; T_k], y the measured or else the estimated state, r the reference's pose
@@ -67,34 +63,30 @@ class DensityWindow(LeafSystem):
 
     def __init__(self, period: float, kind: Kind = "magnitude") -> None:
         super().__init__()
-        self._kind: Kind = kind
-        self._window = self.DeclareDiscreteState(np.full(WINDOW * NUM_INPUTS, np.nan))
         self._measurement = self.DeclareVectorInputPort("measurement", NUM_STATE)
         self._reference = self.DeclareVectorInputPort("reference", NUM_REFERENCE)
         self._torque = self.DeclareVectorInputPort("torque", NUM_TORQUES)
-        self.DeclareVectorOutputPort(
-            "density", NUM_INPUTS, weak(self._density), {self.discrete_state_ticket(self._window)}
-        )
-        update_every(self, period, self._update)
+        self._begin(np.full((WINDOW, NUM_INPUTS), np.nan), period)
+
+        def densities(window: Array) -> Array:
+            return density(window, kind) if np.isfinite(window).any() else window[-1]
+
+        self._put_out("density", NUM_INPUTS, densities)
 
     def window(self, context: Context) -> Array:
         """Return the samples (31, 18) in a context, the newest last, NaN where unknown."""
-        return np.reshape(context.get_discrete_state(self._window).value(), (WINDOW, NUM_INPUTS))
+        window: Array = self.sample(context).memory
+        return window
 
-    def _update(self, context: Context, state: State) -> None:
+    def _prepared(self, context: Context) -> Callable[[], Array]:
         target = np.asarray(self._reference.Eval(context))[:NUM_STATE]
         error = np.asarray(self._measurement.Eval(context)) - target
         sample = np.concatenate([error, self._torque.Eval(context)])
-        moved = np.vstack([self.window(context)[1:], sample])
-        state.get_mutable_discrete_state(self._window).SetFromVector(moved.ravel())
-
-    def _density(self, context: Context, output: BasicVector) -> None:
         window = self.window(context)
-        known = np.isfinite(window).any()
-        output.SetFromVector(density(window, self._kind) if known else window[-1])
+        return lambda: np.vstack([window[1:], sample])
 
 
-class AnnTuner(LeafSystem):
+class AnnTuner(SteppedLaw):
     """Sets w_Q and w_R at every sample by a network (III-D), within its bounds and a rate limit.
 
     With w the weights of the last sample, n the count of fallbacks, rho the densities of samples up
@@ -126,62 +118,36 @@ class AnnTuner(LeafSystem):
     ) -> None:
         super().__init__()
         self._network, self._fixed, self._factor = network, np.array(fixed), factor
-        size = len(WEIGHTS)
-        self._last = self.DeclareDiscreteState(np.full(size, np.nan))
-        self._count = self.DeclareDiscreteState(1)
         self._density = self.DeclareVectorInputPort("density", NUM_INPUTS)
-        self._step = self.DeclareCacheEntry(
-            "step",
-            ValueProducer(
-                allocate=lambda: Value((np.array(fixed), False)), calc=weak(self._calc_step)
-            ),
-            {self._density.ticket(), self.discrete_state_ticket(self._last)},
-        )
-        self.DeclareVectorOutputPort("weights", size, weak(self._weights), {self._step.ticket()})
-        update_every(self, period, self._update)
+        self._begin((np.full(len(WEIGHTS), np.nan), 0), period)
+        self._put_out("weights", len(WEIGHTS), lambda memory: memory[0], now=True)
 
     def fallbacks(self, context: Context) -> int:
         """Return the number of fallbacks so far."""
-        return int(context.get_discrete_state(self._count).value()[0])
+        return int(self.sample(context).memory[1])
 
-    def _calc_step(self, context: Context, result: AbstractValue) -> None:
-        last = context.get_discrete_state(self._last).value()
+    def _prepared(self, context: Context) -> Callable[[], tuple[Array, int]]:
+        last, count = self.sample(context).memory
         densities = np.asarray(self._density.Eval(context))
-        result.set_value(tune(self._network, densities, last, self._fixed, self._factor))
 
-    def _weights(self, context: Context, output: BasicVector) -> None:
-        step: Any = self._step.Eval(context)
-        output.SetFromVector(step[0])
+        def step() -> tuple[Array, int]:
+            weights, fell_back = tune(self._network, densities, last, self._fixed, self._factor)
+            return weights, count + fell_back
 
-    def _update(self, context: Context, state: State) -> None:
-        step: Any = self._step.Eval(context)
-        weights, fell_back = step
-        state.get_mutable_discrete_state(self._last).SetFromVector(weights)
-        count = self.fallbacks(context) + fell_back
-        state.get_mutable_discrete_state(self._count).SetFromVector([count])
+        return step
 
 
-class Remembered(NamedTuple):
-    """A tuner's memory in a Context."""
-
-    memory: TunerMemory
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "Remembered":
-        """Return the same object: a memory is never changed."""
-        return self
-
-
-class LawTuner(LeafSystem):
-    """Sets w_Q and w_R at every sample by what the law remembers.
+class LawTuner(SteppedLaw):
+    """Sets w_Q and w_R at every sample by the memory of the law.
 
     With m the tuner's memory and `decide` and `observe` those of a tuner (`tuner.source`):
 
     Initialise: m of a law before its first sample, then the update of k = 0.
-    Update:     at k dt   m <- observe(m, decide(m), what the law remembers since k, reference).
+    Update:     at k dt   m <- observe(m, decide(m), memory of the law at k, reference).
     Output:     weights = decide(m), hence of samples up to k - 1 until k dt.
 
-    The law's memory since sample k rests on the weights of sample k, and these on m alone: there is
-    no algebraic loop.
+    The law's memory at sample k follows from the weights of sample k, and these from m alone,
+    without an algebraic loop.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
@@ -191,40 +157,27 @@ class LawTuner(LeafSystem):
 
     Args:
         source: the tuner.
-        first: what the law remembers before its first sample.
+        first: memory of the law before its first sample.
         period: dt in s.
     """
 
     def __init__(self, source: WeightsSource, first: Sample, period: float) -> None:
         super().__init__()
         self._source = source
-        start = Remembered(source.start(first.memory))
-        self._kept = self.DeclareAbstractState(Value(start))
         self._memory = self.DeclareAbstractInputPort("memory", Value(first))
         self._reference = self.DeclareVectorInputPort("reference", NUM_REFERENCE)
-        ticket = self.abstract_state_ticket(self._kept)
-        self.DeclareVectorOutputPort("weights", len(WEIGHTS), weak(self._weights), {ticket})
-        update_every(self, period, self._update)
-
-    def memory(self, context: Context) -> TunerMemory:
-        """Return the tuner's memory in a context of this system."""
-        value: Any = context.get_abstract_state(int(self._kept))
-        return value.get_value().memory
+        self._begin(source.start(first.memory), period)
+        self._put_out("weights", len(WEIGHTS), lambda memory: source.decide(memory).weights)
 
     def fallbacks(self, context: Context) -> int:
         """Return the number of fallbacks so far."""
-        return self.memory(context).fallbacks
+        return int(self.sample(context).memory.fallbacks)
 
-    def _weights(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._source.decide(self.memory(context)).weights)
-
-    def _update(self, context: Context, state: State) -> None:
-        memory = self.memory(context)
+    def _prepared(self, context: Context) -> Callable[[], TunerMemory]:
+        memory, source = self.sample(context).memory, self._source
         sample: Any = self._memory.Eval(context)
         wanted = np.asarray(self._reference.Eval(context))[:NUM_STATE]
-        decision = self._source.decide(memory)
-        after = self._source.observe(memory, decision, sample.memory, wanted)
-        state.get_mutable_abstract_state(int(self._kept)).set_value(Remembered(after))
+        return lambda: source.observe(memory, source.decide(memory), sample.memory, wanted)
 
 
 RULES: Final = {True: Rule(-1.77, 2.35, 0.41), False: Rule(-0.82, 1.37, 0.33)}
