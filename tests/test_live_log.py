@@ -17,9 +17,8 @@ import pytest
 
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import KnownMotion
-from stewart_drake.live.log import LiveRecord
+from stewart_drake.live.log import LiveRecord, RowFile
 from stewart_drake.live.machine import Machine
-from stewart_drake.live.rows import RowFile
 from stewart_drake.live.session import drive, prepare_session
 from stewart_drake.loop import results as metrics
 from stewart_drake.loop.law_design import control_law, first_queue

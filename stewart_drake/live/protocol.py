@@ -1,9 +1,8 @@
-"""The datagrams between a machine and its controller: what they hold, and how it is written.
+"""The datagrams between a machine and its controller: contents and encoding.
 
-docs/protocol.md tells every byte; the C of `export-c` speaks the same. Numbers are little-endian.
-Times are whole nanoseconds of the *machine's* clock, which begins when the machine does, but for
-`time` and `echo`, which are of the clock of whoever sends, and of the other. Nothing here knows a
-socket.
+docs/protocol.md defines every byte; `export-c` writes the same protocol in C. Numbers are
+little-endian. Times are whole nanoseconds of the *machine's* clock, which starts with the machine.
+Exceptions are `time`, of the sender's clock, and `echo`, of the receiver's.
 """
 
 import hashlib
@@ -35,19 +34,19 @@ VERSION: Final = 2
 MAGIC_MACHINE: Final = b"STWM"
 MAGIC_CONTROLLER: Final = b"STWC"
 TAG: Final = 16
-"""Bytes of HMAC-SHA256 that a datagram with a key ends with."""
+"""Bytes of HMAC-SHA256 at the end of a datagram with a key."""
 NEVER: Final = 2**64 - 1
-"""A time that is not known yet."""
+"""An unknown time."""
 LONGEST: Final = 1452
-"""Bytes of a datagram: what passes Ethernet and IPv6 in one piece."""
+"""Longest datagram, bytes: not fragmented by Ethernet and IPv6."""
 MOST_ROWS: Final = 24
-"""Torques of a plan."""
+"""Largest number of torques of a plan."""
 MOST_HISTORY: Final = 16
-"""Torques that have acted, in a report."""
+"""Largest number of reported torques."""
 MOST_SAMPLES: Final = 16
-"""Of each encoder in a measurement."""
+"""Largest number of samples of each encoder in a measurement."""
 MISSING: Final = -(2**31)
-"""A code that was not read."""
+"""Code of a missing sample."""
 SECOND: Final = 10**9
 
 # magic, version, bytes of the tag, bytes in all, session, nonce, sequence, acknowledged, time,
@@ -60,31 +59,31 @@ _MACHINE: Final = struct.Struct("<BBBBQQQQddQQIIIBBBBQQ")
 _CONTROLLER: Final = struct.Struct("<BB2xQQQ")
 _PART: Final = struct.Struct(f"<{DIGEST}s{NAME}s")
 _PADDING: Final = bytes(_MACHINE.size - _CONTROLLER.size)
-"""After the identity of a request, which is thus as long as its answer."""
+"""Padding that makes a request as long as its answer."""
 _OFFERS: Final = 3
-"""Kind of a machine's datagram that holds its identity in the place of a measurement."""
+"""Kind of a machine's datagram with its identity instead of a measurement."""
 
 
 class Refusal(Enum):
-    """Why a datagram is not acted upon."""
+    """Cause of the refusal of a datagram."""
 
     MALFORMED = "malformed"
-    """No datagram of this protocol: length, magic, a count or a number outside its range."""
+    """Not a datagram of this protocol: length, magic, a count or a number outside its range."""
     VERSION = "version"
     KEY = "key"
-    """Its tag is wrong, or there is none, or one that nobody asked for."""
+    """A wrong or missing tag, or a tag although no key is used."""
     FOREIGN = "foreign"
-    """Of another session, or from another address."""
+    """Another session or another address."""
     REPLAYED = "replayed"
-    """It has been there before."""
+    """A sequence that has come before."""
     LATE = "late"
-    """So old that it is of no use, or cannot be told from a replay."""
+    """Too old to be used, or to be distinguished from a replay."""
     RATE = "rate"
-    """A request of an unknown address, beyond the rate at which these are answered."""
+    """A request of an unknown address, above the rate at which these are answered."""
 
 
 class RefusedError(Exception):
-    """Bytes that are no datagram to act upon; `cause` says why."""
+    """A datagram that is refused, with its cause."""
 
     def __init__(self, cause: Refusal, detail: str = "") -> None:
         super().__init__(f"{cause.value}: {detail}" if detail else cause.value)
@@ -92,16 +91,16 @@ class RefusedError(Exception):
 
 
 class MachineFlags(IntFlag):
-    """What a machine says of itself."""
+    """State of a machine."""
 
     SIMULATION = 1
-    """Nothing moves. Without it a controller must be armed."""
+    """A simulation. Without it a controller must be armed."""
     PARKED = 2
-    """Brakes are on, or the simulation waits: torques do nothing before `begin`."""
+    """Brakes are on: torques have no effect before `begin`."""
     RUNNING = 4
-    """The run has begun and torques from the buffer act."""
+    """The run has begun and torques act."""
     SAFE = 8
-    """The safe torque acts: nothing was heard for `watchdog`, or the controller said stop."""
+    """The safe torque acts, after a silence of `watchdog` or a stop of the controller."""
     LEFT = 16
     """The plate has left its workspace; the machine has stopped."""
     HOLDS = 32
@@ -109,20 +108,20 @@ class MachineFlags(IntFlag):
     BUSY = 64
     """Another controller drives it: this offer of a session would be refused."""
     WIRE = 128
-    """A simulated wire: a torque acts when it arrives there, whatever its play-out time."""
+    """A simulated wire: torques act on arrival, without play-out time."""
     RESETS = 256
-    """A new session begins at rest at the scenario's start; without it where the machine is."""
+    """A new session begins at rest at the scenario's start; without it at the present state."""
     SAFE_HOLDS = 512
     """The safe torque is the last one; without it zero."""
 
 
 class ControllerFlags(IntFlag):
-    """What a controller asks for beside torques."""
+    """Requests of a controller."""
 
     STOP = 1
     """The safe torque at once, and the end of the session."""
     ARMED = 2
-    """It knows that this is no simulation. A real machine does not begin without it."""
+    """The controller may drive a real machine, which does not begin without it."""
 
 
 NOTHING: Final = ControllerFlags(0)
@@ -130,16 +129,16 @@ NOTHING: Final = ControllerFlags(0)
 
 @dataclass(frozen=True)
 class Head:
-    """What each datagram begins with.
+    """Head of every datagram.
 
     Attributes:
-        session: drawn by the controller, not 0.
-        nonce: of the machine's offer; 0 in a first request, and in the refusal of one.
-        sequence: of the datagrams that a side sends in a session, from 1 on; each is 1 more.
-        acknowledged: newest sequence that was got from the other side, 0 for none.
-        time: ns, of the sender's clock, when it was sent.
-        echo: `time` of the datagram that is acknowledged.
-        held: ns since that was got.
+        session: random number of the controller, not 0.
+        nonce: nonce of the machine's offer; 0 in a first request and in its refusal.
+        sequence: number of the sender's datagram in the session, from 1 on.
+        acknowledged: newest sequence received from the other side, 0 for none.
+        time: sender's clock at sending, ns.
+        echo: `time` of the acknowledged datagram.
+        held: time since its arrival, ns.
     """
 
     session: int
@@ -158,24 +157,24 @@ class MachineMessage:
     Attributes:
         head: see `Head`.
         flags: see `MachineFlags`.
-        sampled: ns, when the measurement was taken, the last of its samples.
-        begin: ns, when the run began or will begin; NEVER without one.
-        period: ns, of the samples and of torques.
-        watchdog: ns of silence after which the safe torque acts.
+        sampled: time of the measurement (of its last sample), ns.
+        begin: time at which the run began or will begin, ns, or NEVER.
+        period: sampling period, ns.
+        watchdog: silence after which the safe torque acts, ns.
         rate: seconds of the machine's clock in a second.
-        torque_limit: of each motor, N m, infinite for none; kept to at the machine.
-        arrived: (n,) whether the datagram `acknowledged` - i has arrived; n = 64.
-        acted_from: ns, when the first row of `acted` began to act; NEVER with no row.
-        acted: (h, 6) N m, what acted there and, i rows on, i periods before.
-        played: periods in which a torque of a plan acted.
-        dry: periods for which there was none.
-        refused: datagrams.
-        state: (12,) pose and rates in rad, m, rad/s, m/s, NaN what is lost; or None.
-        codes: (N, 6) of encoders, int32, the oldest first, MISSING what is lost; or None.
-        bits: of an encoder's turn, 0 without encoders.
-        zeros: (6,) rad at code 0; or None.
-        identity: of the machine, in the answer to a request; or None.
-        reason: why torques do not act any more.
+        torque_limit: limit of each motor at the machine, N m; may be infinite.
+        arrived: whether the datagram `acknowledged` - i has arrived, (64,).
+        acted_from: time at which the first row of `acted` began to act, ns; NEVER without rows.
+        acted: torques (h, 6) that acted, N m; row i acted i periods before the first.
+        played: number of periods with a torque of a plan.
+        dry: number of periods without one.
+        refused: number of refused datagrams.
+        state: pose and rates (12,) in rad, m, rad/s, m/s, NaN for missing values; or None.
+        codes: encoder codes (N, 6), int32, the oldest first, MISSING for missing ones; or None.
+        bits: bits of a turn of an encoder, 0 without encoders.
+        zeros: crank angles (6,) at code 0, rad; or None.
+        identity: identity of the machine, in the answer to a request; or None.
+        reason: why torques do not act.
         before: fault that preceded it; its `leg` is 0.
     """
 
@@ -206,15 +205,12 @@ class MachineMessage:
 
     @property
     def why(self) -> str:
-        """The reason in words, with the fault before it."""
+        """The reason in words, with the fault that preceded it."""
         return in_words(self.reason, self.before)
 
     @property
     def values(self) -> Array | None:
-        """(12,) the state, or (6 N,) crank angles in rad, the oldest first; NaN what is lost.
-
-        None where there is no measurement.
-        """
+        """State (12,), or crank angles (6 N,), rad, the oldest first; None without any."""
         if self.state is not None or self.codes is None:
             return self.state
         angles = self.zeros + 2 * np.pi / 2**self.bits * self.codes
@@ -228,12 +224,11 @@ class ControllerMessage:
     Attributes:
         head: see `Head`.
         flags: see `ControllerFlags`.
-        sampled: ns, the instant for which the torques were computed.
-        playout: ns, when the first row shall act; row i acts i periods later, each for a period.
-        begin: ns, when the run shall begin, in each datagram from when it is known, all that have
-            torques among them; or NEVER.
-        torques: (rows, 6) N m; without a row it only says that the controller is there.
-        identity: of the machine that the controller is designed for, in a request; or None.
+        sampled: time of the sample that the torques were computed for, ns.
+        playout: time at which the first row acts, ns; each row acts for a period.
+        begin: requested begin of the run, ns, or NEVER; every datagram with torques has it.
+        torques: torques (rows, 6), N m; without rows the datagram only shows presence.
+        identity: identity of the machine that the controller is designed for, in a request.
     """
 
     head: Head
@@ -269,10 +264,10 @@ def _equal(one: Any, other: object) -> bool:
 
 
 def encode(message: Message, key: bytes | None = None) -> bytes:
-    """The datagram of a message, with a tag if there is a key.
+    """Return the datagram of a message, with a tag if there is a key.
 
     Raises:
-        ValueError: a count outside its range, more than LONGEST bytes.
+        ValueError: a count outside its range, or more than LONGEST bytes.
         struct.error: a number that does not fit its field.
     """
     if isinstance(message, MachineMessage):
@@ -331,7 +326,7 @@ def _identity_bytes(identity: Identity) -> bytes:
 
 
 def version_refusal(session: int, acknowledged: int) -> bytes:
-    """A head alone, which says to a controller of another version which one is spoken here."""
+    """Return a head alone, which states this version to a controller of another one."""
     numbers = (session, 0, 1, acknowledged, 0, 0, 0, 0)
     return _HEAD.pack(MAGIC_MACHINE, VERSION, 0, _HEAD.size, *numbers)
 
@@ -345,9 +340,9 @@ def _check(rows: NDArray[Any], name: str, most: int) -> None:
 
 
 def decode(data: bytes, key: bytes | None = None) -> Message:
-    """The message of a datagram.
+    """Return the message of a datagram.
 
-    What is looked at comes in this order: length and magic, version, tag, and only then the rest.
+    Checks length and magic, then the version, the tag, and only then the rest.
 
     Raises:
         RefusedError: malformed, version or key.
@@ -408,7 +403,7 @@ def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
         codes = read.astype(np.int32).reshape(samples, NUM_LEGS)
     identity = _identity(measured) if kind == _OFFERS else None
     if not np.all(np.isfinite(acted)) or (zeros is not None and not np.all(np.isfinite(zeros))):
-        raise RefusedError(Refusal.MALFORMED, "a torque or an angle that is no number")
+        raise RefusedError(Refusal.MALFORMED, "a torque or an angle that is not finite")
     there = np.array([bool(arrived >> i & 1) for i in range(64)])
     return MachineMessage(
         head=head,
@@ -463,7 +458,7 @@ def _controller(head: Head, flags: int, body: bytes) -> ControllerMessage:
         raise RefusedError(Refusal.MALFORMED, "a body of another length")
     torques = _rows(body[_CONTROLLER.size :])
     if not np.all(np.isfinite(torques)):
-        raise RefusedError(Refusal.MALFORMED, "a torque that is no number")
+        raise RefusedError(Refusal.MALFORMED, "a torque that is not finite")
     if rows and begin == NEVER:
         raise RefusedError(Refusal.MALFORMED, "torques for no run")
     return ControllerMessage(head, ControllerFlags(flags), sampled, playout, begin, torques)
