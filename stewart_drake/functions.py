@@ -1,4 +1,7 @@
-"""Python functions of the commands that are neither a run nor an analysis of a scenario."""
+"""Python functions of the commands that are neither a run nor an analysis of a scenario.
+
+Bad input is a ConfigError of one line.
+"""
 
 import math
 import time
@@ -64,9 +67,6 @@ def identify(
         precision: of a CSV log; the defaults if None.
         gravity: whether gravity acted in a CSV log.
         command: that the page names; by default the call of this function.
-
-    Raises:
-        ConfigError: bad input.
     """
     paths = [logs] if isinstance(logs, str | Path) else list(logs)
     machine = as_mechanism(mechanism)
@@ -97,9 +97,6 @@ def plan_identification(
         tolerances: prior standard deviations of the machine; the defaults if None.
         precision: of the measurements; the defaults if None.
         command: that the page names; by default the call of this function.
-
-    Raises:
-        ConfigError: bad input.
     """
     loaded = as_scenario(scenario)
     measured = (precision or Precision()).std
@@ -166,7 +163,7 @@ def export_c(
         The paths of the files.
 
     Raises:
-        ConfigError: bad input, or a law that has no C.
+        ConfigError: a law that has no C.
     """
     if not isinstance(scenario, Scenario):
         scenario = load_scenario(scenario, controller, settings)
@@ -193,29 +190,17 @@ def new(directory: str | Path, name: str, *, options: Measurements) -> NewMachin
 
 
 def check_model(mechanism: Mechanism | str | Path) -> MechanismCheck:
-    """Check a mechanism at its home pose, under gravity.
-
-    Raises:
-        ConfigError: bad input.
-    """
+    """Check a mechanism at its home pose, under gravity."""
     return check_mechanism(as_mechanism(mechanism))
 
 
 def model_sdf(mechanism: Mechanism | str | Path) -> str:
-    """Return a mechanism as SDFormat.
-
-    Raises:
-        ConfigError: bad input.
-    """
+    """Return a mechanism as SDFormat."""
     return to_sdformat(as_mechanism(mechanism))
 
 
 def view_model(mechanism: Mechanism | str | Path) -> None:
-    """Show a mechanism in Meshcat, with sliders for its pose, until Stop is pressed there.
-
-    Raises:
-        ConfigError: bad input.
-    """
+    """Show a mechanism in Meshcat, with sliders for its pose, until Stop is pressed there."""
     from pydrake.geometry import Meshcat
 
     from stewart_drake.reporting.viewer import PoseViewer
@@ -240,7 +225,7 @@ def run_live(
         OPTIONS
 
     Raises:
-        ConfigError: bad input, no such machine, or one that does not begin.
+        ConfigError: no such machine, or one that does not begin.
     """
     from stewart_drake.live.contact import address_of
     from stewart_drake.live.endpoint import read_key
@@ -259,9 +244,6 @@ def run_machine(scenario: Scenario | str | Path, *, options: MachineOptions) -> 
     Args:
         scenario: or a shipped name or a path; its plant, sensor, delay, link and limits.
         OPTIONS
-
-    Raises:
-        ConfigError: bad input.
     """
     from stewart_drake.live.machine import open_machine
 
@@ -289,9 +271,6 @@ def make_tuner_data(
         settings: as `load_scenario` takes them.
         progress: called with the number of finished conditions and of all.
         OPTIONS
-
-    Raises:
-        ConfigError: bad input.
     """
     from stewart_drake.reporting.tuner import data_document
     from stewart_drake.tuning.data import make_data, summarize
@@ -319,7 +298,7 @@ def train_tuner(
         OPTIONS
 
     Raises:
-        ConfigError: bad input, or torch is missing.
+        ConfigError: torch is missing.
     """
     from stewart_drake.reporting.tuner import training_document
     from stewart_drake.tuner.network import save_network
@@ -366,9 +345,6 @@ def evaluate_tuner(
         progress: called with the number of finished conditions and of all.
         command: that the page names; by default the call of this function.
         OPTIONS
-
-    Raises:
-        ConfigError: bad input.
     """
     from stewart_drake.reporting.tuner import evaluation_document
     from stewart_drake.tuning.evaluation import evaluate

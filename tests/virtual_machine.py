@@ -11,7 +11,7 @@ import numpy as np
 
 from stewart_drake.dynamics import equations
 from stewart_drake.dynamics.equations import leg_measures, numbers_of, workspace_measures
-from stewart_drake.identification.model import Compiled
+from stewart_drake.identification.model import Compiled, compiled
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_PLANT_PARAMETERS, NUM_STATE, POSE, RATES
 from stewart_drake.types import Array
@@ -47,16 +47,23 @@ class VirtualMachine:
     def _slip(self) -> ca.SX:
         return equations.slip(self._motion.crank_rates, self._symbols["parameters"])
 
-    def _compile(self, name: str, arguments: str, *results: ca.SX) -> Compiled:
+    def _function(self, name: str, arguments: str, *results: ca.SX) -> ca.Function:
         dense = [ca.densify(result) for result in results]
         inputs = [self._symbols[argument] for argument in arguments.split()]
-        return Compiled(ca.Function(name, inputs, dense, {"cse": True}))
+        return ca.Function(name, inputs, dense, {"cse": True})
+
+    def _compile(self, name: str, arguments: str, *results: ca.SX) -> Compiled:
+        return compiled(self._function(name, arguments, *results))
+
+    @cached_property
+    def _accelerations(self) -> ca.Function:
+        s = self._symbols
+        found = equations.accelerations(self._motion, s["torque"], s["parameters"], self._slip)
+        return self._function("accelerations", "pose rates torque parameters gravity", found)
 
     @cached_property
     def accelerations(self) -> Compiled:
-        s = self._symbols
-        found = equations.accelerations(self._motion, s["torque"], s["parameters"], self._slip)
-        return self._compile("accelerations", "pose rates torque parameters gravity", found)
+        return compiled(self._accelerations)
 
     @cached_property
     def inverse_dynamics(self) -> Compiled:
@@ -121,7 +128,7 @@ class VirtualMachine:
 
     def many_steps(self, steps: int) -> Compiled:
         """Steps of the classical Runge-Kutta method: (x, torques, p, g, h (n,)) -> states."""
-        accelerations = self.accelerations.function
+        accelerations = self._accelerations
         x, torque = ca.MX.sym("state", NUM_STATE), ca.MX.sym("torque", 6)
         parameters, gravity = ca.MX.sym("parameters", NUM_PLANT_PARAMETERS), ca.MX.sym("gravity")
         h = ca.MX.sym("h")
@@ -136,4 +143,4 @@ class VirtualMachine:
         k4 = derivative(x + h * k3)
         after = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         step = ca.Function("runge_kutta4", [x, torque, parameters, gravity, h], [after])
-        return Compiled(step.mapaccum("predict", steps, {"base": _UNROLLED}))
+        return compiled(step.mapaccum("predict", steps, {"base": _UNROLLED}))

@@ -22,9 +22,6 @@ def load_npz(path: Path, shapes: Shapes, expected: str) -> dict[str, NDArray[Any
         path: of the file.
         shapes: of its arrays.
         expected: description of the file, closing every message.
-
-    Raises:
-        ConfigError: one line, opened by the path.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -45,9 +42,6 @@ def load_netcdf(path: Path, expected: str) -> xr.Dataset:
     Args:
         path: of the file.
         expected: description of the file, closing every message.
-
-    Raises:
-        ConfigError: one line, opened by the path.
     """
     try:
         return xr.load_dataset(path, engine="h5netcdf", decode_times=False, decode_timedelta=False)

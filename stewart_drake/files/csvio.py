@@ -53,11 +53,7 @@ class Table:
         return f"{self.path}: row {self.lines[row]}{column}"
 
     def stacked(self, names: Iterable[str]) -> Array:
-        """Return columns (n, k).
-
-        Raises:
-            ConfigError: a column is missing.
-        """
+        """Return columns (n, k), all of which must be there."""
         for name in names:
             if name not in self.columns:
                 raise ConfigError(

@@ -21,9 +21,6 @@ def read_bytes(path: Path, most: int, expected: str) -> bytes:
         path: of a regular file; a folder, a pipe or a device is refused.
         most: largest accepted number of bytes.
         expected: description of the file, closing every message.
-
-    Raises:
-        ConfigError: one line, opened by the path.
     """
     try:
         if path.exists() and not path.is_file():
@@ -68,11 +65,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file by `replacing`; text as UTF-8.
-
-    Raises:
-        OSError: see `replacing`.
-    """
+    """Write a file by `replacing`; text as UTF-8."""
     with replacing(path) as partial:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
 

@@ -8,6 +8,5 @@ _version = cache(version)  # read from files, which takes ms
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that a result depends on."""
     packages = ("stewart-drake", "drake", "casadi", "numpy", "scipy")
     return {"python": platform.python_version()} | {name: _version(name) for name in packages}

@@ -84,9 +84,6 @@ def parse_yaml(text: str, where: str) -> Any:
     Args:
         text: YAML.
         where: opening of a message.
-
-    Raises:
-        ConfigError: the text breaks one of the rules.
     """
     try:
         return copy.deepcopy(_parsed(text))
@@ -170,9 +167,6 @@ def validate_pairs(
         settings: the texts; of two with one name the later one counts.
         option: of the command line, opening the message.
         units: of each field, in words. A message shows those of the fields that it names.
-
-    Raises:
-        ConfigError: in one line.
     """
     given: dict[str, Any] = {}
     try:

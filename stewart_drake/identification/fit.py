@@ -106,7 +106,6 @@ class Problem:
 
     @property
     def count(self) -> int:
-        """Number of measured values."""
         return sum(int(np.isfinite(s.log.values[s.rows]).sum()) for s in self.segments)
 
     def model(self) -> MachineModel:
@@ -265,7 +264,6 @@ class Solution(NamedTuple):
 
     @property
     def left_out(self) -> int:
-        """Number of segments that were not fitted."""
         return len(self.whole.segments) - len(self.problem.segments)
 
     @property

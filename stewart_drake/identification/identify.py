@@ -94,7 +94,6 @@ class Identification:
 
     @property
     def std(self) -> Array:
-        """Standard deviations of all unknowns."""
         found: Array = np.sqrt(np.diag(self.covariance))
         return found
 
@@ -203,8 +202,6 @@ def identify(
 
 
 class _Begun(NamedTuple):
-    """Result of a start."""
-
     chi2: float  # per value of the segments that were fitted first
     whole: Problem
     guess: Guess  # values found, and the measured first states of all segments

@@ -9,6 +9,7 @@ for z the state, parameters of the dynamics, or numbers of a leg. The expression
 `dynamics.equations`; only the legs' numbers are symbols.
 """
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Final, NamedTuple
 
@@ -18,7 +19,6 @@ import numpy as np
 from stewart_drake.core.layout import LEG_NUMBERS, SHAPES
 from stewart_drake.dynamics import equations
 from stewart_drake.dynamics.equations import leg_numbers, numbers_of
-from stewart_drake.dynamics.native_functions import Buffered, Buffers
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import (
@@ -36,6 +36,19 @@ LEG_PLACES: Final = (0, 1, 12, 13, 14, 15, 16, 17)
 PER_LEG: Final = len(LEG_PLACES)
 NUM_GEOMETRY: Final = NUM_LEGS * PER_LEG
 NUM_DYNAMIC: Final = SHAPES["parameters"][0]  # parameters of the dynamics
+
+
+Compiled = Callable[..., list[Array]]
+
+
+def compiled(function: ca.Function) -> Compiled:
+    """Return a CasADi function of arrays; CasADi's columns are numpy's rows."""
+
+    def call(*arguments: Array) -> list[Array]:
+        found = function.call([ca.DM(np.asarray(one).T) for one in arguments])
+        return [np.asarray(one).T.squeeze() for one in found]
+
+    return call
 
 
 class Numbers(NamedTuple):
@@ -63,32 +76,6 @@ class SymbolicLegs(NamedTuple):
     def geometry(self) -> ca.SX:
         """Free numbers of the legs (NUM_GEOMETRY,), leg by leg."""
         return ca.vec(self.legs[list(LEG_PLACES), :])
-
-
-class Compiled(Buffered):
-    """CasADi function behind its buffer interface; a plain call spends twice its time converting.
-
-    Arguments and results are dense.
-    """
-
-    def __init__(self, function: ca.Function) -> None:
-        super().__init__()
-        self.function = function
-        for i in range(function.n_out()):
-            if function.sparsity_out(i).nnz() != function.numel_out(i):
-                raise ValueError(f"{function.name()}: result {i} is sparse; densify it")
-
-    def buffers(self) -> Buffers:
-        """Return those of CasADi."""
-        function = self.function
-        buffer, evaluate = function.buffer()
-        arguments = [np.zeros(function.size_in(i)[::-1]).squeeze() for i in range(function.n_in())]
-        results = [np.zeros(function.size_out(i)[::-1]).squeeze() for i in range(function.n_out())]
-        for i, argument in enumerate(arguments):
-            buffer.set_arg(i, memoryview(np.atleast_1d(argument)))  # type: ignore[arg-type, call-arg]
-        for i, result in enumerate(results):
-            buffer.set_res(i, memoryview(np.atleast_1d(result)))  # type: ignore[arg-type, call-arg]
-        return Buffers(arguments, results, evaluate, buffer)
 
 
 class MachineModel:
@@ -127,7 +114,7 @@ class MachineModel:
         """Return a function of all points; the last `shared` inputs are the same for all."""
         one = ca.Function(name, inputs, [ca.densify(one) for one in results], {"cse": True})
         same = list(range(len(inputs) - shared, len(inputs)))
-        return Compiled(one.map(name, "serial", self.points, same, []))
+        return compiled(one.map(name, "serial", self.points, same, []))
 
     @cached_property
     def _accelerations(self) -> Compiled:
@@ -169,9 +156,7 @@ class MachineModel:
         return found.reshape(self.points, NUM_COORDINATES)
 
     def slopes(self, states: Array, torques: Array, numbers: Numbers) -> Slopes:
-        """Return the accelerations with their derivatives."""
         a = self.accelerations(states, torques, numbers)
-        # CasADi's columns are numpy's rows, and points follow one another in columns.
         dF, MN = self._residual(states[:, :6], states[:, 6:], a, torques, *numbers)
         n = self.points
         dF, MN = dF.reshape(n, -1, NUM_COORDINATES), MN.reshape(n, 6, 6)

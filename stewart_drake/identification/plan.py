@@ -88,7 +88,6 @@ class Plan:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Content of `summary.json`."""
         free = self.unknowns.free
         return {
             "mechanism": self.unknowns.mechanism.name,

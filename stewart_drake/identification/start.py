@@ -123,11 +123,7 @@ def segment_length(log: Log, poses: Array, mechanism: Mechanism, delay: float) -
 
 
 def segments_of(log: Log, start: float, length: float) -> list[Segment]:
-    """Return equal parts of the log from `start` in s on; those with few values join the next.
-
-    Raises:
-        ConfigError: nothing is left of the log.
-    """
+    """Return equal parts of the log from `start` in s on; those with few values join the next."""
     rows = np.flatnonzero(log.times >= start - 1e-9)
     few = np.isfinite(log.values[rows]).sum() < 2 * NUM_STATE
     if few or len(rows) < 2 * _LEAST_ROWS or log.times[-1] - log.times[rows[0]] < SHORTEST:
@@ -173,9 +169,6 @@ def problem_of(
         longest: length of a segment, s.
         step: longest integration step, s.
         skip_short: whether to leave out logs that are too short.
-
-    Raises:
-        ConfigError: see `segments_of`.
     """
     segments, delay = list[Segment](), float(values[DELAY])
     first = list[Array]()

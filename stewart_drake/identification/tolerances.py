@@ -45,9 +45,5 @@ TOLERANCE_UNITS: Final = units_of(Tolerances)  # unit and meaning of each field
 
 
 def read_tolerances(settings: Iterable[str]) -> Tolerances:
-    """Return tolerances from `name=value` settings, the value in YAML.
-
-    Raises:
-        ConfigError: in one line.
-    """
+    """Return tolerances from `name=value` settings, the value in YAML."""
     return validate_pairs(Tolerances, settings, "--tolerance", TOLERANCE_UNITS)

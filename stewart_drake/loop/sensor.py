@@ -54,7 +54,7 @@ def faulty(
     """Return the values of a sensor with faults; the first of simultaneous faults counts.
 
     Args:
-        faults: see `scenario.fault_config.SensorFault`.
+        faults: see `scenario.field_types.SensorFault`.
         y: (n,) without faults.
         last: (n,) at the sample before, NaN for none.
         time: s.
@@ -121,7 +121,7 @@ class Sensor(LeafSystem):
         noise_std: (12,) in the units of the state.
         seed: of noise and spikes.
         period: of the controller, s.
-        faults: see `scenario.fault_config.SensorFault`; the first of simultaneous faults counts.
+        faults: see `scenario.field_types.SensorFault`; the first of simultaneous faults counts.
         motion: (6,) scale of each coordinate, rad and m; the same per s for the rates.
     """
 
@@ -202,7 +202,7 @@ class Encoders(LeafSystem):
         offset: (6,) rad.
         seed: of phases, spikes and the values affected by a fault.
         period: dt, of the controller, s.
-        faults: see `scenario.fault_config.SensorFault`; the first of simultaneous faults counts.
+        faults: see `scenario.field_types.SensorFault`; the first of simultaneous faults counts.
         motion: (6,) scale of each crank angle, rad.
     """
 

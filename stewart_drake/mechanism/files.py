@@ -187,11 +187,7 @@ def as_mechanism(given: Mechanism | str | Path) -> Mechanism:
 
 
 def mechanism_spec(name_or_path: str | Path) -> MechanismSpec:
-    """Return the content of a mechanism's file.
-
-    Raises:
-        ConfigError: as `load_mechanism` does for a file that is not well formed.
-    """
+    """Return the content of a mechanism's file, as far as it is well formed."""
     path = resolve("mechanism", name_or_path)
     return validate(MechanismSpec, load_yaml(path), str(path))
 
@@ -231,11 +227,7 @@ def mechanism_yaml(mechanism: Mechanism) -> str:
 
 
 def build_mechanism(spec: MechanismSpec) -> Mechanism:
-    """Return the mechanism of a file's contents.
-
-    Raises:
-        ConfigError, UnreachablePoseError: as `Mechanism` does.
-    """
+    """Return the mechanism of a file's contents; errors are those of `Mechanism`."""
     if spec.pattern is not None and spec.legs is None:
         legs = pattern_legs(spec.pattern, spec.crank.length, spec.rod.length)
     elif spec.legs is not None and spec.pattern is None:

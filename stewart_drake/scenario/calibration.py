@@ -136,11 +136,7 @@ def save_calibration(path: str | Path, calibration: Calibration) -> None:
 
 
 def calibration_file(scenario: Scenario) -> Calibration | None:
-    """Return the content of the file `controller.calibration`, or None without one.
-
-    Raises:
-        ConfigError: one line.
-    """
+    """Return the content of the file `controller.calibration`, or None without one."""
     if scenario.controller.calibration is None:
         return None
     try:

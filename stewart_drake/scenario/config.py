@@ -312,11 +312,7 @@ def compatible_actuator(command: str, actuator: AnyActuator) -> AnyActuator:
 
 
 def with_actuator(given: dict[str, Any], change: Any, where: str) -> AnyActuator:
-    """Return the motors of a section of a file, with a row of `compare` laid over it.
-
-    Raises:
-        ConfigError: in one line, opened by `where`.
-    """
+    """Return the motors of a section of a file, with a row of `compare` laid over it."""
     laid = given | change if isinstance(change, dict) else change
     return validate(Scenario, {"actuator": laid}, where).actuator
 
@@ -573,11 +569,7 @@ class Scenario:
             raise ConfigError(f"{where}: {problem}")
 
     def check_rows(self, where: str) -> None:
-        """Check each row of `compare` by itself.
-
-        Raises:
-            ConfigError: the first problem, in one line, opened by `where`.
-        """
+        """Check each row of `compare` by itself; raise ConfigError."""
         for row, change in self.compare.items():
             place, fields = f"{where}: compare.{row}", dict(change)
             if "/" in row:

@@ -184,9 +184,6 @@ def load_comparison(
 
     Returns:
         Scenarios by row: the controllers, then the further rows in the file's order.
-
-    Raises:
-        ConfigError: the first problem, in one line.
     """
     settings = tuple(settings)
     others = tuple(s for s in settings if not s.strip().startswith("controller.delay_"))
@@ -267,7 +264,6 @@ def _parse_settings(settings: Iterable[str], data: dict[str, Any]) -> dict[str, 
 
 
 def _parse_setting(setting: str) -> dict[str, Any]:
-    """Return one setting as a partial scenario."""
     key, equals, text = setting.partition("=")
     if key.strip() == _OVERLAY and text:
         path = resolve("overlay", text.strip())

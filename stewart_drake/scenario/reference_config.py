@@ -64,7 +64,6 @@ class HoldConfig:
     offset: Six = field(default_factory=lambda: [0.0, 0.0, 0.0, 0.0, 0.0, 0.38])
 
     def problem(self) -> str | None:
-        """Return the first rule between the fields that is broken, or None."""
         return _pitch_problem(abs(self.offset[1]))
 
 
@@ -85,7 +84,6 @@ class WaypointsConfig:
     file: Name | None = None
 
     def problem(self) -> str | None:
-        """Return the first rule between the fields that is broken, or None."""
         if self.file is not None:
             if self.times is None and self.poses is None:
                 return None
@@ -112,7 +110,6 @@ class CsvConfig:
     file: Name | None = None
 
     def problem(self) -> str | None:
-        """Return the first rule between the fields that is broken, or None."""
         if self.file is None:
             return "reference.file: got None; expected the CSV file that kind csv reads"
         return None

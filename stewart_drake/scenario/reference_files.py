@@ -44,11 +44,7 @@ class _WaypointFile:
 
 
 def waypoints(config: WaypointsConfig) -> tuple[Array, Array]:
-    """Return the waypoints of a scenario's section, from its lists or its file.
-
-    Raises:
-        ConfigError: see `read_waypoints`.
-    """
+    """Return the waypoints of a scenario's section, from its lists or its file."""
     if config.file is not None:
         return read_waypoints(config.file)
     if problem := config.problem():
@@ -141,9 +137,6 @@ def _check_samples(
         poses: rad and m.
         place: returns the opening of a message about a row and a column.
         scales: by coordinate, the SI units in the unit of the file.
-
-    Raises:
-        ConfigError: the first sample that breaks a rule.
     """
 
     def check(

@@ -125,7 +125,6 @@ class Signal(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Number of components."""
         return len(self.quantity.units)
 
     @property
@@ -141,12 +140,10 @@ class Signal(NamedTuple):
 
     @property
     def system(self) -> str:
-        """System that has it."""
         return self.source.partition(".")[0]
 
     @property
     def system_port(self) -> str:
-        """Port of that system."""
         return self.source.partition(".")[2] or self.exported
 
 
