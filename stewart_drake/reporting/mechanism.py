@@ -1,6 +1,7 @@
 """Document and figure of a mechanism at its home pose, held there under gravity."""
 
 import itertools
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -84,20 +85,26 @@ def mechanism_figure(mechanism: Mechanism) -> Figure:
     everything = np.vstack(list(points.values()))
     low, high = everything.min(axis=0), everything.max(axis=0)
     half = 0.62 * max((high - low)[:2].max(), high[2] - low[2], abs(high[2]), abs(low[2]))
-    panels = []
-    for name, axes in _VIEWS.items():
-        x, y = (((low[k] + high[k]) / 2 - half, (low[k] + high[k]) / 2 + half) for k in axes)
-
-        def paint(ax: Axes, axes: tuple[int, int] = axes) -> None:
-            _view(ax, points, axes, 1e3 * mechanism.home[3:])
-
-        label = "xyz"[axes[1]]
-        panels.append(
+    middle, centre = (low + high) / 2, 1e3 * mechanism.home[3:]
+    return draw(
+        [
             Panel(
-                f"{label}  [mm]", x="x  [mm]", xlim=x, ylim=y, title=name, height=4.05, paint=paint
+                f"{'xyz'[axes[1]]}  [mm]",
+                x="x  [mm]",
+                title=name,
+                height=4.05,
+                paint=partial(
+                    _view,
+                    points=points,
+                    axes=axes,
+                    centre=centre,
+                    corners=middle + [[-half], [half]],
+                ),
             )
-        )
-    return draw(panels, 2)
+            for name, axes in _VIEWS.items()
+        ],
+        2,
+    )
 
 
 def write_mechanism_figure(mechanism: Mechanism, directory: Path) -> list[Path]:
@@ -105,7 +112,9 @@ def write_mechanism_figure(mechanism: Mechanism, directory: Path) -> list[Path]:
     return write_figures({"mechanism": mechanism_figure(mechanism)}, directory)
 
 
-def _view(ax: Axes, points: dict[str, Array], axes: tuple[int, int], centre: Array) -> None:
+def _view(
+    ax: Axes, points: dict[str, Array], axes: tuple[int, int], centre: Array, corners: Array
+) -> None:
     shaft, tip, joint = (points[name][:, axes] for name in ("shaft", "tip", "joint"))
     seen_from_above = axes == (0, 1)
     # Parts nearer to the viewer are drawn later: by z from above, by -y from the front.
@@ -134,6 +143,9 @@ def _view(ax: Axes, points: dict[str, Array], axes: tuple[int, int], centre: Arr
         )
         ax.plot(*joint[i], "o", color=PLATE.color, ms=4, zorder=order + 0.06)
         ax.plot(*shaft[i], "o", color="#1B1F24", ms=5, zorder=order + 0.06)
+    ax.update_datalim(corners[:, axes])
+    ax.margins(0)
+    ax.set_aspect("equal", adjustable="datalim")
     mass = centre[list(axes)]
     ax.plot(*mass, "+", color="#1B1F24", ms=9, mew=1.4, label="plate's centre of mass", zorder=6)
     _number(ax, shaft, seen_from_above)

@@ -1,14 +1,14 @@
-"""Figures as lists of panels: each says what it shows, and one function draws them all alike."""
+"""Figures as lists of panels, drawn by one function."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any, Final, Literal
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import ScalarFormatter
@@ -27,18 +27,15 @@ from stewart_drake.reporting.style import (
 )
 
 Scale = Literal["linear", "log", "powers"]
-"""Of an axis: `log` has ticks such as 20 and 50, `powers` such as 10⁻³."""
+"""Scale of an axis: `log` has ticks such as 20 and 50, `powers` such as 10⁻³."""
 Ends = tuple[float | None, float | None]
-"""Of an axis; None is left to the data."""
+"""Ends of an axis; None follows the data."""
 
-# Inches around and between panels. A layout engine takes most of the drawing time.
-_LEFT, _RIGHT, _TOP, _BOTTOM = 0.85, 0.2, 0.15, 0.5
-_BESIDE, _BESIDE_SHARED, _BELOW, _BELOW_NAMED = 0.85, 0.25, 0.17, 0.62
-_NAME: Final = -0.58
-"""From an axis to its name."""
 _LEGEND_LINE: Final = 0.25
 _HANDLE, _CHARACTER = 0.62, 0.079
-"""Width of a legend's entry without its text, and of a character."""
+"""Height of a legend's line, width of an entry without its text, and of a character, inches."""
+_LABELS: Final = 0.45
+"""Height of tick labels and name of a horizontal axis, inches."""
 _CROSS: Final = Line2D([], [], ls="", marker="x", color="#666666", ms=7, mew=2)
 
 
@@ -50,7 +47,7 @@ class Curve:
         label: for the legend, or empty.
         steps: whether a value holds until the next x.
         band: lower and upper end of an interval, and its label.
-        ended: x at which a run ended early, which is marked by a cross.
+        ended: x at which a run ended early, marked by a cross.
     """
 
     x: ArrayLike
@@ -68,13 +65,13 @@ class Panel:
 
     Attributes:
         y: name and unit of the vertical axis.
-        x: those of the horizontal axis, shown below the last of the panels that share it.
-        limits: levels that the curves should stay on one side of, with a text on each.
-        marks: places on the horizontal axis with a dotted line, with a label for the legend.
-        legend: where its curves are named: above the whole figure, above the panel, or inside.
+        x: name and unit of the horizontal axis, shown below the last panel that shares it.
+        limits: levels with a text on each.
+        marks: places on the horizontal axis with a dotted line, and labels for the legend.
+        legend: place of its legend: above the whole figure, above the panel, or inside.
         height: in inches.
-        wide: take a row of its own, below the others.
-        paint: draw anything else.
+        wide: whether it fills a whole row, below the others.
+        paint: draws anything else.
     """
 
     y: str
@@ -100,78 +97,59 @@ def draw(
     *,
     down: bool = False,
     sharey: bool | Literal["row"] = False,
-    room: float = _LEFT,
-    edge: float = _RIGHT,
-    top: float = 0.0,
+    colors: tuple[ScalarMappable, str] | None = None,
 ) -> Figure:
     """Draw panels in rows, or column by column with `down`, below a legend of all their curves.
 
-    Panels share a horizontal axis of the same name. `sharey` gives all panels the same vertical
-    axis; with "row" those of a row, while each has its own horizontal one.
-    `room` is for the labels of the vertical axis on the left, `edge` is kept free on the right and
-    `top` above, in inches.
+    Args:
+        panels: share a horizontal axis of the same name.
+        columns: of the panels that are not `wide`.
+        down: whether panels are ordered column by column.
+        sharey: whether all panels share a vertical axis; with "row" those of a row, while each has
+            its own horizontal axis.
+        colors: a scale of colours on the right, and its name.
     """
     grid = [one for one in panels if not one.wide]
     placed = [*grid, *(one for one in panels if one.wide)]
     rows = math.ceil(len(grid) / columns)
     spots = [divmod(k, rows)[::-1] if down else divmod(k, columns) for k in range(len(grid))]
     spots += [(rows + k, 0) for k in range(len(placed) - len(grid))]
+    pairs = list(zip(placed, spots, strict=True))
     alike = sharey == "row" or (sharey and len({one.y for one in grid}) == 1)
-    figure, first = Figure(figsize=(WIDTH, 1.0)), dict[int, Axes]()
-    for one, (row, column) in zip(placed, spots, strict=True):
+    in_row = [[one for one, (r, _) in pairs if r == row] for row in range(spots[-1][0] + 1)]
+    heights = [max(one.height for one in row) for row in in_row]
+    figure, first, named = (
+        Figure(figsize=(WIDTH, 1.0), layout="constrained"),
+        dict[int, Axes](),
+        set(),
+    )
+    spec = figure.add_gridspec(len(heights), columns, height_ratios=heights)
+    for one, (row, column) in pairs:
         sharex = sharey != "row" and one.x == grid[0].x and not one.wide
         same_y = first.get(row if sharey == "row" else 0) if sharey and not one.wide else None
-        ax = figure.add_subplot(sharex=first.get(0) if sharex else None, sharey=same_y)
+        place = spec[row, :] if one.wide else spec[row, column]
+        ax = figure.add_subplot(place, sharex=first.get(0) if sharex else None, sharey=same_y)
         first.setdefault(row, ax)
-        below = [p.x for p, (r, c) in zip(placed, spots, strict=True)
-                 if r > row and c == column and not p.wide]  # fmt: skip
-        _fill(ax, one, last=one.x not in below, named=column == 0 or not alike)
-    beside = _BESIDE_SHARED if alike else _BESIDE
-    _place(figure, placed, spots, (room, edge, top), beside, columns)
+        below = [p.x for p, (r, c) in pairs if r > row and c == column and not p.wide]
+        last = one.x not in below
+        named |= {row} if last else set()
+        _fill(ax, one, last=last, named=column == 0 or not alike)
+    figure.align_ylabels()
+    titled = sum(any(one.title or one.legend == "panel" for one in row) for row in in_row)
+    lines = _legend(figure, panels) + titled
+    figure.set_figheight(sum(heights) + _LABELS * len(named) + _LEGEND_LINE * (lines + 0.5))
+    if colors is not None:
+        figure.colorbar(colors[0], ax=figure.axes, aspect=30).set_label(colors[1])
+    # The layout takes most of the drawing time, so it is computed once.
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    engine.execute(figure)
+    figure.set_layout_engine("none")
     return figure
-
-
-def _place(
-    figure: Figure,
-    panels: Sequence[Panel],
-    spots: Sequence[tuple[int, int]],
-    free: tuple[float, float, float],
-    beside: float,
-    columns: int,
-) -> None:
-    """Put the axes of panels in their places in a figure that is as high as they need."""
-    in_row = [
-        [panel for panel, (r, _) in zip(panels, spots, strict=True) if r == row]
-        for row in range(spots[-1][0] + 1)
-    ]
-    heights = [max(one.height for one in row) for row in in_row]
-    gaps = [_gap(above, below) for above, below in pairwise(in_row)]
-    titled = any(one.title or one.legend == "panel" for one in in_row[0])
-    left, right, top = free
-    top += _TOP + _LEGEND_LINE * (_legend(figure, panels) + titled)
-    height = top + sum(heights) + sum(gaps) + _BOTTOM
-    figure.set_figheight(height)
-    whole = WIDTH - left - right
-    single = (whole - beside * (columns - 1)) / columns
-    for ax, one, (row, column) in zip(figure.axes, panels, spots, strict=False):
-        low = height - top - sum(heights[: row + 1]) - sum(gaps[:row])
-        width = whole if one.wide else single
-        start = left + column * (single + beside)
-        box = (start / WIDTH, low / height, width / WIDTH, heights[row] / height)
-        ax.set_position(box)
-        ax.yaxis.set_label_coords(_NAME / width, 0.5)
-
-
-def _gap(above: Sequence[Panel], below: Sequence[Panel]) -> float:
-    """Return inches between two rows: more where something is written between them."""
-    named = above[0].x != below[0].x or below[0].wide
-    titled = any(one.title or one.legend == "panel" for one in below)
-    return (_BELOW_NAMED if named else _BELOW) + _LEGEND_LINE * titled
 
 
 def _fill(ax: Axes, panel: Panel, last: bool, named: bool) -> None:
     if isinstance(ax.yaxis.get_major_formatter(), ScalarFormatter):
-        # More digits than these would run into the name of the axis.
         ax.ticklabel_format(axis="y", scilimits=(-2, 4), useMathText=True)
     for one in panel.curves:
         how: dict[str, Any] = {"drawstyle": "steps-post"} if one.steps else {}
@@ -210,7 +188,7 @@ def _fill(ax: Axes, panel: Panel, last: bool, named: bool) -> None:
 
 
 def limit(ax: Axes, level: float, text: str, *, below: bool = False) -> None:
-    """Draw a level that something must stay on one side of, with words on it."""
+    """Draw a limit with a text on it."""
     ax.axhline(level, label=None if text else "limit", **LIMIT._asdict())
     ax.annotate(
         text,
@@ -228,7 +206,7 @@ def limit(ax: Axes, level: float, text: str, *, below: bool = False) -> None:
 
 
 def _legend(figure: Figure, panels: Sequence[Panel]) -> int:
-    """Name all curves above the figure, and return in how many lines."""
+    """Name all curves above the figure, and return the number of lines."""
     handles: dict[str, Artist] = {}
     for ax, panel in zip(figure.axes, panels, strict=False):
         if panel.legend == "figure":
@@ -244,5 +222,5 @@ def _legend(figure: Figure, panels: Sequence[Panel]) -> int:
             break
     else:
         return 0
-    figure.legend(handles.values(), labels, loc="upper center", ncols=columns)
+    figure.legend(handles.values(), labels, loc="outside upper center", ncols=columns)
     return lines

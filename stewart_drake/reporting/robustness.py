@@ -233,7 +233,7 @@ def influence_figure(influences: Sequence[Influence]) -> Figure:
         )
         for label, found in shown.items()
     ]
-    return draw(panels, len(panels), sharey=True, room=1.6)
+    return draw(panels, len(panels), sharey=True)
 
 
 def _dots(ax: Axes, found: Sequence[tuple[Correlation, float]], names: Sequence[str]) -> None:

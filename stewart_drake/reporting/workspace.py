@@ -9,14 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
 from stewart_drake.core.layout import DEAD_CENTRE_SINE
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.reporting.document import Document, from_template, number
 from stewart_drake.reporting.panels import Curve, Panel, draw
-from stewart_drake.reporting.style import FACTORS, LEG_LINES, LIMIT, UNITS, figure_style, line
+from stewart_drake.reporting.style import FACTORS, LEG_LINES, LIMIT, UNITS, line
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS
 from stewart_drake.studies.clearance import Nearest
 from stewart_drake.studies.workspace import Sizing, WorkspaceStudy
@@ -25,13 +24,13 @@ from stewart_drake.types import Array
 
 _COORDINATES: Final = tuple(zip(COORDINATE_NAMES, FACTORS, UNITS, strict=True))
 _NEAREST: Final = 8
-"""Number of pairs that are listed even where all of them are apart."""
+"""Smallest number of pairs in the table."""
 _LEVELS: Final = (1, 2, 3, 5, 8, 13, 30, 100)
 """Levels of the condition number."""
 _CMAP: Final = colormaps["cividis_r"]
 _OUTSIDE: Final = "#F2F2F2"
 _HALO: Final = (withStroke(linewidth=3, foreground="#FFFFFF"),)
-"""Around black lines over colours of any darkness; on a dark page the lines are light."""
+"""Outline of black lines on any colour; on a dark page the lines are light."""
 _PATH: Final[dict[str, Any]] = {"color": "#000000", "lw": 1.2, "path_effects": _HALO}
 _HOME: Final[dict[str, Any]] = {**_PATH, "marker": "+", "ls": "", "ms": 9, "mew": 1.5}
 
@@ -70,7 +69,7 @@ def document(study: WorkspaceStudy) -> Document:
 
 
 def travel_text(travel: list[Travel]) -> str:
-    """Return how far each coordinate goes from home alone, in degrees and mm."""
+    """Return the range of each coordinate alone, from home, in degrees and mm."""
     return ", ".join(
         f"{name} {factor * t.low:.3g} to +{factor * t.high:.3g} {unit}"
         for (name, factor, unit), t in zip(_COORDINATES, travel, strict=True)
@@ -86,7 +85,7 @@ def _nearest_text(nearest: Nearest | None) -> str:
 
 
 def _crossing(nearest: Nearest) -> str:
-    """Return whether two parts cross; the disc of the base is only drawn."""
+    """Return a remark on parts that cross."""
     if nearest.distance >= 0:
         return ""
     return "crosses the disc as drawn" if "base" in nearest.pair else "they cross"
@@ -153,7 +152,7 @@ def motors_figure(sizing: Sizing, torque_limit: float | None) -> Figure:
 
 
 def clearance_figure(study: WorkspaceStudy) -> Figure:
-    """Draw distances of the nearest parts: along the reference, and over a section."""
+    """Draw the smallest distances: along the reference, and over a section."""
     along, time = study.clearance.along, study.clearance.along.time
     curves = [
         Curve(time, 1e3 * along.links, "links", line(0, marked=False)),
@@ -174,17 +173,8 @@ def clearance_figure(study: WorkspaceStudy) -> Figure:
         ax.set_facecolor(_OUTSIDE)
 
     right = Panel(_axis(pair.second), x=_axis(pair.first), height=3.2, paint=paint)
-    figure = draw([left, right], 2, edge=1.0)
-    _scale(figure, ends, "nearest links  [mm]")
-    return figure
-
-
-@figure_style()
-def _scale(figure: Figure, norm: Normalize, label: str) -> None:
-    """Draw a scale of colours in the room on the right."""
-    low, high = figure.axes[-1].get_position(), figure.axes[0].get_position()
-    axes = figure.add_axes((0.925, low.y0, 0.018, high.y1 - low.y0))
-    figure.colorbar(ScalarMappable(norm, _CMAP), cax=axes).set_label(label)
+    scale = ScalarMappable(ends, _CMAP), "nearest links  [mm]"
+    return draw([left, right], 2, colors=scale)
 
 
 def _axis(k: int) -> str:
@@ -192,14 +182,14 @@ def _axis(k: int) -> str:
 
 
 def _home(ax: Axes, pair: Section, home: Array) -> None:
-    ax.plot(*(FACTORS[k] * home[k] for k in (pair.first, pair.second)), **_HOME)
+    ax.plot(*(FACTORS[k] * home[k] for k in (pair.first, pair.second)), label="home", **_HOME)
     ax.grid(False)
 
 
 def sections_figure(study: WorkspaceStudy) -> Figure:
     """Draw the condition number over the sections, with the reference projected onto them."""
     norm = BoundaryNorm(_LEVELS, 256, extend="max")
-    figure = draw(
+    return draw(
         [
             Panel(
                 _axis(one.second),
@@ -212,24 +202,16 @@ def sections_figure(study: WorkspaceStudy) -> Figure:
             for one in study.sections
         ],
         2,
-        edge=1.0,
-        top=0.25,
+        colors=(ScalarMappable(norm, _CMAP), "condition number of A  [-], light is good"),
     )
-    _scale(figure, norm, "condition number of A  [-], light is good")
-    with figure_style():
-        border = Line2D([], [], color=LIMIT.color, lw=1.8)
-        handles = [border, Line2D([], [], **_PATH), Line2D([], [], **_HOME)]
-        labels = ["border of the workspace", "reference, projected", "home"]
-        figure.legend(handles, labels, loc="upper center", ncols=3)
-    return figure
 
 
 def _section(ax: Axes, section: Section, study: WorkspaceStudy, norm: BoundaryNorm) -> None:
     pair = section.first, section.second
     factors = [FACTORS[k] for k in pair]
     x, y = factors[0] * section.x, factors[1] * section.y
-    # At a dead centre the condition goes like 1 / sine and the sine like the root of the distance:
-    # what is nearly linear there, and so what a grid can be interpolated in, are squares.
+    # At a dead centre the condition is proportional to 1 / sine, and the sine to the root of the
+    # distance. Squares are nearly linear there and can be interpolated on a grid.
     quality = np.nan_to_num(1 / np.square(section.condition))
     edges = [0.0, *(1 / np.square(_LEVELS[::-1]))]
     shades = [_CMAP(norm(1.01 * level)) for level in _LEVELS[::-1]]
@@ -238,6 +220,11 @@ def _section(ax: Axes, section: Section, study: WorkspaceStudy, norm: BoundaryNo
     ax.contourf(x, y, border, levels=[-1e9, 0.0], colors=_OUTSIDE)
     if (border > 0).any():
         ax.contour(x, y, border, [0.0], colors=LIMIT.color, linewidths=1.8)
+    ax.plot([], [], color=LIMIT.color, lw=1.8, label="border of the workspace")
     poses = study.margins.pose
-    ax.plot(*(f * poses[:, k] for f, k in zip(factors, pair, strict=True)), **_PATH)
+    ax.plot(
+        *(f * poses[:, k] for f, k in zip(factors, pair, strict=True)),
+        label="reference, projected",
+        **_PATH,
+    )
     _home(ax, section, study.experiment.mechanism.home)
