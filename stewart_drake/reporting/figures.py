@@ -31,23 +31,22 @@ from stewart_drake.studies.compare import label as spoken
 from stewart_drake.types import Array
 
 TORQUE_CONTROLLERS: Final = ("delay_lqr", "delay_lqi", "predictor_lqi")
-"""Controllers that know of the delay, whose torques a comparison shows."""
+"""Delay-aware controllers, with figures of their torques in a comparison."""
 
 _SYMBOLS: Final = dict(zip(COORDINATES, ("roll φ", "pitch θ", "yaw ψ", "x", "y", "z"), strict=True))
 _PARAMETER_UNITS: Final = ("mN m",) * 6 + ("kg", "mN m s/rad")
 _PARAMETER_FACTORS: Final = np.array([1e3] * 6 + [1.0, 1e3])
 _STATE_REACH: Final = 0.3
 _ERROR_REACH: Final = 0.5
-"""How far a diverging run may widen an axis, as a share of the reference's peak to peak."""
+"""Largest widening of an axis by a diverging run, as a share of the reference's peak to peak."""
 _LEAST_SIGMAS: Final = 0.02
-"""A parameter's axis shows at least this share of its largest standard deviation to either side."""
+"""Least half width of a parameter's axis, as a share of its largest standard deviation."""
 _LEAST_SPAN: Final = 0.02
-"""Least span of a coordinate's axis, as a share of the widest motion among those of its unit."""
+"""Least span of a coordinate's axis, as a share of the largest motion in its unit."""
 _MARGIN: Final = 0.06
-"""Empty share of an axis beyond the data."""
-
+"""Margin of an axis beyond the data, as a share."""
 _AFTER_END: Final = 1.1
-"""The time axis of a run that ended early goes on for this factor."""
+"""Length of the time axis of a run that ended early, as a factor on its time."""
 _FIXED: Final = Line("#888888", ":", 1.2)
 
 _Runs = Mapping[str, tuple[SimulationResult, Line]]
@@ -56,18 +55,15 @@ _Runs = Mapping[str, tuple[SimulationResult, Line]]
 def comparison_figures(
     results: Mapping[str, SimulationResult], directory: str | Path
 ) -> list[Path]:
-    """Write states, errors, and torques of each delay-aware controller, as PNG and SVG.
-
-    Controllers that find the delay add a figure of it, the neural tuner one of its weights.
-
-    Raises:
-        OSError: the directory cannot be written to.
-    """
+    """Write the figures of `draw_comparison` as PNG and SVG."""
     return write_figures(draw_comparison(results), directory)
 
 
 def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure]:
-    """Return the figures that `comparison_figures` writes, by name; none without results."""
+    """Return states, errors, and torques of each delay-aware controller, by name.
+
+    A controller that finds the delay adds a figure of it, a tuner one of its weights.
+    """
     if not results:
         return {}
     lines = style.controller_lines(results)
@@ -88,18 +84,12 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
 
 
 def run_figures(result: SimulationResult, directory: str | Path) -> list[Path]:
-    """Write states, errors, torques and, with an estimator, the parameters, as PNG and SVG.
-
-    The neural tuner adds a figure of the weights that it set.
-
-    Raises:
-        OSError: the directory cannot be written to.
-    """
+    """Write the figures of `draw_run` as PNG and SVG."""
     return write_figures(draw_run(result), directory)
 
 
 def draw_run(result: SimulationResult) -> dict[str, Figure]:
-    """Return the figures that `run_figures` writes, by name."""
+    """Return states, errors, torques, and if estimated or tuned parameters, delay and weights."""
     runs = {"plate": (result, style.RUN)}
     figures = {
         "states": _states(runs),
@@ -181,7 +171,7 @@ def _torques(run: SimulationResult, label: str, line: Line, commanded: bool = Fa
 
 
 def _packet_strip(ax: Axes, run: SimulationResult) -> None:
-    """Draw a row of ticks for each kind of packet and of period, where its count rises."""
+    """Draw a row of ticks for each count of packets and periods, at its increments."""
     counts = run.signals.packets.values
     rises = np.diff(counts, axis=0, prepend=np.zeros((1, len(PACKETS)))) > 0
     time = run.signals.time.values
@@ -189,7 +179,7 @@ def _packet_strip(ax: Axes, run: SimulationResult) -> None:
         color = style.LIMIT.color if name in ("lost", "late", "dry") else style.RUN.color
         ax.vlines(time[rose], row - 0.35, row + 0.35, color=color, linewidth=1.0)
     labels = [
-        f"{name}  {n:.0f}" if np.isfinite(n) else f"{name}  not known"
+        f"{name}  {n:.0f}" if np.isfinite(n) else f"{name}  unknown"
         for name, n in zip(PACKETS, counts[-1], strict=True)
     ]
     ax.set_ylim(len(PACKETS) - 0.5, -0.5)
@@ -226,7 +216,7 @@ def _parameters(run: SimulationResult) -> Figure:
 
 
 def _delay(run: SimulationResult) -> Figure:
-    """Draw the delay with its band, and how far that is from the truth."""
+    """Draw the estimated delay with its band, and its error."""
     signals, panels = run.signals, []
     time, true, width = signals.time.values, signals.delay_true.values, 2 * signals.delay_std.values
     # Both the final band and an error several times as large are visible on this axis.
@@ -246,10 +236,10 @@ def _delay(run: SimulationResult) -> Figure:
 
 
 def weights_figure(runs: Mapping[str, SimulationResult]) -> Figure:
-    """Draw w_Q, w_R and below them their ratio, on which alone the gain depends, a run per column.
+    """Draw w_Q, w_R and their ratio, which determines the gain.
 
     Args:
-        runs: by what each column is called; at least one.
+        runs: at least one, by the title of its column.
     """
     above, below = list[Panel](), list[Panel]()
     for title, run in runs.items():
@@ -271,7 +261,7 @@ def weights_figure(runs: Mapping[str, SimulationResult]) -> Figure:
 
 
 def shown_until(run: SimulationResult) -> float:
-    """Return where the time axis of a run ends, in s."""
+    """Return the end of a run's time axis, s."""
     end = run.scenario.duration
     return end if run.stopped is None else min(end, _AFTER_END * run.stopped.time) or end
 
@@ -290,7 +280,7 @@ def _curves(runs: _Runs, data: Iterable[Array], steps: bool = False) -> list[Cur
 
 
 def _trusted(runs: _Runs, data: list[Array]) -> list[Array]:
-    """Return the data of runs that completed, or of all where none did."""
+    """Return the data of completed runs, or of all if there are none."""
     pairs = zip(runs.values(), data, strict=True)
     return [values for (run, _), values in pairs if run.status == "completed"] or data
 
@@ -302,7 +292,7 @@ def _spans(values: Array) -> Array:
 def _limits(
     core: Iterable[Array], data: Iterable[Array], reach: float, least: float = 0.0
 ) -> tuple[float, float] | None:
-    """Return limits, `least` apart, that show `core` whole and `data` up to `reach` off it."""
+    """Return limits that contain `core` and `data` up to `reach` beyond, at least `least` apart."""
     inside = np.concatenate(list(core))
     inside = inside[np.isfinite(inside)]
     if not len(inside):

@@ -167,7 +167,7 @@ def residual_figure(found: Identification, log: int) -> Figure:
 
 
 def residuals_of(found: Identification, log: int) -> tuple[Array, Array]:
-    """Return times (n,) of a log in s, and residuals (n, 18) in standard deviations, or NaN."""
+    """Return times (n,) of a log in s, and residuals (n, 18) in standard deviations."""
     times, rows = [], []
     for i, segment in enumerate(found.problem.segments):
         if segment.log is not found.logs[log]:

@@ -22,7 +22,7 @@ def _mean(cell: Cell) -> float:
 
 
 def document(study: LinkStudy) -> Document:
-    """Return bounds, then losses at the best of them."""
+    """Return the results by bound, then by loss at the best bound."""
     best, checked = study.best, study.checked
     own = best is not None and all(one is None or one.completed == 1 for one in (best, checked))
     return from_template(
