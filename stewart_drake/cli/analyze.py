@@ -39,8 +39,8 @@ class _Command(TyperCommand):
         single.command()(_callback(str(self.name)))
         return typer.main.get_command(single)
 
-    params = property(lambda self: self._made.params, lambda self, _: None)  # type: ignore[assignment]
-    callback = property(lambda self: self._made.callback, lambda self, _: None)  # type: ignore[assignment]
+    params = property(lambda self: self._made.params, lambda self, _: None)
+    callback = property(lambda self: self._made.callback, lambda self, _: None)
 
 
 def add_analyses(root: typer.Typer) -> None:
