@@ -123,7 +123,7 @@ def reading(sensing, said, shown, last, still):
     it = c.ffi.new("stewart_reading *", list(map(c.at, (angles, onto, variance))))
     given = map(c.at, (said.known(sensing.size), shown, last, still))
     c.lib.stewart_read(encoders.it, *given, it, c.scratch(sensing.samples))
-    c.lib.stewart_beside(encoders.it, it, c.at(shown), c.at(residuals))
+    c.lib.stewart_node_residuals(encoders.it, it, c.at(shown), c.at(residuals))
     return Reading(angles, variance, list(it.odd), residuals)
 
 
@@ -193,7 +193,7 @@ def test_a_code_that_stands_still_is_worth_less_and_less():
     said, last = Measurement.of(codes.ravel()), np.tile(codes[0], 10)
     still, c = np.zeros(6), core()
     for periods in range(1, 4):
-        c.lib.stewart_encoders_stood(encoders_of(ten).it, *map(c.at, (said.values, last, still)))
+        c.lib.stewart_count_still(encoders_of(ten).it, *map(c.at, (said.values, last, still)))
         assert np.array_equal(still, [0, 0, *[periods] * 4])
         variance = reading(ten, said, shown, last, still).variance[0]
         white = variance[1] * 2  # that of one sample, projected

@@ -299,7 +299,7 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
                 A[X * j + i] += a->instant.H[n * i + k] * L[n * k + j];
         }
     /* Seen from where the period begins. */
-    if (!stewart_seen_root(d->sensing, a->mean, known, A, d->model_std, a->instant.C, scratch))
+    if (!stewart_innovation_root(d->sensing, a->mean, known, A, d->model_std, a->instant.C, scratch))
         return 0;
     stewart_copy(n, a->mean, trial);
     for (int k = 0; k < TRIED; k++) {
@@ -307,7 +307,7 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
         trial[n - 2] = k < TRIED - 1 ? low + (high - low) / (TRIED - 1) * (real)k : high;
         if (!stewart_period_end(a->period, trial, end, scratch))
             return 0;
-        stewart_seen(d->sensing, end, miss);
+        stewart_predict_measurement(d->sensing, end, miss);
         for (int i = 0; i < m; i++)
             miss[i] = a->instant.values[i] - miss[i];
         stewart_whiten(m, 1, a->instant.C, miss);
@@ -402,9 +402,9 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
             || !set_noise(a, xi, used, scratch))
             return 0;
     }
-    stewart_seen_jacobian(d->sensing, a->instant.state, a->instant.J);
-    stewart_seen_changes(d->sensing, a->instant.J, a->rows, a->K, a->seen);
-    if (!stewart_seen_root(d->sensing, a->instant.state, a->rows, a->K, a->drift, C, scratch))
+    stewart_measurement_jacobian(d->sensing, a->instant.state, a->instant.J);
+    stewart_apply_jacobian(d->sensing, a->instant.J, a->rows, a->K, a->seen);
+    if (!stewart_innovation_root(d->sensing, a->instant.state, a->rows, a->K, a->drift, C, scratch))
         return 0;
     for (int i = 0; i < n; i++) {
         lower[i] = -(real)INFINITY;

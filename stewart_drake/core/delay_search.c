@@ -328,13 +328,13 @@ static int compare(const Search *s, const stewart_period *t, const stewart_guess
         for (int j = 0; j <= k; j++)
             for (int i = 0; i < X; i++)
                 A[X * (k < X ? j : X + j) + i] += H[n * i + k] * L[n * k + j];
-    if (!stewart_seen_root(sensing, state, known + X, A, d->model_std, C, scratch))
+    if (!stewart_innovation_root(sensing, state, known + X, A, d->model_std, C, scratch))
         return 0;
     for (int k = 0; k < number; k++) {
         xi[n - 2] = (real)(k + 1) * GRID * d->period;
         if (!stewart_period_end(t, xi, end, scratch))
             return 0;
-        stewart_seen(sensing, end, miss);
+        stewart_predict_measurement(sensing, end, miss);
         for (int i = 0; i < m; i++)
             miss[i] = y[i] - miss[i];
         stewart_whiten(m, 1, C, miss);

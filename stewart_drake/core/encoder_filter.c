@@ -48,7 +48,7 @@ static stewart_schedule cut(const stewart_schedule *schedule, int n, const real 
 
 /* Legs at several instants of a period.
 
-   xi = [x_{k-1}; theta] is corrected by the residuals e_j (`stewart_beside`) at the M nodes s_j of the
+   xi = [x_{k-1}; theta] is corrected by the residuals e_j (`stewart_node_residuals`) at the M nodes s_j of the
    period. With F_j from xi to the state there and J = dh/dq,
 
        H_j = J(q_j) F_j[pose],   R_j = diag(var_j) + diag(s_j^2 J Q J'),
@@ -121,7 +121,7 @@ static int rows_of_legs(void *model, const real *xi, real *e, real *H, stewart_s
     int there[MAX_ROWS], number = 0, kept = 0, given = 0;
     (void)xi;
     (void)scratch;
-    stewart_beside(encoders, &s->reading, s->shown, residual);
+    stewart_node_residuals(encoders, &s->reading, s->shown, residual);
     for (int node = 0; node < encoders->nodes; node++) {
         const int place = (int)s->places[node];
         const real *F = s->H + X * n * place, share = encoders->shares[node];
@@ -263,7 +263,7 @@ static int start_scratch(const stewart_filter *filter)
 
 static void count_still(const stewart_sensing *sensing, const real *values, const real *last, real *still)
 {
-    stewart_encoders_stood(sensing->kind, values, last, still);
+    stewart_count_still(sensing->kind, values, last, still);
 }
 
 const stewart_legs stewart_encoder_legs = {attempt, attempt_scratch, moved, start_scratch,

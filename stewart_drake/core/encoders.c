@@ -170,12 +170,6 @@ stewart_sensing stewart_newest_encoders(const void *sensor)
     return sensing;
 }
 
-int stewart_encoder_fault(const stewart_encoders *encoders, const real *values)
-{
-    const stewart_sensing sensing = stewart_encoder_sensing(encoders);
-    return fault_of_encoders(&sensing, NULL, 0, values, NULL);
-}
-
 /* Number of changes of a leg's code since the last sample of the period before. */
 static int changes_of(const stewart_encoders *encoders, const real *values, const real *last, int leg)
 {
@@ -191,7 +185,7 @@ static int changes_of(const stewart_encoders *encoders, const real *values, cons
     return changes;
 }
 
-void stewart_encoders_stood(const stewart_encoders *encoders, const real *values, const real *last,
+void stewart_count_still(const stewart_encoders *encoders, const real *values, const real *last,
                             real *still)
 {
     for (int leg = 0; leg < LEGS; leg++) {
@@ -306,7 +300,7 @@ void stewart_read(const stewart_encoders *encoders, const real *values, const re
     }
 }
 
-void stewart_beside(const stewart_encoders *encoders, const stewart_reading *reading,
+void stewart_node_residuals(const stewart_encoders *encoders, const stewart_reading *reading,
                     const real *shown, real *e)
 {
     const int N = encoders->samples, M = encoders->nodes;

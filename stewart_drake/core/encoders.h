@@ -24,12 +24,9 @@ typedef struct {
 stewart_sensing stewart_encoder_sensing(const void *sensor);
 stewart_sensing stewart_newest_encoders(const void *sensor);
 
-/* Fault of values (6 N), or 0 if at least one leg has enough samples. */
-int stewart_encoder_fault(const stewart_encoders *encoders, const real *values);
-
 /* Count in `still` (6) the periods for which each leg's code has been constant, with values (6 N) after
    `last`. */
-void stewart_encoders_stood(const stewart_encoders *encoders, const real *values, const real *last,
+void stewart_count_still(const stewart_encoders *encoders, const real *values, const real *last,
                             real *still);
 
 /* Residuals of values (6 N) with respect to a motion, and their variances.
@@ -62,7 +59,7 @@ void stewart_read(const stewart_encoders *encoders, const real *values, const re
                   stewart_scratch scratch);
 
 /* Compute e (M, 6) of a reading for predicted angles `shown` (N, 6). */
-void stewart_beside(const stewart_encoders *encoders, const stewart_reading *reading,
+void stewart_node_residuals(const stewart_encoders *encoders, const stewart_reading *reading,
                     const real *shown, real *e);
 
 /* Scratch of `start` and `stewart_read`: numbers at the most. */

@@ -123,7 +123,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     stewart_attempt_predicted(a);
     if (!a->values)
         return stewart_attempt_ended(a, scratch);
-    if (!stewart_seen_root(f->sensing, a->end, 0, NULL, a->drift, s.instant.C, scratch))
+    if (!stewart_innovation_root(f->sensing, a->end, 0, NULL, a->drift, s.instant.C, scratch))
         return 0;
     const stewart_kalman update = {n, m, ITERATIONS, prior->mean, prior->root, f->lower, f->upper, &s,
                                    stewart_instant_rows, stewart_instant_settle};

@@ -5,7 +5,7 @@
 
 #define SMALL ((real)0.1) /* standard deviations; a shorter correction ends the iterations */
 
-void stewart_seen(const stewart_sensing *sensing, const real *state, real *values)
+void stewart_predict_measurement(const stewart_sensing *sensing, const real *state, real *values)
 {
     if (sensing->seen)
         sensing->seen(sensing, state, values);
@@ -13,13 +13,13 @@ void stewart_seen(const stewart_sensing *sensing, const real *state, real *value
         stewart_copy(X, state, values);
 }
 
-void stewart_seen_jacobian(const stewart_sensing *sensing, const real *state, real *J)
+void stewart_measurement_jacobian(const stewart_sensing *sensing, const real *state, real *J)
 {
     if (sensing->jacobian)
         sensing->jacobian(sensing, state, J);
 }
 
-void stewart_seen_changes(const stewart_sensing *sensing, const real *J, int k, const real *A,
+void stewart_apply_jacobian(const stewart_sensing *sensing, const real *J, int k, const real *A,
                           real *seen)
 {
     if (sensing->jacobian) {
@@ -31,13 +31,13 @@ void stewart_seen_changes(const stewart_sensing *sensing, const real *J, int k, 
             seen[k * i + j] = A[X * j + i];
 }
 
-int stewart_seen_root(const stewart_sensing *sensing, const real *state, int k, const real *A,
+int stewart_innovation_root(const stewart_sensing *sensing, const real *state, int k, const real *A,
                       const real *std, real *C, stewart_scratch scratch)
 {
     const int m = sensing->size;
     real *J = stewart_take(&scratch, m * X), *JA = stewart_take(&scratch, m * k);
-    stewart_seen_jacobian(sensing, state, J);
-    stewart_seen_changes(sensing, J, k, A, JA);
+    stewart_measurement_jacobian(sensing, state, J);
+    stewart_apply_jacobian(sensing, J, k, A, JA);
     stewart_multiply_by_transpose(m, k, m, JA, JA, C);
     for (int i = 0; i < m; i++) {
         for (int j = 0; j <= i; j++)
@@ -70,8 +70,8 @@ int stewart_instant_rows(void *model, const real *xi, real *e, real *H, stewart_
     const int m = a->sensing->size;
     (void)xi;
     (void)scratch;
-    stewart_seen(a->sensing, a->state, e);
-    stewart_seen_jacobian(a->sensing, a->state, a->J);
+    stewart_predict_measurement(a->sensing, a->state, e);
+    stewart_measurement_jacobian(a->sensing, a->state, a->J);
     if (a->sensing->jacobian)
         stewart_multiply(m, X, a->n, a->J, a->H, H);
     else
@@ -88,7 +88,7 @@ static int is_small(const stewart_instant *a, const real *change, stewart_scratc
 {
     const int m = a->sensing->size;
     real *seen = stewart_take(&scratch, m);
-    stewart_seen_changes(a->sensing, a->J, 1, change, seen);
+    stewart_apply_jacobian(a->sensing, a->J, 1, change, seen);
     for (int i = 0; i < m; i++) {
         real variance = 0;
         for (int j = 0; j <= i; j++)
@@ -117,7 +117,7 @@ int stewart_instant_settle(void *model, const real *xi, const real *better, stew
         return -1;
     for (int i = 0; i < X; i++)
         shift[i] = a->state[i] - linear[i];
-    stewart_seen_jacobian(a->sensing, a->state, a->J);
+    stewart_measurement_jacobian(a->sensing, a->state, a->J);
     if (is_small(a, shift, scratch))
         return 1;
     return a->linearize(a->period, better, a->H, scratch) ? 0 : -1;

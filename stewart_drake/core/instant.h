@@ -6,18 +6,18 @@
 #include "sensing.h"
 
 /* h(x) (m) of a state (12). */
-void stewart_seen(const stewart_sensing *sensing, const real *state, real *values);
+void stewart_predict_measurement(const stewart_sensing *sensing, const real *state, real *values);
 
 /* dh/dx (m, 12) at a state; not written where the state itself is measured. */
-void stewart_seen_jacobian(const stewart_sensing *sensing, const real *state, real *J);
+void stewart_measurement_jacobian(const stewart_sensing *sensing, const real *state, real *J);
 
 /* J A' (m, k) of changes A (k, 12) of the state. */
-void stewart_seen_changes(const stewart_sensing *sensing, const real *J, int k, const real *A,
+void stewart_apply_jacobian(const stewart_sensing *sensing, const real *J, int k, const real *A,
                           real *seen);
 
 /* C (m, m), lower triangular, with C C' = J (A'A + diag(std)^2) J' + diag(noise)^2 at a state, A (k, 12).
    Returns 0 where it does not exist. Scratch: m (12 + k) numbers. */
-int stewart_seen_root(const stewart_sensing *sensing, const real *state, int k, const real *A,
+int stewart_innovation_root(const stewart_sensing *sensing, const real *state, int k, const real *A,
                       const real *std, real *C, stewart_scratch scratch);
 
 /* B (m, n) <- C^-1 B, C (m, m) lower triangular. */

@@ -83,6 +83,11 @@ class Core:
             raise ValueError(f"array: got {array.dtype}; expected contiguous doubles or C ints")
         return self.ffi.from_buffer(kind, array)
 
+    def call(self, name: str, *given: Any) -> Any:
+        """Call a function; an array is given by its address."""
+        addresses = (self.at(one) if isinstance(one, np.ndarray) else one for one in given)
+        return getattr(self.lib, f"stewart_{name}")(*addresses)
+
     def plant(self, geometry: Any, parameters: Any, gravity: Any) -> Any:
         """Return a `stewart_plant` that points to numbers of these addresses."""
         return self.ffi.new("stewart_plant *", (geometry, parameters, gravity))

@@ -39,26 +39,26 @@ class Link:
         limit: float = math.inf,
     ) -> None:
         c = core()
-        self._at, self._lib, self.size, self.history = c.at, c.lib, size, history
+        self._core, self.size, self.history = c, size, history
         values = size, kept, history, wire, holds, period, together, limit
         self.data: Any = c.ffi.new("stewart_link *", values)
 
+    def _call(self, name: str, *given: Any) -> Any:
+        return self._core.call(f"link_{name}", self.data, *given)
+
     def start(self) -> Array:
         """Return the memory of an empty link."""
-        memory = np.empty(self._lib.stewart_link_memory(self.data))
-        self._lib.stewart_link_start(self.data, self._at(memory))
+        memory = np.empty(self._call("memory"))
+        self._call("start", memory)
         return memory
 
     def assume(self, memory: Array, time: float, command: Array) -> None:
         """Set the command (size,) that has acted since a time."""
-        command = np.array(command, np.float64)
-        self._lib.stewart_link_assume(self.data, self._at(memory), time, self._at(command))
+        self._call("assume", memory, time, np.array(command, np.float64))
 
     def begin(self, memory: Array, first: float, commands: Array) -> None:
         """Send commands (n, size) that act at `first`, a period later and so on."""
-        commands = np.array(commands, np.float64)
-        given = first, len(commands), self._at(commands)
-        self._lib.stewart_link_begin(self.data, self._at(memory), *given)
+        self._call("begin", memory, first, len(commands), np.array(commands, np.float64))
 
     def take(
         self,
@@ -70,27 +70,26 @@ class Link:
         arrival: float = -math.inf,
     ) -> int:
         """Take a plan (n, size), see core/link.h. Return 0, or the reason for its refusal."""
-        commands = np.array(commands, np.float64)
-        given = now, sequence, arrival, first, len(commands), self._at(commands)
-        return int(self._lib.stewart_link_take(self.data, self._at(memory), *given))
+        given = now, sequence, arrival, first, len(commands), np.array(commands, np.float64)
+        return int(self._call("take", memory, *given))
 
     def next_change(self, memory: Array) -> float:
         """Return when `change` is to be called next, or infinity."""
-        return float(self._lib.stewart_link_next(self.data, self._at(memory)))
+        return float(self._call("next", memory))
 
     def change(self, memory: Array, time: float) -> None:
         """Let the command act that is due at a time."""
-        self._lib.stewart_link_change(self.data, self._at(memory), time)
+        self._call("change", memory, time)
 
     def safe(self, memory: Array, time: float, holds: bool) -> None:
         """Drop waiting commands, and hold the last command or put out zero."""
-        self._lib.stewart_link_safe(self.data, self._at(memory), time, holds)
+        self._call("safe", memory, time, holds)
 
     def acted(self, memory: Array) -> Array:
         """Return a view (h, 1 + size) of past commands, each after its time, the newest first."""
-        begin = self._lib.STEWART_LINK_COMMANDS
+        begin = self._core.lib.STEWART_LINK_COMMANDS
         return memory[begin : begin + self.history * (1 + self.size)].reshape(self.history, -1)
 
     def number(self, memory: Array, name: str) -> float:
         """Return a number of the memory by its name in core/link.h, for example `taken`."""
-        return float(memory[getattr(self._lib, f"STEWART_LINK_{name.upper()}")])
+        return float(memory[getattr(self._core.lib, f"STEWART_LINK_{name.upper()}")])

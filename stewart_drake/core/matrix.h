@@ -1,8 +1,23 @@
-/* Small matrices, stored by rows. */
+/* Small matrices, stored by rows, and scratch memory from one block of the caller. */
 
 #pragma once
 
-#include "scratch.h"
+#include <stddef.h>
+
+#include "real.h"
+
+/* Passed by value: memory that a function takes is free again when it returns. The caller of the
+   outermost function provides enough, so that nothing is checked here. */
+typedef struct {
+    real *next;
+} stewart_scratch;
+
+static inline real *stewart_take(stewart_scratch *scratch, int numbers)
+{
+    real *taken = scratch->next;
+    scratch->next += numbers;
+    return taken;
+}
 
 int stewart_all_finite(int n, const real *x);
 void stewart_copy(int n, const real *from, real *to);

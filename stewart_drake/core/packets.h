@@ -2,7 +2,7 @@
 
 #pragma once
 
-#include "scratch.h"
+#include "matrix.h"
 
 /* Packet k has the torques of `repeats` earlier samples, word for word, then T_k and the plan of
    those that follow: rows = repeats + torques, of 6 numbers each. */

@@ -21,22 +21,19 @@ static int start_of_state(const stewart_sensing *sensing, const real *values, co
     return 1;
 }
 
+/* A measurement that is frozen repeats the last one bit for bit, which is a fault only where it cannot
+   be so. Noise that numbers can tell apart never comes twice: with noise a value that repeats is
+   frozen. Without noise the poses q and rates v have to agree: between two samples a smooth motion
+   goes
+
+       q_k - q_{k-1} = dt/2 (v_{k-1} + v_k) + O(dt^3),
+
+   so a pose that repeats is frozen if its own rates say that it has moved on. A plate at rest repeats
+   pose and rates and is not frozen. A pose that the machine cannot have is rejected. */
 static int fault_of_state(const stewart_sensing *sensing, const real *geometry, real period,
                           const real *values, const real *last)
 {
-    return stewart_state_fault(sensing->kind, geometry, period, values, last);
-}
-
-stewart_sensing stewart_state_sensing(const void *kind)
-{
-    const stewart_state_sensor *sensor = kind;
-    return (stewart_sensing){X,    sensor->noise_std, kind,           NULL,
-                             NULL, start_of_state,    fault_of_state, NULL};
-}
-
-int stewart_state_fault(const stewart_state_sensor *sensor, const real *geometry, real period,
-                        const real *values, const real *last)
-{
+    const stewart_state_sensor *sensor = sensing->kind;
     for (int i = 0; i < X; i++)
         if (!isfinite(values[i]))
             return STEWART_MISSING;
@@ -57,4 +54,11 @@ int stewart_state_fault(const stewart_state_sensor *sensor, const real *geometry
     if (REAL(fabs)(values[1]) >= STEEPEST || !stewart_within_reach(geometry, values, 0))
         return STEWART_REJECTED;
     return 0;
+}
+
+stewart_sensing stewart_state_sensing(const void *kind)
+{
+    const stewart_state_sensor *sensor = kind;
+    return (stewart_sensing){X,    sensor->noise_std, kind,           NULL,
+                             NULL, start_of_state,    fault_of_state, NULL};
 }

@@ -39,17 +39,3 @@ typedef struct {
 } stewart_state_sensor;
 
 stewart_sensing stewart_state_sensing(const void *sensor); /* `stewart_state_sensor` */
-
-/* What is wrong with values (12), or 0; `last` (12) are those before, `period` s ago.
-
-   A measurement that is frozen repeats the last one bit for bit, which is a fault only where it cannot
-   be so. Noise that numbers can tell apart never comes twice: with noise a value that repeats is
-   frozen. Without noise the poses q and rates v have to agree: between two samples a smooth motion
-   goes
-
-       q_k - q_{k-1} = dt/2 (v_{k-1} + v_k) + O(dt^3),
-
-   so a pose that repeats is frozen if its own rates say that it has moved on. A plate at rest repeats
-   pose and rates and is not frozen. A pose that the machine cannot have is rejected. */
-int stewart_state_fault(const stewart_state_sensor *sensor, const real *geometry, real period,
-                        const real *values, const real *last);

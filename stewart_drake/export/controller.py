@@ -38,7 +38,7 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 SOURCES: Final = (
-    *("real.h", "short.h", "scratch.h", "equations.h", "packets.h", "observer.h", "law.h"),
+    *("real.h", "short.h", "equations.h", "packets.h", "observer.h", "law.h"),
     *("matrix", "dynamics", "machine", "kinematics", "riccati", "design", "timeline.c"),
 )
 """Sources of core/ that every law needs; a name without a suffix stands for header and source."""

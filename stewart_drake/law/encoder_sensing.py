@@ -101,7 +101,9 @@ class EncoderSensing:
     ) -> str | None:
         """Return the fault: a measurement is of use as long as one leg is."""
         values, c = measurement.known(self.size), core()
-        found = c.lib.stewart_encoder_fault(encoders_of(self).it, c.at(values))
+        sensor = c.lib.stewart_encoder_sensing(encoders_of(self).it)
+        nothing = c.ffi.NULL, 0.0, c.at(values), c.ffi.NULL
+        found = sensor.fault(c.ffi.addressof(sensor), *nothing)
         return next((name for i, name in enumerate(FAULTS) if found >> i & 1), None)
 
     def start(self, measurement: Measurement, near: Array | None = None) -> FirstState | None:

@@ -106,7 +106,8 @@ class StateSensing:
         """Return the fault; one missing value makes the whole measurement missing."""
         c, values, before = core(), measurement.known(self.size), numbers(last, self.size)
         given = c.at(geometry(mechanism)), period, c.at(values), c.at(before)
-        found = c.lib.stewart_state_fault(state_sensor(self).it, *given)
+        sensor = c.lib.stewart_state_sensing(state_sensor(self).it)
+        found = sensor.fault(c.ffi.addressof(sensor), *given)
         return next((name for i, name in enumerate(FAULTS) if found >> i & 1), None)
 
     def start(self, measurement: Measurement, near: Array | None = None) -> FirstState:
