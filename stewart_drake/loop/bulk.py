@@ -54,13 +54,7 @@ from stewart_drake.scenario.link import (
     torque_delays,
 )
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.scenario.signals import (
-    NUM_STATE,
-    NUM_TORQUES,
-    POSE,
-    TUNER_INPUTS,
-    WEIGHTS,
-)
+from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE, TUNER_INPUTS, WEIGHTS
 from stewart_drake.scenario.timing import event_time, instants, look_time
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.tuner.source import Decision, WeightsSource

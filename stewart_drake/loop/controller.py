@@ -5,11 +5,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    LeafSystem,
-)
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics

@@ -9,11 +9,11 @@ from pydrake.systems.framework import (
     Context,
     Diagram,
     DiagramBuilder,
-    InputPort,
     OutputPort,
     System,
 )
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Saturation
+from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.channel import Channel, Wire
@@ -33,24 +33,18 @@ from stewart_drake.loop.platforms import MultibodyStewart, StartCheck, add_to_to
 from stewart_drake.loop.preparation import Experiment, concrete
 from stewart_drake.loop.servos import Servos, commands_in_flight, servo_law, servo_loop
 from stewart_drake.loop.tuner import AnnTuner, DensityWindow, LawTuner, weights_source
-from stewart_drake.scenario.config import (
-    Scenario,
-    ServoActuatorConfig,
-    TorqueActuatorConfig,
-)
-from stewart_drake.scenario.link import (
-    measurement_times,
-)
-from stewart_drake.scenario.signals import (
-    NUM_TORQUES,
-    RATES,
-    SIGNALS,
-    exported_ports,
-)
+from stewart_drake.scenario.config import Scenario, ServoActuatorConfig, TorqueActuatorConfig
+from stewart_drake.scenario.link import measurement_times
+from stewart_drake.scenario.signals import NUM_TORQUES, RATES, SIGNALS, exported_ports
 from stewart_drake.tuner.source import DensityFeatures, PaperPolicy
+from stewart_drake.types import Array
 
-_TOLD: Final = ("density", "reference")
-"""Optional inputs of a tuner; each is connected to the same output of the same-named system."""
+_TUNER_INPUTS: Final = {
+    "density": "density.density",
+    "reference": "reference.reference",
+    "memory": "controller.memory",
+}
+"""Outputs for the optional inputs of a tuner."""
 
 
 class ClosedLoop(Diagram):
@@ -105,7 +99,12 @@ def build_closed_loop(
     experiment = concrete(scenario, **own)
     experiment.own.claim(experiment.scenario)
     builder = DiagramBuilder()
-    _add_surroundings(builder, experiment, meshcat)
+    sc, network = experiment.scenario, experiment.network
+    builder.AddNamedSystem("sensor", _sensor(experiment))
+    builder.AddNamedSystem("torque_bias", add_to_torque(np.array(sc.plant.torque_bias)))
+    builder.AddNamedSystem("plant", _plant(experiment, meshcat))
+    kind = "magnitude" if network is None else network.density
+    builder.AddNamedSystem("density", DensityWindow(sc.controller.period, kind))
     catch_up = _ACTUATORS[type(experiment.scenario.actuator)](builder, experiment)
     _connect_loop(builder, experiment)
     loop = ClosedLoop()
@@ -129,14 +128,33 @@ def build_machine(experiment: Experiment) -> Diagram:
     """
     builder = DiagramBuilder()
     plant = builder.AddNamedSystem("plant", _plant(experiment, None))
-    sensor = builder.AddNamedSystem("sensor", _sensor(experiment))
-    builder.Connect(plant.GetOutputPort("state"), sensor.GetInputPort("state"))
+    builder.AddNamedSystem("sensor", _sensor(experiment))
+    _connect(builder, "plant.state", "sensor.state")
     builder.ExportInput(plant.GetInputPort("torque"), "torque")
-    builder.ExportOutput(plant.GetOutputPort("state"), "state")
-    builder.ExportOutput(sensor.GetOutputPort("measurement"), "measurement")
+    builder.ExportOutput(_output(builder, "plant.state"), "state")
+    builder.ExportOutput(_output(builder, "sensor.measurement"), "measurement")
     machine = builder.Build()
     machine.set_name("machine")
     return machine
+
+
+def _output(builder: DiagramBuilder, name: str) -> OutputPort:
+    """Return the output `system.port`."""
+    system, port = name.split(".")
+    return builder.GetSubsystemByName(system).GetOutputPort(port)
+
+
+def _connect(builder: DiagramBuilder, source: OutputPort | str, target: str) -> None:
+    """Connect an output with the input `system.port`."""
+    system, port = target.split(".")
+    source = _output(builder, source) if isinstance(source, str) else source
+    builder.Connect(source, builder.GetSubsystemByName(system).GetInputPort(port))
+
+
+def _add_reference(
+    builder: DiagramBuilder, experiment: Experiment, planned: Trajectory, times: Array
+) -> None:
+    builder.AddNamedSystem("reference", Reference(experiment.reference, planned, times))
 
 
 def _add_torques(builder: DiagramBuilder, experiment: Experiment) -> float:
@@ -152,13 +170,12 @@ def _add_torques(builder: DiagramBuilder, experiment: Experiment) -> float:
     if link is None:
         link = LINKS[type(config)].system(config, experiment, channel, reports)
     limit = np.full(link.GetInputPort("commanded").size(), experiment.torque_limit)
-    builder.AddNamedSystem("saturation", Saturation(-limit, limit))
+    limited = builder.AddNamedSystem("saturation", Saturation(-limit, limit))
     builder.AddNamedSystem("delay_chain", link)
-    sends = builder.GetSubsystemByName("controller").HasOutputPort("plan")
-    wanted = builder.GetSubsystemByName("controller").GetOutputPort("plan" if sends else "torque")
-    limited = builder.GetSubsystemByName("saturation")
+    packets = builder.GetSubsystemByName("controller").HasOutputPort("plan")
+    wanted = _output(builder, "controller.plan" if packets else "controller.torque")
     builder.Connect(wanted, limited.get_input_port())
-    builder.Connect(limited.get_output_port(), link.GetInputPort("commanded"))
+    _connect(builder, limited.get_output_port(), "delay_chain.commanded")
     return catch_up
 
 
@@ -168,22 +185,20 @@ def _add_servos(builder: DiagramBuilder, experiment: Experiment) -> float:
     law, planned, catch_up = servo_law(experiment)
     first, believed = commands_in_flight(experiment, law, law.timeline.delay)
     last = believed[-1] if len(believed) else first
-    controller = builder.AddNamedSystem("controller", ServoController(law, last))
-    reference = builder.AddNamedSystem(
-        "reference", Reference(experiment.reference, planned, law.preview_times)
-    )
-    builder.Connect(reference.GetOutputPort("preview"), controller.GetInputPort("preview"))
-    _, flying = commands_in_flight(experiment, law, sc.true_delay)
-    chain = builder.AddNamedSystem("delay_chain", wire(experiment, flying, "command"))
-    builder.Connect(controller.GetOutputPort("command"), chain.GetInputPort("commanded"))
-    servos = builder.AddNamedSystem(
-        "servos",
-        Servos(servo_loop(experiment), machine, first, sc.controller.period, law.reports),
-    )
-    for port in ("command", "arrived"):
-        builder.Connect(chain.GetOutputPort(port), servos.GetInputPort(port))
-    plant = builder.GetSubsystemByName("plant")
-    builder.Connect(plant.GetOutputPort("state"), servos.GetInputPort("state"))
+    builder.AddNamedSystem("controller", ServoController(law, last))
+    _add_reference(builder, experiment, planned, law.preview_times)
+    _, in_flight = commands_in_flight(experiment, law, sc.true_delay)
+    builder.AddNamedSystem("delay_chain", wire(experiment, in_flight, "command"))
+    servos = Servos(servo_loop(experiment), machine, first, sc.controller.period, law.reports)
+    builder.AddNamedSystem("servos", servos)
+    for source, target in (
+        ("reference.preview", "controller.preview"),
+        ("controller.command", "delay_chain.commanded"),
+        ("delay_chain.command", "servos.command"),
+        ("delay_chain.arrived", "servos.arrived"),
+        ("plant.state", "servos.state"),
+    ):
+        _connect(builder, source, target)
     return catch_up
 
 
@@ -194,21 +209,7 @@ _ACTUATORS: Final[Mapping[type, Callable[[DiagramBuilder, Experiment], float]]] 
 """Functions that add controller, link and motors to a loop, and return its catch-up in s."""
 
 
-def _add_surroundings(
-    builder: DiagramBuilder, experiment: Experiment, meshcat: Meshcat | None
-) -> None:
-    """Add sensor, bias, plant and density window."""
-    sc = experiment.scenario
-    period = sc.controller.period
-    builder.AddNamedSystem("sensor", _sensor(experiment))
-    builder.AddNamedSystem("torque_bias", add_to_torque(np.array(sc.plant.torque_bias)))
-    builder.AddNamedSystem("plant", _plant(experiment, meshcat))
-    kind = "magnitude" if experiment.network is None else experiment.network.density
-    builder.AddNamedSystem("density", DensityWindow(period, kind))
-
-
 def _sensor(experiment: Experiment) -> System:
-    """Return the user's own, or the scenario's."""
     own, config = experiment.own.systems.get("sensor"), experiment.scenario.sensor
     return SENSORS[type(config)].system(config, experiment) if own is None else own
 
@@ -220,37 +221,33 @@ def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | Mult
 
 
 def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
-    """Connect what every loop has, and name its outputs."""
-
-    def out(source: str, port: str) -> OutputPort:
-        return builder.GetSubsystemByName(source).GetOutputPort(port)
-
-    def into(target: str, port: str) -> InputPort:
-        return builder.GetSubsystemByName(target).GetInputPort(port)
-
-    bias, motors = builder.GetSubsystemByName("torque_bias"), _motors(builder)
-    measured = _measured(builder, experiment)
-    builder.Connect(measured, into("controller", "measurement"))
-    if "controller" in experiment.own.systems:
-        builder.Connect(measured, into("own_controller", "measurement"))
-    builder.Connect(motors.GetOutputPort("torque"), bias.get_input_port())
-    _disturb(builder, experiment, bias.get_output_port())
-    builder.Connect(out("plant", "state"), into("sensor", "state"))
-    measured_state = experiment.scenario.sensor.measures_state
-    state = measured if measured_state else out("controller", "estimate")
-    builder.Connect(state, into("density", "measurement"))
-    builder.Connect(out("reference", "reference"), into("density", "reference"))
-    builder.Connect(out("controller", "torque"), into("density", "torque"))
+    """Connect what every loop has, and export its outputs."""
+    motors = "servos" if builder.HasSubsystemNamed("servos") else "delay_chain"
+    measured, own = _measured(builder, experiment, motors), experiment.own.systems
+    _connect(builder, measured, "controller.measurement")
+    if "controller" in own:
+        _connect(builder, measured, "own_controller.measurement")
+    bias = builder.GetSubsystemByName("torque_bias")
+    builder.Connect(_output(builder, f"{motors}.torque"), bias.get_input_port())
+    _disturb(builder, own.get("disturbance"), bias.get_output_port())
+    _connect(builder, "plant.state", "sensor.state")
+    measures_state = experiment.scenario.sensor.measures_state
+    _connect(builder, measured if measures_state else "controller.estimate", "density.measurement")
+    _connect(builder, "reference.reference", "density.reference")
+    _connect(builder, "controller.torque", "density.torque")
     if builder.HasSubsystemNamed("tuner"):
         # Weights precede the estimate of their sample, so that a tuner reads the one before.
-        told = ("sensor", "measurement") if measured_state else ("controller", "state_estimate")
-        state = out(*told)
-        _connect_tuner(builder, builder.GetSubsystemByName("tuner"), state)
+        state = "sensor.measurement" if measures_state else "controller.state_estimate"
+        inputs = _TUNER_INPUTS | {"measurement": state}
+        tuner = builder.GetSubsystemByName("tuner")
+        for name, source in inputs.items():
+            if tuner.HasInputPort(name):
+                _connect(builder, source, f"tuner.{name}")
     if experiment.start[RATES].any() and experiment.scenario.plant.kind == "multibody":
         builder.AddNamedSystem("start_check", StartCheck(experiment.start))
-        builder.Connect(out("plant", "state"), into("start_check", "state"))
+        _connect(builder, "plant.state", "start_check.state")
     for name, (source, port) in exported_ports().items():
-        system = motors if name == "torque_applied" else builder.GetSubsystemByName(source)
+        system = builder.GetSubsystemByName(motors if name == "torque_applied" else source)
         if system.HasOutputPort(port):
             builder.ExportOutput(system.GetOutputPort(port), name)
         else:  # a system of the user lacks the port
@@ -260,93 +257,75 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
             builder.ExportOutput(unknown.get_output_port(), name)
 
 
-def _motors(builder: DiagramBuilder) -> System:
-    """Return the system whose torque acts: the servos, or the link where there are none."""
-    servos = builder.HasSubsystemNamed("servos")
-    return builder.GetSubsystemByName("servos" if servos else "delay_chain")
-
-
-def _measured(builder: DiagramBuilder, experiment: Experiment) -> OutputPort:
-    """Return the output that the controller measures: of the sensor, or of its delay."""
+def _measured(builder: DiagramBuilder, experiment: Experiment, motors: str) -> OutputPort:
+    """Return the measurement for the controller, with its delay; connect age and report."""
     sc, controller = experiment.scenario, builder.GetSubsystemByName("controller")
-    measured = builder.GetSubsystemByName("sensor").GetOutputPort("measurement")
-    motors = _motors(builder)
-    report = motors.GetOutputPort("report") if motors.HasOutputPort("report") else None
+    measured, report = _output(builder, "sensor.measurement"), None
+    if builder.GetSubsystemByName(motors).HasOutputPort("report"):
+        report = _output(builder, f"{motors}.report")
     times = measurement_times(sc)
     if np.any(times != 0):
 
-        def late(name: str, port: OutputPort) -> System:
-            way = LateMeasurements(sc.controller.period, times, port.size())
-            builder.AddNamedSystem(name, way)
-            builder.Connect(port, way.GetInputPort("measured"))
-            return way
+        def late(name: str, port: OutputPort) -> OutputPort:
+            builder.AddNamedSystem(name, LateMeasurements(sc.controller.period, times, port.size()))
+            _connect(builder, port, f"{name}.measured")
+            return _output(builder, f"{name}.measurement")
 
-        way = late("late_measurements", measured)
-        measured = way.GetOutputPort("measurement")
+        measured = late("late_measurements", measured)
         if controller.HasInputPort("age"):
-            builder.Connect(way.GetOutputPort("age"), controller.GetInputPort("age"))
+            _connect(builder, "late_measurements.age", "controller.age")
         if report is not None:
-            report = late("late_report", report).GetOutputPort("measurement")
+            report = late("late_report", report)
     if report is not None and sc.link.acknowledged and controller.HasInputPort("report"):
-        builder.Connect(report, controller.GetInputPort("report"))
+        _connect(builder, report, "controller.report")
     return measured
 
 
 def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[PredictiveLqi, float]:
     """Add the shipped controller, its reference and weights; return law and catch-up, s."""
     law, planned, catch_up = control_law(experiment)
-    reference = builder.AddNamedSystem(
-        "reference", Reference(experiment.reference, planned, law.preview_times)
-    )
-    queue, motion = (
-        first_queue(experiment, law),
-        followed_motion(law, planned, experiment.reference),
-    )
-    controller = builder.AddNamedSystem("controller", DelayLqiController(law, queue, motion))
-    weights = _weights(builder, experiment, law)
-    builder.Connect(reference.GetOutputPort("preview"), controller.GetInputPort("preview"))
-    builder.Connect(weights, controller.GetInputPort("weights"))
+    _add_reference(builder, experiment, planned, law.preview_times)
+    queue = first_queue(experiment, law)
+    motion = followed_motion(law, planned, experiment.reference)
+    builder.AddNamedSystem("controller", DelayLqiController(law, queue, motion))
+    _connect(builder, "reference.preview", "controller.preview")
+    c, tuner = experiment.scenario.controller, experiment.own.systems.get("tuner")
+    if tuner is None and experiment.tuned:
+        tuner = _tuner(builder, experiment, law)
+    if tuner is None:
+        weights = ConstantVectorSource(np.array([c.w_Q, c.w_R]))
+        builder.AddNamedSystem("weights", weights)
+        _connect(builder, weights.get_output_port(), "controller.weights")
+    else:
+        builder.AddNamedSystem("tuner", tuner)
+        _connect(builder, "tuner.weights", "controller.weights")
     return law, catch_up
 
 
 def _add_own_controller(builder: DiagramBuilder, experiment: Experiment) -> None:
     """Add the user's controller, its reference, and the system that samples it."""
     sc, system = experiment.scenario, experiment.own.systems["controller"]
-    motion = experiment.reference
-    reference = builder.AddNamedSystem("reference", Reference(motion, motion, np.zeros(1)))
+    _add_reference(builder, experiment, experiment.reference, np.zeros(1))
     builder.AddNamedSystem("own_controller", system)
-    sampled = builder.AddNamedSystem(
-        "controller", SampledController(sc.controller.period, experiment.torque_limit)
-    )
-    builder.Connect(system.GetOutputPort("torque"), sampled.GetInputPort("own_torque"))
+    sampled = SampledController(sc.controller.period, experiment.torque_limit)
+    builder.AddNamedSystem("controller", sampled)
+    _connect(builder, "own_controller.torque", "controller.own_torque")
     if system.HasInputPort("reference"):
-        builder.Connect(reference.GetOutputPort("reference"), system.GetInputPort("reference"))
+        _connect(builder, "reference.reference", "own_controller.reference")
 
 
-def _disturb(builder: DiagramBuilder, experiment: Experiment, torque: OutputPort) -> None:
-    """Connect the torque that arrives with the plant, through a disturbance if there is one."""
-    disturbance = experiment.own.systems.get("disturbance")
-    plant = builder.GetSubsystemByName("plant")
+def _disturb(builder: DiagramBuilder, disturbance: System | None, torque: OutputPort) -> None:
+    """Connect the arriving torque with the plant, through a disturbance if there is one."""
     if disturbance is not None:
         builder.AddNamedSystem("disturbance", disturbance)
         if disturbance.HasOutputPort("wrench"):
-            builder.Connect(disturbance.GetOutputPort("wrench"), plant.GetInputPort("wrench"))
+            _connect(builder, "disturbance.wrench", "plant.wrench")
         if disturbance.HasOutputPort("torque"):
             total = builder.AddNamedSystem("disturbed_torque", Adder(2, NUM_TORQUES))
             builder.Connect(torque, total.get_input_port(0))
-            builder.Connect(disturbance.GetOutputPort("torque"), total.get_input_port(1))
+            builder.Connect(_output(builder, "disturbance.torque"), total.get_input_port(1))
             torque = total.get_output_port()
-    builder.Connect(torque, plant.GetInputPort("torque"))
-
-
-def _weights(builder: DiagramBuilder, experiment: Experiment, law: PredictiveLqi) -> OutputPort:
-    """Return the output that sets the weights: of a `tuner`, or of constant `weights`."""
-    c, own = experiment.scenario.controller, experiment.own.systems.get("tuner")
-    fixed = np.array([c.w_Q, c.w_R])
-    if own is None and not experiment.tuned:
-        return builder.AddNamedSystem("weights", ConstantVectorSource(fixed)).get_output_port()
-    tuner = _tuner(builder, experiment, law) if own is None else own
-    return builder.AddNamedSystem("tuner", tuner).GetOutputPort("weights")
+    _connect(builder, torque, "plant.torque")
 
 
 def _tuner(builder: DiagramBuilder, experiment: Experiment, law: PredictiveLqi) -> System:
@@ -358,14 +337,3 @@ def _tuner(builder: DiagramBuilder, experiment: Experiment, law: PredictiveLqi) 
     controller: Any = builder.GetSubsystemByName("controller")
     first = controller.sample(controller.CreateDefaultContext())
     return LawTuner(source, first, c.period)
-
-
-def _connect_tuner(builder: DiagramBuilder, tuner: System, state: OutputPort) -> None:
-    """Connect the inputs that a tuner has, `measurement` with `state`."""
-    told = {name: builder.GetSubsystemByName(name).GetOutputPort(name) for name in _TOLD}
-    controller = builder.GetSubsystemByName("controller")
-    if controller.HasOutputPort("memory"):
-        told["memory"] = controller.GetOutputPort("memory")
-    for name, port in (told | {"measurement": state}).items():
-        if tuner.HasInputPort(name):
-            builder.Connect(port, tuner.GetInputPort(name))

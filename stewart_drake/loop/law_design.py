@@ -25,11 +25,7 @@ from stewart_drake.law.feedforward import (
     InverseDynamicsFeedforward,
     NoFeedforward,
 )
-from stewart_drake.law.filter_settings import (
-    ParameterSet,
-    filter_settings,
-    usual_parameters,
-)
+from stewart_drake.law.filter_settings import ParameterSet, filter_settings, usual_parameters
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver, DelaySettings
 from stewart_drake.law.planner import NoPlanner, Replan
@@ -54,22 +50,12 @@ from stewart_drake.loop.own import Own, own_motion
 from stewart_drake.loop.preparation import Experiment, calibration_of
 from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.scenario.calibration import OFFSETS, believed_delay
-from stewart_drake.scenario.config import (
-    ControllerConfig,
-    Scenario,
-)
+from stewart_drake.scenario.config import ControllerConfig, Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.field_types import MOST_PERIODS
 from stewart_drake.scenario.packets import times_under_way
-from stewart_drake.scenario.signals import (
-    BIAS,
-    DAMPING,
-    NUM_STATE,
-    PARAMETERS,
-    PAYLOAD,
-    POSE,
-)
+from stewart_drake.scenario.signals import BIAS, DAMPING, NUM_STATE, PARAMETERS, PAYLOAD, POSE
 from stewart_drake.scenario.trajectories import evaluate, motion_range
 from stewart_drake.types import Array
 

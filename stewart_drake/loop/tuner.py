@@ -6,9 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import (
-    Context,
-)
+from pydrake.systems.framework import Context
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.observers import CoreObserver
