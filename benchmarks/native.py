@@ -15,12 +15,11 @@ import stewart_drake as sd
 from stewart_drake.export.recording import record
 from stewart_drake.law.core_law import CoreLqi
 from stewart_drake.law.delay_model import delayed_model
-from stewart_drake.law.doubling import Doubling
 from stewart_drake.law.error_model import linear_model
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.law.riccati import lqr, reduced_gain
+from stewart_drake.law.riccati import lqr, lqr_by_doubling, reduced_gain
 
 MECHANISM = sd.load_mechanism("paper")
 
@@ -68,10 +67,10 @@ def riccati_times(fraction: float) -> tuple[int, float, float]:
         return lqr(*matrices)
 
     reduced_gain(model, 1e4 * np.eye(12), np.eye(6), keep)
-    doubling, times = Doubling(len(given[0])), []
+    times = []
     for _ in range(60):
         one = repeated(lambda: DiscreteAlgebraicRiccatiEquation(*given), 3)
-        times.append((one, repeated(lambda: doubling(*given), 3)))
+        times.append((one, repeated(lambda: lqr_by_doubling(*given), 3)))
     drake, ours = np.min(times, axis=0)
     return len(given[0]), float(drake), float(ours)
 

@@ -12,12 +12,11 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law import core_law
 from stewart_drake.law.core_law import CompiledLaw, CoreLqi, serving, uncovered
 from stewart_drake.law.delay_model import delayed_model
-from stewart_drake.law.doubling import Doubling
 from stewart_drake.law.error_model import linear_model
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.law.riccati import RiccatiError, lqr, reduced_gain
+from stewart_drake.law.riccati import RiccatiError, lqr, lqr_by_doubling, reduced_gain
 from stewart_drake.loop.law_design import compose_law, control_law
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.loading import load_scenario
@@ -80,9 +79,8 @@ def assert_exact(seed):
         return lqr(*matrices)
 
     expected = reduced_gain(model, Q, R, by_drake)
-    doubling = Doubling(len(given[0]))
-    found = reduced_gain(model, Q, R, doubling)
-    K, P = doubling(*given)
+    found = reduced_gain(model, Q, R, lqr_by_doubling)
+    K, P = lqr_by_doubling(*given)
     exact = exact_gain(*given, P)
     assert np.abs(K - exact).max() < 1e-12 * np.abs(exact).max(), seed
     drakes = np.abs(lqr(*given)[0] - exact).max() / np.abs(exact).max()
@@ -109,7 +107,7 @@ def test_the_cost_of_a_run_is_what_the_solution_says(order):
     rng = np.random.default_rng(order)
     A = rng.normal(0, 1.2 / np.sqrt(order), (order, order))
     B, Q, R = rng.normal(0, 1, (order, 6)), np.eye(order), np.diag(rng.uniform(0.5, 2, 6))
-    K, P = Doubling(order)(A, B, Q, R)
+    K, P = lqr_by_doubling(A, B, Q, R)
     x = first = rng.normal(0, 1, order)
     cost = 0.0
     for _ in range(2000):
@@ -123,7 +121,6 @@ def test_the_cost_of_a_run_is_what_the_solution_says(order):
 def test_what_has_no_solution_is_a_failure():
     one, nothing = np.eye(12), np.zeros((12, 6))
     B = np.vstack([np.eye(6), np.zeros((6, 6))])
-    doubling = Doubling(12)
     for A, b, Q, R in (
         (2 * one, nothing, one, np.eye(6)),  # no torque reaches it
         (2 * one, B, one, np.eye(6)),  # nor half of it
@@ -132,9 +129,9 @@ def test_what_has_no_solution_is_a_failure():
         (one, B, one, np.zeros((6, 6))),
     ):
         with pytest.raises(RiccatiError, match="doubling"):
-            doubling(A, b, Q, R)
-    with pytest.raises(ValueError, match="order: got 25; expected 1 to 24"):
-        Doubling(25)
+            lqr_by_doubling(A, b, Q, R)
+    with pytest.raises(ValueError, match="A: got 25 states; expected at most 24"):
+        lqr_by_doubling(np.eye(25), np.zeros((25, 6)), np.eye(25), np.eye(6))
 
 
 # Step by step.

@@ -1,7 +1,4 @@
-"""The way from rest onto a moving reference, planned with torques that are held.
-
-The plan itself is made in C, see core/planning.h. Here is how long it takes, and its trajectory.
-"""
+"""Way from rest onto a moving reference, planned with held torques by core/planning.h."""
 
 import math
 from collections.abc import Callable
@@ -24,12 +21,12 @@ from stewart_drake.scenario.trajectories import evaluate, through_states
 from stewart_drake.types import Array
 
 DEFAULT_CATCH_UP = 0.3
-"""s; when no torque limit says otherwise."""
+"""s; without a torque limit."""
 LONGEST_CATCH_UP = 10.0
 HEADROOM = 0.95
-"""Share of the torque limit that a plan may use; feedback needs the rest."""
+"""Share of the torque limit for a plan; feedback needs the rest."""
 PIECE = 0.025
-"""s; longest part of a planned motion between two instants at which it is judged."""
+"""s; largest distance of the instants at which a planned motion is checked."""
 
 
 def plan_catch_up(
@@ -41,10 +38,10 @@ def plan_catch_up(
     duration: float | None,
     torque_limit: float | None,
 ) -> tuple[Trajectory, float]:
-    """The planned motion, then the reference; and how long the plan takes, in s.
+    """Plan the motion, then the reference; return it with the duration of the plan in s.
 
-    Where no plan of up to LONGEST_CATCH_UP is possible (a plate that falls out of its workspace
-    before the first torque acts), it is the reference alone, and 0 s.
+    Where no plan of up to LONGEST_CATCH_UP is possible, because the plate leaves its workspace
+    before the first torque acts, that is the reference alone, and 0 s.
 
     Args:
         dynamics: the nominal plant.
@@ -75,7 +72,7 @@ class Plan(NamedTuple):
 
 
 class CatchUp:
-    """The plans from one state, each made once, whatever the limit is that they are asked for.
+    """Plans from one state, for any torque limit; each is made once.
 
     Args:
         dynamics, reference, start, t_start, period: as of `plan_catch_up`.
@@ -95,7 +92,7 @@ class CatchUp:
         self._motions: dict[int, Trajectory] = {}
 
     def plan(self, duration: float | None, torque_limit: float | None) -> tuple[Trajectory, float]:
-        """As `plan_catch_up`; the same plan is the same trajectory."""
+        """Return `plan_catch_up`; an equal plan is the same trajectory."""
         periods = shortest(self._possible, self._period, duration, torque_limit)
         if periods is None:
             return self._reference, 0.0
@@ -125,21 +122,21 @@ def shortest(
     duration: float | None,
     torque_limit: float | None,
 ) -> int | None:
-    """Periods of the plan that was asked for, or of the shortest one there is, or None.
+    """Return the periods of the requested plan, or of the shortest possible one, or None.
 
     Args:
-        possible: whether there is a plan of so many periods within so many N m.
+        possible: whether a plan of n periods keeps to a limit in N m.
         period: s.
         duration, torque_limit: as of `plan_catch_up`.
 
     Raises:
-        ConfigError: there is none of the given duration.
+        ConfigError: no plan has the given duration.
     """
     wanted = DEFAULT_CATCH_UP if duration is None else duration
     fewest = 2 if torque_limit is not None and duration is None else periods_of(wanted, period)
     most = fewest if duration is not None else periods_of(LONGEST_CATCH_UP, period)
     limit = math.inf if torque_limit is None or duration is not None else HEADROOM * torque_limit
-    # What n periods can do, more can do with less torque: double n, then halve the bracket.
+    # A longer plan takes less torque: double n, then halve the bracket.
     failed, periods = fewest - 1, fewest
     while not (found := possible(periods, limit)) and periods < most:
         failed, periods = periods, min(2 * periods, most)
@@ -157,7 +154,7 @@ def shortest(
 
 
 def periods_of(duration: float, period: float) -> int:
-    """Return the periods of a plan of so many s."""
+    """Return the number of periods of a plan with a duration in s."""
     return max(2, math.ceil(duration / period - 1e-9))
 
 
@@ -173,7 +170,7 @@ class Model:
     def plan(
         self, reference: Trajectory, start: Array, begin: float, period: float, periods: int
     ) -> Plan | None:
-        """Return the plan over so many periods, or None where there is none.
+        """Return the plan over a number of periods, or None without one.
 
         Args:
             reference: the motion to reach.

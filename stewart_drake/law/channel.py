@@ -1,9 +1,9 @@
-"""How torques get to the motors: one by one over a wire, or as plans in packets.
+"""Channel to the motors: single torques over a wire, or plans in packets over a network.
 
-Packet k has the torques of `repeats` earlier samples, word for word, then T_k and what would follow
-it if all went as predicted. Which packets are there when their torques are due is not known in
-advance, and of those before only as of the last report. The law goes on what the buffer will *most
-probably* play: averaging over what it might play is worse, as it will never play the average.
+Packet k carries the torques of `repeats` earlier samples again, then T_k and the planned torques of
+further samples. Which packets arrive in time is not known in advance; of earlier packets it is
+known from the last report. The law assumes the torques that the buffer will *most probably* play.
+Their average would be worse, since the buffer never plays it.
 """
 
 import sys
@@ -41,7 +41,7 @@ class Sent:
     """Memory of a channel.
 
     Attributes:
-        memory: (1 + n + 6 n rows,) flat, as of core/packets.h; of no packets where n = 0.
+        memory: (1 + n + 6 n rows,) flat, as of core/packets.h; n = 0 without packets.
         rows: of a packet.
     """
 
@@ -50,7 +50,7 @@ class Sent:
 
     @property
     def packets(self) -> Array:
-        """(n, rows, 6) last packets, the newest last; NaN before there were any."""
+        """Last packets (n, rows, 6), the newest last; NaN before the first."""
         kept = (len(self.memory) - 1) // (1 + NUM_TORQUES * self.rows)
         return self.memory[1 + kept :].reshape(kept, self.rows, NUM_TORQUES)
 
@@ -60,11 +60,11 @@ class Channel(Protocol):
 
     @property
     def torques(self) -> int:
-        """N, how many torques are planned at each sample."""
+        """Number N of torques that are planned at each sample."""
         ...
 
     def start(self) -> Sent:
-        """Before the first sample."""
+        """Return the memory before the first sample."""
         ...
 
     def in_flight(
@@ -74,7 +74,7 @@ class Channel(Protocol):
 
         Args:
             sent: after the last sample.
-            in_flight: as they seemed to be then.
+            in_flight: (n, 6) as assumed then.
             timeline: the delay from computing a torque to its time.
             report: that came with this sample's measurement, or None.
         """
@@ -91,21 +91,17 @@ class Wire:
 
     @property
     def torques(self) -> int:
-        """One."""
         return 1
 
     def start(self) -> Sent:
-        """Nothing is to be remembered."""
         return Sent(np.zeros(1))
 
     def in_flight(
         self, sent: Sent, in_flight: Array, timeline: Timeline, report: Report | None
     ) -> tuple[Sent, Array]:
-        """Return what was sent."""
         return sent, in_flight
 
     def send(self, sent: Sent, plan: Array, in_flight: Array) -> Sent:
-        """Nothing is to be remembered."""
         return sent
 
 
@@ -115,15 +111,13 @@ class Packets:
 
     Attributes:
         torques: N.
-        repeats: r, how many earlier torques a packet says again.
+        repeats: r, number of earlier torques that a packet carries again.
         in_time: per row, the probability that a packet which is not lost has arrived by the row's
             time.
-        arrived_by: the same after 0, 1, ... periods; its length is the number of packets that are
-            remembered.
+        arrived_by: the same after 0, 1, ... periods, for all packets that are remembered.
         losses: Markov chain of the packets that are lost.
-        holds: whether a dry buffer holds the last torque, or puts out zero.
-        told: periods that a report looks back: of older packets that had not arrived by then it
-            does not tell whether they have since.
+        holds: whether an empty buffer holds the last torque, or puts out zero.
+        told: periods that a report covers. The later arrival of older packets is not reported.
     """
 
     torques: int
@@ -142,7 +136,6 @@ class Packets:
             )
 
     def start(self) -> Sent:
-        """See `Channel.start`."""
         c, channel = core(), structure(self)
         memory = np.empty(c.lib.stewart_packets_memory(channel))
         c.lib.stewart_packets_start(channel, c.at(memory))
@@ -151,7 +144,6 @@ class Packets:
     def in_flight(
         self, sent: Sent, in_flight: Array, timeline: Timeline, report: Report | None
     ) -> tuple[Sent, Array]:
-        """See `Channel.in_flight`."""
         c, channel = core(), structure(self)
         memory, flying = sent.memory.copy(), in_flight.copy()
         told = None if report is None else report_of(report)
@@ -163,7 +155,6 @@ class Packets:
         return Sent(memory, sent.rows), flying
 
     def send(self, sent: Sent, plan: Array, in_flight: Array) -> Sent:
-        """See `Channel.send`."""
         c, memory = core(), sent.memory.copy()
         given = np.array(plan, np.float64), np.array(in_flight, np.float64)
         c.lib.stewart_packets_send(
@@ -173,7 +164,7 @@ class Packets:
 
 
 class ReportData(NamedTuple):
-    """A `stewart_report *` with what it points to."""
+    """A `stewart_report *` with the arrays that it points to."""
 
     data: Any
     arrived: Array
@@ -181,7 +172,7 @@ class ReportData(NamedTuple):
 
 
 def report_of(report: Report) -> ReportData:
-    """Return a report as the core reads it."""
+    """Return a report for the core."""
     c = core()
     arrived, acted = report.arrived.astype(np.float64), np.array(report.acted, np.float64)
     values = len(arrived), c.at(arrived), len(acted), c.at(acted), report.age
@@ -195,7 +186,7 @@ def structure(channel: Packets) -> Any:
 
 @lru_cache(maxsize=64)
 def structures(channel: Packets) -> tuple[Any, ...]:
-    """Return it with what it points to."""
+    """Return the `stewart_packets` with the arrays that it points to."""
     c, kept = core(), len(channel.arrived_by)
     shares = np.array(channel.in_time), np.array(channel.arrived_by)
     values = {

@@ -59,7 +59,7 @@ _FEEDFORWARDS: Final = {
 def uncovered(law: PredictiveLqi | ServoPreview) -> str | None:
     """Return the field of a scenario whose part the core has not, or None.
 
-    Parts of one's own count as other kinds of that field.
+    A user's part counts as another kind of that field.
     """
     covered = {
         "law": type(law) in (PredictiveLqi, ServoPreview) and type(law.plant) is NominalPlant,
@@ -257,7 +257,7 @@ class CoreMemory:
 
     @cached_property
     def counts(self) -> Counts:
-        """By cause."""
+        """Numbers of survived problems, by cause."""
         return Counts(*(int(count) for count in self.field("counts")))
 
     @cached_property

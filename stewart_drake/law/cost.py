@@ -58,6 +58,6 @@ class QuadraticCost:
         """Return `law.riccati.reduced_gain` of a model from `sampled`.
 
         Raises:
-            RiccatiError: there is no gain.
+            RiccatiError: no gain was found.
         """
         return reduced_gain(model, *self.matrices(weights))

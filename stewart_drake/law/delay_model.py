@@ -40,7 +40,7 @@ class DelayedModel:
 
     @property
     def queue_length(self) -> int:
-        """How many torques are in flight at a sampling instant."""
+        """Torques in flight at a sampling instant."""
         return Delay(self.steps, self.fraction).queue_length
 
 
@@ -54,7 +54,7 @@ class ChainModel:
 
 
 def sample(A: Array, B: Array, duration: float) -> tuple[Array, Array]:
-    """exp(A t) (n, n) and int_0^t exp(A s) B ds (n, m), by one matrix exponential (Van Loan).
+    """Return exp(A t) (n, n) and int_0^t exp(A s) B ds (n, m) by one exponential (Van Loan).
 
     Raises:
         FloatingPointError: the exponential overflows.
@@ -69,10 +69,10 @@ def sample(A: Array, B: Array, duration: float) -> tuple[Array, Array]:
 
 
 def sample_in_steps(A: Array, B: Array, duration: float, step: float) -> tuple[Array, Array]:
-    """What `sample` becomes for an engine of fixed steps: semi-implicit Euler, duration/step times.
+    """Return `sample` for an engine with fixed steps: semi-implicit Euler, duration/step times.
 
-    With x = [pose error; rate error], of A (2k, 2k) and B (2k, m), one step h takes the rates first
-    and then moves the pose with the new ones,
+    With x = [pose error; rate error], A (2k, 2k) and B (2k, m), one step h advances the rates first
+    and then the pose with the new rates,
 
         v' = v + h (A_v x + B_v u),   p' = p + h v',
 
@@ -104,15 +104,15 @@ def delayed_model(
         steps: mu, whole periods of delay.
         fraction: eta0 / dt, in [0, 1).
         integral: append z (p), whose rows the cost sees too (28).
-        step: of an engine that moves the plant by semi-implicit Euler, s, in whole numbers of which
-            period and fraction come; None for the motion itself.
+        step: of an engine that moves the plant by semi-implicit Euler, s; period and fraction are
+            multiples of it. None: exact sampling.
 
     Raises:
-        ValueError: a delay or a period that cannot be.
+        ValueError: a negative delay, or a period that is not positive.
     """
     if not 0 < period < np.inf:
         raise ValueError(f"period: got {period}; expected a positive time in s")
-    Delay(steps, fraction)  # refuses what is none
+    Delay(steps, fraction)  # checks them
     eta0 = fraction * period
 
     def sampled(duration: float) -> tuple[Array, Array]:
@@ -139,7 +139,7 @@ def delayed_model(
 
 
 def chain(model: DelayedModel, *, always_extra: bool = False) -> ChainModel:
-    """The delay chain (37)-(39) as one undelayed system.
+    """Return the delay chain (37)-(39) as one undelayed system.
 
     Args:
         model: the delayed model.

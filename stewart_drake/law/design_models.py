@@ -1,4 +1,4 @@
-"""A, B of the error, which the gain is designed for."""
+"""Models A, B of the error, for the design of the gain."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -16,10 +16,10 @@ class DesignModel(ABC):
     def at(
         self, state: Array, torque: Array, parameters: Array, plant: NominalPlant
     ) -> ContinuousModel:
-        """The error model about a state (12,) under a torque (6,), with parameters (8,).
+        """Return the error model about a state (12,) under a torque (6,), with parameters (p,).
 
         Raises:
-            UnreachablePoseError: the plate cannot be there, or not be moved there.
+            UnreachablePoseError: the pose is out of reach or singular.
         """
         plant.dynamics.require_reach(state[POSE])
         return self.about(state, torque, parameters, plant)
@@ -28,7 +28,7 @@ class DesignModel(ABC):
     def about(
         self, state: Array, torque: Array, parameters: Array, plant: NominalPlant
     ) -> ContinuousModel:
-        """`at`, of a pose that is known to be within reach."""
+        """Return the model of `at` for a pose within reach."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class PaperModel(DesignModel):
     """Six double integrators behind the paper's torque map.
 
     Attributes:
-        form: which of the torque maps.
+        form: of the torque map.
     """
 
     form: TorqueMap = "virtual_work"
@@ -44,7 +44,6 @@ class PaperModel(DesignModel):
     def about(
         self, state: Array, torque: Array, parameters: Array, plant: NominalPlant
     ) -> ContinuousModel:
-        """By the pose alone."""
         return double_integrators(plant.dynamics.massless_map(state[POSE], self.form))
 
 
@@ -55,6 +54,5 @@ class MultibodyModel(DesignModel):
     def about(
         self, state: Array, torque: Array, parameters: Array, plant: NominalPlant
     ) -> ContinuousModel:
-        """By `StewartDynamics.derivatives`."""
         derivatives = plant.dynamics.derivatives(state[POSE], state[RATES], torque, parameters)
         return linear_model(derivatives.A, derivatives.B)

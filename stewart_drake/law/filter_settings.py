@@ -1,4 +1,4 @@
-"""What the estimator assumes of a machine: priors, bounds, trust in model and delay."""
+"""Assumptions of the estimator: priors, bounds, standard deviations of model and delay."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,20 +24,19 @@ from stewart_drake.types import Array
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """Constants that nobody tells the controller, and what is known beforehand.
+    """Unknown constants of plant and sensor, and their prior.
 
-    They are the plant's (`scenario.signals.PLANT_PARAMETERS`) or the sensor's; what of them is
-    estimated is a matter of this set, and of `free` of the dynamics, which has the same names.
+    The names are those of `free` of the dynamics, of `scenario.signals.PLANT_PARAMETERS` and
+    `scenario.calibration.OFFSETS`.
 
     Attributes:
         names: of n parameters, those of the equations of motion first.
         units: of each.
-        prior: (n,) what each is taken for before any measurement.
-        std: (n,) how far from there it may be.
+        prior: (n,) mean before any measurement.
+        std: (n,) of the prior.
         lower, upper: (n,) physical bounds.
-        correlation: (n, n) of these errors; None is none.
-        usual: (n,) std where nobody knows more than the machine, which says what it is to know a
-            parameter well; None is std.
+        correlation: (n, n) of the prior; None: uncorrelated.
+        usual: (n,) std without a calibration, the scale of a well-known parameter; None: std.
 
     Raises:
         ValueError: naming the parameter; a shape that does not fit.
@@ -63,25 +62,25 @@ class ParameterSet:
 
     @property
     def covariance(self) -> Array:
-        """(n, n) of the prior."""
+        """Covariance (n, n) of the prior."""
         if self.correlation is None:
             return np.diag(self.std**2)
         return self.correlation * np.outer(self.std, self.std)
 
     @property
     def usual_std(self) -> Array:
-        """(n,) of a machine of which nobody knows more."""
+        """Standard deviations (n,) without a calibration."""
         return self.std if self.usual is None else self.usual
 
     def knowing(self, known: Calibration) -> "ParameterSet":
-        """With what is known of a machine: means, standard deviations, correlations.
+        """Return the prior with the calibration of a machine: means, covariance.
 
-        What it says nothing of stays, and goes together with nothing. A mean that is beyond a bound
-        by chance, up to three standard deviations, is taken for the bound; a standard deviation is
-        at least EXACT of the usual one, since what is estimated cannot be known exactly.
+        Other parameters stay, uncorrelated. A mean beyond a bound by up to three standard
+        deviations is moved to the bound. A standard deviation is at least EXACT of the usual one,
+        since an estimated parameter cannot be known exactly.
 
         Raises:
-            ValueError: naming the parameter that is further off.
+            ValueError: a mean is further beyond a bound; names the parameter.
         """
         prior, std, correlation = self.prior.copy(), self.std.copy(), np.eye(len(self.names))
         own = [i for i, name in enumerate(self.names) if name in known.names]
@@ -98,7 +97,7 @@ class ParameterSet:
         return replace(self, prior=prior, std=std, correlation=correlation, usual=self.usual_std)
 
     def trusting(self, std: Mapping[str, float]) -> "ParameterSet":
-        """With other standard deviations by name, of errors that go together with no other."""
+        """Return the prior with other standard deviations by name, uncorrelated with the rest."""
         chosen = np.array([name in std for name in self.names])
         correlation = self.correlation
         if correlation is not None:
@@ -110,13 +109,13 @@ class ParameterSet:
 
 @dataclass(frozen=True)
 class FilterSettings:
-    """What the filter assumes; standard deviations in SI units.
+    """Assumptions of the filter; standard deviations in SI units.
 
     Attributes:
-        parameters: what is estimated beside the state.
-        model_std: (12,) by which one step of the model may be off; without it a noiseless sensor
-            would let the filter explain integration errors by parameters.
-        timing_std: s by which a torque may come early or late.
+        parameters: estimated together with the state.
+        model_std: (12,) error of one step of the model; without it the filter would explain
+            integration errors by parameters where a sensor has no noise.
+        timing_std: s, of the instant of a torque.
     """
 
     parameters: ParameterSet
@@ -125,16 +124,16 @@ class FilterSettings:
 
 
 EXACT = 1e-6
-"""Least standard deviation of what is estimated, as a share of the usual one."""
+"""Least standard deviation of an estimated parameter, as a share of the usual one."""
 MOUNTING = float(np.deg2rad(0.1))
-"""rad by which an encoder may be mounted otherwise than drawn."""
+"""Standard deviation of the mounting angle of an encoder, rad."""
 CHANCE = 3.0
-"""Standard deviations by which an estimate may be beyond what is possible."""
+"""Standard deviations by which an estimate may be beyond a bound."""
 MODEL_ERROR = 2e-4
-"""Share of the motion by which one step of the model may be off: what a 1 ms engine deviates."""
+"""Error of one step of the model as a share of the motion: that of an engine with 1 ms."""
 TIMING_ERROR = 0.01
-"""Share of a period by which the delay may be other than believed. A filter that trusts the delay
-takes the effect of a late torque, large in a catch-up, for payload and bias."""
+"""Standard deviation of the delay, as a share of a period. With an exact delay the filter would
+attribute the effect of a late torque, large in a catch-up, to payload and bias."""
 
 
 def usual_parameters(
@@ -144,21 +143,21 @@ def usual_parameters(
     radius: float = 0.0,
     free: Sequence[str] = PARAMETERS,
 ) -> ParameterSet:
-    """What is known of a machine of which nobody knows more than its drawing and its motion.
+    """Return default priors, from the drawing and the reference motion only.
 
-    A payload up to ten plates, within two radii of the plate's joints; friction and bias by its
-    torques; encoders that are mounted to a tenth of a degree.
+    The payload is up to ten plates, within two radii of the plate's joints. Friction and bias scale
+    with the torques. Encoders are mounted to a tenth of a degree.
 
     Args:
         plate_mass, torque_scale, torque_limit: as of `filter_settings`.
-        radius: of the plate's joints, m; only the payload's place asks for it.
-        free: names out of PLANT_PARAMETERS and OFFSETS, those of the plant first.
+        radius: of the plate's joints, m, for the position of the payload.
+        free: names of PLANT_PARAMETERS and OFFSETS, those of the plant first.
     """
     prior, std, lower, upper = (np.zeros(NUM_PLANT_PARAMETERS) for _ in range(4))
     bias_bound = 100 * torque_scale if torque_limit is None else torque_limit
     std[BIAS], lower[BIAS], upper[BIAS] = 0.3 * torque_scale, -bias_bound, bias_bound
     std[PAYLOAD], upper[PAYLOAD] = 0.25 * plate_mass, 10 * plate_mass
-    lower[PAYLOAD] = -0.5 * plate_mass  # a plate that is lighter than believed
+    lower[PAYLOAD] = -0.5 * plate_mass  # the plate may be lighter than assumed
     for friction in (DAMPING, COULOMB):
         std[friction], upper[friction] = 0.1 * torque_scale, 100 * torque_scale
     at = COULOMB_SPEED
@@ -188,15 +187,15 @@ def filter_settings(
     period: float,
     parameters: ParameterSet | None = None,
 ) -> FilterSettings:
-    """Settings for a machine.
+    """Return the settings for a machine.
 
     Args:
-        motion_scale: (6,) how far each coordinate moves, rad and m; the same per s for the rates.
+        motion_scale: (6,) range of each coordinate, rad and m; the same per s for the rates.
         plate_mass: kg.
-        torque_scale: torque that the motion takes, N m.
+        torque_scale: of the motion, N m.
         torque_limit: of the motors in N m, or None.
         period: between two torques, s.
-        parameters: what is estimated, `usual_parameters` if None.
+        parameters: to estimate; `usual_parameters` if None.
     """
     if parameters is None:
         parameters = usual_parameters(plate_mass, torque_scale, torque_limit)

@@ -2,11 +2,11 @@
 
 (A, B) is controllable if and only if [lambda I - A, B] has full row rank for every eigenvalue
 lambda of A; stabilisable, if for every one on or outside the stability boundary. The smallest
-singular value tells how far a pair is from failing, which powers of A (the controllability matrix)
-cannot: they lose all digits beyond a few states. By transposition (A, C) is observable, detectable.
+singular value measures the distance from failure. Powers of A (the controllability matrix) do not:
+they lose all digits beyond a few states. By transposition (A, C) is observable, detectable.
 
-A left null vector w of the pencil, w' A = lambda w', w' B = 0, is a combination of states that goes
-its own way whatever the input does. Its transposed counterpart is a motion no output shows.
+A left null vector w of the pencil, w' A = lambda w', w' B = 0, is a combination of states that the
+input does not change. Its transposed counterpart is a motion that no output shows.
 """
 
 from dataclasses import dataclass
@@ -63,12 +63,12 @@ class Hautus:
 
     @property
     def complete(self) -> bool:
-        """Controllable; of the dual, observable."""
+        """Whether the pair is controllable; for the dual, observable."""
         return not self.deficient
 
     @property
     def harmless(self) -> bool:
-        """Stabilisable; of the dual, detectable: what fails decays by itself."""
+        """Whether the pair is stabilisable; for the dual, detectable."""
         return all(mode.decays for mode in self.deficient)
 
     @property
@@ -78,12 +78,12 @@ class Hautus:
 
     @property
     def lasting_margin(self) -> float:
-        """Least margin of the modes that do not decay, infinite without one."""
+        """Least margin of the modes that do not decay; infinite without any."""
         return min((mode.margin for mode in self.modes if not mode.decays), default=np.inf)
 
     @property
     def deficient(self) -> tuple[Mode, ...]:
-        """The modes that fail."""
+        """Modes that fail."""
         return tuple(mode for mode in self.modes if mode.margin < self.tolerance)
 
 
@@ -119,7 +119,7 @@ def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool, tolerance: float = TOL
             center = complex(center.real)
         if center.imag < 0:
             continue  # as its conjugate
-        # A point that is no eigenvalue never fails, so looking at more of them does no harm.
+        # Other points than eigenvalues never fail, so that more points do no harm.
         points = np.unique(np.append(members, center))
         margins = pbh_margins(A, B, points) / size
         failing = margins < tolerance
@@ -143,7 +143,7 @@ def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool, tolerance: float = TOL
 def scaled(
     A: Array, B: Array, C: Array, states: Array, inputs: Array, outputs: Array
 ) -> tuple[Array, Array, Array]:
-    """The same system in units in which 1 is a usual size of every state (n,), input (m,), output.
+    """Return the system in units in which 1 is a usual size of each state, input and output.
 
     With x = S x', u = U u', y = Y y' it is S^-1 A S, S^-1 B U and Y^-1 C S.
     """
@@ -155,10 +155,10 @@ def scaled(
 
 
 def cluster(values: Complex, distance: float) -> list[Complex]:
-    """Groups of values, each linked to another of its group by at most `distance`.
+    """Return groups of values, each within `distance` of another value of its group.
 
     A defective eigenvalue of multiplicity p comes out spread over a circle of radius eps^(1/p),
-    but the mean of the circle is good to eps. So the mean is where the pencil must be looked at.
+    but the mean of the circle is exact to eps. The pencil is therefore evaluated at the mean.
     """
     remaining, groups = list(np.argsort(values.real, kind="stable")), []
     while remaining:
@@ -172,7 +172,7 @@ def cluster(values: Complex, distance: float) -> list[Complex]:
 
 
 def pbh_margins(A: Array, B: Array, eigenvalues: Complex) -> Array:
-    """Smallest singular value of [lambda I - A, B] (n, n + m) for each of the eigenvalues (k,)."""
+    """Return the smallest singular value of [lambda I - A, B] for each eigenvalue (k,)."""
     if eigenvalues.size == 0:
         return np.empty(0)
     real = np.all(np.abs(eigenvalues.imag) <= 1e-12 * np.abs(eigenvalues))
@@ -182,7 +182,7 @@ def pbh_margins(A: Array, B: Array, eigenvalues: Complex) -> Array:
 
 
 def distinct(values: Complex, resolution: float) -> Complex:
-    """One of each group that agrees to `resolution`, as far as defective eigenvalues spread."""
+    """Return one value of each group that agrees to `resolution`."""
     grid = np.round(values / resolution)
     _, first = np.unique(grid, return_index=True)
     return values[first]
@@ -194,6 +194,6 @@ def _pencils(A: Array, B: Array, points: NDArray[np.inexact]) -> NDArray[np.inex
 
 
 def _null_space(A: Array, B: Array, point: complex, threshold: float) -> Complex:
-    """Orthonormal w (n, d) with w' [point I - A, B] = 0, the prime without conjugation."""
+    """Return orthonormal w (n, d) with w' [point I - A, B] = 0, without conjugation."""
     left, values, _ = np.linalg.svd(_pencils(A, B, np.array([point]))[0], full_matrices=False)
     return left[:, values < threshold].conj()

@@ -16,8 +16,8 @@ right, and the rates there differ from the motion's by
 
     rates_k - rates(t_k) = -dt/24 B (s_{k-1} + s_k),                                   (rates)
 
-which is no error and must not be fed back as one. A motion that held torques made has s = 0 and is
-followed as it is.
+which must not be fed back as an error. A motion under held torques has s = 0 and is followed
+exactly.
 """
 
 import numpy as np
@@ -35,7 +35,7 @@ GAUSS_NODES = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3)
 def torques_at_nodes(
     dynamics: StewartDynamics, motion: Trajectory, starts: Array, ends: Array
 ) -> Array:
-    """Inverse-dynamics torques (n, 2, 6) in N m along `motion`, at the nodes of each hold, in s."""
+    """Return inverse-dynamics torques (n, 2, 6) in N m along `motion` at the nodes of each hold."""
     torques = np.empty((len(starts), 2, NUM_TORQUES))
     for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
         for j, node in enumerate(GAUSS_NODES):
@@ -47,23 +47,23 @@ def torques_at_nodes(
 def mean_torques(
     dynamics: StewartDynamics, motion: Trajectory, starts: Array, ends: Array
 ) -> Array:
-    """Mean inverse-dynamics torque (n, 6) in N m along `motion` over each interval, in s."""
+    """Return the mean inverse-dynamics torque (n, 6) in N m over each interval, in s."""
     return means_and_changes(torques_at_nodes(dynamics, motion, starts, ends))[0]
 
 
 def means_and_changes(at_nodes: Array) -> tuple[Array, Array]:
-    """Mean of T over each hold, and its change over it, (n, 6), from T at the nodes (n, 2, 6)."""
+    """Return mean and change of T over each hold, (n, 6), from T at the nodes (n, 2, 6)."""
     # The nodes lie 1/sqrt(3) of a hold apart.
     return at_nodes.mean(axis=1), np.sqrt(3) * (at_nodes[:, 1] - at_nodes[:, 0])
 
 
 def held_torques(means: Array, changes: Array) -> Array:
-    """(hold): torques (n - 2, 6) for the inner ones of n >= 3 consecutive holds."""
+    """Return torques (n - 2, 6) by (hold) for the inner ones of n >= 3 consecutive holds."""
     return means[1:-1] - (changes[2:] - changes[:-2]) / 24
 
 
 def rates_at_samples(changes: Array, B: Array, period: float) -> Array:
-    """(rates): offset (6,) of the rates at the instant between two holds.
+    """Return the offset (6,) by (rates) of the rates at the instant between two holds.
 
     Args:
         changes: (2, 6) of the torque over the hold before and the hold after.
@@ -74,7 +74,7 @@ def rates_at_samples(changes: Array, B: Array, period: float) -> Array:
 
 
 def state_within_hold(change: Array, B: Array, period: float, passed: float) -> Array:
-    """Offset (12,) of pose and rates when the share `passed` of a hold is over.
+    """Return the offset (12,) of pose and rates when the share `passed` of a hold is over.
 
     From (rates) at its start on, with x = passed and constant slope of T:
     rates -dt B s (1/12 - x (1 - x) / 2),  pose -dt^2 B s x (1 - x) (1 - 2 x) / 12.
@@ -93,9 +93,9 @@ def state_within_hold(change: Array, B: Array, period: float, passed: float) -> 
 
 
 def cubic(start: Array, end: Array, h: float, s: float) -> tuple[Array, Array]:
-    """Pose and rates (6,) when the share s of h seconds is over, between two states (12,).
+    """Return pose and rates (6,) at the share s of h seconds, by the cubic of two states (12,).
 
-    The cubic through both; the same for crank angles and their rates.
+    The same holds for crank angles and their rates.
     """
     rise, v_0, v_1 = (end[POSE] - start[POSE]) / h, start[RATES], end[RATES]
     a, b = v_0 - rise, v_1 - rise

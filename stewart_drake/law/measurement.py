@@ -10,7 +10,7 @@ from stewart_drake.types import Array
 
 @dataclass(frozen=True)
 class Measurement:
-    """Values of one sample, of which some may be missing.
+    """Values of one sample; some may be missing.
 
     Attributes:
         values: (m,) in the units of the sensing; meaningless where not valid.
@@ -24,7 +24,7 @@ class Measurement:
 
     @classmethod
     def of(cls, values: Array, age: float = 0.0) -> "Measurement":
-        """Return a measurement from values (m,), of which the missing ones are not finite."""
+        """Return a measurement from values (m,), with missing ones that are not finite."""
         values = np.array(values, np.float64)
         return cls(values, np.isfinite(values), age)
 

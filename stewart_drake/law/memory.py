@@ -20,7 +20,7 @@ class Counts(NamedTuple):
         unreachable: samples without a model: a plate at the predicted pose cannot be regulated.
         nonfinite_torque: samples with a torque that was not finite; the last one was sent again.
         measurements_missing: measurements with values that are not finite.
-        measurements_frozen: measurements that repeat the last one, or a leg of which does.
+        measurements_frozen: measurements that repeat the last one, or with a leg that does.
         measurements_rejected: measurements that the plate cannot have, or that the filter rejects
             as outliers, or single values of theirs.
         saturated_steps: samples with a torque at the limit.

@@ -112,7 +112,7 @@ class CoreObserver:
     """Observer of the core.
 
     Attributes:
-        settings: of the filter; None: nothing is estimated beside the state.
+        settings: of the filter; None: only the state is estimated.
         delay: prior of an unknown delay; None: the delay is known.
         gaps: whether the filter corrects the estimate before a gap between measurements.
     """

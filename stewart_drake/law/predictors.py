@@ -27,7 +27,7 @@ class Predictor(Protocol):
     """A kind of prediction. Instances are immutable."""
 
     def samples(self, timeline: Timeline) -> Array:
-        """Return the instants (s,), s from now, of comparisons with the reference, beside now."""
+        """Return the instants (s,), s from now, of further comparisons with the reference."""
         ...
 
     def pending(self, timeline: Timeline) -> int:

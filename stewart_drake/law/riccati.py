@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 
+from stewart_drake.core.library import core
 from stewart_drake.law.delay_model import DelayedModel, chain, delayed_model
 from stewart_drake.law.error_model import ContinuousModel
 from stewart_drake.law.hautus import distinct, pbh_margins
@@ -14,23 +15,24 @@ from stewart_drake.scenario.delay import Delay
 from stewart_drake.types import Array
 
 Solver = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
-"""What takes and gives what `lqr` does."""
+"""Function with the arguments and results of `lqr`."""
 
 
+MAX_ORDER = 24
+"""States in `lqr_by_doubling`: error, integral, and a torque that still acts."""
 RESIDUAL = 1e-4
-"""Of the Riccati equation, relative to its solution, above which that is none."""
+"""Largest residual of the Riccati equation, relative to its solution."""
 
 
 class RiccatiError(ArithmeticError):
     """The Riccati equation has no stabilising solution, or the solver did not find it.
 
-    It is about values. Shapes that do not fit each other are a mistake in a program, and raise a
-    plain ValueError.
+    It concerns values. Shapes that do not fit raise a ValueError.
     """
 
 
 def lqr(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:
-    """Gain K (m, n) of T = -K x that minimises sum x'Qx + T'RT, and P (n, n), its cost x'Px.
+    """Return the gain K (m, n) of T = -K x that minimises sum x'Qx + T'RT, and P (n, n).
 
     (43)-(44) by Drake's DiscreteAlgebraicRiccatiEquation. That function can end the process on bad
     input, and can return NaN or a matrix that solves nothing, so both sides of it are checked here.
@@ -65,8 +67,26 @@ def lqr(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:
     return K, P
 
 
+def lqr_by_doubling(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array]:
+    """Return K (6, n) and P (n, n) as `lqr` does, by the solver of core/riccati.c.
+
+    Raises:
+        RiccatiError: no stabilising solution was found.
+        ValueError: more than 24 states.
+    """
+    c, n = core(), len(A)
+    if n > MAX_ORDER:
+        raise ValueError(f"A: got {n} states; expected at most {MAX_ORDER}")
+    kept = [np.ascontiguousarray(matrix, np.float64) for matrix in (A, B, Q, R)]
+    K, P = np.empty((B.shape[1], n)), np.empty((n, n))
+    given = (*map(c.at, kept), c.at(K), c.at(P), c.scratch(c.lib.stewart_lqr_scratch(n)))
+    if not c.lib.stewart_lqr(n, *given):
+        raise RiccatiError("Riccati equation: doubling has found no solution")
+    return K, P
+
+
 def full_gain(model: DelayedModel, Q: Array, R: Array, solver: Solver = lqr) -> tuple[Array, Array]:
-    """(42)-(44) on the whole chain (37)-(39): K (m, n + m L) and P, with Q (p, p) on y = C e.
+    """Return (42)-(44) on the whole chain (37)-(39): K (m, n + m L) and P, with Q on y = C e.
 
     The queue makes the equation large; `augmented_gain` finds the same K without it.
 
@@ -83,23 +103,23 @@ def full_gain(model: DelayedModel, Q: Array, R: Array, solver: Solver = lqr) -> 
 
 
 def _units(A: Array, Q: Array) -> Array:
-    """Size (n,) of each state that costs one now and at the next sample together.
+    """Return the size (n,) of each state that costs one now and at the next sample together.
 
-    Metres beside radians, of a machine of 1 mm or of 1 m, make matrices that the solver takes for
-    singular, or not, by their units. With x = diag(units) x~ and T likewise the equation has none:
-    P~ = units P units and K~ = K units / units, whatever the size of the machine.
+    With metres and radians, for a machine of 1 mm or of 1 m, the solver finds matrices singular or
+    not by their units. With x = diag(units) x~ and T likewise the equation has none:
+    P~ = units P units and K~ = K units / units, for any size of the machine.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # what is no number is for `lqr` to refuse
+    with np.errstate(over="ignore", invalid="ignore"):  # `lqr` refuses NaN
         cost = np.diag(Q) + np.einsum("ji,ji->i", A, Q @ A)
     useful = np.isfinite(cost) & (cost > 0)
     return 1 / np.sqrt(np.where(useful, cost, 1.0))
 
 
 def reduced_gain(model: DelayedModel, Q: Array, R: Array, solver: Solver = lqr) -> Array:
-    """K (m, n) on the state predicted to when the next torque starts to act; the same for any mu.
+    """Return K (m, n) on the state predicted to the instant at which the next torque acts.
 
-    T_k cannot change e_k ... e_{k+mu}, and the cost puts no weight on the queue. What is left to
-    minimise is the cost from e_{k+mu} on, with mu = 0 and T_k acting at once. Where eta0 > 0 the
+    T_k cannot change e_k ... e_{k+mu}, and the cost puts no weight on the queue. The rest to
+    minimise is the cost from e_{k+mu} on, with mu = 0 and an immediate T_k. Where eta0 > 0 the
     last part of T_{k-1} is still to act by then, so the predicted state is [e_{k+mu}; T_{k-1}] and
     K is (m, n + m).
 
@@ -110,20 +130,20 @@ def reduced_gain(model: DelayedModel, Q: Array, R: Array, solver: Solver = lqr) 
 
 
 def prediction_matrix(model: DelayedModel) -> Array:
-    """Maps [e; queue] (n + m L) to the predicted state of `reduced_gain`.
+    """Return the map of [e; queue] (n + m L) to the predicted state of `reduced_gain`.
 
     Without a fraction this is [A^mu, A^(mu-1) B, ..., B], ordered as the queue.
     """
     n, m = model.B_new.shape
     extra, length = model.queue_length - model.steps, m * model.queue_length
     # Read backwards: T_{k-1} acts last, its predecessors one factor A earlier each.
-    ahead, acting = np.hstack([np.eye(n), model.B_new, model.B_old]), []
+    ahead, columns = np.hstack([np.eye(n), model.B_new, model.B_old]), []
     for _ in range(model.steps):
-        acting.append(ahead[:, n:])
+        columns.append(ahead[:, n:])
         ahead = model.A @ ahead
     power, torques = ahead[:, :n], np.zeros((n, length))
-    if acting:
-        oldest_first = np.stack(acting[::-1], axis=1)
+    if columns:
+        oldest_first = np.stack(columns[::-1], axis=1)
         torques[:, m * extra :] += oldest_first[:, :, :m].reshape(n, -1)
         torques[:, : m * model.steps] += oldest_first[:, :, m:].reshape(n, -1)
     newest = np.zeros((m * extra, n + length))
@@ -132,7 +152,7 @@ def prediction_matrix(model: DelayedModel) -> Array:
 
 
 def augmented_gain(model: DelayedModel, Q: Array, R: Array) -> Array:
-    """K_aug (m, n + m L) = K [A^mu, A^(mu-1) B, ..., B], equal to that of `full_gain`.
+    """Return K_aug (m, n + m L) = K [A^mu, A^(mu-1) B, ..., B], equal to that of `full_gain`.
 
     Raises:
         RiccatiError: see `lqr`.
@@ -192,7 +212,7 @@ def _check(A: Array, B: Array, Q: Array, R: Array) -> None:
 
 
 def is_stabilizable(A: Array, B: Array) -> bool:
-    """Whether every mode with |lambda| >= 1 (up to rounding) can be reached by the input.
+    """Return whether the input reaches every mode with |lambda| >= 1 (up to rounding).
 
     [B, AB, A^2 B] of full rank proves controllability, at a tenth of the cost of the PBH test,
     which decides where those three do not.

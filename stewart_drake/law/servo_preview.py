@@ -1,14 +1,14 @@
 """The law for position servos: crank angles of the reference, sent ahead.
 
-The command computed at t = k dt is reached one period after it arrives, at t + eta + dt, and until
-then the servos move to it from the one before (`law.servos.Segment`):
+The command computed at t = k dt is reached one period after it arrives, at t + eta + dt. Until then
+the servos move to it from the one before (`law.servos.Segment`):
 
     command = [alpha(r); Jac(r) r'; T_ff],    r the reference at t + eta + dt.
 
-Nothing is fed back across the delay, so that no delay makes the loop unstable. What an observer
-finds of the machine goes into T_ff, the torque that the reference takes, without which the servos
-need an error to put it out. An observer needs the torques that acted; here these depend on what the
-servos saw, and the machine reports them with the measurement.
+Nothing is fed back across the delay, so that no delay makes the loop unstable. Estimates of an
+observer enter T_ff, the torque that the reference takes; without T_ff the servos need an error to
+produce it. The torques that acted depend on the servos' measurements, so that the machine reports
+them with the measurement.
 """
 
 from dataclasses import dataclass, replace
@@ -40,17 +40,17 @@ from stewart_drake.types import Array
 
 @dataclass(frozen=True)
 class ServoMemory:
-    """What the law carries from one sample to the next, in the words of `law.memory.Memory`.
+    """Memory of the law, with the names of `law.memory.Memory`.
 
     Attributes:
         command: (18,) sent last.
         belief: of the observer, at the last measurement.
-        behind: periods since that was taken.
+        lag: age of that measurement, periods.
         measurement: (m,) at the last sample, as it came; NaN before the first.
-        torque: (6,) that the servos asked for when they reported last.
-        in_flight: (1, 6) what their limit let through of it.
+        torque: (6,) of the servos before their limit, in the last report.
+        in_flight: (1, 6) the same within the limit.
         counts: see `law.memory.Counts`.
-        integral, weights: NaN: there are none.
+        integral, weights: NaN.
     """
 
     command: Array
@@ -59,7 +59,7 @@ class ServoMemory:
     torque: Array
     in_flight: Array
     counts: Counts
-    behind: int
+    lag: int
     integral: Array
     weights: Array
 
@@ -69,12 +69,12 @@ class ServoPreview:
     """The law for one machine, made of parts of `law.predictive_lqi.PredictiveLqi`.
 
     Attributes:
-        timeline: clock and delay; parts as of the reports.
-        plant: the machine as it is known.
-        sensing: what is measured.
-        observer: what it makes of measurements and of the torques that are reported.
-        feedforward: the torque T_ff that goes with the angles.
-        reports: how the machine tells what acted.
+        timeline: clock and delay; `parts` as of the reports.
+        plant: model of the plant.
+        sensing: model of the sensor.
+        observer: estimates state and parameters, with the reported torques.
+        feedforward: the torque T_ff of a command.
+        reports: layout of the machine's reports.
     """
 
     timeline: Timeline
@@ -86,11 +86,11 @@ class ServoPreview:
 
     @cached_property
     def preview_times(self) -> Array:
-        """(1,) s from now, when the next command is to be reached."""
+        """Instant (1,) at which the next command is to be reached, s from now."""
         return np.array([self.timeline.eta + self.timeline.period])
 
     def command(self, wanted: Array, parameters: Array) -> Array:
-        """(18,) for pose, rates and accelerations (18,), with parameters (p,) of the plant.
+        """Return the command (18,) for pose, rates and accelerations (18,), with parameters (p,).
 
         Raises:
             UnreachablePoseError: the pose is out of reach.
@@ -101,7 +101,7 @@ class ServoPreview:
         return np.concatenate([angles, rates, torque])
 
     def initial_memory(self, command: Array) -> ServoMemory:
-        """Before the first sample, with a command (18,) for the one that was sent last."""
+        """Return the memory before the first sample, with the command (18,) that was sent last."""
         nothing = np.zeros(NUM_TORQUES)
         return ServoMemory(
             command=command,
@@ -110,62 +110,64 @@ class ServoPreview:
             torque=nothing,
             in_flight=nothing[None],
             counts=Counts(),
-            behind=0,
+            lag=0,
             integral=np.full(NUM_COORDINATES, np.nan),
             weights=np.full(len(WEIGHTS), np.nan),
         )
 
-    @np.errstate(over="ignore", invalid="ignore")  # its outcome is checked and counted instead
+    @np.errstate(over="ignore", invalid="ignore")  # the result is checked instead
     def step(
         self, memory: ServoMemory, measurement: Measurement, motion: Motion, report: Array
     ) -> ServoMemory:
-        """One sample.
+        """Compute the command of one sample.
 
         Args:
             memory: after the last sample.
-            measurement: of `sensing`; it may be of an earlier sample, and says so by its age.
-            motion: to follow. It is asked once, for `preview_times`.
+            measurement: of `sensing`; its age may be that of an earlier sample.
+            motion: to follow. It is evaluated once, at `preview_times`.
             report: as of `reports`, that came with the measurement; NaN for none.
 
         Returns:
             The new memory; its command (18,) is finite.
         """
-        behind, belief, said = memory.behind + 1, memory.belief, None
+        lag, belief, reported = memory.lag + 1, memory.belief, None
         if np.any(measurement.valid):
             age = round(measurement.age / self.timeline.period)
-            said = self.reports.read(report, behind - age)
-            belief, behind = self._observed(belief, replace(measurement, age=0.0), said), age
+            reported = self.reports.read(report, lag - age)
+            belief, lag = self._observe(belief, replace(measurement, age=0.0), reported), age
         else:
             belief = replace(belief, faults=("measurements_missing",))
-        command, trouble = self._ahead(memory.command, motion(self.preview_times)[0], belief)
-        saturated = 0 if said is None else said.saturated
-        asked = memory.torque if said is None else said.asked
+        command, cause = self._next(memory.command, motion(self.preview_times)[0], belief)
+        saturated = 0 if reported is None else reported.saturated
+        torque = memory.torque if reported is None else reported.asked
         return replace(
             memory,
             command=command,
             belief=belief,
-            behind=behind,
+            lag=lag,
             measurement=measurement.values,
-            torque=asked,
-            in_flight=self.plant.motors.saturate(asked)[None],
-            counts=memory.counts.plus(*belief.faults, trouble, *["saturated_steps"] * saturated),
+            torque=torque,
+            in_flight=self.plant.motors.saturate(torque)[None],
+            counts=memory.counts.plus(*belief.faults, cause, *["saturated_steps"] * saturated),
         )
 
-    def _observed(self, belief: Belief, measurement: Measurement, said: Reported | None) -> Belief:
-        """After a measurement, of which the report tells what acted since the one before.
+    def _observe(
+        self, belief: Belief, measurement: Measurement, reported: Reported | None
+    ) -> Belief:
+        """Take a measurement, with the reported torques since the one before.
 
-        Where that got lost too, the observer begins anew, from the parameters that it had found.
+        Without a report the observer begins anew, from the estimated parameters.
         """
         torques = np.zeros((1, NUM_TORQUES))
-        if said is not None:
-            torques = said.torques
+        if reported is not None:
+            torques = reported.torques
         elif belief.has_state:
             fresh = self.observer.start(self.timeline, self.sensing, self.plant)
             belief = replace(fresh.assuming(belief.parameters), measured=belief.measured)
         return self.observer.observe(belief, measurement, torques, self.sensing, self.plant)
 
-    def _ahead(self, last: Array, wanted: Array, belief: Belief) -> tuple[Array, str | None]:
-        """The next command (18,), and what went wrong: then the cranks stop where they are."""
+    def _next(self, last: Array, wanted: Array, belief: Belief) -> tuple[Array, str | None]:
+        """Return the next command (18,); where there is none, the cranks stop, with the cause."""
         stay = np.concatenate([last[POSE], np.zeros(NUM_COORDINATES), last[MODEL_TORQUE]])
         try:
             command = self.command(wanted, belief.parameters)

@@ -1,21 +1,21 @@
-"""Position servos: what a local loop at each motor makes of the crank angles that arrive.
+"""Position servos: a local loop at each motor follows the crank angles that arrive.
 
 In the motors' coordinates, the crank angles a (6,), the machine is
 
     H a'' + ... = tau,    H = Jac^-T M Jac^-1,    Jac = d a / d pose,
 
-and each servo knows one number of that, the inertia J that a motor moves at home while the others
-are free, on average: 1 / J = trace(H^-1) / 6, the mean acceleration of a crank per its own torque.
+and each servo uses one number of that, the mean inertia J that a motor moves at home while the
+others are free: 1 / J = trace(H^-1) / 6, the mean acceleration of a crank per its own torque.
 
     tau = J (w^2 (a_r - a) + 2 d w (a_r' - a')) + tau_model.                          (servo)
 
 A direction in which H has the eigenvalue m follows the setpoint a_r with the error e = a_r - a,
 
-    m e'' + 2 d w J e' + w^2 J e = m a_r'' - (tau_model + what else acts),
+    m e'' + 2 d w J e' + w^2 J e = m a_r'' - (tau_model + other torques),
 
-a second-order loop with the frequency w sqrt(J / m) and the damping d sqrt(J / m). A constant
-torque b that nobody tells leaves e = b / (J w^2), whatever the model; a motion that comes without
-its torque leaves m a_r'' / (J w^2). That is stiffness instead of knowledge.
+a second-order loop with the frequency w sqrt(J / m) and the damping d sqrt(J / m). An unknown
+constant torque b leaves e = b / (J w^2), independent of the model; a motion without its torque
+leaves m a_r'' / (J w^2).
 """
 
 import math
@@ -39,25 +39,25 @@ from stewart_drake.types import Array
 
 
 def crank_mobility(dynamics: StewartDynamics, pose: Array) -> Array:
-    """H^-1 = Jac M^-1 Jac' (6, 6): accelerations of the cranks per torque, rad/s^2 per N m."""
+    """Return H^-1 = Jac M^-1 Jac' (6, 6), crank accelerations per torque, rad/s^2 per N m."""
     map_ = dynamics.actuation_map(pose)  # Jac'
     return np.asarray(map_.T @ np.linalg.solve(dynamics.mass_matrix(pose), map_))
 
 
 def mean_inertia(dynamics: StewartDynamics) -> float:
-    """J in kg m^2."""
+    """Return J, kg m^2."""
     mobility = crank_mobility(dynamics, dynamics.mechanism.home)
     return NUM_TORQUES / float(np.trace(mobility))
 
 
 def turned(angles: Array, near: Array) -> Array:
-    """The same angles in rad, by whole turns within half a turn of others."""
+    """Return the angles in rad, moved by whole turns to within half a turn of others."""
     return near + (angles - near + np.pi) % (2 * np.pi) - np.pi
 
 
 @dataclass(frozen=True)
 class ServoLoop:
-    """(servo), sampled: what each motor's local loop does.
+    """Local loop of each motor: (servo), sampled.
 
     Attributes:
         inertia: J, kg m^2.
@@ -76,12 +76,12 @@ class ServoLoop:
     speed_limit: float = math.inf
 
     def torque(self, setpoint: Array, model: Array, cranks: Array) -> Array:
-        """(servo), before any limit, N m.
+        """Return (servo), before any limit, N m.
 
         Args:
             setpoint: (12,) crank angles and rates to follow, rad and rad/s.
             model: (6,) torque that came with it, N m.
-            cranks: (12,) as they are; whole turns do not count.
+            cranks: (12,) measured; whole turns do not count.
         """
         error = turned(setpoint[POSE], cranks[POSE]) - cranks[POSE]
         rates = setpoint[RATES] - cranks[RATES]
@@ -89,7 +89,7 @@ class ServoLoop:
         return np.asarray(self.inertia * (w**2 * error + 2 * self.damping * w * rates) + model)
 
     def limited(self, wanted: Array, last: Array) -> Array:
-        """The setpoint (12,) that the speed limit makes of `wanted`, a period after `last` (6,)."""
+        """Return the setpoint (12,) within the speed limit, a period after `last` (6,)."""
         if self.speed_limit == math.inf:
             return wanted
         most = self.speed_limit * self.period
@@ -100,7 +100,7 @@ class ServoLoop:
         return np.concatenate([last + np.clip(moved, -most, most), rates])
 
     def highest_bandwidth(self, inertias: Array) -> float:
-        """w in rad/s below which the loop, sampled and held, is stable for modes of `inertias`.
+        """Return the w in rad/s below which the sampled loop is stable for modes of `inertias`.
 
         With u = -p e - q e' held for h, p = w^2 J / m and q = 2 d w J / m, the mode goes from
         (e, e') to e' + h u, e + h e' (an engine's semi-implicit step) or e + h e' + h^2 u / 2
@@ -112,7 +112,7 @@ class ServoLoop:
 
 
 class Segment(NamedTuple):
-    """The way of the setpoint from where it is to what a command asks for.
+    """Motion of the setpoint from its present value to a command.
 
     Angles are cubic in time, with the angles and rates of both ends, and the model's torque is
     linear: with commands a period apart, setpoint, rates and torque are continuous.
@@ -128,7 +128,7 @@ class Segment(NamedTuple):
     """(18,)."""
 
     def at(self, time: float, coast: float) -> Array:
-        """(18,) at a time in s; beyond the end on at its rates for `coast` s, then still."""
+        """Return (18,) at a time in s; after the end it moves on for `coast` s, then stays."""
         h = self.end - self.begin
         if time < self.end:
             s = (time - self.begin) / h
@@ -142,20 +142,20 @@ class Segment(NamedTuple):
         return np.concatenate([angles, rates if past < coast else 0 * rates, torques])
 
     def then(self, command: Array, begin: float, end: float, coast: float) -> "Segment":
-        """On from where it is at `begin` to a command (18,) that is to be reached at `end`, s."""
+        """Return the segment from the setpoint at `begin` to a command (18,) at `end`, s."""
         start, stop = self.at(begin, coast), np.array(command)
         stop[POSE] = turned(command[POSE], start[POSE])
         return Segment(begin, end, start, stop)
 
 
 def still(command: Array, time: float) -> Segment:
-    """The setpoint of a command (18,), reached at a time in s."""
+    """Return the setpoint of a command (18,) that is reached at a time in s."""
     assert command.shape == (NUM_REFERENCE,)
     return Segment(time, time, command, command)
 
 
 class Reported(NamedTuple):
-    """What servos put out between two measurements."""
+    """Torques of the servos between two measurements."""
 
     torques: Array
     """(n, 6) N m, means over equal parts of the time."""
@@ -167,14 +167,14 @@ class Reported(NamedTuple):
 
 @dataclass(frozen=True)
 class ReportLayout:
-    """What a machine with servos says with each measurement, of the periods before it.
+    """Layout of the report that a machine with servos sends with each measurement.
 
     A row for each period, the oldest first: the means of the torques over equal parts of it
-    (6 parts), and whether one was at the limit (1 or 0). Then what was asked for last (6).
+    (6 parts), and whether one was at the limit (1 or 0). Then the last torque before the limit (6).
 
     Attributes:
         parts: of a period.
-        periods: rows; so many reports less one may be lost in a row without losing what they said.
+        periods: rows; one report fewer may be lost in a row without loss of information.
     """
 
     parts: int
@@ -182,23 +182,23 @@ class ReportLayout:
 
     @property
     def width(self) -> int:
-        """Of a row."""
+        """Size of a row."""
         return NUM_TORQUES * self.parts + 1
 
     @property
     def size(self) -> int:
-        """Of the whole report."""
+        """Size of the report."""
         return self.periods * self.width + NUM_TORQUES
 
     def written(self, put_out: Array, asked: Array, motors: TorqueLimit) -> Array:
-        """A report (size,) of torques (n, 6), the oldest first, n a multiple of all parts."""
+        """Return the report (size,) of torques (n, 6), oldest first, n a multiple of all parts."""
         means = put_out.reshape(self.periods, self.parts, -1, NUM_TORQUES).mean(axis=2)
         at_limit = np.array([motors.reached(part) for part in np.split(put_out, self.periods)])
         rows = np.column_stack([means.reshape(self.periods, -1), at_limit])
         return np.concatenate([rows.ravel(), asked])
 
     def read(self, report: Array, periods: int) -> Reported | None:
-        """The last so many periods of a report (size,), or None where it does not tell of them."""
+        """Return the last periods of a report (size,), or None where it does not cover them."""
         if periods > self.periods:
             return None
         rows = report[:-NUM_TORQUES].reshape(self.periods, self.width)[self.periods - periods :]

@@ -1,8 +1,7 @@
-"""What is fixed before the loop starts: torques in flight, weights, steps of the prediction.
+"""Design before the start: torques in flight, weights, steps of the prediction.
 
-No number here is a torque or a length by itself: a machine of other size and mass, with everything
-else in proportion, gets the same law. Lengths are measured against its `reach`, torques against its
-`machine_torque`; times are those of the person who wants the motion, in s.
+All numbers are relative: a machine of another size and mass, with everything else in proportion,
+gets the same law. Lengths are relative to its `reach`, torques to its `machine_torque`.
 """
 
 import functools
@@ -97,7 +96,7 @@ def weight_scales(
 ) -> tuple[Array, Array, Array]:
     """Weights (6,) of the pose error, its integral and the torques in the cost, before w_Q, w_R.
 
-    Bryson's rule, one over the square of what is tolerable: of the error TOLERANCE times half the
+    Bryson's rule, one over the square of the tolerable value: of the error TOLERANCE times half the
     reference's peak to peak (`sizes` where that is 0), that for 1 s of the integral, and the torque
     in N m that the reference takes, or `least_torque`. The paper's choice (41) is `identity`.
     """
@@ -169,7 +168,7 @@ def choose_substeps(
 def turning_substeps(
     dynamics: StewartDynamics, reference: Trajectory, period: float, duration: float
 ) -> int:
-    """Runge-Kutta steps per period in each of which no crank's rate changes by more than its slip.
+    """Return Runge-Kutta steps per period that resolve changes of a crank rate by its slip.
 
     Coulomb friction changes sides while a crank that turns back passes the rates within
     coulomb_speed, which coarser steps do not see. 1 where no friction is known or looked for.

@@ -112,8 +112,8 @@ class Timeline:
     def last_period(self, in_flight: Array) -> tuple[TorqueSchedule, Array]:
         """Return the schedule since the last sample, and the torque (6,) that acts next.
 
-        Without a delay that one is still to be computed, and with reported torques the servos
-        decide it: the last torque stands for it.
+        Without a delay it is still to be computed, and with reported torques it depends on the
+        servos; the last torque is returned then.
 
         Args:
             in_flight: (n > L, 6) torques, oldest first; with `parts` the reported ones.
@@ -126,7 +126,7 @@ class Timeline:
         return TorqueSchedule(torques[:n], durations[:n]), torques[min(n, len(torques) - 1)]
 
     def _since(self, in_flight: Array, periods: int) -> Array:
-        """Return the torques (L + periods, 6) that act from so many periods ago on."""
+        """Return the torques (L + n, 6) that act from n = `periods` ago on."""
         longest = len(in_flight) - periods
         if longest < self.queue_length:
             raise ValueError(
