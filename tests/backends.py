@@ -7,5 +7,5 @@ from stewart_drake.loop import controller
 
 
 def stepped_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Controllers that are made from now on step their law in Python, whatever is compiled."""
+    """Let controllers that are made from now on step their law in Python."""
     monkeypatch.setattr(controller, "serving", lambda law: Serving(law, "python (asked for)"))

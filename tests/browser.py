@@ -141,7 +141,7 @@ class Browser:
 
 @contextlib.contextmanager
 def browser() -> Iterator[Browser]:
-    """A browser of its own, with a profile of its own, gone afterwards."""
+    """Open a browser with a fresh profile; remove both afterwards."""
     assert CHROMIUM is not None
     # Clear of the two descriptors that are taken over.
     theirs_in, ours_out = (fcntl.fcntl(end, fcntl.F_DUPFD, 10) for end in os.pipe())

@@ -35,7 +35,7 @@ _server.set_forkserver_preload(
 
 @contextmanager
 def copied(work: Callable[[], object]) -> Iterator[BaseProcess]:
-    """A copy that has begun with `work`; it is killed where it has not come to its end.
+    """Yield a copy that has begun `work`; kill it if it has not ended.
 
     The copy leads a process group and says nothing; what is patched here is not patched there. Its
     exit status is what `work` returns, 0 for None, 70 where it raises.
@@ -78,7 +78,7 @@ def kill(copy: BaseProcess) -> None:
 
 
 def status_of(work: Callable[[], object]) -> int:
-    """The exit status of a copy, which must come to its end."""
+    """Return the exit status of a copy, which must end."""
     with copied(work) as copy:
         copy.join(PATIENCE)
         assert copy.exitcode is not None, f"no end after {PATIENCE} s"

@@ -239,7 +239,7 @@ class Together:
         self.driver = Driver(self.scenario, self.ear.address, self.key)
 
     def at(self, time: int) -> None:
-        """Let the machine's clock come to a time."""
+        """Advance the machine's clock to a time."""
         while True:
             self.machine.poll(self.machine.time())
             upcoming = self.machine.advance(self.machine.time())

@@ -199,7 +199,7 @@ class PartitionedTree:
         return gamma.T @ M @ gamma, gamma.T @ h, gamma.T @ self._actuation
 
     def _passive(self, parameters: Array) -> Array:
-        """Torque (6,) at the shafts beside the motors', at the state that was reduced last."""
+        """Return the passive torque (6,) at the shafts, at the state that was reduced last."""
         rates = np.array([crank.get_angular_rate(self.context) for crank in self._cranks])
         friction = parameters[COULOMB] * np.tanh(rates / parameters[COULOMB_SPEED])
         return parameters[BIAS] - friction
@@ -254,7 +254,7 @@ def off_dead_centre(mechanism: Mechanism, pose: Array) -> float:
 
 
 def relative(value: Array, expected: Array) -> float:
-    """Norm of the deviation by the norm of what is expected."""
+    """Return the norm of the deviation over the norm of the expected value."""
     return float(np.linalg.norm(value - expected) / np.linalg.norm(expected))
 
 

@@ -84,7 +84,7 @@ KINDS = {
     **{f"link.{name}": {"kind": "network", "low": 0.5, "high": 0.9} for name in ("low", "high")},
     "link.return.low": {"kind": "network", "return": {"low": 0.5, "high": 0.9}},
 }
-"""Fields that a section needs beside the one that is wrong."""
+"""Fields that a section needs in addition to the wrong one."""
 
 PAPER = YAML(typ="safe").load((data_root() / "models" / "paper.yaml").read_text())
 MECHANISM_RANGES = {

@@ -377,7 +377,7 @@ def test_a_known_reference_is_followed_at_a_high_order_of_the_period(fraction, p
 
 @pytest.mark.parametrize("prediction", ["nonlinear", "linear"])
 def test_what_flies_keeps_the_limit_and_saturated_steps_are_counted(prediction):
-    """The law asks as if there were no limit, and believes in what that lets through."""
+    """The law commands as if there were no limit, and expects the limited torque to act."""
     law = law_of(f"controller.prediction={prediction}", "controller.estimate=[]", limit=0.02)
     rng, memory, preview = np.random.default_rng(4), sampled(law), at_home(law)
     unlimited_plant = dataclasses.replace(law.plant, motors=TorqueLimit())
@@ -579,7 +579,7 @@ def test_a_duration_of_whole_periods_designs_the_same_law(frequency, whole, odd)
 
 
 def test_a_motion_of_one_radian_peak_to_peak_is_no_constant():
-    """Constants are measured against 1, which is also what an amplitude of 0.5 comes to."""
+    """Constants have the scale 1, as has an amplitude of 0.5."""
     scales = []
     for amplitude in (0.5, 0.5001):
         settings = [f"reference.amplitude=[0,0,{amplitude},0,0,0]", "plant.kind=exact"]

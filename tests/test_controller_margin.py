@@ -212,7 +212,7 @@ def test_only_the_predictor_is_stable_on_the_papers_experiment():
     assert verdicts == dict.fromkeys(CONTROLLERS, False) | {"predictor_lqi": True}
 
 
-def test_a_delay_of_very_many_periods_is_not_judged_but_told():
+def test_a_delay_of_very_many_periods_is_not_judged_but_reported():
     experiment = prepare(scenario("delay.steps=900", "plant.kind=exact"))
     found = controller_margin(experiment)
     assert found.stable is None and math.isnan(found.radius)
@@ -269,7 +269,7 @@ def test_an_unstable_loop_that_completes_is_warned_about():
         ("constant", 5.0, 10.1, ["slowest step took 10.1 ms"]),
     ],
 )
-def test_steps_longer_than_the_period_are_told(kind, median, worst, told):
+def test_steps_longer_than_the_period_are_reported(kind, median, worst, told):
     """The slowest step of a search for the delay counts; the period is 10 ms."""
     experiment = prepare(scenario(f"controller.delay_estimator={kind}", name="gravity"))
     summary = {
@@ -281,7 +281,7 @@ def test_steps_longer_than_the_period_are_told(kind, median, worst, told):
     assert len(found) == len(told) and all(map(str.__contains__, found, told))
 
 
-def test_the_fastest_pole_is_told_where_it_is(tmp_path):
+def test_the_fastest_pole_is_reported_where_it_is(tmp_path):
     """The true machine does not reach one side; on the way up it falls."""
     path = tmp_path / "short.yaml"
     path.write_text(mechanism_yaml(replace(PAPER, crank_lengths=0.6 * PAPER.crank_lengths)))

@@ -1,4 +1,4 @@
-"""A delay that nobody tells the controller: what acts when, the filter, the search, the loop."""
+"""An unknown delay: which torque acts when, the filter, the search, the loop."""
 
 import dataclasses
 from dataclasses import replace
@@ -167,7 +167,7 @@ def test_sensitivity_to_the_delay_equals_a_finer_difference(eta):
 
 
 def record(eta, samples, seed, rate=0.0, jitter=0.0):
-    """Torques, states and measurements at the samples, by fine integration of its own."""
+    """Return torques, states and measurements at the samples, by a separate fine integration."""
     torques = np.array([swing(k) for k in range(samples)])
     step, states, x = 5e-3, [HOME], HOME
     arrive = DT * np.arange(samples) + eta + rate * DT * np.arange(samples)
@@ -341,7 +341,7 @@ def small_record(torques, eta, samples):
 
 
 def known_delay_likelihood(torques, measured, eta):
-    """Log-likelihood of the measurements by a filter that is told the delay."""
+    """Return the log-likelihood of the measurements by a filter that knows the delay."""
     c, prior = core(), SETTINGS.parameters
     size = c.lib.stewart_guess_size(8)
     guess, after = np.zeros(size), np.zeros(size)

@@ -31,7 +31,7 @@ def run(*settings, scenario="paper", controller=None):
 
 
 def bad(result):
-    """Measurements of which something was left out: missing, frozen, rejected."""
+    """Return the counts of incomplete measurements: missing, frozen, rejected."""
     counts = result.summary["counts"]
     names = ("missing", "frozen", "rejected")
     missing, frozen, rejected = (counts[f"measurements_{name}"] for name in names)
@@ -187,7 +187,7 @@ def test_what_is_not_known_is_found():
     ],
 )
 def test_faults_do_little_and_are_counted(faults, counted):
-    """Windows of 0.1 s, of which one more than the fault lasts has a part of it."""
+    """One window of 0.1 s more than the fault lasts contains a part of it."""
     usual = (*ON_REFERENCE, *FINE, "duration=6")
     clean, result = run(*usual), run(*usual, f"sensor.faults={faults}")
     assert result.accumulated_error < 1.2 * clean.accumulated_error

@@ -42,7 +42,7 @@ SMALL = (
 
 
 def constant(weights, path):
-    """A network that answers the same whatever it is asked."""
+    """Write a network with a constant answer; return its path."""
     network = Network(
         input_mean=np.zeros(18),
         input_scale=np.ones(18),

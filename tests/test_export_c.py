@@ -103,7 +103,7 @@ def test_the_replay_of_servos_is_exact(sensor, tmp_path):
 
 @pytest.mark.slow
 def test_gravity_is_exported_as_it_is_shipped(tmp_path):
-    """The steps of 1 ms of its plant, which lose the loop, are no part of the controller."""
+    """The plant's steps of 1 ms, which lose the loop, are not part of the controller."""
     scenario = load_scenario("gravity", settings=("duration=1.7",))
     assert scenario.plant.kind == "multibody"
     export_c.write(export_c.exported(scenario, measured=False), tmp_path)
@@ -141,7 +141,7 @@ def test_other_compilers_and_processors(compiler, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_controller_that_is_off_is_told(tmp_path):
+def test_a_controller_that_is_off_is_reported(tmp_path):
     """The replay reports a changed period and a changed status."""
     folder = exported(tmp_path, "paper", ("duration=2.0",))
     config, test = folder / "stewart_config.c", folder / "stewart_test.c"
@@ -180,7 +180,7 @@ def test_single_precision_is_close(name, settings, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_sizes_are_told_and_kept_to(tmp_path):
+def test_the_sizes_are_stated_and_kept(tmp_path):
     """The text of `paper` is at most 180 kB, its state 10.4 kB."""
     files = export_c.exported(load_scenario("paper", settings=(*SHORT, "duration=1.0")))
     readme = files["README.md"]
@@ -241,7 +241,7 @@ int main(void) {
 
 
 @pytest.mark.slow
-def test_the_stack_is_not_deeper_than_told(tmp_path, compiler):
+def test_the_stack_is_not_deeper_than_stated(tmp_path, compiler):
     folder = exported(tmp_path, "paper", ("duration=1.0",))
     (folder / "painted.c").write_text(PAINTED)
     command = [*compiler, "-O2", "-Dmain=replay", "-c", "stewart_test.c"]

@@ -27,7 +27,7 @@ def run():
 
 @pytest.fixture(scope="module")
 def comparison(run):
-    """All controllers, one of which goes far off and leaves the workspace at 0.42 s."""
+    """All controllers; one goes far off and leaves the workspace at 0.42 s."""
     early = run.signals.isel(time=slice(0, 22))
     early["pose"] = early.pose + np.geomspace(1e-3, 100.0, 22)[:, None]
     early["error"] = early.pose - early.reference
@@ -130,7 +130,7 @@ def test_a_run_stopped_before_its_first_sample_can_be_drawn(run, drawn):
 
 
 @pytest.mark.parametrize("number", [3, 7, 12])
-def test_any_number_of_controllers_is_told_apart_and_named_on_the_figure(run, drawn, number):
+def test_any_number_of_controllers_has_distinct_lines_named_on_the_figure(run, drawn, number):
     names = [*CONTROLLERS, *(f"a controller of my own {k}" for k in range(7))][:number]
     lines = controller_lines(names)
     grey = {(line.linestyle, line.marker) for line in lines.values()}

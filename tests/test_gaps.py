@@ -33,7 +33,7 @@ HOME = np.concatenate([PAPER.home, np.zeros(6)])
 
 
 def watched(observer, theta, there, seed):
-    """The belief after samples of which some are there, and the true state."""
+    """Return the belief after samples, some of them lost, and the true state."""
     rng, x = np.random.default_rng(seed), HOME
     timeline = Timeline(DT, Delay(0))
     belief, in_flight = observer.start(timeline, SENSING, PLANT), np.zeros((1, 6))

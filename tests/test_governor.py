@@ -153,7 +153,7 @@ def test_a_motion_of_the_scenario_is_taken_over_and_given_back():
             np.testing.assert_allclose(evaluate(blend.way, at), wanted, atol=1e-9)
 
 
-def test_a_limit_that_leaves_no_way_is_told():
+def test_a_limit_that_leaves_no_way_is_reported():
     one = governor("paper", True, 0.5)  # less than what holds the plate
     begun = one.begin(at_rest(one.dynamics.mechanism.home).state)
     assert isinstance(begun, str) and begun.startswith("motor")

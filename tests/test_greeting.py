@@ -87,7 +87,7 @@ def test_replayed_requests_do_not_keep_a_controller_out():
 
 
 def ask(run, time, number=1):
-    """The answers to so many requests of an address, at a time of the machine's clock."""
+    """Return the answers to `number` requests at a time of the machine's clock."""
     endpoint, said = run.driver.endpoint, []
     run.at(time)
     for _ in range(number):
@@ -163,7 +163,7 @@ def test_a_controller_of_version_1_is_refused_in_one_line():
 
 
 def answering(reply):
-    """A machine that answers whatever it gets with the same bytes."""
+    """Start a machine that answers every datagram with the same bytes."""
     ear = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     ear.bind(("127.0.0.1", 0))
     ear.settimeout(0.05)
@@ -298,7 +298,7 @@ def test_a_machine_that_reports_a_period_too_late_is_refused(quiet_machine, monk
 # ---------------------------------------------------------------- identity
 
 
-def test_parts_of_one_name_are_told_apart_by_their_numbers():
+def test_parts_of_one_name_are_distinguished_by_their_numbers():
     other = IDENTITY._replace(mechanism=Part(bytes(8), "paper"))
     assert IDENTITY.differing(IDENTITY) is None
     assert IDENTITY.differing(other) == (
@@ -343,7 +343,7 @@ def test_the_documented_faults_are_those_of_the_table():
 
 
 def test_a_loss_is_said_with_what_came_before_it():
-    """A machine that stood still: the same words in its terminal and in its last datagrams."""
+    """A suspended machine reports the same words in its terminal and its last datagrams."""
     run = begun("queue=equilibrium", "plant.gravity=true", samples=1, watchdog=20)
     machine = run.machine
     run.clock.time += round(0.33 * SECOND)
@@ -393,7 +393,7 @@ class Watching(Viewer):
 
 @pytest.mark.slow
 def test_live_and_machine_say_a_loss_in_the_same_words(quiet_machine):
-    """A machine under gravity, of which the controller knows nothing, falls."""
+    """A machine falls under gravity that is unknown to the controller."""
     watching = Watching()
     with Running("plant.gravity=true") as running:
         # Outliers alone would end the run before the plate has fallen.

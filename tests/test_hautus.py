@@ -177,7 +177,7 @@ def test_a_spread_defective_eigenvalue_is_one_mode(size):
     assert mode.margin < 1e-12
 
 
-def test_a_slowly_decaying_mode_is_told_from_one_that_stays():
+def test_a_slowly_decaying_mode_is_distinguished_from_one_that_stays():
     for value, decays in ((1 - 1e-4, True), (1 - 1e-9, False), (1.0, False), (-1.0, False)):
         assert hautus([[value]], [[0.0]], discrete=True).harmless is decays
     system = np.diag([-1e-9, -1.0])

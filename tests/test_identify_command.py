@@ -88,7 +88,7 @@ def test_the_error_of_a_code_is_that_of_rounding():
         (csv_text(rows=[[row[0], *ROWS[0][1:]] for row in ROWS]), "one torque throughout"),
     ],
 )  # fmt: skip
-def test_a_bad_csv_log_is_told_in_one_line(tmp_path, text, named):
+def test_a_bad_csv_log_is_reported_in_one_line(tmp_path, text, named):
     path = tmp_path / "log.csv"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
@@ -143,7 +143,7 @@ def broken(signals, how):
     "how",
     ["scenario", "network", "sensor.delay", "log_period", "at 5 instants", "measurement"],
 )
-def test_a_run_that_is_no_log_is_told_in_one_line(lost, tmp_path, how):
+def test_a_run_that_is_no_log_is_reported_in_one_line(lost, tmp_path, how):
     with xr.open_dataset(lost, engine="h5netcdf") as signals:
         broken(signals.load(), how).to_netcdf(tmp_path / "bad.nc", engine="h5netcdf")
     with pytest.raises(ConfigError) as caught:
@@ -169,7 +169,7 @@ def test_a_run_that_is_no_log_is_told_in_one_line(lost, tmp_path, how):
         (["LEGLESS", "--mechanism", "paper"], "at 0 instants; expected at least 8"),
     ],
 )
-def test_a_bad_command_is_told_in_one_line(tmp_path, capsys, arguments, named):
+def test_a_bad_command_is_reported_in_one_line(tmp_path, capsys, arguments, named):
     path = tmp_path / "log.csv"
     path.write_text(csv_text())
     legless = tmp_path / "legless.csv"  # one encoder says nothing
@@ -213,7 +213,7 @@ def test_a_lost_log_lets_the_next_run_be_held(lost, tmp_path, capsys):
     assert run["delay"]["estimated_s"] == pytest.approx(summary["delay_s"], rel=1e-12)
 
 
-def test_logs_of_one_name_are_told_by_their_folders():
+def test_logs_of_one_name_are_distinguished_by_their_folders():
     def told(*names):
         return file_names([SimpleNamespace(name=name) for name in names])
 

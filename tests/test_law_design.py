@@ -1,4 +1,4 @@
-"""A law without a scenario, in a diagram of one's own."""
+"""A law without a scenario, in a user's diagram."""
 
 import numpy as np
 import pytest

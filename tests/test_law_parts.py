@@ -1,4 +1,4 @@
-"""The parts of the control law, each alone, and parts of one's own put in from outside."""
+"""The parts of the control law, each alone, and parts of a user."""
 
 from dataclasses import dataclass, replace
 
@@ -121,7 +121,7 @@ def test_who_takes_values_for_those_of_now_refuses_old_ones(estimate):
         law.step(memory, old, lambda times: np.tile(HOME, (len(times), 1)), WEIGHTS)
 
 
-def test_a_loss_is_told_by_the_mask_alone():
+def test_a_loss_is_known_by_the_mask_alone():
     """A number in its place is not looked at."""
     law = law_of("controller.estimate=[]", "delay.steps=0")
     valid = np.ones(12, bool)
@@ -164,7 +164,7 @@ def test_each_fault_of_a_state_by_hand(fault, change):
 
 @dataclass(frozen=True)
 class Twice:
-    """Pose and rates in units of their own, each measured by two sensors."""
+    """Pose and rates in other units, each measured by two sensors."""
 
     unit: Array
     std: Array
@@ -233,7 +233,7 @@ def test_two_sensors_with_the_noise_of_two_are_one():
 
 
 def nodes_of(feedforward, timeline):
-    """The reference (n, 18) at the nodes, of a motion that is no symmetric one."""
+    """Return the reference (n, 18) at the nodes of an asymmetric motion."""
     reference = sine(0.7)
     return np.array([reference(1.0 + t) for t in feedforward.nodes(timeline, 2)])
 
@@ -298,7 +298,7 @@ def test_a_preview_of_other_instants_is_a_mistake():
 
 @dataclass(frozen=True)
 class Blend:
-    """A fourth observer: the model, and a share of what the measurement says beside it."""
+    """A fourth observer: the model, corrected by a share of the innovation."""
 
     share: float
 
@@ -335,7 +335,7 @@ def test_a_fourth_observer_needs_no_change_of_the_package():
 
 @dataclass(frozen=True)
 class Told(CoreObserver):
-    """Begins with the delay that the law assumes, and is told another one at the first sample."""
+    """An observer that begins with the assumed delay and learns another one at the first sample."""
 
     other: Timeline | None = None
 

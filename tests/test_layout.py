@@ -224,7 +224,7 @@ def test_a_motion_out_of_reach_is_judged_without_a_run():
     assert list(found["measures"]) == ["reach"]
 
 
-def test_a_layout_that_loses_its_goal_between_the_instants_looked_at_is_told():
+def test_a_layout_that_loses_its_goal_between_the_instants_looked_at_is_reported():
     own = own_values(SPEC)
     lost = Layout("layout_1", PAPER, OWN.order, own, {"reach": -0.01}, {"reach": 1.02}, None,
                   Outcome("refused", "out of reach", time=0.0))  # fmt: skip
@@ -237,7 +237,7 @@ def test_a_layout_that_loses_its_goal_between_the_instants_looked_at_is_told():
 
 
 def test_errata_another_layout_is_conditioned_better():
-    """Published lengths and separations; numbers of the search that docs/errata.md tells of."""
+    """Published lengths and separations, and the search of docs/errata.md."""
     asked = problem_of(
         load_scenario("paper"), "condition", {"reach": 0.005, "clearance": -1.0}, {}, ()
     )
@@ -307,7 +307,7 @@ def test_the_command_writes_machines_that_run_and_goes_on(tmp_path, capsys, in_p
     assert "belongs to other settings (seed: 2 there, 3 now)" in capsys.readouterr().err
 
 
-def test_limits_that_nothing_keeps_are_told_and_no_machine_is_written(tmp_path, capsys):
+def test_limits_that_nothing_keeps_are_reported_and_no_machine_is_written(tmp_path, capsys):
     assert main([*SMALL, "--limit", "clearance=1", "--out", str(tmp_path)]) == 0
     told = " ".join(capsys.readouterr().out.split())
     assert told.startswith("no: of ") and "the nearest misses" in told and "clearance by" in told

@@ -250,7 +250,7 @@ def test_the_faithful_controller_is_unstable_on_the_true_plant():
     ],
 )
 def test_weights_that_hardly_act_keep_the_faithful_controllers_stable(controller, weight, radius):
-    """At mu = 8, by an eigenvalue problem of its own; unstable for every mu is w_Q = w_R."""
+    """A separate eigenvalue problem at mu = 8; w_Q = w_R is unstable for every mu."""
     integral = controller == "delay_lqi"
     models = [
         delayed_model(model, 0.1, 8, integral=integral)

@@ -63,7 +63,7 @@ def test_they_are_the_loop_that_the_margins_judge(controller, settings):
 
 
 def test_a_delay_that_is_estimated_has_been_found():
-    """The loop that the margins judge, whatever the controller believed at first."""
+    """The models are the loop that the margins judge, for any delay assumed at first."""
     wrong = ("controller.delay_steps=4",)
     experiment = prepare(sd.load_scenario("paper", "adaptive_lqi", wrong))
     judged = controller_margin(experiment)

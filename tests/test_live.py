@@ -83,7 +83,7 @@ class Running:
 
 
 def driven(running, seconds, *settings, **how):
-    """Return the result of a run on this machine, whatever the jitter."""
+    """Return the result of a run on this machine; any jitter is accepted."""
     ready = prepare_session(scenario_of(*settings), running.address)
     return drive(ready, seconds, accept_jitter=True, say=lambda line: None, **how)
 
@@ -162,7 +162,7 @@ class Hand(Viewer):
 
 @pytest.mark.slow
 @in_real_time
-def test_a_hand_leads_and_a_target_beyond_reach_is_told(quiet_machine):
+def test_a_hand_leads_and_a_target_beyond_reach_is_reported(quiet_machine):
     target = load_mechanism("paper").home + [0, 0, 0, 0, 0, 0.3]
     hand = Hand(target)
     with Running() as running:
@@ -469,7 +469,7 @@ def test_the_advised_queue_holds_the_plate(offer, gravity, better):
 @pytest.mark.slow
 @pytest.mark.parametrize(("settings", "said"), [((), True), (FROM_REST, False)])
 @in_real_time
-def test_torques_in_flight_that_end_too_soon_are_told(quiet_machine, settings, said):
+def test_torques_in_flight_that_end_too_soon_are_reported(quiet_machine, settings, said):
     with Running(OVER_A_NETWORK, *settings) as running:
         ready = prepare_session(scenario_of(*settings), running.address)
         ready.endpoint.close()
@@ -588,7 +588,7 @@ def test_an_address_that_is_none_is_refused(text):
 
 
 @pytest.mark.slow
-def test_nobody_there_is_told():
+def test_nobody_there_is_reported():
     endpoint = Endpoint(ControllerMessage, "127.0.0.1", 0)
     try:
         with pytest.raises(ConfigError, match="where nothing answers"):

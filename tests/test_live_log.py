@@ -1,4 +1,4 @@
-"""The log of a live run: rows as they come, whatever ends the process or the disk; and memory."""
+"""The log of a live run: rows as they come, a killed process, a full disk, memory."""
 
 import gc
 import math

@@ -37,7 +37,7 @@ needs_proc = pytest.mark.skipif(
 
 
 def growth_per_run(runs, warm_up):
-    """Bytes by which each of so many short runs makes the process larger: the slope of a line."""
+    """Return the growth of the process per run in bytes: the slope of a line."""
     settings = ("duration=0.2", "delay.steps=2", *ON_REFERENCE)
     scenarios = [load_scenario("paper", None, (f"plant.kind={k}", *settings)) for k in PLANTS]
     sizes = []

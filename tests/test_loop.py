@@ -437,7 +437,7 @@ def test_a_simulator_of_the_loop_alone_starts_there_too(settings):
     )
 
 
-def test_a_moving_start_that_a_simulator_cannot_know_of_is_told():
+def test_a_moving_start_that_a_simulator_cannot_know_of_is_reported():
     loop = loop_of("plant.kind=multibody", *MOVING)
     with pytest.warns(UserWarning, match="loop.CreateDefaultContext"):
         Simulator(loop).Initialize()

@@ -103,7 +103,7 @@ def test_counts_are_those_of_the_simulation():
     assert (machine["played"], machine["dry"]) == (played, dry)
 
 
-def test_encoders_are_told_as_codes():
+def test_encoders_send_codes():
     run = begun(
         "sensor={kind: encoders, bits: 12, samples: 3, offset: [0.01,0,0,0,0,0]}", samples=5
     )
@@ -127,7 +127,7 @@ def torque_of(run):
 @pytest.mark.parametrize("safe", ["zero", "hold"])
 @pytest.mark.parametrize("settings", [(), (NETWORK,)])
 def test_silence_ends_in_the_safe_torque_in_time(safe, settings):
-    """At `watchdog` after the last datagram, whatever is in the buffer."""
+    """The safe torque acts `watchdog` after the last datagram, with any buffer."""
     run = begun(*settings, samples=20, safe=safe, watchdog=0.35)
     run.at(run.machine.time() + round(0.33 * SECOND) * bool(settings))  # what is under way is heard
     heard = run.machine.session.heard

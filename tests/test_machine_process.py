@@ -181,7 +181,7 @@ def test_a_lost_datagram_of_the_controller_in_c_costs_nothing(folder, tmp_path):
 
 
 def in_a_row(number, loss, seed):
-    """A link that loses so many datagrams in a row; a torque acts 0.2 s after its measurement."""
+    """Return a link with losses in a row; a torque acts 0.2 s after its measurement."""
     lossy = f"low: 0.0, high: 0.02, loss: {loss}, burst: {number}, playout: 0.1"
     return (*SETTINGS, f"link={{kind: network, {lossy}, seed: {seed}}}")
 
@@ -269,7 +269,7 @@ def test_ctrl_c_ends_it_with_one_summary():
 @pytest.mark.slow
 @pytest.mark.parametrize("side", ["controller", "machine"])
 def test_either_side_of_a_network_may_stand_still_for_a_second(side):
-    """Told in one line by whoever stood still; the machine is at its safe torque within the time
+    """The suspended side reports it in one line; the machine is at its safe torque within the time
     that it promises, and the controller leads the plate back, or says why not."""
     way = "low: 0.1, high: 0.12"
     link = f"link={{kind: network, {way}, return: {{{way}}}}}"

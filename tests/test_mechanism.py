@@ -157,7 +157,7 @@ def test_unknown_and_missing_keys_are_named(edits, problem, load):
     assert str(caught.value).endswith(f"mine.yaml: {problem}")
 
 
-def test_all_impossible_bodies_are_told_at_once(load):
+def test_all_impossible_bodies_are_reported_at_once(load):
     edits = {"base.inertia": [1.0, 1.0, 3.0], "crank.mass": 0, "rod.inertia": [0, 1e-3, 1e-3]}
     with pytest.raises(ConfigError) as caught:
         load(paper_with(edits))

@@ -85,7 +85,7 @@ def test_check_of_a_singular_machine_is_a_verdict(machine, why, tmp_path, capsys
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["torque"] == []
 
 
-def test_motors_that_cannot_hold_the_plate_are_told():
+def test_motors_that_cannot_hold_the_plate_are_reported():
     weak = load_mechanism("motion_base")
     object.__setattr__(weak, "effort_limit", 500.0)
     assert "cannot hold the plate, 928 N m" in check_mechanism(weak).verdict

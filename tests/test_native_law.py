@@ -315,7 +315,7 @@ def test_after_a_gap_the_way_back_is_that_of_python(case, first, number):
 @pytest.mark.parametrize("case", ["paper", "a fraction of a period", "no delay", "gravity"])
 @pytest.mark.parametrize("start", ["measured", "unmeasured"])
 def test_a_reference_that_is_missing_is_continued_as_in_python(case, start):
-    """The same torques, counts and memory; with weights that are no numbers, too."""
+    """Torques, counts and memory are the same, with weights that are NaN, too."""
     name, settings, _ = CASES[case]
     pair = Pair(name, (*settings, "start=on_reference", "queue=reference"))
     gaps, peak = [], 0.0

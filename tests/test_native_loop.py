@@ -372,7 +372,7 @@ def test_a_preview_that_is_missing_is_continued_from_the_last(number):
 
 
 def error_of_a_later_start(samples_late):
-    """E_ac of `paper` from rest, held there for so many samples before the first torque."""
+    """Return E_ac of `paper` from rest, held there for some samples before the first torque."""
     preparation = preparation_of(scenario("paper"))
     prepared = preparation.prepared(preparation.experiment(scenario("paper")))
     experiment, law, late = prepared.experiment, prepared.law, 0.1 * samples_late

@@ -30,7 +30,7 @@ SWING = Drive(HOLD, 0.05 * HOLD, 9.0, np.arange(6.0))
 
 
 def of_scipy(dynamics, drives, times, rtol):
-    """States (n, 12) at the times, each drive a problem of its own."""
+    """Return states (n, 12) at the times; each drive is a separate problem."""
     states, x = np.full((len(times), 12), np.nan), AT_HOME
     for i, drive in enumerate(drives):
         end = drives[i + 1].start if i + 1 < len(drives) else times[-1]
@@ -75,7 +75,7 @@ def test_any_machine_is_followed():
 
 
 def test_energy_is_kept():
-    """A fall from home and back up, without torque or friction, in steps of its own choice."""
+    """A fall from home and back up, without torque or friction, in adaptive steps."""
     free = StewartDynamics(PAPER, gravity=1.0)
     start = AT_HOME + 0.2 * np.eye(12)[11]
     found = integrate(free, start, [Drive()], np.linspace(0, 0.15, 40), 1e-13)

@@ -17,7 +17,7 @@ import stewart_drake as sd
 
 
 class Steady(LeafSystem):
-    """One torque, whatever happens."""
+    """A controller with one constant torque."""
 
     def __init__(self, torque=0.0):
         super().__init__()
@@ -142,7 +142,7 @@ def fails(number, how):
         ("exit", SystemExit, "Drake says no"),
     ],
 )
-def test_an_exception_of_a_job_is_told_as_it_is(how, kind, message, workers, tmp_path):
+def test_an_exception_of_a_job_is_reported_as_it_is(how, kind, message, workers, tmp_path):
     """The odd one was taken for a killed worker."""
     jobs = {"first": (0, how), "second": (1, how)}
     with pytest.raises(kind, match=rf"^{message}\nraised by the job (first|second)$"):

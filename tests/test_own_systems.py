@@ -1,4 +1,4 @@
-"""Controllers, references and disturbances of one's own in the loop of a scenario."""
+"""Controllers, references and disturbances of a user in the loop of a scenario."""
 
 import importlib.util
 import json

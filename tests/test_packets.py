@@ -449,7 +449,7 @@ QUICK = ("link.kind=network", "link.low=0.2", "link.high=0.45")
 
 
 def test_the_study_finds_the_best_bound_and_the_loss_that_is_borne(known_outcomes):
-    """Half periods beside the best whole one are tried: 0.45 s is better than 0.4 s."""
+    """Half periods next to the best whole one are tried: 0.45 s is better than 0.4 s."""
     told = []
     study = study_link(scenario(*QUICK), LinkOptions(runs=3), lambda *counts: told.append(counts))
     bounds = [0.3, 0.35, 0.4, 0.45, 0.5, 0.6]

@@ -1,4 +1,4 @@
-"""The analysis page: one file, nothing fetched, whatever the names in it are."""
+"""The analysis page: one file, nothing fetched, names escaped."""
 
 import re
 from html.parser import HTMLParser

@@ -1,4 +1,4 @@
-"""A platform in a diagram of one's own."""
+"""A platform in a user's diagram."""
 
 import importlib.util
 from pathlib import Path
@@ -88,7 +88,7 @@ def test_both_kinds_in_a_diagram_of_ones_own_agree():
 
 
 def test_without_gravity_it_does_not_matter_where_the_base_is_welded():
-    """Pose and rates are told relative to the base, which here is turned over and far away."""
+    """Pose and rates are relative to the base, which here is turned over and far away."""
     state = np.concatenate([PAPER.home + 0.02, np.full(6, 0.05)])
 
     def welded(builder):
@@ -125,7 +125,7 @@ def test_two_machines_in_one_plant_move_on_their_own():
     np.testing.assert_allclose(still, [*PAPER.home, *np.zeros(6)], atol=1e-9)
 
 
-def test_a_platform_begins_where_it_is_told():
+def test_a_platform_begins_at_the_given_state():
     start = PAPER.home + np.array([0.1, -0.1, 0.2, 0.01, 0.02, -0.01])
     for kind in ("exact", "multibody"):
         builder = DiagramBuilder()

@@ -171,7 +171,7 @@ class Push(LeafSystem):
         )
 
 
-def test_version_and_types_are_told():
+def test_version_and_types_are_reported():
     assert sd.__version__ == importlib.metadata.version("stewart-drake")
     assert (Path(sd.__file__).parent / "py.typed").is_file()
 
@@ -245,7 +245,7 @@ def test_compare_takes_own_controllers_and_disturbances(tmp_path):
         ({"reference": "handle"}, "cannot be sent to other processes"),
     ],
 )
-def test_what_compare_cannot_run_is_told_in_one_line(given, message):
+def test_what_compare_cannot_run_is_reported_in_one_line(given, message):
     if given.get("disturbance"):
         given = {"disturbance": Push()}
     if given.get("reference"):

@@ -1,4 +1,4 @@
-"""Runs are shown again through the SDFormat model, beside their reference."""
+"""The replay shows runs by the SDFormat model, with their reference."""
 
 import dataclasses
 import json
@@ -72,7 +72,7 @@ def test_the_angle_of_the_page_is_that_of_one_turn(run):
     assert np.allclose(data["angle"], 3.0, atol=1e-4) and np.allclose(data["position"], 0.0)
 
 
-def test_names_are_escaped_and_the_outcome_is_told(run):
+def test_names_are_escaped_and_the_outcome_is_reported(run):
     failed = dataclasses.replace(
         run, status="left_workspace", stopped=Failure(0.4, 2, 0.0, "leg 2 was too short")
     )

@@ -147,7 +147,7 @@ def collect_of(scenario, **changes):
     return report_document.ReportData(**(parts | changes))
 
 
-def test_a_run_that_ends_early_is_told_at_once():
+def test_a_run_that_ends_early_is_reported_at_once():
     scenario = load_scenario("paper", "lqr", ("plant.kind=exact",))
     page = report_document.document(collect_of(scenario), "mine")
     assert page.tone == "bad"

@@ -25,7 +25,7 @@ EXACT = ("--set", "plant.kind=exact", "--set", "duration=0.3", "--set", "delay.s
 
 
 def broken(folder):
-    """Stands for whatever draws; the results must be there before it is called."""
+    """Return a function that fails to draw; the results must be there before it is called."""
 
     def draw(*_, **__):
         assert (folder / "summary.json").exists()

@@ -216,7 +216,7 @@ def test_draws_fill_their_ranges():
 
 
 def test_friction_and_the_payloads_place_are_drawn_where_they_are_asked_for():
-    """And leave all other draws, and what is told of them, as they are."""
+    """All other draws, and the report on them, stay as they are."""
     scenario, asked = short(), Ranges(coulomb=0.1, payload_position=0.3)
     scenario.plant.coulomb_friction, scenario.plant.payload_position = 1e-3, [0.0, 0.0, 0.05]
     draws = [draw(asked, SCALES, scenario, 0, i) for i in range(200)]

@@ -62,7 +62,7 @@ def test_a_second_of_it_is_survived(kind, estimate, bound):
 
 
 @pytest.mark.parametrize("size", [0.01, 0.1, 1.0, 1e3])
-def test_spikes_of_all_sizes_are_told_from_motion(size):
+def test_spikes_of_all_sizes_are_distinguished_from_motion(size):
     """Also within reach, and ten in a row: they do not bear each other out."""
     run = simulate(on_reference(fault("spike", size=size)), judge_stability=False)
     assert run.status == "completed"

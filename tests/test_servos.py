@@ -1,6 +1,7 @@
 """Position servos: the local loop against closed forms and brute force, the law, the whole loop."""
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -54,6 +55,7 @@ def scenario(*more, controller="servo_preview", kind="exact"):
     return sd.load_scenario("paper", controller, given)
 
 
+@cache
 def run(*more, controller="servo_preview", kind="exact"):
     return sd.simulate(scenario(*more, controller=controller, kind=kind))
 

@@ -66,7 +66,7 @@ def test_friction_in_steps_of_the_engine_is_a_factor_per_step(stiffness):
     np.testing.assert_allclose(modes[:, -1] @ rates, (1 - stiffness) ** 4 * 1e-2 * speed, rtol=0.03)
 
 
-def test_a_step_in_which_friction_makes_cranks_tremble_is_told():
+def test_a_step_in_which_friction_makes_cranks_tremble_is_reported():
     def said(*settings):
         return cautions_before(prepare(sd.load_scenario("paper", settings=settings)), None)
 

@@ -105,7 +105,7 @@ class Counted:
 
 
 def missing() -> list[str]:
-    """Return Debian's packages of what is not installed."""
+    """Return the Debian packages of missing programs."""
     packages = [package for command, package in PACKAGES.items() if shutil.which(command) is None]
     if shutil.which("arm-none-eabi-gcc") is not None:
         command = "arm-none-eabi-gcc -E -x c -o /dev/null -"

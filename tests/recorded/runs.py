@@ -1,4 +1,4 @@
-"""Torques of every shipped scenario with every controller on both plants, kept beside the tests.
+"""Recorded torques of every shipped scenario with every controller on both plants.
 
     python -m tests.recorded.runs                       # what has no row yet
     python -m tests.recorded.runs paper/lqi/exact ...   # these rows anew, after a deliberate change
