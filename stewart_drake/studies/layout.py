@@ -402,7 +402,7 @@ def search(
     space = problem.space
     low, high = np.array(space.ranges(arrangement)).T
     free = low < high
-    # The first trial of the machine's arrangement is the machine, so that the result is no worse.
+    # The machine is the first trial of its arrangement, so that the result is as good at least.
     own = own_values(space.spec)
     is_own = list(arrangement.order) == space.pattern.plate_order
     is_own &= list(arrangement.branches) == space.pattern.branches
@@ -413,9 +413,12 @@ def search(
         values[free] = some
         return values
 
+    def cost(some: Array) -> float:
+        return problem.cost(problem.trial(whole(some), arrangement))
+
     stream = [seed, start, *arrangement.order, *(b + 1 for b in arrangement.branches)]
     found = differential_evolution(
-        lambda some: problem.cost(problem.trial(whole(some), arrangement)),
+        cost,
         Bounds(low[free], high[free]),
         maxiter=generations,
         popsize=POPULATION,

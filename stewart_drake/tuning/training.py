@@ -218,7 +218,7 @@ def fit(
         residuals, theta, jac=jacobian, method="lm", max_nfev=evaluations, x_scale=1.0
     )
     curve.append((rms(found.x, train), rms(found.x, test)))
-    found.curve = np.array(curve)
+    found["curve"] = np.array(curve)
     return found
 
 
