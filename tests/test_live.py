@@ -414,6 +414,7 @@ def test_a_tuner_that_runs_is_refused():
 
 def test_a_link_that_takes_longer_than_the_delay_is_refused(offer):
     message, link = offer
+    link = replace(link, trips=deque([0.21, 0.25]))
     with pytest.raises(ConfigError, match=r"^delay\.steps: got 0\.1 s .* delay\.steps=4$"):
         as_seen(scenario_of("delay.steps=1"), link, message)
 
