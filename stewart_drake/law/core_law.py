@@ -1,8 +1,7 @@
-"""The whole step of a law in C, core/law.c, in the place of `PredictiveLqi.step`.
+"""The step of a law in C, core/law.c, where the core has every part of it.
 
-`serving` chooses. If the core has every part of a law, C steps it; otherwise Python composes the
-same kernels. Memory is one flat vector; `CoreMemory` reads its fields by the
-names of `law.memory.Memory`.
+`serving` decides; otherwise Python composes the same kernels in `PredictiveLqi.step`. Memory is one
+flat vector, and `CoreMemory` gives its fields the names of `law.memory.Memory`.
 """
 
 from dataclasses import dataclass
@@ -46,9 +45,7 @@ from stewart_drake.scenario.signals import (
 from stewart_drake.types import Array
 
 _OF_TORQUES: Final = {"integral": NUM_COORDINATES, "weights": len(WEIGHTS)}
-"""Sizes of fields that a law for servos has not: NaN there."""
-CAUSES: Final = Counts._fields
-"""Names of the bits of a status."""
+"""Sizes of fields that are NaN in a law for servos."""
 _FEEDFORWARDS: Final = {
     NoFeedforward: "STEWART_NO_FEEDFORWARD",
     EquilibriumFeedforward: "STEWART_EQUILIBRIUM",
@@ -57,7 +54,7 @@ _FEEDFORWARDS: Final = {
 
 
 def uncovered(law: PredictiveLqi | ServoPreview) -> str | None:
-    """Return the field of a scenario whose part the core has not, or None.
+    """Return the scenario field of the first part that the core does not have, or None.
 
     A user's part counts as another kind of that field.
     """
@@ -82,23 +79,22 @@ def uncovered(law: PredictiveLqi | ServoPreview) -> str | None:
 
 
 def _predictor(law: PredictiveLqi) -> type:
-    """Return the kind of prediction that the core has for the observer of a law."""
+    """Return the predictor of the core for the observer of a law."""
     return ArrivalPredictor if law.finds_delay else NonlinearPredictor
 
 
 class CompiledLaw:
-    """The constants of a law as the core has them.
+    """The constants of a law in the core.
 
     Args:
-        law: one without an `uncovered` part.
+        law: without an `uncovered` part.
 
     Attributes:
-        law: the same.
+        law: the law.
         data: `stewart_law *`, or of servos `stewart_servo *`.
         fields: (place, rows, columns) of each field of the memory.
-        observer: the observer's part.
         tables: name of each table of functions that the law points to, by its address.
-        keep: what else it points to, arrays and C structures.
+        keep: arrays and C structures that it points to.
         sources: of the core, beyond those of every law.
     """
 
@@ -197,10 +193,10 @@ class CompiledLaw:
 
 @dataclass(frozen=True)
 class CoreMemory:
-    """A memory of the law in C, which reads as a `law.memory.Memory`.
+    """Memory of a law in C, with the names of `law.memory.Memory`.
 
     Attributes:
-        data: (n,) all of it.
+        data: (n,) all fields.
         compiled: the law.
     """
 
@@ -220,7 +216,7 @@ class CoreMemory:
 
     @property
     def in_flight(self) -> Array:
-        """(n, 6) torques as limited, the oldest first."""
+        """Torques (n, 6) within the limit, oldest first."""
         return self.field("in_flight").reshape(-1, NUM_TORQUES)
 
     def __getattr__(self, name: str) -> Array:
@@ -247,12 +243,8 @@ class CoreMemory:
         return channel.start()
 
     @property
-    def path(self) -> None:
-        """There is none."""
-
-    @property
     def silence(self) -> int:
-        """Samples that are still to go on without feedback."""
+        """Samples that remain without feedback."""
         return int(self.field("silence")[0])
 
     @cached_property
@@ -262,25 +254,21 @@ class CoreMemory:
 
     @cached_property
     def belief(self) -> Belief:
-        """State of now, parameters, covariance at the last measurement."""
+        """State now, with the covariance at the last measurement."""
         law, data = self.law, self.compiled.data
         given = data if isinstance(law, PredictiveLqi) else core().ffi.addressof(data, "law")
         belief = belief_of(law.observer, given, self.field("observer"), law.timeline)
         return belief.at(self.field("state"))
 
     def without_error(self) -> "CoreMemory":
-        """Return the same with nothing integrated."""
+        """Return the memory with error and integral reset."""
         after = CoreMemory(self.data.copy(), self.compiled)
         after.field("error")[:] = after.field("integral")[:] = 0.0
         return after
 
 
 class CoreLqi:
-    """`PredictiveLqi.initial_memory` and `step` of a law that is not `uncovered`.
-
-    Args:
-        law: the same in Python.
-    """
+    """`PredictiveLqi.initial_memory` and `step` in C, of a law that is not `uncovered`."""
 
     def __init__(self, law: PredictiveLqi) -> None:
         self._law, self._compiled = law, CompiledLaw(law)
@@ -319,9 +307,9 @@ class CoreLqi:
         return CoreMemory(data, self._compiled)
 
     def _asked(self, sample: Any, motion: Motion) -> Compiled:
-        """Let a sample ask for the reference; return what it points to.
+        """Set the reference of a sample; return the objects that it points to.
 
-        Where the delay is known the instants are, too, and all rows are given beforehand.
+        With a known delay the instants are known, too, and all rows are given beforehand.
         """
         law, c = self._law, core()
         if not law.finds_delay and isinstance(law.planner, NoPlanner):
@@ -339,11 +327,7 @@ class CoreLqi:
 
 
 class CoreServo:
-    """`ServoPreview.initial_memory` and `step` of a law that is not `uncovered`.
-
-    Args:
-        law: the same in Python.
-    """
+    """`ServoPreview.initial_memory` and `step` in C, of a law that is not `uncovered`."""
 
     def __init__(self, law: ServoPreview) -> None:
         self._law, self._compiled = law, CompiledLaw(law)

@@ -1,25 +1,25 @@
-"""The paper's tuner: densities in, and a network that makes (w_Q, w_R) of them, in plain numpy.
+"""The paper's tuner: a network maps densities to (w_Q, w_R), in plain numpy.
 
-Densities, equation (45), show how a signal stands against its own recent mean. With w_in + 1 = 31
-samples in the window and n of them known,
+Densities, equation (45), compare a signal with its own recent mean. With w_in + 1 = 31 samples in
+the window and n of them known,
 
     magnitude (bounded):   rho(k) = |eps(k)| / mean |eps(i)|,
     signed (as printed):   rho(k) = eps(k) / mean eps(i),         i = k - w_in, ..., k.
 
-A sample is unknown before the first one and where it is not finite (a missed measurement); the mean
-is over the known ones, so that a window that is not yet full has a value too. Where eps(k) itself
-is unknown, or nothing but zeros is known, rho(k) = 1: nothing out of the ordinary.
+A sample is unknown before the first one and where it is not finite (a missed measurement). The mean
+is over the known ones, so that a window that is not full has a value too. Where eps(k) is unknown,
+or only zeros are known, rho(k) = 1.
 
 The mean of n magnitudes is at least |eps(k)| / n, hence 0 <= rho <= n <= 31. The signed mean passes
-through zero while eps(k) does not, so that (45) as printed has no bound; it is cut at SIGNED_LIMIT.
+through zero while eps(k) does not, so that (45) as printed is unbounded; it is cut at SIGNED_LIMIT.
 
 The network is
 
     y = W2 sigmoid(W1 (rho - input_mean) / input_scale + b1) + b2,
 
-with rho the densities, or other features of the same number by the name in its file.
+with rho the densities or the features `health`, by the name in its file.
 
-A network lives in one JSON file, read as strictly as a scenario.
+A network is one JSON file, read as strictly as a scenario.
 """
 
 import dataclasses
@@ -57,12 +57,12 @@ NUM_OUTPUTS: Final = len(WEIGHTS)
 
 MAX_BYTES: Final = 10_000_000
 EXPECTED: Final = "the JSON file of one network"
-"""In words, where a file is none."""
+"""For messages."""
 _ARRAYS: Final = ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds")
 
 
 def density(window: ArrayLike, kind: Kind = "magnitude") -> Array:
-    """Equation (45) for the newest sample of a window.
+    """Return equation (45) for the newest sample of a window.
 
     Args:
         window: (..., WINDOW, m) samples, the newest last; unknown ones are not finite.
@@ -99,11 +99,11 @@ def density(window: ArrayLike, kind: Kind = "magnitude") -> Array:
 
 
 def densities(samples: ArrayLike, kind: Kind = "magnitude") -> Array:
-    """Equation (45) along a record of samples.
+    """Return equation (45) along a record of samples.
 
     Args:
         samples: (N, 18) in time order, rows [measurement - reference (12); commanded torque (6)]
-            in rad, m, rad/s, m/s and N m; what is not finite is unknown.
+            in rad, m, rad/s, m/s and N m; values that are not finite are unknown.
         kind: `magnitude` or `signed`.
 
     Returns:
@@ -125,9 +125,9 @@ class Network:
     """A trained network; the paper's has h = 10 hidden neurons.
 
     Attributes:
-        input_mean: (18,) of the densities it was trained on.
+        input_mean: (18,) of the training densities.
         input_scale: (18,) their spread, above zero.
-        W1: (h, 18) into the hidden layer, whose activation is the sigmoid.
+        W1: (h, 18) into the hidden layer, with the sigmoid as activation.
         b1: (h,) bias there.
         W2: (2, h) into the output layer, which is linear.
         b2: (2,) bias there.
