@@ -73,7 +73,7 @@ static stewart_arrivals arriving(const stewart_period *t, const real *xi)
     return view;
 }
 
-/* What acts, one torque after the other, and where it leads to. */
+/* Torque schedule of a period, and the states along it. */
 typedef struct {
     int number;
     real *torques, *durations;
@@ -88,7 +88,7 @@ static Way take_way(const stewart_period *t, stewart_scratch *scratch)
     return way;
 }
 
-/* What acts between two instants; 0 for too many torques. */
+/* Schedule between two instants. Returns 0 for too many torques. */
 static int act(const stewart_period *t, const real *xi, real begin, real end, Way *way)
 {
     const stewart_arrivals view = arriving(t, xi);
@@ -97,7 +97,7 @@ static int act(const stewart_period *t, const real *xi, real begin, real end, Wa
     return way->number <= MOST;
 }
 
-/* The way of a period from xi, and its end; 0 where there is none. */
+/* States along a period from xi, and its end. Returns 0 if there are none. */
 static int predict(const stewart_period *t, const real *xi, Way *way, real *state)
 {
     if (!act(t, xi, 0, t->delay->period, way))
@@ -216,7 +216,7 @@ int stewart_period_late(const stewart_period *t, const real *xi, const real *sta
 
 /* ---- a measurement at its end ----------------------------------------------------------------- */
 
-/* A period linearised at xi, and how its end is seen. */
+/* A period linearised at xi, and the measurement at its end. */
 typedef struct {
     stewart_instant instant;
     const stewart_period *period;
@@ -321,16 +321,15 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
     return 1;
 }
 
-/* Update what a hypothesis says of the timing of single torques, and its outliers.
+/* Update a hypothesis' estimate of the timing of single torques, and its outliers.
 
    With S = S_0 + s M, s the variance, the log-likelihood has the slope and the information
 
        dL/ds = 1/2 (nu' S^-1 M S^-1 nu - tr S^-1 M),   I = 1/2 tr S^-1 M S^-1 M,
 
-   so that s + (dL/ds) / I is what this measurement alone says of it (Fisher scoring). One torque whose
-   timing is all that is uncertain says it to I = 1 / (2 s^2): a measurement counts as 2 s^2 I torques.
-   The mean over those is the estimate; a weight that is itself 1 / s^4 would for ever believe the first
-   ones that happened to be on time.
+   so that s + (dL/ds) / I is the estimate of this measurement alone (Fisher scoring). One torque with
+   nothing else uncertain has I = 1 / (2 s^2): a measurement counts as 2 s^2 I torques. The estimate is
+   the mean over those; with a weight of 1 / s^4 the first punctual torques would dominate for ever.
 
    Whitened by C, S is 1 + W W' with W = C^-1 H L, and s M is B B' with B = C^-1 J K' of the own rows
    of K. With T = B' S^-1 B the traces are those of T and of T T. Returns 0 where S is not positive
@@ -557,7 +556,7 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
             stewart_guess_root(guess, n, L);
         }
     }
-    if (!goes || !attempt(&a, guess, L, NULL, 0, after, scratch)) /* it explains nothing any more */
+    if (!goes || !attempt(&a, guess, L, NULL, 0, after, scratch)) /* the hypothesis has failed */
         stewart_copy(stewart_guess_size(p), (const real *)guess, (real *)after);
     if (y) {
         after->fits = 0;

@@ -13,33 +13,33 @@ enum {
     STEWART_MAX_SCHEDULE = 8,  /* torques that act in a period, at a rate of the delay within bounds */
 };
 
-/* What is assumed of the state, the parameters theta (p) and the delay. */
+/* Assumptions about the state, the parameters theta (p) and the delay. */
 typedef struct {
     const stewart_machine *machine;
     const stewart_sensing *sensing;
     real period;                     /* dt, s */
-    real model_std[STEWART_STATES];  /* by which one step of the model may be off */
+    real model_std[STEWART_STATES];  /* error of one step of the model */
     const real *prior, *prior_root;  /* of theta: mean (p), root of the covariance (p, p) */
     const real *std, *usual_std;     /* (p) of the prior, and of the prior from a drawing alone */
     const real *lower, *upper;       /* (p) bounds of theta */
     real gate;                       /* squared innovation that makes an outlier */
-    real first_timing;               /* s, by which a torque may come early or late, to begin with */
+    real first_timing;               /* s, first standard deviation of the timing of torques */
     real believed, delay_std;        /* s, mean and standard deviation of the delay's prior */
     real longest;                    /* s */
-    real timing_std;                 /* s, the least by which a torque may come early or late */
+    real timing_std;                 /* s, least standard deviation of the timing of torques */
     real walk, rate_std, rate_walk;  /* s per root s; s/s, 0 for a delay without a rate; s/s per root s */
     int quiet;                       /* whether nothing is fed back before the delay is found */
 } stewart_delay;
 
-/* A hypothesis of the delay, with all that follows from it, in one flat vector. */
+/* A hypothesis of the delay with its filter, in one flat vector. */
 typedef struct {
     real low, high;      /* s, between which eta is */
     real log_likelihood; /* of the last measurement */
     real fits;           /* whether the last measurement was not an outlier */
-    real outliers;       /* in a row, with those that a torque at another time explains */
-    real timing;         /* s^2, variance by which single torques come early or late */
-    real torques;        /* number of torques behind that */
-    real heard;          /* number of measurements that an own torque had to do with */
+    real outliers;       /* in a row, also those that another timing of a torque explains */
+    real timing;         /* s^2, variance of the timing of single torques */
+    real torques;        /* number of torques in that estimate */
+    real heard;          /* number of measurements after an own torque */
     real weight;         /* log of the odds */
     real numbers[];      /* mean of xi = [x; theta; eta; eta_dot] (n), then the lower triangle of the
                             root of its covariance, by rows; its last two rows are 0, and eta is
@@ -63,7 +63,7 @@ typedef struct {
 
 int stewart_period_scratch(int p, int flights); /* of each of these */
 
-/* State at the end. Returns 0 where that does not exist. */
+/* State at the end. Returns 0 if it does not exist. */
 int stewart_period_end(const stewart_period *period, const real *xi, real *state,
                        stewart_scratch scratch);
 
@@ -72,9 +72,9 @@ int stewart_period_end(const stewart_period *period, const real *xi, real *state
 int stewart_period_at(const stewart_period *period, const real *xi, int exact, real *state, real *H,
                       stewart_scratch scratch);
 
-/* Rows K (k, 12) by which the state at the end differs where single torques are early or late: the
-   first `others` by one standard deviation of those before the controller's own, the rest by that of
-   the own ones, `std` in s. K'K is the covariance. Returns k, at most STEWART_MAX_SCHEDULE, or -1. */
+/* Rows K (k, 12): changes of the state at the end if single torques are early or late by one standard
+   deviation, first the `others` before the controller's own, then the own ones, `std` in s. K'K is the
+   covariance. Returns k, at most STEWART_MAX_SCHEDULE, or -1. */
 int stewart_period_late(const stewart_period *period, const real *xi, const real *state, real std,
                         real *K, int *others, stewart_scratch scratch);
 
@@ -84,19 +84,19 @@ void stewart_delay_advance(const stewart_period *period, const stewart_guess *gu
 
 int stewart_delay_advance_scratch(int p, int m, int flights);
 
-/* What is believed, in one flat vector. */
+/* The belief, in one flat vector. */
 typedef struct {
-    real eta, rate, sent;        /* the delay to act on, s and s/s, see stewart_arrivals */
-    real known;                  /* whether there is a state: not before the first measurement */
+    real eta, rate, sent;        /* the delay to use, s and s/s, see stewart_arrivals */
+    real known;                  /* whether there has been a measurement */
     real searching;              /* whether there are several hypotheses */
-    real cells;                  /* number of hypotheses that something has arrived */
-    real best;                   /* place of the one that the law goes on with */
+    real cells;                  /* number of hypotheses in which a torque has arrived */
+    real best;                   /* place of the most probable one */
     real rejected;               /* whether the last measurement was an outlier */
     real found;                  /* whether the delay has just been found, or is another than before */
     real fresh;                  /* whether that was at this sample, and took so long that planning waits
                                     for the next one */
     real silent;                 /* whether nothing is fed back until then */
-    real feeds_back;             /* whether the estimate is good enough to act on */
+    real feeds_back;             /* whether the estimate is good enough for feedback */
     real caution;                /* factor on the weight of torques */
     real settled;                /* whether the delay is known */
     real mean, std;              /* s, of the delay; NaN before the first measurement */

@@ -17,23 +17,22 @@
 #include "delay.h"
 #include "short.h"
 
-#define LEAD 7       /* log of the odds at which the search is over */
-#define FORGOTTEN 14 /* log of the odds at which a cell is dropped */
-#define NEAR ((real)0.2) /* periods; what is nearer is one hypothesis */
-#define LEAST_SHARE ((real)1e-4) /* of the master's weight that goes to a cell, and that stays */
-#define SUSPICIOUS 2 /* outliers in a row that may be a jump */
-#define PATIENCE 3   /* outliers in a row after which the measurement is believed */
-#define GRID ((real)0.5) /* periods between the delays that are tried after a jump */
-#define BEST 2       /* of them, from which filters are begun */
-#define HOPELESS 100 /* squared distance from which on a filter is not begun */
-#define SETTLED 5    /* log of the odds at which one of those takes over */
-#define AT_ONCE 2    /* cells that leave time for a plan at the same sample */
-#define CAUTION 10   /* times the weight of torques while the delay is sought */
-#define LOOSENED ((real)0.05) /* deviations of the prior by which parameters may change with the delay */
+#define LEAD 7       /* log of the odds that ends the search */
+#define FORGOTTEN 14 /* log of the odds that drops a cell */
+#define NEAR ((real)0.2) /* periods; nearer delays are one hypothesis */
+#define LEAST_SHARE ((real)1e-4) /* of the master's weight, for a cell and for the master */
+#define SUSPICIOUS 2 /* outliers in a row that start the search for a jump */
+#define PATIENCE 3   /* outliers in a row after which the filter restarts */
+#define GRID ((real)0.5) /* periods between the delays of the grid after a jump */
+#define BEST 2       /* filters that are started from the grid */
+#define HOPELESS 100 /* squared distance above which no filter is started */
+#define SETTLED 5    /* log of the odds at which one of them takes over */
+#define AT_ONCE 2    /* cells with which a plan fits in the same sample */
+#define CAUTION 10   /* factor on the weight of torques during the search */
+#define LOOSENED ((real)0.05) /* deviations of the prior, allowed change of parameters */
 #define LOOSENED_BY_JUMP ((real)0.01)
-#define TORQUES 1 /* torques taken to have come early or late by `first_timing` before any was looked at.
-                     Were they taken to have been on time, the first late ones would be outliers, and
-                     the next ones payload and bias. */
+#define TORQUES 1 /* prior weight of `first_timing`, in torques. Without it the first late torques
+                     would be outliers, and the next ones would change payload and bias. */
 #define SQRT_HALF ((real)0.70710678118654752)
 #define SQRT_12 ((real)3.4641016151377546)
 #define SQRT_2_PI ((real)2.5066282746310005)
@@ -374,7 +373,7 @@ static int jump(Search *s, const real *y, stewart_scratch scratch)
     stewart_period periods[2] = {s->since, s->since};
     if (!stewart_all_finite(2 * m, s->past) || !stewart_all_finite(m, y))
         return 0;
-    stewart_copy(U, s->before, before); /* what acted before is not known: the same */
+    stewart_copy(U, s->before, before); /* the torque before is unknown: assume the same */
     stewart_copy(U * s->since.view.before, s->before, before + U);
     periods[0].view.others = before;
     periods[0].view.before++;
@@ -405,7 +404,7 @@ static int jump(Search *s, const real *y, stewart_scratch scratch)
             total[chosen] += moved->log_likelihood;
         }
     }
-    if (!chosen) /* no number: astray */
+    if (!chosen) /* not finite */
         return 0;
     const int second = chosen > 1, best = second && total[1] > total[0];
     stewart_guess *found = ended[best];
@@ -472,7 +471,7 @@ static void mix(Search *s)
     memory->std = REAL(sqrt)(square / total);
 }
 
-/* Write what the law reads: the delay, and whether to act on it. */
+/* Write the delay for the law, and whether to use it. */
 static void report(Search *s, int measured)
 {
     const stewart_delay *d = s->delay;

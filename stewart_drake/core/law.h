@@ -2,7 +2,8 @@
 
    Once:           stewart_start(&law, memory, number, queue);
    every period:   status = stewart_step(&law, memory, scratch, &sample, torque);
-   and only if something else was sent than `torque`, limited:   stewart_note_acted(&law, memory, 1, 1, sent);
+   if another torque than the limited `torque` was sent:
+                   stewart_note_acted(&law, memory, 1, 1, sent);
 
    A pose is roll, pitch, yaw (rad) and x, y, z (m) of the plate's centre of mass, a state the pose
    and its rates, a reference the pose, its rates and its accelerations. Matrices are stored by rows.
@@ -23,8 +24,8 @@ typedef struct {
 } stewart_field;
 
 typedef struct {
-    stewart_field in_flight;   /* torques as limited, the oldest first */
-    stewart_field observer;    /* of the observer, at the last measurement that it took */
+    stewart_field in_flight;   /* limited torques, the oldest first */
+    stewart_field observer;    /* of the observer, at its last measurement */
     stewart_field behind;      /* periods since that was taken */
     stewart_field state;       /* now */
     stewart_field parameters;  /* estimated, or as they are known beforehand */
@@ -35,9 +36,9 @@ typedef struct {
     stewart_field torque;      /* the last, as asked for */
     stewart_field feedforward; /* and how much of it takes no measurement */
     stewart_field weights;
-    stewart_field silence;     /* samples that are still to go on without feedback */
+    stewart_field silence;     /* samples left without feedback */
     stewart_field times;       /* of the last preview, s from its sample */
-    stewart_field reference;   /* the last preview, with numbers for what was missing */
+    stewart_field reference;   /* the last preview, with missing numbers filled in */
     stewart_field followed;    /* the same with the way back after a gap */
     stewart_field gap;         /* whether the last row of the last preview was missing */
     stewart_field offset;      /* from the reference where the next torque acts, after a gap in it */
@@ -62,10 +63,10 @@ typedef struct {
     int (*scratch)(const stewart_law *law);
     int (*torques)(const stewart_law *law); /* that are planned at each sample */
     void (*start)(const stewart_law *law, real *memory);
-    /* Replaces the torques in flight by the most probable ones. */
+    /* Replace the torques in flight by the most probable ones. */
     void (*update)(const stewart_law *law, real *memory, const stewart_report *report,
                    real *in_flight, stewart_scratch scratch);
-    /* Remembers what is sent: this torque and further ones, for `in_flight` before it. */
+    /* Keep the packet: this torque and planned ones; `in_flight` are those before. */
     void (*send)(const stewart_law *law, real *memory, const stewart_outlook *outlook,
                  const stewart_ahead *ahead, const real *in_flight, stewart_scratch scratch);
 } stewart_channel;
@@ -79,7 +80,7 @@ typedef struct {
     int (*memory)(const stewart_law *law);
     int (*scratch)(const stewart_law *law);
     void (*start)(const stewart_law *law, real *memory);
-    /* Plans anew where that is of use, once at each sample. Returns whether it did. */
+    /* Plan again if that is useful, once at each sample. Returns whether it did. */
     int (*follow)(const stewart_law *law, real *memory, const stewart_outlook *outlook,
                   const stewart_sample *sample, stewart_scratch scratch);
     /* Rows (number, 18) of that motion, at instants in s from now. */
@@ -114,7 +115,7 @@ struct stewart_law {
 /* Rows (number, 18) of the reference at instants in s from now, some of them negative. */
 typedef void (*stewart_preview_function)(void *about, int number, const real *times, real *rows);
 
-/* What a sample brings. */
+/* Input of a sample. */
 struct stewart_sample {
     const real *measurement; /* (measured); what is lost is NaN */
     int age;                 /* of it in periods; negative for a lost one */
@@ -128,7 +129,7 @@ struct stewart_sample {
     real weights[2]; /* of errors and of torques; with others than finite ones the last gain is used */
 };
 
-/* Fills in `memory` and `layout` of a law whose other fields are set. */
+/* Fill in `memory` and `layout` from the other fields of a law. */
 void stewart_prepare(stewart_law *law);
 
 /* Numbers of scratch memory that a step takes at the most. */
@@ -153,7 +154,7 @@ void stewart_note_acted(const stewart_law *law, real *memory, int ago, int numbe
 /* A `stewart_preview_function`: `about` points to all rows that are asked for. */
 void stewart_given_rows(void *about, int number, const real *times, real *rows);
 
-/* The torque as the motors let it through; whether that is another one. */
+/* Limit a torque. Returns whether that changed it. */
 int stewart_limit(const stewart_machine *machine, const real *torque, real *limited);
 
 /* What acts in whole periods that begin with the oldest of `periods` + 1 torques. */
