@@ -2,12 +2,10 @@
 
 import contextlib
 from collections.abc import Callable
-from functools import cached_property
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
-from typer.core import TyperCommand
 
 from stewart_drake.cli.common import (
     GO_ON,
@@ -30,24 +28,11 @@ if TYPE_CHECKING:
 app = typer.Typer(rich_markup_mode=None, help="Analyse a loop before it is built.")
 
 
-class _Command(TyperCommand):
-    """Command of an analysis, which imports the options of its study when it is called."""
-
-    @cached_property
-    def _made(self) -> Any:
-        single = typer.Typer(rich_markup_mode=None, add_completion=False)
-        single.command()(_callback(str(self.name)))
-        return typer.main.get_command(single)
-
-    params = property(lambda self: self._made.params, lambda self, _: None)
-    callback = property(lambda self: self._made.callback, lambda self, _: None)
-
-
 def add_analyses(root: typer.Typer) -> None:
     """Add the command of every analysis to the family `analyze`, or to the root."""
     for name, row in ANALYSES.items():
         group = root if row.alone else app
-        group.command(name, cls=_Command, help=row.help)(lambda: None)
+        group.command(name, help=row.help)(_callback(name))
 
 
 def _callback(name: str) -> Callable[..., int]:

@@ -85,12 +85,12 @@ def identify(
     typed = {"delay": delay, "tolerance": tolerance, "bits": bits, "pose-std": pose_std, "out": out}
     of_csv = {"--bits": bits, "--pose-std": pose_std, "--gravity": gravity}
     if plan is not None:
-        said = {"--mechanism": mechanism, "--delay": delay, "--gravity": gravity}
-        refuse(said, "with --plan, whose scenario says it (--set); expected none")
+        of_scenario = {"--mechanism": mechanism, "--delay": delay, "--gravity": gravity}
+        refuse(of_scenario, "with --plan; expected it in the scenario, or as --set")
     else:
         refuse({"--set": settings}, "without --plan; expected it with --plan")
         if all(path.suffix == ".nc" for path in logs or ()):
-            refuse(of_csv, "with logs that say it themselves (.nc); expected it of a CSV log")
+            refuse(of_csv, "with .nc logs, which contain it; expected it with a CSV log only")
     delivery = Delivery(out, quiet, as_json)
     if plan is None and mechanism is None:
         raise ConfigError("--mechanism: is missing; expected a shipped name or a file, as drawn")

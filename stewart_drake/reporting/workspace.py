@@ -48,7 +48,7 @@ def document(study: WorkspaceStudy) -> Document:
         study=study,
         summary=summary,
         along=along,
-        said=_nearest_text,
+        nearest_text=_nearest_text,
         crossing=_crossing,
         largest=not np.isnan(study.factor.value) and study.factor,
         dead_centre=DEAD_CENTRE_SINE,
