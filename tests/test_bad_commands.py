@@ -66,7 +66,7 @@ BAD_ARGUMENTS = [
     (["identify", "--plan", "paper", "--mechanism", "paper"], "--mechanism: got paper with --plan"),
     (["identify", "--plan", "paper", "--delay", "0"], "--delay: got 0.0 with --plan"),
     (["identify", "run.nc", "--bits", "14"], "--bits: got 14 with .nc logs, which contain it"),
-    (["identify", "run.nc", "--no-gravity"], "--gravity: got False with logs"),
+    (["identify", "run.nc", "--no-gravity"], "--gravity: got False with .nc logs"),
     (["layout", "paper", "--goal", "beauty"], "--goal: got beauty"),
     (["layout", "paper", "--set", "plant.mechanism=desktop"], "plant.mechanism: got desktop"),
     (["export", "nowhere.nc"], "nowhere.nc"),
