@@ -203,7 +203,7 @@ class Preparation:
         self._sizing = sizing_of(self._base)
         self._ways: dict[bytes, CatchUp | None] = {}
         self._previews: dict[int, tuple[Trajectory, Array]] = {}
-        self._motions: dict[int, tuple[Trajectory, Any]] = {}
+        self._motions: dict[int, tuple[Trajectory, tuple[Array, Array]]] = {}
         self.when: Instants = instants_of(scenario.duration, scenario.controller.period)
         reference = self._base.reference
         self.references = np.array([evaluate(reference, t)[:NUM_STATE] for t in self.when.looks])
@@ -234,9 +234,8 @@ class Preparation:
             motion, _ = way.plan(catch_up, experiment.planned_limit)
         source = (tuner or weights_source)(experiment, law)
         previews = self._preview(motion, law)
-        followed, motions = followed_motion(law, motion, experiment.reference), ()
-        if followed is not None:
-            motions = tuple(self._pieces(one, followed) for one in followed)
+        followed = followed_motion(law, motion, experiment.reference) or ()
+        motions = tuple(self._pieces(one, followed) for one in followed)
         return Prepared(experiment, law, motion, previews, source, motions)
 
     def _preview(self, motion: Trajectory, law: PredictiveLqi) -> Array:
@@ -247,17 +246,13 @@ class Preparation:
             self._previews[id(motion)] = motion, np.array(rows)
         return self._previews[id(motion)][1]
 
-    def _pieces(
-        self, motion: Trajectory, followed: tuple[Trajectory, Trajectory]
-    ) -> tuple[Array, Array]:
+    def _pieces(self, motion: Trajectory, followed: tuple[Trajectory, ...]) -> tuple[Array, Array]:
         if id(motion) not in self._motions:
-            c = self._base.scenario.controller
-            ahead = (c.delay_max or 0.0) + c.replan + 20 * c.period
-            ahead += believed_delay(self._base.scenario).eta(c.period)
-            pieces = pieces_of(motion, followed, self._base.scenario.duration + 2 * ahead)
-            self._motions[id(motion)] = motion, pieces
-        pieces: tuple[Array, Array] = self._motions[id(motion)][1]
-        return pieces
+            sc, c = self._base.scenario, self._base.scenario.controller
+            delay = (c.delay_max or 0.0) + believed_delay(sc).eta(c.period)
+            until = sc.duration + 2 * (delay + c.replan + 20 * c.period)
+            self._motions[id(motion)] = motion, pieces_of(motion, followed, until)
+        return self._motions[id(motion)][1]
 
 
 def pieces_of(
