@@ -213,6 +213,7 @@ def test_the_reference_mechanism_crosses_and_paper_clear_does_not():
 
 def test_paper_clear_has_what_the_paper_publishes():
     clear = load_mechanism("paper_clear")
+    assert proportions(clear)[:2] == pytest.approx((0.011, 0.0176))  # of a crank of 0.11 m
     for lengths in ("crank_lengths", "rod_lengths"):
         np.testing.assert_array_equal(getattr(clear, lengths), getattr(PAPER, lengths))
     for body in ("base", "plate", "crank", "rod"):

@@ -22,7 +22,7 @@ from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism import kinematics
 from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.reporting.robustness import document
-from stewart_drake.scenario.config import StateSensorConfig
+from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.studies import robustness, statistics
 from stewart_drake.studies.robustness import RobustnessStudy, factor_values, study_robustness, table
 from stewart_drake.studies.runs import Outcome
@@ -445,7 +445,7 @@ def test_a_draw_beyond_all_scenarios_is_an_outcome(one, field):
 
 @pytest.mark.parametrize(
     ("changes", "loop"),
-    [({}, "native"), ({"sensor": StateSensorConfig(delay=0.1)}, "drake, sensor.delay")],
+    [({}, "native"), ({"plant": PlantConfig(kind="multibody")}, "drake, plant.kind")],
 )
 def test_the_summary_counts_runs_by_what_ran_them(tmp_path, changes, loop):
     study = study_robustness(short(**changes), tmp_path, RobustnessOptions(runs=2, workers=1))
