@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stewart_drake.core.library import core
-from stewart_drake.law.core_law import address_of
+from stewart_drake.law.compiled import address_of
 
 
 class Constants:

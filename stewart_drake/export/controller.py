@@ -26,6 +26,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import replacing
 from stewart_drake.law.compiled import Compiled
 from stewart_drake.law.core_law import CompiledLaw
+from stewart_drake.law.observers import estimates_parameters
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.peer import FAULTS, identity_of
@@ -82,7 +83,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "PERIOD": f"{law.timeline.period:g}",
         "TOLERANCE": f"{TOLERANCES['float' if single else 'double']:g}",
         "REAL": "float" if single else "double",
-        "ESTIMATES": "yes" if law.estimates else "no",
+        "ESTIMATES": "yes" if estimates_parameters(law.observer) else "no",
         "TESTS": "stewart_test protocol_test" if over_udp else "stewart_test",
         "TEST_OBJECTS": "stewart_motion.o" if recorded.moves else "",
     }

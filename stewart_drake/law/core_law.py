@@ -158,8 +158,7 @@ class CompiledLaw:
     def _plans(self, planner: Replan) -> None:
         c, d, law = core(), self.data, self.law
         plan, until = c.ffi.new("stewart_replan *"), law.timeline.queue_length
-        if law.finds_delay:
-            assert isinstance(law.observer, CoreObserver)
+        if isinstance(law.observer, CoreObserver) and law.observer.delay is not None:
             until = law.observer.max_schedule_length(d.period)
         plan.periods, plan.until = periods_of(planner.duration, d.period), until
         plan.size, plan.sign = planner.size.tolist(), home_sign(law.plant.mechanism)

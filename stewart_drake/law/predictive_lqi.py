@@ -27,7 +27,7 @@ from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts, Memory
 from stewart_drake.law.motion import Course, Motion
 from stewart_drake.law.nominal import NominalPlant
-from stewart_drake.law.observers import CoreObserver, Observer
+from stewart_drake.law.observers import CoreObserver, Observer, estimates_parameters
 from stewart_drake.law.planner import NoPlanner, Planner
 from stewart_drake.law.predictors import PredictedState, Predictor
 from stewart_drake.law.sensing import Sensing
@@ -99,7 +99,7 @@ class PredictiveLqi:
     @property
     def estimates(self) -> bool:
         """Whether the observer estimates parameters."""
-        return not (isinstance(self.observer, CoreObserver) and self.observer.settings is None)
+        return estimates_parameters(self.observer)
 
     @property
     def finds_delay(self) -> bool:
@@ -253,7 +253,8 @@ class PredictiveLqi:
         target = min(age, self.longest_wait) if valid else self.longest_wait
         delayed = memory.belief if memory.delayed is None else memory.delayed
         lag, flown = memory.lag + 1, memory.in_flight
-        faults, partial = (() if valid else ("measurements_missing",)), 0
+        faults: tuple[str, ...] = () if valid else ("measurements_missing",)
+        partial = 0
         while lag > target:
             lag -= 1
             fresh = valid and lag == age

@@ -131,14 +131,14 @@ class Network:
         b1: (h,) bias there.
         W2: (2, h) into the output layer, which is linear.
         b2: (2,) bias there.
-        bounds: (2, 2) lower, then upper bound of (w_Q, w_R); what uses the weights clips to them.
-        output: what the output layer gives: `weights` (w_Q, w_R) or `log_weights`, their natural
+        bounds: (2, 2) lower, then upper bound of (w_Q, w_R), to which its users clip.
+        output: of the output layer: `weights` (w_Q, w_R) or `log_weights`, their natural
             logarithms.
-        density: the kind of density it was trained on, `magnitude` or `signed`.
-        features: what its inputs are, `densities` (`tuner.network`) or `health` (`tuner.source`).
-        start: (2,) w_Q and w_R at the first sample, and to go back to; null is what the controller
-            has. A network with a start moves along w_Q / w_R, see `tuner.source`.
-        card: where it comes from: data, seed, versions, errors; plain JSON values.
+        density: kind of the training densities, `magnitude` or `signed`.
+        features: of its input, `densities` (`tuner.network`) or `health` (`tuner.source`).
+        start: (2,) w_Q and w_R at the first sample, and to return to; null: the controller's. A
+            network with a start moves along w_Q / w_R, see `tuner.source`.
+        card: origin: data, seed, versions, errors; plain JSON values.
 
     Raises:
         ConfigError: shapes that do not fit, values that are not finite, a scale or a lower bound
