@@ -53,7 +53,7 @@ class Table:
         return f"{self.path}: row {self.lines[row]}{column}"
 
     def stacked(self, names: Iterable[str]) -> Array:
-        """Return columns (n, k), all of which must be there."""
+        """Return columns (n, k); a missing one is an error."""
         for name in names:
             if name not in self.columns:
                 raise ConfigError(
