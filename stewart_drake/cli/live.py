@@ -67,9 +67,6 @@ def live(
     The law is that of `simulate`; a page in the browser has sliders for the pose. Ctrl-C brings the
     plate to rest and ends the run; Ctrl-C again, or Stop on the page, stops it at once.
     """
-    from stewart_drake.live.contact import address_of
-    from stewart_drake.live.endpoint import read_key
-    from stewart_drake.live.session import check_armed, check_jitter, drive, plans, prepare_session
     from stewart_drake.scenario.loading import load_scenario
 
     if (machine is None) != demo:
@@ -85,13 +82,17 @@ def live(
         where = machine or running.enter_context(
             _demo_machine(scenario, loaded.eta, controller, settings or ())
         )
+        from stewart_drake.live import session
+        from stewart_drake.live.contact import address_of
+        from stewart_drake.live.endpoint import read_key
+
         delivery.say(f"calling {where}")
-        ready = prepare_session(loaded, address_of(where), read_key(options.key))
-        delivery.say_wrapped(*plans(ready, span, name))
-        check_armed(ready, options.armed)
+        ready = session.prepare_session(loaded, address_of(where), read_key(options.key))
+        delivery.say_wrapped(*session.plans(ready, span, name))
+        session.check_armed(ready, options.armed)
         # The demo's machine is simulated and needs no consent.
         problem = None if options.accept_jitter or demo else ready.jitter_problem
-        check_jitter(ready, problem is None or _agreed(problem))
+        session.check_jitter(ready, problem is None or _agreed(problem))
         if viewer is not None:
             url = viewer.opened()
             echo(f"page: {url}", error=True)  # also with --quiet
@@ -103,7 +104,7 @@ def live(
         how: Any = {"armed": options.armed, "viewer": viewer, "max_missing": options.max_missing}
         how["log"] = None if out is None else out / LOG
         with _Ending() as ending:
-            result = drive(
+            result = session.drive(
                 ready, span, ending=ending, say=delivery.say_wrapped, accept_jitter=True, **how
             )
     return _delivered(delivery, result)
@@ -181,6 +182,9 @@ def _demo_machine(
         preexec_fn=_end_with_parent(),
     )
     try:
+        # Imported while the machine starts, which takes as long.
+        from stewart_drake.live import session  # noqa: F401
+
         assert process.stdout is not None
         named = (line for line in process.stdout if line.startswith("machine "))
         _, _, rest = next(named, "").partition(" at ")

@@ -11,10 +11,10 @@ from stewart_drake.law.compiled import address_of
 
 
 class Constants:
-    """Initialisers of structures, and definitions of what these point to.
+    """Initialisers of structures, and definitions of the data that they point to.
 
     Args:
-        keep: arrays and C structures that they point to.
+        keep: these arrays and C structures.
         tables: names of the core's tables of functions, by address.
         suffix: of a number, `f` in single precision.
 
@@ -51,7 +51,7 @@ class Constants:
         return number(value, self._suffix) if kind.cname == "double" else str(int(value))
 
     def _pointed(self, value: Any, about: str) -> str:
-        """Return what a pointer is, having defined what it points to."""
+        """Return the initialiser of a pointer, and define its target."""
         address = address_of(value)
         if address == 0:
             return "0"

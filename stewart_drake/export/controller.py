@@ -1,7 +1,7 @@
 """The controller of a scenario as a folder of C, with a test that replays a run of it.
 
-The sources are those of core/, as they are; what is written here is the configuration, and what the
-law in Python was given and answered. The folder holds only what the law uses.
+The sources are those of core/ that the law uses. Written here are the configuration, and the inputs
+and outputs of the law in Python for the test.
 """
 
 import os
@@ -44,7 +44,7 @@ SOURCES: Final = (
 )
 """Sources of core/ that every law needs; a name without a suffix stands for header and source."""
 MACHINE: Final = ("link.h", "link.c")
-"""Sources of core/ that the example of a machine takes beside those."""
+"""Additional sources of core/ for the example of a machine."""
 EXAMPLES: Final = (
     *("protocol.c", "protocol.h", "protocol_test.c", "udp.c", "udp.h"),
     *("stewart_example.c", "stewart_example.h", "stewart_machine.c", "stewart_udp.c", *MACHINE),
@@ -52,8 +52,8 @@ EXAMPLES: Final = (
 """Examples over UDP: for a measured state, a known delay, and one torque at a sample."""
 TEMPLATES: Final = Path(__file__).with_name("templates")
 TOLERANCES: Final = {"double": 1e-9, "float": 1e-3}
-"""Of the answer that the replay may differ by, as a share of its peak."""
-_UNMEASURED: Final = "It was not compiled where it was written: `make size` and `make test` tell.\n"
+"""Tolerance of the replay, as a share of the peak."""
+_UNMEASURED: Final = "Not compiled here: run `make size` and `make test`.\n"
 
 
 def exported(scenario: Scenario, single: bool = False, measured: bool = True) -> dict[str, str]:
@@ -233,7 +233,7 @@ def _reports(reports: list[Any], suffix: str) -> str:
 
 
 def _surroundings(experiment: Experiment, recorded: Recorded, suffix: str) -> dict[str, str]:
-    """Return what the examples know of the scenario beside the controller."""
+    """Return the data of the scenario for the examples."""
     scenario, c = experiment.scenario, experiment.scenario.controller
     rows = recorded.motion
     if rows is None:
@@ -273,7 +273,7 @@ def _goal(rows: Array) -> str:
 
 
 def write(files: Mapping[str, str], folder: Path) -> list[Path]:
-    """All of them or, on an error, none; the folder is there."""
+    """Write all files to an existing folder or, on an error, none."""
     paths = [folder / name for name in files]
     with ExitStack() as all_of_them:
         for path, text in zip(paths, files.values(), strict=True):
@@ -282,12 +282,12 @@ def write(files: Mapping[str, str], folder: Path) -> list[Path]:
 
 
 def _filled(text: str, values: Mapping[str, str]) -> str:
-    """With each @NAME@ that has a value in its place."""
+    """Replace each @NAME@ that has a value."""
     return re.sub(r"@([A-Z_]+)@", lambda found: values.get(found[1], found[0]), text)
 
 
 def _sizes(files: Mapping[str, str]) -> str:
-    """What `make test` and `make size` say here, or how to find out."""
+    """Return the output of `make test` and `make size`, or how to get it."""
     command = compiler()
     if command is None or shutil.which("make") is None:
         return _UNMEASURED

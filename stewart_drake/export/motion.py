@@ -1,4 +1,4 @@
-"""A motion as knots between which a polynomial of fifth order is it, for C.
+"""A motion as knots of a piecewise polynomial of fifth order, for C.
 
 The polynomial has pose, rates and accelerations of the motion at both knots. Between them it is off
 by O(h^6) where the motion is smooth; where it is not, or h is too long, knots come closer.
@@ -15,17 +15,17 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 TOLERANCE: Final = 1e-7
-"""Of what a coordinate, its rate or acceleration is at the most over the motion."""
+"""Tolerance, as a share of the largest value of a coordinate, rate or acceleration."""
 LONGEST: Final = 0.5
-"""s between two knots."""
+"""Longest time between two knots, s."""
 _HALVES: Final = 16
-"""Of LONGEST, at the most: a motion's jump is not chased any further."""
+"""Largest number of halvings of LONGEST, as at a jump of the motion."""
 _LOOKS: Final = (0.21, 0.5, 0.79)
-"""Shares of the way between two knots at which the polynomial is compared."""
+"""Shares of the time between two knots at which the polynomial is compared."""
 
 
 def knots(motion: Trajectory, end: float) -> Array:
-    """(n, 19) times and the motion there, so close that the rest follows.
+    """Return times and motion (n, 19) at sufficiently close knots.
 
     Args:
         motion: a trajectory (6, 1), for t >= 0.
@@ -49,7 +49,7 @@ def _row(motion: Trajectory, time: float) -> Array:
 def _refine(
     motion: Trajectory, a: Array, b: Array, size: Array, found: list[Array], halves: int
 ) -> None:
-    """Append what is needed after `a`, up to `b`."""
+    """Append the knots after `a`, up to `b`."""
     span = b[0] - a[0]
     off = [
         np.abs(between(a[1:], b[1:], span, share) - evaluate(motion, a[0] + share * span)) / size

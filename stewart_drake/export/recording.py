@@ -61,8 +61,8 @@ class Recorded:
         law: the law, without what records it.
         steps: of it, MOST_SAMPLES at the most.
         first: (n, 6) torques in flight, or (18,) the command before the first sample.
-        motion: (k, 19) times and rows of what the law followed, where it asks at any instant.
-        goal: the same of the reference that it leads back to.
+        motion: times and reference (k, 19), if the law chooses the instants of the reference.
+        goal: the same of the motion that the law returns to.
     """
 
     law: PredictiveLqi | ServoPreview

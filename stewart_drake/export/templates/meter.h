@@ -1,4 +1,4 @@
-/* What the replay measures around each step. meter.c does so on a host; a board brings its own. */
+/* Measures each step of the replay: meter.c on a host; a board has its own. */
 
 #ifndef METER_H
 #define METER_H

@@ -235,7 +235,7 @@ static int get_head(const uint8_t *data, size_t size, stewart_key key, stewart_h
     return h->session == 0 || h->sequence == 0 ? STEWART_MALFORMED : STEWART_TAKEN;
 }
 
-/* The head of a datagram of a kind, whose body has at least so many bytes. */
+/* Read the head of a datagram of a kind with a body of at least `least` bytes. */
 static int get_head_of(const char *magic, size_t least, const uint8_t *data, size_t size,
                        stewart_key key, stewart_head *h, const uint8_t **at, size_t *body)
 {

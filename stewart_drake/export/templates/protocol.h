@@ -1,5 +1,5 @@
-/* The datagrams between a machine and its controller: docs/protocol.md of stewart_drake tells every
-   byte. No state, no allocation. Times are ns; torques N m; angles rad. */
+/* The datagrams between a machine and its controller: docs/protocol.md of stewart_drake defines
+   every byte. No state, no allocation. Times are ns; torques N m; angles rad. */
 
 #ifndef STEWART_PROTOCOL_H
 #define STEWART_PROTOCOL_H
@@ -7,7 +7,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#define STEWART_PROTOCOL 2 /* the version that is spoken here */
+#define STEWART_PROTOCOL 2 /* version of the protocol */
 #define STEWART_LONGEST 1452
 #define STEWART_HEAD 60
 #define STEWART_TAG 16
@@ -131,8 +131,8 @@ int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key,
                           stewart_measured *message);
 int stewart_read_plan(const uint8_t *data, size_t size, stewart_key key, stewart_plan *message);
 
-/* A head alone, which tells a controller of another version which one is spoken here; `data` is
-   its datagram. Returns STEWART_HEAD. */
+/* A head alone, which states this version to a controller of another one; `data` is its datagram.
+   Returns STEWART_HEAD. */
 size_t stewart_write_version(const uint8_t *data, uint8_t *answer);
 
 /* Bit i is set where parts i differ. */

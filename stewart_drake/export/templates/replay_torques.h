@@ -1,6 +1,5 @@
-/* One sample of the recorded run, for the law that sends torques. What was sent then is handed to the
-   controller after each sample: alone, without a plant, it would make more of every rounding with each
-   further one. */
+/* One sample of the recorded run, for the law that sends torques. The torques that were sent
+   are passed to the controller after each sample: without a plant its rounding errors would grow. */
 
 #define ANSWER STEWART_MOTORS
 
@@ -10,7 +9,7 @@ static const real weights[STEPS][2] = {
 static const real sent[STEPS][@TORQUES@ * STEWART_MOTORS] = {
     @SENT@};
 @REPORTS@
-#if @MOVES@ /* the law asks for the reference at instants that it finds itself */
+#if @MOVES@ /* the law chooses the instants of the reference */
 #include "stewart_motion.h"
 
 static void look(void *about, int number, const real *times, real *rows)
@@ -30,7 +29,7 @@ static void look_back(void *about, int number, const real *times, real *rows)
 static real preview[STEPS][STEWART_PREVIEW * STEWART_REFERENCE] = {
     @PREVIEW_ROWS@};
 #endif
-#if @TUNED@ /* which finds the weights itself */
+#if @TUNED@ /* the tuner chooses the weights */
 static const real wanted[STEPS][STEWART_STATES] = {
     @WANTED@};
 static real tuner_memory[STEWART_TUNER_MEMORY];

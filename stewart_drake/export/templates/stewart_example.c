@@ -1,4 +1,4 @@
-/* What the examples over UDP know of the scenario beside the controller. */
+/* Data of the scenario for the examples over UDP. */
 
 #include "stewart_example.h"
 

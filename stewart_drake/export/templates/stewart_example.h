@@ -1,4 +1,4 @@
-/* What the examples over UDP know of the scenario beside the controller: its start, its limits. */
+/* Data of the scenario for the examples over UDP: start, limits, motion. */
 
 #ifndef STEWART_EXAMPLE_H
 #define STEWART_EXAMPLE_H
@@ -8,10 +8,10 @@
 
 extern const real stewart_weights[2];                  /* of errors and of torques */
 extern const real stewart_first_state[STEWART_STATES]; /* of the plate */
-extern const real stewart_least[STEWART_MEASURES];     /* what the measures of the workspace must be above */
+extern const real stewart_least[STEWART_MEASURES];     /* lower limits of the workspace measures */
 extern const real stewart_home_sign;                   /* of the measure of parallel singularity */
 
-/* What both sides must agree on, of the scenario. */
+/* Identity that both sides must agree on. */
 extern const stewart_identity stewart_own_identity;
 /* The words of each fault, with a place for the leg or the duration in s. */
 extern const char *const stewart_faults[STEWART_FAULTS];

@@ -1,4 +1,4 @@
-/* A machine behind a socket, as an example: what a board must do, with a simulated plate in the place
+/* A machine behind a socket, as an example: what a board must do, with a simulated plate instead
    of motors and sensors. See docs/protocol.md.
 
        ./stewart_machine PORT [SECONDS [KEYFILE]]
@@ -17,13 +17,13 @@
 #include "stewart_example.h"
 #include "udp.h"
 
-#define WAITING 1024         /* torques that wait for their time, at the most */
+#define WAITING 1024         /* largest number of waiting torques */
 #define FINEST 1000000u      /* ns, a step of the simulated plate */
 #define WATCHDOG SECOND      /* ns of silence */
 #define FURTHEST (3600ull * SECOND)
-#define STOOD (SECOND / 5)   /* ns by which a process that comes late has stood still */
-#define RECENT (10ull * SECOND) /* for which a fault counts as what came before the next one */
-#define LAST_WORDS 3         /* datagrams at the end: some may be lost */
+#define STALL (SECOND / 5)   /* delay of the process that is reported, ns */
+#define RECENT (10ull * SECOND) /* time for which a fault counts as preceding the next one */
+#define LAST_DATAGRAMS 3     /* datagrams at the end: some may be lost */
 
 enum { LINK = STEWART_LINK_COMMANDS + 7 * STEWART_HISTORY + 9 * WAITING }; /* numbers of its memory */
 
@@ -31,19 +31,19 @@ typedef struct {
     int socket;
     stewart_key key;
     uint64_t started, period;
-    /* who drives, and who may next */
+    /* session */
     stewart_session session;
     stewart_offers offers;
     struct sockaddr_in driver;
-    uint64_t told_refusal; /* session of it */
+    uint64_t refused_session; /* session of it */
     int driven, stopped;
-    /* what acts, and what waits */
+    /* torques */
     stewart_link buffer;
     double link[LINK];
     uint64_t begin, sample;
     int running, safe, left;
     stewart_reason reason, before; /* why torques do not act, and the fault before that */
-    uint64_t preceded, told_until; /* when that was; until when the machine stood still */
+    uint64_t preceded, stalled_until; /* time of `before`; end of the last stall */
     unsigned refused[STEWART_REFUSALS], sent, silences;
     /* the simulated plate */
     uint64_t time;
@@ -63,7 +63,7 @@ static void precede(machine *m, stewart_reason reason, uint64_t time)
     m->preceded = time;
 }
 
-/* Why torques do not act any more. */
+/* Set the reason why torques do not act. */
 static void fail(machine *m, uint8_t fault, uint8_t leg, uint64_t lasted, uint64_t time)
 {
     stewart_reason reason = {fault, leg, lasted}, none = {0, 0, 0};
@@ -74,7 +74,7 @@ static void fail(machine *m, uint8_t fault, uint8_t leg, uint64_t lasted, uint64
     m->reason = reason;
 }
 
-/* In words. */
+/* Return the reason in words. */
 static const char *why(const machine *m)
 {
     static char text[160];
@@ -84,7 +84,7 @@ static const char *why(const machine *m)
 
 /* ---------------------------------------------------------------- the plate: yours */
 
-/* How the plate left its workspace, or STEWART_NO_FAULT. */
+/* Return how the plate left its workspace, or STEWART_NO_FAULT. */
 static uint8_t plate_fault(const machine *m, uint8_t *leg)
 {
     real measures[STEWART_MEASURES];
@@ -106,7 +106,7 @@ static uint8_t plate_fault(const machine *m, uint8_t *leg)
     return measures[6] > stewart_least[6] ? STEWART_NO_FAULT : STEWART_SINGULAR;
 }
 
-/* On to an instant under the torque that acts; brakes hold before the run. */
+/* Advance the plate to a time under the torque that acts; brakes hold before the run. */
 static void plate_follow(machine *m, uint64_t time)
 {
     const stewart_law *c = &stewart_configuration;
@@ -183,7 +183,7 @@ static int alive(const machine *m, uint64_t time)
 static void begin(machine *m)
 {
     if (!alive(m, m->begin)) {
-        printf("nobody was heard when the run should have begun; still parked\n");
+        printf("no controller was heard at the begin of the run: still parked\n");
         m->begin = STEWART_NEVER;
         return;
     }
@@ -199,9 +199,9 @@ static void begin(machine *m)
     printf("the run began at %.3f s\n", 1e-9 * (double)m->begin);
 }
 
-/* ---------------------------------------------------------------- what is said */
+/* ---------------------------------------------------------------- messages */
 
-/* What every datagram says of the machine. */
+/* Fill in the fields of every datagram. */
 static void describe(const machine *m, uint64_t sampled, stewart_measured *s)
 {
     memset(s, 0, sizeof *s);
@@ -222,7 +222,7 @@ static void describe(const machine *m, uint64_t sampled, stewart_measured *s)
     s->before = m->before;
 }
 
-/* A measurement and what has acted, to who drives. */
+/* Send a measurement and the torques that acted to the controller. */
 static void say(machine *m, uint64_t sampled)
 {
     static stewart_measured s;
@@ -241,17 +241,17 @@ static void say(machine *m, uint64_t sampled)
     m->sent += (unsigned)udp_put(m->socket, data, stewart_write_measured(&s, m->key, data), &m->driver);
 }
 
-/* ---------------------------------------------------------------- who drives */
+/* ---------------------------------------------------------------- session */
 
-/* Once for each session: who asks may go on asking. */
+/* Print a refusal, once for each session. */
 static void refuse_aloud(machine *m, uint64_t session, const char *why)
 {
-    if (session != m->told_refusal)
+    if (session != m->refused_session)
         printf("refused a controller: %s\n", why);
-    m->told_refusal = session;
+    m->refused_session = session;
 }
 
-/* The answer to a request for a session; nothing is remembered of it. */
+/* Answer a request for a session, without keeping state of it. */
 static int greet(machine *m, const stewart_plan *request, const struct sockaddr_in *from, uint64_t now)
 {
     static stewart_measured s;
@@ -281,7 +281,7 @@ static int greet(machine *m, const stewart_plan *request, const struct sockaddr_
     return STEWART_TAKEN;
 }
 
-/* Torques; why they are of no use, or STEWART_TAKEN. */
+/* Take a plan; return the cause of its refusal, or STEWART_TAKEN. */
 static int plan_ahead(machine *m, const stewart_plan *plan, uint64_t now)
 {
     if (plan->playout > now + FURTHEST ||
@@ -362,7 +362,7 @@ static void receive(machine *m)
     }
 }
 
-/* All that is due by now, in its order; when there is something next. */
+/* Process all events due by now; return the time of the next one. */
 static uint64_t advance(machine *m, uint64_t now)
 {
     for (;;) {
@@ -375,12 +375,12 @@ static uint64_t advance(machine *m, uint64_t now)
         next = silent < next ? silent : next;
         if (next > now)
             return next;
-        if (m->running && now - next > STOOD && next != silent && now > m->told_until) {
-            stewart_reason stood = {STEWART_STOOD, 0, now - next};
-            m->told_until = now;
-            precede(m, stood, next);
+        if (m->running && now - next > STALL && next != silent && now > m->stalled_until) {
+            stewart_reason stall = {STEWART_STOOD, 0, now - next};
+            m->stalled_until = now;
+            precede(m, stall, next);
             printf("at %.3f s: the machine stood still for %.2f s\n", 1e-9 * (double)next,
-                   1e-9 * (double)stood.lasted);
+                   1e-9 * (double)stall.lasted);
         }
         if (next == silent) {
             m->silences++;
@@ -432,7 +432,7 @@ int main(int argc, char **argv)
         go_safe(&m, now);
     if (!m.left)
         fail(&m, STEWART_ENDED, 0, 0, now);
-    for (int i = 0; i < LAST_WORDS && m.driven; i++)
+    for (int i = 0; i < LAST_DATAGRAMS && m.driven; i++)
         say(&m, now);
     printf("ended after %.1f s: %u measurements sent, %u torques played, %u periods dry, %u silences\n",
            1e-9 * (double)now, m.sent, (unsigned)m.link[STEWART_LINK_PLAYED],

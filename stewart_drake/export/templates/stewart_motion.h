@@ -10,7 +10,7 @@ extern const double stewart_duration; /* s */
 /* The reference at t: pose, rates, accelerations. Before 0 it is that at 0, and for NaN too. */
 void stewart_reference(double t, real *reference);
 
-/* The same of the motion that a law leads back to, where it plans ways. */
+/* The motion that a law with a planner returns to. */
 void stewart_goal(double t, real *reference);
 
 #endif

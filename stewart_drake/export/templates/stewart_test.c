@@ -1,4 +1,4 @@
-/* Replays what the reference in Python was given and compares what it answered. */
+/* Replays a run recorded in Python and compares the torques. */
 
 #include <math.h>
 #include <stdio.h>

@@ -20,11 +20,11 @@
 #include "udp.h"
 
 #define TRIPS 64
-#define ENOUGH 10 /* round trips that tell the clock */
-#define REPEATS 7 /* earlier torques that a datagram says again, for those that get lost */
-#define PLANNED 8 /* torques that it says ahead, for those that will */
+#define ENOUGH 10 /* round trips for the offset of the clock */
+#define REPEATS 7 /* earlier torques that a datagram repeats, against losses */
+#define PLANNED 8 /* planned torques of a datagram, against later losses */
 
-/* Round trips, and the machine's clock less the own one by each: the shortest one counts. */
+/* Round trips, and the offset of the machine's clock by each; the shortest one is used. */
 typedef struct {
     double trip[TRIPS], there[TRIPS], rate;
     unsigned number;
@@ -67,7 +67,7 @@ static unsigned shortest(const other_clock *c)
     return best;
 }
 
-/* The own clock at an instant of the machine's. */
+/* The own clock at a time of the machine's. */
 static uint64_t own_time(const other_clock *c, uint64_t machine)
 {
     return (uint64_t)(((double)machine - c->there[shortest(c)]) / c->rate);
@@ -109,7 +109,7 @@ static void receive(controller *c)
     }
 }
 
-/* A datagram with torques, the first of which is for `playout`. */
+/* Send torques; the first acts at `playout`. */
 static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playout,
                 real torques[][STEWART_MOTORS], unsigned rows)
 {
@@ -129,7 +129,7 @@ static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playou
     udp_put(c->socket, data, stewart_write_plan(&plan, c->key, data), &c->machine);
 }
 
-/* The measurement of an instant, NaN where there is none; its age in periods. */
+/* Take the measurement of an instant, NaN without any; return its age in periods. */
 static int take(controller *c, uint64_t sampled, real *measurement)
 {
     int fresh = c->last.kind == STEWART_STATE && c->last.sampled >= c->used &&
@@ -161,7 +161,7 @@ static uint64_t eta(const controller *c)
     return (uint64_t)((law->steps + (double)law->fraction) * (double)c->last.period + 0.5);
 }
 
-/* The machine says what has acted: where torques came too late, or never, not what was sent. */
+/* Correct the memory by the reported torques, which differ from the sent ones if these came late. */
 static void correct(controller *c, unsigned k)
 {
     real acted[STEWART_HISTORY][STEWART_MOTORS];
@@ -201,7 +201,7 @@ static void compute(controller *c, real *memory, unsigned k, const real *measure
     stewart_note_acted(law, memory, 1, 1, torque);
 }
 
-/* What would follow if no more measurements came: the model stands in for them. */
+/* Plan the torques that follow without further measurements. */
 static void plan(controller *c, unsigned k)
 {
     real nothing[STEWART_STATES];
@@ -216,7 +216,7 @@ static void step(controller *c, unsigned k)
 {
     uint64_t period = c->last.period, sampled = c->begin + k * period;
     real measurement[STEWART_STATES], *torque = c->said[REPEATS];
-    /* Repetitions and plans are of use where a buffer waits; the former for periods to come. */
+    /* Repetitions and plans need a buffer; only torques of future periods are repeated. */
     int waits = !(c->last.head.flags & STEWART_WIRE);
     unsigned steps = (unsigned)stewart_configuration.steps, repeats = steps < k ? steps : k;
     repeats = !waits ? 0 : repeats < REPEATS ? repeats : REPEATS;
@@ -235,7 +235,7 @@ static void step(controller *c, unsigned k)
     c->missed += udp_now() > own_time(&c->clock, sampled + period);
 }
 
-/* Why a machine is not driven, or NULL. */
+/* Return why a machine is not driven, or NULL. */
 static const char *objection(const controller *c)
 {
     static char text[512], own[160], other[160];
@@ -268,7 +268,7 @@ static const char *in_use(const controller *c)
     return text;
 }
 
-/* Why the machine does not go on, or NULL. */
+/* Return why the machine does not continue, or NULL. */
 static const char *fault(const controller *c)
 {
     static char text[200];
@@ -282,7 +282,7 @@ static const char *fault(const controller *c)
     return text;
 }
 
-/* A session and a run that will begin, or why not. */
+/* Agree on a session and a begin; return why not, or NULL. */
 static const char *greet(controller *c)
 {
     uint64_t patience = udp_now() + 10ull * SECOND;
@@ -310,7 +310,7 @@ static const char *greet(controller *c)
     return NULL;
 }
 
-/* One sample after the other; why it ended before its time, or NULL. */
+/* Run all samples; return why the run ended early, or NULL. */
 static const char *drive(controller *c)
 {
     unsigned number = (unsigned)(c->seconds / (double)stewart_configuration.period + 0.5);

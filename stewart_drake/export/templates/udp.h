@@ -1,4 +1,4 @@
-/* What the two examples need of POSIX: a clock that nobody sets, a socket that never blocks, a key. */
+/* POSIX functions of the two examples: monotonic clock, non-blocking socket, key. */
 
 #ifndef STEWART_UDP_H
 #define STEWART_UDP_H
@@ -10,14 +10,14 @@
 
 #define SECOND 1000000000u
 
-/* ns of the own clock. */
+/* Monotonic clock, ns. */
 uint64_t udp_now(void);
 
-/* Random bytes of the system; 0 where there are none, which is told. */
+/* Random bytes of the system; prints an error and returns 0 if there are none. */
 int udp_draw(void *bytes, size_t size);
 
 /* A socket at a port, 0 for any, of the loopback interface or, with a key, of all; -1 on an error,
-   which is told. */
+   which is printed. */
 int udp_open(uint16_t port, stewart_key key);
 
 /* Wait for a datagram, at the longest until an instant of the own clock. */
@@ -26,12 +26,13 @@ void udp_wait(int socket, uint64_t until);
 /* Whether there was a datagram, and its size, of up to STEWART_LONGEST + 1 bytes, which may be 0. */
 int udp_get(int socket, uint8_t *data, size_t *size, struct sockaddr_in *from);
 
-/* Whether it went out. */
+/* Whether the datagram was sent. */
 int udp_put(int socket, const uint8_t *data, size_t size, const struct sockaddr_in *to);
 
 int udp_same(const struct sockaddr_in *one, const struct sockaddr_in *other);
 
-/* The key of a file, NULL for none; with no bytes if it has not 16 to 4096, which is told. */
+/* The key of a file, NULL for none. Prints an error and returns an empty key unless it has 16 to
+   4096 bytes. */
 stewart_key udp_key(const char *path);
 
 /* See `stewart_nonce`. */
@@ -40,7 +41,7 @@ uint64_t udp_nonce(const stewart_offers *offers, uint64_t session, const struct 
 /* Whether Ctrl-C was pressed since this was called first. */
 int udp_interrupted(void);
 
-/* Datagrams that were not acted upon, by cause. */
+/* Print the number of refused datagrams by cause. */
 void udp_tell(const unsigned *refused);
 
 /* Why torques do not act, in words. */
