@@ -503,7 +503,7 @@ def test_what_does_not_fit_is_refused():
     for wrong in ("controller.estimate=[]", "controller.prediction=linear"):
         with pytest.raises(ConfigError, match=r"controller\.delay_estimator: got 'constant'"):
             looped(wrong)
-    with pytest.raises(ConfigError, match=r"controller\.delay_max: got 0\.5 .* believed"):
+    with pytest.raises(ConfigError, match=r"controller\.delay_max: got 0\.5 .* assumed delay"):
         looped("controller.delay_max=0.5")
 
 
