@@ -2,8 +2,8 @@
 
 `python benchmarks/fresh.py` prints E_ac of each condition, and its ratio to 0.2's. A condition is a
 machine, a motion, a delay, a period, a sensor, a link and unknown parameters, drawn from SEED. Each
-runs with three seeds of its noise and signs, on the exact plant. fresh_0.2.json has the same runs of
-0.2's law: condition, seed, E_ac.
+runs with three seeds of its noise and signs, on the exact plant. fresh_0.2.json has the same runs
+of 0.2's law: condition, seed, E_ac.
 """
 
 import json
