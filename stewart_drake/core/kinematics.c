@@ -1,9 +1,7 @@
 /* See kinematics.h. */
 
-#include "kinematics.h"
-#include "short.h"
+#include "legs.h"
 
-#define DEAD_CENTRE_SINE ((real)0.01) /* core/layout.py */
 #define NEWTON_STEPS 50
 #define LEAST_STEP ((real)1e-3) /* share of Newton's */
 #define WRONG_BRANCH ((real)1e-5)
@@ -17,62 +15,6 @@
 #define DEAD_CENTRE 1e-7 /* |rod.tangent| that counts as zero: acos resolves angles to 1.5e-8 rad there */
 #endif
 
-/* The numbers of a leg. */
-typedef struct {
-    real crank, rod, branch, R[3][3] /* R_WS */, joint[3] /* p_PQ */, shaft[3] /* p_WS */;
-} Leg;
-
-static Leg leg_of(const real *geometry, int i)
-{
-    const real *own = geometry + i;
-    Leg leg = {own[0], own[LEGS], own[2 * LEGS], {{0}}, {0}, {0}};
-    for (int a = 0; a < 3; a++) {
-        for (int b = 0; b < 3; b++)
-            leg.R[b][a] = own[LEGS * (3 + 3 * a + b)];
-        leg.joint[a] = own[LEGS * (12 + a)];
-        leg.shaft[a] = own[LEGS * (15 + a)];
-    }
-    return leg;
-}
-
-/* R_WP of roll, pitch and yaw, and E. */
-typedef struct {
-    real R[3][3], E[3][3];
-} Turn;
-
-static Turn turn_of(const real *angles)
-{
-    const real sf = REAL(sin)(angles[0]), cf = REAL(cos)(angles[0]);
-    const real st = REAL(sin)(angles[1]), ct = REAL(cos)(angles[1]);
-    const real sp = REAL(sin)(angles[2]), cp = REAL(cos)(angles[2]);
-    return (Turn){{{cp * ct, cp * st * sf - sp * cf, cp * st * cf + sp * sf},
-                   {sp * ct, sp * st * sf + cp * cf, sp * st * cf - cp * sf},
-                   {-st, ct * sf, ct * cf}},
-                  {{cp * ct, -sp, 0}, {sp * ct, cp, 0}, {-st, 0, 1}}};
-}
-
-static real dot(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
-/* arm (3), from the plate's COM to the joint, and q (3), in the motor's frame. */
-static void joint_of(const Leg *leg, const Turn *turn, const real *pose, real *arm, real *q)
-{
-    real p[3];
-    for (int i = 0; i < 3; i++) {
-        arm[i] = dot(turn->R[i], leg->joint);
-        p[i] = pose[3 + i] + arm[i] - leg->shaft[i];
-    }
-    for (int j = 0; j < 3; j++)
-        q[j] = leg->R[0][j] * p[0] + leg->R[1][j] * p[1] + leg->R[2][j] * p[2];
-}
-
-/* Crank angle for a joint at q; NaN out of reach. */
-static real angle_of(const Leg *leg, const real *q)
-{
-    const real a = 2 * leg->crank * q[0], b = 2 * leg->crank * q[1];
-    const real c = dot(q, q) + leg->crank * leg->crank - leg->rod * leg->rod;
-    return REAL(atan2)(b, a) + leg->branch * REAL(acos)(c / REAL(hypot)(a, b));
-}
-
 void stewart_crank_angles(const real *geometry, const real *pose, real *angles)
 {
     const Turn turn = turn_of(pose);
@@ -81,60 +23,6 @@ void stewart_crank_angles(const real *geometry, const real *pose, real *angles)
         real arm[3], q[3];
         joint_of(&leg, &turn, pose, arm, q);
         angles[i] = angle_of(&leg, q);
-    }
-}
-
-int stewart_within_reach(const real *geometry, const real *pose, int strictly)
-{
-    const Turn turn = turn_of(pose);
-    for (int i = 0; i < LEGS; i++) {
-        const Leg leg = leg_of(geometry, i);
-        real arm[3], q[3];
-        joint_of(&leg, &turn, pose, arm, q);
-        const real rho = REAL(hypot)(q[0], q[1]), shortest = REAL(hypot)(rho - leg.crank, q[2]);
-        const real longest = REAL(hypot)(rho + leg.crank, q[2]);
-        const real margin = REAL(fmin)(leg.rod - shortest, longest - leg.rod);
-        if (!(strictly ? margin > 0 : margin >= 0)) /* or NaN */
-            return 0;
-    }
-    return 1;
-}
-
-real stewart_margin(const real *geometry, const real *pose, real sign, const real *least)
-{
-    real measures[STEWART_MEASURES], margin = (real)HUGE_VAL;
-    stewart_measures(geometry, pose, NULL, measures);
-    measures[6] *= sign;
-    for (int i = 0; i < STEWART_MEASURES; i++) {
-        const real above = measures[i] - least[i];
-        if (above < margin || isnan(above))
-            margin = above;
-    }
-    return margin;
-}
-
-int stewart_is_workable(const real *geometry, const real *pose)
-{
-    real measures[STEWART_MEASURES];
-    if (!stewart_within_reach(geometry, pose, 1))
-        return 0;
-    stewart_measures(geometry, pose, NULL, measures);
-    for (int i = 0; i < LEGS; i++)
-        if (measures[i] < DEAD_CENTRE_SINE)
-            return 0;
-    return 1;
-}
-
-/* row (6) = [(arm x along)' E, along'] / scale. */
-static void row_of(const Turn *turn, const real *arm, const real *along, real scale, real *row)
-{
-    const real moment[3] = {arm[1] * along[2] - arm[2] * along[1],
-                            arm[2] * along[0] - arm[0] * along[2],
-                            arm[0] * along[1] - arm[1] * along[0]};
-    for (int j = 0; j < 3; j++) {
-        row[j] = (moment[0] * turn->E[0][j] + moment[1] * turn->E[1][j] + moment[2] * turn->E[2][j])
-                 / scale;
-        row[3 + j] = along[j] / scale;
     }
 }
 

@@ -20,10 +20,6 @@ void stewart_crank_angles(const real *geometry, const real *pose, real *angles);
 /* Whether all legs reach a pose; `strictly`: and can still move there. */
 int stewart_within_reach(const real *geometry, const real *pose, int strictly);
 
-/* Least distance of the measures of a pose above `least` (8); NaN if one of them is NaN. `sign` is that
-   of the parallel measure at home. */
-real stewart_margin(const real *geometry, const real *pose, real sign, const real *least);
-
 /* Whether a plate at a pose can be regulated: all legs are within reach, none at a dead centre. */
 int stewart_is_workable(const real *geometry, const real *pose);
 

@@ -1,6 +1,5 @@
 /* Plans: see planning.h. */
 
-#include "kinematics.h"
 #include "planning.h"
 #include "reference.h"
 #include "short.h"
@@ -19,6 +18,20 @@
 /* Share of the motion by which a prediction is off, when the delay was just found and else. */
 #define SURPRISE ((real)0.02)
 #define OFF ((real)0.08)
+
+real stewart_margin(const real *geometry, const real *pose, real sign, const real *least)
+{
+    real measures[STEWART_MEASURES], margin = (real)HUGE_VAL;
+    stewart_measures(geometry, pose, NULL, measures);
+    measures[6] *= sign;
+    for (int i = 0; i < STEWART_MEASURES; i++) {
+        const real above = measures[i] - least[i];
+        if (above < margin || isnan(above))
+            margin = above;
+    }
+    return margin;
+}
+
 /* The longest that a leg reaches, crank and rod in line, m. */
 static real reach(const real *geometry)
 {

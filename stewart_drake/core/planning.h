@@ -10,6 +10,10 @@ enum {
     STEWART_MOST_HOLDS = 100    /* torques in a plan */
 };
 
+/* Least distance of the measures of a pose above `least` (8); NaN if one of them is NaN. `sign` is that
+   of the parallel measure at home. */
+real stewart_margin(const real *geometry, const real *pose, real sign, const real *least);
+
 /* Where a plan that begins at an instant needs the reference: its end, and two nodes of the period
    after it. */
 void stewart_plan_times(real begin, real period, int periods, real times[3]);

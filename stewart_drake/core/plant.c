@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "dop853.h"
+#include "planning.h"
 #include "plant.h"
 #include "reference.h"
 #include "short.h"

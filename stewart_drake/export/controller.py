@@ -39,8 +39,17 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 SOURCES: Final = (
-    *("real.h", "short.h", "equations.h", "packets.h", "observer.h", "law.h"),
-    *("matrix", "dynamics", "machine", "kinematics", "riccati", "design", "timeline.c"),
+    *(
+        "real.h",
+        "short.h",
+        "equations.h",
+        "packets.h",
+        "observer.h",
+        "law.h",
+        "legs.h",
+        "kinematics.h",
+    ),
+    *("matrix", "dynamics", "machine", "reach.c", "riccati", "design", "timeline.c"),
 )
 """Sources of core/ that every law needs; a name without a suffix stands for header and source."""
 MACHINE: Final = ("link.h", "link.c")

@@ -113,7 +113,7 @@ class CompiledLaw:
             c.lib.stewart_prepare(self.data)
         else:
             self.data = c.ffi.new("stewart_servo *")
-            self.sources = ("servo", "kinematics", *part.sources)
+            self.sources = ("servo", "kinematics.c", *part.sources)
             self._fill(self.data.law)
             self.data.law.parts, self.data.periods = law.reports.parts, law.reports.periods
             c.lib.stewart_servo_prepare(self.data)

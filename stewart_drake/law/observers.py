@@ -212,13 +212,16 @@ class Part(NamedTuple):
 _KALMAN: Final = ("sensing", "instant", "kalman")
 _SOURCES: Final[dict[str, tuple[str, ...]]] = {
     "state": ("observers", "sensing"),
-    "differences": ("observers", "sensing", "encoders", "differences_observer.c"),
+    "differences": ("observers", "sensing", "encoders", "kinematics.c", "differences_observer.c"),
     "filter": ("observers", "filter_observers", "filter", "filter_attempt.h", *_KALMAN),
     "delay": ("delay_observer", "delay", "delay_search.c", "arrivals", *_KALMAN),
 }
 _SOURCES["gap"] = _SOURCES["filter"]
-_SOURCES["encoder"] = (*_SOURCES["filter"], "encoders", "encoder_filter.c")
-_SOURCES["encoder_delay"] = (*_SOURCES["delay"], "encoders", "encoder_delay_observer.c")
+_SOURCES["encoder"] = (*_SOURCES["filter"], "encoders", "kinematics.c", "encoder_filter.c")
+_SOURCES["encoder_delay"] = (
+    *_SOURCES["delay"],
+    *("encoders", "kinematics.c", "encoder_delay_observer.c"),
+)
 """Files of the core for each kind of observer."""
 
 

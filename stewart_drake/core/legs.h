@@ -1,0 +1,75 @@
+/* The vectors of a leg at a pose, for the sources of kinematics.h. */
+
+#pragma once
+
+#include "kinematics.h"
+#include "short.h"
+
+/* The numbers of a leg. */
+typedef struct {
+    real crank, rod, branch, R[3][3] /* R_WS */, joint[3] /* p_PQ */, shaft[3] /* p_WS */;
+} Leg;
+
+static inline Leg leg_of(const real *geometry, int i)
+{
+    const real *own = geometry + i;
+    Leg leg = {own[0], own[LEGS], own[2 * LEGS], {{0}}, {0}, {0}};
+    for (int a = 0; a < 3; a++) {
+        for (int b = 0; b < 3; b++)
+            leg.R[b][a] = own[LEGS * (3 + 3 * a + b)];
+        leg.joint[a] = own[LEGS * (12 + a)];
+        leg.shaft[a] = own[LEGS * (15 + a)];
+    }
+    return leg;
+}
+
+/* R_WP of roll, pitch and yaw, and E. */
+typedef struct {
+    real R[3][3], E[3][3];
+} Turn;
+
+static inline Turn turn_of(const real *angles)
+{
+    const real sf = REAL(sin)(angles[0]), cf = REAL(cos)(angles[0]);
+    const real st = REAL(sin)(angles[1]), ct = REAL(cos)(angles[1]);
+    const real sp = REAL(sin)(angles[2]), cp = REAL(cos)(angles[2]);
+    return (Turn){{{cp * ct, cp * st * sf - sp * cf, cp * st * cf + sp * sf},
+                   {sp * ct, sp * st * sf + cp * cf, sp * st * cf - cp * sf},
+                   {-st, ct * sf, ct * cf}},
+                  {{cp * ct, -sp, 0}, {sp * ct, cp, 0}, {-st, 0, 1}}};
+}
+
+static inline real dot(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+/* arm (3), from the plate's COM to the joint, and q (3), in the motor's frame. */
+static inline void joint_of(const Leg *leg, const Turn *turn, const real *pose, real *arm, real *q)
+{
+    real p[3];
+    for (int i = 0; i < 3; i++) {
+        arm[i] = dot(turn->R[i], leg->joint);
+        p[i] = pose[3 + i] + arm[i] - leg->shaft[i];
+    }
+    for (int j = 0; j < 3; j++)
+        q[j] = leg->R[0][j] * p[0] + leg->R[1][j] * p[1] + leg->R[2][j] * p[2];
+}
+
+/* Crank angle for a joint at q; NaN out of reach. */
+static inline real angle_of(const Leg *leg, const real *q)
+{
+    const real a = 2 * leg->crank * q[0], b = 2 * leg->crank * q[1];
+    const real c = dot(q, q) + leg->crank * leg->crank - leg->rod * leg->rod;
+    return REAL(atan2)(b, a) + leg->branch * REAL(acos)(c / REAL(hypot)(a, b));
+}
+
+/* row (6) = [(arm x along)' E, along'] / scale. */
+static inline void row_of(const Turn *turn, const real *arm, const real *along, real scale, real *row)
+{
+    const real moment[3] = {arm[1] * along[2] - arm[2] * along[1],
+                            arm[2] * along[0] - arm[0] * along[2],
+                            arm[0] * along[1] - arm[1] * along[0]};
+    for (int j = 0; j < 3; j++) {
+        row[j] = (moment[0] * turn->E[0][j] + moment[1] * turn->E[1][j] + moment[2] * turn->E[2][j])
+                 / scale;
+        row[3 + j] = along[j] / scale;
+    }
+}
