@@ -136,7 +136,7 @@ def record_analyses(found, arrays):
 
 
 def record_identify(found, arrays):
-    """A short run is identified from its signals, through the command."""
+    """Identify the machine of a short run from its signals, through the command."""
     with TemporaryDirectory() as folder:
         run = ["simulate", "desktop", "--set", "plant.kind=exact", "--set", "overlay=dirty"]
         _json_of([*run, "--set", "duration=3", "--out", folder])

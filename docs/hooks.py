@@ -26,7 +26,7 @@ REMOTE: Final = re.compile(r"<(?:script|img|iframe|link rel=.stylesheet)[^>]*(?:
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Adds the README and what stands outside of docs/."""
+    """Add the README and what stands outside of docs/."""
     found = sorted(path for pattern in FOLDERS for path in ROOT.glob(pattern))
     for path in (*OUTSIDE, *(str(path.relative_to(ROOT)) for path in found)):
         files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
@@ -61,7 +61,7 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
 
 @functools.cache
 def abbreviations() -> str:
-    """The terms of docs/terms.md, for the extension that explains them wherever they stand."""
+    """Return the terms of docs/terms.md for the extension that explains them in each page."""
     text = (ROOT / "docs" / "terms.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (.+?) \| (.+) \|$", text, re.MULTILINE)[2:]  # below the heading
     told = (f"*[{term}]: {meaning.replace('`', '')}" for term, meaning in rows)

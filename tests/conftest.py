@@ -21,7 +21,7 @@ terminal.EVERY = 3600.0
 
 @pytest.fixture(scope="session")
 def one_browser() -> Iterator[Browser]:
-    """The browser of a session, which takes seconds to start."""
+    """Return the browser of a session, which takes seconds to start."""
     with browser() as opened:
         yield opened
 

@@ -52,7 +52,7 @@ def exchange() -> list[Message]:
     zero, found = clock.time, list[Message]()
 
     def says(message: ControllerMessage, milliseconds: int, answer_at: int | None = None) -> None:
-        """A datagram that arrives; what the machine sends next."""
+        """Deliver a datagram; return the machine's next ones."""
         time = milliseconds * MILLISECOND
         clock.time = zero + time
         machine.advance(time)

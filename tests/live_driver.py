@@ -103,7 +103,7 @@ class Driver:
         return message
 
     def step(self, time: int, own: int | None = None) -> ControllerMessage:
-        """The sample that is due at a time of the machine's clock; `own` is another one's."""
+        """Return the sample due at a time of the machine's clock; `own` is another clock's."""
         own = time if own is None else own
         number = (time - self.begin) // self.period
         self.receive(own)

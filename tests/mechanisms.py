@@ -23,7 +23,7 @@ def random_inertia(rng: np.random.Generator, scale: float) -> Array:
 
 
 def random_mechanism(rng: np.random.Generator) -> Mechanism:
-    """A mechanism with no symmetry left: legs, motor frames, lengths and inertias all differ."""
+    """Return a mechanism without symmetry: legs, motor frames, lengths and inertias differ."""
     while True:
         tilt = [_small_rotation(rng, 0.3) for _ in range(6)]
         scale = rng.uniform(0.5, 3.0)
@@ -51,7 +51,7 @@ def random_mechanism(rng: np.random.Generator) -> Mechanism:
 def random_pose(
     rng: np.random.Generator, mechanism: Mechanism, least_transmission: float = 0.2
 ) -> Array:
-    """A pose (6,) within reach, every leg at least arcsin(least_transmission) off dead centre."""
+    """Return a pose (6,) within reach, all legs arcsin(least_transmission) or more off dead centre."""
     size = mechanism.rod_lengths.mean() / PAPER.rod_lengths.mean()
     scale = SPREAD * ([1] * 3 + [size] * 3)
     while True:

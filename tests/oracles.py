@@ -294,7 +294,7 @@ def central_difference_linearization(
     parameters: Array = NO_PARAMETERS,
     step: float = 1e-4,
 ) -> tuple[Array, Array]:
-    """A (12, 12) and B (12, 6) of d state / dt."""
+    """Return A (12, 12) and B (12, 6) of d state / dt."""
     a = tree.accelerations
     return (
         central_difference(field(a, torque, parameters), state, step),

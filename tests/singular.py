@@ -45,7 +45,7 @@ def parallel_rods() -> Mechanism:
 
 
 def write_mechanism(mechanism: Mechanism, path: Path) -> Path:
-    """A mechanism file with explicit legs; JSON is YAML."""
+    """Return a mechanism file with explicit legs; JSON is YAML."""
     legs = [
         {
             "shaft": p_WS.tolist(),

@@ -127,7 +127,7 @@ def test_a_motion_out_of_reach_gets_a_verdict(kind, gravity, tmp_path, capsys):
 
 
 def singular_mechanism(folder):
-    """The paper's machine, assembled where its rods cannot hold it against one motion."""
+    """Return the paper's machine, assembled where its rods cannot hold it against one motion."""
 
     def rolled(angle):
         return np.concatenate([[angle], PAPER.home[1:]])

@@ -41,7 +41,7 @@ def seek(tab, time):
 
 
 def scene(tab):
-    """The middle of the canvas, where no panel covers the machine."""
+    """Return the middle of the canvas, where no panel covers the machine."""
     return tab.screenshot()[60:620, 380:900]
 
 

@@ -18,7 +18,7 @@ BIAS = "plant.torque_bias=[3e-4,-3e-4,3e-4,-3e-4,3e-4,-3e-4]"
 
 
 def run(*settings, controller=None):
-    """The paper's scenario with settings."""
+    """Return the paper's scenario with settings."""
     return sd.simulate(
         sd.load_scenario("paper", controller=controller, settings=settings), judge_stability=False
     )

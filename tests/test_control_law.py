@@ -46,7 +46,7 @@ LINEAR = (*PLAIN, "controller.prediction=linear")
 
 
 def law_of(*settings, controller=None, limit=None, **plant):
-    """The law of the paper's scenario, started on the reference, with settings.
+    """Return the law of the paper's scenario, started on the reference, with settings.
 
     `limit` is the motors', N m; `plant` changes what is believed of the plant.
     """
@@ -68,12 +68,12 @@ def _law(settings, controller):
 
 
 def at_home(law):
-    """A preview that asks to stay at home."""
+    """Return a preview that asks to stay at home."""
     return np.tile(HOME, (len(law.preview_times), 1))
 
 
 def sampled(law, **parts):
-    """A memory after some sample, with random parts where none are given."""
+    """Return a memory after some sample, with random parts where none are given."""
     rng = np.random.default_rng(1)
     length = law.timeline.queue_length
     memory = law.initial_memory(np.zeros((length, 6)))
@@ -137,7 +137,7 @@ PAPERS = make_reference(load_scenario("paper").reference, 10.0)
 
 
 def sine(size=1.0):
-    """The trajectory (46) at a share of its amplitude."""
+    """Return the trajectory (46) at a share of its amplitude."""
     rest = evaluate(PAPERS, 0.0) * np.repeat([1.0, 0, 0], 6)
     return lambda t: rest + size * (evaluate(PAPERS, t) - rest)
 

@@ -304,7 +304,7 @@ def test_the_fastest_pole_is_reported_where_it_is(tmp_path):
 
 
 def shrunk(folder, scale):
-    """Settings of the paper's machine and motion at `scale`, under gravity."""
+    """Return settings of the paper's machine and motion at `scale`, under gravity."""
     data = yaml.safe_load(resolve("mechanism", "paper").read_text())
     data["home"] = [scale * value for value in data["home"]]
     for name in ("base_radius", "plate_radius", "shaft_height"):

@@ -66,7 +66,7 @@ def base(*settings, controller="delay_lqi"):
 
 
 def shrink(patch):
-    """A grid of two delays, one frequency and three pairs."""
+    """Return a grid of two delays, one frequency and three pairs."""
     patch.setattr(families, "DELAYS", (0, 3))
     patch.setattr(families, "FREQUENCIES", (2.0,))
     patch.setattr(families, "PAIRS", ((0.1, 4.0), (1.0, 1.0), (4.0, 0.1)))
@@ -184,7 +184,7 @@ def test_the_hash_sees_every_value(data):
 
 
 def made_up(error, weights=PAIRS):
-    """A data set of one cell with these errors."""
+    """Return a data set of one cell with these errors."""
     n = len(error)
     return xr.Dataset(
         {
@@ -292,7 +292,7 @@ def test_a_draw_has_one_fault_within_its_range(name):
 
 
 def faulty(name, *settings):
-    """The base of a family with faults."""
+    """Return the base of a family with faults."""
     return faulty_family(name, 0, 0, "training", settings).base
 
 

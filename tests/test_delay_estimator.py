@@ -213,7 +213,7 @@ def guesses_of(belief):
 
 
 def observed(torques, measured, believed, **changes):
-    """The beliefs at all samples."""
+    """Return the beliefs at all samples."""
     observer = CoreObserver(SETTINGS, replace(DELAY, mean=believed, **changes))
     belief = observer.start(Timeline(DT, Delay(0)), SENSING, PLANT)
     in_flight = np.zeros((observer.kept(DT) + 1, 6))

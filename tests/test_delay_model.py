@@ -43,7 +43,7 @@ def continuous_models(draw):
 
 
 def platforms():
-    """The paper's double integrators, and the machine under gravity, which is unstable."""
+    """Return the paper's double integrators, and the machine under gravity, which is unstable."""
     return {
         "paper": double_integrators(torque_map(PAPER, PAPER.home)),
         "gravity": linear_model(*StewartDynamics(PAPER, gravity=True).linearize(PAPER.home)),
@@ -95,7 +95,7 @@ def simulate_delayed(model, period, steps, fraction, start, torques):
 
 
 def assert_chain_agrees(model, period, steps, fraction, integral, extra, rng):
-    """The chain gives the errors and integrals of the oracle, and carries the right queue."""
+    """Check errors, integrals and queue of the chain against the oracle."""
     n, m = model.B.shape
     torques = {k: rng.normal(0, 1, m) for k in range(-steps - 1, SAMPLES + 1)}
     start = rng.normal(0, 1, n)

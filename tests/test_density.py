@@ -39,7 +39,7 @@ def oracle(column, kind):
 
 
 def record(*column):
-    """Samples (N, 18) whose signals are all the same."""
+    """Return samples (N, 18) whose signals are all the same."""
     return np.tile(np.array(column)[:, None], NUM_INPUTS)
 
 

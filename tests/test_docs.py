@@ -88,7 +88,7 @@ def blocks(*languages):
 
 
 def prose(path):
-    """A document without its fenced blocks; of the changelog what is not history."""
+    """Return a document without its fenced blocks; of the changelog what is not history."""
     return FENCE.sub("", path.read_text(encoding="utf-8")).split("\n## [0.1.0]")[0]
 
 
@@ -126,7 +126,7 @@ def functions_in(path):
 
 @functools.cache
 def sources():
-    """The texts of the package, the Makefile and the data files."""
+    """Return the texts of the package, the Makefile and the data files."""
     package = (path for kind in ("py", "j2", "c", "h") for path in PACKAGE.rglob(f"*.{kind}"))
     paths = (*package, ROOT / "Makefile", ROOT / "mkdocs.yml")
     data = (*(ROOT / "models").rglob("*.yaml"), *(ROOT / "diagrams").rglob("*.yaml"))
@@ -219,7 +219,7 @@ def is_name(dotted):
 
 @functools.cache
 def loop():
-    """The closed loop of the paper's scenario, with the exact plant."""
+    """Return the closed loop of the paper's scenario, with the exact plant."""
     return sd.build_closed_loop(sd.load_scenario("paper", settings=["plant.kind=exact"]))
 
 
@@ -417,7 +417,7 @@ def command_lines(block):
 
 
 def parse(arguments):
-    """The parameters of a call, by the command line's own parser; nothing is run."""
+    """Return the parameters of a call, by the command line's own parser; nothing is run."""
     typer = pytest.importorskip("typer")
     cli = pytest.importorskip("stewart_drake.cli")
     command, name, parameters = typer.main.get_command(cli.app), "stewart-drake", {}

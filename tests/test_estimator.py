@@ -61,7 +61,7 @@ def start(y, assumed=ASSUMED):
 
 
 def advance(estimate, period, y, assumed=ASSUMED):
-    """A period, and a measurement (12,) or none at its end."""
+    """Advance the filter by a period, with a measurement (12,) or none at its end."""
     return assumed.advance(estimate, period, y)
 
 
@@ -79,7 +79,7 @@ def transition(dynamics, xi, period):
 
 
 def within_bounds(mean, covariance, box):
-    """The mean (20,) that the core finds."""
+    """Return the mean (20,) that the core finds."""
     c, n, free, moved = core(), len(mean), np.full(12, np.inf), np.empty(len(mean))
     root = np.linalg.cholesky(covariance)
     bounds = np.concatenate([-free, box.lower]), np.concatenate([free, box.upper])
@@ -101,7 +101,7 @@ class Run(NamedTuple):
 
 
 def acted(torques, durations, substeps=SUBSTEPS):
-    """A period whose last torque goes on."""
+    """Return a period whose last torque goes on."""
     return Period(torques, durations, torques[-1], substeps)
 
 

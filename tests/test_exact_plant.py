@@ -41,7 +41,7 @@ AT_HOME = np.concatenate([PAPER.home, np.zeros(6)])
 
 
 def simulator_of(plant, state, torque, scheme):
-    """A simulator of one plant from a state, under a constant torque."""
+    """Return a simulator of one plant from a state, under a constant torque."""
     simulator = Simulator(plant)
     context = simulator.get_mutable_context()
     plant.set_state(context, state)
@@ -323,7 +323,7 @@ def test_absurd_speeds_end_in_the_first_step():
 
 
 def crossing(mechanism, seed):
-    """A pose on a parallel singularity well off dead centres, and a direction across it."""
+    """Return a pose on a parallel singularity well off dead centres, and a direction across it."""
     rng, sign = np.random.default_rng(seed), home_sign(mechanism)
     scale = np.array([1, 1, 1, 0.3, 0.3, 0.3])
 

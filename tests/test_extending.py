@@ -17,7 +17,7 @@ EXAMPLES = dict(
 
 @functools.cache
 def example(title):
-    """The names that are there when its last line has run."""
+    """Return the names that are there when its last line has run."""
     names = {"__name__": "__main__"}
     exec(compile(EXAMPLES[title], f"{GUIDE}: {title}", "exec", dont_inherit=True), names)
     return names

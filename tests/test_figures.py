@@ -42,7 +42,7 @@ def comparison(run):
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The figures by name, instead of their files."""
+    """Return the figures by name, instead of their files."""
     kept = {}
     monkeypatch.setattr(figures, "write_figures", lambda made, _: kept.update(made) or [])
     return kept
@@ -54,7 +54,7 @@ def limits(ax):
 
 @pytest.fixture(scope="module")
 def written(run, tmp_path_factory):
-    """The folder of one run's figures."""
+    """Return the folder of one run's figures."""
     before = dict(plt.rcParams)
     folder = tmp_path_factory.mktemp("figures")
     paths = run_figures(run, folder)

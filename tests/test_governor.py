@@ -28,7 +28,7 @@ def governor(name="paper", gravity=False, limit=np.inf):
 
 
 def ways(one, begin, targets, each=30):
-    """The states (n, 18) of a run in steps of 1 ms, and the last memory; targets one by one."""
+    """Return the states (n, 18) of a run in steps of 1 ms, and the last memory."""
     now, states = begin, []
     for target in targets:
         for _ in range(each):

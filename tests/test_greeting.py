@@ -56,7 +56,7 @@ __all__ = ["quiet_machine"]
 
 
 def request_of(driver, sequence=1):
-    """A request for a session, as somebody may record it."""
+    """Return a request for a session, as somebody may record it."""
     driver.session._sent = sequence - 1
     return encode(ControllerMessage(driver.session.head(0), identity=driver.identity), KEY)
 
@@ -185,7 +185,7 @@ def answering(reply):
 
 @pytest.fixture
 def contact_with():
-    """Makes a contact with a machine that always answers the same."""
+    """Make a contact with a machine that always answers the same."""
     made = []
 
     def contact(reply):

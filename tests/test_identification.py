@@ -162,7 +162,7 @@ def test_the_model_with_drawn_legs_is_the_same():
 
 
 def short_log(times, mechanism=PAPER, delay=0.23, gravity=0.0):
-    """A log of torques at 0, 0.1, ... s, and the states behind it."""
+    """Return a log of torques at 0, 0.1, ... s, and the states behind it."""
     first = np.concatenate([mechanism.home, [0.1, -0.1, 0.2, 0.02, -0.01, 0.03]])
     sent = 0.1 * np.arange(8)
     torques = np.vstack([TORQUES, -TORQUES, TORQUES[:2]])
@@ -494,7 +494,7 @@ def test_the_delay_is_found_in_a_short_log_of_a_lost_run(case):
 
 @pytest.fixture(scope="module")
 def short_run_log(tmp_path_factory):
-    """The first 1.2 s of a log with a delay of 0.8 s and noise; the queue was empty."""
+    """Return the first 1.2 s of a log with a delay of 0.8 s and noise; the queue was empty."""
     folder = tmp_path_factory.mktemp("short")
     short_logs.short_run("paper", 0.8, 1e-3, 4000).save(folder)
     return up_to(read_log(folder / "signals.nc", PAPER, Precision()), 1.2)

@@ -99,7 +99,7 @@ def test_a_bad_csv_log_is_reported_in_one_line(tmp_path, text, named):
 
 @pytest.fixture(scope="module")
 def lost(tmp_path_factory):
-    """The log of a run whose delay is believed to be 0.8 s and is 0.93 s."""
+    """Return the log of a run whose delay is believed to be 0.8 s and is 0.93 s."""
     folder = tmp_path_factory.mktemp("lost")
     settings = (
         "plant.kind=exact", "start=on_reference", "queue=reference", "controller.delay_steps=8",

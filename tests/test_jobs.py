@@ -173,7 +173,7 @@ def test_a_killed_worker_costs_the_jobs_in_flight_only(tmp_path):
 
 
 def start(folder):
-    """A process with two workers on thirty jobs of 0.4 s."""
+    """Return a process with two workers on thirty jobs of 0.4 s."""
     code = (
         "import sys\nfrom pathlib import Path\nfrom stewart_drake.studies.jobs import run_jobs\n"
         "from tests.test_jobs import SETTINGS, numbered, slow\n"

@@ -31,7 +31,7 @@ seeded = settings(max_examples=40, deadline=None, derandomize=True)
 
 
 def random_machine(rng):
-    """A random mechanism whose legs use either crank branch."""
+    """Return a random mechanism whose legs use either crank branch."""
     return dataclasses.replace(random_mechanism(rng), branches=rng.choice([-1, 1], 6))
 
 

@@ -133,7 +133,7 @@ def test_closed_loop_is_that_of_the_chain(steps, fraction):
 
 
 def run(model, K, disturbance, gain=1.0):
-    """The loop torque by torque: commanded (k, m) and the state at the end."""
+    """Return the loop torque by torque: commanded (k, m) and the state at the end."""
     n, m = model.B_new.shape
     e, sent = np.zeros(n), np.zeros((len(disturbance) + 50, m))
     e[0] = 1e-3

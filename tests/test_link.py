@@ -52,7 +52,7 @@ def scenario(*more):
 
 
 def bare(delays, before):
-    """A link alone; the torque of sample k is k, also where it was sent before t = 0."""
+    """Return a link alone; the torque of sample k is k, also where it was sent before t = 0."""
     builder = DiagramBuilder()
     source = builder.AddSystem(Numbers())
     queue = np.repeat(np.arange(-before.queue_length, 0.0)[:, None], 6, axis=1)

@@ -103,7 +103,7 @@ def scenario_of(*settings):
 
 @pytest.fixture
 def jumping_clock(monkeypatch):
-    """A time of day that is an hour off, to either side by turns."""
+    """Return a time of day that is an hour off, to either side by turns."""
     true, jumps = time.time, itertools.cycle((3600.0, -3600.0))
     monkeypatch.setattr(time, "time", lambda: true() + next(jumps))
     monkeypatch.setattr(time, "time_ns", lambda: int(1e9 * time.time()))
@@ -360,7 +360,7 @@ def test_what_is_fixed_does_not_change_when_a_hand_moves():
 
 @pytest.fixture(scope="module")
 def offer():
-    """A machine's offer, with the link that it came over."""
+    """Return a machine's offer, with the link that it came over."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Machine, "stop", lambda self: None)
         with Running(OVER_A_NETWORK) as running:

@@ -347,7 +347,7 @@ def test_what_was_recorded_of_an_earlier_session_is_foreign():
 
 
 def attack(rng, run, attacker, recorded):
-    """A datagram that must not do anything."""
+    """Return a datagram that must not do anything."""
     driver, time = run.driver, run.machine.time()
     if recorded and rng.random() < 0.3:
         data = rng.choice(recorded)  # from another address: foreign; from its own: replayed
@@ -378,7 +378,7 @@ def attack(rng, run, attacker, recorded):
 
 
 def attacked(seed, samples, most):
-    """A run among such datagrams: what was refused, how many there were, the states."""
+    """Return a run among such datagrams: what was refused, how many there were, the states."""
     rng = random.Random(seed)
     run = together(EXACT, NETWORK, key=KEY)
     attacker = Endpoint(MachineMessage, key=KEY)

@@ -51,7 +51,7 @@ class Process:
         return " ".join(" ".join(self.lines).split())
 
     def until(self, pattern):
-        """The line that has it, which must come before the process ends."""
+        """Return the line that has it, which must come before the process ends."""
         for line in self._read():
             if re.search(pattern, line):
                 return line
@@ -121,7 +121,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def soon(tmp_path_factory):
-    """The same for torques that act 0.2 s after their measurement."""
+    """Return the same for torques that act 0.2 s after their measurement."""
     return exported(tmp_path_factory.mktemp("soon"), (*SETTINGS, "delay.steps=2"))
 
 

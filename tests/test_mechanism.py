@@ -30,7 +30,7 @@ LEG = {
 
 @pytest.fixture
 def load(tmp_path):
-    """Writes a mechanism file and loads it."""
+    """Write a mechanism file and load it."""
 
     def write_and_load(contents):
         yaml = YAML()
@@ -43,7 +43,7 @@ def load(tmp_path):
 
 
 def paper_with(edits):
-    """The paper's file with fields, dots between their sections, replaced or taken out."""
+    """Return the paper's file with fields, dots between their sections, replaced or taken out."""
     contents = YAML(typ="safe").load(FILE.read_text())
     for name, value in edits.items():
         section = contents
@@ -212,7 +212,7 @@ LENGTHS += ["pattern.shaft_height"]
 
 
 def enlarged(name, factor, masses, inertias):
-    """A shipped mechanism's file with all lengths, masses and inertias multiplied."""
+    """Return a shipped mechanism's file with all lengths, masses and inertias multiplied."""
     contents = YAML(typ="safe").load((FILE.parent / f"{name}.yaml").read_text())
     for field in [*LENGTHS, "pattern.plate_height"]:
         section, key = field.split(".")

@@ -179,7 +179,7 @@ _START = np.concatenate([PAPER.home, np.zeros(6)])
 
 
 def made_of(equations, folder):
-    """The dynamics compiled with other equations, quickly."""
+    """Return the dynamics compiled with other equations, quickly."""
     shutil.copytree(build.FOLDER, folder, ignore=shutil.ignore_patterns("*.so", "*.py"))
     (folder / "equations.h").write_text(equations)
     target = folder / "lib.so"

@@ -38,7 +38,7 @@ DIRTY = (
 
 
 def problem(seed):
-    """A random machine at home, moving, with any delay and weights."""
+    """Return a random machine at home, moving, with any delay and weights."""
     rng = np.random.default_rng(seed)
     mechanism = random_mechanism(rng)
     dynamics = StewartDynamics(mechanism, gravity=bool(rng.integers(2)))

@@ -17,7 +17,7 @@ ARRAYS = ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds")
 
 
 def small_network(hidden=10, **changes):
-    """An untrained one, always the same, whose weights move a lot."""
+    """Return an untrained network, always the same, with large weights."""
     rng = np.random.default_rng(7)
     fields = {
         "input_mean": rng.uniform(0.5, 1.5, 18),
@@ -34,7 +34,7 @@ def small_network(hidden=10, **changes):
 
 
 def torch_twin(torch, network):
-    """The same network built from torch's own layers, in double precision."""
+    """Return the same network built from torch's own layers, in double precision."""
     layers = torch.nn.Sequential(
         torch.nn.Linear(18, network.hidden), torch.nn.Sigmoid(), torch.nn.Linear(network.hidden, 2)
     ).double()
@@ -113,7 +113,7 @@ def test_a_network_does_not_change_once_made():
 
 
 def written(tmp_path, change):
-    """The file of a network, changed."""
+    """Return the file of a network, changed."""
     path = tmp_path / "network.json"
     save_network(small_network(), path)
     data = json.loads(path.read_text())

@@ -80,7 +80,7 @@ def test_own_controllers_are_compared(place, workers, tmp_path):
 
 
 def system_of_a_script():
-    """A class that cloudpickle sends by its contents."""
+    """Return a class that cloudpickle sends by its contents."""
     names = {"__name__": "__main__", "LeafSystem": LeafSystem}
     exec("class Mine(LeafSystem):\n    pass", names)
     made = names["Mine"]

@@ -423,7 +423,7 @@ def test_a_network_has_the_delay_of_bound_and_repetitions():
 
 @pytest.fixture
 def known_outcomes(monkeypatch):
-    """Runs whose outcome is known: best at 0.43 s, and nothing completes above 20 % lost.
+    """Return runs whose outcome is known: best at 0.43 s, and nothing completes above 20 % lost.
 
     The list is of the runs that were asked for.
     """

@@ -59,7 +59,7 @@ def picture():
 
 
 def embedded(text):
-    """The figures in a page, as a browser finds them in its attributes."""
+    """Return the figures in a page, as a browser finds them in its attributes."""
     head = "data:image/svg+xml,"
     sources = [str(image["src"]) for image in Outline(text).all("img")]
     assert all(one.startswith(head) for one in sources)

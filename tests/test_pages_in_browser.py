@@ -15,7 +15,7 @@ MADE = Provenance("stewart-drake analyze hautus paper --out out/hautus")
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """A figure with a line of every controller, a wide table and one with long words."""
+    """Return a figure with a line of every controller, a wide table and one with long words."""
     with figure_style():
         figure = Figure(figsize=(10, 6))
         ax = figure.subplots()

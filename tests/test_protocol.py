@@ -110,12 +110,12 @@ VECTORS = [
 
 
 def documented():
-    """The vectors of docs/protocol.md."""
+    """Return the vectors of docs/protocol.md."""
     return blocks_of("Test vectors")
 
 
 def blocks_of(section):
-    """The datagrams of a section of docs/protocol.md."""
+    """Return the datagrams of a section of docs/protocol.md."""
     text = (ROOT / "docs" / "protocol.md").read_text("utf-8").split(f"## {section}\n")[1]
     text = text.split("\n## ")[0]
     return [bytes.fromhex(block) for block in re.findall(r"```text\n(.*?)```", text, re.DOTALL)]

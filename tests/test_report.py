@@ -36,7 +36,7 @@ pytestmark = pytest.mark.slow  # one report of all there is, which most of them 
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    """The folder of a report on two seconds of the paper's scenario."""
+    """Return the folder of a report on two seconds of the paper's scenario."""
     folder = tmp_path_factory.mktemp("report")
     (folder / "summary.json").write_text("of an earlier run")
     with pytest.MonkeyPatch.context() as patch:

@@ -49,7 +49,7 @@ NOTHING = dict.fromkeys(
 
 
 def short(**changes):
-    """The paper's experiment on the exact plant, its first 0.2 s, where nothing has gone wrong."""
+    """Return the first 0.2 s of the paper's experiment on the exact plant, without failures."""
     scenario = sd.load_scenario(
         "paper", None, ["plant.kind=exact", "start=on_reference", "queue=reference"]
     )
@@ -61,7 +61,7 @@ def changed(scenario, one):
 
 
 def machine(payload, one):
-    """The paper's machine, of a scenario with a payload in kg, as it was drawn."""
+    """Return the paper's machine, of a scenario with a payload in kg, as it was drawn."""
     scenario = short()
     scenario.plant.payload_mass = payload
     return apply_draw(MACHINE, scenario, PAPER, one).machine()
@@ -540,7 +540,7 @@ def test_influences_are_found():
 
 
 def with_failures(failing, n=300):
-    """A made-up study in which those draws fail that `failing` says; E_ac follows the noise."""
+    """Return a made-up study in which the draws of `failing` fail; E_ac follows the noise."""
     study = made_up(n)
     rng = np.random.default_rng(7)
     outcomes = [

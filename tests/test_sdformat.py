@@ -26,7 +26,7 @@ LEGS = range(1, 7)
 
 
 def parse(mechanism):
-    """The document alone, at the positions it gives."""
+    """Return the document alone, at the positions it gives."""
     plant = MultibodyPlant(time_step=1e-3)
     Parser(plant).AddModelsFromString(to_sdformat(mechanism), "sdf")
     plant.Finalize()
@@ -34,7 +34,7 @@ def parse(mechanism):
 
 
 def any_machine(seed):
-    """The paper's mechanism for seed 0, else a random one that uses either crank branch."""
+    """Return the paper's mechanism for seed 0, else a random one that uses either crank branch."""
     rng = np.random.default_rng(seed)
     if seed == 0:
         return PAPER
@@ -269,7 +269,7 @@ def test_loops_close_at_any_pose_and_rates(seed):
 
 
 def scene(documents):
-    """The documents in a plant of somebody else's, not finalized yet."""
+    """Return the documents in a plant of somebody else's, not finalized yet."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
     for document in documents:

@@ -27,7 +27,7 @@ COUNT = {
 
 
 def on_reference(*settings, controller=None):
-    """The paper's experiment on the exact plant, from its reference on."""
+    """Return the paper's experiment on the exact plant, from its reference on."""
     mine = ("plant.kind=exact", "start=on_reference", "queue=reference")
     return load_scenario("paper", controller, (*mine, *settings))
 
@@ -38,7 +38,7 @@ def fault(kind, start=4.0, end=5.0, **more):
 
 
 def bad(run):
-    """The measurements that were not used, by cause."""
+    """Return the measurements that were not used, by cause."""
     counts = run.summary["counts"]
     found = {name: counts[name] for name in COUNT.values() if counts[name]}
     assert counts["bad_measurements"] == sum(found.values())

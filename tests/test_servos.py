@@ -233,7 +233,7 @@ def test_servos_tick_on_steps_and_samples(steps, time_step):
 
 
 def loop_at(*more, until, **which):
-    """A loop that has run until then, its context, and what the servos remember."""
+    """Return a loop that has run until then, its context, and what the servos remember."""
     loop = build_closed_loop(scenario(*more, **which))
     simulator = make_simulator(loop)
     simulator.Initialize()

@@ -91,7 +91,7 @@ def short():
 
 
 def of_the_paper(results):
-    """The table that has the paper's numbers, and the paragraphs below it."""
+    """Return the table that has the paper's numbers, and the paragraphs below it."""
     table, *told = comparison_document(results).sections[0].blocks
     assert isinstance(table, Table)
     return table, [block.text for block in told if isinstance(block, Paragraph)]

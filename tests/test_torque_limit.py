@@ -30,7 +30,7 @@ def scenario(*settings, plant="exact"):
 
 
 def paper_with(folder, effort, masses=1.0):
-    """The paper's machine with other motors, all masses and inertias so many times as large."""
+    """Return the paper's machine with other motors and scaled masses and inertias."""
     data = load_yaml(resolve("mechanism", "paper"))
     data["motor"]["effort_limit"] = effort
     for part in ("base", "plate", "crank", "rod"):
@@ -43,7 +43,7 @@ def paper_with(folder, effort, masses=1.0):
 
 @pytest.fixture(scope="module")
 def weak(tmp_path_factory):
-    """The paper's experiment with motors of 0.3 N m on both plants."""
+    """Return the paper's experiment with motors of 0.3 N m on both plants."""
     motors = paper_with(tmp_path_factory.mktemp("weak"), WEAK)
     return {
         plant: simulate(scenario(motors, plant=plant), judge_stability=False) for plant in PLANTS

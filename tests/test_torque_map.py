@@ -14,7 +14,7 @@ from tests.mechanisms import PAPER, random_mechanism, random_pose
 
 
 def with_legs_scaled(mechanism, factor):
-    """The same mechanism, mass and inertia of cranks and rods multiplied by `factor`."""
+    """Return the same mechanism, mass and inertia of cranks and rods multiplied by `factor`."""
     crank, rod = (
         Link(factor * link.mass, factor * link.inertia, link.center)
         for link in (mechanism.crank, mechanism.rod)

@@ -42,7 +42,7 @@ NUMBERS = ("accumulated_error", "cost", "rms_torque", "peak_torque", "torque_var
 
 
 def toy_data(cells=8, seed=0):
-    """Runs of noise whose best gain shows in how steady the errors are."""
+    """Return runs of noise whose best gain shows in how steady the errors are."""
     random = rng(seed)
     runs, rows = [], []
     for cell in range(cells):
@@ -290,7 +290,7 @@ def test_a_network_learns_to_lose_little_where_it_was_not_trained():
 
 
 def family_data(curves):
-    """A data set of these curves, with the features as densities."""
+    """Return a data set of these curves, with the features as densities."""
     count, ratios, samples, _ = curves.features.shape
     runs = count * ratios
     half = np.tile(RATIOS / 2, count)

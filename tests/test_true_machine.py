@@ -117,7 +117,7 @@ def test_the_law_sees_a_crank_turn_back():
 
 @pytest.fixture
 def machine(tmp_path):
-    """The paper's with rods 0.3 mm longer."""
+    """Return the paper's machine with rods 0.3 mm longer."""
     data = YAML(typ="safe").load((data_root() / "models" / "paper.yaml").read_text())
     data["rod"]["length"] = float(PAPER.rod_lengths[0]) + 3e-4
     path = tmp_path / "mine.yaml"

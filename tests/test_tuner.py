@@ -116,7 +116,7 @@ def test_tuner_topology_state_and_output():
 
 
 def scenario(tmp_path, network, *settings):
-    """The paper's scenario on the exact plant, with this network or with fixed weights."""
+    """Return the paper's scenario on the exact plant, with this network or with fixed weights."""
     tuner = []
     if network is not None:
         save_network(network, tmp_path / "network.json")
@@ -125,13 +125,13 @@ def scenario(tmp_path, network, *settings):
 
 
 def at_samples(result):
-    """The signals at the controller's samples, 0.1 s apart."""
+    """Return the signals at the controller's samples, 0.1 s apart."""
     return result.signals.isel(time=slice(None, None, 5))
 
 
 @pytest.fixture(scope="module")
 def tuned(tmp_path_factory):
-    """The paper's whole experiment with a network."""
+    """Return the paper's whole experiment with a network."""
     return sd.simulate(
         scenario(tmp_path_factory.mktemp("tuned"), small_network()), judge_stability=False
     )

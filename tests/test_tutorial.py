@@ -32,7 +32,7 @@ OTHERS = f"{BEFORE}\n## {_AFTER}"
 
 @pytest.fixture
 def do(tmp_path, monkeypatch, capsys):
-    """Does what a part of it says, in an empty folder; returns what each command printed."""
+    """Run a part of it in an empty folder; return what each command printed."""
     monkeypatch.chdir(tmp_path)
     # Its simulations over delay and amplitude have tests of their own, and take a while.
     monkeypatch.setattr(delay, "delay_map", lambda *_: ([], False))

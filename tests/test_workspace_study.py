@@ -46,7 +46,7 @@ seeded = settings(max_examples=30, deadline=None, derandomize=True)
 
 
 def heave(amplitude, frequency=1.0, pose=PAPER.home):
-    """The paper's scenario, but up and down only."""
+    """Return the paper's scenario, but up and down only."""
     sine = SineConfig(
         amplitude=[0.0] * 5 + [amplitude], offset=list(map(float, pose)), frequency=frequency
     )

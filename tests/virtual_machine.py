@@ -127,7 +127,7 @@ class VirtualMachine:
         return float(above.min())
 
     def many_steps(self, steps: int) -> Compiled:
-        """Steps of the classical Runge-Kutta method: (x, torques, p, g, h (n,)) -> states."""
+        """Return classical Runge-Kutta steps: (x, torques, p, g, h (n,)) -> states."""
         accelerations = self._accelerations
         x, torque = ca.MX.sym("state", NUM_STATE), ca.MX.sym("torque", 6)
         parameters, gravity = ca.MX.sym("parameters", NUM_PLANT_PARAMETERS), ca.MX.sym("gravity")

@@ -73,7 +73,7 @@ _ROUTES: Final[dict[tuple[str, str], _Route]] = {
 
 @figure_style()
 def loop_figure(loop: Diagram) -> Figure:
-    """The block diagram of a closed loop, see `loop.diagram.build_closed_loop`.
+    """Draw the block diagram of a closed loop, see `loop.diagram.build_closed_loop`.
 
     Raises:
         ValueError: a block or a connection that has no place in the drawing.
@@ -167,7 +167,7 @@ def _anchor(name: str, at: tuple[str, float]) -> Point:
 
 
 def _corners(start: Point, end: Point, route: _Route) -> list[Point]:
-    """The way from start to end, along axes."""
+    """Return the way from start to end, along axes."""
     if route.via:
         return [start, *route.via, end]
     if route.start[0] in ("left", "right"):

@@ -77,7 +77,7 @@ class Studio:
         self.eye = looking_at(z * np.array([3.0, -2.3, 2.1]), np.array([0.0, 0.0, 0.62 * z]))
 
     def picture(self, pose: Array, wanted: Array) -> Image.Image:
-        """The plate at a pose (6,) and the ring at another, rad and m."""
+        """Return the plate at a pose (6,) and the ring at another, rad and m."""
         context = self.plant.GetMyContextFromRoot(self.context)
         set_pose(self.plant, context, self.mechanism, pose, np.zeros(6))
         place = RigidTransform(RollPitchYaw(wanted[:3]), wanted[3:])
@@ -102,7 +102,7 @@ def mesh(vertices: Array, faces: NDArray[np.int32]) -> Mesh:
 
 
 def film(name: str) -> list[Image.Image]:
-    """A run of a controller; once the plate has left its workspace it stays where it did."""
+    """Return a run of a controller; once the plate has left its workspace it stays where it did."""
     settings = ("plant.kind=exact", f"duration={SECONDS}", f"log_period={1 / FRAMES_PER_S}")
     scenario = sd.load_scenario("paper", name, settings)
     whole = sd.simulate(sd.load_scenario("paper", "predictor_lqi", settings), judge_stability=False)
@@ -124,12 +124,12 @@ def film(name: str) -> list[Image.Image]:
 
 
 def lettering(size: int) -> ImageFont.FreeTypeFont:
-    """The letters of matplotlib's figures."""
+    """Return the letters of matplotlib's figures."""
     return ImageFont.truetype(font_manager.findfont("DejaVu Sans"), size)
 
 
 def write(path: Path) -> None:
-    """Writes the animation."""
+    """Write the animation."""
     frames = []
     for k, (left, right) in enumerate(zip(*map(film, SHOWN), strict=True)):
         frame = Image.new("RGB", (2 * SIZE[0], left.height), "white")

@@ -28,7 +28,7 @@ _POINTS: Final = 72 * _HEIGHT / (_RANGE[1] - _RANGE[0])
 
 @figure_style()
 def network_figure(network: Network) -> Figure:
-    """The network, neuron by neuron: a link's width is the size of its weight, its dash the sign.
+    """Draw the network: the width of a link is the size of its weight, the dash its sign.
 
     Widths are relative to the largest weight of the layer.
     """

@@ -46,7 +46,7 @@ ROWS = tuple(
 
 
 def closed_loop(row: str) -> ClosedLoop:
-    """The loop of a row."""
+    """Return the loop of a row."""
     scenario, controller, kind = row.split("/")
     settings = (f"plant.kind={kind}",)
     return build_closed_loop(load_compatible(scenario, controller, settings))
