@@ -51,7 +51,7 @@ def random_mechanism(rng: np.random.Generator) -> Mechanism:
 def random_pose(
     rng: np.random.Generator, mechanism: Mechanism, least_transmission: float = 0.2
 ) -> Array:
-    """Return a pose (6,) within reach, all legs arcsin(least_transmission) or more off dead centre."""
+    """Return a pose (6,) in reach, each leg arcsin(least_transmission) or more off dead centre."""
     size = mechanism.rod_lengths.mean() / PAPER.rod_lengths.mean()
     scale = SPREAD * ([1] * 3 + [size] * 3)
     while True:

@@ -558,6 +558,31 @@ def test_figures_of_a_row_are_those_of_the_table_of_claims(path):
     assert not problems, "\n".join(sorted(map(str, problems)))
 
 
+RETIRED = {
+    "nobody": "unknown to",
+    "whatever": "any",
+    "whoever": "the user who",
+    "reckon": "compute",
+    "let_go": "dispose",
+    "so many": "a number of",
+    "thereof": "of it",
+    "is borne": "is tolerated",
+    "one's own": "your own",
+}
+"""Words that readers stumbled over, and their replacements."""
+
+
+def test_retired_words_stay_away():
+    texts = [path for kind in ("py", "c", "h", "j2", "md") for path in PACKAGE.rglob(f"*.{kind}")]
+    words = re.compile(rf"\b({'|'.join(RETIRED)})\b", re.IGNORECASE)
+    found = [
+        f"{document(path)}: {match[0]}; write: {RETIRED[match[0].lower()]}"
+        for path in (*texts, *DOCS)
+        for match in words.finditer(prose(path))
+    ]
+    assert not found, "\n".join(found)
+
+
 def port_rows(text):
     """Port -> size and unit, of the table of output ports in a text; a row may name several."""
     table = text.split("with output ports", 1)[1].split("\n\n", 2)[1]

@@ -111,7 +111,7 @@ def test_errors_are_of_the_size_of_the_accuracy():
 
 
 def falling():
-    """Check that the platform falls out of its workspace with hardly any torque."""
+    """Return a platform that falls out of its workspace with hardly any torque."""
     return StewartDynamics(PAPER), [Drive(PUSH - HOLD)]
 
 

@@ -153,7 +153,7 @@ class Endpoint:
                 data, address = self._socket.recvfrom(LONGEST + 1)
             except BlockingIOError:
                 return
-            except ConnectionError:  # nobody listens at the address of an earlier datagram
+            except ConnectionError:  # the address of an earlier datagram has no listener
                 continue
             try:
                 message = decode(data, self._key)
