@@ -141,6 +141,19 @@ def test_other_compilers_and_processors(compiler, tmp_path):
 
 
 @pytest.mark.slow
+def test_the_makefile_compiles_again_for_other_options(tmp_path):
+    """Objects of a host are not linked or measured as those of a board."""
+    folder = exported(tmp_path, "gravity", ("duration=0.5",))
+    make(folder, "test", "CFLAGS=-O0")
+    compiled = (folder / "law.o").stat().st_mtime_ns
+    total = make(folder, "size", "CFLAGS=-O0").splitlines()[-1]
+    assert (folder / "law.o").stat().st_mtime_ns == compiled
+    assert make(folder, "size", "CFLAGS=-O1").splitlines()[-1] != total
+    make(folder, "test", "CFLAGS=-O1")
+    assert make(folder, "size", "CFLAGS=-O0").splitlines()[-1] == total
+
+
+@pytest.mark.slow
 def test_a_controller_that_is_off_is_reported(tmp_path):
     """The replay reports a changed period and a changed status."""
     folder = exported(tmp_path, "paper", ("duration=2.0",))

@@ -7,8 +7,8 @@
 
    A pose is roll, pitch, yaw (rad) and x, y, z (m) of the plate's centre of mass, a state the pose
    and its rates, a reference the pose, its rates and its accelerations. Matrices are stored by rows.
-   Nothing is allocated, nothing kept but in the memory that the caller hands over: one vector of
-   numbers, counts and flags too, whose fields `law.layout` names. */
+   No memory is allocated. All state, counts and flags included, is in the caller's vector `memory`;
+   `law.layout` names its fields. */
 
 #pragma once
 
@@ -34,7 +34,7 @@ typedef struct {
     stewart_field integral;
     stewart_field gain;        /* the last good one; NaN before there is any */
     stewart_field torque;      /* the last, as asked for */
-    stewart_field feedforward; /* and how much of it takes no measurement */
+    stewart_field feedforward; /* share of `torque` without feedback */
     stewart_field weights;
     stewart_field silence;     /* samples left without feedback */
     stewart_field times;       /* of the last preview, s from its sample */
@@ -119,14 +119,14 @@ typedef void (*stewart_preview_function)(void *about, int number, const real *ti
 struct stewart_sample {
     const real *measurement; /* (measured); what is lost is NaN */
     int age;                 /* of it in periods; negative for a lost one */
-    /* What is NaN or infinite in the reference continues from the rows next to it and from the last
-       preview; after a gap the law goes back onto it. Without a complete row until now the torque is
-       the last one in flight. */
+    /* NaN or infinite numbers of the reference are filled in from neighbouring rows and the last
+       preview; after a gap the law goes back onto it. Until the first complete row the torque is the
+       last one in flight. */
     stewart_preview_function reference;
     stewart_preview_function goal; /* what a planner leads back to, or NULL for a law without one */
     void *about;
     const stewart_report *report; /* that came with the measurement, or NULL */
-    real weights[2]; /* of errors and of torques; with others than finite ones the last gain is used */
+    real weights[2]; /* of errors and of torques; if one is not finite, the last gain is used */
 };
 
 /* Fill in `memory` and `layout` from the other fields of a law. */
@@ -141,14 +141,15 @@ int stewart_queue_length(const stewart_law *law);
 /* Before the first step; `queue` (number, 6) has the torques that are under way, the oldest first. */
 void stewart_start(const stewart_law *law, real *memory, int number, const real *queue);
 
-/* One sample: the torque (6) to send, as asked for; the motors' limit stands behind it. Returns what
-   went wrong, bits of `stewart_status`. `scratch` has place for `stewart_step_scratch` numbers. */
+/* One sample: the torque (6) to send; it is not limited: apply `stewart_limit` before you send it.
+   Returns what went wrong, bits of `stewart_status`. `scratch` has place for `stewart_step_scratch`
+   numbers. */
 int stewart_step(const stewart_law *law, real *memory, real *scratch, const stewart_sample *sample,
                  real *torque);
 
-/* What has acted, where that may not be what was sent: `number` torques, the newest first, the first
-   in the place of the one computed `ago` >= 1 samples before the next step. Torques that are older than
-   the memory, or not finite, change nothing. */
+/* Pass torques that acted, if they differ from the sent ones. `torques`: `number` rows, newest first.
+   Row i replaces the torque that was computed `ago` + i samples before the next step (`ago` = 1: the
+   last step). Torques that are older than the memory, or not finite, change nothing. */
 void stewart_note_acted(const stewart_law *law, real *memory, int ago, int number, const real *torques);
 
 /* A `stewart_preview_function`: `about` points to all rows that are asked for. */

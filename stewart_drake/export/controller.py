@@ -26,7 +26,6 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import replacing
 from stewart_drake.law.compiled import Compiled
 from stewart_drake.law.core_law import CompiledLaw
-from stewart_drake.law.observers import estimates_parameters
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.peer import FAULTS, identity_of
@@ -92,7 +91,8 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "PERIOD": f"{law.timeline.period:g}",
         "TOLERANCE": f"{TOLERANCES['float' if single else 'double']:g}",
         "REAL": "float" if single else "double",
-        "ESTIMATES": "yes" if estimates_parameters(law.observer) else "no",
+        "ESTIMATES": _estimates(scenario),
+        "SILENCE": str(getattr(law, "silence", 0)),
         "TESTS": "stewart_test protocol_test" if over_udp else "stewart_test",
         "TEST_OBJECTS": "stewart_motion.o" if recorded.moves else "",
     }
@@ -117,6 +117,14 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         files["README.md"], {"SIZES": _sizes(files) if measured else _UNMEASURED}
     )
     return files
+
+
+def _estimates(scenario: Scenario) -> str:
+    """Return the names of the estimated parameters."""
+    names = [name.replace("_", " ") for name in scenario.controller.estimate]
+    if scenario.controller.delay_estimator != "none":
+        names.append("delay")
+    return ", ".join(names) or "no parameters"
 
 
 def _is_example(recorded: Recorded, tuner: Compiled | None) -> bool:
