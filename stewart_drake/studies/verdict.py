@@ -132,7 +132,7 @@ def loop_verdict(loop: ControllerMargin) -> str:
     assumptions = []
     if loop.estimated:
         found = "payload, friction and delay" if loop.delay_found else "payload and friction"
-        assumptions.append(f"the estimator left out, {found} taken as found")
+        assumptions.append(f"without the estimator, which can reduce this range; {found} known")
     if loop.tuned:
         assumptions.append("with the weights that the tuner starts from")
     assumed = f" ({'; '.join(assumptions)})" if assumptions else ""
@@ -145,8 +145,8 @@ def loop_verdict(loop: ControllerMargin) -> str:
     up = f"{m.gain_up:.4g}" if math.isfinite(m.gain_up) else "any"
     return (
         "this loop is stable: linearised along the reference, for delay errors from "
-        f"-{milliseconds(m.shorter)} to +{milliseconds(m.longer)} and motor gains from "
-        f"{m.gain_down:.3g} to {up}{assumed}"
+        f"-{milliseconds(m.shorter)} (true delay shorter) to +{milliseconds(m.longer)} (longer) "
+        f"and motor gains from {m.gain_down:.3g} to {up}{assumed}"
     )
 
 
