@@ -22,7 +22,7 @@ from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.law.core_law import Serving
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.design_models import DesignModel
-from stewart_drake.law.feedforward import Feedforward
+from stewart_drake.law.feedforward import InverseDynamicsFeedforward
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictors import NonlinearPredictor
 from stewart_drake.loop import controller
@@ -35,7 +35,7 @@ ESTIMATORS = {"parameters": "[torque_bias,payload,damping]", "none": "[]"}
 PARTS = {
     "observe": (CoreObserver, "observe"),
     "predict": (NonlinearPredictor, "predict"),
-    "feedforward": (Feedforward, "held"),
+    "feedforward": (InverseDynamicsFeedforward, "held"),
     "linear model": (DesignModel, "at"),
     "sample": (QuadraticCost, "sampled"),
     "Riccati gain": (QuadraticCost, "gain"),

@@ -5,6 +5,7 @@ Workers of pytest-xdist inherit the folder of the objects from the process that 
 
 import atexit
 import os
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -33,7 +34,7 @@ def make(folder, *arguments, fails=False):
     """Return what `make` prints; it must succeed, or fail."""
     surroundings = os.environ | {
         "REAL_CC": " ".join(c_compiler()),
-        "CC": str(Path(__file__).with_name("cached_cc.sh")),
+        "CC": shlex.quote(str(Path(__file__).with_name("cached_cc.sh"))),
     }
     command = ["make", "-s", *arguments]
     done = subprocess.run(command, cwd=folder, env=surroundings, capture_output=True, text=True)

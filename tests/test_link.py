@@ -273,11 +273,14 @@ def test_without_times_packets_take_about_the_scenarios_delay(tmp_path):
     assert law.channel != other.channel
 
 
-def test_what_runs_have_in_common_knows_the_times():
-    """Two networks with one bound, so that only the weighing of packets differs."""
+def test_runs_with_one_preparation_know_their_own_times():
+    """Two networks with one bound: only the probabilities of the packets differ."""
     one, other = (network(f"delay.steps={n}", "link.playout=0.9") for n in (4, 8))
-    assert preparation_of(one) is preparation_of(one)
-    assert preparation_of(one) is not preparation_of(other)
+    common = preparation_of(one)
+    assert preparation_of(other) is common
+    channels = [common.prepared(common.experiment(each)).law.channel for each in (one, other)]
+    assert channels[0] != channels[1]
+    assert channels == [compose_law(prepare(each)).channel for each in (one, other)]
 
 
 def test_a_controller_without_a_delay_may_drive_a_network():

@@ -86,6 +86,7 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(tmp_path, capsys):
         ({"delay": -1}, "--delay: got -1.0; expected greater than or equal to 0"),
         ({"torque_limit": 0}, "--torque-limit: got 0.0; expected greater than 0"),
         ({"rod": None, "plate_mass": None}, "got no --rod, --plate-mass;"),
+        ({"plate_mass": 2500}, "plate-mass: got 2500 kg; expected kilograms, 2.5 for 2500 g"),
         ({"cranks": "up"}, "--cranks"),
     ):
         assert main(["new", str(tmp_path / "mine"), *flags(**other)]) == 2

@@ -243,7 +243,9 @@ def _explain_unknown(type_: type, data: Any, error: Any) -> str:
     start = f"{_cut(place, 60)}: "
     if (plain := re.sub(r"\[\d+\]", "", place)) in known:
         got = f"got {brief(error['input'])}, which kind {error['loc'][-2]!r} does not use"
-        return f"{start}{got}; expected a field of that kind"
+        kind = dataclasses.fields(known[plain])[0].default
+        section = place.rpartition(".")[0]
+        return f"{start}{got}; expected {section}.kind={kind}"
     above, dot, name = plain.rpartition(".")
     section = place.rpartition(".")[0] + dot
     siblings = [one.rpartition(".")[2] for one in known if one.rpartition(".")[0] == above]

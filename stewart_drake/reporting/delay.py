@@ -119,7 +119,10 @@ def growth_figure(study: DelayStudy) -> Figure:
         "growth $e^{pη}$ at the worst instant",
         [Curve(delay, 10**decades)],
         "delay η  [s]",
-        limits={HARDLY: f"hardly beatable above {HARDLY:g}", NO: f"not beatable above {NO:g}"},
+        limits={
+            HARDLY: f"hardly compensated above {HARDLY:g}",
+            NO: f"not compensated above {NO:g}",
+        },
         marks={study.eta: f"this delay, {study.eta:.3g} s"},
         yscale="powers",
         xlim=(0, longest),

@@ -43,9 +43,7 @@ Tone = Literal["good", "fair", "bad", "plain"]
 
 WIDTH: Final = 80
 _NO_BREAK: Final = "\N{NO-BREAK SPACE}"
-_TOGETHER: Final = (
-    r"(?<=\d) (?=(?:%|mm|ms|s|N|mN|kg|deg)(?!\w))|(?<=N) (?=m\b)|(?<=\d %) (?=s\b)|(?<=beatable:) "
-)
+_TOGETHER: Final = r"(?<=\d) (?=(?:%|mm|ms|s|N|mN|kg|deg)(?!\w))|(?<=N) (?=m\b)|(?<=\d %) (?=s\b)"
 """Spaces at which no line is broken: before a unit and in it."""
 _SHORT: Final = 36
 """Characters of a cell that stays on one line."""

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from stewart_drake.files.resources import Kind
 
 _COLORS: Final = {
-    "green": r"\bcompleted\b|(?<=beatable: )yes|(?<=loop is )stable",
-    "yellow": r"(?<=beatable: )hardly|\binterrupted( at [\d.]+ s)?|\bwarning:",
-    "red": r"(?<=beatable: )no\b|\bunstable\b|^error:"
+    "green": r"\bcompleted\b|(?<=s )can be compensated|(?<=loop is )stable",
+    "yellow": r"can hardly be compensated|\binterrupted( at [\d.]+ s)?|\bwarning:",
+    "red": r"cannot be compensated|\bunstable\b|^error:"
     r"|\b(left workspace|solver failed)( at [\d.]+ s(, leg \d)?)?",
 }
 EVERY: Final = 10.0

@@ -197,6 +197,8 @@ class LayoutOptions(JobOptions):
 
 LARGEST: Final = 5.0
 """Largest length in m; above, millimetres were probably meant."""
+STEEL: Final = 7850.0
+"""kg/m^3; a part heavier than a solid disc of its size was probably given in grams."""
 _Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Mass = Annotated[float, Field(gt=0, lt=1e6)]
 
@@ -230,6 +232,17 @@ class Measurements(Options):
             if value > LARGEST:
                 raise ConfigError(
                     f"{name}: got {value:g} m; expected metres, {value / 1000:g} for {value:g} mm"
+                )
+        for name, size in {
+            "plate": self.plate_radius,
+            "crank": self.crank,
+            "rod": self.rod,
+        }.items():
+            mass = getattr(self, f"{name}_mass")
+            if mass > STEEL * math.pi * size**3:
+                raise ConfigError(
+                    f"{name}_mass: got {mass:g} kg; expected kilograms, {mass / 1000:g} for "
+                    f"{mass:g} g"
                 )
         if self.rod <= self.crank:
             raise ConfigError(

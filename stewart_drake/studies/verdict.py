@@ -85,7 +85,7 @@ def _end(duration: float, failure: Failure | None) -> float:
 
 HARDLY: Final = 10.0
 NO: Final = 1e3
-"""Growth of prediction errors from which a delay is hardly, or not, beatable."""
+"""Growth of prediction errors from which a delay can hardly, or not, be compensated."""
 
 
 @dataclass(frozen=True)
@@ -114,14 +114,16 @@ class Verdict:
         return "hardly" if self.amplification >= HARDLY else "yes"
 
     def __str__(self) -> str:
-        opening = f"the delay of {self.eta:.4g} s alone, under any controller, beatable: "
-        if self.beatable == "yes":
-            factor = f"{self.amplification:.1f}"
-            return f"{opening}yes, prediction errors grow by a factor of {factor}"
+        can = {"yes": "can", "hardly": "can hardly", "no": "cannot"}[self.beatable]
+        growth = f"by a factor of {self.amplification:.1f}"
+        if self.beatable != "yes":
+            growth = (
+                f"e^(p eta) = {_power(self.pole * self.eta)} fold at t = {self.time:.1f} s "
+                f"(pole {self.pole:.3g} /s)"
+            )
         return (
-            f"{opening}{self.beatable}, prediction errors grow e^(p eta) = "
-            f"{_power(self.pole * self.eta)} fold at t = {self.time:.1f} s "
-            f"(pole {self.pole:.3g} /s)"
+            f"the delay of {self.eta:.4g} s {can} be compensated: under any controller, "
+            f"prediction errors grow {growth} over it"
         )
 
 
