@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 import stewart_drake as sd
-from stewart_drake.core.layout import STANDARD_GRAVITY
+from stewart_drake.core.layout import DEFAULT_GRAVITY
 from stewart_drake.mechanism.assembly import assemble, joint_state
 from stewart_drake.mechanism.geometry import Body, Mechanism
 from stewart_drake.scenario.signals import LEGS, POSE, RATES
@@ -60,7 +60,7 @@ def to_mjcf(mechanism: Mechanism, gravity: bool, closure: Closure) -> str:
         solver="Newton",
         tolerance="0",
         iterations=str(closure.iterations),
-        gravity=_listed([0, 0, -STANDARD_GRAVITY if gravity else 0]),
+        gravity=_listed([0, 0, -DEFAULT_GRAVITY if gravity else 0]),
     )
     # Otherwise time constants below two time steps would be raised to that.
     ET.SubElement(option, "flag", refsafe="disable", contact="disable")

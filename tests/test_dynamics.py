@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from stewart_drake.core.layout import DEAD_CENTRE_SINE, STANDARD_GRAVITY
+from stewart_drake.core.layout import DEAD_CENTRE_SINE, DEFAULT_GRAVITY
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.mechanism.kinematics import (
     UnreachablePoseError,
@@ -110,7 +110,7 @@ def test_agrees_with_the_oracle_for_random_mechanisms(index):
     dynamics = all_free(random_mechanism(rng))
     for gravity in (True, False):
         # An argument of the compiled functions: nothing is built a second time.
-        dynamics.gravity = STANDARD_GRAVITY * gravity
+        dynamics.gravity = DEFAULT_GRAVITY * gravity
         assert_agrees(dynamics, PartitionedTree(dynamics.mechanism, gravity), rng, 4)
 
 

@@ -201,7 +201,7 @@ def test_sensitivities_are_differences_of_trajectories(delay):
         plan = plan_steps(segment, values[DELAY], 2e-3)
         return integrate(model, unknowns.numbers(values), first[None], plan, sensitive)
 
-    slopes = at(values, sensitive=True).slopes[:, 0]
+    slopes = at(values, sensitive=True).sensitivities[:, 0]
     column = {DELAY: -1, 0: 12, 6: 18, 7: 19, 8: 20, 11: 23}
     column |= {GEOMETRY.start + k: 12 + NUM_DYNAMIC + k for k in (0, 1, 3, 7, 41, 47)}
     for place, k in column.items():
@@ -227,7 +227,7 @@ def test_the_delay_s_slope_is_that_of_exact_trajectories():
     model = MachineModel(PAPER, 0.0, 1)
     plan = plan_steps([Segment(log, 0.255, np.arange(len(times)))], 0.23, 1e-3)
     numbers = some_unknowns(PAPER).numbers(values)
-    slope = integrate(model, numbers, states[:1], plan, True).slopes[:, 0, :, -1]
+    slope = integrate(model, numbers, states[:1], plan, True).sensitivities[:, 0, :, -1]
     later, sooner = (
         exact_states(PAPER, PARAMETERS, 0.0, states[0], log.sent, log.torques, 0.23 + h, times)
         for h in (1e-5, -1e-5)

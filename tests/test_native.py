@@ -222,7 +222,7 @@ def test_a_library_that_does_not_fit_is_refused_in_one_line(
     damaged = tmp_path / "lib.so"
     damaged.write_bytes(b"no library")
     for change, problem in (
-        (("source_hash", lambda: "another"), "is older than its source"),
+        (("source_hash", lambda: "another"), "was built from other source"),
         (("LIBRARY", damaged), "cannot be loaded"),
         (("LIBRARY", tmp_path / "none.so"), "is missing"),
     ):
@@ -250,7 +250,7 @@ def test_the_build_knows_whether_its_generated_text_is_current(monkeypatch, tmp_
 
 def test_a_compiler_that_fails_is_named(monkeypatch, tmp_path):
     monkeypatch.setenv("CC", "false")
-    assert build.compile_library(tmp_path / "lib.so") == "false: it failed"
+    assert build.compile_library(tmp_path / "lib.so") == "false: failed with exit code 1"
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,8 +1,8 @@
 """`python -m stewart_drake.core.build` makes the compiled core, as an installation does.
 
-First the text that is generated from the equations and the mechanism files, where it is missing or
-older than its source; then the library. The build hook loads this file by its path before anything
-is installed, so it imports nothing but Python's own modules.
+First it generates equations.h if its source has changed, and the .sdf files if one is missing; then
+the library. The build hook loads this file by its path before anything is installed, so it imports
+only modules of the standard library.
 """
 
 import hashlib
@@ -24,9 +24,8 @@ MODELS = ROOT / "models"
 GENERATORS = ("equations", "derivatives", "generate")
 """Modules of `dynamics` that write equations.h."""
 
-# Neither contracted to fused operations nor reordered: the numbers are those of the equations in
-# CasADi to the last digits. Without errno and traps, which nothing reads, the compiler can do two
-# legs at a time; that changes no number.
+# No fused operations and no reordering, so that results match CasADi's to the last digits.
+# No errno or traps, so that loops over legs vectorise.
 FLAGS = (
     *("-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"),
     *("-fPIC", "-shared", "-fno-semantic-interposition"),
@@ -63,7 +62,7 @@ def generate() -> None:
         CalledProcessError: what writes them failed, for want of CasADi for example.
     """
     command = [sys.executable, "-m", "stewart_drake.dynamics.generate"]
-    # pip's build environment is itself on PYTHONPATH.
+    # Keep the old PYTHONPATH: pip passes its build environment in it.
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     subprocess.run(command, check=True, cwd=ROOT, env=os.environ | {"PYTHONPATH": path})
 
@@ -107,7 +106,8 @@ def compile_library(target: Path = LIBRARY) -> str | None:
                 return None
     except OSError as error:
         return f"{error}"
-    said = next((line for line in done.stderr.splitlines() if "error" in line), "it failed")
+    failed = f"failed with exit code {done.returncode}"
+    said = next((line for line in done.stderr.splitlines() if "error" in line), failed)
     return f"{shlex.join(command)}: {said}"
 
 

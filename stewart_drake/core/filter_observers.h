@@ -8,17 +8,24 @@
 
 #define STEWART_LEG_GATE 30 /* squared residual of a leg, per variance, from which it is left out */
 
-/* `estimation` of the law; `filter` without machine, sensing and legs, which are the law's. */
+/* Settings at `law->estimation`. In `filter`, leave machine, sensing and legs unset: the observer fills
+   them in from the law. */
 typedef struct {
     stewart_filter filter;
-    const real *prior; /* (p) of the parameters */
+    const real *prior; /* (p) initial estimate of the parameters */
 } stewart_filter_settings;
 
-extern const stewart_observer stewart_filter_observer; /* of the measured state */
-extern const stewart_observer stewart_gap_observer;    /* of that, for measurements that get lost */
+/* Extended Kalman filter of the measured state; the same, re-linearised over a gap in the measurements;
+   and of encoders. */
+extern const stewart_observer stewart_filter_observer;
+extern const stewart_observer stewart_gap_observer;
 extern const stewart_observer stewart_encoder_observer;
 
-extern const stewart_legs stewart_encoder_legs;
+extern const stewart_legs stewart_encoder_legs; /* filter step with encoders, see filter_attempt.h */
+
+/* Callbacks of `stewart_observer` that these observers share: size of the memory, scratch numbers of
+   `observe`, start from the prior, one period of the filter, restart with the estimated parameters, and
+   parameters with their standard deviations. */
 
 int stewart_filtered_memory(const stewart_law *law);
 int stewart_filtered_scratch(const stewart_law *law);

@@ -5,12 +5,12 @@
 
 #define SMALL ((real)0.1) /* standard deviations; a shorter correction ends the iterations */
 
-void stewart_predict_measurement(const stewart_sensing *sensing, const real *state, real *values)
+void stewart_predict_measurement(const stewart_sensing *sensing, const real *state, real *predicted)
 {
     if (sensing->seen)
-        sensing->seen(sensing, state, values);
+        sensing->seen(sensing, state, predicted);
     else
-        stewart_copy(X, state, values);
+        stewart_copy(X, state, predicted);
 }
 
 void stewart_measurement_jacobian(const stewart_sensing *sensing, const real *state, real *J)

@@ -5,10 +5,10 @@
 #include "kalman.h"
 #include "sensing.h"
 
-/* h(x) (m) of a state (12). */
-void stewart_predict_measurement(const stewart_sensing *sensing, const real *state, real *values);
+/* `predicted` (m) = h(x) of a state (12); m = sensing->size here and below. */
+void stewart_predict_measurement(const stewart_sensing *sensing, const real *state, real *predicted);
 
-/* dh/dx (m, 12) at a state; not written where the state itself is measured. */
+/* J (m, 12) = dh/dx at a state; not written if the state itself is measured. */
 void stewart_measurement_jacobian(const stewart_sensing *sensing, const real *state, real *J);
 
 /* J A' (m, k) of changes A (k, 12) of the state. */
@@ -28,17 +28,18 @@ typedef struct {
     const stewart_sensing *sensing;
     const real *values; /* (m) */
     int n;
-    real *state;        /* (12) at the end, from the xi where the period is linearised */
+    real *state;        /* (12) at the period's end, for the current xi */
     real *H;            /* (12, n) d[state]/d[xi] there */
-    real *C;            /* (m, m) root of the covariance of the noise, the model's error too */
-    real *J;            /* (m, 12) */
-    void *period;
-    /* Write the state at the end, and then H, both from xi. Return 0 where they do not exist. */
+    real *C;            /* (m, m) Cholesky factor of the covariance of measurement noise plus model error */
+    real *J;            /* (m, 12) dh/dx at `state` */
+    void *period;       /* first argument of the two callbacks */
+    /* Compute the state at the period's end; then H, for the same xi. Return 0 if there is none. */
     int (*predict)(void *period, const real *xi, real *state);
     int (*linearize)(void *period, const real *xi, real *H, stewart_scratch scratch);
 } stewart_instant;
 
-/* `rows` and `settle` of a `stewart_kalman` whose model begins with a `stewart_instant`. A correction is
-   small relative to the noise, since the error of linearising is of second order. */
+/* Callbacks of a `stewart_kalman` whose `model` has a `stewart_instant` as its first member. Iteration
+   ends at a correction below 0.1 standard deviations: the linearisation error, of second order, is then
+   negligible. */
 int stewart_instant_rows(void *model, const real *xi, real *e, real *H, stewart_scratch scratch);
 int stewart_instant_settle(void *model, const real *xi, const real *better, stewart_scratch scratch);

@@ -17,7 +17,7 @@
 /* Crank angles (6) in rad at a pose (6); NaN where a leg does not reach. */
 void stewart_crank_angles(const real *geometry, const real *pose, real *angles);
 
-/* Whether all legs reach a pose; `strictly`: and can still move there. */
+/* Whether all legs reach a pose; `strictly`: no leg fully stretched or folded. */
 int stewart_within_reach(const real *geometry, const real *pose, int strictly);
 
 /* Whether a plate at a pose can be regulated: all legs are within reach, none at a dead centre. */
@@ -27,14 +27,16 @@ int stewart_is_workable(const real *geometry, const real *pose);
 
        u rod.tangent alpha_dot = [(p_PQ x rod)' E, rod'] rates,
 
-   E the map from rates of roll, pitch and yaw to the angular velocity. Returns 0, and J of NaN, where
-   a leg does not reach, or is at its dead centre. */
+   T the crank tip, rod = p_TQ, tangent = the tip's direction of motion, E the map from rates of roll,
+   pitch and yaw to the angular velocity. Returns 0, and J of NaN, where a leg does not reach, or is at
+   its dead centre. */
 int stewart_crank_jacobian(const real *geometry, const real *pose, real *J);
 
 /* The pose (6) with these crank angles (6), from a guess in its place. Newton's method with halving
    steps on f_i = |p_TQ|^2 / l^2 - 1 from crank tip to plate joint, which stays smooth through dead
    centres and outside the workspace. A pose on the other side of a parallel singularity than the guess
-   is another assembly: the cranks then turn there in 2, 4, 8, 16 pieces. Returns 0 where that finds
-   none, or one of another crank branch. Scratch: 48 numbers. */
+   is another assembly. If Newton ends in another assembly, the angles of the guess are moved to `angles`
+   in 2, 4, 8, 16 steps. Returns 0 if that finds no pose, or one of another crank branch. Scratch: 48
+   numbers. */
 int stewart_forward_kinematics(const real *geometry, const real *angles, real *pose,
                                stewart_scratch scratch);

@@ -10,20 +10,22 @@ from stewart_drake.scenario.signals import (
     NUM_TORQUES,
 )
 
-STANDARD_GRAVITY: Final = 9.81
-"""m/s^2, along -z of W; Drake's default."""
+DEFAULT_GRAVITY: Final = 9.81
+"""Gravity along -z of W, m/s^2; Drake's default."""
 DEAD_CENTRE_SINE: Final = 0.01
 """Sine of the crank's angle off dead centre at which a leg counts as out of reach.
 
 At a dead centre pose coordinates are singular: alpha_dot grows like 1 / sine.
 """
 LEG_NUMBERS: Final = 18
-"""Crank's and rod's lengths, branch, R_WS by columns (9), p_PQ (3), p_WS (3); each for six legs."""
+"""Numbers of a leg, in this order: lengths of crank and rod, branch, R_WS by columns (9), p_PQ (3),
+p_WS (3). `GEOMETRY` has each of them for six legs before the next one, then the common numbers."""
 COMMON_NUMBERS: Final = 13
-"""Plate's mass and inertia (3); crank's mass, centre and inertia about the motor axis; rod's mass,
-centre and inertia (3); the plate's mean radius."""
+"""Numbers of all legs and the plate, in this order: mass and inertia (3) of the plate; mass, centre
+and inertia about the motor axis of the crank; mass, centre and inertia (3) of the rod; the plate's
+mean radius."""
 MEASURES: Final = NUM_LEGS + 2
-"""Measures of the workspace."""
+"""Six sines off dead centre, the measure of parallel singularity, minus |pitch|."""
 GEOMETRY: Final = NUM_LEGS * LEG_NUMBERS + COMMON_NUMBERS
 
 SHAPES: Final = {

@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from stewart_drake.core.build import FOLDER, LIBRARY, source_hash
 from stewart_drake.files.errors import ConfigError
 
-PRIVATE: Final = (
+SOURCE_ONLY_HEADERS: Final = (
     *("real.h", "equations.h", "dop853.h", "dop853_table.h"),
-    *("filter_attempt.h", "short.h"),
+    *("filter_attempt.h", "legs.h", "short.h"),
 )
 """Headers that Python does not use."""
 
 
 def declarations() -> str:
-    """Return the declarations of the headers, without directives but for whole numbers.
+    """Return the declarations of the headers, without directives but for integer constants.
 
-    A size that is a sum is an enumeration constant in a header, not a macro.
+    cffi reads only `#define NAME 123`; a header writes any other constant as an enum.
     """
     headers: dict[str, str] = {}
     for path in sorted(FOLDER.glob("*.h")):
@@ -37,7 +37,7 @@ def declarations() -> str:
 
 def _include(name: str, headers: dict[str, str]) -> None:
     """Add a header to the others, after those that it includes."""
-    if name in headers or name in PRIVATE:
+    if name in headers or name in SOURCE_ONLY_HEADERS:
         return
     text = (FOLDER / name).read_text("utf-8")
     for included in re.findall(r'^#include "(.*)"', text, re.MULTILINE):
@@ -69,9 +69,9 @@ class Core:
         self._block = self.ffi.new_allocator(should_clear_after_alloc=False)
 
     def at(self, array: NDArray[Any] | None) -> Any:
-        """Return a pointer to a contiguous array of doubles or C ints, which it keeps alive.
+        """Return a pointer to a contiguous array of doubles or C ints.
 
-        A structure that holds the pointer does not keep the array alive.
+        The pointer keeps the array alive; a copy of it in a structure does not.
 
         Raises:
             ValueError: other numbers, or not contiguous.
@@ -102,7 +102,7 @@ def core() -> Core:
     """Load the library.
 
     Raises:
-        ConfigError: it is missing, older than its source, or cannot be loaded.
+        ConfigError: it is missing, was built from other source, or cannot be loaded.
     """
     problem = "is missing"
     if LIBRARY.exists():
@@ -110,9 +110,7 @@ def core() -> Core:
             loaded = Core(LIBRARY)
             if loaded.ffi.string(loaded.lib.stewart_source()).decode() == source_hash():
                 return loaded
-            problem = "is older than its source"
+            problem = "was built from other source"
         except (OSError, AttributeError) as error:
             problem = f"cannot be loaded ({error})"
-    raise ConfigError(
-        f"the compiled core {problem}; expected one that python -m stewart_drake.core.build made"
-    )
+    raise ConfigError(f"the compiled core {problem}; run: python -m stewart_drake.core.build")

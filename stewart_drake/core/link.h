@@ -1,73 +1,79 @@
-/* The link from the controller to the motors, as a machine of events over one clock: begin, take,
-   next_change, change. It is either a wire, on which a command acts when it arrives, or a play-out
-   buffer, in which commands wait for their times.
+/* The link from controller to motors, as an event-driven state machine: call `start` once, `take` for
+   each plan, `change` at every time that `next` returns. It is either a wire, on which a command acts
+   when it arrives, or a play-out buffer, in which commands wait for their times.
 
-   Times are numbers of any unit, double so that nanoseconds are exact for a hundred days. */
+   Events at the same time have this order: the controller samples and sends its command; then the
+   newest of the due commands acts; then the plant moves on.
+
+   Times have any unit. They are doubles, exact for nanoseconds over a hundred days. */
 
 #pragma once
 
 #include "real.h"
 
-/* Order of the events of one instant: the controller's sample is taken and its command sent; then a
-   command acts, of several that are there the newest; then the plant goes on. */
 typedef struct {
     int size;        /* numbers of a command */
-    int kept;        /* commands that can wait */
-    int history;     /* commands that have acted and are remembered, >= 1 */
-    int wire;        /* whether it is a wire */
-    int holds;       /* whether a dry buffer holds the last command, or puts out zero */
-    double period;   /* of a buffered command */
-    double together; /* instants so close to each other are one */
-    real limit;      /* of each number of a command that acts; infinite for none */
+    int kept;        /* greatest number of waiting commands */
+    int history;     /* number of past commands in memory, >= 1 */
+    int wire;        /* 1: a wire, 0: a buffer */
+    int holds;       /* a dry buffer holds the last command (1), or puts out zero (0) */
+    double period;   /* from each command of a plan to the next */
+    double together; /* times closer than this are equal */
+    real limit;      /* greatest absolute value of each number of a command; may be infinite */
 } stewart_link;
 
-/* Places in the memory, which then has the commands that have acted, the newest first (history,
-   1 + size), each after its time, and those that wait (kept, 3 + size), each after the time at which
-   it is to act, its sequence and its arrival. */
+/* Memory, in this order:
+
+       numbers                 content
+       STEWART_LINK_COMMANDS   the values below
+       history (1 + size)      past commands, the newest first: time, command
+       kept (3 + size)         waiting commands: time to act, sequence, arrival, command */
 enum {
     STEWART_LINK_LAST,     /* time of the last change */
-    STEWART_LINK_NEWEST,   /* sequence of the command that acts on a wire */
-    STEWART_LINK_COUNTS,   /* whether a period without a command counts as dry */
-    STEWART_LINK_FED,      /* whether what acts was taken, not there from the beginning */
-    STEWART_LINK_PLAYED,   /* changes to a command that was taken */
-    STEWART_LINK_DRY,      /* periods without one */
-    STEWART_LINK_TAKEN,    /* commands or plans that were taken */
-    STEWART_LINK_WAITING,  /* number of commands that wait */
-    STEWART_LINK_ACTED,    /* number of commands that have acted, `history` at the most */
-    STEWART_LINK_COMMANDS, /* here the commands begin */
+    STEWART_LINK_NEWEST,   /* sequence of the last command that acted, -infinity before the first */
+    STEWART_LINK_COUNTS,   /* 1 after the first change: from then on each dry period is a change */
+    STEWART_LINK_FED,      /* 1 if the acting command came from `take` */
+    STEWART_LINK_PLAYED,   /* number of commands from `take` that have acted */
+    STEWART_LINK_DRY,      /* number of periods of a buffer without a command */
+    STEWART_LINK_TAKEN,    /* number of plans that found room, late ones too */
+    STEWART_LINK_WAITING,  /* number of waiting commands */
+    STEWART_LINK_ACTED,    /* number of past commands in memory, at most `history` */
+    STEWART_LINK_COMMANDS, /* first number of the past commands */
 };
 
+/* Results of `take`. */
 enum { STEWART_LINK_TAKES, STEWART_LINK_FULL, STEWART_LINK_LATE };
 
-/* Numbers of the memory. */
+/* Number of doubles in the memory. */
 int stewart_link_memory(const stewart_link *link);
 
-/* Nothing waits, nothing acts but zero. */
+/* Empty the memory; zero acts. */
 void stewart_link_start(const stewart_link *link, double *memory);
 
-/* What acts (size) before the first change, and has done so since `time`. */
+/* Set the command (size) that has acted since `time`; fills the history. */
 void stewart_link_assume(const stewart_link *link, double *memory, double time,
                          const double *command);
 
-/* Commands (number, size) are under way that act at `first`, a period later and so on. */
+/* Queue commands (number, size) for `first`, a period later, and so on, as if under way already. */
 void stewart_link_begin(const stewart_link *link, double *memory, double first, int number,
                         const double *commands);
 
-/* A plan (number, size) whose first command shall act at `first`, and the others a period later each.
-   On a wire only the first counts. `sequence` > 0 orders plans by age. It is there from its
-   `arrival` on, infinite for a lost one; commands that are to act before that, or before `now`,
-   never do. Returns why it is of no use, or STEWART_LINK_TAKES. */
+/* Take a plan (number, size): its first command is to act at `first`, each other one a period later. A
+   wire takes only the first. `sequence` > 0 orders plans by age. The plan arrives at `arrival`
+   (infinite: lost). Commands due before that, or before `now`, are dropped. Returns
+   STEWART_LINK_TAKES, or the reason of the refusal. */
 int stewart_link_take(const stewart_link *link, double *memory, double now, double sequence,
                       double arrival, double first, int number, const double *commands);
 
-/* When `change` is to be called next; infinite for never. */
+/* Time of the next call of `change`; infinite for none. */
 double stewart_link_next(const stewart_link *link, const double *memory);
 
-/* What acts from an instant on. */
+/* Let the newest command act that is due at `time` and has arrived, and drop the others that are due.
+   A buffer without one goes dry: it holds the last command, or puts out zero. */
 void stewart_link_change(const stewart_link *link, double *memory, double time);
 
-/* Forget what waits; the last command, or zero, until another is taken. */
+/* Drop the waiting commands. Until another is taken, hold the last command (`holds`) or put out zero. */
 void stewart_link_safe(const stewart_link *link, double *memory, double time, int holds);
 
-/* The command (size) that acts. */
+/* The acting command (size). */
 const double *stewart_link_current(const double *memory);

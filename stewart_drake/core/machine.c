@@ -3,7 +3,7 @@
 #include "machine.h"
 #include "short.h"
 
-#define FINER 2 /* times as many substeps beyond `coarse_torque` */
+#define FINE_SUBSTEP_FACTOR 2 /* times as many substeps above `coarse_torque_limit`, see law/nominal.py */
 
 void stewart_believe(const stewart_machine *machine, const real *theta, stewart_belief *belief)
 {
@@ -35,7 +35,7 @@ int stewart_substeps(const stewart_machine *machine, int number, const real *tor
 {
     for (int i = 0; i < U * number; i++)
         if (REAL(fabs)(torques[i]) > machine->coarse_torque_limit)
-            return FINER * machine->substeps;
+            return FINE_SUBSTEP_FACTOR * machine->substeps;
     return machine->substeps;
 }
 
@@ -78,17 +78,12 @@ void stewart_advance(const stewart_belief *belief, const real *torque, real dura
     }
 }
 
-static int substeps_of(const stewart_machine *machine, const stewart_schedule *schedule)
-{
-    if (schedule->substeps)
-        return schedule->substeps;
-    return stewart_substeps(machine, schedule->number, schedule->torques);
-}
-
 void stewart_predict(const stewart_machine *machine, const real *theta, const stewart_schedule *schedule,
                      const real *state, real *states)
 {
-    const int substeps = substeps_of(machine, schedule);
+    const int substeps = schedule->substeps
+                             ? schedule->substeps
+                             : stewart_substeps(machine, schedule->number, schedule->torques);
     stewart_belief belief;
     stewart_believe(machine, theta, &belief);
     for (int k = 0; k < schedule->number; k++, state = states, states += X) {
@@ -155,7 +150,7 @@ int stewart_derivatives(const stewart_machine *machine, const stewart_belief *be
     return 1;
 }
 
-/* The state when the share s of h seconds is over: the cubic through both ends. */
+/* State after the share s of h seconds, on the cubic through the states at both ends. */
 static void within_hold(const real *start, const real *end, real h, real s, real *state)
 {
     real left = 1 - s;
@@ -166,8 +161,10 @@ static void within_hold(const real *start, const real *end, real h, real s, real
     }
 }
 
-/* Phi (12, 12) and S (12, p) of one torque that leads from `start` to `end` in h seconds. They solve
-   F_dot = L F, L = [A G; 0 0], at the Gauss nodes: F = exp(h/2 (L1 + L2) + sqrt(3)/12 h^2 [L2, L1]). */
+/* Phi (12, 12) and S (12, p) of one torque that leads from `start` to `end` in h seconds, the first rows
+   of the solution F of F_dot = L F, L = [A G; 0 0]. With L1 and L2 at the two Gauss nodes, the method of
+   fourth order is F = exp(h/2 (L1 + L2) + sqrt(3)/12 h^2 [L2, L1]). Else the midpoint rule,
+   F = exp(h L). */
 static int transition_of_hold(const stewart_machine *machine, const stewart_belief *belief,
                               const real *torque, real h, int exact, const real *start,
                               const real *end, real *Phi, real *S, stewart_scratch scratch)
@@ -183,17 +180,18 @@ static int transition_of_hold(const stewart_machine *machine, const stewart_beli
             return 0;
     }
     if (exact) {
-        const real part = SQRT_3 / 12 * h * h, *A1 = A + X * X, *G1 = G + X * p;
+        const real part = SQRT_3 / 12 * h * h;
+        const real *A1 = A, *A2 = A + X * X, *G1 = G, *G2 = G + X * p;
         real *one = stewart_take(&scratch, X * X), *other = stewart_take(&scratch, X * X);
         real *first = stewart_take(&scratch, X * p), *second = stewart_take(&scratch, X * p);
-        stewart_multiply(X, X, X, A1, A, one);
-        stewart_multiply(X, X, X, A, A1, other);
-        stewart_multiply(X, X, p, A1, G, first);
-        stewart_multiply(X, X, p, A, G1, second);
+        stewart_multiply(X, X, X, A2, A1, one);
+        stewart_multiply(X, X, X, A1, A2, other);
+        stewart_multiply(X, X, p, A2, G1, first);
+        stewart_multiply(X, X, p, A1, G2, second);
         for (int i = 0; i < X * X; i++)
-            omega[i] = h / 2 * (A[i] + A1[i]) + part * (one[i] - other[i]);
+            omega[i] = h / 2 * (A1[i] + A2[i]) + part * (one[i] - other[i]);
         for (int i = 0; i < X * p; i++)
-            turned[i] = h / 2 * (G[i] + G1[i]) + part * (first[i] - second[i]);
+            turned[i] = h / 2 * (G1[i] + G2[i]) + part * (first[i] - second[i]);
     } else {
         for (int i = 0; i < X * X; i++)
             omega[i] = h * A[i];

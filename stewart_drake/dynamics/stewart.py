@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stewart_drake.core.layout import DEAD_CENTRE_SINE, STANDARD_GRAVITY
+from stewart_drake.core.layout import DEAD_CENTRE_SINE, DEFAULT_GRAVITY
 from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.workspace import measures_at
 from stewart_drake.files.errors import ConfigError
@@ -141,7 +141,7 @@ class StewartDynamics:
     ) -> None:
         self.mechanism = mechanism
         switch = isinstance(gravity, bool | np.bool_)
-        scale = STANDARD_GRAVITY if switch else 1.0
+        scale = DEFAULT_GRAVITY if switch else 1.0
         self.gravity = float(scale * _finite("gravity", gravity, ()))
         self.plant_parameters = plant_parameters(parameters)
         self.free = tuple(free)

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from stewart_drake.identification.logs import ANGLES, KINDS, NUM_MEASURED, POSE
 from stewart_drake.identification.model import NUM_DYNAMIC, DrawnModel, MachineModel
 from stewart_drake.identification.shooting import (
-    FIRST,
-    NUMBERS,
+    DELAY_COLUMN,
+    FIRST_COLUMNS,
+    PARAMETER_COLUMNS,
     Segment,
     integrate,
     plan_steps,
@@ -38,7 +39,7 @@ MOST_ITERATIONS: Final = 60
 # chi^2 per value of a segment that no similar machine explains; an error of a millimetre in the
 # drawing causes some fifty
 ASTRAY: Final = 1e3
-_SLOPES_STEP: Final = 0.02  # step of the integration of slopes, s
+_SENSITIVITY_STEP: Final = 0.02  # step of the integration of sensitivities, s
 _STEP_ERROR: Final = 0.05  # RMS error of the integration in standard deviations of a measurement
 _SHORTEST_STEP: Final = 1e-3  # s
 _DAMPING: Final = (1e-3, 1e-9, 1e12)  # first, least and largest
@@ -146,8 +147,8 @@ class Evaluator:
         their relative error moves the minimum by the same share of a standard deviation only.
         """
         residuals = self.residuals(guess)
-        slopes_step = max(self.problem.longest_step, _SLOPES_STEP)
-        _, J = self._evaluate(guess, slopes_step, sensitive=True)
+        sensitivity_step = max(self.problem.longest_step, _SENSITIVITY_STEP)
+        _, J = self._evaluate(guess, sensitivity_step, sensitive=True)
         # Points and values of a segment in one column.
         _, n, _, columns = J.shape
         rows = J.transpose(1, 0, 2, 3).reshape(n, -1, columns)
@@ -164,7 +165,7 @@ class Evaluator:
         unknowns, free = self.problem.unknowns, self.free
         numbers = unknowns.numbers(guess.values)
         steps = plan_steps(self.problem.segments, guess.values[DELAY], longest_step)
-        states, state_slopes = integrate(self.model, numbers, guess.first, steps, sensitive)
+        states, state_sensitivities = integrate(self.model, numbers, guess.first, steps, sensitive)
         m, n, _ = states.shape
         predicted = np.empty((m, n, NUM_MEASURED))
         J = np.zeros((m, n, NUM_MEASURED, len(free) + NUM_STATE if sensitive else 0))
@@ -175,27 +176,28 @@ class Evaluator:
                 alpha, by_pose, by_geometry = self.model.crank_angles(states[k, :, :6], numbers)
                 predicted[k, :, ANGLES] = alpha + guess.values[OFFSETS]
                 if sensitive:
-                    slopes = by_pose @ state_slopes[k][:, :6]
-                    slopes[:, :, NUM_STATE + NUM_DYNAMIC : NUMBERS.stop] += by_geometry
-                    J[k, :, ANGLES] = self._columns(slopes, np.eye(6))
+                    legs = slice(NUM_STATE + NUM_DYNAMIC, PARAMETER_COLUMNS.stop)
+                    sensitivities = by_pose @ state_sensitivities[k][:, :6]
+                    sensitivities[:, :, legs] += by_geometry
+                    J[k, :, ANGLES] = self._columns(sensitivities, np.eye(6))
             residual = self.values - predicted
             residual[:, :, ANGLES] = np.remainder(residual[:, :, ANGLES] + np.pi, 2 * np.pi) - np.pi
             residual /= self.std
         if sensitive:
-            J[:, :, POSE.start :] = self._columns(state_slopes, np.zeros((NUM_STATE, 6)))
+            J[:, :, POSE.start :] = self._columns(state_sensitivities, np.zeros((NUM_STATE, 6)))
             J *= -1 / self.std[:, :, None]
             J[np.isnan(self.values)] = 0.0
         residual[np.isnan(self.values)] = 0.0
         prior = ((guess.values - unknowns.mean)[free]) / unknowns.std[free]
         return Residuals(residual, prior), J
 
-    def _columns(self, slopes: Array, offsets: Array) -> Array:
+    def _columns(self, sensitivities: Array, offsets: Array) -> Array:
         """Return the columns of S as those of free unknowns and first state."""
-        whole = np.empty((*slopes.shape[:-1], NUM_UNKNOWNS))
-        whole[..., : OFFSETS.start] = slopes[..., NUMBERS]
+        whole = np.empty((*sensitivities.shape[:-1], NUM_UNKNOWNS))
+        whole[..., : OFFSETS.start] = sensitivities[..., PARAMETER_COLUMNS]
         whole[..., OFFSETS] = offsets
-        whole[..., DELAY] = slopes[..., -1]
-        return np.concatenate([whole[..., self.free], slopes[..., FIRST]], axis=-1)
+        whole[..., DELAY] = sensitivities[..., DELAY_COLUMN]
+        return np.concatenate([whole[..., self.free], sensitivities[..., FIRST_COLUMNS]], axis=-1)
 
 
 def followed(problem: Problem, start: Guess) -> tuple[Problem, Guess]:

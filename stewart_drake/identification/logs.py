@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from stewart_drake.core.layout import STANDARD_GRAVITY
+from stewart_drake.core.layout import DEFAULT_GRAVITY
 from stewart_drake.files.arrayio import load_netcdf
 from stewart_drake.files.csvio import ANGLE_UNITS, LENGTH_UNITS, TORQUE_UNITS, read_table
 from stewart_drake.files.errors import ConfigError
@@ -118,7 +118,7 @@ def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bo
     if path.suffix == ".nc":
         log = _of_run(path, mechanism)
     else:
-        log = _of_csv(path, mechanism, precision, STANDARD_GRAVITY if gravity else 0.0)
+        log = _of_csv(path, mechanism, precision, DEFAULT_GRAVITY if gravity else 0.0)
     if len(log.sent) < 2:
         raise ConfigError(f"{path}: got one torque throughout; expected torques that change")
     kept, last = list[int](), -math.inf
@@ -177,7 +177,7 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
         times=times,
         values=values,
         std=std,
-        gravity=STANDARD_GRAVITY if scenario.plant.gravity else 0.0,
+        gravity=DEFAULT_GRAVITY if scenario.plant.gravity else 0.0,
         delay=believed if math.isfinite(believed) else None,
         before=None if changing else applied[0],
     )

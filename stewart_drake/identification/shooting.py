@@ -22,9 +22,11 @@ from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, RATES
 from stewart_drake.types import Array
 
 _INSTANT: Final = 1e-9  # s; events closer to each other are one
+_ROUNDING: Final = 1e-9  # excess of a number of steps that is rounded down
 # Columns of S: first state, parameters of the dynamics and numbers of the legs, and last the delay
-FIRST: Final = slice(0, NUM_STATE)
-NUMBERS: Final = slice(NUM_STATE, NUM_STATE + NUM_DYNAMIC + NUM_GEOMETRY)
+FIRST_COLUMNS: Final = slice(0, NUM_STATE)
+PARAMETER_COLUMNS: Final = slice(NUM_STATE, NUM_STATE + NUM_DYNAMIC + NUM_GEOMETRY)
+DELAY_COLUMN: Final = -1
 
 
 class Segment(NamedTuple):
@@ -45,10 +47,13 @@ class Steps(NamedTuple):
 
 
 class Trajectories(NamedTuple):
-    """States and sensitivities at the samples of n segments, at most m each; NaN without one."""
+    """States and sensitivities at the samples of n segments, at most m each.
+
+    Where a segment has no sample, states are NaN and sensitivities 0.
+    """
 
     states: Array  # (m, n, 12)
-    slopes: Array  # (m, n, 12, columns)
+    sensitivities: Array  # (m, n, 12, columns)
 
 
 def plan_steps(segments: list[Segment], delay: float, longest_step: float) -> Steps:
@@ -66,6 +71,7 @@ def plan_steps(segments: list[Segment], delay: float, longest_step: float) -> St
 
 
 def _steps_of(segment: Segment, delay: float, longest_step: float) -> Steps:
+    """Return the steps of one segment; arrays (m,) and (m, 6)."""
     log, start = segment.log, segment.start
     samples = log.times[segment.rows]
     arrivals = log.sent + delay
@@ -73,10 +79,12 @@ def _steps_of(segment: Segment, delay: float, longest_step: float) -> Steps:
     events = np.sort(np.concatenate([samples, inner]))
     events = events[np.diff(events, prepend=-np.inf) > _INSTANT]
     gaps = np.diff(events, prepend=start)
-    parts = np.maximum(1, np.ceil(gaps / longest_step - 1e-9)).astype(int)
+    parts = np.maximum(1, np.ceil(gaps / longest_step - _ROUNDING)).astype(int)
     ends = np.cumsum(parts) - 1
     sample = np.full(ends[-1] + 1, -1)
     sample[ends[np.searchsorted(events, samples - _INSTANT)]] = np.arange(len(samples))
+    # Torque in the middle of each gap. An arrival within _INSTANT of the start counts as before it,
+    # so look just behind.
     middle = np.repeat(np.maximum(events - gaps / 2, start + 2 * _INSTANT), parts)
     torques = log.applied_torque(middle, delay)
     after = np.vstack([torques[1:], log.applied_torque(samples[-1:] + 2 * _INSTANT, delay)])
@@ -91,22 +99,23 @@ def integrate(
     A state that grows beyond all bounds ends as NaN or infinity, without a warning.
     """
     n, count = len(first), int(steps.sample.max()) + 1
-    columns = NUMBERS.stop + 1 if sensitive else 0
+    columns = PARAMETER_COLUMNS.stop + 1 if sensitive else 0
     x, S = first.copy(), np.zeros((n, NUM_STATE, columns))
     if sensitive:
-        S[:, :, FIRST] = np.eye(NUM_STATE)
+        S[:, :, FIRST_COLUMNS] = np.eye(NUM_STATE)
     states = np.full((count, n, NUM_STATE), np.nan)
-    slopes = np.zeros((count, n, NUM_STATE, columns))
+    sensitivities = np.zeros((count, n, NUM_STATE, columns))
     with np.errstate(all="ignore"):
         for h, torques, after, sample in zip(*steps, strict=True):
             x, S = _step(model, numbers, x, S, torques, h)
             if sensitive and np.any(torques != after):
+                # before the sample: a sample at the very switch gets the derivative from the right
                 old = model.accelerations(x, torques, numbers)
-                S[:, RATES, -1] += old - model.accelerations(x, after, numbers)
+                S[:, RATES, DELAY_COLUMN] += old - model.accelerations(x, after, numbers)
             there = np.flatnonzero(sample >= 0)
             states[sample[there], there] = x[there]
-            slopes[sample[there], there] = S[there]
-    return Trajectories(states, slopes)
+            sensitivities[sample[there], there] = S[there]
+    return Trajectories(states, sensitivities)
 
 
 def _step(
@@ -125,7 +134,7 @@ def _step(
         S_dot = np.empty_like(S)
         S_dot[:, :6] = S[:, 6:]
         np.matmul(at.state, S, out=S_dot[:, 6:])
-        S_dot[:, 6:, NUMBERS] += at.numbers
+        S_dot[:, 6:, PARAMETER_COLUMNS] += at.numbers
         return np.hstack([x[:, RATES], at.accelerations]), S_dot
 
     one, all_ = h[:, None], h[:, None, None]
