@@ -17,19 +17,19 @@ static int periods(const stewart_arrivals *a, real end)
     return (int)((end < FURTHEST ? end : FURTHEST) / a->period);
 }
 
-int stewart_arrivals_most(const stewart_arrivals *a, real end)
+int stewart_max_torques(const stewart_arrivals *a, real end)
 {
-    return 1 + periods(a, end) + a->sent;
+    return 1 + periods(a, end) + a->num_own;
 }
 
-int stewart_switches(const stewart_arrivals *a, real begin, real end, int newest, real *at)
+int stewart_switch_times(const stewart_arrivals *a, real begin, real end, int newest, real *at)
 {
-    const real first = a->sent > 0 ? arrival(a, newest + 1 - a->sent) : (real)INFINITY;
+    const real first = a->num_own > 0 ? arrival(a, newest + 1 - a->num_own) : (real)INFINITY;
     const int grid = periods(a, end);
     int number = 0;
-    for (int k = 1; k <= grid + a->sent; k++) {
+    for (int k = 1; k <= grid + a->num_own; k++) {
         const int own = k - grid;
-        const real t = own > 0 ? arrival(a, newest + own - a->sent) : a->period * (real)k;
+        const real t = own > 0 ? arrival(a, newest + own - a->num_own) : a->period * (real)k;
         const int acts = own > 0 || t < first - STEWART_INSTANT;
         if (acts && t > begin + STEWART_INSTANT && t < end - STEWART_INSTANT)
             at[number++] = t;
@@ -37,24 +37,24 @@ int stewart_switches(const stewart_arrivals *a, real begin, real end, int newest
     return number;
 }
 
-int stewart_within(const stewart_arrivals *a, int flights, const real *in_flight, real begin,
+int stewart_torque_schedule(const stewart_arrivals *a, int flights, const real *in_flight, real begin,
                    real end, int newest, real *torques, real *durations)
 {
-    const int number = 1 + stewart_switches(a, begin, end, newest, durations + 1);
+    const int number = 1 + stewart_switch_times(a, begin, end, newest, durations + 1);
     static const real none[U];
     int own = 0; /* controller's torques that have arrived */
     durations[0] = begin;
     for (int k = 0; k < number; k++) {
         const real start = durations[k], *torque;
-        while (own < a->sent && arrival(a, newest + 1 + own - a->sent) <= start + STEWART_INSTANT)
+        while (own < a->num_own && arrival(a, newest + 1 + own - a->num_own) <= start + STEWART_INSTANT)
             own++;
         if (own > 0) {
-            torque = in_flight + U * (flights - a->sent + own - 1);
+            torque = in_flight + U * (flights - a->num_own + own - 1);
         } else {
             const real passed = REAL(floor)(start / a->period + STEWART_INSTANT / a->period);
-            const int last = a->before - 1;
+            const int last = a->num_others - 1;
             const int period = !(passed > 0) ? 0 : passed < (real)last ? (int)passed : last;
-            torque = last < 0 ? none : a->others + U * period;
+            torque = last < 0 ? none : a->other_torques + U * period;
         }
         stewart_copy(U, torque, torques + U * k);
         durations[k] = (k + 1 < number ? durations[k + 1] : end) - start;

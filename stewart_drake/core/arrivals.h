@@ -16,26 +16,26 @@
        a_i = (i dt + eta) (1 + r).
 
    It acts until the next one arrives. Until the first of the controller's own torques arrives, the
-   torques in `others` act, one per period from now. */
+   torques in `other_torques` act, one per period from now. */
 typedef struct {
-    real period; /* dt, s */
-    real eta;    /* of a torque that arrives now, s; infinite for none ever */
-    real rate;   /* of eta, s/s */
-    int sent;    /* number of the controller's own torques in flight, the newest ones */
-    int before;  /* number of `others` */
-    const real *others; /* (before, 6) N m, one per period; the last one stays */
+    real period;    /* dt, s */
+    real eta;       /* of a torque that arrives now, s; infinite for none ever */
+    real rate;      /* of eta, s/s */
+    int num_own;    /* number of the controller's own torques in flight, the newest ones */
+    int num_others; /* number of `other_torques` */
+    const real *other_torques; /* (num_others, 6) N m, one per period; the last one stays */
 } stewart_arrivals;
 
 /* Upper bound of the number of torques in a schedule that ends at `end`, s from now. */
-int stewart_arrivals_most(const stewart_arrivals *arrivals, real end);
+int stewart_max_torques(const stewart_arrivals *arrivals, real end);
 
 /* Times in (begin, end) at which another torque begins to act, ascending; returns their number. `at` has
-   places for stewart_arrivals_most(arrivals, end) - 1. `newest` is i of the last torque: -1 before a
+   places for stewart_max_torques(arrivals, end) - 1. `newest` is i of the last torque: -1 before a
    sample's torque is computed, 0 after it. */
-int stewart_switches(const stewart_arrivals *arrivals, real begin, real end, int newest, real *at);
+int stewart_switch_times(const stewart_arrivals *arrivals, real begin, real end, int newest, real *at);
 
 /* Torque schedule from `begin` to `end`: torques (n, 6) and durations (n); returns n. Both have places
-   for n = stewart_arrivals_most(arrivals, end). `in_flight` (flights, 6) has the oldest torque first;
-   only the last `sent` count. */
-int stewart_within(const stewart_arrivals *arrivals, int flights, const real *in_flight, real begin,
+   for n = stewart_max_torques(arrivals, end). `in_flight` (flights, 6) has the oldest torque first;
+   only the last `num_own` count. */
+int stewart_torque_schedule(const stewart_arrivals *arrivals, int flights, const real *in_flight, real begin,
                    real end, int newest, real *torques, real *durations);

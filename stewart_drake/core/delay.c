@@ -92,8 +92,8 @@ static Way take_way(const stewart_period *t, stewart_scratch *scratch)
 static int act(const stewart_period *t, const real *xi, real begin, real end, Way *way)
 {
     const stewart_arrivals view = arriving(t, xi);
-    way->number = stewart_within(&view, t->flights, t->in_flight, begin, end, t->newest,
-                                 way->torques, way->durations);
+    way->number = stewart_torque_schedule(&view, t->flights, t->in_flight, begin, end, t->newest,
+                                          way->torques, way->durations);
     return way->number <= MOST;
 }
 
@@ -132,14 +132,14 @@ int stewart_period_end(const stewart_period *t, const real *xi, real *state,
 }
 
 /* H (12, n) along the way of a period from xi. */
-static int linearize_along(const stewart_period *t, const real *xi, const Way *way, int exact, real *H,
+static int linearize_along(const stewart_period *t, const real *xi, const Way *way, int fourth_order, real *H,
                            stewart_scratch scratch)
 {
     const int n = size_of(t->delay), known = n - 2;
     const stewart_schedule schedule = {way->number, way->torques, way->durations, 0};
     real *all = stewart_take(&scratch, MOST * X * known), *moved = stewart_take(&scratch, n);
     real later[X], sooner[X];
-    if (!stewart_transitions_along(t->delay->machine, xi, &schedule, exact, way->states, all, scratch))
+    if (!stewart_transitions_along(t->delay->machine, xi, &schedule, fourth_order, way->states, all, scratch))
         return 0;
     for (int i = 0; i < X; i++) {
         stewart_copy(known, all + X * known * (way->number - 1) + known * i, H + n * i);
@@ -161,11 +161,11 @@ static int linearize_along(const stewart_period *t, const real *xi, const Way *w
     return 1;
 }
 
-int stewart_period_at(const stewart_period *t, const real *xi, int exact, real *state, real *H,
+int stewart_period_at(const stewart_period *t, const real *xi, int fourth_order, real *state, real *H,
                       stewart_scratch scratch)
 {
     Way way = take_way(t, &scratch);
-    return predict(t, xi, &way, state) && linearize_along(t, xi, &way, exact, H, scratch);
+    return predict(t, xi, &way, state) && linearize_along(t, xi, &way, fourth_order, H, scratch);
 }
 
 /* Probability that a normal error of this standard deviation lies between two bounds. */
@@ -189,7 +189,7 @@ int stewart_period_late(const stewart_period *t, const real *xi, const real *sta
     const stewart_arrivals view = arriving(t, xi);
     real before[6], after[6], at = -EDGE * dt;
     Way way = take_way(t, &scratch);
-    const real first = ((real)(t->newest + 1 - view.sent) * dt + view.eta) * (1 + view.rate);
+    const real first = ((real)(t->newest + 1 - view.num_own) * dt + view.eta) * (1 + view.rate);
     stewart_belief belief;
     stewart_believe(t->delay->machine, xi + X, &belief);
     *others = 0;
@@ -200,7 +200,7 @@ int stewart_period_late(const stewart_period *t, const real *xi, const real *sta
         real left, share = REAL(sqrt)(BEFORE) * dt;
         at += way.durations[k];
         left = dt - at < 0 ? 0 : dt - at < dt ? dt - at : dt;
-        if (view.sent > 0 && at >= first - STEWART_INSTANT)
+        if (view.num_own > 0 && at >= first - STEWART_INSTANT)
             share = std * REAL(sqrt)(REAL(fmax)(between(-at, dt - at, std), 0));
         else
             ++*others;
@@ -222,7 +222,7 @@ typedef struct {
     const stewart_period *period;
     const real *mean;    /* (n) prior */
     Way way;             /* the last one */
-    int m, n, exact, rows, others;
+    int m, n, fourth_order, rows, others;
     real *first;         /* state and H about the prior, for all attempts */
     real K[X * MOST];    /* see stewart_period_late */
     real drift[X];       /* standard deviations of the model's other errors */
@@ -239,7 +239,7 @@ static int predict_model(void *about, const real *xi, real *state)
 static int linearize_model(void *about, const real *xi, real *H, stewart_scratch scratch)
 {
     Model *a = about;
-    return linearize_along(a->period, xi, &a->way, a->exact, H, scratch);
+    return linearize_along(a->period, xi, &a->way, a->fourth_order, H, scratch);
 }
 
 static int rows(void *about, const real *xi, real *e, real *H, stewart_scratch scratch)
@@ -397,7 +397,7 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
     if (std > d->period / 10) {
         if (!best_of_many(a, guess, L, std, xi, scratch)
             || !predict(a->period, xi, &a->way, a->instant.state)
-            || !linearize_along(a->period, xi, &a->way, a->exact, a->instant.H, scratch)
+            || !linearize_along(a->period, xi, &a->way, a->fourth_order, a->instant.H, scratch)
             || !set_noise(a, xi, used, scratch))
             return 0;
     }
@@ -541,8 +541,8 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
     stewart_guess_root(guess, n, L);
     for (int i = 0; i < p; i++)
         if (!(stewart_norm(n, L + n * (X + i)) <= KNOWN * d->usual_std[i])) /* or NaN */
-            a.exact = 1;
-    const int goes = stewart_period_at(t, guess->numbers, a.exact, a.first, a.first + X, scratch);
+            a.fourth_order = 1;
+    const int goes = stewart_period_at(t, guess->numbers, a.fourth_order, a.first, a.first + X, scratch);
     if (y && goes) {
         if (attempt(&a, guess, L, y, 0, after, scratch))
             return;

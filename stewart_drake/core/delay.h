@@ -57,7 +57,7 @@ real stewart_guess_std(const stewart_guess *guess, int n);
 typedef struct {
     const stewart_delay *delay;
     stewart_arrivals view; /* from its beginning; eta and rate do not count */
-    int flights, newest;   /* see stewart_within */
+    int flights, newest;   /* see stewart_torque_schedule */
     const real *in_flight; /* (flights, 6) */
 } stewart_period;
 
@@ -67,9 +67,9 @@ int stewart_period_scratch(int p, int flights); /* of each of these */
 int stewart_period_end(const stewart_period *period, const real *xi, real *state,
                        stewart_scratch scratch);
 
-/* State at the end, and H (12, n) = d[state]/d[xi]; `exact`: see stewart_transitions. Returns 0 where
-   they do not exist. */
-int stewart_period_at(const stewart_period *period, const real *xi, int exact, real *state, real *H,
+/* State at the end, and H (12, n) = d[state]/d[xi]; `fourth_order`: see stewart_transitions. Returns 0
+   where they do not exist. */
+int stewart_period_at(const stewart_period *period, const real *xi, int fourth_order, real *state, real *H,
                       stewart_scratch scratch);
 
 /* Rows K (k, 12): changes of the state at the end if single torques are early or late by one standard

@@ -114,9 +114,10 @@ void stewart_delayed_outlook(const stewart_law *law, const real *memory, int num
     outlook->eta = m->eta * (1 + m->rate);
     outlook->fraction = 0;
     outlook->pending = 0;
-    const int pieces = stewart_within(&arrivals, number, torques, 0, outlook->eta, -1, each, durations);
+    const int pieces = stewart_torque_schedule(&arrivals, number, torques, 0, outlook->eta, -1, each,
+                                               durations);
     outlook->until = outlook->horizon = (stewart_schedule){pieces, each, durations, 0};
-    outlook->samples = stewart_switches(&arrivals, 0, outlook->eta, -1, times);
+    outlook->samples = stewart_switch_times(&arrivals, 0, outlook->eta, -1, times);
     times[outlook->samples++] = outlook->eta;
     outlook->times = times;
     stewart_schedule last;
@@ -133,8 +134,8 @@ void stewart_delayed_last_period(const stewart_law *law, const real *memory, int
     for (int i = 0; i < 1 + (following != NULL); i++) {
         real *each = stewart_take(scratch, U * STEWART_MAX_SCHEDULE);
         real *durations = stewart_take(scratch, STEWART_MAX_SCHEDULE);
-        const int pieces = stewart_within(&arrivals, number, torques, begins[i],
-                                          begins[i] + law->period, -1, each, durations);
+        const int pieces = stewart_torque_schedule(&arrivals, number, torques, begins[i],
+                                                   begins[i] + law->period, -1, each, durations);
         if (i == 0)
             *schedule = (stewart_schedule){pieces, each, durations, 0};
         else

@@ -195,7 +195,7 @@ static void begin(Search *s, const real *y, const real *near, stewart_scratch sc
     stewart_guess_keep_root(n, L, master);
     s->memory->known = s->memory->searching = 1;
     s->memory->cells = s->memory->best = 0;
-    for (int k = 1; k <= s->since.view.sent; k++)
+    for (int k = 1; k <= s->since.view.num_own; k++)
         if ((real)k * d->period < d->longest)
             spawn(s, k, scratch);
 }
@@ -217,7 +217,7 @@ static void search(Search *s, const real *y, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
     stewart_delay_memory *memory = s->memory;
-    const int n = s->n, k = s->since.view.sent;
+    const int n = s->n, k = s->since.view.num_own;
     const real near = NEAR * d->period;
     real top, rival;
     int busy, best = 0, kept = 0;
@@ -369,14 +369,14 @@ static int jump(Search *s, const real *y, stewart_scratch scratch)
     stewart_guess *guess = guess_at(s, 0);
     stewart_guess *ended[BEST], *moved = (stewart_guess *)stewart_take(&scratch, size);
     real *cost = stewart_take(&scratch, number), states[2][X], roots[2][X * X], total[BEST];
-    real *before = stewart_take(&scratch, U * (s->since.view.before + 1));
+    real *before = stewart_take(&scratch, U * (s->since.view.num_others + 1));
     stewart_period periods[2] = {s->since, s->since};
     if (!stewart_all_finite(2 * m, s->past) || !stewart_all_finite(m, y))
         return 0;
     stewart_copy(U, s->before, before); /* the torque before is unknown: assume the same */
-    stewart_copy(U * s->since.view.before, s->before, before + U);
-    periods[0].view.others = before;
-    periods[0].view.before++;
+    stewart_copy(U * s->since.view.num_others, s->before, before + U);
+    periods[0].view.other_torques = before;
+    periods[0].view.num_others++;
     periods[0].newest = 1;
     stewart_fill(number, 0, cost);
     for (int i = 0; i < 2; i++)

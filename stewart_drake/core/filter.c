@@ -81,7 +81,7 @@ int stewart_attempt_ended(stewart_attempt *a, stewart_scratch scratch)
 typedef struct {
     stewart_instant instant;
     const stewart_attempt *attempt;
-    int exact;
+    int fourth_order;
     real *states, *H; /* (number, 12), (number, 12, n) of `stewart_transitions` */
 } Sample;
 
@@ -100,7 +100,7 @@ static int linearize(void *about, const real *xi, real *last, stewart_scratch sc
     Sample *s = about;
     (void)last;
     return stewart_transitions_along(s->attempt->filter->machine, xi, &s->attempt->period->schedule,
-                                     s->exact, s->states, s->H, scratch);
+                                     s->fourth_order, s->states, s->H, scratch);
 }
 
 static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
@@ -109,7 +109,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     const stewart_posterior *prior = a->prior;
     const int n = a->n, m = f->sensing->size, pieces = a->period->schedule.number;
     /* Corrections of parameters that are known already are too small to need F to fourth order. */
-    Sample s = {.attempt = a, .exact = !is_known(f, prior->root, KNOWN)};
+    Sample s = {.attempt = a, .fourth_order = !is_known(f, prior->root, KNOWN)};
     real *xi = a->after->mean, distance = 0, spread;
     s.instant = (stewart_instant){f->sensing, a->values, n,  a->end,  NULL,
                                   NULL,       NULL,      &s, predict, linearize};

@@ -1,4 +1,4 @@
-/* The machine of the link: see link.h. */
+/* See link.h. */
 
 #include <string.h>
 
@@ -17,7 +17,7 @@ static double *waiting(const stewart_link *link, double *memory)
 
 int stewart_link_memory(const stewart_link *link)
 {
-    return STEWART_LINK_COMMANDS + link->history * (1 + link->size) + link->kept * width(link);
+    return STEWART_LINK_COMMANDS + link->history * (1 + link->size) + link->max_waiting * width(link);
 }
 
 void stewart_link_start(const stewart_link *link, double *memory)
@@ -66,14 +66,14 @@ static int keep(const stewart_link *link, double *memory, double at, double sequ
     if (!isfinite(at) || arrival == (double)HUGE_VAL) /* it is lost */
         return 1;
     for (int i = 0; i < number; i++, row += width(link))
-        if (!link->wire && fabs(row[AT] - at) <= link->together) {
+        if (!link->is_wire && fabs(row[AT] - at) <= link->time_tolerance) {
             if (row[SEQUENCE] > sequence && row[ARRIVAL] <= arrival)
                 return 1;
             if (row[SEQUENCE] <= sequence && row[ARRIVAL] >= arrival)
                 break;
         }
     if (row == waiting(link, memory) + width(link) * number) {
-        if (number == link->kept)
+        if (number == link->max_waiting)
             return 0;
         memory[STEWART_LINK_WAITING]++;
     }
@@ -87,7 +87,7 @@ static int keep(const stewart_link *link, double *memory, double at, double sequ
     return 1;
 }
 
-void stewart_link_begin(const stewart_link *link, double *memory, double first, int number,
+void stewart_link_preload(const stewart_link *link, double *memory, double first, int number,
                         const double *commands)
 {
     for (int i = 0; i < number; i++)
@@ -99,25 +99,25 @@ int stewart_link_take(const stewart_link *link, double *memory, double now, doub
                       double arrival, double first, int number, const double *commands)
 {
     const double last = first + (number - 1) * link->period;
-    if (memory[STEWART_LINK_WAITING] + (link->wire ? 1 : number) > link->kept)
-        return STEWART_LINK_FULL;
-    memory[STEWART_LINK_TAKEN]++;
+    if (memory[STEWART_LINK_WAITING] + (link->is_wire ? 1 : number) > link->max_waiting)
+        return STEWART_LINK_NO_ROOM;
+    memory[STEWART_LINK_OFFERED]++;
     if (number == 0)
-        return STEWART_LINK_TAKES;
-    if (link->wire) {
+        return STEWART_LINK_ACCEPTED;
+    if (link->is_wire) {
         if (sequence < memory[STEWART_LINK_NEWEST])
-            return STEWART_LINK_LATE;
+            return STEWART_LINK_TOO_LATE;
         keep(link, memory, first, sequence, arrival, commands);
-        return STEWART_LINK_TAKES;
+        return STEWART_LINK_ACCEPTED;
     }
-    if (last < now - link->together || last <= memory[STEWART_LINK_LAST] + link->together)
-        return STEWART_LINK_LATE;
+    if (last < now - link->time_tolerance || last <= memory[STEWART_LINK_LAST] + link->time_tolerance)
+        return STEWART_LINK_TOO_LATE;
     for (int i = 0; i < number; i++) {
         const double at = first + i * link->period;
-        if (at > memory[STEWART_LINK_LAST] + link->together && at >= now - link->together)
+        if (at > memory[STEWART_LINK_LAST] + link->time_tolerance && at >= now - link->time_tolerance)
             keep(link, memory, at, sequence, arrival, commands + link->size * i);
     }
-    return STEWART_LINK_TAKES;
+    return STEWART_LINK_ACCEPTED;
 }
 
 double stewart_link_next(const stewart_link *link, const double *memory)
@@ -127,7 +127,7 @@ double stewart_link_next(const stewart_link *link, const double *memory)
     for (int i = 0; i < (int)memory[STEWART_LINK_WAITING]; i++, row += width(link))
         if (row[AT] < next)
             next = row[AT];
-    if (!link->wire && memory[STEWART_LINK_COUNTS] > 0 &&
+    if (!link->is_wire && memory[STEWART_LINK_COUNTS] > 0 &&
         memory[STEWART_LINK_LAST] + link->period < next)
         next = memory[STEWART_LINK_LAST] + link->period;
     return next;
@@ -137,23 +137,23 @@ double stewart_link_next(const stewart_link *link, const double *memory)
    On a wire an overtaken command never acts. All other due commands are dropped. */
 void stewart_link_change(const stewart_link *link, double *memory, double time)
 {
-    const double until = time + link->together;
-    const double from = link->wire ? -(double)HUGE_VAL : time - link->together;
+    const double until = time + link->time_tolerance;
+    const double from = link->is_wire ? -(double)HUGE_VAL : time - link->time_tolerance;
     double *row = waiting(link, memory), *best = NULL;
     for (int i = 0; i < (int)memory[STEWART_LINK_WAITING]; i++, row += width(link))
         if (row[AT] >= from && row[AT] <= until && row[ARRIVAL] <= until &&
             !(best && best[SEQUENCE] > row[SEQUENCE]))
             best = row;
     memory[STEWART_LINK_LAST] = time;
-    if (best && !(link->wire && best[SEQUENCE] < memory[STEWART_LINK_NEWEST])) {
+    if (best && !(link->is_wire && best[SEQUENCE] < memory[STEWART_LINK_NEWEST])) {
         act(link, memory, best + COMMAND, best[AT]);
         memory[STEWART_LINK_NEWEST] = best[SEQUENCE];
         memory[STEWART_LINK_FED] = best[SEQUENCE] > 0;
         memory[STEWART_LINK_PLAYED] += best[SEQUENCE] > 0;
-    } else if (!link->wire) {
+    } else if (!link->is_wire) {
         memory[STEWART_LINK_DRY]++;
         memory[STEWART_LINK_FED] = 0;
-        act(link, memory, link->holds ? stewart_link_current(memory) : NULL, time);
+        act(link, memory, link->hold_when_dry ? stewart_link_current(memory) : NULL, time);
     }
     memory[STEWART_LINK_COUNTS] = 1;
     for (int i = (int)memory[STEWART_LINK_WAITING] - 1; i >= 0; i--) {
@@ -163,7 +163,7 @@ void stewart_link_change(const stewart_link *link, double *memory, double time)
     }
 }
 
-void stewart_link_safe(const stewart_link *link, double *memory, double time, int holds)
+void stewart_link_reset(const stewart_link *link, double *memory, double time, int holds)
 {
     memory[STEWART_LINK_WAITING] = memory[STEWART_LINK_COUNTS] = memory[STEWART_LINK_FED] = 0;
     memory[STEWART_LINK_NEWEST] = -(double)HUGE_VAL; /* a new session counts anew */

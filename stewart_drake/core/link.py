@@ -8,39 +8,42 @@ import numpy as np
 from stewart_drake.core.library import core
 from stewart_drake.types import Array
 
-FULL: Final = 1
+NO_ROOM: Final = 1
 """Result of `Link.take` if the memory is full."""
 
 
 class Link:
-    """A machine of events whose memory, a vector of numbers, is the caller's.
+    """State machine of events. Its memory, a vector of numbers, is the caller's.
 
     Args:
         size: numbers of a command.
-        kept: commands that can wait.
-        period: of a buffered command, in the unit of all times.
-        wire: whether commands act when they arrive.
-        holds: whether a dry buffer holds the last command, or puts out zero.
-        history: past commands that are kept.
-        together: greatest distance of simultaneous instants.
-        limit: of each number of a command.
+        max_waiting: greatest number of waiting commands.
+        period: from each command of a plan to the next, in the unit of all times.
+        is_wire: whether commands act when they arrive.
+        hold_when_dry: whether a dry buffer holds the last command, or puts out zero.
+        history: number of past commands in memory.
+        time_tolerance: times closer than this are equal.
+        limit: greatest absolute value of each number of a command.
     """
 
     def __init__(
         self,
         size: int,
-        kept: int,
+        max_waiting: int,
         period: float,
         *,
-        wire: bool,
-        holds: bool = True,
+        is_wire: bool,
+        hold_when_dry: bool = True,
         history: int = 1,
-        together: float = 0.0,
+        time_tolerance: float = 0.0,
         limit: float = math.inf,
     ) -> None:
         c = core()
         self._core, self.size, self.history = c, size, history
-        values = size, kept, history, wire, holds, period, together, limit
+        values = (
+            *(size, max_waiting, history, is_wire, hold_when_dry),
+            *(period, time_tolerance, limit),
+        )
         self.data: Any = c.ffi.new("stewart_link *", values)
 
     def _call(self, name: str, *given: Any) -> Any:
@@ -56,9 +59,9 @@ class Link:
         """Set the command (size,) that has acted since a time."""
         self._call("assume", memory, time, np.array(command, np.float64))
 
-    def begin(self, memory: Array, first: float, commands: Array) -> None:
-        """Send commands (n, size) that act at `first`, a period later and so on."""
-        self._call("begin", memory, first, len(commands), np.array(commands, np.float64))
+    def preload(self, memory: Array, first: float, commands: Array) -> None:
+        """Queue commands (n, size) for `first`, a period later, and so on."""
+        self._call("preload", memory, first, len(commands), np.array(commands, np.float64))
 
     def take(
         self,
@@ -81,9 +84,9 @@ class Link:
         """Let the command act that is due at a time."""
         self._call("change", memory, time)
 
-    def safe(self, memory: Array, time: float, holds: bool) -> None:
+    def reset(self, memory: Array, time: float, holds: bool) -> None:
         """Drop waiting commands, and hold the last command or put out zero."""
-        self._call("safe", memory, time, holds)
+        self._call("reset", memory, time, holds)
 
     def acted(self, memory: Array) -> Array:
         """Return a view (h, 1 + size) of past commands, each after its time, the newest first."""
@@ -91,5 +94,5 @@ class Link:
         return memory[begin : begin + self.history * (1 + self.size)].reshape(self.history, -1)
 
     def number(self, memory: Array, name: str) -> float:
-        """Return a number of the memory by its name in core/link.h, for example `taken`."""
+        """Return a number of the memory by its name in core/link.h, for example `offered`."""
         return float(memory[getattr(self._core.lib, f"STEWART_LINK_{name.upper()}")])

@@ -14,20 +14,21 @@ void stewart_believe(const stewart_machine *machine, const real *theta, stewart_
     belief->plant.geometry = machine->geometry;
     belief->plant.gravity = &machine->gravity;
     belief->plant.parameters = belief->parameters;
-    belief->map = machine->map;
+    belief->acceleration_per_torque = machine->acceleration_per_torque;
 }
 
 void stewart_accelerate(const stewart_belief *belief, const real *state, const real *torque,
                         real *accelerations)
 {
-    if (!belief->map) {
+    const real *per_torque = belief->acceleration_per_torque;
+    if (!per_torque) {
         stewart_accelerations(&belief->plant, state, state + 6, torque, accelerations);
         return;
     }
     for (int i = 0; i < 6; i++) {
         accelerations[i] = 0;
         for (int j = 0; j < U; j++) /* the biases are the first of the parameters */
-            accelerations[i] += belief->map[U * i + j] * (torque[j] + belief->parameters[j]);
+            accelerations[i] += per_torque[U * i + j] * (torque[j] + belief->parameters[j]);
     }
 }
 
@@ -49,14 +50,14 @@ int stewart_at_limit(const stewart_machine *machine, int number, const real *tor
 
 void stewart_required_torque(const stewart_belief *belief, const real *row, real *torque)
 {
-    real map[36];
-    if (!belief->map) {
+    real per_torque[36];
+    if (!belief->acceleration_per_torque) {
         stewart_inverse_dynamics(&belief->plant, row, row + 6, row + 12, torque);
         return;
     }
-    stewart_copy(36, belief->map, map);
+    stewart_copy(36, belief->acceleration_per_torque, per_torque);
     stewart_copy(U, row + 12, torque);
-    if (!stewart_solve(6, 1, map, torque))
+    if (!stewart_solve(6, 1, per_torque, torque))
         stewart_fill(U, (real)NAN, torque);
     for (int i = 0; i < U; i++)
         torque[i] -= belief->parameters[i];
@@ -66,7 +67,7 @@ void stewart_advance(const stewart_belief *belief, const real *torque, real dura
                      real *state)
 {
     real a[6];
-    if (!belief->map) {
+    if (!belief->acceleration_per_torque) {
         for (int i = 0; i < substeps; i++)
             stewart_move(&belief->plant, torque, duration / (real)substeps, state);
         return;
@@ -93,7 +94,7 @@ void stewart_predict(const stewart_machine *machine, const real *theta, const st
 }
 
 /* right (6, 18 + p) <- -M^-1 dF/d[state, torque, theta] of the equations F. */
-static int of_equations(const stewart_machine *machine, const stewart_belief *belief,
+static int solve_acceleration_derivatives(const stewart_machine *machine, const stewart_belief *belief,
                         const real *state, const real *torque, int p, real *right,
                         stewart_scratch scratch)
 {
@@ -124,15 +125,16 @@ int stewart_derivatives(const stewart_machine *machine, const stewart_belief *be
 {
     const int p = G ? machine->estimated : 0, columns = X + U + p;
     real *right = stewart_take(&scratch, 6 * columns);
-    if (belief->map) {
+    const real *per_torque = belief->acceleration_per_torque;
+    if (per_torque) {
         stewart_fill(6 * columns, 0, right);
         for (int i = 0; i < 6; i++) {
-            stewart_copy(U, belief->map + U * i, right + columns * i + X);
+            stewart_copy(U, per_torque + U * i, right + columns * i + X);
             for (int j = 0; j < p; j++)
                 if (machine->place[j] >= 0 && machine->place[j] < U)
-                    right[columns * i + X + U + j] = belief->map[U * i + machine->place[j]];
+                    right[columns * i + X + U + j] = per_torque[U * i + machine->place[j]];
         }
-    } else if (!of_equations(machine, belief, state, torque, p, right, scratch)) {
+    } else if (!solve_acceleration_derivatives(machine, belief, state, torque, p, right, scratch)) {
         return 0;
     }
     stewart_fill(6 * X, 0, A);
@@ -151,7 +153,7 @@ int stewart_derivatives(const stewart_machine *machine, const stewart_belief *be
 }
 
 /* State after the share s of h seconds, on the cubic through the states at both ends. */
-static void within_hold(const real *start, const real *end, real h, real s, real *state)
+static void hermite_state(const real *start, const real *end, real h, real s, real *state)
 {
     real left = 1 - s;
     for (int i = 0; i < 6; i++) {
@@ -166,20 +168,20 @@ static void within_hold(const real *start, const real *end, real h, real s, real
    fourth order is F = exp(h/2 (L1 + L2) + sqrt(3)/12 h^2 [L2, L1]). Else the midpoint rule,
    F = exp(h L). */
 static int transition_of_hold(const stewart_machine *machine, const stewart_belief *belief,
-                              const real *torque, real h, int exact, const real *start,
+                              const real *torque, real h, int fourth_order, const real *start,
                               const real *end, real *Phi, real *S, stewart_scratch scratch)
 {
-    const int p = machine->estimated, nodes = 1 + exact;
+    const int p = machine->estimated, nodes = 1 + fourth_order;
     real *A = stewart_take(&scratch, nodes * X * X), *G = stewart_take(&scratch, nodes * X * p);
     real *omega = stewart_take(&scratch, X * X), *turned = stewart_take(&scratch, X * p);
     real *B = stewart_take(&scratch, X * U), state[X];
     for (int node = 0; node < nodes; node++) {
-        within_hold(start, end, h, exact ? GAUSS_NODES[node] : (real)0.5, state);
+        hermite_state(start, end, h, fourth_order ? GAUSS_NODES[node] : (real)0.5, state);
         if (!stewart_derivatives(machine, belief, state, torque, A + X * X * node, B,
                                  G + X * p * node, scratch))
             return 0;
     }
-    if (exact) {
+    if (fourth_order) {
         const real part = SQRT_3 / 12 * h * h;
         const real *A1 = A, *A2 = A + X * X, *G1 = G, *G2 = G + X * p;
         real *one = stewart_take(&scratch, X * X), *other = stewart_take(&scratch, X * X);
@@ -203,14 +205,14 @@ static int transition_of_hold(const stewart_machine *machine, const stewart_beli
 }
 
 int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
-                        int exact, real *states, real *H, stewart_scratch scratch)
+                        int fourth_order, real *states, real *H, stewart_scratch scratch)
 {
     stewart_predict(machine, xi + X, schedule, xi, states);
-    return stewart_transitions_along(machine, xi, schedule, exact, states, H, scratch);
+    return stewart_transitions_along(machine, xi, schedule, fourth_order, states, H, scratch);
 }
 
 int stewart_transitions_along(const stewart_machine *machine, const real *xi,
-                              const stewart_schedule *schedule, int exact, const real *states, real *H,
+                              const stewart_schedule *schedule, int fourth_order, const real *states, real *H,
                               stewart_scratch scratch)
 {
     const int p = machine->estimated, n = X + p;
@@ -220,7 +222,7 @@ int stewart_transitions_along(const stewart_machine *machine, const real *xi,
     stewart_believe(machine, xi + X, &belief);
     for (int k = 0; k < schedule->number; k++, before = H, start = states, states += X, H += X * n) {
         const real *torque = schedule->torques + U * k, h = schedule->durations[k];
-        if (!transition_of_hold(machine, &belief, torque, h, exact, start, states, Phi, S, scratch))
+        if (!transition_of_hold(machine, &belief, torque, h, fourth_order, start, states, Phi, S, scratch))
             return 0;
         if (before) /* [Phi S; 0 1] [H; 0 1] */
             stewart_multiply(X, X, n, Phi, before, H);

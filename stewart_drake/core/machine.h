@@ -20,7 +20,7 @@ typedef struct {
     int substeps;                        /* Runge-Kutta steps per torque */
     int estimated;                       /* p */
     int place[STEWART_MAX_ESTIMATED];    /* of each in `parameters`, or -1 */
-    const real *map; /* (6, 6), or NULL: accelerations = map (torque + bias) at any pose */
+    const real *acceleration_per_torque; /* (6, 6) at any pose, times torque + bias; NULL: the equations */
 } stewart_machine;
 
 /* Torque schedule: torques that act one after the other, each for its duration. */
@@ -35,7 +35,7 @@ typedef struct {
 typedef struct {
     stewart_plant plant;
     real parameters[STEWART_PARAMETERS];
-    const real *map; /* as of the machine */
+    const real *acceleration_per_torque; /* as of the machine */
 } stewart_belief;
 
 /* `theta` (p), or NULL for what is known beforehand. The belief points into itself: it is not copied. */
@@ -68,14 +68,14 @@ int stewart_derivatives(const stewart_machine *machine, const stewart_belief *be
                         stewart_scratch scratch);
 
 /* States (number, 12) after each of the torques, and the first 12 rows H (number, 12, 12 + p) of
-   F = [Phi S; 0 1] from xi = [state; theta] to there. `exact`: Magnus steps of fourth order, else the
-   midpoint's of second. Returns 0 where they do not exist. */
+   F = [Phi S; 0 1] from xi = [state; theta] to there. `fourth_order`: Magnus steps of
+   fourth order, else the midpoint rule, of second order. Returns 0 where they do not exist. */
 int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
-                        int exact, real *states, real *H, stewart_scratch scratch);
+                        int fourth_order, real *states, real *H, stewart_scratch scratch);
 
 /* The same H along states that `stewart_predict` gave from xi. */
 int stewart_transitions_along(const stewart_machine *machine, const real *xi,
-                              const stewart_schedule *schedule, int exact, const real *states, real *H,
+                              const stewart_schedule *schedule, int fourth_order, const real *states, real *H,
                               stewart_scratch scratch);
 
 int stewart_transitions_scratch(int estimated);

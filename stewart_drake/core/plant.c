@@ -126,7 +126,7 @@ int stewart_open_loop(stewart_run *r, const stewart_drive *drives, long number)
    the last periods, the newest first. */
 static void write_report(const stewart_loop *o, long k, double *arrived)
 {
-    const double until = o->period * (double)k + o->link->together;
+    const double until = o->period * (double)k + o->link->time_tolerance;
     const double *acted = o->memory + STEWART_LINK_COMMANDS + 1;
     for (long i = 0, packet = k - 1; i < o->reported; i++, packet--) {
         arrived[i] = packet >= 0 && o->period * (double)packet + o->transit[packet] <= until;
@@ -142,10 +142,10 @@ static int pass_back(const stewart_loop *o, long k, double *values)
     const double now = o->period * (double)k, *newest = o->back_memory + STEWART_LINK_COMMANDS;
     double arrival = now + o->back_transit[k];
     stewart_link_take(back, o->back_memory, now, (double)(k + 1), 0., arrival, 1, values);
-    if (stewart_link_next(back, o->back_memory) <= now + back->together)
+    if (stewart_link_next(back, o->back_memory) <= now + back->time_tolerance)
         stewart_link_change(back, o->back_memory, now);
     int arrived = o->back_memory[STEWART_LINK_ACTED] > 0. &&
-                  newest[0] > now - o->period + back->together;
+                  newest[0] > now - o->period + back->time_tolerance;
     for (int i = 0; i < back->size; i++)
         values[i] = arrived ? newest[1 + i] : (double)NAN;
     return arrived ? (int)((double)(k + 1) - o->back_memory[STEWART_LINK_NEWEST]) : 0;
@@ -168,7 +168,7 @@ static int sample(const dop853 *s, stewart_loop *o, long k, stewart_controller l
         measured.report = &report;
     if (law(about, k, &measured, torque, command))
         return STEWART_CONTROLLER_FAILED;
-    if (o->link->wire)
+    if (o->link->is_wire)
         stewart_link_take(o->link, o->memory, now, (double)(k + 1), 0., arrival, 1, command);
     else
         stewart_link_take(o->link, o->memory, now, (double)(k + 1), arrival,
@@ -188,11 +188,11 @@ int stewart_closed_loop(stewart_run *r, stewart_loop *o, stewart_controller law,
             d.torque[i] = stewart_link_current(o->memory)[i] + o->bias[i];
         double sampled = k < o->samples ? o->sampled[k] : HUGE_VAL;
         double released = stewart_link_next(o->link, o->memory);
-        int samples = sampled <= released + o->link->together, how = STEWART_INSIDE;
+        int samples = sampled <= released + o->link->time_tolerance, how = STEWART_INSIDE;
         double next = samples ? sampled : released;
         if (next > r->end)
             return ended(r, &s, advance(&s, r, r->end));
-        if (next > s.time + o->link->together)
+        if (next > s.time + o->link->time_tolerance)
             how = advance(&s, r, next);
         if (how == STEWART_INSIDE && samples)
             how = sample(&s, o, k++, law, about);

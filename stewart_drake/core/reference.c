@@ -266,7 +266,7 @@ static void return_after_gap(const stewart_course_input *m, const stewart_course
 void stewart_follow(const stewart_course_input *m, const stewart_course *last, const real *given,
                     stewart_course *c, stewart_scratch scratch)
 {
-    const real *geometry = m->machine->map ? NULL : m->machine->geometry;
+    const real *geometry = m->machine->acceleration_per_torque ? NULL : m->machine->geometry;
     const stewart_preview now = {c->number, c->times, given};
     const stewart_preview before = {last->number, last->times, last->reference};
     stewart_complete(geometry, m->period, m->eta, &now, -(real)HUGE_VAL, &before, c->reference);

@@ -111,5 +111,5 @@ def machine_of(plant: NominalPlant) -> Compiled:
     if not isinstance(dynamics, FrozenDynamics):
         return Compiled(machine)
     frozen = numbers(dynamics.map)
-    machine.map = core().at(frozen)
+    machine.acceleration_per_torque = core().at(frozen)
     return Compiled(machine, (frozen,))

@@ -165,7 +165,7 @@ class Arrivals(Timeline):
     def samples(self) -> Array:
         """Instants (s,), s from now, at which another torque begins to act, then the next one."""
         view, at = self._compiled(), np.empty(self._most(self.eta))
-        number = core().lib.stewart_switches(view, 0.0, self.eta, -1, core().at(at))
+        number = core().lib.stewart_switch_times(view, 0.0, self.eta, -1, core().at(at))
         return np.append(at[:number], self.eta)
 
     def queue(self, in_flight: Array) -> Array:
@@ -194,7 +194,7 @@ class Arrivals(Timeline):
         queue = np.ascontiguousarray(in_flight)
         durations = np.empty(self._most(end))
         torques, c = np.empty((len(durations), NUM_TORQUES)), core()
-        number = c.lib.stewart_within(
+        number = c.lib.stewart_torque_schedule(
             *(self._compiled(), len(queue), c.at(queue), begin, end, newest),
             *(c.at(torques), c.at(durations)),
         )
@@ -206,4 +206,4 @@ class Arrivals(Timeline):
         return core().ffi.new("stewart_arrivals *", (*numbers, core().at(self.before)))
 
     def _most(self, end: float) -> int:
-        return int(core().lib.stewart_arrivals_most(self._compiled(), end))
+        return int(core().lib.stewart_max_torques(self._compiled(), end))

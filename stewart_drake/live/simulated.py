@@ -111,7 +111,9 @@ class Motors:
     ) -> None:
         self.holds, self.is_wire, self._delay_of = holds, delay_of is not None, delay_of
         given, history = (NUM_TORQUES, MOST_WAITING, period), MOST_HISTORY
-        self._link = Link(*given, wire=self.is_wire, holds=holds, history=history, limit=limit)
+        self._link = Link(
+            *given, is_wire=self.is_wire, hold_when_dry=holds, history=history, limit=limit
+        )
         self._memory, self._begun = self._link.start(), False
 
     @classmethod
@@ -157,7 +159,7 @@ class Motors:
     def begin(self, queue: Plan) -> None:
         """Begin with the torques in flight."""
         self._begun = True
-        self._link.begin(self._memory, queue.playout, queue.torques)
+        self._link.preload(self._memory, queue.playout, queue.torques)
 
     def take(self, plan: Plan, time: int) -> Refusal | None:
         """Take a plan that has arrived; return why it is refused, or None."""
@@ -178,7 +180,7 @@ class Motors:
 
     def safe(self, time: int, holds: bool) -> None:
         """Drop what waits; hold the torque, or output zero, until the next plan."""
-        self._link.safe(self._memory, time, holds)
+        self._link.reset(self._memory, time, holds)
 
 
 # ---------------------------------------------------------------- plant and sensor

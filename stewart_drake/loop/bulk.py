@@ -554,16 +554,16 @@ def _motor_link(
         kept = len(queue) + int(transit.max(initial=0.0) / period) + 2
     link = Link(
         *(NUM_TORQUES, kept, period),
-        wire=config.kind == "wire",
-        holds=holds,
+        is_wire=config.kind == "wire",
+        hold_when_dry=holds,
         history=history,
-        together=SIMULTANEOUS * period,
+        time_tolerance=SIMULTANEOUS * period,
         limit=experiment.torque_limit,
     )
     memory, first = link.start(), (delay.periods - len(queue)) * period
     if len(queue):
         link.assume(memory, first, queue[0])
-        link.begin(memory, first, queue)
+        link.preload(memory, first, queue)
     return link, memory, transit
 
 

@@ -11,7 +11,7 @@ from typing import Final, Literal
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
-from stewart_drake.core.link import FULL, Link
+from stewart_drake.core.link import NO_ROOM, Link
 from stewart_drake.loop.sampling import declare_constant, update_every, weak
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import SIMULTANEOUS, releases
@@ -39,7 +39,7 @@ class LinkSystem(LeafSystem):
         self._commanded = self.DeclareVectorInputPort("commanded", rows * link.size)
         memory, first = link.start(), (delay.periods - len(queue)) * period
         link.assume(memory, *((first, queue[0]) if len(queue) else (np.nan, np.zeros(link.size))))
-        link.begin(memory, first, queue)
+        link.preload(memory, first, queue)
         self._memory = self.DeclareDiscreteState(memory)
         update_every(self, period, self._take)
 
@@ -52,7 +52,7 @@ class LinkSystem(LeafSystem):
         memory = self._of(state)
         number = self._taken(memory)
         result = self._send(memory, number, self._commanded.Eval(context))
-        assert result != FULL, "more commands are in flight than the link has places for"
+        assert result != NO_ROOM, "more commands are in flight than the link has places for"
         self._change(memory, number * self._period)
 
     def _change(self, memory: Array, time: float) -> None:
@@ -65,7 +65,7 @@ class LinkSystem(LeafSystem):
         return np.asarray(state.get_discrete_state(self._memory).value())
 
     def _taken(self, memory: Array) -> int:
-        return int(self._link.number(memory, "taken"))
+        return int(self._link.number(memory, "offered"))
 
     def _put_out(self, name: str, columns: slice) -> None:
         """Declare an output: columns of [begin of its action; command] that acts."""
@@ -83,7 +83,9 @@ class Wire(LinkSystem):
     def _lay(self, period: float, kept: int, delay: Delay, queue: Array, carries: Carried) -> None:
         """Declare ports and state, with places for `kept` commands beyond the queue."""
         kept += delay.queue_length
-        link = Link(CARRIED[carries], kept, period, wire=True, together=SIMULTANEOUS * period)
+        link = Link(
+            CARRIED[carries], kept, period, is_wire=True, time_tolerance=SIMULTANEOUS * period
+        )
         self._begin(link, period, 1, delay, queue)
         self._put_out(carries, slice(1, None))
         if carries == "command":
@@ -263,10 +265,10 @@ class PlayoutBuffer(LinkSystem):
         self._arrivals = period * np.arange(len(times)) + np.asarray(times, dtype=np.float64)
         link = Link(
             *(NUM_TORQUES, buffer_places(delay, rows), period),
-            wire=False,
-            holds=dry == "hold",
+            is_wire=False,
+            hold_when_dry=dry == "hold",
             history=history,
-            together=SIMULTANEOUS * period,
+            time_tolerance=SIMULTANEOUS * period,
         )
         self._begin(link, period, rows, delay, queue)
         self._put_out("torque", slice(1, None))
@@ -360,7 +362,7 @@ class LateMeasurements(LeafSystem):
         """Return the memory of the link with the present measurement, whether taken or not."""
         memory = np.array(context.get_discrete_state(self._memory).value())
         k = round(context.get_time() / self._period)
-        if self._link.number(memory, "taken") == k:
+        if self._link.number(memory, "offered") == k:
             waits = self._times[k] if k < len(self._times) else np.inf
             now, y = k * self._period, np.asarray(self._measured.Eval(context))
             self._link.take(memory, now, k + 1, now + waits, y[None])
@@ -373,7 +375,7 @@ class LateMeasurements(LeafSystem):
 
     def _given(self, memory: Array) -> Array | None:
         """Return the measurement that arrived in the last period, or None."""
-        arrived, begun = self._link.acted(memory)[0], self._link.number(memory, "taken") - 2
+        arrived, begun = self._link.acted(memory)[0], self._link.number(memory, "offered") - 2
         there = self._link.number(memory, "acted") > 0
         new = arrived[0] > (begun + SIMULTANEOUS) * self._period
         return arrived[1:] if there and new else None
@@ -384,12 +386,12 @@ class LateMeasurements(LeafSystem):
 
     def _age(self, context: Context, output: BasicVector) -> None:
         memory = self._now(context)
-        behind = self._link.number(memory, "taken") - self._link.number(memory, "newest")
+        behind = self._link.number(memory, "offered") - self._link.number(memory, "newest")
         output.SetFromVector([0.0 if self._given(memory) is None else behind * self._period])
 
 
 def measurement_link(period: float, times: Array, size: int) -> Link:
     """Return the link for measurements (size,) with transit times in s."""
     longest = times.max(initial=0.0, where=np.isfinite(times))
-    together = SIMULTANEOUS * period
-    return Link(size, int(longest / period) + 2, period, wire=True, together=together)
+    tolerance = SIMULTANEOUS * period
+    return Link(size, int(longest / period) + 2, period, is_wire=True, time_tolerance=tolerance)

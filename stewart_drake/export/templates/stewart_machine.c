@@ -158,7 +158,7 @@ static void change(machine *m, uint64_t time)
 static void go_safe(machine *m, uint64_t time)
 {
     plate_follow(m, time);
-    stewart_link_safe(&m->buffer, m->link, (double)time, 0);
+    stewart_link_reset(&m->buffer, m->link, (double)time, 0);
     m->safe = 1;
 }
 
@@ -195,7 +195,7 @@ static void begin(machine *m)
     m->running = 1;
     for (int i = 0; i < 6 * number; i++) /* what is in flight: a real machine has nothing */
         torques[i] = (double)stewart_queue[i];
-    stewart_link_begin(&m->buffer, m->link, floor((double)m->begin + early + 0.5), number, torques);
+    stewart_link_preload(&m->buffer, m->link, floor((double)m->begin + early + 0.5), number, torques);
     printf("the run began at %.3f s\n", 1e-9 * (double)m->begin);
 }
 
