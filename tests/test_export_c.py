@@ -313,3 +313,32 @@ def test_the_command_writes_all_files_or_none(tmp_path, capsys):
     with pytest.raises(FileNotFoundError):
         export_c.write(files, folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("settings", "step"),
+    [
+        ((), "stewart_step"),
+        (("tuner.kind=ann",), "stewart_tuned_step"),
+        (("actuator.kind=servo",), "stewart_servo_step"),
+    ],
+    ids=["torques", "tuner", "servos"],
+)
+def test_the_wiring_of_the_readme_compiles(settings, step, tmp_path):
+    controller = "servo_feedforward" if step == "stewart_servo_step" else None
+    scenario = load_scenario("paper", controller, (*SHORT, "duration=0.5", *settings))
+    files = export_c.exported(scenario, measured=False)
+    for name, text in files.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    code = files["README.md"].split("```c\n")[1].split("```")[0]
+    assert f"{step}(" in code and "@" not in files["README.md"]
+    declared = "void read_plate(real *);\nvoid read_report(real *);\nvoid send(const real *);\n"
+    declared += "void setup(void);\nvoid every_period(void);\n"
+    body = "{ (void)about, (void)number, (void)times, (void)rows; }"
+    first, _, rest = code.partition("\n\n")
+    wiring = tmp_path / "wiring.c"
+    wiring.write_text(f"{first}\n{declared}{rest}".replace("{ .. }", body), encoding="utf-8")
+    strict = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror"]
+    command = [*c_compiler(), *strict, "-c", "wiring.c", "-o", "wiring.o"]
+    subprocess.run(command, cwd=tmp_path, check=True)

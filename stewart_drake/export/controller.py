@@ -61,6 +61,8 @@ EXAMPLES: Final = (
 TEMPLATES: Final = Path(__file__).with_name("templates")
 TOLERANCES: Final = {"double": 1e-9, "float": 1e-3}
 """Tolerance of the replay, as a share of the peak."""
+_PER_KIND: Final = ("replay_", "wiring_")
+"""Beginnings of templates of which an export has one."""
 _UNMEASURED: Final = "Not compiled here: run `make size` and `make test`.\n"
 
 
@@ -98,7 +100,10 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     }
     values |= _configuration(recorded, compiled, tuner, suffix)
     values |= _replay(recorded, experiment, tuner, suffix)
-    names = {path.name for path in TEMPLATES.iterdir()} - {"replay_torques.h", "replay_servos.h"}
+    kind = "torques" if isinstance(law, PredictiveLqi) else "servos"
+    wiring = TEMPLATES / f"wiring_{kind if tuner is None else 'tuned'}.md"
+    values["WIRING"] = _filled(wiring.read_text("utf-8"), values)
+    names = {path.name for path in TEMPLATES.iterdir() if not path.name.startswith(_PER_KIND)}
     if over_udp or recorded.moves:
         values |= _surroundings(experiment, recorded, suffix)
     else:
@@ -107,7 +112,6 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         files |= {name: (FOLDER / name).read_text("utf-8") for name in MACHINE}
     else:
         names -= set(EXAMPLES)
-    kind = "torques" if isinstance(law, PredictiveLqi) else "servos"
     texts = {name: (TEMPLATES / name).read_text("utf-8") for name in sorted(names)}
     texts["replay.h"] = (TEMPLATES / f"replay_{kind}.h").read_text("utf-8")
     files |= {name: _filled(text, values) for name, text in texts.items()}
