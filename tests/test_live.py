@@ -255,7 +255,7 @@ def test_an_error_of_which_half_was_measured_is_none(quiet_machine):
         result = driven(running, 3.0)
     assert result.status == "completed" and math.isnan(result.accumulated_error)
     assert result.summary["measured_share"] == pytest.approx(0.5, abs=0.1)
-    share = f"measured at {100 * result.summary['measured_share']:.3g} %"
+    share = f"measured at {100 * result.summary['measured_share']:.1f} %"
     assert share in " ".join(run_document(result).plain().split())
 
 

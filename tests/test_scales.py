@@ -61,13 +61,8 @@ def run(monkeypatch, s, m, *settings):
     sc.plant.torque_bias = [m * s**2 * bias for bias in sc.plant.torque_bias]
     mechanism = scaled(s, m)
     monkeypatch.setattr(experiment_module, "load_mechanism", lambda _: mechanism)
-    if sc.plant.gravity:  # goes with lengths too, as times stay
-
-        def dynamics(machine, gravity, *more):
-            return StewartDynamics(machine, 9.81 * s * gravity, *more)
-
-        monkeypatch.setattr(experiment_module, "StewartDynamics", dynamics)
-        monkeypatch.setattr("stewart_drake.loop.diagram.StewartDynamics", dynamics)
+    # Gravity goes with the lengths, as times stay.
+    monkeypatch.setattr("stewart_drake.dynamics.stewart.DEFAULT_GRAVITY", 9.81 * s)
     result = simulate(sc, judge_stability=False)
     return result, result.signals.torque_commanded.values / (m * s**2)
 

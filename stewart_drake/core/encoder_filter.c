@@ -14,6 +14,13 @@
 #define ROUNDING 1e-9
 #endif
 
+int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
+                        int fourth_order, real *states, real *H, stewart_scratch scratch)
+{
+    stewart_predict(machine, xi + X, schedule, xi, states);
+    return stewart_transitions_along(machine, xi, schedule, fourth_order, states, H, scratch);
+}
+
 /* Cut a schedule (number) at instants (n), ascending, in s. There is place for number + n torques and
    durations; `places` (n) are the pieces that end at the instants. */
 static stewart_schedule cut(const stewart_schedule *schedule, int n, const real *instants,

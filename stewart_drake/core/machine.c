@@ -204,13 +204,6 @@ static int transition_of_hold(const stewart_machine *machine, const stewart_beli
     return 1;
 }
 
-int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
-                        int fourth_order, real *states, real *H, stewart_scratch scratch)
-{
-    stewart_predict(machine, xi + X, schedule, xi, states);
-    return stewart_transitions_along(machine, xi, schedule, fourth_order, states, H, scratch);
-}
-
 int stewart_transitions_along(const stewart_machine *machine, const real *xi,
                               const stewart_schedule *schedule, int fourth_order, const real *states, real *H,
                               stewart_scratch scratch)
