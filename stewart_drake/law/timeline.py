@@ -188,7 +188,8 @@ class Arrivals(Timeline):
 
         Args:
             in_flight: (n, 6) torques, oldest first; those before the last `sent` are not used.
-            begin, end: s.
+            begin: s, of the first instant.
+            end: s, of the last instant.
             newest: sample of the last torque: -1 before this sample's is computed, 0 after it.
         """
         queue = np.ascontiguousarray(in_flight)

@@ -38,7 +38,8 @@ def figures(
     """Compute the figures of merit of a run.
 
     Args:
-        time, error: on the metric's grid, as of `accumulated_error`.
+        time: (n,) of the metric's grid, s.
+        error: (n, 6) on that grid, as of `accumulated_error`.
         scale: (6,) as of `accumulated_error`.
         errors: (k, 6) pose error at the controller's samples.
         asked: (k, 6) torques of the law there, N m.
@@ -77,7 +78,8 @@ def quadratic_cost(
         error: (n, 6) pose error at the controller's samples.
         torque: (n, 6) within the motors' limit, N m.
         period: s; z follows from the errors by the trapezoid rule.
-        w_Q, w_R: the weights.
+        w_Q: weight of the errors.
+        w_R: weight of the torques.
         integral: whether the cost includes z, (28).
     """
     cost = w_Q * float(np.sum(error**2)) + w_R * float(np.sum(torque**2))
