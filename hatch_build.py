@@ -10,6 +10,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from packaging.tags import sys_tags
 
 GENERATOR = ["casadi==3.8.2", "cffi>=1.16", "numpy>=2", "pydantic>=2", "ruamel.yaml>=0.18"]
+READER = ["cffi>=1.16"]
 COMPILER = ["ziglang==0.17.1"]
 
 
@@ -30,8 +31,8 @@ class CoreHook(BuildHookInterface):
     def dependencies(self) -> list[str]:
         """Return what the build needs and does not find: the generator's packages, a compiler."""
         needed = [] if self.build.is_generated() else [*GENERATOR]
-        if self.target_name == "wheel" and self.build.system_compiler() is None:
-            needed += COMPILER
+        if self.target_name == "wheel":
+            needed += READER + ([] if self.build.system_compiler() else COMPILER)
         return needed
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
@@ -53,8 +54,9 @@ class CoreHook(BuildHookInterface):
         if reason is not None:
             raise RuntimeError(f"the core cannot be compiled: {reason}")
         if version != "editable":
-            place = build.LIBRARY.relative_to(self.root).as_posix()
-            build_data["force_include"][str(target)] = place
+            for part in Path(self.folder).iterdir():
+                place = build.LIBRARY.with_name(part.name).relative_to(self.root).as_posix()
+                build_data["force_include"][str(part)] = place
         # As hatchling does: neither manylinux nor musllinux, which would be a promise.
         tags = (tag.platform for tag in sys_tags())
         platform = next(tag for tag in tags if not tag.startswith(("manylinux", "musllinux")))

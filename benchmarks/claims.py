@@ -12,12 +12,11 @@ import math
 import os
 import tempfile
 from collections.abc import Iterable
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from _bench import Push, size, table, write
+from _bench import size, table, write
 from joblib import Parallel, delayed
 from true_machine import calibrated
 
@@ -44,6 +43,7 @@ OFFSET = float(np.deg2rad(0.1))
 
 ON = ("start=on_reference", "queue=reference")
 NONE = "controller.estimate=[]"
+WRENCH = "controller.estimate=[torque_bias,payload,damping,wrench]"
 PAYLOAD = "plant.payload_mass=0.4"
 THREE = (PAYLOAD, "plant.joint_damping=1e-3")
 HALF = f"reference.amplitude={(0.5 * AMPLITUDE).tolist()}"
@@ -65,10 +65,6 @@ class Row(NamedTuple):
     """What the seed draws, separated by spaces; see `of_seed`. Nothing: one run."""
     controller: str = "predictor_lqi"
     scenario: str = "paper"
-    force: float = 0.0
-    """N, pushes the plate horizontally: along x, or in a drawn direction."""
-    span: tuple[float, float] = (4.0, math.inf)
-    """s, beginning and end of the force."""
     known: bool = False
     """Whether the controller reads the plant's true numbers from a file."""
 
@@ -76,6 +72,12 @@ class Row(NamedTuple):
 def noise(share: float) -> str:
     """Return the setting of noise: a share of the amplitudes, per second for the rates."""
     return f"sensor.noise_std={[float(f'{share * a:.10g}') for a in np.tile(AMPLITUDE, 2)]}"
+
+
+def pushed(force: float, turn: float = 0.0, begin: float = 4.0, end: str = "null") -> str:
+    """Return the setting of a horizontal force in N, turned from x by an angle in rad."""
+    x, y = (float(f"{force * part:.10g}") for part in (np.cos(turn), np.sin(turn)))
+    return f"plant.push={{wrench: [0, 0, 0, {x}, {y}, 0], from: {begin:g}, to: {end}}}"
 
 
 def of_seed(drawn: str, seed: int) -> list[str]:
@@ -90,7 +92,7 @@ def of_seed(drawn: str, seed: int) -> list[str]:
         "losses": (f"sensor.seed={seed}",),
         "packets": (f"link.seed={seed}",),
         "jitter": (f"delay.seed={seed}",),
-        "direction": (),
+        "direction": (pushed(0.01, 2 * np.pi * np.random.default_rng(seed).uniform()),),
     }
     return [setting for name in drawn.split() for setting in settings[name]]
 
@@ -107,16 +109,9 @@ def run(row: Row, seed: int) -> tuple[float | None, float | None]:
     """Return E_ac in % s, or None and the instant at which the plate was lost, s."""
     with tempfile.TemporaryDirectory() as folder:
         scenario = scenario_of(row, seed, folder)
-        if row.force:
-            turn = 2 * np.pi * np.random.default_rng(seed).uniform() if row.drawn else 0.0
-            force = row.force * np.array([np.cos(turn), np.sin(turn), 0.0])
-            push = partial(Push, force, row.span)
-            result = sd.simulate(scenario, disturbance=push, judge_stability=False)
-            stopped, error = result.stopped, result.accumulated_error
-        else:
-            ending = run_in_bulk(scenario)
-            stopped, error = ending.stopped, ending.figures.accumulated_error
-    return (None, stopped.time) if stopped else (error, None)
+        ending = run_in_bulk(scenario)
+    stopped = ending.stopped
+    return (None, stopped.time) if stopped else (ending.figures.accumulated_error, None)
 
 
 # ------------------------------------------------------------------ the rows
@@ -355,16 +350,34 @@ def gravity() -> list[Row]:
 
 
 def push() -> list[Row]:
-    """Unknown forces on the plate; no part of the law has a state for them."""
-    rows = []
+    """Unknown forces on the plate, without and with `wrench` among the estimated parameters."""
+    adaptive, rows = {"controller": "adaptive_lqi"}, []
     for force in (0.01, 0.05, 0.1, 1.0):
-        words = f"{force:g} N along x from 4 s on"
-        on = Row(f"push-{force:g}", words, ON, force=force)
-        rows += [on, on._replace(name=f"push-{force:g}-adaptive", controller="adaptive_lqi")]
-    turned = Row("push-turned", "0.01 N in a drawn horizontal direction, noise", ON, force=0.01)
-    kick = Row("push-kick", "5 N along x for 0.1 s at 3 s", ON, force=5.0, span=(3.0, 3.1))
-    half = Row("push-half", "half the motion, 0.05 N along x from 4 s on", (*ON, HALF), force=0.05)
-    return [*rows, half, kick, turned._replace(drawn="noise direction")]
+        words, name = f"{force:g} N along x from 4 s on", f"push-{force:g}"
+        on = Row(name, words, (*ON, pushed(force)))
+        found = on._replace(name=f"{name}-wrench", settings=(*on.settings, WRENCH))
+        rows += [on, on._replace(name=f"{name}-adaptive", **adaptive)]
+        rows += [found, found._replace(name=f"{name}-wrench-adaptive", **adaptive)]
+        noisy = [one._replace(name=f"{one.name}-noise", drawn="noise") for one in rows[-2:]]
+        rows += [one._replace(words=f"{words}, noise") for one in noisy]
+    none = Row("push-none-wrench", "no force", (*ON, WRENCH))
+    noisy = none._replace(name="push-none-wrench-noise", words="no force, noise", drawn="noise")
+    turned = Row("push-turned", "0.01 N in a drawn horizontal direction, noise", ON)
+    half = "half the motion, 0.05 N along x from 4 s on"
+    many = [
+        Row("push-half", half, (*ON, HALF, pushed(0.05))),
+        Row("push-kick", "5 N along x for 0.1 s at 3 s", (*ON, pushed(5.0, 0.0, 3.0, "3.1"))),
+        turned._replace(drawn="noise direction"),
+        Row("push-start", "0.05 N along x from the start on", (*ON, pushed(0.05, begin=0.0))),
+    ]
+    same = [
+        one._replace(name=f"{one.name}-wrench", settings=(*one.settings, WRENCH)) for one in many
+    ]
+    told = (*same[-1].settings, "controller.prior={wrench: [0.005, 0.05]}")
+    return [
+        *(*rows, none, noisy, noisy._replace(name="push-none-wrench-adaptive-noise", **adaptive)),
+        *(*many, *same, same[-1]._replace(name="push-start-prior", settings=told)),
+    ]
 
 
 def encoders() -> list[Row]:
@@ -538,8 +551,7 @@ def described(row: Row) -> str:
     settings = [f"`{one}`" for one in row.settings if one not in ON]
     on = ["on the reference"] if ON[0] in row.settings else []
     known = ["true numbers in `controller.calibration`"] if row.known else []
-    force = [f"{row.force:g} N, {row.span[0]:g} to {row.span[1]:g} s"] if row.force else []
-    return ", ".join([*on, *parts, *settings, *known, *force])
+    return ", ".join([*on, *parts, *settings, *known])
 
 
 def numbers(found: dict[str, Any]) -> list[str]:

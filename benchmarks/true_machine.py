@@ -16,7 +16,7 @@ from _bench import EXACT, ON, PAYLOAD, grouped, noise, section, size, table, wri
 import stewart_drake as sd
 from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.scenario.calibration import Calibration, save_calibration
-from stewart_drake.scenario.signals import PLANT_PARAMETERS
+from stewart_drake.scenario.signals import CONSTANTS
 
 STARTS = {"on the reference": ON, "from rest": ()}
 SEEDS = range(100, 100 + size("SEEDS", 5))
@@ -51,11 +51,9 @@ def calibrated(settings: Sequence[str], folder: str) -> tuple[str, ...]:
     scenario = sd.load_scenario("paper", settings=settings)
     mechanism = sd.load_mechanism("paper")
     truth = np.array(scenario.plant.parameters)
-    std = np.array([1e-6] * 6 + [1e-4, 1e-7, 1e-7, 1e-5] + [1e-5] * 3)
+    std = np.array([1e-6] * 6 + [1e-4, 1e-7, 1e-7, 1e-5] + [1e-5] * 3 + [1e-7, 1e-7, 1e-5])
     path = Path(folder) / f"{abs(hash(tuple(settings)))}.yaml"
-    save_calibration(
-        path, Calibration(fingerprint(mechanism), PLANT_PARAMETERS, truth, np.diag(std**2))
-    )
+    save_calibration(path, Calibration(fingerprint(mechanism), CONSTANTS, truth, np.diag(std**2)))
     return (f"controller.calibration={path}",)
 
 

@@ -7,7 +7,8 @@ from stewart_drake.reporting.analyses import ANALYSES, words_of
 
 _PUBLIC: Final = {
     "functions": "check_model evaluate_tuner export_c export_csv identify make_tuner_data "
-    "model_sdf new plan_identification run_live run_machine train_tuner view_model",
+    "model_sdf new plan_identification replay_log run_live run_machine setpoints train_tuner "
+    "view_model",
     "files.resources": "shipped",
     "dynamics.stewart": "StewartDynamics",
     "files.errors": "ConfigError",
@@ -22,11 +23,13 @@ _PUBLIC: Final = {
     "reporting.api": "compare report simulate " + " ".join("_".join(words_of(n)) for n in ANALYSES),
     "reporting.results": "AnalysisResult ComparisonResult SimulationResult",
     "scenario.config": "ActuatorConfig ControllerConfig DelayConfig EncoderSensorConfig "
-    "PlantConfig Scenario SensorConfig ServoActuatorConfig StateSensorConfig TorqueActuatorConfig "
-    "TunerConfig",
+    "PlantConfig PositionServoConfig Scenario SensorConfig ServoActuatorConfig StateSensorConfig "
+    "TorqueActuatorConfig TunerConfig",
     "scenario.link_config": "LinkConfig NetworkConfig WireConfig",
     "scenario.loading": "load_scenario",
-    "scenario.reference_config": "CsvConfig HoldConfig ReferenceConfig SineConfig WaypointsConfig",
+    "scenario.run_log": "read_log",
+    "scenario.reference_config": "CsvConfig HoldConfig ReachyMoveConfig ReferenceConfig SineConfig "
+    "WaypointsConfig",
 }
 """Public names by module. *.ci/public_names.py* writes a stub for type checkers from it.
 

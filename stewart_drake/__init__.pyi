@@ -18,6 +18,8 @@ from stewart_drake.functions import export_csv as export_csv
 from stewart_drake.functions import identify as identify
 from stewart_drake.functions import model_sdf as model_sdf
 from stewart_drake.functions import plan_identification as plan_identification
+from stewart_drake.functions import replay_log as replay_log
+from stewart_drake.functions import setpoints as setpoints
 from stewart_drake.functions import view_model as view_model
 from stewart_drake.loop.controller_margin import linear_models as linear_models
 from stewart_drake.loop.diagram import ClosedLoop as ClosedLoop
@@ -43,6 +45,7 @@ from stewart_drake.scenario.config import ControllerConfig as ControllerConfig
 from stewart_drake.scenario.config import DelayConfig as DelayConfig
 from stewart_drake.scenario.config import EncoderSensorConfig as EncoderSensorConfig
 from stewart_drake.scenario.config import PlantConfig as PlantConfig
+from stewart_drake.scenario.config import PositionServoConfig as PositionServoConfig
 from stewart_drake.scenario.config import Scenario as Scenario
 from stewart_drake.scenario.config import SensorConfig as SensorConfig
 from stewart_drake.scenario.config import ServoActuatorConfig as ServoActuatorConfig
@@ -55,9 +58,11 @@ from stewart_drake.scenario.link_config import WireConfig as WireConfig
 from stewart_drake.scenario.loading import load_scenario as load_scenario
 from stewart_drake.scenario.reference_config import CsvConfig as CsvConfig
 from stewart_drake.scenario.reference_config import HoldConfig as HoldConfig
+from stewart_drake.scenario.reference_config import ReachyMoveConfig as ReachyMoveConfig
 from stewart_drake.scenario.reference_config import ReferenceConfig as ReferenceConfig
 from stewart_drake.scenario.reference_config import SineConfig as SineConfig
 from stewart_drake.scenario.reference_config import WaypointsConfig as WaypointsConfig
+from stewart_drake.scenario.run_log import read_log as read_log
 
 __version__: str
 __all__ = [
@@ -79,6 +84,8 @@ __all__ = [
     "Mechanism",
     "NetworkConfig",
     "PlantConfig",
+    "PositionServoConfig",
+    "ReachyMoveConfig",
     "ReferenceConfig",
     "Scenario",
     "SensorConfig",
@@ -109,6 +116,7 @@ __all__ = [
     "identify",
     "law",
     "layout",
+    "learn",
     "linear_models",
     "load_mechanism",
     "load_scenario",
@@ -116,10 +124,13 @@ __all__ = [
     "model_sdf",
     "new",
     "plan_identification",
+    "read_log",
+    "replay_log",
     "report",
     "run_live",
     "run_machine",
     "set_accuracy",
+    "setpoints",
     "shipped",
     "simulate",
     "systems",
@@ -180,12 +191,13 @@ def run_live(
     scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
     machine: str,
     *,
-    log: str | pathlib.Path | None = None,
     duration: float | None = None,
     armed: bool = False,
     key: pathlib.Path | None = None,
     max_missing: float | None = None,
     accept_jitter: bool = False,
+    log: pathlib.Path | None = None,
+    mirror: str | None = None,
 ) -> stewart_drake.reporting.results.SimulationResult: ...
 def run_machine(
     scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
@@ -198,6 +210,8 @@ def run_machine(
     host: str = "127.0.0.1",
     key: pathlib.Path | None = None,
     duration: float = 0.0,
+    log: pathlib.Path | None = None,
+    reachy: str | None = None,
 ) -> dict[str, typing.Any]: ...
 def train_tuner(
     data: str | pathlib.Path,
@@ -250,4 +264,7 @@ def layout(
     seed: int = 0,
     workers: int | None = None,
     scheduler: str | None = None,
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def learn(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, repetitions: int = 6
 ) -> stewart_drake.reporting.results.AnalysisResult: ...

@@ -11,17 +11,25 @@ from typing import Any, Final
 
 import numpy as np
 
+from stewart_drake.core.layout import DEFAULT_GRAVITY
 from stewart_drake.export.controller import exported, write
+from stewart_drake.export.setpoints import Setpoints, load_units, make_setpoints
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
+from stewart_drake.files.yamlio import yaml_text
 from stewart_drake.identification import identify as identification
-from stewart_drake.identification.logs import ANGLES, POSE, Precision, read_log
+from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
 from stewart_drake.identification.plan import MOTION, Plan, plan
+from stewart_drake.identification.servo_fit import ServoIdentification, identify_servos
+from stewart_drake.identification.servo_logs import is_servo_log, read_servo_log
+from stewart_drake.identification.servo_plan import SETPOINTS_FILE, ServoPlan, plan_servos
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.live.options import LiveOptions, MachineOptions
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import as_mechanism, load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
+from stewart_drake.reporting import servo_identification
 from stewart_drake.reporting.csv_file import read_signals, signals_csv
 from stewart_drake.reporting.identification import document, plan_document
 from stewart_drake.reporting.page import Provenance
@@ -43,6 +51,9 @@ from stewart_drake.tuning.options import DataOptions, EvaluationOptions, Trainin
 MECHANISM: Final = "mechanism.yaml"
 CALIBRATION: Final = "calibration.yaml"
 SCENARIO: Final = "scenario.yaml"
+SERVOS: Final = "servos.yaml"
+_CODE_12_BITS: Final = angle_std(12)
+"""Rounding of a crank angle in a log of servos by default, rad."""
 
 
 def identify(
@@ -57,24 +68,42 @@ def identify(
 ) -> AnalysisResult:
     """Find delay, friction and geometry in logs of one machine.
 
-    `save` of the result also writes mechanism.yaml and calibration.yaml, for `simulate`.
+    `save` of the result also writes mechanism.yaml and calibration.yaml, for `simulate`. From a CSV
+    log of setpoints and crank angles it finds the numbers of position servos instead, and writes
+    servos.yaml, an overlay of a scenario.
 
     Args:
-        logs: signals.nc of a run, or CSV.
+        logs: signals.nc of a run, or CSV; one CSV log of setpoints.
         mechanism: as drawn; a shipped name or a path.
         delay: believed, s; None is that of the log, or 0.1 s.
         tolerances: prior standard deviations of the machine; the defaults if None.
-        precision: of a CSV log; the defaults if None.
+        precision: of a CSV log; the defaults if None, with 12 bits for one of setpoints.
         gravity: whether gravity acted in a CSV log.
         command: that the page names; by default the call of this function.
     """
     paths = [logs] if isinstance(logs, str | Path) else list(logs)
     machine = as_mechanism(mechanism)
+    typed = command or f"sd.identify({[str(path) for path in paths]!r}, {mechanism!r})"
+    if any(is_servo_log(Path(path)) for path in paths):
+        if len(paths) > 1 or delay is not None or tolerances is not None:
+            raise ConfigError(
+                f"{paths[0]}: got more than one log of setpoints, --delay or --tolerance; expected "
+                "one log, whose delay is found without any"
+            )
+        log = read_servo_log(Path(paths[0]), machine)
+        rounding = _CODE_12_BITS if precision is None else precision.angle
+        g = DEFAULT_GRAVITY if gravity else 0.0
+        return analysis_result(
+            lambda: identify_servos(log, machine, rounding, g),
+            servo_identification.document,
+            typed,
+            _write_servos,
+        )
     read = [read_log(Path(path), machine, precision or Precision(), gravity) for path in paths]
     return analysis_result(
         lambda: identification.identify(read, machine, tolerances, delay),
         document,
-        command or f"sd.identify({[str(path) for path in paths]!r}, {mechanism!r})",
+        typed,
         _write_machine,
     )
 
@@ -89,7 +118,8 @@ def plan_identification(
 ) -> AnalysisResult:
     """Plan a motion to log, and predict what its log shows of the machine.
 
-    `save` of the result also writes the motion and the scenario that follows it.
+    `save` of the result also writes the motion and the scenario that follows it; for a scenario
+    with position servos, setpoints.csv.
 
     Args:
         scenario: of the machine; a shipped name or a path.
@@ -99,6 +129,21 @@ def plan_identification(
         command: that the page names; by default the call of this function.
     """
     loaded = as_scenario(scenario)
+    typed = command or f"sd.plan_identification({scenario!r})"
+    if loaded.actuator.kind == "position_servo":
+        if poses or tolerances is not None:
+            raise ConfigError(
+                "--plan: got --pose-std or --tolerance with position servos; expected neither, "
+                "their log has setpoints and crank angles"
+            )
+        rounding = _CODE_12_BITS if precision is None else precision.angle
+        prepared = prepare(loaded)
+        return analysis_result(
+            lambda: plan_servos(prepared, rounding),
+            servo_identification.plan_document,
+            typed,
+            _write_setpoints,
+        )
     measured = (precision or Precision()).std
     std = np.full_like(measured, np.inf)
     for part in (ANGLES, POSE) if poses else (ANGLES,):
@@ -107,7 +152,7 @@ def plan_identification(
     return analysis_result(
         lambda: plan(experiment, std, tolerances),
         plan_document,
-        command or f"sd.plan_identification({scenario!r})",
+        typed,
         _write_plan,
     )
 
@@ -117,6 +162,16 @@ def _write_machine(found: identification.Identification, folder: Path) -> list[s
     calibration = found.calibration(load_mechanism(folder / MECHANISM))
     save_calibration(folder / CALIBRATION, calibration)
     return [MECHANISM, CALIBRATION]
+
+
+def _write_servos(found: ServoIdentification, folder: Path) -> list[str]:
+    write_whole(folder / SERVOS, yaml_text(found.overlay))
+    return [SERVOS]
+
+
+def _write_setpoints(found: ServoPlan, folder: Path) -> list[str]:
+    write_whole(folder / SETPOINTS_FILE, found.csv)
+    return [SETPOINTS_FILE]
 
 
 def _write_plan(found: Plan, folder: Path) -> list[str]:
@@ -140,6 +195,62 @@ def export_csv(signals: str | Path, out: str | Path | None = None) -> str:
     if out is not None:
         write_whole(Path(out), text)
     return text
+
+
+def replay_log(log: str | Path, out: str | Path | None = None) -> str:
+    """Return a log as an HTML page with a 3-D animation.
+
+    Args:
+        log: .mcap, .csv, signals.nc or the folder of a run.
+        out: file to write, if not None.
+
+    Raises:
+        ConfigError: no log of a run, or one without its scenario.
+    """
+    from stewart_drake.reporting.replay import log_html
+
+    text = log_html(Path(log))
+    if out is not None:
+        write_whole(Path(out), text)
+    return text
+
+
+def setpoints(
+    scenario: Scenario | str | Path,
+    rate: float = 50.0,
+    out: str | Path | None = None,
+    *,
+    plain: bool = False,
+    start: Sequence[float] | None = None,
+    units: str | Path | None = None,
+    controller: str | Path | None = None,
+    settings: Iterable[str] = (),
+) -> Setpoints:
+    """Return the crank angles to send to position servos for a scenario's motion.
+
+    They are checked for reach, and for range, speed and torque of each motor. `export.setpoints`
+    has the equations.
+
+    Args:
+        scenario: or a shipped name or a path; its `actuator.kind` is `position_servo`.
+        rate: of the setpoints, Hz.
+        out: CSV file to write, if not None.
+        plain: whether to send the angles of the reference, without compensation.
+        start: (6,) pose at which the plate rests at first, rad and m; None is the reference's.
+        units: YAML file with the units of the servos (`export.setpoints.ServoUnits`), for `out`.
+        controller: laid over the scenario's own; for a name or a path.
+        settings: as `load_scenario` takes them; for a name or a path.
+
+    Raises:
+        ConfigError: bad input, or a motion beyond a limit, with time and motor.
+    """
+    if not isinstance(scenario, Scenario):
+        scenario = load_scenario(scenario, controller, settings)
+    told = None if units is None else load_units(units)
+    made = make_setpoints(scenario, rate, plain=plain, start=start)
+    if out is not None:
+        made.save(out, told)
+    return made
 
 
 def export_c(
@@ -214,14 +325,12 @@ def run_live(
     machine: str,
     *,
     options: LiveOptions,
-    log: str | Path | None = None,
 ) -> SimulationResult:
     """Drive a machine over UDP in real time.
 
     Args:
         scenario: or a shipped name or a path.
         machine: HOST:PORT where it listens.
-        log: CSV file that is written as the run goes on.
         OPTIONS
 
     Raises:
@@ -229,25 +338,27 @@ def run_live(
     """
     from stewart_drake.live.contact import address_of
     from stewart_drake.live.endpoint import read_key
-    from stewart_drake.live.session import drive, prepare_session
+    from stewart_drake.live.session import drive, open_logs, prepare_session
 
     ready = prepare_session(as_scenario(scenario), address_of(machine), read_key(options.key))
     how: Any = options.model_dump(include={"armed", "accept_jitter", "max_missing"})
     span = math.inf if options.duration is None else options.duration
-    return SimulationResult.of(drive(ready, span, log=None if log is None else Path(log), **how))
+    return SimulationResult.of(drive(ready, span, logs=open_logs(ready, options, print), **how))
 
 
 @takes(MachineOptions)
 def run_machine(scenario: Scenario | str | Path, *, options: MachineOptions) -> dict[str, Any]:
-    """Simulate a machine in real time, for a controller over UDP; return what happened.
+    """Simulate a machine in real time, or drive a robot, for a controller over UDP.
+
+    Returns what happened.
 
     Args:
         scenario: or a shipped name or a path; its plant, sensor, delay, link and limits.
         OPTIONS
     """
-    from stewart_drake.live.machine import open_machine
+    from stewart_drake.live.reachy import open_chosen
 
-    with open_machine(as_scenario(scenario), options) as (machine, _):
+    with open_chosen(as_scenario(scenario), options) as (machine, _):
         machine.run(options.duration or math.inf)
     return machine.summary()
 

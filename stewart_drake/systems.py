@@ -4,7 +4,7 @@ from stewart_drake.loop.controller import DelayLqiController, Reference, ServoCo
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.link import DelayChain, LateMeasurements, PlayoutBuffer, VaryingDelay
 from stewart_drake.loop.sensor import Encoders, Sensor
-from stewart_drake.loop.servos import Servos
+from stewart_drake.loop.servos import PositionServos, Servos
 from stewart_drake.loop.tuner import AnnTuner, DensityWindow, LawTuner
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "Reference",
     "Sensor",
     "ServoController",
+    "PositionServos",
     "Servos",
     "VaryingDelay",
 ]

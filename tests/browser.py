@@ -51,6 +51,19 @@ _PATIENCE = 120.0
 """s, for anything that a browser is asked on a busy machine."""
 
 
+_KEYS = {
+    "Tab": (9, ""),
+    "Enter": (13, "\r"),
+    "Escape": (27, ""),
+    "Space": (32, " "),
+    "End": (35, ""),
+    "Home": (36, ""),
+    "ArrowLeft": (37, ""),
+    "ArrowRight": (39, ""),
+}
+"""Virtual key code of a key, and its text."""
+
+
 class Browser:
     """One tab. `errors` are uncaught exceptions and what pages wrote by console.error;
     `requests` what was asked for and is no part of the page's own file."""
@@ -81,16 +94,18 @@ class Browser:
                 assert "error" not in answer, f"{method}: {answer['error']}"
                 return dict(answer["result"])
 
-    def open(self, path: Path, width: int = 1000, height: int = 700, **media: str) -> None:
-        """Open a file and wait for its `load` event."""
+    def open(self, path: Path | str, width: int = 1000, height: int = 700, **media: str) -> None:
+        """Open a file or an address, and wait for its `load` event."""
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.call("Emulation.setDeviceMetricsOverride", **size)
         features = [{"name": name.replace("_", "-"), "value": v} for name, v in media.items()]
         self.call("Emulation.setEmulatedMedia", features=features)
         self.errors.clear()
         self.requests.clear()
-        self.call("Page.navigate", url=path.resolve().as_uri())
+        url = path if isinstance(path, str) else path.resolve().as_uri()
+        self.call("Page.navigate", url=url)
         self.wait("document.readyState === 'complete'")
+        self.call("Page.bringToFront")  # gives it the keyboard
 
     def evaluate(self, expression: str) -> Any:
         """Return the value of a JavaScript expression, which may be a promise."""
@@ -105,6 +120,19 @@ class Browser:
         while not self.evaluate(condition):
             assert time.monotonic() < end, f"never true: {condition}"
             time.sleep(0.1)
+
+    def type(self, text: str) -> None:
+        """Type a text into the element with the focus."""
+        self.call("Input.insertText", text=text)
+
+    def press(self, key: str) -> None:
+        """Press and release a key: Tab, Enter, Space, Home, End, Escape, ArrowRight, ..."""
+        code, text = _KEYS[key]
+        name = " " if key == "Space" else key
+        shared = {"key": name, "code": key, "windowsVirtualKeyCode": code}
+        down = "keyDown" if text else "rawKeyDown"
+        self.call("Input.dispatchKeyEvent", type=down, text=text, **shared)
+        self.call("Input.dispatchKeyEvent", type="keyUp", **shared)
 
     def screenshot(self, path: Path | None = None, whole: bool = False) -> NDArray[np.float64]:
         """Return the window, or the whole page, as an image of values 0 to 1; write it if asked."""

@@ -15,7 +15,8 @@ import pytest
 
 from stewart_drake.core import build
 
-SANITIZED = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+SANITIZED = ["-O1", "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+"""Options of `make check` in an exported folder."""
 
 if "STEWART_OBJECTS" not in os.environ:
     os.environ["STEWART_OBJECTS"] = tempfile.mkdtemp(prefix="objects")

@@ -26,6 +26,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RollPitchYaw
+from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -51,6 +52,7 @@ from stewart_drake.scenario.signals import (
     PAYLOAD,
     PAYLOAD_POSITION,
     POSITION,
+    WRENCH,
 )
 from stewart_drake.types import Array
 
@@ -72,7 +74,8 @@ class PartitionedTree:
         ball = re.compile(r"<drake:ball_constraint>.*?</drake:ball_constraint>", re.DOTALL)
         plant = MultibodyPlant(0.0)
         Parser(plant).AddModelsFromString(ball.sub("", to_sdformat(mechanism)), "sdf")
-        plate = plant.GetBodyByName("plate").body_frame()
+        self._plate_body = plant.GetBodyByName("plate")
+        plate = self._plate_body.body_frame()
         self._floating = plant.AddJoint(RpyFloatingJoint("plate", plant.world_frame(), plate))
         massless = SpatialInertia(0.0, np.zeros(3), UnitInertia(0, 0, 0))
         self._payload = plant.AddRigidBody(
@@ -194,6 +197,13 @@ class PartitionedTree:
         for crank in self._cranks:
             crank.SetDamping(context, parameters[DAMPING])
         plant.CalcForceElementsContribution(context, self._forces)  # gravity and joint damping
+        self._plate_body.AddInForce(
+            context,
+            np.zeros(3),
+            SpatialForce(parameters[WRENCH]),
+            plant.world_frame(),
+            self._forces,
+        )
         M = plant.CalcMassMatrix(context)
         h = plant.CalcInverseDynamics(context, gamma_dot_nu, self._forces)
         return gamma.T @ M @ gamma, gamma.T @ h, gamma.T @ self._actuation

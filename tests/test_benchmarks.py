@@ -30,7 +30,7 @@ def only_here():
 
 @pytest.mark.parametrize("name", [path.stem for path in sorted(FOLDER.glob("[a-z]*.py"))])
 def test_a_script_finds_what_it_imports(name, monkeypatch):
-    if name in ("plants", "speed", "mujoco_model"):
+    if name in ("plants", "speed", "mujoco_model", "reachy_player"):
         pytest.importorskip("mujoco")
     assert script(name, monkeypatch).__doc__
 

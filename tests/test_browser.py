@@ -91,3 +91,39 @@ def test_plate_reference_and_readout_are_where_the_run_had_them(replay, run):
         assert shown.startswith(f"t = {at:.2f} s")
         told = float(shown.split("off by ")[1].split(" mm")[0])
         assert told == pytest.approx(off, rel=0.1, abs=5e-3)
+
+
+def test_a_narrow_screen_shows_all_and_keys_alone_drive_it(tab, page):
+    tab.open(page, 400, 800)
+    tab.wait("viewer.animator.actions.length > 0 && document.querySelector('canvas') !== null")
+    assert tab.evaluate("document.documentElement.scrollWidth") == 400
+    boxes = [
+        tab.evaluate(f"(b => [b.left, b.top, b.right, b.bottom])({one}.getBoundingClientRect())")
+        for one in ("document.getElementById('run-about')", "document.getElementById('run-play')")
+    ]
+    assert all(
+        left >= 0 and top >= 0 and right <= 400 and bottom <= 800
+        for left, top, right, bottom in boxes
+    )
+    assert boxes[0][3] + 300 < boxes[1][1], "the panels leave no room for the machine"
+
+    def go_to(name):
+        for _ in range(40):
+            if tab.evaluate(f"document.activeElement === {name}"):
+                return
+            tab.press("Tab")
+        raise AssertionError(f"{name} is not reached by Tab")
+
+    go_to("button")
+    tab.press("Enter")
+    tab.wait("!player.playing")
+    go_to("slider")
+    tab.press("Home")
+    tab.wait("player.time === 0")
+    for _ in range(5):
+        tab.press("ArrowRight")
+    tab.wait("player.time > 0 && now.textContent.startsWith(`t = ${run.time[shown].toFixed(2)} s`)")
+    assert tab.evaluate("shown") > 0
+    tab.press("Space")
+    tab.wait("player.playing")
+    assert tab.errors == []

@@ -24,7 +24,7 @@ from stewart_drake.scenario.calibration import (
     save_calibration,
 )
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.signals import DAMPING, PARAMETERS, PAYLOAD, PLANT_PARAMETERS
+from stewart_drake.scenario.signals import CONSTANTS, DAMPING, PARAMETERS, PAYLOAD, PLANT_PARAMETERS
 from tests.mechanisms import PAPER
 
 NAMES = ("payload_mass", "joint_damping", "coulomb_friction", "delay")
@@ -162,8 +162,8 @@ def test_a_standard_deviation_that_is_said_goes_together_with_nothing():
 
 
 def test_every_parameter_can_be_free():
-    every = usual((*PLANT_PARAMETERS, *OFFSETS))
-    assert every.names == (*PLANT_PARAMETERS, *OFFSETS)
+    every = usual((*CONSTANTS, *OFFSETS))
+    assert every.names == (*CONSTANTS, *OFFSETS)
     assert set(every.units) == {"N m", "kg", "N m s/rad", "rad/s", "m", "rad"}
     only = usual(("coulomb_speed", "offset_A3"))
     assert only.prior.tolist() == [0.02, 0.0]

@@ -89,10 +89,11 @@ def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys, monkeyp
     lines = out.splitlines()
     assert err == ""
     assert not too_long(out)
-    rows = [next(line for line in lines if line.startswith(LABELS[n])) for n in CONTROLLERS]
+    rows = [next(line for line in lines if line.startswith(f"{n} ")) for n in CONTROLLERS]
+    assert all(f"{n} ({LABELS[n]})" in " ".join(out.split()) for n in CONTROLLERS)
     assert "left workspace" in rows[0] and "at 1.36 s, leg 2" in lines[lines.index(rows[0]) + 1]
-    assert [row.split()[2] for row in rows] == ["NaN", "NaN", "225", "80", "-"]
-    assert rows[-1].split()[4] == "15.2", "the delay floor stands beside E_ac"
+    assert [row.split()[1] for row in rows] == ["NaN", "NaN", "225", "80", "-"]
+    assert rows[-1].split()[3] == "15.2", "the delay floor stands beside E_ac"
     heads = next(line for line in lines if "asked" in line)
     assert heads.split()[-4:-2] == ["asked", "acted"] and "(commanded)" in out
     # The LQI asked for a torque that never acted: the plate was gone before it arrived.

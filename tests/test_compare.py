@@ -9,18 +9,22 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.resources import shipped
+from stewart_drake.files.resources import data_root, shipped
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_comparison, load_scenario
 from stewart_drake.studies.compare import (
     ADAPTIVE,
     CONTROLLERS,
+    GRAVITY,
     LABELS,
+    LIMITED,
     SERVOS,
     compare,
     save_comparison,
+    shown,
 )
 from stewart_drake.studies.verdict import Verdict, delay_verdict
 
@@ -33,8 +37,8 @@ def results():
 
 
 def test_every_shipped_controller_takes_part():
-    assert sorted([*CONTROLLERS, ADAPTIVE, *SERVOS]) == shipped("controller")
-    assert tuple(LABELS) == (*CONTROLLERS, ADAPTIVE, *SERVOS)
+    assert sorted([*CONTROLLERS, ADAPTIVE, LIMITED, *GRAVITY, *SERVOS]) == shipped("controller")
+    assert tuple(LABELS) == (*CONTROLLERS, ADAPTIVE, LIMITED, *GRAVITY, *SERVOS)
 
 
 def test_the_order_is_kept_and_each_run_is_that_of_its_controller(results):
@@ -87,6 +91,56 @@ def test_a_refused_controller_is_named(monkeypatch):
     settings = (*SHORT, "plant.gravity=true", "controller.catch_up=0.3")
     with pytest.raises(ConfigError, match=r"delay_lqr: controller\.catch_up"):
         compare("paper", settings)
+
+
+# ---------------------------------------------------------------- chosen controllers
+
+
+@pytest.fixture
+def own_file(tmp_path):
+    text = (data_root() / "diagrams/controllers/predictor_lqi.yaml").read_text("utf-8")
+    path = tmp_path / "mine.yaml"
+    path.write_text(text + "w_R: 7.0\n", "utf-8")
+    return path
+
+
+def test_chosen_controllers_run_in_their_order_and_no_others(own_file):
+    results = compare("paper", SHORT, controllers=[own_file, "lqi"])
+    assert tuple(results) == ("mine", "lqi")
+    assert results["mine"].scenario == load_scenario("paper", own_file, SHORT)
+    assert results["mine"].scenario.controller.w_R == 7.0
+    alone = simulate(load_scenario("paper", "lqi", SHORT))
+    xr.testing.assert_identical(alone.signals, results["lqi"].signals)
+
+
+def test_a_row_of_the_scenario_can_be_chosen():
+    rows = shown("table2", controllers=["delay_lqi_sum", "delay_lqr"])
+    assert tuple(rows) == ("delay_lqi_sum", "delay_lqr")
+    assert rows["delay_lqi_sum"] == shown("table2")["delay_lqi_sum"]
+
+
+def test_the_command_compares_the_chosen_controllers(own_file, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(joblib, "cpu_count", lambda: 1)
+    settings = [word for one in SHORT for word in ("--set", one)]
+    chosen = ["--controllers", f"delay_lqi, {own_file}"]
+    assert main(["compare", "paper", *settings, *chosen, "--json"]) == 0
+    assert list(json.loads(capsys.readouterr().out)["controllers"]) == ["delay_lqi", "mine"]
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        (["lqi", "lqi"], "controllers: got 'lqi' twice; expected different names"),
+        (["nothing"], "controller: got 'nothing'; expected one of adaptive_lqi, "),
+        (["a/lqi.yaml"], "controllers: got 'a/lqi.yaml', named as a shipped controller"),
+        ([], "controllers: got \\[\\]; expected a list of names or files, or a mapping"),
+        ("lqi", "controllers: got 'lqi'; expected a list"),
+        ([7], "controllers: got 7; expected a list"),
+    ],
+)
+def test_controllers_that_cannot_be_compared_are_refused_in_one_line(chosen, message):
+    with pytest.raises(ConfigError, match=message):
+        compare("paper", SHORT, controllers=chosen)
 
 
 # ---------------------------------------------------------------- the verdict

@@ -108,6 +108,8 @@ ALONE = (
         ("delay_lqi", ("controller.w_Q=1e-6",), 200),
         ("delay_lqi", ("delay.steps=3", "delay.fraction=0.4"), 30),
         ("delay_lqi", ("delay.steps=1", "controller.delay_steps=2"), 20),
+        ("pd_gravity", (), 50),
+        ("pd_gravity", ("controller.delay_steps=8", "controller.delay_fraction=0.4"), 40),
         ("predictor_lqi", (), 100),
         ("predictor_lqi", ("controller.model=paper",), 40),
         ("predictor_lqi", ("delay.fraction=0.5", "delay.steps=2"), 100),

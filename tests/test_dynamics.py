@@ -10,7 +10,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from stewart_drake.core.layout import DEAD_CENTRE_SINE, DEFAULT_GRAVITY
-from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
 from stewart_drake.mechanism.kinematics import (
     UnreachablePoseError,
     angle_rate_map,
@@ -25,6 +25,7 @@ from stewart_drake.scenario.signals import (
     PAYLOAD,
     PAYLOAD_POSITION,
     PLANT_PARAMETERS,
+    WRENCH,
 )
 from stewart_drake.types import Array
 from tests.mechanisms import PAPER, SPREAD, random_mechanism, random_pose
@@ -49,13 +50,15 @@ AT_REST = np.zeros(6)
 
 
 all_free = functools.partial(StewartDynamics, free=PLANT_PARAMETERS)
-"""Dynamics whose methods take all parameters of the plant (13,)."""
+"""Dynamics whose methods take all parameters of the plant (22,)."""
 
 
 def random_parameters(rng):
-    """Torque bias, payload, damping, Coulomb friction and its speed, place of the payload (13,)."""
+    """Bias, payload, damping, Coulomb friction and its speed, payload's place, wrench (22,)."""
     friction = rng.uniform([0.1, 0.0, 0.0, 0.05], [2.0, 0.1, 0.1, 1.0])
-    return np.concatenate([rng.normal(0, 0.1, 6), friction, rng.normal(0, 0.05, 3)])
+    place, wrench = rng.normal(0, 0.05, 3), rng.normal(0, 1, 6)
+    no_ball_joints = [0.0, 0.0, 0.1]
+    return np.concatenate([rng.normal(0, 0.1, 6), friction, place, no_ball_joints, wrench])
 
 
 @functools.cache
@@ -139,7 +142,7 @@ def test_energy_changes_by_the_work_of_torque_bias_and_friction(index):
     dynamics, rng = shared(index), np.random.default_rng(index + 1)
     mechanism = dynamics.mechanism
     parameters = np.concatenate([rng.normal(0, 0.05, 6), [0.5, 0.05, 0.03, 0.2]])
-    parameters = np.append(parameters, [0.03, -0.02, 0.05])
+    parameters = plant_parameters(np.append(parameters, [0.03, -0.02, 0.05]))
     span = size(mechanism) * (1.0 if mechanism is PAPER else 0.3)
 
     def with_work(x):
@@ -174,7 +177,7 @@ def states(draw):
 @given(states(), st.floats(0, 5))
 def test_mass_matrix_is_symmetric_positive_definite(state, payload):
     dynamics, pose, rates = state
-    parameters = np.zeros(13)
+    parameters = plant_parameters()
     parameters[PAYLOAD], parameters[PAYLOAD_POSITION] = payload, 0.1 * pose[:3]
     mass = dynamics.mass_matrix(pose, parameters)
     assert relative(mass.T, mass) < 1e-14
@@ -197,7 +200,9 @@ def test_inverse_dynamics_inverts_accelerations(state, seed):
     assert relative(dynamics.actuation_map(pose), jacobian.T) < 1e-11
     shaft = torque + parameters[BIAS] - friction(parameters, jacobian @ rates)
     left = dynamics.mass_matrix(pose, parameters) @ accelerations
-    assert relative(left, jacobian.T @ shaft - dynamics.bias(pose, rates, parameters)) < 1e-9
+    moment, push = np.split(parameters[WRENCH], 2)
+    shaft_and_push = jacobian.T @ shaft + np.append(angle_rate_map(pose[:3]).T @ moment, push)
+    assert relative(left, shaft_and_push - dynamics.bias(pose, rates, parameters)) < 1e-9
 
 
 # Linearisation and prediction.
@@ -207,7 +212,9 @@ def test_inverse_dynamics_inverts_accelerations(state, seed):
 @pytest.mark.parametrize("t", TIMES)
 def test_derivatives_equal_central_differences_of_the_oracle(t, gravity):
     dynamics, tree = all_free(PAPER, gravity), PartitionedTree(PAPER, gravity)
-    parameters = np.array([0.01, -0.02, 0.03, 0.01, 0, 0.02, 0.5, 0.01, 0.02, 0.5, 0.1, -0.05, 0.2])
+    parameters = [0.01, -0.02, 0.03, 0.01, 0, 0.02, 0.5, 0.01, 0.02, 0.5, 0.1, -0.05, 0.2]
+    no_ball_joints, wrench = [0.0, 0.0, 0.1], [0.1, -0.2, 0.1, 1.0, -2.0, 0.5]
+    parameters = np.array([*parameters, *no_ball_joints, *wrench])
     pose, rates, accelerations = trajectory(t)
     torque = tree.inverse_dynamics(pose, rates, accelerations, parameters) + 0.1 * ALTERNATING
     state = np.concatenate([pose, rates])

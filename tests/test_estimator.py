@@ -70,10 +70,11 @@ def transition(dynamics, xi, period):
     c, number = core(), len(period.torques)
     states, H, F = np.empty((number, 12)), np.empty((number, 12, 20)), np.eye(20)
     schedule = [number, c.at(period.torques), c.at(period.durations), period.substeps]
-    given = (c.at(xi), c.ffi.new("stewart_schedule *", schedule), 1, c.at(states), c.at(H))
-    scratch = c.scratch(c.lib.stewart_transitions_scratch(8))
+    until, scratch = c.ffi.new("stewart_schedule *", schedule), c.lib.stewart_transitions_scratch(8)
     machine = machine_of(NominalPlant(dynamics, 1, np.inf, TorqueLimit()))
-    assert c.lib.stewart_transitions(machine.it, *given, scratch)
+    c.lib.stewart_predict(machine.it, c.at(xi[12:]), until, c.at(xi), c.at(states))
+    along = c.at(xi), until, 1, c.at(states), c.at(H)
+    assert c.lib.stewart_transitions(machine.it, *along, c.scratch(scratch))
     F[:12] = H[-1]
     return states[-1], F
 

@@ -42,6 +42,14 @@ RUNS = {
     "rule": ("desktop", ("tuner.kind=rule", FASTER)),
     "network of weights": ("desktop", ("tuner.kind=ann", FASTER)),
     "encoders": ("paper", ("sensor.kind=encoders", "sensor.bits=14", "sensor.samples=20")),
+    "wrench": (
+        "paper",
+        (
+            "start=on_reference",
+            "controller.estimate=[payload,wrench]",
+            "plant.push={wrench: [0, 0, 0, 0.05, 0, 0], from: 2}",
+        ),
+    ),
     "measurements that get lost": ("desktop", ("sensor.loss=0.2", FASTER)),
     "network": ("desktop", ("link.kind=network", "link.loss=0.2", "link.burst=3", FASTER)),
 }
@@ -64,10 +72,11 @@ def exported(folder, name, settings, single=False):
     return folder
 
 
-def sources(folder):
-    """Return the sources of the controller in an export."""
-    makefile = {"Makefile": (folder / "Makefile").read_text()}
-    return [name.replace(".o", ".c") for name in export_c.objects(makefile)]
+def objects(folder, *options):
+    """Compile the controller in an export; return the names of its objects."""
+    names = export_c.objects({"Makefile": (folder / "Makefile").read_text()})
+    make(folder, *options, *names)
+    return names
 
 
 @pytest.mark.slow
@@ -218,9 +227,8 @@ def test_odd_inputs_are_survived(name, settings, tmp_path, compiler):
     """NaN, infinity, huge numbers, INT_MIN and INT_MAX, under both sanitizers."""
     folder = exported(tmp_path, name, (*settings, "duration=0.5"))
     shutil.copy(Path(__file__).with_name("odd_inputs.c"), folder)
-    options = ["-std=c99", "-O1", *SANITIZED]
-    own = ["odd_inputs.c", *sources(folder), "stewart_motion.c"]
-    command = [*compiler, *options, *own, "-lm", "-o", "odd_inputs"]
+    own = [*objects(folder, f"CFLAGS={' '.join(SANITIZED)}"), "odd_inputs.c", "stewart_motion.c"]
+    command = [*compiler, "-std=c99", *SANITIZED, *own, "-lm", "-o", "odd_inputs"]
     subprocess.run(command, cwd=folder, check=True)
     done = subprocess.run(["./odd_inputs"], cwd=folder, capture_output=True, text=True)
     assert (done.stdout, done.stderr, done.returncode) == ("odd inputs: survived\n", "", 0)
@@ -259,18 +267,8 @@ def test_the_stack_is_not_deeper_than_stated(tmp_path, compiler):
     (folder / "painted.c").write_text(PAINTED)
     command = [*compiler, "-O2", "-Dmain=replay", "-c", "stewart_test.c"]
     subprocess.run(command, cwd=folder, check=True)
-    command = [
-        *compiler,
-        "-O2",
-        *sources(folder),
-        "meter.c",
-        "painted.c",
-        "stewart_test.o",
-        "-lm",
-        "-pthread",
-        "-o",
-        "painted",
-    ]
+    own = [*objects(folder), "meter.c", "painted.c", "stewart_test.o"]
+    command = [*compiler, "-O2", *own, "-lm", "-pthread", "-o", "painted"]
     subprocess.run(command, cwd=folder, check=True)
     said = subprocess.run(["./painted"], cwd=folder, capture_output=True, text=True, check=True)
     told = int((folder / "README.md").read_text().split("less than ")[1].split(" kB")[0])

@@ -7,12 +7,15 @@ from scipy.integrate import solve_ivp
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.live.governor import (
+    FASTEST,
     LEAST_MARGIN,
+    PACE,
     TORQUE_SHARE,
     Blend,
     Governor,
     GovernorState,
     response,
+    stop_pose,
 )
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.reference_config import SineConfig
@@ -33,7 +36,7 @@ def ways(one, begin, targets, each=30):
     for target in targets:
         for _ in range(each):
             now = one.follow(now, target)
-            states.append(response(now.state, now.applied, one.pace, FINE))
+            states.append(response(now.state, now.applied, now.pace, FINE))
             now = one.after(now, PERIOD)
     return np.vstack(states), now
 
@@ -62,7 +65,7 @@ def at_rest(pose):
 
 @pytest.mark.parametrize(
     ("name", "gravity", "limit"),
-    [("paper", False, 0.1), ("paper", True, 2.0), ("desktop", True, 0.4)],
+    [("paper", False, 0.66), ("paper", False, 0.1), ("paper", True, 2.0), ("desktop", True, 0.4)],
 )
 def test_whatever_is_asked_for_the_limits_hold(name, gravity, limit):
     one = governor(name, gravity, limit)
@@ -126,16 +129,72 @@ def test_a_step_from_rest_never_turns_back():
     assert (states[:, RATES] * np.sign(target - home) > -1e-12).all()
 
 
+def lateness(states):
+    """Return the time by which a step of the height is late on average, s."""
+    return 1e-3 * (1 - (states[:, 5] - states[0, 5]) / (states[-1, 5] - states[0, 5])).sum()
+
+
+@pytest.mark.parametrize("limit", [np.inf, 0.66, 0.05, 0.01])
+def test_a_step_is_as_fast_as_the_torque_allows(limit):
+    """The impulse response w^3 t^2 exp(-wt) / 2 has its mean at 3 / w; torque grows with w^2."""
+    one = governor("paper", False, limit)
+    home = one.dynamics.mechanism.home
+    target, allowed = home + [0, 0, 0, 0, 0, 0.02], TORQUE_SHARE * limit
+    states, end = ways(one, at_rest(home), [target])
+
+    def torque(pace):
+        rows = response(at_rest(home).state, target, pace, np.arange(0, 3, 1e-3))
+        return max(
+            np.abs(one.dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])).max()
+            for x in rows
+        )
+
+    assert lateness(states) == pytest.approx(3 / end.pace, abs=1e-3)
+    assert torque(end.pace) < allowed
+    if np.isinf(limit):
+        assert end.pace == PACE
+    elif end.pace < FASTEST:
+        assert torque((FASTEST / PACE) ** 0.25 * end.pace) > 0.99 * allowed
+
+
+def test_a_target_beyond_reach_is_approached_as_fast():
+    slow, fast = (governor("paper", False, limit) for limit in (np.inf, 0.66))
+    home = slow.dynamics.mechanism.home
+    late = [
+        lateness(ways(g, at_rest(home), [home + [0, 0, 0, 0, 0, 0.5]])[0]) for g in (slow, fast)
+    ]
+    np.testing.assert_allclose(late, [3 / PACE, 3 / FASTEST], atol=5e-3)
+
+
+def test_a_slower_pace_never_passes_the_target():
+    """From a fast step, a far target in another direction takes so much torque that w falls."""
+    one = governor("paper", False, 0.1)
+    home = one.dynamics.mechanism.home
+    now, paces = at_rest(home), []
+    for k in range(80):
+        now = one.follow(
+            now, home + ([0, 0, 0, 0, 0, 0.005] if k < 2 else [0.4, 0, 0, 0.05, 0, 0.03])
+        )
+        paces.append(now.pace)
+        fine = response(now.state, now.applied, now.pace, FINE)
+        assert (fine[:, [0, 3, 5]] <= now.applied[[0, 3, 5]] + 1e-9).all()
+        assert (fine[:, [6, 9, 11]] >= -1e-9).all()
+        now = one.after(now, PERIOD)
+    assert paces[1] == FASTEST and min(paces) < 0.7 * FASTEST
+    np.testing.assert_allclose(now.state[[0, 3, 5]] - home[[0, 3, 5]], [0.4, 0.05, 0.03], atol=1e-6)
+
+
 def test_a_stop_does_not_turn_back_and_is_soon():
     one = governor("paper", False, 10.0)
     home = one.dynamics.mechanism.home
     targets = home + np.array([[0, 0, 0, 0, 0, 0.08], [0, 0, 0, 0, 0, -0.08], [0.2, 0, 0, 0, 0, 0]])
     for each in (3, 7, 12):
         _, moving = ways(one, at_rest(home), targets, each)
-        stop = one.stop_pose(moving.state)
-        after = response(moving.state, stop, one.pace, np.arange(0, 6, 1e-3))
-        assert (after[:, RATES] * np.sign(moving.state[RATES]) >= -1e-9).all()
-        assert np.abs(after[-1, RATES]).max() < 1e-6
+        for pace in one.paces:
+            stop = stop_pose(moving.state, pace)
+            after = response(moving.state, stop, pace, np.arange(0, 6, 1e-3))
+            assert (after[:, RATES] * np.sign(moving.state[RATES]) >= -1e-9).all()
+            assert np.abs(after[-1, RATES]).max() < 1e-6
 
 
 def test_a_motion_of_the_scenario_is_taken_over_and_given_back():
@@ -144,7 +203,7 @@ def test_a_motion_of_the_scenario_is_taken_over_and_given_back():
     for t in np.arange(0.0, 6.0, 0.7):
         begun = one.begin(evaluate(motion, t))
         assert isinstance(begun, GovernorState), begun
-        way = one.future(begun.state, begun.applied)
+        way = one.future(begun.state, begun.applied, begun.pace)
         assert one.problem(way) is None
         rest = one.after(begun, 0.5)
         blend = one.onto(rest.state, t + 0.5, motion)

@@ -1,5 +1,6 @@
 """Requests, offers, identities and faults, as both sides say them."""
 
+import math
 import re
 import socket
 import threading
@@ -11,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stewart_drake.dynamics.workspace import diagnose
+from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live import contact as contacts
 from stewart_drake.live.checks import ReportCheck
 from stewart_drake.live.contact import Contact, await_free, call, open_endpoint
 from stewart_drake.live.endpoint import ANSWERS, ANSWERS_AT_ONCE
-from stewart_drake.live.loop import Viewer
+from stewart_drake.live.loop import End, Viewer
 from stewart_drake.live.machine import Machine
 from stewart_drake.live.page import PageViewer
 from stewart_drake.live.protocol import (
@@ -154,10 +155,10 @@ def test_a_controller_of_version_1_is_refused_in_one_line():
         old.sendto(changed(encode(PLAN), 4, b"\1"), run.ear.address)
     run.at(1)
     answer = old.recv(2000)
-    assert len(answer) == 60 and answer[:5] == b"STWM\2"
+    assert len(answer) == 60 and answer[:5] == b"STWM\3"
     _, port = old.getsockname()
     assert run.said == [
-        f"refused a controller at 127.0.0.1:{port}: it speaks protocol version 1; expected 2"
+        f"refused a controller at 127.0.0.1:{port}: it speaks protocol version 1; expected 3"
     ]
     old.close()
 
@@ -206,7 +207,7 @@ def test_a_machine_of_version_1_is_refused_in_one_line(contact_with):
     with pytest.raises(ConfigError) as refused:
         call(contact)
     assert re.fullmatch(
-        r"--machine: machine at 127.0.0.1:\d+ speaks protocol version 1; expected 2, of the same "
+        r"--machine: machine at 127.0.0.1:\d+ speaks protocol version 1; expected 3, of the same "
         "release on both sides",
         str(refused.value),
     )
@@ -387,8 +388,8 @@ class Watching(Viewer):
     def __init__(self):
         self.words = ""
 
-    def ended(self, words):
-        self.words = words
+    def ended(self, end):
+        self.words = end.words
 
 
 @pytest.mark.slow
@@ -430,7 +431,8 @@ def test_the_page_shows_how_a_run_ended():
     url = viewer.opened()
     events = urllib.request.urlopen(url.replace("/?", "/events?"))
     assert b"ended" not in events.readline()
-    viewer.ended("left workspace: leg 2 reached the end of its reach at t = 1.500 s")
+    why = "leg 2 reached the end of its reach"
+    viewer.ended(End("left_workspace", Failure(1.5, 2, math.nan, why)))
     viewer.close()
     said = events.read().decode()
     assert '"ended": "left workspace: leg 2 reached the end of its reach at t = 1.500 s"' in said

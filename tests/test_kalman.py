@@ -92,12 +92,13 @@ def test_bounds_hold_in_an_update_and_nan_is_no_result():
 def test_a_prediction_has_the_sum_of_both_covariances():
     c, n = core(), 20
     H, std, L = RNG.normal(size=(12, n)), RNG.uniform(0, 1, 12), RNG.normal(size=(n, n))
+    walk = np.linspace(0, 1, n - 12)
     std[3] = 0.0
-    F, Q = np.eye(n), np.zeros((n, n))
-    F[:12], Q[:12, :12] = H, np.diag(std**2)
+    F = np.eye(n)
+    F[:12], Q = H, np.diag(np.append(std, walk) ** 2)
     expected = F @ L @ L.T @ F.T + Q
     scratch = c.scratch(2 * n * n + n)
-    c.lib.stewart_root_of_prediction(n, c.at(H), c.at(std), c.at(L), scratch)
+    c.lib.stewart_root_of_prediction(n, c.at(H), c.at(std), c.at(walk), c.at(L), scratch)
     assert pytest.approx(expected, abs=1e-11) == L @ L.T
     assert not np.triu(L, 1).any()
 

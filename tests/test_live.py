@@ -22,6 +22,7 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.cli import main
+from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.logs import Precision, read_log
 from stewart_drake.law.belief import Estimate
@@ -31,7 +32,7 @@ from stewart_drake.live.contact import Contact, Link, address_of, await_free, ca
 from stewart_drake.live.design import as_seen, check_controller, design
 from stewart_drake.live.endpoint import Endpoint
 from stewart_drake.live.governor import Governor
-from stewart_drake.live.loop import LiveLoop, Snapshot, Viewer
+from stewart_drake.live.loop import End, LiveLoop, Snapshot, Viewer
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.page import PageRequest, PageViewer, Readouts, read_request
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerMessage, MachineFlags
@@ -173,6 +174,33 @@ def test_a_hand_leads_and_a_target_beyond_reach_is_reported(quiet_machine):
     np.testing.assert_allclose(last.state[POSE], last.wanted[POSE], atol=2e-3)
     # It rises until a leg is at the end of its reach.
     assert last.state[5] > 0.45
+
+
+class Step(Hand):
+    """Holds the plate at home, then asks for a pose."""
+
+    def request(self):
+        return super().request()._replace(rest=len(self.seen) < self._after)
+
+
+@pytest.mark.slow
+@in_real_time
+def test_a_step_is_as_late_as_delay_holds_and_pace(quiet_machine):
+    """On average by eta + 2 dt + 3 / w, w = 10 / s with 0.66 N m: 1.3 s."""
+    home, height = load_mechanism("paper").home, 0.02
+    still, limit = "reference.amplitude=[0, 0, 0, 0, 0, 0]", "actuator.torque_limit=0.66"
+    hand = Step(home + [0, 0, 0, 0, 0, height])
+    with Running(still, limit) as running:
+        ready = prepare_session(scenario_of(still, limit), running.address)
+        result = drive(ready, 4.0, accept_jitter=True, viewer=hand, say=lambda line: None)
+    states = np.array([seen.state for seen in hand.seen[5:41]])
+    late = 0.1 * (1 - (states[:, 5] - home[5]) / height).sum() - 0.05  # trapezoid rule
+    assert late == pytest.approx(0.8 + 2 * 0.1 + 3 / 10, abs=0.02)
+    assert np.abs(result.signals.torque_commanded.values).max() < 0.8 * 0.66
+    wanted = np.array([seen.wanted[:6] for seen in hand.seen[5:41]])
+    assert np.abs(states[:, :6] - wanted).max() < 0.02 * height
+    # The rates of held torques at the samples are no reason for a new reference.
+    assert result.summary["live"]["recoveries"] == 0
 
 
 @pytest.mark.slow
@@ -722,6 +750,93 @@ def test_the_loop_goes_on_where_the_page_is_gone():
     for _ in range(3):
         viewer.show(seen)
     assert viewer.request() == Request()
+
+
+def seen_at(time, error=0.1, torque=0.5):
+    """Return a sample of a plate at home."""
+    state = np.concatenate([load_mechanism("paper").home, np.zeros(6)])
+    wanted, torques = np.append(state, np.zeros(6)), np.full(6, torque)
+    return Snapshot(time, state, wanted, torques, error, *[0.1] * 4, 0, None, False, None)
+
+
+@pytest.mark.slow
+@needs_chromium
+@pytest.mark.parametrize("width", [400, 1280])
+def test_after_a_loss_the_page_shows_reason_last_seconds_and_advice(width, tab):
+    viewer = PageViewer(load_mechanism("paper"), "live: a test")
+    try:
+        tab.open(viewer.opened(), width, 800)
+        for k in range(80):  # 8 s; the last 5 are shown
+            viewer.show(seen_at(0.1 * k, error=10.0 if k < 20 else 0.1 * k, torque=0.5))
+            tab.wait(f"window.live !== undefined && window.live.time >= {0.1 * k - 0.3}")
+            time.sleep(0.1)
+        failure = Failure(7.9, 3, -0.1, "crank 3 passed its dead centre")
+        viewer.ended(End("left_workspace", failure))
+        tab.wait(
+            "document.body.classList.contains('over') && !document.getElementById('last').hidden"
+        )
+        note = tab.evaluate("document.getElementById('note').textContent")
+        assert "left workspace" in note and "crank 3 passed its dead centre" in note
+        assert "Bring the plate back to its start" in note and "identify LOG" in note
+        last = tab.evaluate("document.getElementById('last').textContent")
+        span = float(last.split("last ")[1].split(" s:")[0])
+        assert 4.5 < span <= 5.0, "not the last seconds"
+        assert "at most 7.9 %" in last.replace("7.90", "7.9") and "at most 0.500 N m" in last
+        points = tab.evaluate("document.querySelector('#last polyline').points.length")
+        assert points > 20
+        assert tab.evaluate("document.documentElement.scrollWidth") == width
+        assert tab.evaluate(
+            "[...document.querySelectorAll('input, button')].every(x => x.disabled)"
+        )
+        assert tab.errors == []
+    finally:
+        viewer.close()
+
+
+@pytest.mark.slow
+@needs_chromium
+def test_the_page_is_driven_by_keys_alone_on_a_narrow_screen(tab):
+    viewer = PageViewer(load_mechanism("paper"), "live: a test")
+    try:
+        tab.open(viewer.opened(), 400, 800)
+        viewer.show(seen_at(1.0))
+        tab.wait("window.live !== undefined")
+        sides = "[...document.querySelectorAll('input, button, dd')]"
+        sides += ".map(x => x.getBoundingClientRect())"
+        assert tab.evaluate(f"{sides}.every(x => x.left >= 0 && x.right <= 400 && x.width > 20)")
+
+        def go_to(name):
+            for _ in range(40):
+                if tab.evaluate("document.activeElement.id") == name:
+                    return
+                tab.press("Tab")
+            raise AssertionError(f"{name} is not reached by Tab")
+
+        go_to("s2")
+        outline = "getComputedStyle(document.activeElement).outlineStyle"
+        assert tab.evaluate(outline) == "solid", "the focus is not visible"
+        before = float(tab.evaluate("document.activeElement.value"))
+        for _ in range(10):
+            tab.press("ArrowRight")
+        wait_until(lambda: viewer.request().target is not None)
+        wait_until(lambda: abs(np.rad2deg(viewer.request().target[2]) - before - 1.0) < 0.05)
+        go_to("motion")
+        tab.press("Space")
+        wait_until(lambda: viewer.request().target is None)
+        go_to("stop")
+        tab.press("Enter")
+        wait_until(lambda: (viewer.request(), viewer.stopped())[1])
+        assert tab.errors == []
+    finally:
+        viewer.close()
+
+
+def wait_until(condition):
+    for _ in range(600):
+        if condition():
+            return
+        time.sleep(0.1)
+    raise AssertionError("never")
 
 
 @pytest.mark.slow

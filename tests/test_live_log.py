@@ -221,7 +221,7 @@ def test_ten_minutes_keep_no_more_than_a_minute():
             record.acted({k - 1: np.array(memory.torque)})
             record.sample(k, memory, measurement, wanted, 1e-3, 1e-3, np.full(5, np.nan))
             if k % 1000 == 0:
-                while not record._file._rows.empty():
+                while not record._file._log._rows.empty():
                     time.sleep(0.01)
             if k in (1000, 6_000):
                 gc.collect()

@@ -274,6 +274,9 @@ def test_summary_is_what_the_signals_say():
         "saturated_steps",
         "references_missing",
         "tuner_fallbacks",
+        "limited_steps",
+        "qp_failures",
+        "qp_late",
     }
     assert run.summary["failure"] is None
     assert run.failure is None

@@ -235,6 +235,24 @@ def test_a_file_in_millimetres_is_asked_for_metres(name, masses, load):
     assert len(str(caught.value).splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        (["rod.length"], "crank.length, rod.length"),
+        (["pattern.base_radius", "pattern.plate_radius"], "pattern"),
+    ],
+    ids=["rods", "radii"],
+)
+def test_some_lengths_in_millimetres_are_named(fields, named, load):
+    contents = enlarged("desktop", 1, 1, 1)
+    for field in fields:
+        section, key = field.split(".")
+        contents[section][key] *= 1000
+    contents["plate"]["mass"] *= 1e5  # heavier than paper at any size
+    with pytest.raises(ConfigError, match=rf"{named}: got up to .*\(are these millimetres\?\)"):
+        load(contents)
+
+
 @pytest.mark.parametrize("name", ["paper", "desktop", "motion_base"])
 @pytest.mark.parametrize("factor", [1e-3, 0.01, 0.1, 1, 5])
 def test_machines_of_any_size_in_metres_are_taken(name, factor, load):
@@ -313,7 +331,7 @@ def test_arrays_are_copies_and_read_only():
 
     bodies = [mechanism, *(getattr(mechanism, name) for name in ("base", "plate", "crank", "rod"))]
     arrays = [value for body in bodies for value in vars(body).values() if np.ndim(value)]
-    assert len(arrays) == 11
+    assert len(arrays) == 12
     for array in arrays:
         assert array.dtype == np.float64
         with pytest.raises(ValueError, match="read-only"):

@@ -18,9 +18,14 @@ from stewart_drake.core import build, library
 from stewart_drake.core.layout import SIGNATURES
 from stewart_drake.dynamics import generate, native_functions
 from stewart_drake.dynamics.native_functions import NativeFunctions, functions_of
-from stewart_drake.dynamics.stewart import plant_parameters
+from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
 from stewart_drake.dynamics.workspace import margin, measures_at
-from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, PAYLOAD
+from stewart_drake.scenario.signals import (
+    BALL_JOINTS,
+    NUM_PLANT_PARAMETERS,
+    PAYLOAD,
+    PLANT_PARAMETERS,
+)
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.virtual_machine import VirtualMachine
 
@@ -51,6 +56,7 @@ def parameters(rng):
     """Return random parameters of the plant; the payload leaves the plate a positive mass."""
     found = rng.normal(0, 0.1, NUM_PLANT_PARAMETERS)
     found[PAYLOAD] = abs(found[PAYLOAD])
+    found[BALL_JOINTS] = 0.0, 0.0, 0.1  # which the virtual machine lacks
     return found
 
 
@@ -92,6 +98,19 @@ def test_native_equals_the_virtual_machine():
         assert_equal(seed, QUICK)
     for seed in range(4):
         assert_equal(seed)
+
+
+def test_mass_matrix_bias_and_map_are_those_of_the_equations():
+    """They come from derivatives and accelerations; the oracle has its own expressions."""
+    for seed in range(6):
+        other = machine(seed)
+        given = arguments(np.random.default_rng(seed), other.mechanism)
+        pose, rates, free = given["pose"], given["rates"], given["parameters"]
+        dynamics = StewartDynamics(other.mechanism, gravity=given["gravity"], free=PLANT_PARAMETERS)
+        found = dynamics.mass_matrix(pose, free), dynamics.bias(pose, rates, free)
+        found = [*found, dynamics.actuation_map(pose).T]
+        expected = other.terms(pose, rates, free, given["gravity"])
+        assert difference(found, expected) < 1e-9
 
 
 @pytest.mark.soak

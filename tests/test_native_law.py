@@ -163,6 +163,7 @@ CASES = {
     "no delay": ("gravity", ("delay.steps=0",), None),
     "less than a period": ("paper", ("delay.steps=0", "delay.fraction=0.5"), None),
     "without estimator": ("motion_base", ("controller.estimate=[]",), None),
+    "wrench": ("gravity", (*DIRTY, "controller.estimate=[payload,wrench]"), spoiled),
     "saturation": ("paper", (*DIRTY, "actuator.torque_limit=0.03"), None),
     "bad measurements": ("gravity", DIRTY, spoiled),
     "bad measurements without estimator": (

@@ -1,13 +1,23 @@
 """new: a machine, a scenario and a first look from a few measurements."""
 
 import json
+import re
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from http.client import HTTPConnection
+from urllib.parse import parse_qs, urlsplit
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
+import yaml
 
 import stewart_drake as sd
 from stewart_drake.cli import main, model
 from stewart_drake.mechanism.kinematics import leg_geometry
+from stewart_drake.reporting.machine_form import machine_form
+from tests.browser import needs_chromium
 from tests.screen import too_long
 
 MEASURED = {
@@ -80,7 +90,9 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(tmp_path, capsys):
         ({"rod": 260}, "--rod: got 260 m; expected metres, 0.26 for 260 mm"),
         ({"rod": 0.06}, "reach the plate"),
         ({"crank": 0.3}, "--rod: got 0.26 m with cranks of 0.3 m; expected a rod longer"),
-        ({"rod": float("nan")}, "--rod: got nan; expected a finite number"),
+        ({"rod": float("nan")}, "--rod: got 'nan'; expected a number with mm, cm, m"),
+        ({"rod": "260 mmm"}, "--rod: got '260 mmm'; expected a number with mm, cm, m or without"),
+        ({"rod_mass": "50 mm"}, "--rod-mass: got '50 mm'; expected a number with g, kg"),
         ({"crank_mass": -1}, "--crank-mass: got -1.0; expected greater than 0"),
         ({"shaft_distance": 0.35}, "--shaft-distance: got 0.35 m on a circle of radius 0.2 m"),
         ({"delay": -1}, "--delay: got -1.0; expected greater than or equal to 0"),
@@ -103,16 +115,164 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(tmp_path, capsys):
     assert (tmp_path / "machine.yaml").read_bytes() == before
 
 
-def test_what_is_missing_is_asked_for_and_millimetres_are_noticed(tmp_path, monkeypatch):
-    answers, agreed = iter([270.0, 260.0, 2.5]), list[str]()
+def answering(monkeypatch, answers, agreed):
+    """Let a terminal answer questions, and refuse the first confirmation."""
+    given = iter(answers)
 
     def agree(text, **_):
         agreed.append(text)
         return len(agreed) > 1  # no: it is asked for again
 
     monkeypatch.setattr(model.sys.stdin, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr(model.typer, "prompt", lambda *_, **__: next(answers))
+    monkeypatch.setattr(model.typer, "prompt", lambda *_, **__: next(given))
     monkeypatch.setattr(model.typer, "confirm", agree)
+    return given
+
+
+def test_what_is_missing_is_asked_for_and_millimetres_are_noticed(tmp_path, monkeypatch):
+    agreed = list[str]()
+    answering(monkeypatch, ["270", "260", "2500 g"], agreed)
     assert main(["new", str(tmp_path), *flags(rod=None, plate_mass=None)]) == 0
     assert agreed == ["270 m? 0.27 m for 270 mm", "260 m? 0.26 m for 260 mm"]
+    machine = sd.load_mechanism(tmp_path / "machine.yaml")
+    assert machine.rod_lengths[0] == 0.26 and machine.plate.mass == 2.5
+
+
+def test_an_answer_that_does_not_fit_is_asked_for_again(tmp_path, monkeypatch, capsys):
+    answers = answering(monkeypatch, ["long", "40 mm", "260 mm"], [])
+    assert main(["new", str(tmp_path), *flags(rod=None)]) == 0
+    assert next(answers, None) is None
+    said = capsys.readouterr().err
+    assert "rod: got 'long'" in said and "rod: got 0.04 m with cranks of 0.05 m" in said
     assert sd.load_mechanism(tmp_path / "machine.yaml").rod_lengths[0] == 0.26
+
+
+def test_lengths_and_masses_have_units(tmp_path):
+    units = {"base_radius": "200 mm", "shaft_distance": "13cm", "rod": "0.26 m", "rod_mass": "50 g"}
+    assert machine_text_of(tmp_path / "a", **units) == machine_text_of(tmp_path / "b")
+    made_by_python = sd.new(
+        tmp_path / "c",
+        "c",
+        **({name.replace("-", "_"): value for name, value in MEASURED.items()} | units),
+    )
+    assert made_by_python.check.mechanism.rod_lengths[0] == 0.26
+
+
+def machine_text_of(folder, **other):
+    made(folder, **other)
+    return (folder / "machine.yaml").read_text().replace(f"name: {folder.name}", "")
+
+
+def test_it_ends_with_the_first_report(tmp_path):
+    made(tmp_path / "mine")
+    page = (tmp_path / "mine" / "report.html").read_text()
+    for words in ("First report on mine", "every leg in reach", "E_ac", "completed"):
+        assert words in page
+    assert page.count("<img") >= 4  # the drawing, and the figures of the run
+    assert json.loads((tmp_path / "mine" / "summary.json").read_text())["peak_torque"] > 0
+    scenario = yaml.safe_load((tmp_path / "mine" / "scenario.yaml").read_text())
+    assert scenario["mechanism"] == "machine.yaml"
+
+
+# The form.
+
+
+def fields(**other):
+    texts = {name.replace("-", "_"): str(value) for name, value in MEASURED.items()}
+    return texts | {name: str(value) for name, value in other.items()}
+
+
+def asked(url, path, data, token=None):
+    """Return status and JSON of a request to a page."""
+    where = urlsplit(url)
+    token = parse_qs(where.query)["token"][0] if token is None else token
+    connection = HTTPConnection(where.hostname, where.port, timeout=60)
+    connection.request("POST", path, data, {"X-Token": token})
+    answer = connection.getresponse()
+    body = answer.read()
+    return answer.status, json.loads(body) if answer.status == 200 else None
+
+
+@pytest.fixture
+def form():
+    with machine_form({"rod": "0.26"}, "new machine") as served:
+        yield served
+
+
+def test_the_form_draws_before_masses_are_known_and_names_what_is_wrong(form):
+    lengths = fields(plate_mass="", crank_mass="", rod_mass="")
+    _, found = asked(form.url, "/check", json.dumps(lengths))
+    assert found["drawing"].startswith("data:image/svg")
+    assert (found["field"], found["problem"]) == ("plate_mass", "is missing")
+    for wrong, field, words in (
+        ({"rod": "40 mm"}, "rod", "expected a rod longer"),
+        ({"rod": "2 feet"}, "rod", "expected a number with mm"),
+        ({"crank": "-1 mm"}, "crank", "expected greater than 0"),
+        ({"rod": "55 mm"}, "rod", "reach the plate"),
+        ({"plate_mass": "2500"}, "plate_mass", "2.5 for 2500 g"),
+        ({"cranks": "up"}, "cranks", "expected"),
+    ):
+        _, found = asked(form.url, "/check", json.dumps(fields(**wrong)))
+        assert found["field"] == field and words in found["problem"]
+    longer = asked(form.url, "/check", json.dumps(fields(rod="300 mm")))[1]
+    assert longer["problem"] is None
+    assert longer["drawing"] != asked(form.url, "/check", json.dumps(fields()))[1]["drawing"]
+
+
+def test_the_form_refuses_strangers_and_malformed_requests(form):
+    assert asked(form.url, "/check", b"{}", token="guess")[0] == 403
+    for data in (b"", b"[]", b"{", b'{"rod": 1}', b'{"other": "1"}', b"[" * 4000, b"x" * 5000):
+        assert asked(form.url, "/check", data)[0] in (400, 413)
+    assert asked(form.url, "/other", json.dumps(fields()))[0] == 400
+    with urlopen(form.url) as page:
+        text = page.read().decode()
+    assert 'value="0.26"' in text and "Radius of the circle of the motor shafts" in text
+
+
+def test_the_form_gives_the_measurements_and_shows_the_report(form):
+    waiting = ThreadPoolExecutor(2)
+    measured = waiting.submit(form.wait)
+    assert asked(form.url, "/write", json.dumps(fields(rod="")))[1]["problem"] == "is missing"
+    assert not measured.done()
+    assert asked(form.url, "/write", json.dumps(fields(rod="260 mm")))[1]["problem"] is None
+    assert measured.result(timeout=30).rod == 0.26
+    shown = waiting.submit(form.show, "<p>done</p>")
+    with urlopen(form.url.replace("/?", "/report?")) as page:
+        assert page.read() == b"<p>done</p>"
+    shown.result(timeout=30)
+
+
+@pytest.mark.slow
+@needs_chromium
+@pytest.mark.parametrize("width", [400, 1280])
+def test_the_form_in_a_browser_by_keyboard(tab, tmp_path, width):
+    """Type every measurement with Tab between them, press Enter, and read the report."""
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; from stewart_drake.cli import main; sys.exit(main(sys.argv[1:]))",
+        "new",
+        str(tmp_path / "mine"),
+        "--form",
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            url = re.search(r"http://\S+", process.stdout.readline())[0].rstrip(",")
+            tab.open(url, width, 900)
+            assert tab.evaluate("document.documentElement.scrollWidth") == width
+            names = [name.replace("-", "_") for name in MEASURED]
+            tab.evaluate("document.forms[0].elements[0].focus()")
+            for name in names:
+                assert tab.evaluate("document.activeElement.name") == name
+                unit = "kg" if "mass" in name else "m"
+                tab.type(f"{MEASURED[name.replace('_', '-')]} {unit}")
+                tab.press("Tab")
+            tab.wait("!document.querySelector('button').disabled")
+            assert tab.evaluate("document.getElementById('drawing').naturalWidth") > 100
+            tab.press("Enter")
+            tab.wait("document.title.startsWith('First report')")
+            assert tab.errors == []
+            assert process.wait(timeout=120) == 0
+        finally:
+            process.kill()
+    assert (tmp_path / "mine" / "report.html").exists()

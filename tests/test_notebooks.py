@@ -10,7 +10,7 @@ import pytest
 from tests.shorter import judge_few_delays
 
 FOLDER = Path(__file__).resolve().parents[1] / "analysis"
-NOTEBOOKS = ("first_hour.ipynb", "lost_log.ipynb", "own_controller.ipynb")
+NOTEBOOKS = tuple(sorted(path.name for path in FOLDER.glob("*.ipynb")))
 
 
 class Done(NamedTuple):
@@ -80,3 +80,23 @@ def test_a_lost_log_leads_to_full_amplitude(capsys):
     assert names["full"].status == "completed" and names["full"].accumulated_error < 10
     assert not names["folder"].exists()
     assert "completed" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
+def test_at_the_limits_plans_are_better_than_cut_torques(capsys):
+    names, _ = run("at_the_limits.ipynb")
+    cut, planned = (names["compared"][f"predictor_{kind}"] for kind in ("lqi", "mpc"))
+    assert planned.accumulated_error < cut.accumulated_error / 2
+    assert names["too_large"].status == "completed"
+    assert "predictor_mpc" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
+def test_setpoints_of_reachy_mini_are_compensated(capsys):
+    names, _ = run("reachy_mini.ipynb")
+    plain, compensated = (names["compared"][f"servo_{k}"] for k in ("preview", "feedforward"))
+    assert compensated.accumulated_error < plain.accumulated_error / 2
+    assert names["angles"].shape == names["plain"].shape == (400, 6)
+    assert "deg" in capsys.readouterr().out

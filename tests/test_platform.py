@@ -1,18 +1,23 @@
 """A platform in a user's diagram."""
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.multibody.tree import FixedOffsetFrame
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 import stewart_drake as sd
+from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.scenario.signals import PLANT_PARAMETERS
 
 ROOT = Path(__file__).resolve().parents[1] / "diagrams"
 PAPER = sd.load_mechanism("paper")
@@ -51,7 +56,7 @@ def deck_height(mechanism):
     return placed + inspector.GetShape(disc).length() / 2
 
 
-def run(build, until=0.1, state=None):
+def run(build, until=0.1, state=None, change=None, look=None):
     builder = DiagramBuilder()
     platform = build(builder)
     builder.ExportInput(platform.GetInputPort("torque"), "torque")
@@ -63,8 +68,12 @@ def run(build, until=0.1, state=None):
         sd.set_accuracy(simulator, 1e-10)
     if state is not None:
         platform.SetState(context, state)
+    if change is not None:
+        platform.SetParameters(context, **change)
     diagram.GetInputPort("torque").FixValue(context, TORQUE)
     simulator.AdvanceTo(until)
+    if look is not None:
+        look(context)
     return diagram.GetOutputPort("state").Eval(context)
 
 
@@ -123,6 +132,125 @@ def test_two_machines_in_one_plant_move_on_their_own():
     alone = run(lambda builder: sd.AddStewartPlatform(builder, PAPER))
     np.testing.assert_allclose(moved, alone, atol=1e-9)
     np.testing.assert_allclose(still, [*PAPER.home, *np.zeros(6)], atol=1e-9)
+
+
+def test_a_robot_beside_it_does_not_change_its_motion():
+    def beside(builder):
+        plant, _ = AddMultibodyPlantSceneGraph(builder, 1e-3)
+        platform = sd.AddStewartPlatform(
+            builder, PAPER, plant=plant, X_PB=RigidTransform([2.0, 0, 0])
+        )
+        url = "package://drake/examples/acrobot/Acrobot.urdf"
+        scene["plant"], (scene["robot"],) = plant, Parser(plant).AddModels(url=url)
+        plant.Finalize()
+        plant.GetJointByName("shoulder", scene["robot"]).set_default_angle(1.0)
+        return platform
+
+    def look(context):
+        plant = scene["plant"]
+        angle = plant.GetPositions(plant.GetMyContextFromRoot(context), scene["robot"])[0]
+        assert abs(angle - 1.0) > 0.1, "the robot hangs still"
+
+    scene = {}
+    simulated = run(beside, 0.3, look=look)
+    np.testing.assert_allclose(simulated, run(lambda b: sd.AddStewartPlatform(b, PAPER), 0.3))
+    assert np.abs(simulated[:6] - PAPER.home).max() > 1e-3
+
+
+LOADS = {"payload_mass": 0.3, "payload_position": [0.05, -0.03, 0.1], "joint_damping": 0.01}
+LOADS |= {"coulomb_friction": 0.02, "coulomb_speed": 0.5}
+HEAVY = replace(PAPER, plate=replace(PAPER.plate, mass=5.0))
+
+
+@pytest.mark.parametrize("kind", ["exact", "multibody"])
+def test_changing_parameters_in_a_context_equals_building_with_them(kind):
+    """One by one and together; the default values are back in the next context."""
+
+    def built(mechanism, loads):
+        config = sd.PlantConfig(kind, gravity=True, **{"coulomb_friction": 1e-3} | loads)
+        return lambda builder: sd.AddStewartPlatform(builder, mechanism, config)
+
+    plain = run(built(PAPER, {}))
+    changes = [{name: LOADS[name]} for name in ("payload_mass", "joint_damping", "coulomb_speed")]
+    for loads in ({}, *changes, LOADS):
+        machine = PAPER if loads else HEAVY
+        change = loads or {"plate_mass": HEAVY.plate.mass}
+        changed = run(built(PAPER, {}), change=change)
+        np.testing.assert_allclose(changed, run(built(machine, loads)), rtol=1e-9, atol=1e-12)
+        assert np.abs(changed - plain).max() > 1e-6, change
+    # Where the payload is, of a payload that is there.
+    here, there = ({"payload_mass": 0.3, "payload_position": [0, 0, z]} for z in (0.1, 0.2))
+    moved = run(built(PAPER, here), change={"payload_position": there["payload_position"]})
+    np.testing.assert_allclose(moved, run(built(PAPER, there)), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["exact", "multibody"])
+def test_a_closed_loop_takes_parameters_in_its_context(kind):
+    settings = (f"plant.kind={kind}", "start=on_reference", "queue=reference", "delay.steps=1")
+
+    def state(change, *more, **own):
+        loop = sd.build_closed_loop(sd.load_scenario("paper", settings=(*settings, *more)), **own)
+        context = loop.CreateDefaultContext()
+        loop.SetParameters(context, **change)
+        simulator = Simulator(loop, context)
+        if kind == "exact":
+            sd.set_accuracy(simulator, 1e-10)
+        simulator.AdvanceTo(0.35)
+        return loop.GetOutputPort("state").Eval(context)
+
+    loaded = state({"payload_mass": 0.3})
+    np.testing.assert_allclose(loaded, state({}, "plant.payload_mass=0.3"), atol=1e-10)
+    heavy = state({"plate_mass": 5.0})
+    np.testing.assert_allclose(heavy, state({}, true_mechanism=HEAVY), atol=1e-10)
+    assert min(np.abs(changed - state({})).max() for changed in (loaded, heavy)) > 1e-6
+
+
+def test_derivatives_by_parameters_are_exact():
+    dynamics = sd.StewartDynamics(PAPER, True, free=PLANT_PARAMETERS)
+    plant = sd.systems.ExactPlant(dynamics).ToAutoDiffXd()
+    context = plant.CreateDefaultContext()
+    state = np.concatenate([PAPER.home + 0.02, np.full(6, 0.05)])
+    values = plant_parameters([*np.full(6, 0.01), 0.3, 0.02, 0.01, 0.5, 0.05, 0.0, 0.1])
+    context.SetContinuousState([AutoDiffXd(x) for x in state])
+    plant.GetInputPort("torque").FixValue(context, np.array([AutoDiffXd(T) for T in TORQUE]))
+    varied = InitializeAutoDiff(values).ravel()
+    context.get_mutable_numeric_parameter(0).SetFromVector(varied)
+    change = plant.EvalTimeDerivatives(context).CopyToVector()
+    found = ExtractGradient(change)
+    expected = dynamics.derivatives(state[:6], state[6:], TORQUE, values).G
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+    plate = context.get_mutable_numeric_parameter(1)
+    plate.SetFromVector(InitializeAutoDiff(ExtractValue(plate.CopyToVector())).ravel())
+    with pytest.raises(ValueError, match="derivatives by mass or inertia of the plate"):
+        plant.EvalTimeDerivatives(context)
+
+
+@pytest.mark.parametrize("kind", ["exact", "multibody"])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"payload": 1.0}, "parameter: got 'payload'; expected plate_mass, payload_mass"),
+        ({"payload_mass": -1.0}, "payload_mass: got -1"),
+        ({"payload_mass": np.nan}, "payload_mass: got nan"),
+        ({"plate_mass": 0.0}, "plate.mass: got 0 kg"),
+        ({"plate_mass": np.nan}, "plate.mass: got nan kg"),
+    ],
+)
+def test_wrong_parameters_are_refused_and_change_nothing(kind, change, message):
+    def build(builder):
+        return sd.AddStewartPlatform(builder, PAPER, sd.PlantConfig(kind))
+
+    with pytest.raises(ConfigError) as refused:
+        run(build, change={"payload_position": [0, 0, 0.1]} | change)
+    assert message in str(refused.value)
+
+
+def test_friction_that_was_not_built_is_refused():
+    with pytest.raises(ConfigError, match="coulomb_friction: got a platform without"):
+        run(lambda b: sd.AddStewartPlatform(b, PAPER), change={"coulomb_friction": 0.1})
+    loop = sd.build_closed_loop(sd.load_scenario("paper", settings=("plant.kind=paper",)))
+    with pytest.raises(ConfigError, match="got paper; expected exact or multibody"):
+        loop.SetParameters(loop.CreateDefaultContext(), payload_mass=0.1)
 
 
 def test_a_platform_begins_at_the_given_state():

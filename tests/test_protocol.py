@@ -61,6 +61,7 @@ PLAN = ControllerMessage(
     1_000_000_000,
     np.vstack([ACTED, [[0.125, 0, 0, 0, 0, -8]]]),
 )
+CRANKS = replace(PLAN, flags=ControllerFlags(0), torques=ACTED, cranks=True)
 STATE = MachineMessage(
     head=HEAD,
     flags=MachineFlags.SIMULATION | MachineFlags.RUNNING | MachineFlags.HOLDS,
@@ -106,6 +107,7 @@ VECTORS = [
     (ENCODERS, None),
     (REQUEST, None),
     (OFFER, None),
+    (CRANKS, None),
 ]
 
 
@@ -163,7 +165,7 @@ def test_each_field_lies_where_the_tables_say():
     head, machine, controller = re.split(r"## (?:Machine|Controller) to ", text)
     formats = {"u8": "<B", "u16": "<H", "u32": "<I", "u64": "<Q", "f64": "<d"}
     wanted = {
-        "version": 2,
+        "version": 3,
         "tag": 0,
         "kind": 1,
         "samples": 1,
@@ -190,7 +192,7 @@ def test_each_field_lies_where_the_tables_say():
                 expected = getattr(message.head, name) if expected is None else expected
             assert value == expected, name
             seen += 1
-    assert seen == 2 * 11 + 20 + 5
+    assert seen == 2 * 11 + 21 + 5
 
 
 def test_the_tag_is_the_first_half_of_an_hmac():
@@ -220,7 +222,8 @@ def any_message(rng):
         if rng.random() < 0.3:
             return ControllerMessage(head, identity=identity)
         torques = np.outer(1 + np.arange(rng.randrange(MOST_ROWS + 1)), some)
-        return ControllerMessage(head, ControllerFlags.STOP, 3, 4, rng.randrange(2**63), torques)
+        rows, cranks = (3, 4, rng.randrange(2**63), torques), rng.random() < 0.5
+        return ControllerMessage(head, ControllerFlags.STOP, *rows, cranks=cranks)
     acted = np.outer(1 + np.arange(rng.randrange(MOST_HISTORY + 1)), some)
     times = (rng.randrange(1, 2**64) for _ in range(4))
     flags, there = MachineFlags(rng.randrange(1024)), np.array(rng.choices([True, False], k=64))
@@ -228,6 +231,7 @@ def any_message(rng):
     faults = {
         "reason": Reason(rng.choice(list(Fault)), rng.randrange(7), rng.randrange(2**64)),
         "before": Reason(rng.choice(list(Fault)), 0, rng.randrange(2**64)),
+        "cranks": rng.random() < 0.5,
     }
     if rng.random() < 0.3:
         offered = (*fixed[:4], acted[:0], *fixed[5:])
@@ -287,6 +291,7 @@ def test_the_first_thing_that_is_wrong_is_the_cause():
         (changed(plan, 60, b"\3"), None, Refusal.MALFORMED),
         (changed(plan, 60, b"\xff"), None, Refusal.MALFORMED),
         (changed(plan, 61, b"\1"), None, Refusal.MALFORMED),
+        (changed(plan, 61, b"\3"), None, Refusal.MALFORMED),
         (changed(plan, 62, b"\1"), None, Refusal.MALFORMED),
         (changed(request, 60, b"\1"), None, Refusal.MALFORMED),
         (changed(request, 96, b"\n"), None, Refusal.MALFORMED),
@@ -409,7 +414,7 @@ def test_an_endpoint_counts_what_it_refuses():
         b"x",
         good[:-1],
         encode(PLAN),
-        changed(good, 4, b"\3"),
+        changed(good, 4, b"\4"),
         encode(STATE, KEY),
     ):
         mouth._socket.sendto(data, ear.address)

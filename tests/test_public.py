@@ -64,6 +64,12 @@ def test_the_signature_of_an_analysis_shows_its_options():
     )
 
 
+def test_help_names_arrays_instead_of_the_unions_behind_them():
+    assert str(inspect.signature(sd.StewartDynamics.mass_matrix)).startswith(
+        "(self, pose: ArrayLike"
+    )
+
+
 def test_a_scenario_tells_what_is_not_as_usual():
     assert repr(sd.Scenario()) == "Scenario()"
     scenario = sd.load_scenario("paper", settings=SETTINGS)
@@ -89,6 +95,7 @@ FUNCTIONS = {
     "list": "shipped",
     "live": "run_live",
     "machine": "run_machine",
+    "replay": "replay_log",
     "model check": "check_model",
     "model sdf": "model_sdf",
     "model view": "view_model",

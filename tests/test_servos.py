@@ -512,7 +512,7 @@ def test_a_row_may_have_servos_of_its_own():
     ("more", "said"),
     [
         (("controller.command=torque",), "controller.command: got 'torque' with actuator.kind"),
-        (("link.kind=network",), "link.kind: got 'network' with controller.command 'cranks'"),
+        (("link.kind=network",), "link.kind: got 'network' with actuator.kind 'servo'"),
         (("tuner.kind=ann",), "tuner.kind: got 'ann' with controller.command 'cranks'"),
         (
             (

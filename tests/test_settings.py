@@ -12,11 +12,14 @@ import pytest
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.schema import spelling
+from stewart_drake.law.learned import LearnedTorque
+from stewart_drake.loop.learned import save_learned
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.scenario.calibration import DELAY, Calibration, save_calibration
-from stewart_drake.scenario.config import ESTIMATED, PriorConfig
+from stewart_drake.scenario.config import ESTIMATED, PriorConfig, PushConfig
 from stewart_drake.scenario.dependencies import NEEDS
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import shown
@@ -26,7 +29,7 @@ DOCS = Path(__file__).parents[1] / "docs" / "reference" / "scenario.md"
 SIX = [0.01, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 SCENARIOS = {
-    "paper": ("paper", None, ("duration=0.6", "delay.steps=2")),
+    "paper": ("paper", None, ("duration=0.45", "delay.steps=2")),
     "paper's plant": ("table2", "delay_lqi", ("overlay=paper_plant", "duration=0.9")),
     "gravity, hold": (
         "gravity",
@@ -36,7 +39,13 @@ SCENARIOS = {
     "desktop, encoders": (
         "desktop",
         None,
-        ("plant.kind=exact", "sensor.kind=encoders", "sensor.bits=20", "duration=0.5"),
+        (
+            "plant.kind=exact",
+            "plant.push={wrench: [0, 0, 0, 0, 0, 1]}",
+            "sensor.kind=encoders",
+            "sensor.bits=20",
+            "duration=0.35",
+        ),
     ),
     "motion_base, rule": (
         "motion_base",
@@ -61,10 +70,31 @@ SCENARIOS = {
             "queue=reference",
         ),
     ),
+    "limited": (
+        "paper",
+        "predictor_mpc",
+        (
+            "plant.kind=exact",
+            "start=on_reference",
+            "queue=reference",
+            "delay.steps=2",
+            "actuator.torque_limit=0.009",
+            "duration=0.6",
+        ),
+    ),
+    "gravity, pd": ("gravity", "pd_gravity", ("plant.kind=exact", "duration=0.4")),
     "servos": (
         "paper",
         "servo_feedforward",
-        ("actuator.kind=servo", "plant.kind=exact", "delay.steps=2", "duration=0.5"),
+        ("actuator.kind=servo", "plant.kind=exact", "delay.steps=2", "duration=0.35"),
+    ),
+    "position servos": (
+        "paper",
+        "servo_feedforward",
+        (
+            *("actuator.kind=position_servo", "plant.kind=exact", "plant.ball_joint_friction=0.02"),
+            *("delay.steps=2", "controller.period=0.04", "duration=0.4"),
+        ),
     ),
     "adaptive, drifting": (
         "paper",
@@ -94,7 +124,7 @@ OTHER = {
     "compare": {"lqr": {"w_Q": 2.0}},
     "reference.amplitude": [0.05, 0.02, 0.03, 0.004, 0.005, 0.006],
     "reference.offset": [0.0, 0.0, 0.01, 0.0, 0.0, 0.381],
-    "reference.frequency": 1.3,
+    "reference.frequency": [1.0, 1.3, 1.0, 0.7, 1.0, 2.0],
     "plant.time_step": 0.002,
     "plant.accuracy": 1e-12,
     "plant.payload_mass": 0.3,
@@ -104,6 +134,12 @@ OTHER = {
     "plant.coulomb_friction": 1e-3,
     "plant.coulomb_speed": 0.5,
     "plant.payload_position": [0.02, 0.0, 0.0],
+    "plant.push.wrench": [0.0, 0.0, 0.0, 0.05, 0.0, 0.0],
+    "plant.push.from": 0.1,
+    "plant.push.to": 0.1,
+    "plant.ball_joint_damping": 1e-3,
+    "plant.ball_joint_friction": 1e-3,
+    "plant.ball_joint_friction_speed": 0.5,
     "delay.steps": 1,
     "delay.fraction": 0.5,
     "delay.drift": 0.05,
@@ -125,6 +161,8 @@ OTHER = {
     "controller.period": 0.05,
     "controller.delay_steps": 1,
     "controller.delay_fraction": 0.5,
+    "controller.kp": 60.0,
+    "controller.kd": 8.0,
     "controller.w_Q": 5.0,
     "controller.w_R": 5.0,
     "controller.integral_weight": 5.0,
@@ -134,18 +172,29 @@ OTHER = {
     "controller.delay_std": 0.1,
     "controller.delay_max": 2.5,
     "controller.replan": 0.3,
+    "controller.horizon": 10,
     "controller.calibration": "FILE",
+    "controller.learned": "FILE",
     "controller.prior.torque_bias": 1e-4,
     "controller.prior.payload": 0.01,
     "controller.prior.damping": 1e-5,
     "controller.prior.rates": [0.5, 0.1, 0.1, 0.1, 0.1, 0.1],
     "controller.prior.offsets": 0.05,
+    "controller.prior.wrench": [1e-4, 1e-3],
+    "controller.prior.wrench_walk": [1e-4, 1e-3],
     "actuator.torque_limit": 0.004,
     "actuator.bandwidth": 5.0,
     "actuator.damping": 2.0,
     "actuator.speed_limit": 0.02,
     "actuator.gear_ratio": 5.0,
     "actuator.rotor_inertia": 1e-5,
+    "actuator.stiffness": 20.0,
+    "actuator.velocity_gain": 0.05,
+    "actuator.crank_damping": 0.05,
+    "actuator.friction": 0.05,
+    "actuator.friction_speed": 0.1,
+    "actuator.armature": 0.002,
+    "actuator.angle_range": [-0.1, 0.1],
     "sensor.noise_std": [1e-4] * 12,
     "sensor.delay": 0.1,
     "sensor.loss": 0.4,
@@ -172,7 +221,9 @@ def fields_of(scenario):
         for field in dataclasses.fields(owner):
             name = f"{above}{spelling(type(owner), field.name)}"
             value = getattr(owner, field.name)
-            if isinstance(value, PriorConfig) or (dataclasses.is_dataclass(value) and not above):
+            if isinstance(value, PriorConfig | PushConfig) or (
+                dataclasses.is_dataclass(value) and not above
+            ):
                 yield from walk(value, f"{name}.")
             else:
                 yield name
@@ -188,7 +239,8 @@ def other_values(owner_hint, name, value):
         return [not value]
     if name == "controller.estimate":
         some = [*ESTIMATED]
-        return [one for one in ([], [*some, "coulomb"], [*some, "offsets"], some) if one != value]
+        extra = [[*some, one] for one in ("coulomb", "wrench", "offsets")]
+        return [one for one in ([], *extra, some) if one != value]
     words = getattr(owner_hint, "__args__", ())
     return [word for word in words if word != value]
 
@@ -211,6 +263,9 @@ def value_of(scenario, name):
 
 def setting_of(name, value):
     section, *parts = name.split(".")
+    if len(parts) == 2 and parts[0] == "push":  # of a push that acts
+        pushed = {"wrench": [0.0, 0.0, 0.0, 0.0, 0.0, 1.0]}
+        return f"{section}.push={json.dumps(pushed | {parts[1]: value})}"
     if len(parts) == 2:
         return f"{section}.{parts[0]}={json.dumps({parts[1]: value})}"
     return f"{name}={json.dumps(value)}"
@@ -233,6 +288,10 @@ def files(tmp_path_factory):
             mean = np.array([0.1 * machine.plate.mass, 1e-3, 0.05])
             path = path.with_suffix(".yaml")
             save_calibration(path, Calibration(fingerprint(machine), names, mean, 1e-8 * np.eye(3)))
+        elif name == "controller.learned":
+            path = path.with_suffix(".npz")
+            experiment = prepare(load_scenario("paper"))
+            save_learned(path, LearnedTorque(2 * np.pi, np.full((17, 6), 1e-4)), experiment)
         else:
             given = Path(scenario.reference.file)
             path = path.with_suffix(given.suffix)
@@ -256,6 +315,10 @@ NO_EFFECT = {
     "controller.model": lambda sc: sc.plant.kind == "paper",
     "plant.payload_position": lambda sc: sc.plant.payload_mass == 0,
     "plant.coulomb_speed": lambda sc: sc.plant.coulomb_friction == 0,
+    "plant.push.from": lambda sc: not any(sc.plant.push.wrench),
+    "plant.push.to": lambda sc: not any(sc.plant.push.wrench),
+    "plant.ball_joint_friction_speed": lambda sc: sc.plant.ball_joint_friction == 0,
+    "actuator.friction_speed": lambda sc: sc.actuator.friction == 0,
     "actuator.gear_ratio": lambda sc: sc.actuator.rotor_inertia == 0,
     "delay.swing_frequency": lambda sc: sc.delay.swing == 0 or sc.link.kind == "network",
     "delay.jump_time": lambda sc: sc.delay.jump == 0 or sc.link.kind == "network",
@@ -265,7 +328,9 @@ NO_EFFECT = {
     "controller.packet_torques": lambda sc: sc.link.kind == "wire",
     "controller.packet_repeats": lambda sc: sc.link.kind == "wire",
     "controller.open_loop_start": lambda sc: sc.start == "on_reference" or _cranks(sc),
-    "controller.integral": lambda sc: _cranks(sc),
+    # The desktop platform keeps far from its limit.
+    "controller.limits": lambda sc: sc.actuator.torque_limit is None or sc.mechanism == "desktop",
+    "controller.integral": lambda sc: _cranks(sc) or sc.controller.kind == "pd",
 } | {
     f"delay.{name}": lambda sc: sc.link.kind == "network"
     for name in ("steps", "fraction", "drift", "swing", "jump", "jitter_std")
@@ -303,11 +368,15 @@ REFUSED = {
     "controller.estimate=[]": [
         "controller.prior={payload: 0.1}",
         *("controller.prior={torque_bias: 0.1}", "controller.prior={damping: 0.1}"),
+        *("controller.prior={wrench: [1, 1]}", "controller.prior={wrench_walk: [1, 1]}"),
     ],
     "controller.delay_estimator=none": [
         *("controller.replan=0.3", "controller.delay_std=0.1", "controller.delay_max=2.0"),
     ],
     "tuner.kind=rule": ["controller.w_Q=2.0", "controller.w_R=2.0"],
+    "controller.limits=ignore": ["controller.horizon=10"],
+    "controller.kind=pd": ["controller.w_R=2.0", "controller.integral_weight=2.0"],
+    "controller.kind=lqi": ["controller.kp=2.0", "controller.kd=2.0"],
     "controller.integral=false": ["controller.integral_weight=2.0"],
     "sensor.kind=state": ["controller.prior={rates: [1, 1, 1, 1, 1, 1]}"],
     "controller.estimate=[torque_bias,payload,damping]": ["controller.prior={offsets: 0.1}"],
@@ -376,8 +445,9 @@ def test_a_comparison_refuses_what_no_row_uses(tmp_path):
 
 def test_what_is_accepted_without_an_effect_stands_in_the_docs():
     rows = [line for line in DOCS.read_text().splitlines() if line.startswith("| `")]
+    fields = {".".join(name.split(".")[:2]) for name in NO_EFFECT if name[:6] != "delay."}
     told = {word for row in rows for word in re.findall(r"`([\w.]+)", row.split("|")[1])}
-    assert "delay" in told and {name for name in NO_EFFECT if name[:6] != "delay."} <= told
+    assert "delay" in told and fields <= told
 
 
 @pytest.mark.slow

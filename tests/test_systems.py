@@ -302,6 +302,8 @@ def test_controller_topology_and_initial_state():
         "weights_used": 2,
         "parameters": 8,
         "parameter_std": 8,
+        "wrench_estimate": 6,
+        "wrench_std": 6,
         "delay_estimate": 1,
         "delay_std": 1,
         "memory": 0,  # an object

@@ -163,8 +163,8 @@ def test_none_is_written_and_read_back(tmp_path):
 
 
 def test_a_limit_of_the_machine_alone_plans_nothing():
-    """The way onto the reference takes 0.3 s; only a number that was asked for makes it shorter,
-    and only that one bounds what the estimator may believe in."""
+    """The way onto the reference takes 0.3 s; only a number that was asked for changes it, and only
+    that one bounds what the estimator may believe in."""
 
     @functools.cache
     def built(*settings):
@@ -175,7 +175,7 @@ def test_a_limit_of_the_machine_alone_plans_nothing():
     catch_up, prior = built()
     free, same = built("actuator.torque_limit=none")
     asked, narrower = built("actuator.torque_limit=5")
-    assert catch_up == free == pytest.approx(0.3) and asked < 0.25
+    assert catch_up == free == pytest.approx(0.3) and asked > 0.5
     assert np.array_equal(prior.upper, same.upper)
     assert narrower.upper[0] == 5.0 < prior.upper[0]
 

@@ -73,7 +73,7 @@ def test_the_sine_is_the_papers_equation_46():
 
 
 @given(
-    frequency=st.floats(0.01, 5),
+    frequency=st.floats(0.01, 5) | st.lists(st.floats(0.01, 5), min_size=6, max_size=6),
     unit=st.sampled_from(["rad/s", "Hz"]),
     amplitude=st.lists(st.floats(-0.5, 0.5), min_size=6, max_size=6),
     t=st.floats(0.1, 20),
@@ -83,11 +83,14 @@ def test_the_derivatives_of_a_sine_are_exact(frequency, unit, amplitude, t):
     config = SineConfig(amplitude=amplitude, frequency=frequency, frequency_unit=unit)
     trajectory = make_reference(config, 10.0)
     assert_derivatives_agree(trajectory, t)
-    omega = config.angular_frequency
-    assert omega == pytest.approx(frequency * (2 * math.pi if unit == "Hz" else 1))
+    omega = np.array(config.angular_frequency)
+    factor = 2 * math.pi if unit == "Hz" else 1
+    assert omega == pytest.approx(np.broadcast_to(frequency, 6) * factor)
+    waves = [a * math.sin(w * t) for a, w in zip(amplitude, omega, strict=True)]
+    assert np.array_equal(trajectory.value(t)[:, 0], np.add(config.offset, waves))
     third = trajectory.MakeDerivative(3).value(t)[:, 0]
     np.testing.assert_allclose(
-        third, -(omega**2) * evaluate(trajectory, t)[RATES], atol=1e-9 * (1 + omega**3)
+        third, -(omega**2) * evaluate(trajectory, t)[RATES], atol=1e-9 * (1 + omega.max() ** 3)
     )
 
 

@@ -187,7 +187,7 @@ def test_a_machine_in_c_says_why_it_stopped(folder):
             old.sendto(changed(encode(PLAN), 4, b"\1"), ("127.0.0.1", port))
         answer = old.recv(2000)
         old.close()
-        assert len(answer) == 60 and answer[:5] == b"STWM\2"
+        assert len(answer) == 60 and answer[:5] == b"STWM\3"
         driver = Driver(load_scenario("paper", settings=SETTINGS), ("127.0.0.1", port))
         while not driver.session.nonce:
             driver.say(now())
@@ -207,6 +207,6 @@ def test_a_machine_in_c_says_why_it_stopped(folder):
     assert last.reason.fault in (Fault.ENDED, Fault.REACH)
     assert last.before.fault == Fault.SILENCE
     assert [m.reason for m in driver.got[-3:]] == [last.reason] * 3
-    refusal = "refused a controller: it speaks protocol version 1; expected 2"
+    refusal = "refused a controller: it speaks protocol version 1; expected 3"
     assert running.lines.count(refusal) == 1
     assert FAULTS[Fault.ENDED] == "the machine was ended"

@@ -70,7 +70,7 @@ def test_an_old_name_that_a_person_writes_is_refused_with_the_new_one(tmp_path, 
         with pytest.raises(ConfigError, match=rf"{name}: .*called .*{CONTROLLER[name]} since") as e:
             load_scenario(**given)
         assert "\n" not in str(e.value)
-    with pytest.raises(ConfigError, match=r"expected one of period, .*, calibration$"):
+    with pytest.raises(ConfigError, match=r"expected one of kind, .*, learned$"):
         load_scenario("paper", settings=["controller.xyz=1"])  # the table itself is no field
 
 

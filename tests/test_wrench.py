@@ -9,6 +9,7 @@ from pydrake.systems.analysis import Simulator
 import stewart_drake as sd
 from stewart_drake.loop.exact import ExactPlant, set_accuracy
 from stewart_drake.loop.platforms import MultibodyStewart
+from stewart_drake.scenario.signals import NUM_CONSTANTS
 
 PAPER = sd.load_mechanism("paper")
 POSE0 = PAPER.home + np.array([0.1, -0.15, 0.2, 0.01, -0.02, 0.015])
@@ -31,6 +32,10 @@ def test_torques_of_virtual_work_balance_a_wrench():
     scale = np.abs(found).max()
     found = found + dynamics.wrench_accelerations(POSE0, WRENCH)
     assert scale > 1 and np.abs(found).max() < 1e-7 * scale
+    constants = dynamics.plant_parameters[:NUM_CONSTANTS]
+    pushed = sd.StewartDynamics(PAPER, False, np.concatenate([constants, WRENCH]))
+    assert np.abs(pushed.accelerations(POSE0, np.zeros(6), torque)).max() < 1e-7 * scale
+    np.testing.assert_allclose(pushed.equilibrium_torque(POSE0), torque, rtol=1e-7)
 
 
 def _rotation_vector(pose, unit):

@@ -79,7 +79,10 @@ class VirtualMachine:
 
     @cached_property
     def terms(self) -> Compiled:
-        found = equations.terms(self._motion)
+        """M, h and B' in pose coordinates: N' times those of nu = N rates."""
+        motion, N = self._motion, self._motion.rates_map
+        h = motion.bias + ca.mtimes(motion.mass, motion.nu_dot_bias)
+        found = [ca.mtimes(N.T, each) for each in (ca.mtimes(motion.mass, N), h, motion.arm.T)]
         return self._compile("terms", "pose rates parameters gravity", *found)
 
     @cached_property

@@ -80,6 +80,7 @@ def _callback(name: str) -> Callable[..., int]:
                 name, loaded, options, command=command, directory=out or scratch, progress=progress
             )
         files, interrupted = (getattr(found.study, key, ()) for key in ("files", "interrupted"))
+        files = (*files, *found.write_files(delivery.out))
         return delivery.answer(found, *files, interrupted=bool(interrupted))
 
     return run

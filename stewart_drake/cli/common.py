@@ -69,6 +69,10 @@ Controller = Annotated[
 Out = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder of summary, signals and figures.")
 ]
+Log = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Log to write during the run, .mcap or .csv."),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")]
 
@@ -109,16 +113,26 @@ def check_writable(directory: Path | None, *, alone: bool = True) -> None:
         ) from None
 
 
-def check_file(path: Path) -> None:
-    """Make the directory of a file that `--out` names.
+def check_file(path: Path, option: str = "--out") -> None:
+    """Make the directory of a file that `--out`, or another option, names.
 
     Raises:
         ConfigError: a directory or a device, or not writable.
     """
     if path.exists() and not path.is_file():
         kind = "a directory" if path.is_dir() else "no regular file"
-        raise ConfigError(f"--out: got {str(path)!r}, {kind}; expected a file")
+        raise ConfigError(f"{option}: got {str(path)!r}, {kind}; expected a file")
     check_writable(path.parent, alone=False)
+
+
+def check_log(path: Path | None) -> None:
+    """Make the directory of a file that `--log` names, if any.
+
+    Raises:
+        ConfigError: see `check_file`.
+    """
+    if path is not None:
+        check_file(path, "--log")
 
 
 def release() -> None:

@@ -8,8 +8,11 @@ _LINES: Final = """\
 simulate paper --set plant.gravity=true --set delay.steps=1
 simulate paper --controller lqi --out out/lqi --replay
 compare paper --set start=on_reference --set queue=reference
+simulate paper --set plant.kind=exact --log out/run.mcap
 export out/lqi/signals.nc --out lqi.csv
+replay out/lqi --out out/lqi.html
 export-c paper --out out/board
+setpoints reachy_mini --out out/setpoints.csv
 report paper --set plant.kind=exact --out out/report
 identify --plan paper --out out/plan
 identify out/lqi/signals.nc --mechanism paper --out out/m

@@ -26,7 +26,10 @@ Tolerance = Annotated[
 ]
 Bits = Annotated[
     int | None,
-    typer.Option(metavar="N", help="Bits per turn of the encoders of a CSV log; 14 by default."),
+    typer.Option(
+        metavar="N",
+        help="Bits per turn of the encoders of a CSV log; 14, or 12 of position servos.",
+    ),
 ]
 Gravity = Annotated[
     bool | None,
@@ -37,9 +40,7 @@ Gravity = Annotated[
 def identify(
     logs: Annotated[
         list[Path] | None,
-        typer.Argument(
-            metavar="[LOG]...", help="Logs of one machine: signals.nc of simulate, or CSV."
-        ),
+        typer.Argument(metavar="[LOG]...", help="Logs of one machine: of a run, or CSV."),
     ] = None,
     mechanism: Annotated[
         str | None, typer.Option(metavar="NAME|FILE", help="Mechanism as drawn; needed with logs.")
@@ -74,9 +75,12 @@ def identify(
     The run may have ended early. Writes mechanism.yaml and calibration.yaml for simulate, and a
     page. A CSV log has the columns time[s], torque_1[N m] to torque_6 (commanded), angle_1[rad] to
     angle_6 and, if measured, roll[rad] to z[m].
+
+    A CSV log with time[s], setpoint_1[rad] to setpoint_6 and crank_1[rad] to crank_6 shows the
+    numbers of position servos. Writes servos.yaml, for --set overlay=FILE.
     """
-    tolerances = read_tolerances(tolerance or ())
-    precision = _precision(bits, pose_std)
+    tolerances = read_tolerances(tolerance) if tolerance else None
+    precision = _precision(bits, pose_std) if bits is not None or pose_std else None
     if (plan is None) == (not logs):
         given = "neither" if plan is None else "both"
         raise ConfigError(f"LOG, --plan: got {given}; expected logs, or --plan SCENARIO")
@@ -96,6 +100,7 @@ def identify(
         raise ConfigError("--mechanism: is missing; expected a shipped name or a file, as drawn")
     from stewart_drake import functions
     from stewart_drake.identification.plan import MOTION
+    from stewart_drake.identification.servo_plan import SETPOINTS_FILE
     from stewart_drake.reporting.page import command_line
     from stewart_drake.scenario.loading import load_scenario
 
@@ -107,7 +112,7 @@ def identify(
         )
         with count_bar("plan", quiet, "computing"):
             found = functions.plan_identification(loaded, poses=pose_std is not None, **chosen)
-        delivery.discard(MOTION, functions.SCENARIO)
+        delivery.discard(MOTION, functions.SCENARIO, SETPOINTS_FILE)
     else:
         words = [*map(str, logs or []), *(["--no-gravity"] if gravity is False else [])]
         options = {"mechanism": mechanism, **typed}
@@ -116,7 +121,7 @@ def identify(
             found = functions.identify(
                 logs or [], mechanism or "", delay=delay, gravity=gravity is not False, **chosen
             )
-        delivery.discard(functions.MECHANISM, functions.CALIBRATION)
+        delivery.discard(functions.MECHANISM, functions.CALIBRATION, functions.SERVOS)
     return delivery.answer(found, *found.write_files(delivery.out))
 
 

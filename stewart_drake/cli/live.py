@@ -21,6 +21,7 @@ from stewart_drake.cli.common import (
     Quiet,
     ScenarioName,
     Settings,
+    check_log,
 )
 from stewart_drake.cli.options import Given, with_options
 from stewart_drake.files.errors import ConfigError
@@ -103,10 +104,14 @@ def live(
         delivery.discard("signals.nc")
         how: Any = {"armed": options.armed, "viewer": viewer, "max_missing": options.max_missing}
         how["log"] = None if out is None else out / LOG
+        check_log(options.log)
+        how["logs"] = session.open_logs(ready, options, delivery.say_wrapped)
         with _Ending() as ending:
             result = session.drive(
                 ready, span, ending=ending, say=delivery.say_wrapped, accept_jitter=True, **how
             )
+    if options.log is not None:
+        delivery.say(f"log written to {options.log}")
     return _delivered(delivery, result)
 
 
@@ -233,7 +238,7 @@ def machine(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Simulate a machine in real time, for a controller over UDP.
+    """Simulate a machine in real time, or drive a robot, for a controller over UDP.
 
     Plant, sensor, delay, link and limits are those of the scenario. Ctrl-C ends it.
     """
@@ -241,18 +246,22 @@ def machine(
     def interrupt(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    from stewart_drake.live.machine import open_machine
+    from stewart_drake.live.reachy import open_chosen
     from stewart_drake.scenario.loading import load_scenario
 
     options, loaded = given.options(), load_scenario(scenario, controller, settings or ())
     delivery, interrupted = Delivery(None, quiet, as_json), False
-    with given.named(), open_machine(loaded, options, delivery.say_wrapped) as (running, address):
+    check_log(options.log)
+    with given.named(), open_chosen(loaded, options, delivery.say_wrapped) as (running, address):
         delivery.say_link(loaded)
         before = signal.signal(signal.SIGTERM, interrupt)
         try:
+            moved = f"simulated by {running.simulated_by}"
+            if options.reachy is not None:
+                moved = f"drives the robot behind {options.reachy}"
             delivery.say(
-                f"machine {scenario} at {address[0]}:{address[1]}: simulated by "
-                f"{running.simulated_by}, every {1e-6 * running.period:g} ms\n"
+                f"machine {scenario} at {address[0]}:{address[1]}: {moved}, "
+                f"every {1e-6 * running.period:g} ms\n"
                 "waits for a controller; Ctrl-C ends it"
             )
             running.run(options.duration or math.inf)
@@ -260,6 +269,8 @@ def machine(
             interrupted = True
         finally:
             signal.signal(signal.SIGTERM, before)
+    if options.log is not None:
+        delivery.say(f"log written to {options.log}")
     s: Any = running.summary()
     refused = ", ".join(f"{number} {cause}" for cause, number in s["refused"].items() if number)
     delivery.say_wrapped(

@@ -14,6 +14,7 @@ from stewart_drake.cli.common import (
     Quiet,
     check_file,
     open_meshcat,
+    stopping,
 )
 from stewart_drake.cli.options import Given, with_options
 from stewart_drake.files.errors import ConfigError
@@ -104,51 +105,113 @@ def view(
 @with_options(Measurements)
 def new(
     *,
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the two files.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the files.")],
     given: Given,
+    form: Annotated[
+        bool, typer.Option("--form", help="Ask by a form in a browser, with a drawing.")
+    ] = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
     """Make a machine and a first scenario from a few measurements.
 
-    Asks for the measurements that are not given. Lengths in m, masses in kg; moments of inertia
-    are estimated.
+    Asks for the measurements that are not given. Lengths in m or with a unit, as 300 mm; masses in
+    kg, or as 250 g. Moments of inertia are estimated. Runs the scenario, and writes report.html.
     """
-    from stewart_drake.reporting.mechanism import document
     from stewart_drake.studies import new_machine as study
-    from stewart_drake.studies.verdict import Verdict, loop_verdict
 
     delivery = Delivery(folder, quiet, as_json)
     study.check_free(folder)
-    asked = _asked(given.missing, sys.stdin.isatty() and not (quiet or as_json))
-    measurements = given.options(more=asked)
+    if form:
+        from stewart_drake.reporting.machine_form import machine_form
+
+        with stopping("nothing was written"), machine_form(given.given, "new machine") as page:
+            # The address is printed also with --quiet.
+            echo(f"fill in the form at {page.url}, Ctrl-C ends it", error=as_json)
+            measurements = page.wait()
+            status, text = _new(delivery, given, measurements, folder)
+            page.show(text)
+        return status
+    asking = sys.stdin.isatty() and not (quiet or as_json)
+    return _new(delivery, given, _measured(given, asking), folder)[0]
+
+
+def _new(
+    delivery: Delivery, given: Given, measurements: Measurements, folder: Path
+) -> tuple[int, str]:
+    """Write the files; return the exit status and the report as HTML."""
+    from stewart_drake.loop.simulation import simulate
+    from stewart_drake.reporting.first_report import first_report
+    from stewart_drake.reporting.mechanism import document
+    from stewart_drake.reporting.page import Provenance, command_line, html
+    from stewart_drake.reporting.results import PAGE
+    from stewart_drake.scenario.loading import load_scenario
+    from stewart_drake.studies import new_machine as study
+    from stewart_drake.studies.verdict import Verdict, loop_verdict
+
     with given.named():
         made = study.new_machine(measurements, _name_of(folder), folder)
+    delivery.wrote(study.MACHINE, study.SCENARIO)
     margin = made.margin
     delay = Verdict(margin.eta, margin.pole, margin.pole_time)
+    findings = [made.verdict, loop_verdict(margin), str(delay)]
     delivery.say(document(made.check).plain())
-    delivery.say_wrapped(made.verdict, loop_verdict(margin), str(delay))
-    delivery.wrote(study.MACHINE, study.SCENARIO)
+    delivery.say_wrapped(*findings)
+    delivery.discard(PAGE)
     delivery.write(made.summary)
+    text = ""
+
+    def draw(where: Path) -> None:
+        nonlocal text
+        result = simulate(load_scenario(folder / study.SCENARIO))
+        typed = {name.replace("_", "-"): value for name, value in measurements.model_dump().items()}
+        made_by = Provenance(command_line("new", str(folder), options=typed))
+        text = html(first_report(made, result, findings), made_by)
+        write_whole(where / PAGE, text)
+
+    delivery.draw(PAGE, draw)
     status = delivery.end(made.summary)
     delivery.say(f"next: stewart-drake simulate {folder / study.SCENARIO} --out {folder / 'run'}")
-    return status
+    return status, text or "The report could not be written; see the terminal."
 
 
-def _asked(missing: "list[Option]", asking: bool) -> dict[str, float]:
-    """Ask for missing measurements at a terminal; elsewhere they are an error."""
+def _measured(given: Given, asking: bool) -> Measurements:
+    """Return the measurements; ask for missing ones, and again for those that do not fit."""
+    missing = {one.name: one for one in given.missing}
     if missing and not asking:
-        flags = ", ".join("--" + one.name.replace("_", "-") for one in missing)
+        flags = ", ".join("--" + name.replace("_", "-") for name in missing)
         raise ConfigError(
-            f"new: got no {flags}; expected the measurements as options, or a terminal to ask at"
+            f"new: got no {flags}; expected the measurements as options, a terminal to ask at, or "
+            "--form"
         )
-    return {one.name: _ask(one.help[0].lower() + one.help[1:-1]) for one in missing}
-
-
-def _ask(question: str) -> float:
+    asked = {name: _ask(one) for name, one in missing.items()}
     while True:
-        value = float(typer.prompt(question, type=float))
-        if not (question.endswith(", m") and value > LARGEST):
+        try:
+            measurements: Measurements = given.options(more=asked)
+        except ConfigError as error:
+            flag = str(error).partition(":")[0]
+            name = flag.removeprefix("--").replace("-", "_")
+            if name not in asked:
+                raise
+            echo(f"{error}", error=True)
+            asked[name] = _ask(missing[name])
+        else:
+            return measurements
+
+
+def _ask(one: "Option") -> float:
+    from stewart_drake.studies.options import quantity
+
+    question, unit = one.help[0].lower() + one.help[1:-1], one.unit or ""
+    while True:
+        text = str(typer.prompt(question)).strip()
+        try:
+            value = quantity(one.name, text, unit)
+        except ConfigError as error:
+            echo(str(error), error=True)
+            continue
+        bare = text[-1:].isdigit() or text.endswith(".")
+        if not (bare and unit == "m" and value > LARGEST):
             return value
         if typer.confirm(f"{value:g} m? {value / 1000:g} m for {value:g} mm", default=True):
             return value / 1000

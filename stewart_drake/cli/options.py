@@ -35,6 +35,12 @@ class Given:
         """Typed values for the command on a page."""
         return {_dashed(one): self._typed[_name(one)] for one in _offered(self._kind, True)}
 
+    @property
+    def given(self) -> dict[str, Any]:
+        """Typed values by field, without those that were not given."""
+        offered = ((one, self._typed[_name(one)]) for one in _offered(self._kind))
+        return {one.name: value for one, value in offered if value is not None}
+
     def options(
         self,
         load: "Callable[[str], Scenario] | None" = None,
@@ -112,6 +118,8 @@ def _parameter(one: Option) -> inspect.Parameter:
     annotation, default, name = one.annotation, one.default, _dashed(one)
     if one.read:
         annotation, default = list[str] | None, None
+    elif one.unit:
+        annotation, default = str | None, None if one.required else f"{default:g} {one.unit}"
     elif one.required:
         annotation, default = annotation | None, None
     option = typer.Option(

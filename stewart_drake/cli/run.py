@@ -13,11 +13,13 @@ from stewart_drake.cli.common import (
     AsJson,
     Controller,
     Delivery,
+    Log,
     Out,
     Quiet,
     ScenarioName,
     Settings,
     check_file,
+    check_log,
     check_writable,
     open_meshcat,
 )
@@ -48,6 +50,7 @@ def simulate(
     replay: Annotated[
         bool, typer.Option("--replay", help="Write replay.html, a 3-D animation; needs --out.")
     ] = False,
+    log: Log = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
     meshcat: Annotated[
@@ -69,6 +72,7 @@ def simulate(
             raise ConfigError(f"{option}: got it without --out; expected --out DIR to write into")
     experiment = prepare(load_scenario(scenario, controller, settings or ()))
     delivery = Delivery(out, quiet, as_json)
+    check_log(log)
     viewer = open_meshcat() if meshcat else None
     delivery.say_link(experiment.scenario)
     margin = controller_margin(experiment)
@@ -80,7 +84,8 @@ def simulate(
         _await_viewer(viewer)
     name = Path(scenario).stem
     with progress_bars([name], experiment.scenario.duration, quiet) as progress:
-        result = run(experiment, progress=progress[name], meshcat=viewer, judge_stability=margin)
+        shown = progress[name]
+        result = run(experiment, progress=shown, meshcat=viewer, judge_stability=margin, log=log)
     delivery.say(run_document(result).plain())
 
     def draw(folder: Path) -> list[Path]:
@@ -105,6 +110,8 @@ def simulate(
     delivery.draw("figures", draw)
     if replay or meshcat:
         delivery.draw(REPLAY, film)
+    if log is not None:
+        delivery.say(f"log written to {log}")
     status = delivery.end(result.summary, interrupted=result.status == "interrupted")
     if viewer is not None:
         from stewart_drake.reporting.replay import replay as play
@@ -152,6 +159,21 @@ def export(
         echo(f"written to {out}")
 
 
+def replay(
+    log: Annotated[
+        Path,
+        typer.Argument(metavar="LOG", help="Log (.mcap, .csv), signals.nc, or run's folder."),
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Page to write.")] = Path(REPLAY),
+) -> None:
+    """Write a log as a 3-D animation, one HTML file."""
+    from stewart_drake.functions import replay_log
+
+    check_file(out)
+    replay_log(log, out)
+    echo(f"written to {out}")
+
+
 def export_c(
     scenario: ScenarioName = "paper",
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")] = Path(
@@ -172,14 +194,80 @@ def export_c(
     echo(f"written to {out}: {len(files)} files; make test replays the run")
 
 
+def setpoints(
+    scenario: ScenarioName = "reachy_mini",
+    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="File to write.")] = Path(
+        "out/setpoints.csv"
+    ),
+    rate: Annotated[float, typer.Option(metavar="HZ", help="Setpoints per second.")] = 50.0,
+    plain: Annotated[
+        bool, typer.Option("--plain", help="Angles of the reference, without compensation.")
+    ] = False,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="POSE",
+            help="Pose where the plate rests: roll,pitch,yaw in rad, x,y,z in m.",
+        ),
+    ] = None,
+    units: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Units of the servos: rad, deg or ticks, offset, sign."),
+    ] = None,
+    controller: Controller = None,
+    settings: Settings = None,
+) -> None:
+    """Write the crank angles to send to position servos.
+
+    They are compensated for the torque of the motion, and checked for reach, and for range, speed
+    and torque of each motor.
+    """
+    from stewart_drake.functions import setpoints as make
+
+    check_file(out)
+    pose = None if start is None else _pose(start)
+    made = make(
+        *(scenario, rate, out),
+        plain=plain,
+        start=pose,
+        units=units,
+        controller=controller,
+        settings=settings or (),
+    )
+    kind = "plain" if plain else "compensated"
+    echo(f"written to {out}: {len(made.times)} {kind} setpoints at {rate:g} Hz")
+    torque, speed = abs(made.torques).max(), abs(made.crank_rates).max()
+    echo(f"largest torque {torque:.3g} N m, largest speed of a crank {speed:.3g} rad/s")
+    if made.blend:
+        echo(f"soft start: the motion joins the reference after {made.blend:g} s")
+
+
+def _pose(text: str) -> list[float]:
+    try:
+        pose = [float(part) for part in text.strip(" []()").split(",")]
+    except ValueError:
+        pose = []
+    if len(pose) != 6:
+        raise ConfigError(
+            f"--from: got {text!r}; expected six numbers, roll,pitch,yaw in rad and x,y,z in m, "
+            "with commas"
+        )
+    return pose
+
+
 def compare(
     scenario: ScenarioName = "paper",
+    controllers: Annotated[
+        str | None,
+        typer.Option(metavar="A,B,...", help="Names or files of controllers, in this order."),
+    ] = None,
     settings: Settings = None,
     out: Out = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Compare the shipped controllers on a scenario."""
+    """Compare controllers on a scenario: by default the shipped ones."""
     from stewart_drake.loop.preparation import prepare
     from stewart_drake.reporting.run import comparison_document
     from stewart_drake.scenario.loading import load_compatible
@@ -191,14 +279,18 @@ def compare(
 
         return comparison_figures(results, folder)
 
+    chosen = None if controllers is None else [one.strip() for one in controllers.split(",")]
+    names = tuple(study.shown(scenario, settings or (), chosen))
     experiment = prepare(load_compatible(scenario, settings=settings or ()))
     delivery = Delivery(out, quiet, as_json)
-    names = tuple(study.shown(scenario, settings or ()))
     delivery.say_link(experiment.scenario)
     delivery.say_wrapped(str(delay_verdict(experiment)))
     with progress_bars(names, experiment.scenario.duration, quiet) as progress:
         results = study.compare(
-            scenario, settings or (), lambda name, time, error: progress[name](time, error)
+            scenario,
+            settings or (),
+            lambda name, time, error: progress[name](time, error),
+            controllers=chosen,
         )
     delivery.say(comparison_document(results).plain())
     known = dict.fromkeys((*names, *study.LABELS))

@@ -9,6 +9,7 @@ import hashlib
 import importlib.util
 import os
 import platform
+import re
 import shlex
 import shutil
 import subprocess
@@ -19,10 +20,18 @@ from pathlib import Path
 FOLDER = Path(__file__).resolve().parent
 ROOT = FOLDER.parents[1]
 LIBRARY = FOLDER / "_dynamics.so"
+DECLARED = "_dynamics.cffi"
+"""Python module beside the library: its declarations as cffi loads them without a parser."""
 EQUATIONS = FOLDER / "equations.h"
 MODELS = ROOT / "models"
 GENERATORS = ("equations", "derivatives", "generate")
 """Modules of `dynamics` that write equations.h."""
+
+SOURCE_ONLY_HEADERS = (
+    *("real.h", "equations.h", "dop853.h", "dop853_table.h"),
+    *("filter_attempt.h", "legs.h", "short.h"),
+)
+"""Headers that Python does not use."""
 
 # No fused operations and no reordering, so that results match CasADi's to the last digits.
 # No errno or traps, so that loops over legs vectorise.
@@ -90,6 +99,50 @@ def compiler() -> list[str] | None:
     return found
 
 
+def declarations() -> str:
+    """Return the declarations of the headers, without directives but for integer constants.
+
+    cffi reads only `#define NAME 123`; a header writes any other constant as an enum.
+    """
+    headers: dict[str, str] = {}
+    for path in sorted(FOLDER.glob("*.h")):
+        _include(path.name, headers)
+    text = "\n".join(headers.values())
+    text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
+    text = re.sub(r"^static inline .*?^}\n", "", text, flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(r"\brestrict\b|(?<=extern )const", "", text)
+    lines = (line for line in text.splitlines() if not _is_directive(line))
+    return "typedef double real;\n" + "\n".join(lines)
+
+
+def _include(name: str, headers: dict[str, str]) -> None:
+    """Add a header to the others, after those that it includes."""
+    if name in headers or name in SOURCE_ONLY_HEADERS:
+        return
+    text = (FOLDER / name).read_text("utf-8")
+    for included in re.findall(r'^#include "(.*)"', text, re.MULTILINE):
+        _include(included, headers)
+    headers.setdefault(name, text)
+
+
+def _is_directive(line: str) -> bool:
+    return line.startswith("#") and not re.fullmatch(r"#define \w+ +\d+ *", line)
+
+
+def declare(target: Path) -> None:
+    """Write the module of declarations, where cffi is installed."""
+    if importlib.util.find_spec("cffi") is None:
+        return
+    from cffi import FFI
+
+    ffi = FFI()
+    ffi.set_source("declared", None, compiler_verbose=0)
+    ffi.cdef(declarations())
+    ffi.emit_python_code(str(target))
+    with target.open("a", encoding="utf-8") as file:
+        file.write(f'source = "{source_hash()}"\n')
+
+
 def compile_library(target: Path = LIBRARY) -> str | None:
     """Compile into a file. Return None, or one line with the reason of a failure."""
     command = compiler()
@@ -102,7 +155,9 @@ def compile_library(target: Path = LIBRARY) -> str | None:
             arguments = [*command, *options, *SOURCES, "-lm"]
             done = subprocess.run(arguments, capture_output=True, text=True, errors="replace")
             if done.returncode == 0:
-                os.replace(made, target)  # a process that has the former one open keeps it
+                declare(made.with_name(DECLARED))
+                for part in made.parent.iterdir():  # a process keeps the former one if open
+                    os.replace(part, target.with_name(part.name))
                 return None
     except OSError as error:
         return f"{error}"

@@ -22,7 +22,8 @@
 #define FEW 4        /* once it is known */
 #define TRIED 15     /* values of the delay that are tried before the iterations of a vague one */
 #define DIFFERENCE ((real)1e-3) /* s */
-#define KNOWN ((real)0.01) /* a parameter is known at this share of its usual standard deviation */
+#define KNOWN ((real)0.01) /* a constant is known at this share of its usual standard deviation */
+#define HEARD 10           /* measurements after which a misfit may be a jump of parameters */
 #define MEMORY 5           /* s over which the timing of single torques is judged */
 #define UNTIMELY ((real)0.05) /* periods by which a torque may come early or late at the most */
 #define JERKED ((real)0.02)   /* periods by which the delay may have changed where it did */
@@ -139,7 +140,7 @@ static int linearize_along(const stewart_period *t, const real *xi, const Way *w
     const stewart_schedule schedule = {way->number, way->torques, way->durations, 0};
     real *all = stewart_take(&scratch, MOST * X * known), *moved = stewart_take(&scratch, n);
     real later[X], sooner[X];
-    if (!stewart_transitions_along(t->delay->machine, xi, &schedule, fourth_order, way->states, all, scratch))
+    if (!stewart_transitions(t->delay->machine, xi, &schedule, fourth_order, way->states, all, scratch))
         return 0;
     for (int i = 0; i < X; i++) {
         stewart_copy(known, all + X * known * (way->number - 1) + known * i, H + n * i);
@@ -475,6 +476,8 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
     stewart_fill(n * n, 0, R);
     for (int i = 0; i < X; i++)
         R[(n + 1) * i] = a->drift[i];
+    for (int i = X; i < n - 2; i++)
+        R[(n + 1) * i] = d->walk_std[i - X];
     if (guess->numbers[n - 2] < STEWART_NEVER) {
         R[n * n - n - 2] = REAL(sqrt)(less_sure + d->walk * d->walk * dt);
         R[n * n - 1] = d->rate_walk * REAL(sqrt)(dt);
@@ -520,6 +523,28 @@ static void jerk(int n, real std, real *L)
     rate[1] = REAL(hypot)(rate[1], along * std / *eta);
 }
 
+/* `after` with a measurement that a jump of parameters explains; the delay may have jumped instead,
+   which further misfits will show. Returns 0, with L as before, where none does. */
+static int pushed(Model *a, const stewart_guess *guess, real *L, const real *y, stewart_guess *after,
+                  stewart_scratch scratch)
+{
+    const stewart_delay *d = a->period->delay;
+    const int n = a->n, p = n - X - 2;
+    real jump[STEWART_MAX_ESTIMATED + 2];
+    for (real share = 1; share <= STEWART_LARGEST_JUMP; share *= 10) {
+        for (int i = 0; i < n - X; i++)
+            jump[i] = i < p ? share * d->jump_std[i] : 0;
+        stewart_widen_root(n, jump, L, scratch);
+        const int fits = attempt(a, guess, L, y, 0, after, scratch);
+        stewart_guess_root(guess, n, L);
+        if (fits) {
+            after->outliers = guess->outliers + 1;
+            return 1;
+        }
+    }
+    return 0;
+}
+
 void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, const real *y,
                            stewart_guess *after, stewart_scratch scratch)
 {
@@ -540,7 +565,8 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
     a.instant.J = stewart_take(&scratch, m * X);
     stewart_guess_root(guess, n, L);
     for (int i = 0; i < p; i++)
-        if (!(stewart_norm(n, L + n * (X + i)) <= KNOWN * d->usual_std[i])) /* or NaN */
+        if (!(d->walk_std[i] > 0)
+            && !(stewart_norm(n, L + n * (X + i)) <= KNOWN * d->usual_std[i])) /* or NaN */
             a.fourth_order = 1;
     const int goes = stewart_period_at(t, guess->numbers, a.fourth_order, a.first, a.first + X, scratch);
     if (y && goes) {
@@ -555,6 +581,9 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
             }
             stewart_guess_root(guess, n, L);
         }
+        if (d->jump_std && guess->heard >= HEARD && guess->outliers == 0
+            && pushed(&a, guess, L, y, after, scratch))
+            return;
     }
     if (!goes || !attempt(&a, guess, L, NULL, 0, after, scratch)) /* the hypothesis has failed */
         stewart_copy(stewart_guess_size(p), (const real *)guess, (real *)after);

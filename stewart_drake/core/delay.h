@@ -21,6 +21,8 @@ typedef struct {
     real model_std[STEWART_STATES];  /* error of one step of the model */
     const real *prior, *prior_root;  /* of theta: mean (p), root of the covariance (p, p) */
     const real *std, *usual_std;     /* (p) of the prior, and of the prior from a drawing alone */
+    const real *walk_std;            /* (p) change of theta in a period; 0 for a constant */
+    const real *jump_std;            /* (p) sudden change of theta, as of a filter, or NULL */
     const real *lower, *upper;       /* (p) bounds of theta */
     real gate;                       /* squared innovation that makes an outlier */
     real first_timing;               /* s, first standard deviation of the timing of torques */

@@ -12,6 +12,8 @@
 #endif
 
 #define SUMS 28 /* numbers of `equations.Sums`, symmetric matrices as triangles */
+#define BIAS_FORCE 21 /* place of h (6) among them */
+#define BALL_JOINTS 13 /* place of the ball joints' three parameters */
 #define COMMON (LEGS * LEG_NUMBERS) /* place of the numbers after those of the legs */
 
 /* `equations.slip` of six cranks. */
@@ -26,6 +28,12 @@ typedef struct {
     real sums[SUMS], arms[36], rates[LEGS], slip[LEGS];
 } Motion;
 
+static int joints_resist(const stewart_plant *plant)
+{
+    const real *damping = plant->parameters + BALL_JOINTS, *friction = damping + 1;
+    return plant->joints && (*damping != 0 || *friction != 0);
+}
+
 static void motion(const stewart_plant *plant, const real *pose, const real *rates, Motion *m)
 {
     const real *legs = plant->geometry, *common = legs + COMMON, *parameters = plant->parameters;
@@ -35,6 +43,12 @@ static void motion(const stewart_plant *plant, const real *pose, const real *rat
     for (int i = 0; i < SUMS; i++)
         for (int leg = 0; leg < LEGS; leg++)
             m->sums[i] += added[LEGS * i + leg];
+    if (joints_resist(plant)) {
+        real force[6];
+        plant->joints->force(plant, pose, rates, force);
+        for (int i = 0; i < 6; i++)
+            m->sums[BIAS_FORCE + i] += force[i];
+    }
     /* A tenth of the time, and only needed with Coulomb friction. */
     memset(m->slip, 0, sizeof m->slip);
     if (parameters[COULOMB] != 0)
@@ -72,14 +86,6 @@ void stewart_energy(const stewart_plant *plant, const real *pose, const real *ra
     *energy = m.sums[SUMS - 1];
 }
 
-void stewart_terms(const stewart_plant *plant, const real *pose, const real *rates, real *M,
-                   real *h, real *B)
-{
-    Motion m;
-    motion(plant, pose, rates, &m);
-    pose_terms(pose, rates, m.sums, m.arms, M, h, B);
-}
-
 void stewart_residual_derivatives(const stewart_plant *plant, const real *pose, const real *rates,
                                   const real *accelerations, const real *torque, real *dF_dx,
                                   real *dF_dp, real *M, real *B)
@@ -101,6 +107,8 @@ void stewart_residual_derivatives(const stewart_plant *plant, const real *pose, 
             mass[i] += mass_of_legs[LEGS * i + leg];
     pose_derivatives(pose, rates, accelerations, parameters, gravity, mass, B, arm_rates, slip, dF_dp,
                      M);
+    if (joints_resist(plant))
+        plant->joints->derivatives(plant, pose, rates, dF_dx, dF_dp + 6 * BALL_JOINTS);
 }
 
 void stewart_measures(const real *geometry, const real *pose, const real *angles, real *measures)

@@ -4,16 +4,29 @@
 
 #include "real.h"
 
-#define STEWART_PARAMETERS 13 /* of the equations, see scenario/signals.py */
-#define STEWART_GEOMETRY 121 /* numbers of a machine, see core/layout.py */
+#define STEWART_PARAMETERS 22 /* of the equations, see scenario/signals.py */
+#define STEWART_GEOMETRY 133 /* numbers of a machine, see core/layout.py */
 #define STEWART_MEASURES 8   /* of the workspace */
+
+typedef struct stewart_joint_friction stewart_joint_friction;
 
 /* A machine and its parameters. */
 typedef struct {
     const real *geometry;   /* STEWART_GEOMETRY numbers */
-    const real *parameters; /* STEWART_PARAMETERS: torque biases (6, N m), payload (kg), .. */
+    const real *parameters; /* STEWART_PARAMETERS: torque biases (6, N m), payload (kg), .. , wrench (6) */
     const real *gravity;    /* m/s^2, along -z */
+    const stewart_joint_friction *joints; /* NULL: none */
 } stewart_plant;
+
+/* Friction of passive joints: a force on the plate in the coordinates of its pose. */
+struct stewart_joint_friction {
+    /* F (6) at a pose and its rates, added to h. Beyond the workspace it stays finite. */
+    void (*force)(const stewart_plant *plant, const real *pose, const real *rates, real *force);
+    /* dF/d[pose; rates] (6, 12), added to `by_state`, and dF/d[c, f, s] (6, 3) in `by_parameters`, by
+       columns and by central differences. */
+    void (*derivatives)(const stewart_plant *plant, const real *pose, const real *rates, real *by_state,
+                        real *by_parameters);
+};
 
 /* A pose and its rates are 6 numbers each, angles (rad) before positions (m), torques 6 in N m, a
    state is pose and rates; matrices are stored by columns. */
@@ -32,12 +45,9 @@ void stewart_change(const stewart_plant *plant, const real *state, const real *t
 /* Kinetic and potential energy, J. */
 void stewart_energy(const stewart_plant *plant, const real *pose, const real *rates, real *energy);
 
-/* Mass matrix M (6, 6), bias h (6) and input matrix B' (6, 6) in coordinates of the pose. */
-void stewart_terms(const stewart_plant *plant, const real *pose, const real *rates, real *M,
-                   real *h, real *B);
-
 /* Of F = M accelerations + h - B torque at constant accelerations: dF/dstate (6, 12),
-   dF/dparameters (6, STEWART_PARAMETERS), then M (6, 6), and B (6, 6) by rows. */
+   dF/dparameters (6, STEWART_PARAMETERS), then M (6, 6), and B (6, 6) by rows. Without friction of the
+   ball joints, derivatives by its parameters are 0. */
 void stewart_residual_derivatives(const stewart_plant *plant, const real *pose, const real *rates,
                                   const real *accelerations, const real *torque, real *dF_dx,
                                   real *dF_dp, real *M, real *B);

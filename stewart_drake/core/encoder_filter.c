@@ -14,13 +14,6 @@
 #define ROUNDING 1e-9
 #endif
 
-int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
-                        int fourth_order, real *states, real *H, stewart_scratch scratch)
-{
-    stewart_predict(machine, xi + X, schedule, xi, states);
-    return stewart_transitions_along(machine, xi, schedule, fourth_order, states, H, scratch);
-}
-
 /* Cut a schedule (number) at instants (n), ascending, in s. There is place for number + n torques and
    durations; `places` (n) are the pieces that end at the instants. */
 static stewart_schedule cut(const stewart_schedule *schedule, int n, const real *instants,
@@ -84,6 +77,7 @@ static int along(Legs *s, const real *xi, stewart_scratch scratch)
     const stewart_filter *f = a->filter;
     const stewart_encoders *encoders = s->encoders;
     const int n = a->n, last = s->coarse.number - 1;
+    stewart_predict(f->machine, xi + X, &s->coarse, xi, s->states);
     if (!stewart_transitions(f->machine, xi, &s->coarse, s->coarse.number <= 2, s->states, s->H,
                              scratch))
         return 0;
@@ -101,14 +95,16 @@ static int along(Legs *s, const real *xi, stewart_scratch scratch)
     return 1;
 }
 
-/* Reasons for which values of legs were left out. */
+/* Reasons for which values of legs were left out; counts the legs that do not fit. */
 static int causes_of(const Legs *s, const int *there)
 {
     int causes = s->reading.missing ? STEWART_MISSING : 0;
+    s->attempt->gated = 0;
     for (int leg = 0; leg < LEGS; leg++) {
         int gated = 0;
         for (int row = leg; row < LEGS * s->encoders->nodes; row += LEGS)
             gated = gated || (there[row] && !s->kept[row]);
+        s->attempt->gated += gated && !s->reading.odd[leg];
         const int stuck = gated && s->attempt->history->still[leg] > 0 && !s->reading.odd[leg];
         if (stuck)
             causes |= STEWART_FROZEN;

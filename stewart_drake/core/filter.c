@@ -4,7 +4,7 @@
 #include "short.h"
 
 #define ITERATIONS 4 /* at the most; one does once the parameters are roughly known */
-#define KNOWN ((real)0.01) /* a parameter is known when its deviation is this share of the usual one */
+#define KNOWN ((real)0.01) /* a constant is known when its deviation is this share of the usual one */
 #define LEARNT ((real)0.3) /* the same, for parameters that are good enough over a few periods */
 
 int stewart_posterior_size(int n, int m)
@@ -25,7 +25,8 @@ static int is_known(const stewart_filter *filter, const real *root, real share)
 {
     const int n = size_of(filter);
     for (int i = X; i < n; i++)
-        if (!(stewart_norm(n, root + n * i) <= share * filter->usual_std[i - X])) /* or NaN */
+        if (!(filter->walk_std[i - X] > 0)
+            && !(stewart_norm(n, root + n * i) <= share * filter->usual_std[i - X])) /* or NaN */
             return 0;
     return 1;
 }
@@ -71,7 +72,7 @@ int stewart_attempt_ended(stewart_attempt *a, stewart_scratch scratch)
     const stewart_posterior *after = a->after;
     if (!a->values)
         stewart_copy(n * n, a->prior->root, after->root);
-    stewart_root_of_prediction(n, a->last, a->drift, after->root, scratch);
+    stewart_root_of_prediction(n, a->last, a->drift, a->filter->walk_std, after->root, scratch);
     stewart_copy(X, a->end, after->mean);
     *after->left_out = (real)a->left_out;
     return stewart_all_finite(n, after->mean) && stewart_all_finite(n * n, after->root);
@@ -99,8 +100,8 @@ static int linearize(void *about, const real *xi, real *last, stewart_scratch sc
 {
     Sample *s = about;
     (void)last;
-    return stewart_transitions_along(s->attempt->filter->machine, xi, &s->attempt->period->schedule,
-                                     s->fourth_order, s->states, s->H, scratch);
+    return stewart_transitions(s->attempt->filter->machine, xi, &s->attempt->period->schedule,
+                               s->fourth_order, s->states, s->H, scratch);
 }
 
 static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
@@ -136,7 +137,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
    outlier, or without a finite result. */
 static int attempt(stewart_attempt *a, stewart_scratch scratch)
 {
-    a->left_out = 0;
+    a->left_out = a->gated = 0;
     stewart_copy(a->n, a->prior->mean, a->after->mean);
     return a->filter->legs ? a->filter->legs->attempt(a, scratch) : attempt_sample(a, scratch);
 }
@@ -174,6 +175,27 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
     return 1;
 }
 
+/* Compute `after` of a jump in the parameters, from `now` with widened variances in `before`. A single
+   leg that does not fit is rather a fault than a large jump. Returns 0 where none explains the values. */
+static int jump(stewart_attempt *a, const stewart_posterior *now, const stewart_posterior *before,
+                stewart_scratch scratch)
+{
+    const stewart_filter *filter = a->filter;
+    real std[STEWART_MAX_ESTIMATED];
+    const real largest = a->gated == 1 ? 1 : STEWART_LARGEST_JUMP;
+    a->prior = before;
+    for (real share = 1; share <= largest; share *= 10) {
+        for (int i = 0; i < a->n - X; i++)
+            std[i] = share * filter->jump_std[i];
+        stewart_copy(stewart_posterior_size(a->n, filter->sensing->size), now->mean, before->mean);
+        stewart_widen_root(a->n, std, before->root, scratch);
+        if (attempt(a, scratch) && !a->gated)
+            return 1;
+    }
+    a->prior = now;
+    return 0;
+}
+
 static void accept(int n, int m, const stewart_posterior *found, stewart_posterior *now)
 {
     stewart_copy(n, found->mean, now->mean);
@@ -196,7 +218,15 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
     real outliers = 1;
     stewart_attempt a = {.filter = filter, .n = n, .period = period, .prior = &now,
                          .values = values, .history = history, .after = &after};
-    if (values && attempt(&a, scratch)) {
+    int fits = values && attempt(&a, scratch);
+    if (values && filter->jump_std && (!fits || a.gated)) {
+        if (jump(&a, &now, &before, scratch)) {
+            accept(n, m, &after, &now);
+            return;
+        }
+        fits = fits && attempt(&a, scratch);
+    }
+    if (fits) {
         const int lost = *now.unseen >= STEWART_PATIENCE && !is_known(filter, now.root, LEARNT);
         if (!lost || !stewart_filter_start(filter, values, theta, after.mean, estimate, scratch))
             accept(n, m, &after, &now);
@@ -229,7 +259,7 @@ int stewart_filter_scratch(const stewart_filter *filter, int torques)
     const int n = size_of(filter), p = n - X, m = filter->sensing->size;
     const int sample = m * (m + 1 + X) + X * (n + 1) * torques + stewart_kalman_scratch(n, m);
     const int step = legs ? legs->scratch(filter, torques) : sample;
-    const int within = step + stewart_transitions_scratch(p) + 2 * n * n + n;
+    const int within = step + stewart_transitions_scratch(p) + 2 * n * n + (X + 2) * n;
     const int start = X * X + m + LEGS * (6 + p) + (legs ? legs->start_scratch(filter) : 0);
     return 2 * stewart_posterior_size(n, m) + (within > start ? within : start);
 }

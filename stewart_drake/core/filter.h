@@ -1,9 +1,9 @@
-/* Extended Kalman filter over the state and constant parameters of the plant.
+/* Extended Kalman filter over the state and parameters of the plant.
 
-   The parameters theta (p) never change, the state obeys the exact dynamics under the torques that are
-   known to act:
+   The parameters theta (p) are constants, or random walks: such a one changes by noise from period to
+   period, by nothing within. The state obeys the exact dynamics under the torques that are known to act:
 
-       [x_{k+1}; theta] = [f(x_k, T, theta); theta] + noise,    y_k = h(x_k) + measurement noise.
+       [x_{k+1}; theta_{k+1}] = [f(x_k, T, theta_k); theta_k] + noise,    y_k = h(x_k) + measurement noise.
 
    Linearised, F = [[Phi, S], [0, 1]] with Phi = df/dx and S = df/dtheta. One-step prediction errors
    drive the filter: y_k corrects x_{k-1} and theta, and x_k follows by the model. The error of one step
@@ -44,6 +44,8 @@ typedef struct {
     const real *model_std;  /* (12) by which one step of the model may be off */
     const real *prior_root; /* (p, p) */
     const real *usual_std;  /* (p) before anything is known but the machine's drawing */
+    const real *walk_std;   /* (p) by which a parameter changes in a period; 0 for a constant */
+    const real *jump_std;   /* (p) by which one may change at once; 0 for a constant; NULL for none */
     const real *lower;      /* (n), infinite for the state */
     const real *upper;
 } stewart_filter;
@@ -74,9 +76,11 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
 
    the iterated filter over one transition; one iteration is the extended Kalman filter.
 
-   A measurement that does not fit (an outlier, or diverging iterations) is left out, and the model
-   predicts. If the plate was moved by hand, the outliers agree with each other under the model: after
-   three of them, or where the model has no finite prediction, the estimate starts again from the
+   If a measurement or one of its legs does not fit, parameters that walk may have jumped: the update is
+   repeated with their variances widened by jump_std^2, then, unless a single leg does not fit, by 10 and
+   100 times jump_std. A measurement that does not fit then either (an outlier, or diverging iterations)
+   is left out, and the model predicts. If the plate was moved by hand, the outliers agree with each
+   other under the model: after three of them, or where the model has no finite prediction, the estimate starts again from the
    measurement. So it does with the first measurement after three or more periods without any, if the
    parameters are uncertain: linearised along a guessed path, the covariance is wrong. */
 void stewart_filter_advance(const stewart_filter *filter, const stewart_interval *period,

@@ -16,6 +16,7 @@ typedef struct {
     real drift[STEWART_STATES]; /* standard deviation of the model's error there */
     const real *last;           /* (12, n) d[end]/d[xi] */
     int left_out;                 /* why values were left out */
+    int gated;                    /* legs with a value that does not fit */
 } stewart_attempt;
 
 /* Fill in `drift` from `end` of the prior. */

@@ -129,7 +129,9 @@ const stewart_observer stewart_filter_observer = {
    linearised along the corrected path. With q_p and q_v the standard deviations of the model's error in
    pose and rates over one step, n steps have
 
-       q_p^2 n + q_v^2 dt^2 (0^2 + 1^2 + ... + (n - 1)^2)   and   q_v^2 n. */
+       q_p^2 n + q_v^2 dt^2 (0^2 + 1^2 + ... + (n - 1)^2)   and   q_v^2 n.
+
+   A parameter that walks is held over the gap, and widens by n steps at its end. */
 
 #define LONGEST_GAP 10 /* periods; after more the filter continues from its prediction */
 
@@ -156,7 +158,7 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
     real *anchor = memory + stewart_filtered_memory(law), *since = anchor + size;
     real *durations = since + U * GAP_TORQUES, *pieces = durations + GAP_TORQUES, *periods = pieces + 1;
     real *known = stewart_take(&scratch, size), *last = stewart_take(&scratch, m);
-    real longer[X];
+    real longer[X], walk[STEWART_MAX_ESTIMATED];
     const stewart_sensing sensing = stewart_sensing_of(law);
     stewart_filter filter = filter_of(law, &sensing);
     stewart_copy(size, memory, known);
@@ -191,7 +193,10 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
         longer[i] = REAL(sqrt)(passed * pose * pose + drifts * rate * rate);
         longer[6 + i] = REAL(sqrt)(passed * rate * rate);
     }
+    for (int i = 0; i < estimated(law); i++)
+        walk[i] = REAL(sqrt)(passed) * filter.walk_std[i];
     filter.model_std = longer;
+    filter.walk_std = walk;
     stewart_filter_advance(&filter, &period, values, &history, anchor, scratch);
     if (*stewart_posterior_at(anchor, n, m).outliers > 0)
         return status;

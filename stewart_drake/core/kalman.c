@@ -89,13 +89,13 @@ void stewart_absorb(int n, int m, real *R, real *W, stewart_scratch scratch)
     }
 }
 
-void stewart_root_of_prediction(int n, const real *H, const real *std, real *L,
+void stewart_root_of_prediction(int n, const real *H, const real *std, const real *walk, real *L,
                                 stewart_scratch scratch)
 {
     real *R = stewart_take(&scratch, n * n), *W = stewart_take(&scratch, n * n);
     stewart_fill(n * n, 0, R);
-    for (int i = 0; i < X; i++)
-        R[(n + 1) * i] = std[i];
+    for (int i = 0; i < n; i++)
+        R[(n + 1) * i] = i < X ? std[i] : walk[i - X];
     for (int i = 0; i < n; i++) /* W = (F L)' */
         for (int j = 0; j < n; j++)
             W[n * j + i] = L[n * i + j];
@@ -112,6 +112,16 @@ void stewart_root_of_prediction(int n, const real *H, const real *std, real *L,
     for (int i = 0; i < n; i++)
         for (int j = 0; j < n; j++)
             L[n * i + j] = j <= i ? R[n * j + i] : 0;
+}
+
+void stewart_widen_root(int n, const real *jump, real *L, stewart_scratch scratch)
+{
+    real *same = stewart_take(&scratch, X * n), none[X];
+    stewart_fill(X * n, 0, same);
+    stewart_fill(X, 0, none);
+    for (int i = 0; i < X; i++)
+        same[(n + 1) * i] = 1;
+    stewart_root_of_prediction(n, same, none, jump, L, scratch);
 }
 
 int stewart_root(int n, real *P)

@@ -4,6 +4,7 @@
 
 #include "matrix.h"
 
+#define STEWART_LARGEST_JUMP ((real)100) /* of a parameter, in its standard deviations jump_std */
 #define STEWART_MAX_BOUNDED 21 /* components that may be at a bound at a time */
 
 /* Prior N(mean, L L') of xi (n), and the model of a measurement.
@@ -39,10 +40,13 @@ int stewart_kalman_scratch(int n, int most);
    R'R and W'W that is the root of their sum. Scratch: n numbers. */
 void stewart_absorb(int n, int m, real *R, real *W, stewart_scratch scratch);
 
-/* L (n, n) <- root of F L L' F' + diag(std)^2, F = [H; 0 1] with H (12, n), std (12).
-   Scratch: 2 n n + n numbers. */
-void stewart_root_of_prediction(int n, const real *H, const real *std, real *L,
+/* L (n, n) <- root of F L L' F' + diag(std, walk)^2, F = [H; 0 1] with H (12, n), std (12) and walk
+   (n - 12). Scratch: 2 n n + n numbers. */
+void stewart_root_of_prediction(int n, const real *H, const real *std, const real *walk, real *L,
                                 stewart_scratch scratch);
+
+/* L (n, n) <- root of L L' + diag(0, jump)^2 with jump (n - 12). Scratch: 2 n n + 14 n numbers. */
+void stewart_widen_root(int n, const real *jump, real *L, stewart_scratch scratch);
 
 /* P (n, n) <- L, lower triangular with L L' = P, which is symmetric and may be singular: a component
    that those before it determine has a column of zeros. Returns 0 for a negative variance beyond rounding, or NaN. */

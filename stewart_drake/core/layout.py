@@ -17,9 +17,10 @@ DEAD_CENTRE_SINE: Final = 0.01
 
 At a dead centre pose coordinates are singular: alpha_dot grows like 1 / sine.
 """
-LEG_NUMBERS: Final = 18
+LEG_NUMBERS: Final = 20
 """Numbers of a leg, in this order: lengths of crank and rod, branch, R_WS by columns (9), p_PQ (3),
-p_WS (3). `GEOMETRY` has each of them for six legs before the next one, then the common numbers."""
+p_WS (3), whether the ball joints at crank and plate have friction (2). `GEOMETRY` has each of them
+for six legs before the next one, then the common numbers."""
 COMMON_NUMBERS: Final = 13
 """Numbers of all legs and the plate, in this order: mass and inertia (3) of the plate; mass, centre
 and inertia about the motor axis of the crank; mass, centre and inertia (3) of the rod; the plate's
@@ -49,7 +50,6 @@ SIGNATURES: Final = {
     "accelerations": _signature("pose rates torque parameters gravity", (6,)),
     "inverse_dynamics": _signature("pose rates accelerations parameters gravity", (6,)),
     "energy": _signature("pose rates parameters gravity", ()),
-    "terms": _signature("pose rates parameters gravity", (6, 6), (6,), (6, 6)),
     "residual_derivatives": _signature(
         "pose rates accelerations torque parameters gravity",
         *((NUM_STATE, 6), (NUM_PLANT_PARAMETERS, 6), (6, 6), (6, 6)),

@@ -73,3 +73,52 @@ static inline void row_of(const Turn *turn, const real *arm, const real *along, 
         row[3 + j] = along[j] / scale;
     }
 }
+
+static inline void cross(const real *a, const real *b, real *c)
+{
+    c[0] = a[1] * b[2] - a[2] * b[1];
+    c[1] = a[2] * b[0] - a[0] * b[2];
+    c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* A leg of a moving plate; unit vectors in W. */
+typedef struct {
+    real angle, rate;      /* of the crank */
+    real arm[3];           /* from the plate's COM to the joint */
+    real velocity[3];      /* of the joint */
+    real tangent[3];       /* direction of the crank's tip */
+    real rod[3];
+    real lever;            /* u rod.tangent */
+} LegMotion;
+
+#define LEAST_TRANSMISSION ((real)0.01) /* of a rod; below it, outside the workspace, it stays there */
+
+/* Motion of a leg for the plate's angular velocity w and the velocity v of its COM. Out of reach and at
+   dead centres, which an integrator's stages may pass, it stays finite. */
+static inline LegMotion leg_motion_of(const Leg *leg, const Turn *turn, const real *pose, const real *w,
+                                      const real *v)
+{
+    LegMotion m;
+    real q[3], length = 0;
+    joint_of(leg, turn, pose, m.arm, q);
+    const real a = 2 * leg->crank * q[0], b = 2 * leg->crank * q[1];
+    const real c = dot(q, q) + leg->crank * leg->crank - leg->rod * leg->rod;
+    const real cosine = REAL(fmax)(-1, REAL(fmin)(1, c / REAL(hypot)(a, b)));
+    m.angle = REAL(atan2)(b, a) + leg->branch * REAL(acos)(cosine);
+    const real ca = REAL(cos)(m.angle), sa = REAL(sin)(m.angle);
+    cross(w, m.arm, m.velocity);
+    for (int i = 0; i < 3; i++) {
+        const real *axes = leg->R[i];
+        m.velocity[i] += v[i];
+        m.tangent[i] = ca * axes[1] - sa * axes[0];
+        m.rod[i] = pose[3 + i] + m.arm[i] - leg->shaft[i] - leg->crank * (ca * axes[0] + sa * axes[1]);
+        length += m.rod[i] * m.rod[i];
+    }
+    for (int i = 0; i < 3; i++)
+        m.rod[i] /= REAL(sqrt)(length);
+    /* rod.tangent has the sign of -branch. */
+    const real transmission = REAL(fmax)(LEAST_TRANSMISSION, -leg->branch * dot(m.rod, m.tangent));
+    m.lever = -leg->branch * leg->crank * transmission;
+    m.rate = dot(m.rod, m.velocity) / m.lever;
+    return m;
+}

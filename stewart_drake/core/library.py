@@ -1,52 +1,27 @@
 """The compiled core, loaded once in a process through cffi, which reads its headers."""
 
-import re
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from cffi import FFI
 from numpy.typing import NDArray
 
-from stewart_drake.core.build import FOLDER, LIBRARY, source_hash
+from stewart_drake.core.build import DECLARED, LIBRARY, declarations, source_hash
 from stewart_drake.files.errors import ConfigError
 
-SOURCE_ONLY_HEADERS: Final = (
-    *("real.h", "equations.h", "dop853.h", "dop853_table.h"),
-    *("filter_attempt.h", "legs.h", "short.h"),
-)
-"""Headers that Python does not use."""
 
-
-def declarations() -> str:
-    """Return the declarations of the headers, without directives but for integer constants.
-
-    cffi reads only `#define NAME 123`; a header writes any other constant as an enum.
-    """
-    headers: dict[str, str] = {}
-    for path in sorted(FOLDER.glob("*.h")):
-        _include(path.name, headers)
-    text = "\n".join(headers.values())
-    text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
-    text = re.sub(r"^static inline .*?^}\n", "", text, flags=re.DOTALL | re.MULTILINE)
-    text = re.sub(r"\brestrict\b|(?<=extern )const", "", text)
-    lines = (line for line in text.splitlines() if not _is_directive(line))
-    return "typedef double real;\n" + "\n".join(lines)
-
-
-def _include(name: str, headers: dict[str, str]) -> None:
-    """Add a header to the others, after those that it includes."""
-    if name in headers or name in SOURCE_ONLY_HEADERS:
-        return
-    text = (FOLDER / name).read_text("utf-8")
-    for included in re.findall(r'^#include "(.*)"', text, re.MULTILINE):
-        _include(included, headers)
-    headers.setdefault(name, text)
-
-
-def _is_directive(line: str) -> bool:
-    return line.startswith("#") and not re.fullmatch(r"#define \w+ +\d+ *", line)
+def _declared(path: Path) -> Any:
+    """Return the declarations that the build has read; parse the headers where it has not."""
+    if path.exists():
+        names: dict[str, Any] = {}
+        exec(compile(path.read_text("utf-8"), path, "exec"), names)
+        if names["source"] == source_hash():
+            return names["ffi"]
+    ffi = FFI()
+    ffi.cdef(declarations())
+    return ffi
 
 
 class Core:
@@ -61,8 +36,7 @@ class Core:
     """
 
     def __init__(self, path: Path = LIBRARY) -> None:
-        self.ffi: Any = FFI()
-        self.ffi.cdef(declarations())
+        self.ffi: Any = _declared(path.with_name(DECLARED))
         self.lib: Any = self.ffi.dlopen(str(path))
         names = {np.float64: "double[]", np.intc: "int[]"}
         self._kinds = {np.dtype(kind): self.ffi.typeof(name) for kind, name in names.items()}
@@ -90,7 +64,8 @@ class Core:
 
     def plant(self, geometry: Any, parameters: Any, gravity: Any) -> Any:
         """Return a `stewart_plant` that points to numbers of these addresses."""
-        return self.ffi.new("stewart_plant *", (geometry, parameters, gravity))
+        joints = self.ffi.addressof(self.lib, "stewart_ball_joints")
+        return self.ffi.new("stewart_plant *", (geometry, parameters, gravity, joints))
 
     def scratch(self, numbers: int) -> Any:
         """Return a `stewart_scratch` with `numbers` numbers, for one call."""

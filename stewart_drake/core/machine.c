@@ -13,6 +13,7 @@ void stewart_believe(const stewart_machine *machine, const real *theta, stewart_
             belief->parameters[machine->place[i]] = theta[i];
     belief->plant.geometry = machine->geometry;
     belief->plant.gravity = &machine->gravity;
+    belief->plant.joints = machine->joints;
     belief->plant.parameters = belief->parameters;
     belief->acceleration_per_torque = machine->acceleration_per_torque;
 }
@@ -204,9 +205,8 @@ static int transition_of_hold(const stewart_machine *machine, const stewart_beli
     return 1;
 }
 
-int stewart_transitions_along(const stewart_machine *machine, const real *xi,
-                              const stewart_schedule *schedule, int fourth_order, const real *states, real *H,
-                              stewart_scratch scratch)
+int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
+                        int fourth_order, const real *states, real *H, stewart_scratch scratch)
 {
     const int p = machine->estimated, n = X + p;
     real *Phi = stewart_take(&scratch, X * X), *S = stewart_take(&scratch, X * p);

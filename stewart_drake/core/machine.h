@@ -7,7 +7,7 @@
 
 #define STEWART_STATES 12
 #define STEWART_MOTORS 6
-#define STEWART_MAX_ESTIMATED 19 /* parameters of the plant, and offsets of six encoders */
+#define STEWART_MAX_ESTIMATED 25 /* parameters of the plant, and offsets of six encoders */
 
 /* Estimated parameters theta (p) are some of the plant's; what else xi = [state; theta] has, such as
    offsets of encoders, changes nothing in the motion. */
@@ -15,6 +15,7 @@ typedef struct {
     real geometry[STEWART_GEOMETRY];
     real parameters[STEWART_PARAMETERS]; /* as they are known beforehand */
     real gravity;                        /* m/s^2 */
+    const stewart_joint_friction *joints; /* NULL: none */
     real torque_limit;                   /* of each motor, N m; infinite for none */
     real coarse_torque_limit;            /* N m, limit beyond which substeps are twice as many */
     int substeps;                        /* Runge-Kutta steps per torque */
@@ -67,15 +68,10 @@ int stewart_derivatives(const stewart_machine *machine, const stewart_belief *be
                         const real *state, const real *torque, real *A, real *B, real *G,
                         stewart_scratch scratch);
 
-/* States (number, 12) after each of the torques, and the first 12 rows H (number, 12, 12 + p) of
-   F = [Phi S; 0 1] from xi = [state; theta] to there. `fourth_order`: Magnus steps of
-   fourth order, else the midpoint rule, of second order. Returns 0 where they do not exist. */
+/* First 12 rows H (number, 12, 12 + p) of F = [Phi S; 0 1] from xi = [state; theta] to the end of each
+   torque, along the `states` of `stewart_predict` from xi. `fourth_order`: Magnus steps of fourth
+   order, else the midpoint rule, of second order. Returns 0 where they do not exist. */
 int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
-                        int fourth_order, real *states, real *H, stewart_scratch scratch);
-
-/* The same H along states that `stewart_predict` gave from xi. */
-int stewart_transitions_along(const stewart_machine *machine, const real *xi,
-                              const stewart_schedule *schedule, int fourth_order, const real *states, real *H,
-                              stewart_scratch scratch);
+                        int fourth_order, const real *states, real *H, stewart_scratch scratch);
 
 int stewart_transitions_scratch(int estimated);

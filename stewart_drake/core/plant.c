@@ -27,8 +27,30 @@ void stewart_steps(const stewart_plant *plant, long number, const double *state,
 typedef struct {
     stewart_run *run;
     const stewart_drive *drive;
-    double torque[U];
+    const stewart_position_servo *servo; /* turns setpoints into torques, NULL for none */
+    double torque[U], setpoint[U], bias[U];
+    int at_limit; /* whether a servo has reached its limit since the last sample */
 } driven;
+
+/* Torque at the cranks, from the servos with the state. */
+static void set_by_servo(driven *d, const double *x)
+{
+    double asked[U];
+    stewart_position_torque(d->servo, d->run->plant->geometry, d->setpoint, x, asked, d->torque);
+    for (int i = 0; i < U; i++)
+        d->torque[i] += d->bias[i];
+}
+
+/* Notes whether a servo is at its limit. Not at the stages of steps, which may be rejected. */
+static void note_limit(driven *d, const double *x)
+{
+    double asked[U], torque[U];
+    if (!d->servo)
+        return;
+    stewart_position_torque(d->servo, d->run->plant->geometry, d->setpoint, x, asked, torque);
+    for (int i = 0; i < U; i++)
+        d->at_limit |= fabs(asked[i]) > d->servo->torque_limit;
+}
 
 static void set_torque(driven *d, const stewart_drive *drive, double time)
 {
@@ -41,6 +63,8 @@ static void slope(void *system, double time, const double *x, double *rate)
     driven *d = system;
     if (d->drive)
         set_torque(d, d->drive, time);
+    if (d->servo)
+        set_by_servo(d, x);
     stewart_change(d->run->plant, x, d->torque, rate);
 }
 
@@ -70,8 +94,10 @@ static int advance(dop853 *s, stewart_run *r, double end)
 {
     for (; r->seen < r->number && r->times[r->seen] <= s->time; r->seen++)
         stewart_copy(X, s->x, r->states + X * r->seen);
-    if (s->time < end)
+    if (s->time < end) {
+        note_limit(s->system, s->x);
         dop853_begin(s);
+    }
     while (s->time < end) {
         if (!dop853_step(s, end))
             return STEWART_TOO_SHORT_STEPS;
@@ -83,6 +109,7 @@ static int advance(dop853 *s, stewart_run *r, double end)
                 return leave(s, r, from, to);
             from = to;
         }
+        note_limit(s->system, s->x);
         if (!inside(r, s->x))
             return leave(s, r, from, s->time);
     }
@@ -118,6 +145,19 @@ int stewart_open_loop(stewart_run *r, const stewart_drive *drives, long number)
         d.drive = constant ? NULL : drive;
         set_torque(&d, drive, s.time);
         how = advance(&s, r, i + 1 < number ? fmin(drive[1].from, r->end) : r->end);
+    }
+    return ended(r, &s, how);
+}
+
+int stewart_servo_run(stewart_run *r, const stewart_position_servo *servo, long number,
+                      const double *from, const double *setpoints)
+{
+    driven d = {.run = r, .servo = servo};
+    dop853 s = integrator(&d);
+    int how = STEWART_INSIDE;
+    for (long i = 0; i < number && how == STEWART_INSIDE; i++) {
+        stewart_copy(U, setpoints + U * i, d.setpoint);
+        how = advance(&s, r, i + 1 < number ? fmin(from[i + 1], r->end) : r->end);
     }
     return ended(r, &s, how);
 }
@@ -168,6 +208,13 @@ static int sample(const dop853 *s, stewart_loop *o, long k, stewart_controller l
         measured.report = &report;
     if (law(about, k, &measured, torque, command))
         return STEWART_CONTROLLER_FAILED;
+    if (o->servo && k > 0) { /* before, no setpoint has acted */
+        double limited[U];
+        driven *d = s->system;
+        stewart_position_torque(o->servo, d->run->plant->geometry, d->setpoint, s->x, torque, limited);
+        o->saturated += d->at_limit;
+        d->at_limit = 0;
+    }
     if (o->link->is_wire)
         stewart_link_take(o->link, o->memory, now, (double)(k + 1), 0., arrival, 1, command);
     else
@@ -177,13 +224,29 @@ static int sample(const dop853 *s, stewart_loop *o, long k, stewart_controller l
     return STEWART_INSIDE;
 }
 
+/* Advance to `end`, in pieces between which the push begins or ends. */
+static int advance_pushed(dop853 *s, stewart_run *r, const stewart_loop *o, double end)
+{
+    for (;;) {
+        const int pushed = o->push_from <= s->time && s->time < o->push_to;
+        const double change = pushed ? o->push_to : s->time < o->push_from ? o->push_from : HUGE_VAL;
+        for (int i = 0; i < 6; i++)
+            o->wrench[i] = pushed ? o->push[i] : 0.;
+        const int how = advance(s, r, fmin(change, end));
+        if (how != STEWART_INSIDE || end <= change)
+            return how;
+    }
+}
+
 /* Take samples and release torques until the run's end. A change of the torque that coincides with a
    sample takes place at the sample's instant. */
 int stewart_closed_loop(stewart_run *r, stewart_loop *o, stewart_controller law, void *about)
 {
-    driven d = {.run = r};
+    driven d = {.run = r, .servo = o->servo};
     dop853 s = integrator(&d);
+    stewart_copy(U, o->bias, d.bias);
     for (long k = 0;;) {
+        stewart_copy(U, stewart_link_current(o->memory), d.setpoint);
         for (int i = 0; i < U; i++)
             d.torque[i] = stewart_link_current(o->memory)[i] + o->bias[i];
         double sampled = k < o->samples ? o->sampled[k] : HUGE_VAL;
@@ -191,9 +254,9 @@ int stewart_closed_loop(stewart_run *r, stewart_loop *o, stewart_controller law,
         int samples = sampled <= released + o->link->time_tolerance, how = STEWART_INSIDE;
         double next = samples ? sampled : released;
         if (next > r->end)
-            return ended(r, &s, advance(&s, r, r->end));
+            return ended(r, &s, advance_pushed(&s, r, o, r->end));
         if (next > s.time + o->link->time_tolerance)
-            how = advance(&s, r, next);
+            how = advance_pushed(&s, r, o, next);
         if (how == STEWART_INSIDE && samples)
             how = sample(&s, o, k++, law, about);
         else if (how == STEWART_INSIDE)
@@ -255,6 +318,23 @@ static int step(void *about, long k, const stewart_sample *measured, double *tor
         torque = in->memory + sent->at + sent->rows * sent->columns - U * in->rows;
     stewart_copy(U * in->rows, torque, command);
     return 0;
+}
+
+static int servo_step(void *about, long k, const stewart_sample *measured, double *torque,
+                      double *command)
+{
+    const stewart_servo_in_loop *in = about;
+    stewart_sample sample = *measured;
+    sample.reference = stewart_given_rows;
+    sample.about = (void *)(in->previews + STEWART_REFERENCE * k);
+    stewart_fill(U, 0, torque); /* replaced by that of the servos */
+    stewart_servo_step(in->law, in->memory, in->scratch, &sample, in->report, command);
+    return 0;
+}
+
+int stewart_closed_loop_of_servo(stewart_run *r, stewart_loop *o, stewart_servo_in_loop *law)
+{
+    return stewart_closed_loop(r, o, servo_step, law);
 }
 
 int stewart_closed_loop_of_law(stewart_run *run, stewart_loop *loop, stewart_law_in_loop *law)

@@ -8,6 +8,8 @@
 
 #include "kinematics.h"
 #include "link.h"
+#include "position_servo.h"
+#include "servo.h"
 #include "tuner.h"
 
 /* Hash of the source that this library was compiled from. */
@@ -63,10 +65,14 @@ typedef struct {
     const double *back_transit; /* (samples) s; infinite for a lost measurement */
     int reported;               /* periods of a report, 0 for none */
     double bias[STEWART_MOTORS]; /* added to the torque at the plant */
+    double push[6], push_from, push_to; /* wrench on the plate between two times, s; infinite: never */
+    double *wrench;              /* (6) its place among the plant's parameters */
+    const stewart_position_servo *servo; /* commands begin with its setpoints (6); NULL: with torques */
     double *scratch;          /* 12 + 7 reported + 6 rows numbers */
     double *measured;         /* (samples, 12) result: as the controller gets them */
-    double *asked;            /* (samples, 6) result: torques without limit */
+    double *asked;            /* (samples, 6) result: torques without limit, of servos at the samples */
     long taken;               /* result: samples */
+    long saturated;           /* result: periods in which a servo reached its limit */
 } stewart_loop;
 
 int stewart_closed_loop(stewart_run *run, stewart_loop *loop, stewart_controller law, void *about);
@@ -92,5 +98,20 @@ typedef struct {
     long preview_rows, columns;
     int rows; /* torques of a command */
 } stewart_law_in_loop;
+
+/* The law of servo.h as the controller of servos, without reports; its memory has been started. */
+typedef struct {
+    const stewart_servo *law;
+    double *memory, *scratch;
+    const double *previews; /* (samples, 18) */
+    const double *report;   /* of NaN */
+} stewart_servo_in_loop;
+
+int stewart_closed_loop_of_servo(stewart_run *run, stewart_loop *loop, stewart_servo_in_loop *law);
+
+/* Run under setpoints (number, 6) of servos, each from its time on (number) in s, the first one from the
+   start on. Returns how the run has ended. */
+int stewart_servo_run(stewart_run *run, const stewart_position_servo *servo, long number,
+                      const double *from, const double *setpoints);
 
 int stewart_closed_loop_of_law(stewart_run *run, stewart_loop *loop, stewart_law_in_loop *law);

@@ -99,6 +99,14 @@ static int observe(const stewart_servo *servo, real *memory, const stewart_sampl
     return status;
 }
 
+/* The setpoint within range and speed, a period after `last`. */
+static real limited(const stewart_stiffness *stiff, int i, real setpoint, real last)
+{
+    const real near = last + REAL(remainder)(setpoint - last, (real)6.283185307179586);
+    const real within = REAL(fmax)(stiff->low[i], REAL(fmin)(stiff->high[i], near));
+    return last + REAL(fmax)(-stiff->most, REAL(fmin)(stiff->most, within - last));
+}
+
 /* [crank angles; their rates; torque] for a row of the reference; what went wrong. */
 static int command_for(const stewart_servo *servo, const real *theta, const real *row, real *command)
 {
@@ -117,8 +125,15 @@ static int command_for(const stewart_servo *servo, const real *theta, const real
     if (law->cost.feedforward != STEWART_NO_FEEDFORWARD)
         stewart_inverse_dynamics(&belief.plant, row, moves ? row + 6 : still,
                                  moves ? row + 12 : still, found + 12);
+    const stewart_stiffness *stiff = &servo->stiff;
+    if (stiff->stiffness > 0) /* before the check, so that NaN stops here */
+        for (int i = 0; i < U; i++)
+            found[i] += (found[12 + i] + (moves ? stiff->velocity_gain * found[6 + i] : 0)) / stiff->stiffness;
     if (!stewart_all_finite(STEWART_COMMAND, found))
         return STEWART_NONFINITE_TORQUE;
+    if (stiff->stiffness > 0)
+        for (int i = 0; i < U; i++)
+            found[i] = limited(stiff, i, found[i], command[i]);
     stewart_copy(STEWART_COMMAND, found, command);
     return 0;
 }
@@ -129,7 +144,8 @@ int stewart_servo_step(const stewart_servo *servo, real *memory, real *scratch_m
     const stewart_law *law = &servo->law;
     const stewart_servo_layout *l = &servo->layout;
     const stewart_scratch scratch = {scratch_memory};
-    const real time = ((real)law->steps + law->fraction + 1) * law->period;
+    const real ahead = servo->stiff.stiffness > 0 ? (real)0.5 : 1;
+    const real time = ((real)law->steps + law->fraction + ahead) * law->period;
     const int behind = (int)memory[l->behind.at] + 1;
     real row[ROW], *last = memory + l->command.at;
     int there = 0, status = STEWART_MEASUREMENT_MISSING;

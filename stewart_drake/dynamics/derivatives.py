@@ -1,6 +1,6 @@
 """Derivatives of the equations of motion, by the chain rule leg by leg.
 
-With F = M nu_dot + h - B torque and the reduction of each leg to its plate joint Q (`equations`),
+With F = M nu_dot + h - B torque - wrench, and each leg reduced to its plate joint Q (`equations`),
 
     F = F_plate + sum [b x R f; R f],   f(q, w, a) = m(q) a + c(q, w) - g(q) torque,
 
@@ -26,6 +26,7 @@ from stewart_drake.dynamics.equations import CommonNumbers, LegNumbers
 from stewart_drake.scenario.signals import (
     COULOMB,
     COULOMB_SPEED,
+    NUM_BALL_JOINT_PARAMETERS,
     NUM_PLANT_PARAMETERS,
     PAYLOAD,
     PAYLOAD_POSITION,
@@ -138,6 +139,8 @@ def assembled(
         ca.vertcat(ca.cross(r, k), k),
         ca.mtimes(arm.T, ca.horzcat(arm_rates, slips, -steep)),
         p[PAYLOAD] * ca.mtimes(moving, plate.R_WP),
+        ca.SX.zeros(6, NUM_BALL_JOINT_PARAMETERS),  # core/ball_joints.c
+        -ca.SX.eye(6),  # a wrench at constant accelerations
     )
     E = equations.angle_rate_map(s["pose"][:3])
     return [dF_dx, dF_dp, ca.mtimes(M, ca.diagcat(E, ca.SX.eye(3))), arm]

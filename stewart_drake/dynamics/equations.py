@@ -2,7 +2,7 @@
 
 With nu = (w, v), the plate's angular velocity and the velocity of its COM in W, the mechanism obeys
 
-    M(q) nu_dot + h(q, nu) = B(q) torque.                                                  (EOM)
+    M(q) nu_dot + h(q, nu) = B(q) torque + wrench.                                         (EOM)
 
 A leg has three degrees of freedom and touches the plate in one point Q, whose position q and
 velocity w, taken in the leg's motor frame S, fix the motion of crank and rod. By virtual power
@@ -29,6 +29,7 @@ from stewart_drake.scenario.signals import (
     NUM_LEGS,
     PAYLOAD,
     PAYLOAD_POSITION,
+    WRENCH,
 )
 
 Number = float | ca.SX
@@ -89,8 +90,10 @@ def numbers_of(mechanism: Mechanism) -> tuple[list[LegNumbers], CommonNumbers]:
 
 
 def leg_numbers(symbols: ca.SX) -> LegNumbers:
-    """Return the numbers of a leg from its part (18,) of the geometry."""
-    u, rod, branch, R_WS, p_PQ, p_WS = ca.vertsplit(symbols, [0, 1, 2, 3, 12, 15, LEG_NUMBERS])
+    """Return the numbers of a leg from its part (20,) of the geometry."""
+    u, rod, branch, R_WS, p_PQ, p_WS, _ = ca.vertsplit(
+        symbols, [0, 1, 2, 3, 12, 15, 18, LEG_NUMBERS]
+    )
     return LegNumbers(u, rod, branch, ca.reshape(R_WS, 3, 3), p_PQ, p_WS, (symbols,))
 
 
@@ -415,9 +418,13 @@ def shaft_torque(
 
 
 def force(motion: Motion, torque: ca.SX, parameters: ca.SX, slip: ca.SX) -> ca.SX:
-    """Return the generalised force (6,) B torque - h."""
+    """Return the generalised force (6,) of nu, B torque + wrench - h.
+
+    A wrench F = [moment; force] at the plate's COM, in W, has the power moment . w + force . v =
+    F . nu, so that it is a generalised force of nu as it is.
+    """
     shaft = shaft_torque(torque, parameters[BIAS], motion.crank_rates, slip, parameters)
-    return ca.mtimes(motion.arm.T, shaft) - motion.bias
+    return ca.mtimes(motion.arm.T, shaft) + parameters[WRENCH] - motion.bias
 
 
 def accelerations(motion: Motion, torque: ca.SX, parameters: ca.SX, slip: ca.SX) -> ca.SX:
@@ -428,20 +435,10 @@ def accelerations(motion: Motion, torque: ca.SX, parameters: ca.SX, slip: ca.SX)
 
 def inverse_dynamics(motion: Motion, accelerations: ca.SX, parameters: ca.SX, slip: ca.SX) -> ca.SX:
     """Return the motor torques (6,) for given accelerations of the pose."""
-    # `force` without motor torque: bias, friction and h
+    # `force` without motor torque: bias, friction, wrench and h
     passive = force(motion, ca.SX.zeros(NUM_LEGS), parameters, slip)
     nu_dot = ca.mtimes(motion.rates_map, accelerations) + motion.nu_dot_bias
     return ca.solve(motion.arm.T, ca.mtimes(motion.mass, nu_dot) - passive)
-
-
-def terms(motion: Motion) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Return M (6, 6), bias (6,) and B (6, 6) in pose coordinates."""
-    N = motion.rates_map
-    return (
-        ca.mtimes([N.T, motion.mass, N]),
-        ca.mtimes(N.T, motion.bias + ca.mtimes(motion.mass, motion.nu_dot_bias)),
-        ca.mtimes(N.T, motion.arm.T),
-    )
 
 
 def solve_symmetric(matrix: ca.SX, right: ca.SX) -> ca.SX:

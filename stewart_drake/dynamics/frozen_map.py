@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from stewart_drake.dynamics.native_functions import Call
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -27,7 +26,7 @@ from stewart_drake.scenario.signals import (
     POSE,
     RATES,
 )
-from stewart_drake.types import Array
+from stewart_drake.types import Array, ArrayLike
 
 
 class FrozenMap:
@@ -55,8 +54,8 @@ class FrozenMap:
         rates = np.asarray(arguments[1])
         return [rates @ self._mass @ rates / 2]
 
-    def terms(self, *arguments: ArrayLike) -> Sequence[Array]:
-        return [self._mass.copy(), np.zeros(NUM_COORDINATES), (self._mass @ self.map).T]
+    def inertia(self, pose: ArrayLike, parameters: Array) -> tuple[Array, Array]:
+        return self._mass.copy(), self._mass @ self.map
 
     def residual_derivatives(self, *arguments: ArrayLike) -> Sequence[Array]:
         """Return the derivatives of F = accelerations - map (torque + bias), transposed."""

@@ -187,7 +187,6 @@ def _motion() -> list[str]:
     p = s["parameters"]
     forward = equations.accelerations(whole, s["torque"], p, slip)
     inverse = equations.inverse_dynamics(whole, s["accelerations"], p, slip)
-    M, h, B = equations.terms(whole)
     state = _inputs(s, "pose rates")
     return [
         c_function(
@@ -213,11 +212,6 @@ def _motion() -> list[str]:
             "solve_torque",
             [*state, *_inputs(s, "accelerations parameters"), *moving, sums, arms],
             [Output("torque", inverse)],
-        ),
-        c_function(
-            "pose_terms",
-            [*state, sums, arms],
-            [Output("M", M), Output("h", h), Output("B", B)],
         ),
     ]
 

@@ -7,14 +7,14 @@ from functools import lru_cache, partial
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 from threadpoolctl import OpenBLASController, threadpool_limits
 
 from stewart_drake.core.layout import SHAPES, SIGNATURES
 from stewart_drake.core.library import core
 from stewart_drake.mechanism.geometry import Mechanism, geometry_of
-from stewart_drake.scenario.signals import NUM_PLANT_PARAMETERS, NUM_STATE, NUM_TORQUES
-from stewart_drake.types import Array
+from stewart_drake.mechanism.kinematics import angle_rate_map
+from stewart_drake.scenario.signals import ANGLES, NUM_PLANT_PARAMETERS, NUM_STATE, NUM_TORQUES
+from stewart_drake.types import Array, ArrayLike
 
 Call = Callable[..., Sequence[Array]]
 """Broadcasts its arguments; returns new arrays, matrices transposed. Several threads may call."""
@@ -64,24 +64,39 @@ class NativeFunction(Buffered):
     Args:
         name: in `core.layout.SIGNATURES`.
         geometry: numbers of the machine.
+        points: number n of points that a call evaluates; arguments but parameters and gravity, and
+            results, are then (n, ...). None for one point.
     """
 
-    def __init__(self, name: str, geometry: Array) -> None:
+    def __init__(self, name: str, geometry: Array, points: int | None = None) -> None:
         super().__init__()
         self._name, self._geometry = name, geometry
+        self._points = () if points is None else (points,)
 
     def buffers(self) -> Buffers:
         (names, shapes), c = SIGNATURES[self._name], core()
-        given, results = {n: np.zeros(SHAPES[n]) for n in names}, [np.zeros(s) for s in shapes]
-        at = {name: c.at(array) for name, array in given.items()}
-        first = c.at(self._geometry)
-        if "gravity" in at:
-            first = c.plant(first, at.pop("parameters"), at.pop("gravity"))
-        if self._name == "measures":
-            at["angles"] = c.ffi.NULL
+        lead = dict.fromkeys(names, self._points) | {"parameters": (), "gravity": ()}
+        given = {name: np.zeros((*lead[name], *SHAPES[name])) for name in names}
+        results, first = [np.zeros((*self._points, *s)) for s in shapes], c.at(self._geometry)
+        at_points = dict(given)
+        if "gravity" in given:
+            shared = at_points.pop("parameters"), at_points.pop("gravity")
+            first = c.plant(first, *map(c.at, shared))
+        no_angles = [c.ffi.NULL] if self._name == "measures" else []
         function = getattr(c.lib, f"stewart_{self._name.removesuffix('_of_tree')}")
-        evaluate = partial(function, first, *at.values(), *map(c.at, results))
-        return Buffers(list(given.values()), results, evaluate, first)
+        calls = []
+        for point in np.ndindex(self._points):
+            inputs, outputs = (
+                [c.at(array[(*point, ...)]) for array in arrays]
+                for arrays in (at_points.values(), results)
+            )
+            calls.append(partial(function, first, *inputs, *no_angles, *outputs))
+
+        def evaluate() -> None:
+            for call in calls:
+                call()
+
+        return Buffers(list(given.values()), results, evaluate if self._points else calls[0], first)
 
 
 class NativeFunctions:
@@ -97,7 +112,6 @@ class NativeFunctions:
     accelerations: Call
     inverse_dynamics: Call
     energy: Call
-    terms: Call
     residual_derivatives: Call
     measures: Call
     measures_of_tree: Call
@@ -116,6 +130,17 @@ class NativeFunctions:
         evaluate()
         return np.array(results[0])
 
+    def inertia(self, pose: ArrayLike, parameters: Array) -> tuple[Array, Array]:
+        """Return M (6, 6) and B (6, 6) of M accelerations + h = B torque.
+
+        `residual_derivatives` has M N and B of nu = N rates, N = diag(E(angles), 1); N' times them
+        is in pose coordinates.
+        """
+        *_, MN, B = self.residual_derivatives(pose, 0.0, 0.0, 0.0, parameters, 0.0)
+        N = np.eye(NUM_TORQUES)
+        N[ANGLES, ANGLES] = angle_rate_map(np.asarray(pose)[ANGLES])
+        return N.T @ MN.T, N.T @ B
+
     def margin(self, pose: Array, sign: float, least: Array) -> float:
         """Return the least distance of the measures of a pose above `least` (8,); NaN for NaN.
 
@@ -124,6 +149,14 @@ class NativeFunctions:
         c = core()
         pose = np.array(pose, np.float64)
         return float(c.lib.stewart_margin(self._first, c.at(pose), sign, c.at(least)))
+
+    def margins(self, poses: Array, sign: float, least: Array) -> Array:
+        """Return `margin` (n,) of poses (n, 6)."""
+        c, function = core(), core().lib.stewart_margin
+        rows = np.array(poses, np.float64)
+        first, limits = c.at(rows), c.at(least)
+        number = range(0, rows.size, NUM_TORQUES)
+        return np.array([function(self._first, first + i, sign, limits) for i in number])
 
     def many_steps(self, steps: int) -> Call:
         """Return (state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12).

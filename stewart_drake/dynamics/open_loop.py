@@ -11,14 +11,13 @@ from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import LEAST, Failure, diagnose, home_sign, margin
 from stewart_drake.mechanism.geometry import geometry_of
-from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE
-from stewart_drake.types import Array
+from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE, WRENCH
+from stewart_drake.types import Array, ArrayLike
 
 _NONE: Final = (0.0,) * NUM_TORQUES
 
@@ -48,6 +47,7 @@ class NativePlant:
 
     Attributes:
         states: (n, 12) result; the first `seen` are valid.
+        wrench: (6,) on the plate, a view of the parameters that the run reads.
         run: the `stewart_run`.
     """
 
@@ -63,6 +63,7 @@ class NativePlant:
         self.states = np.empty((len(times), NUM_STATE))
         numbers = geometry_of(mechanism), dynamics.plant_parameters, dynamics.gravity
         copies = [np.array(one, np.float64) for one in numbers]
+        self.wrench = copies[1][WRENCH]
         plant = c.plant(*map(c.at, copies))
         self.run: Any = c.ffi.new("stewart_run *")
         self.run.plant, self.run.sign, self.run.least = plant, home_sign(mechanism), list(LEAST)
@@ -166,7 +167,41 @@ def integrate(
     if not margin(dynamics.mechanism, x0[POSE]) > 0:
         raise ValueError(f"start: got pose {x0[POSE]}; expected one in the workspace")
     plant = NativePlant(dynamics, x0, looks, accuracy, longest_step)
-    ended = plant.call("open_loop", *in_c(drives))
+    return _course(plant, dynamics, plant.call("open_loop", *in_c(drives)), looks, accuracy)
+
+
+def follow(
+    dynamics: StewartDynamics,
+    start: Array,
+    servo: Any,
+    setpoint: Array,
+    end: float,
+    accuracy: float,
+    longest_step: float,
+) -> Course:
+    """Integrate the exact plant under servos with a constant setpoint, as `integrate`.
+
+    Args:
+        dynamics: equations of motion, with the true parameters.
+        start: (12,) state at t = 0.
+        servo: the `stewart_position_servo *`.
+        setpoint: (6,) crank angles, rad.
+        end: s.
+        accuracy: as of `integrate`.
+        longest_step: s.
+
+    Raises:
+        IntegrationError: no step is short enough for the accuracy.
+    """
+    looks, held, at = np.array([end]), np.array(setpoint, np.float64), core().at
+    plant = NativePlant(dynamics, np.array(start), looks, accuracy, longest_step)
+    ended = plant.call("servo_run", servo, 1, at(np.zeros(1)), at(held))
+    return _course(plant, dynamics, ended, looks, accuracy)
+
+
+def _course(
+    plant: NativePlant, dynamics: StewartDynamics, ended: Ended, looks: Array, accuracy: float
+) -> Course:
     if ended == Ended.TOO_SHORT_STEPS:
         raise IntegrationError(
             f"no step is short enough at t = {plant.time:.6g} s for an accuracy of {accuracy:g}"

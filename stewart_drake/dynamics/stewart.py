@@ -1,10 +1,9 @@
 """`StewartDynamics`: the exact dynamics of a mechanism as a pure calculator, no LeafSystem."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from stewart_drake.core.layout import DEAD_CENTRE_SINE, DEFAULT_GRAVITY
 from stewart_drake.dynamics.native_functions import functions_of
@@ -15,8 +14,14 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, angle_rate_map
 from stewart_drake.scenario.signals import (
     ANGLES,
+    BALL_JOINT_FRICTION_SPEED,
+    COULOMB,
     COULOMB_SPEED,
+    DAMPING,
+    DEFAULT_BALL_JOINT_SPEED,
     DEFAULT_COULOMB_SPEED,
+    NUM_BALL_JOINT_PARAMETERS,
+    NUM_CONSTANTS,
     NUM_COORDINATES,
     NUM_PARAMETERS,
     NUM_PLANT_PARAMETERS,
@@ -26,8 +31,16 @@ from stewart_drake.scenario.signals import (
     PLANT_PARAMETERS,
     POSE,
     RATES,
+    WRENCH,
 )
-from stewart_drake.types import Array
+from stewart_drake.types import Array, ArrayLike
+
+_SPEEDS: Final = {
+    COULOMB_SPEED: DEFAULT_COULOMB_SPEED,
+    BALL_JOINT_FRICTION_SPEED: DEFAULT_BALL_JOINT_SPEED,
+}
+"""Speeds of smooth friction among the parameters, rad/s, above 0."""
+_WITHOUT_BALL_JOINTS: Final = NUM_CONSTANTS - NUM_BALL_JOINT_PARAMETERS
 
 
 class Linearization(NamedTuple):
@@ -69,27 +82,31 @@ def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def plant_parameters(values: ArrayLike | None = None) -> Array:
-    """Return all parameters of the plant (13,), in the order of `PLANT_PARAMETERS`.
+    """Return all parameters of the plant (22,), in the order of `PLANT_PARAMETERS`.
 
     Args:
-        values: all of them, or the first eight; then without Coulomb friction, and with a payload
-            at the plate's COM. None is a plant without any.
+        values: all of them; the constants (16,), without a wrench; the first 13, also without
+            friction in ball joints; or the first eight, also without Coulomb friction, and with a
+            payload at the plate's COM. None is a plant without any.
 
     Raises:
         ConfigError: another shape, numbers that are not finite, a speed that is not positive.
     """
     whole = np.zeros(NUM_PLANT_PARAMETERS)
-    whole[COULOMB_SPEED] = DEFAULT_COULOMB_SPEED
+    for place, speed in _SPEEDS.items():
+        whole[place] = speed
     if values is None:
         return whole
-    if np.shape(values) == (NUM_PARAMETERS,):
-        whole[:NUM_PARAMETERS] = _finite("parameters", values, (NUM_PARAMETERS,))
-        return whole
-    whole = _finite("parameters", values, (NUM_PLANT_PARAMETERS,))
-    if not whole[COULOMB_SPEED] > 0:
-        raise ConfigError(
-            f"parameters: got a coulomb_speed of {whole[COULOMB_SPEED]:g} rad/s; expected above 0"
-        )
+    first = np.shape(values)
+    if first not in ((NUM_PARAMETERS,), (_WITHOUT_BALL_JOINTS,), (NUM_CONSTANTS,)):
+        first = (NUM_PLANT_PARAMETERS,)
+    whole[: first[0]] = _finite("parameters", values, first)
+    for place in _SPEEDS:
+        if not whole[place] > 0:
+            raise ConfigError(
+                f"parameters: got a {PLANT_PARAMETERS[place]} of {whole[place]:g} rad/s; expected "
+                "above 0"
+            )
     return whole
 
 
@@ -103,10 +120,12 @@ def _slice(indices: list[int]) -> slice | list[int]:
 class StewartDynamics:
     """Equations of motion of a `Mechanism` in the pose coordinates of its plate.
 
-    Loops are closed exactly: the state is [pose; rates] (12,). The plant's parameters (13,) are
+    Loops are closed exactly: the state is [pose; rates] (12,). The plant's parameters (22,) are
     torque bias (6, N m), payload (kg), viscous damping of the crank shafts (N m s/rad), their
-    Coulomb friction (N m) with the speed over which it builds up (rad/s), and where the payload is
-    (3, m in the plate's frame, from its COM).
+    Coulomb friction (N m) with the speed over which it builds up (rad/s), where the payload is
+    (3, m in the plate's frame, from its COM), of each ball joint viscous damping (N m s/rad),
+    Coulomb friction (N m) and its speed (rad/s) (core/ball_joints.h), and a wrench on the plate
+    (moment, N m, then force, N, in W at its COM).
 
     Some of them are `free`: the methods' `parameters` (p,) and the columns of G. The others are
     constant. By default bias, payload and damping are free (8,). A free name that the plant lacks,
@@ -115,14 +134,14 @@ class StewartDynamics:
     Args:
         mechanism: the machine.
         gravity: True for 9.81 m/s^2 along -z, which is Drake's default, False for none, or m/s^2.
-        parameters: (13,) or the first eight, see `plant_parameters`.
+        parameters: (22,) or fewer, see `plant_parameters`.
         free: names (p,) out of `scenario.signals.PLANT_PARAMETERS`, and others.
 
     Raises:
         ConfigError: gravity or parameters of another shape, or not finite.
 
     Attributes:
-        plant_parameters: (13,) all parameters.
+        plant_parameters: (22,) all parameters.
         parameters: (p,) the free ones, the default of the methods' `parameters`.
 
     Methods raise ValueError for an argument of another shape; one number is not broadcast to six.
@@ -163,7 +182,7 @@ class StewartDynamics:
         return type(self)(self.mechanism, self.gravity, self.complete(parameters), self.free)
 
     def complete(self, parameters: ArrayLike | None) -> Array:
-        """Return all parameters of the plant (13,) for free ones (p,); None is the default."""
+        """Return all parameters of the plant (22,) for free ones (p,); None is the default."""
         if parameters is None:
             return self.plant_parameters
         _shaped("parameters", parameters, (len(self.free),))
@@ -172,7 +191,7 @@ class StewartDynamics:
         return whole
 
     def free_of(self, of_plant: Array) -> Array:
-        """Return the free rows (p, ...) of (13, ...), 0 for names that the plant lacks."""
+        """Return the free rows (p, ...) of (22, ...), 0 for names that the plant lacks."""
         spread = np.zeros((len(self.free), *of_plant.shape[1:]))
         spread[self._own] = of_plant[self._place]
         return spread
@@ -239,12 +258,16 @@ class StewartDynamics:
     def mass_matrix(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> Array:
         """Return the mass matrix (6, 6): kinetic energy = rates' M rates / 2."""
         _check(pose=pose)
-        return self._functions.terms(pose, 0.0, self.complete(parameters), self.gravity)[0]
+        return self._functions.inertia(pose, self.complete(parameters))[0]
 
     def bias(self, pose: ArrayLike, rates: ArrayLike, parameters: ArrayLike | None = None) -> Array:
         """Return h (6,): M accelerations + h = actuation_map (torque + torque bias - friction)."""
         _check(pose=pose, rates=rates)
-        return self._functions.terms(pose, rates, self.complete(parameters), self.gravity)[1]
+        free, rest = np.array(self.complete(parameters)), np.zeros(NUM_TORQUES)
+        free[[*range(NUM_TORQUES), DAMPING, COULOMB]] = 0  # biases and friction
+        free[WRENCH] = 0
+        M = self._functions.inertia(pose, free)[0]
+        return -M @ self._functions.accelerations(pose, rates, rest, free, self.gravity)[0]
 
     def wrench_accelerations(
         self, pose: ArrayLike, wrench: ArrayLike, parameters: ArrayLike | None = None
@@ -273,7 +296,7 @@ class StewartDynamics:
     def actuation_map(self, pose: ArrayLike) -> Array:
         """Return the generalised force per torque (6, 6): the Jacobian's transpose."""
         _check(pose=pose)
-        return self._functions.terms(pose, 0.0, 0.0, 0.0)[2].T
+        return self._functions.inertia(pose, self.plant_parameters)[1]
 
     def linearize(
         self, pose: ArrayLike, rates: ArrayLike | None = None, torque: ArrayLike | None = None

@@ -68,6 +68,11 @@ def margin(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None)
     return _margin_of(_measures(mechanism, pose, crank_angles), sign)
 
 
+def margins(mechanism: Mechanism, poses: Array) -> Array:
+    """Return `margin` (n,) of poses (n, 6)."""
+    return functions_of(mechanism).margins(poses, home_sign(mechanism), LEAST)
+
+
 def _margin_of(measures: Array, sign: float) -> float:
     above = measures - LEAST
     above[NUM_LEGS] = sign * measures[NUM_LEGS] - LEAST[NUM_LEGS]

@@ -4,10 +4,10 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from stewart_drake.core.library import core
 from stewart_drake.law.compiled import address_of
+from stewart_drake.types import ArrayLike
 
 
 class Constants:

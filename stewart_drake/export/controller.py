@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from jinja2 import Environment, StrictUndefined
 
 from stewart_drake.core.build import FOLDER, compiler
 from stewart_drake.core.library import core
@@ -61,8 +62,14 @@ EXAMPLES: Final = (
 TEMPLATES: Final = Path(__file__).with_name("templates")
 TOLERANCES: Final = {"double": 1e-9, "float": 1e-3}
 """Tolerance of the replay, as a share of the peak."""
-_PER_KIND: Final = ("replay_", "wiring_")
-"""Beginnings of templates of which an export has one."""
+_README: Final = Environment(
+    variable_start_string="@",
+    variable_end_string="@",
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+)
 _UNMEASURED: Final = "Not compiled here: run `make size` and `make test`.\n"
 
 
@@ -101,9 +108,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     values |= _configuration(recorded, compiled, tuner, suffix)
     values |= _replay(recorded, experiment, tuner, suffix)
     kind = "torques" if isinstance(law, PredictiveLqi) else "servos"
-    wiring = TEMPLATES / f"wiring_{kind if tuner is None else 'tuned'}.md"
-    values["WIRING"] = _filled(wiring.read_text("utf-8"), values)
-    names = {path.name for path in TEMPLATES.iterdir() if not path.name.startswith(_PER_KIND)}
+    names = {path.name for path in TEMPLATES.iterdir() if not path.name.startswith("replay_")}
     if over_udp or recorded.moves:
         values |= _surroundings(experiment, recorded, suffix)
     else:
@@ -114,13 +119,11 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         names -= set(EXAMPLES)
     texts = {name: (TEMPLATES / name).read_text("utf-8") for name in sorted(names)}
     texts["replay.h"] = (TEMPLATES / f"replay_{kind}.h").read_text("utf-8")
+    readme = _README.from_string(texts.pop("README.md"))
     files |= {name: _filled(text, values) for name, text in texts.items()}
-    if not over_udp:
-        files["README.md"] = files["README.md"].partition("## Over UDP")[0].rstrip() + "\n"
-    files["README.md"] = _filled(
-        files["README.md"], {"SIZES": _sizes(files) if measured else _UNMEASURED}
-    )
-    return files
+    values["SIZES"] = _sizes(files) if measured else _UNMEASURED
+    kinds = {"servos": kind == "servos", "tuned": tuner is not None, "over_udp": over_udp}
+    return files | {"README.md": readme.render(values | kinds)}
 
 
 def _estimates(scenario: Scenario) -> str:

@@ -11,7 +11,7 @@ import io
 import json
 import re
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -147,14 +147,43 @@ def validate(type_: type[_T], data: Any, where: str) -> _T:
         # JSON mode is the one in which strict pydantic lets a mapping become a nested dataclass.
         return pydantic.TypeAdapter(type_).validate_json(json.dumps(data, default=str))
     except pydantic.ValidationError as caught:
-        errors = caught.errors(include_url=False)
+        raise ConfigError(f"{where}: {_explained(type_, data, caught)}") from None
     except (ValueError, RecursionError) as error:  # recursive data, numbers of too many digits
         raise ConfigError(f"{where}: {_cut(str(error), 160)}; expected plain data") from None
+
+
+def in_one_line(type_: Any) -> Any:
+    """Let a pydantic dataclass raise ConfigError, as `validate` does, for a wrong argument."""
+    names = [one.name for one in dataclasses.fields(type_)]
+    make, assign = type_.__init__, type_.__setattr__
+
+    def checked(call: Callable[..., None], given: dict[str, Any], *arguments: Any) -> None:
+        try:
+            call(*arguments)
+        except pydantic.ValidationError as caught:
+            text = _explained(type_, given, caught)
+            raise ConfigError(f"{type_.__name__}: {text}") from None
+
+    @functools.wraps(make)
+    def init(self: Any, *args: Any, **kwargs: Any) -> None:
+        given = dict(zip(names, args, strict=False))
+        rest = args[len(names) :]
+        checked(functools.partial(make, self, *rest, **given, **kwargs), given | kwargs)
+
+    def setattr_(self: Any, name: str, value: Any) -> None:
+        checked(assign, {name: value}, self, name, value)
+
+    type_.__init__, type_.__setattr__ = init, setattr_
+    return type_
+
+
+def _explained(type_: type, data: Any, caught: pydantic.ValidationError) -> str:
+    errors = caught.errors(include_url=False)
     problems = [_explain_unknown(type_, data, one) for one in errors if one["type"] in _UNKNOWN]
     problems = problems or [explain(data, one) for one in errors]
     if (more := len(problems) - _MOST_PROBLEMS) > 0:
         problems = [*problems[:_MOST_PROBLEMS], f"and {more} more"]
-    raise ConfigError(f"{where}: {'; '.join(problems)}")
+    return "; ".join(problems)
 
 
 def validate_pairs(

@@ -11,13 +11,12 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from stewart_drake.core.layout import DEFAULT_GRAVITY
-from stewart_drake.files.arrayio import load_netcdf
-from stewart_drake.files.csvio import ANGLE_UNITS, LENGTH_UNITS, TORQUE_UNITS, read_table
+from stewart_drake.files.csvio import ANGLE_UNITS, LENGTH_UNITS, TORQUE_UNITS, Table, read_table
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.yamlio import parse_yaml, validate
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.renames import with_new_names
+from stewart_drake.scenario.run_log import is_run, scenario_of
+from stewart_drake.scenario.run_log import read_log as read_run
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, NUM_LEGS, NUM_STATE
 from stewart_drake.types import Array
 
@@ -28,7 +27,7 @@ RATES: Final = slice(12, 18)
 NUM_MEASURED: Final = NUM_LEGS + NUM_STATE
 KINDS: Final = {"angles": ANGLES, "pose": POSE, "rates": RATES}
 
-EXPECTED: Final = "a log: signals.nc of simulate, or CSV with time, torque_1 ... and angle_1 ..."
+EXPECTED: Final = "a log of a run, or CSV with time, torque_1 ... and angle_1 ..."
 FINEST: Final = 0.01  # least time between two measurements, s; more frequent ones are left out
 _LEAST_VALUES: Final = 96  # of a log: six crank angles at 16 instants, or a state at eight
 _TORQUES: Final = [f"torque_{leg}" for leg in LEGS]
@@ -107,7 +106,7 @@ def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bo
     """Read a log without empty rows, and with at most one row per `FINEST` s.
 
     Args:
-        path: a file of `simulate` where it ends in .nc, else CSV.
+        path: of a run: signals.nc, a log (.mcap, .csv) or a folder; else CSV of a machine.
         mechanism: its motors' limit clips the torques of a CSV log.
         precision: of a CSV log.
         gravity: whether it acted, in a CSV log.
@@ -115,7 +114,7 @@ def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bo
     Raises:
         ConfigError: one line, with the file, and row and column where there are such.
     """
-    if path.suffix == ".nc":
+    if is_run(path):
         log = _of_run(path, mechanism)
     else:
         log = _of_csv(path, mechanism, precision, DEFAULT_GRAVITY if gravity else 0.0)
@@ -138,16 +137,20 @@ def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bo
 
 def _of_run(path: Path, mechanism: Mechanism) -> Log:
     """Return the log of a run's signals."""
-    signals = load_netcdf(path, EXPECTED)
+    signals = read_run(path)
+    scenario = scenario_of(signals, path)
     try:
-        data = with_new_names(parse_yaml(signals.attrs["scenario"], f"{path}: scenario"))
         time, measured = signals.time.values, signals.measurement.transpose("time", ...).values
+        if "torque_commanded" not in signals or not np.isfinite(signals.torque_commanded).any():
+            raise ConfigError(
+                f"{path}: has the torques that acted, not those sent, as a log of `machine`; "
+                "expected that of its controller, from `live --log`"
+            )
         commanded = signals.torque_commanded.transpose("time", "leg").values
         applied = signals.torque_applied.transpose("time", "leg").values
         believed = float(signals.delay_estimate.values[-1])
     except (KeyError, AttributeError, ValueError, TypeError) as error:
         raise ConfigError(f"{path}: lacks a signal ({error}); expected {EXPECTED}") from None
-    scenario = validate(Scenario, data, f"{path}: scenario")
     if problem := _run_problem(scenario):
         raise ConfigError(f"{path}: {problem}; expected {EXPECTED}")
     period = scenario.controller.period
@@ -223,6 +226,19 @@ def _limited(torques: Array, limit: float | str | None) -> Array:
     return torques if limit is None or isinstance(limit, str) else np.clip(torques, -limit, limit)
 
 
+def _require_radians(table: Table, mechanism: Mechanism) -> None:
+    """Check that angles are no more than a turn off those of the assembled machine."""
+    cranks = mechanism.crank_angles(mechanism.home)
+    home = {**dict(zip(_CRANKS, cranks, strict=True)), "roll": 0.0, "pitch": 0.0, "yaw": 0.0}
+    for name in (one for one in home if one in table.columns):
+        off = np.abs(table.columns[name] - home[name])
+        for bad in np.flatnonzero(off > 2 * np.pi)[:1]:
+            raise ConfigError(
+                f"{table.place(bad, name)}: got {table.columns[name][bad]:.4g} rad, more than a "
+                f"turn from home, {home[name]:.4g} rad; expected radians, or [deg] in the header"
+            )
+
+
 def _of_csv(path: Path, mechanism: Mechanism, precision: Precision, gravity: float) -> Log:
     optional = _UNITS.keys() - {"time"}
     table = read_table(path, EXPECTED, _HEADER, _UNITS, optional=optional)
@@ -236,6 +252,7 @@ def _of_csv(path: Path, mechanism: Mechanism, precision: Precision, gravity: flo
             f"{table.place(bad, 'time')}: got {time[bad]:.9g} s after {time[bad - 1]:.9g} s; "
             "expected increasing times"
         )
+    _require_radians(table, mechanism)
     there = np.isfinite(torques)
     for bad in np.flatnonzero(there.any(axis=1) != there.all(axis=1))[:1]:
         raise ConfigError(

@@ -11,23 +11,23 @@ for z the state, parameters of the dynamics, or numbers of a leg. The expression
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from stewart_drake.core.layout import LEG_NUMBERS, SHAPES
+from stewart_drake.core.layout import LEG_NUMBERS
 from stewart_drake.dynamics import equations
 from stewart_drake.dynamics.equations import leg_numbers, numbers_of
-from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.dynamics.native_functions import NativeFunction
+from stewart_drake.dynamics.stewart import plant_parameters
+from stewart_drake.mechanism.geometry import Mechanism, geometry_of
 from stewart_drake.scenario.signals import (
+    NUM_CONSTANTS,
     NUM_COORDINATES,
     NUM_LEGS,
     NUM_STATE,
-    PLANT_PARAMETERS,
-    POSE,
-    RATES,
+    WRENCHES,
 )
 from stewart_drake.types import Array
 
@@ -35,19 +35,32 @@ LEG_PLACES: Final = (0, 1, 12, 13, 14, 15, 16, 17)
 """In a leg's numbers (`mechanism.geometry.geometry_of`): crank, rod, plate joint, shaft; m."""
 PER_LEG: Final = len(LEG_PLACES)
 NUM_GEOMETRY: Final = NUM_LEGS * PER_LEG
-NUM_DYNAMIC: Final = SHAPES["parameters"][0]  # parameters of the dynamics
+NUM_DYNAMIC: Final = NUM_CONSTANTS  # parameters of the dynamics; a log has no wrench
 
 
 Compiled = Callable[..., list[Array]]
 
 
 def compiled(function: ca.Function) -> Compiled:
-    """Return a CasADi function of arrays; CasADi's columns are numpy's rows."""
+    """Return a dense CasADi function of arrays; CasADi's columns are numpy's rows.
+
+    It keeps places for arguments and results, so one thread at a time may call it.
+    """
+    buffer: Any  # its stubs are those of the C interface
+    buffer, evaluate = function.buffer()
+    given = [np.zeros(function.size_in(k)[::-1]) for k in range(function.n_in())]
+    results = [np.zeros(function.size_out(k)[::-1]) for k in range(function.n_out())]
+    for put, places in ((buffer.set_arg, given), (buffer.set_res, results)):
+        for k, place in enumerate(places):
+            put(k, place.reshape(-1).data)
 
     def call(*arguments: Array) -> list[Array]:
-        found = function.call([ca.DM(np.asarray(one).T) for one in arguments])
-        return [np.asarray(one).T.squeeze() for one in found]
+        for place, argument in zip(given, arguments, strict=True):
+            place.squeeze()[...] = argument
+        evaluate()
+        return [result.squeeze().copy() for result in results]
 
+    call.owners = function, buffer  # type: ignore[attr-defined]  # `evaluate` keeps neither alive
     return call
 
 
@@ -67,10 +80,11 @@ class Slopes(NamedTuple):
 
 
 class SymbolicLegs(NamedTuple):
-    """Symbols of a machine's legs (18, 6), and those of the equations."""
+    """Symbols of the equations, of a machine's legs (18, 6), and of its constants (13,)."""
 
     s: dict[str, ca.SX]
     legs: ca.SX
+    constants: ca.SX
 
     @property
     def geometry(self) -> ca.SX:
@@ -92,11 +106,14 @@ class MachineModel:
 
     @cached_property
     def _symbols(self) -> SymbolicLegs:
-        return SymbolicLegs(equations.symbols(), ca.SX.sym("legs", LEG_NUMBERS, NUM_LEGS))
+        constants = ca.SX.sym("constants", NUM_CONSTANTS)
+        whole = ca.vertcat(constants, ca.SX.zeros(len(WRENCHES)))
+        legs = ca.SX.sym("legs", LEG_NUMBERS, NUM_LEGS)
+        return SymbolicLegs(equations.symbols() | {"parameters": whole}, legs, constants)
 
     @cached_property
     def _motion(self) -> equations.Motion:
-        (s, legs), common = self._symbols, numbers_of(self.mechanism)[1]
+        (s, legs, _), common = self._symbols, numbers_of(self.mechanism)[1]
         plate = equations.plate_motion(s["pose"], s["rates"], ca.SX(self.gravity))
         sums = equations.plate_alone(common, plate, s["parameters"])
         numbers, arms, crank_rates = ca.SX.sym("leg", LEG_NUMBERS), [], []
@@ -118,27 +135,30 @@ class MachineModel:
 
     @cached_property
     def _accelerations(self) -> Compiled:
-        (s, legs), p = self._symbols, self._symbols.s["parameters"]
+        s, legs, constants = self._symbols
+        p = s["parameters"]
         slip = equations.slip(self._motion.crank_rates, p)
         found = equations.accelerations(self._motion, s["torque"], p, slip)
-        return self._many("forward", [s["pose"], s["rates"], s["torque"], p, legs], [found], 2)
+        inputs = [s["pose"], s["rates"], s["torque"], constants, legs]
+        return self._many("forward", inputs, [found], 2)
 
     @cached_property
     def _residual(self) -> Compiled:
-        (s, legs), motion, p = self._symbols, self._motion, self._symbols.s["parameters"]
+        (s, legs, constants), motion = self._symbols, self._motion
+        p = s["parameters"]
         nu_dot = ca.mtimes(motion.rates_map, s["accelerations"]) + motion.nu_dot_bias
         force = equations.force(motion, s["torque"], p, equations.slip(motion.crank_rates, p))
         F = ca.mtimes(motion.mass, nu_dot) - force
         by_legs = ca.jacobian(F, ca.vec(legs))
         places = [LEG_NUMBERS * leg + k for leg in range(NUM_LEGS) for k in LEG_PLACES]
         state = ca.vertcat(s["pose"], s["rates"])
-        slopes = ca.horzcat(ca.jacobian(F, state), ca.jacobian(F, p), by_legs[:, places])
-        inputs = [s["pose"], s["rates"], s["accelerations"], s["torque"], p, legs]
+        slopes = ca.horzcat(ca.jacobian(F, state), ca.jacobian(F, constants), by_legs[:, places])
+        inputs = [s["pose"], s["rates"], s["accelerations"], s["torque"], constants, legs]
         return self._many("residual", inputs, [slopes, ca.mtimes(motion.mass, motion.rates_map)], 2)
 
     @cached_property
     def _angles(self) -> Compiled:
-        (s, legs), geometry = self._symbols, self._symbols.geometry
+        (s, legs, _), geometry = self._symbols, self._symbols.geometry
         R_WP, angles = equations.rotation(s["pose"][:3]), []
         for number in range(NUM_LEGS):
             leg = leg_numbers(legs[:, number])
@@ -180,20 +200,29 @@ class MachineModel:
 class DrawnModel(MachineModel):
     """Machine with its legs as drawn: fifty times as fast, zero derivatives by the geometry."""
 
+    def _compiled(self, name: str) -> Compiled:
+        """Return a function of the core at all points; its last argument, the legs, is unused."""
+        function = NativeFunction(name, geometry_of(self.mechanism), self.points)
+        parameters = plant_parameters()
+
+        def call(*arguments: Array) -> list[Array]:
+            *at, parameters[:NUM_DYNAMIC], _ = arguments
+            return [*function(*at, parameters, self.gravity)]
+
+        return call
+
     @cached_property
-    def _dynamics(self) -> StewartDynamics:
-        return StewartDynamics(self.mechanism, self.gravity, free=PLANT_PARAMETERS)
+    def _accelerations(self) -> Compiled:
+        return self._compiled("accelerations")
 
-    def accelerations(self, states: Array, torques: Array, numbers: Numbers) -> Array:
-        p, f = numbers.parameters, self._dynamics.accelerations
-        pairs = zip(states, torques, strict=True)
-        return np.array([f(x[POSE], x[RATES], torque, p) for x, torque in pairs])
+    @cached_property
+    def _residual(self) -> Compiled:
+        derivatives = self._compiled("residual_derivatives")
+        by_geometry = np.zeros((self.points, NUM_GEOMETRY, NUM_COORDINATES))
 
-    def slopes(self, states: Array, torques: Array, numbers: Numbers) -> Slopes:
-        p, f = numbers.parameters, self._dynamics.derivatives
-        pairs = zip(states, torques, strict=True)
-        found = [f(x[POSE], x[RATES], torque, p) for x, torque in pairs]
-        by_numbers = np.zeros((self.points, NUM_COORDINATES, NUM_DYNAMIC + NUM_GEOMETRY))
-        by_numbers[:, :, :NUM_DYNAMIC] = [one.G[RATES] for one in found]
-        state = np.array([one.A[RATES] for one in found])
-        return Slopes(self.accelerations(states, torques, numbers), state, by_numbers)
+        def slopes(*arguments: Array) -> list[Array]:
+            by_state, by_parameters, MN, _ = derivatives(*arguments)
+            by_constants = by_parameters[:, :NUM_DYNAMIC]
+            return [np.concatenate([by_state, by_constants, by_geometry], axis=1), MN]
+
+        return slopes

@@ -16,17 +16,19 @@ from stewart_drake.identification.model import LEG_PLACES, NUM_DYNAMIC, NUM_GEOM
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.mechanism.geometry import Mechanism, geometry_of, plate_radius
 from stewart_drake.scenario.signals import (
+    BALL_JOINT_FRICTION_SPEED,
     BIAS,
+    CONSTANT_UNITS,
+    CONSTANTS,
     COULOMB,
     COULOMB_SPEED,
     DAMPING,
+    DEFAULT_BALL_JOINT_SPEED,
     DEFAULT_COULOMB_SPEED,
     LEGS,
     NUM_LEGS,
     PAYLOAD,
     PAYLOAD_POSITION,
-    PLANT_PARAMETER_UNITS,
-    PLANT_PARAMETERS,
 )
 from stewart_drake.types import Array
 
@@ -42,12 +44,12 @@ _OF_A_LEG: Final = (
     *(f"shaft_{axis}" for axis in "xyz"),
 )
 NAMES: Final = (
-    *PLANT_PARAMETERS,
+    *CONSTANTS,
     *(f"{name}_{leg}" for leg in LEGS for name in _OF_A_LEG),
     *(f"offset_A{leg}" for leg in LEGS),
     "delay",
 )
-UNITS: Final = (*PLANT_PARAMETER_UNITS, *("m",) * NUM_GEOMETRY, *("rad",) * NUM_LEGS, "s")
+UNITS: Final = (*CONSTANT_UNITS, *("m",) * NUM_GEOMETRY, *("rad",) * NUM_LEGS, "s")
 ONE_SIDED: Final = (DAMPING, COULOMB)  # unknowns that are not negative
 
 
@@ -123,6 +125,7 @@ def unknowns_of(
     std[GEOMETRY] = np.tile([t.lengths] * 2 + [t.joints] * 6, NUM_LEGS)
     std[OFFSETS], std[DELAY] = t.offsets, t.delay
     mean[COULOMB_SPEED] = DEFAULT_COULOMB_SPEED
+    mean[BALL_JOINT_FRICTION_SPEED] = DEFAULT_BALL_JOINT_SPEED
     for place, given, usual in (
         (BIAS, t.bias, torque),
         (PAYLOAD, t.payload, m.plate.mass),

@@ -12,10 +12,12 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.compiled import machine_of
+from stewart_drake.law.least_error import LeastError
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.timeline import TorqueSchedule
 from stewart_drake.scenario.signals import (
     NUM_REFERENCE,
+    NUM_TORQUES,
 )
 from stewart_drake.scenario.trajectories import evaluate, through_states
 from stewart_drake.types import Array
@@ -25,6 +27,8 @@ DEFAULT_CATCH_UP = 0.3
 LONGEST_CATCH_UP = 10.0
 HEADROOM = 0.95
 """Share of the torque limit for a plan; feedback needs the rest."""
+LEAST_ERROR_SHARE = 0.65
+"""The same for a plan of least error, which is at its limit for most of its time."""
 PIECE = 0.025
 """s; largest distance of the instants at which a planned motion is checked."""
 
@@ -76,6 +80,7 @@ class CatchUp:
 
     Args:
         dynamics, reference, start, t_start, period: as of `plan_catch_up`.
+        least: makes the plans of least error under a torque limit, or None for the shortest ones.
     """
 
     def __init__(
@@ -85,7 +90,9 @@ class CatchUp:
         start: Array,
         t_start: float,
         period: float,
+        least: Callable[[], LeastError] | None = None,
     ) -> None:
+        self._least, self._improved = least, dict[tuple[int, float], tuple[Trajectory, float]]()
         self._model, self._reference, self._period = Model(dynamics), reference, period
         self._start, self._t_start = start, t_start
         self._plans: dict[int, Plan | None] = {}
@@ -96,7 +103,17 @@ class CatchUp:
         periods = shortest(self._possible, self._period, duration, torque_limit)
         if periods is None:
             return self._reference, 0.0
-        return self._motion(periods), periods * self._period
+        plan = self._motion(periods), periods * self._period
+        if self._least is None or torque_limit is None or duration is not None:
+            return plan
+        key = periods, torque_limit
+        if key not in self._improved:
+            given = plan[0], self._reference, self._start, self._t_start, self._period, periods
+            pieces = self._least().pieces(*given, LEAST_ERROR_SHARE * torque_limit)
+            if pieces is not None:
+                plan = self._through(pieces), float(pieces[-1, 1]) - self._t_start
+            self._improved[key] = plan
+        return self._improved[key]
 
     def _possible(self, periods: int, limit: float) -> bool:
         if periods not in self._plans:
@@ -109,11 +126,13 @@ class CatchUp:
         if periods not in self._motions:
             found = self._plans[periods]
             assert found is not None
-            pieces = [
-                (p[0], p[2 : 2 + NUM_REFERENCE], p[1], p[-NUM_REFERENCE:]) for p in found.pieces
-            ]
-            self._motions[periods] = through_states(pieces, self._reference)
+            self._motions[periods] = self._through(found.pieces)
         return self._motions[periods]
+
+    def _through(self, pieces: Array) -> Trajectory:
+        """Return the motion along pieces (n, 38), then the reference."""
+        states = [(p[0], p[2 : 2 + NUM_REFERENCE], p[1], p[-NUM_REFERENCE:]) for p in pieces]
+        return through_states(states, self._reference)
 
 
 def shortest(
@@ -187,6 +206,15 @@ class Model:
         results = c.at(pieces), c.at(peak), scratch
         number = c.lib.stewart_plan_way(self.data, self._sign, *given, *results)
         return Plan(pieces, float(peak[0])) if number else None
+
+    def torques(self, rows: Array) -> Array:
+        """Return the torques (n, 6) that rows (n, 18) take, N m."""
+        c, rows, torques = core(), np.array(rows, np.float64), np.empty((len(rows), NUM_TORQUES))
+        first, result = c.at(rows), c.at(torques)
+        for k in range(len(rows)):
+            given = first + NUM_REFERENCE * k, result + NUM_TORQUES * k
+            c.lib.stewart_required_torque(self.data, *given)
+        return torques
 
     def way(self, schedule: TorqueSchedule, states: Array, begin: float) -> Array:
         """Return the pieces (n, 38) of the motion through states (1 + n, 12) from `begin` s on."""

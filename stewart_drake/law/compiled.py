@@ -8,9 +8,10 @@ import numpy as np
 
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.frozen_map import FrozenDynamics
+from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.mechanism.geometry import Mechanism, geometry_of
-from stewart_drake.scenario.signals import PLANT_PARAMETERS
+from stewart_drake.scenario.signals import BALL_JOINTS, PLANT_PARAMETERS
 from stewart_drake.types import Array
 
 Made = TypeVar("Made")
@@ -97,6 +98,13 @@ def geometry(mechanism: Mechanism) -> Array:
     return numbers(geometry_of(mechanism))
 
 
+def resists(dynamics: StewartDynamics) -> bool:
+    """Return whether the ball joints of a plant have friction, or may have some."""
+    names = PLANT_PARAMETERS[BALL_JOINTS]
+    known = np.any(dynamics.plant_parameters[BALL_JOINTS][:2])
+    return bool(known) or any(name in names for name in dynamics.free)
+
+
 @Once
 def machine_of(plant: NominalPlant) -> Compiled:
     """Return the `stewart_machine` of a plant."""
@@ -106,6 +114,8 @@ def machine_of(plant: NominalPlant) -> Compiled:
     machine.gravity, machine.torque_limit = dynamics.gravity, plant.motors.limit
     machine.coarse_torque_limit, machine.substeps = plant.coarse_torque_limit, plant.substeps
     machine.estimated = len(dynamics.free)
+    if resists(dynamics):
+        machine.joints = core().ffi.addressof(core().lib, "stewart_ball_joints")
     for i, name in enumerate(dynamics.free):
         machine.place[i] = PLANT_PARAMETERS.index(name) if name in PLANT_PARAMETERS else -1
     if not isinstance(dynamics, FrozenDynamics):

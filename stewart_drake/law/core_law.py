@@ -16,7 +16,7 @@ from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.catch_up import periods_of
 from stewart_drake.law.channel import Packets, Report, Sent, Wire, report_of, structures
-from stewart_drake.law.compiled import Compiled, address_of, machine_of
+from stewart_drake.law.compiled import Compiled, address_of, machine_of, resists
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.design_models import MultibodyModel
 from stewart_drake.law.encoder_sensing import EncoderSensing
@@ -59,6 +59,8 @@ def uncovered(law: PredictiveLqi | ServoPreview) -> str | None:
     A user's part counts as another kind of that field.
     """
     covered = {
+        "controller.limits": not hasattr(law, "limits"),
+        "controller.learned": not hasattr(law, "learned"),
         "law": type(law) in (PredictiveLqi, ServoPreview) and type(law.plant) is NominalPlant,
         "plant.kind": type(law.plant.dynamics) is StewartDynamics,
         "sensor.kind": type(law.sensing) in (StateSensing, EncoderSensing),
@@ -72,7 +74,7 @@ def uncovered(law: PredictiveLqi | ServoPreview) -> str | None:
             "controller.replan": type(law.planner) in (NoPlanner, Replan),
             "controller.prediction": type(law.predictor) is _predictor(law),
             "controller.model": type(law.model) is MultibodyModel,
-            "controller.integral": type(law.cost) is QuadraticCost,
+            "controller.kind": type(law.cost) is QuadraticCost,
             "link.kind": type(law.channel) in (Wire, Packets),
         }
     return next((field for field, yes in covered.items() if not yes), None)
@@ -116,6 +118,9 @@ class CompiledLaw:
             self.sources = ("servo", "kinematics.c", *part.sources)
             self._fill(self.data.law)
             self.data.law.parts, self.data.periods = law.reports.parts, law.reports.periods
+            if (servo := law.servo) is not None:
+                limits = servo.low.tolist(), servo.high.tolist(), servo.most
+                self.data.stiff = (servo.stiffness, servo.velocity_gain, *limits)
             c.lib.stewart_servo_prepare(self.data)
         layout = self.data.layout
         self.fields = {
@@ -127,6 +132,9 @@ class CompiledLaw:
         """Fill in what both kinds of laws have."""
         c, law, part, timeline = core(), self.law, self._part, self.law.timeline
         machine = machine_of(law.plant)
+        if resists(law.plant.dynamics):
+            self.tables[address_of(machine.it.joints)] = "stewart_ball_joints"
+            self.sources += ("ball_joints",)
         data.machine = machine.it[0]
         self.keep += machine.pointed()
         data.period, data.steps, data.fraction = timeline.period, timeline.steps, timeline.fraction
@@ -137,6 +145,7 @@ class CompiledLaw:
 
     def _of_torques(self, law: PredictiveLqi) -> None:
         c, d, cost = core(), self.data, law.cost
+        assert isinstance(cost, QuadraticCost)
         d.cost.errors, d.cost.torques = cost.errors.tolist(), cost.torques.tolist()
         d.cost.integrates = int(cost.integrals is not None)
         d.cost.integrals = (np.zeros(6) if cost.integrals is None else cost.integrals).tolist()

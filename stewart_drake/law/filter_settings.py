@@ -1,5 +1,6 @@
 """Assumptions of the estimator: priors, bounds, standard deviations of model and delay."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -7,10 +8,13 @@ import numpy as np
 
 from stewart_drake.scenario.calibration import OFFSETS, Calibration
 from stewart_drake.scenario.signals import (
+    BALL_JOINT_FRICTION_SPEED,
+    BALL_JOINTS,
     BIAS,
     COULOMB,
     COULOMB_SPEED,
     DAMPING,
+    DEFAULT_BALL_JOINT_SPEED,
     DEFAULT_COULOMB_SPEED,
     NUM_PLANT_PARAMETERS,
     PARAMETERS,
@@ -18,13 +22,15 @@ from stewart_drake.scenario.signals import (
     PAYLOAD_POSITION,
     PLANT_PARAMETER_UNITS,
     PLANT_PARAMETERS,
+    WRENCH,
+    WRENCHES,
 )
 from stewart_drake.types import Array
 
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """Unknown constants of plant and sensor, and their prior.
+    """Unknown parameters of plant and sensor, and their prior: constants and random walks.
 
     The names are those of `free` of the dynamics, of `scenario.signals.PLANT_PARAMETERS` and
     `scenario.calibration.OFFSETS`.
@@ -37,6 +43,8 @@ class ParameterSet:
         lower, upper: (n,) physical bounds.
         correlation: (n, n) of the prior; None: uncorrelated.
         usual: (n,) std without a calibration, the scale of a well-known parameter; None: std.
+        walk: (n,) standard deviation of the change per root second; None: constants.
+        jump: (n,) standard deviation of a sudden change; None: constants.
 
     Raises:
         ValueError: naming the parameter; a shape that does not fit.
@@ -50,6 +58,8 @@ class ParameterSet:
     upper: Array
     correlation: Array | None = None
     usual: Array | None = None
+    walk: Array | None = None
+    jump: Array | None = None
 
     def __post_init__(self) -> None:
         columns = (self.units, self.prior, self.std, self.lower, self.upper)
@@ -103,8 +113,22 @@ class ParameterSet:
         if correlation is not None:
             apart = chosen[:, None] | chosen[None, :]
             correlation = np.where(apart, np.eye(len(chosen)), correlation)
-        values = [std.get(name, own) for name, own in zip(self.names, self.std, strict=True)]
-        return replace(self, std=np.array(values), correlation=correlation)
+        return replace(self, std=self._with(self.std, std), correlation=correlation)
+
+    def changing(self, walk: Mapping[str, float], jump: Mapping[str, float]) -> "ParameterSet":
+        """Return the prior with other changes by name, per root second and sudden ones.
+
+        At the start such a parameter is off by a sudden change, or else by what it changes in a
+        second.
+        """
+        still = np.zeros(len(self.names))
+        walks, jumps = (still if own is None else own for own in (self.walk, self.jump))
+        found = replace(self, walk=self._with(walks, walk), jump=self._with(jumps, jump))
+        return found.trusting({**walk, **jump})
+
+    def _with(self, own: Array, other: Mapping[str, float]) -> Array:
+        values = [other.get(name, value) for name, value in zip(self.names, own, strict=True)]
+        return np.array(values)
 
 
 @dataclass(frozen=True)
@@ -116,17 +140,25 @@ class FilterSettings:
         model_std: (12,) error of one step of the model; without it the filter would explain
             integration errors by parameters where a sensor has no noise.
         timing_std: s, of the instant of a torque.
+        walk_std: (p,) change of a parameter in a period; None: constants.
+        jump_std: (p,) sudden change of a parameter; None: constants.
     """
 
     parameters: ParameterSet
     model_std: Array
     timing_std: float
+    walk_std: Array | None = None
+    jump_std: Array | None = None
 
 
 EXACT = 1e-6
 """Least standard deviation of an estimated parameter, as a share of the usual one."""
 MOUNTING = float(np.deg2rad(0.1))
 """Standard deviation of the mounting angle of an encoder, rad."""
+JUMP_SHARE = 0.4
+"""Standard deviation of a sudden wrench, as a share of what the motion takes."""
+WALK_SHARE = 0.001
+"""The same of its change in a second."""
 CHANCE = 3.0
 """Standard deviations by which an estimate may be beyond a bound."""
 MODEL_ERROR = 2e-4
@@ -142,40 +174,54 @@ def usual_parameters(
     torque_limit: float | None,
     radius: float = 0.0,
     free: Sequence[str] = PARAMETERS,
+    wrench: Sequence[float] = (1.0, 1.0),
 ) -> ParameterSet:
     """Return default priors, from the drawing and the reference motion only.
 
     The payload is up to ten plates, within two radii of the plate's joints. Friction and bias scale
-    with the torques. Encoders are mounted to a tenth of a degree.
+    with the torques, a wrench with what a motor does for the motion; in a second it may change by
+    as much. Encoders are mounted to a tenth of a degree.
 
     Args:
         plate_mass, torque_scale, torque_limit: as of `filter_settings`.
         radius: of the plate's joints, m, for the position of the payload.
+        wrench: scale of a wrench on the plate, moment in N m and force in N.
         free: names of PLANT_PARAMETERS and OFFSETS, those of the plant first.
     """
-    prior, std, lower, upper = (np.zeros(NUM_PLANT_PARAMETERS) for _ in range(4))
+    prior, std, lower, upper, walk, jump = (np.zeros(NUM_PLANT_PARAMETERS) for _ in range(6))
     bias_bound = 100 * torque_scale if torque_limit is None else torque_limit
     std[BIAS], lower[BIAS], upper[BIAS] = 0.3 * torque_scale, -bias_bound, bias_bound
     std[PAYLOAD], upper[PAYLOAD] = 0.25 * plate_mass, 10 * plate_mass
     lower[PAYLOAD] = -0.5 * plate_mass  # the plate may be lighter than assumed
-    for friction in (DAMPING, COULOMB):
+    for friction in (DAMPING, COULOMB, BALL_JOINTS.start, BALL_JOINTS.start + 1):
         std[friction], upper[friction] = 0.1 * torque_scale, 100 * torque_scale
-    at = COULOMB_SPEED
-    prior[at] = std[at] = DEFAULT_COULOMB_SPEED
-    lower[at], upper[at] = 1e-3, 10.0
+    speeds = {
+        COULOMB_SPEED: DEFAULT_COULOMB_SPEED,
+        BALL_JOINT_FRICTION_SPEED: DEFAULT_BALL_JOINT_SPEED,
+    }
+    for at, speed in speeds.items():
+        prior[at] = std[at] = speed
+        lower[at], upper[at] = 1e-3, 10.0
     std[PAYLOAD_POSITION] = radius / 2
     lower[PAYLOAD_POSITION], upper[PAYLOAD_POSITION] = -2 * radius, 2 * radius
-    of_sensor = (0.0, MOUNTING, -np.pi, np.pi)
+    lower[WRENCH], upper[WRENCH] = -np.inf, np.inf
+    std[WRENCH] = walk[WRENCH] = WALK_SHARE * np.repeat(wrench, 3)
+    jump[WRENCH] = JUMP_SHARE * np.repeat(wrench, 3)
+    of_sensor = (0.0, MOUNTING, -np.pi, np.pi, 0.0, 0.0)
     columns = [
         np.append(column, len(OFFSETS) * [value])
-        for column, value in zip((prior, std, lower, upper), of_sensor, strict=True)
+        for column, value in zip((prior, std, lower, upper, walk, jump), of_sensor, strict=True)
     ]
     names, units = (*PLANT_PARAMETERS, *OFFSETS), (*PLANT_PARAMETER_UNITS, *("rad",) * len(OFFSETS))
     chosen = [names.index(name) for name in free]
+    changes = dict(zip(("walk", "jump"), (column[chosen] for column in columns[4:]), strict=True))
+    if not walk[WRENCH].any() or not any(name in WRENCHES for name in free):
+        changes = {}
     return ParameterSet(
         tuple(free),
         tuple(units[i] for i in chosen),
-        *(column[chosen] for column in columns),
+        *(column[chosen] for column in columns[:4]),
+        **changes,
     )
 
 
@@ -200,4 +246,5 @@ def filter_settings(
     if parameters is None:
         parameters = usual_parameters(plate_mass, torque_scale, torque_limit)
     model_std = MODEL_ERROR * np.concatenate([motion_scale, motion_scale])
-    return FilterSettings(parameters, model_std, TIMING_ERROR * period)
+    walk = None if parameters.walk is None else math.sqrt(period) * parameters.walk
+    return FilterSettings(parameters, model_std, TIMING_ERROR * period, walk, parameters.jump)

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from stewart_drake.types import Array, Complex
+from stewart_drake.types import Array, ArrayLike, Complex
 
 TOLERANCE: Final = 1e-10
 """Singular values below this share of ||[A, B]|| count as zero: rounding leaves some 1e-14."""

@@ -1,5 +1,6 @@
 """Memory of the control law from one sample to the next."""
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -26,6 +27,9 @@ class Counts(NamedTuple):
         saturated_steps: samples with a torque at the limit.
         references_missing: samples with NaN or infinity in the reference, which continued from the
             last one.
+        limited_steps: samples in which a limit binds within the horizon, for `limits: qp`.
+        qp_failures: samples without a plan within the limits; the last plan went on.
+        qp_late: the same because time or iterations ran out.
     """
 
     riccati_failures: int = 0
@@ -36,10 +40,14 @@ class Counts(NamedTuple):
     measurements_rejected: int = 0
     saturated_steps: int = 0
     references_missing: int = 0
+    limited_steps: int = 0
+    qp_failures: int = 0
+    qp_late: int = 0
 
     def plus(self, *causes: str | None) -> "Counts":
-        """Return the counts with one more of each cause that is not None."""
-        return self._replace(**{cause: getattr(self, cause) + 1 for cause in causes if cause})
+        """Return the counts with one more for each cause that is not None."""
+        added = Counter(cause for cause in causes if cause)
+        return self._replace(**{cause: getattr(self, cause) + n for cause, n in added.items()})
 
     @property
     def bad_measurements(self) -> int:

@@ -283,11 +283,14 @@ def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
         "model_std": numbers(settings.model_std, NUM_STATE),
         "prior_root": numbers(np.linalg.cholesky(known.covariance), p, p),
         "usual_std": numbers(known.usual_std, p),
+        "walk_std": numbers(np.zeros(p) if settings.walk_std is None else settings.walk_std, p),
         "lower": numbers([*-free, *known.lower], NUM_STATE + p),
         "upper": numbers([*free, *known.upper], NUM_STATE + p),
     }
     it.prior, it.filter.gate, it.filter.timing_std = c.at(prior), _gate(size), settings.timing_std
     it.filter.offsets = known.names.index(OFFSETS[0]) if OFFSETS[0] in known.names else -1
+    if settings.jump_std is not None:
+        arrays["jump_std"] = numbers(settings.jump_std, p)
     for name, array in arrays.items():
         setattr(it.filter, name, c.at(array))
     return Compiled(it, (prior, arrays))
@@ -298,6 +301,7 @@ def _delay_settings_of(
 ) -> Compiled:
     """Return the `stewart_delay_settings` for `size` values of one instant."""
     c, prior, delay = core(), settings.parameters, observer.delay
+    p = len(prior.names)
     assert delay is not None
     it = c.ffi.new("stewart_delay_settings *")
     it.values, it.most = size, observer.max_schedule_length(period)
@@ -305,7 +309,10 @@ def _delay_settings_of(
         "prior_root": numbers(np.linalg.cholesky(prior.covariance)),
         **{name: numbers(getattr(prior, name)) for name in ("prior", "std", "usual_std")},
         **{name: numbers(getattr(prior, name)) for name in ("lower", "upper")},
+        "walk_std": numbers(np.zeros(p) if settings.walk_std is None else settings.walk_std, p),
     }
+    if settings.jump_std is not None:
+        arrays["jump_std"] = numbers(settings.jump_std, p)
     for name, array in arrays.items():
         setattr(it.delay, name, c.at(array))
     it.delay.period, it.delay.gate, it.delay.believed = period, _gate(size), delay.mean

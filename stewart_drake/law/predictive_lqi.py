@@ -12,15 +12,15 @@ dynamics through the queue. Torques enter the linear parts as deviations from th
 """
 
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.channel import Channel, Report, Wire
-from stewart_drake.law.cost import QuadraticCost
+from stewart_drake.law.cost import Cost
 from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import Feedforward
 from stewart_drake.law.measurement import Measurement
@@ -72,7 +72,7 @@ class PredictiveLqi:
         predictor: error and integral where the next torque acts.
         feedforward: torque that the reference takes.
         model: of the error, for the gain.
-        cost: that the gain minimises.
+        cost: computes the gain.
         channel: link to the motors.
         kept: number of torques in flight beyond those of the delay, for late measurements.
         longest_wait: periods to wait for a late measurement before the model continues; 0:
@@ -89,12 +89,17 @@ class PredictiveLqi:
     predictor: Predictor
     feedforward: Feedforward
     model: DesignModel
-    cost: QuadraticCost
+    cost: Cost
     channel: Channel = field(default_factory=Wire)
     kept: int = 0
     longest_wait: int = 0
     planner: Planner = field(default_factory=NoPlanner)
     silence: int = 0
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """Attributes of this class by name, without those of a derived one."""
+        return {one.name: getattr(self, one.name) for one in fields(PredictiveLqi)}
 
     @property
     def estimates(self) -> bool:

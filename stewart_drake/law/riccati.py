@@ -7,11 +7,9 @@ import numpy as np
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 
 from stewart_drake.core.library import core
-from stewart_drake.law.delay_model import DelayedModel, chain, delayed_model
-from stewart_drake.law.error_model import ContinuousModel
+from stewart_drake.law.delay_model import DelayedModel, chain
 from stewart_drake.law.hautus import distinct, pbh_margins
 from stewart_drake.law.stability import is_stable
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.types import Array
 
 Solver = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
@@ -158,34 +156,6 @@ def augmented_gain(model: DelayedModel, Q: Array, R: Array) -> Array:
         RiccatiError: see `lqr`.
     """
     return reduced_gain(model, Q, R) @ prediction_matrix(model)
-
-
-def law_gain(
-    design: ContinuousModel,
-    predictor: ContinuousModel,
-    period: float,
-    delay: Delay,
-    weights: tuple[Array, Array],
-) -> Array:
-    """Return K P (m, n + m L): the gain of one model on the prediction of another.
-
-    Args:
-        design: model of the gain.
-        predictor: model of the prediction.
-        period: s.
-        delay: that the law believes in.
-        weights: Q (p, p) and R (m, m); a Q of twice the outputs includes the integral.
-
-    Raises:
-        RiccatiError: see `lqr`.
-    """
-    Q, R = weights
-    integral = len(Q) > len(design.C)
-    designed, predicted = (
-        delayed_model(model, period, delay.steps, delay.fraction, integral=integral)
-        for model in (design, predictor)
-    )
-    return reduced_gain(designed, Q, R) @ prediction_matrix(predicted)
 
 
 def _check(A: Array, B: Array, Q: Array, R: Array) -> None:

@@ -9,6 +9,10 @@ Nothing is fed back across the delay, so that no delay makes the loop unstable. 
 observer enter T_ff, the torque that the reference takes; without T_ff the servos need an error to
 produce it. The torques that acted depend on the servos' measurements, so that the machine reports
 them with the measurement.
+
+Servos given by their stiffness hold a setpoint for a period instead of moving to it. Its angles are
+(setpoint) of `law.servos` for the middle of that period, r at t + eta + dt / 2: with T_ff they are
+compensated for torque and velocity gain, without it they are the angles of the reference.
 """
 
 from dataclasses import dataclass, replace
@@ -17,14 +21,14 @@ from functools import cached_property
 import numpy as np
 
 from stewart_drake.law.belief import Belief
-from stewart_drake.law.feedforward import Feedforward
+from stewart_drake.law.feedforward import Feedforward, InverseDynamicsFeedforward
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import Motion
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import Observer
 from stewart_drake.law.sensing import Sensing
-from stewart_drake.law.servos import Reported, ReportLayout
+from stewart_drake.law.servos import Reported, ReportLayout, Stiffness
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.signals import (
@@ -75,6 +79,7 @@ class ServoPreview:
         observer: estimates state and parameters, with the reported torques.
         feedforward: the torque T_ff of a command.
         reports: layout of the machine's reports.
+        servo: servos given by their stiffness, None for others.
     """
 
     timeline: Timeline
@@ -83,11 +88,13 @@ class ServoPreview:
     observer: Observer
     feedforward: Feedforward
     reports: ReportLayout
+    servo: Stiffness | None = None
 
     @cached_property
     def preview_times(self) -> Array:
         """Instant (1,) at which the next command is to be reached, s from now."""
-        return np.array([self.timeline.eta + self.timeline.period])
+        share = 1.0 if self.servo is None else 0.5
+        return np.array([self.timeline.eta + share * self.timeline.period])
 
     def command(self, wanted: Array, parameters: Array) -> Array:
         """Return the command (18,) for pose, rates and accelerations (18,), with parameters (p,).
@@ -98,6 +105,9 @@ class ServoPreview:
         angles = self.plant.mechanism.crank_angles(wanted[POSE])
         rates = self.plant.dynamics.actuation_map(wanted[POSE]).T @ wanted[RATES]
         torque = self.feedforward.at(wanted, self.plant.dynamics, parameters)
+        if self.servo is not None:
+            moves = isinstance(self.feedforward, InverseDynamicsFeedforward)
+            angles = self.servo.setpoint(angles, rates * moves, torque)
         return np.concatenate([angles, rates, torque])
 
     def initial_memory(self, command: Array) -> ServoMemory:
@@ -175,4 +185,6 @@ class ServoPreview:
             return stay, "unreachable"
         if not np.all(np.isfinite(command)):
             return stay, "nonfinite_torque"
+        if self.servo is not None:
+            command[POSE] = self.servo.limited(command[POSE], last[POSE])
         return command, None

@@ -1,5 +1,7 @@
 """Position servos: a local loop at each motor follows the crank angles that arrive.
 
+A servo is given by its bandwidth (`ServoLoop`) or by its stiffness (`Stiffness`).
+
 In the motors' coordinates, the crank angles a (6,), the machine is
 
     H a'' + ... = tau,    H = Jac^-T M Jac^-1,    Jac = d a / d pose,
@@ -16,14 +18,24 @@ A direction in which H has the eigenvalue m follows the setpoint a_r with the er
 a second-order loop with the frequency w sqrt(J / m) and the damping d sqrt(J / m). An unknown
 constant torque b leaves e = b / (J w^2), independent of the model; a motion without its torque
 leaves m a_r'' / (J w^2).
+
+A servo with the stiffness k and the gain k_v has tau = k (u - a) - k_v a'. Its setpoint is held for
+a period. To follow a_r, whose motion takes the torque tau_r with friction and armature, it needs
+
+    u = a_r + (tau_r + k_v a_r') / k,                                             (setpoint)
+
+taken in the middle of the hold: a motion within it deviates from its mean by the second order.
 """
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.holds import cubic
 from stewart_drake.law.nominal import TorqueLimit
@@ -111,6 +123,67 @@ class ServoLoop:
         return min(math.sqrt(4 * d**2 + 4 * ratio) - 2 * d, 4 * d) / self.period
 
 
+@dataclass(frozen=True)
+class PositionServo:
+    """The six servos of a machine, given by their stiffness (core/position_servo.h).
+
+    Attributes:
+        stiffness: k, N m/rad.
+        velocity_gain: k_v, N m s/rad.
+        torque_limit: N m, infinite for none.
+    """
+
+    stiffness: float
+    velocity_gain: float
+    torque_limit: float
+
+    @cached_property
+    def compiled(self) -> Any:
+        """The `stewart_position_servo *`."""
+        numbers = self.stiffness, self.velocity_gain, self.torque_limit
+        return core().ffi.new("stewart_position_servo *", numbers)
+
+    def torques(self, geometry: Array, setpoint: Array, state: Array) -> Array:
+        """Return torques (2, 6) in N m, without and within the limit.
+
+        Args:
+            geometry: numbers of the machine, `mechanism.geometry.geometry_of`.
+            setpoint: (6,) crank angles, rad.
+            state: (12,) pose and rates.
+        """
+        c, found = core(), np.empty((2, NUM_TORQUES))
+        given = map(c.at, (geometry, setpoint, state, found[0], found[1]))
+        c.lib.stewart_position_torque(self.compiled, *given)
+        return found
+
+
+@dataclass(frozen=True)
+class Stiffness:
+    """Servos given by their stiffness, as the controller knows them; their setpoints are held.
+
+    Attributes:
+        stiffness: k, N m/rad.
+        velocity_gain: k_v, N m s/rad.
+        low, high: (6,) range of the setpoints, rad, infinite for none.
+        most: largest change of a setpoint per period, rad, infinite for none.
+    """
+
+    stiffness: float
+    velocity_gain: float
+    low: Array
+    high: Array
+    most: float
+
+    def setpoint(self, angles: Array, rates: Array, torque: Array) -> Array:
+        """Return (setpoint) (6,) in rad, without limits, for angles, rates and torques (6,)."""
+        return np.asarray(angles + (torque + self.velocity_gain * rates) / self.stiffness)
+
+    def limited(self, setpoint: Array, last: Array) -> Array:
+        """Return a setpoint (6,) within range and speed, a period after `last` (6,), rad."""
+        within = np.clip(turned(setpoint, last), self.low, self.high)
+        return np.asarray(last + np.clip(within - last, -self.most, self.most))
+
+
 class Segment(NamedTuple):
     """Motion of the setpoint from its present value to a command.
 
@@ -192,9 +265,17 @@ class ReportLayout:
 
     def written(self, put_out: Array, asked: Array, motors: TorqueLimit) -> Array:
         """Return the report (size,) of torques (n, 6), oldest first, n a multiple of all parts."""
-        means = put_out.reshape(self.periods, self.parts, -1, NUM_TORQUES).mean(axis=2)
+        means = put_out.reshape(self.periods * self.parts, -1, NUM_TORQUES).mean(axis=1)
         at_limit = np.array([motors.reached(part) for part in np.split(put_out, self.periods)])
-        rows = np.column_stack([means.reshape(self.periods, -1), at_limit])
+        return self.of_means(means, np.repeat(at_limit, self.parts), asked)
+
+    def of_means(self, means: Array, at_limit: NDArray[np.bool_], asked: Array) -> Array:
+        """Return the report (size,) of mean torques (n, 6) of all parts, oldest first.
+
+        `at_limit` (n,) is whether a torque was at its limit within a part.
+        """
+        ever = at_limit.reshape(self.periods, self.parts).any(axis=1)
+        rows = np.column_stack([means.reshape(self.periods, -1), ever])
         return np.concatenate([rows.ravel(), asked])
 
     def read(self, report: Array, periods: int) -> Reported | None:

@@ -4,7 +4,7 @@ Open loop: an error of the predicted state grows by e^(p eta) before any torque 
 p the fastest pole.
 
 Closed loop: near the reference, every variant of the law multiplies the error, its integral and the
-torques in flight by a constant matrix K (`law.riccati.law_gain`):
+torques in flight by a constant matrix K (`law.cost.law_gain`):
 
     T_k = -K [e_k; z_k; T_{k-L} ... T_{k-1}] = -K_e [e_k; z_k] - sum_i K_i T_{k-i}.      (law)
 

@@ -170,11 +170,12 @@ class Contact:
         playout: int = 0,
         begin: int = NEVER,
         flags: ControllerFlags = NOTHING,
+        cranks: bool = False,
     ) -> int:
         """Send a datagram of these fields; return its sequence."""
         rows = np.empty((0, NUM_TORQUES)) if torques is None else torques
         head = self.session.head(now())
-        message = ControllerMessage(head, flags, sampled, playout, begin, rows)
+        message = ControllerMessage(head, flags, sampled, playout, begin, rows, cranks=cranks)
         self.endpoint.send(message, self.session.address)
         self._pending[head.sequence] = False
         return head.sequence
@@ -269,18 +270,18 @@ class Contact:
 # ---------------------------------------------------------------- finding a machine
 
 
-def address_of(text: str) -> Address:
-    """Return the address of HOST:PORT.
+def address_of(text: str, option: str = "--machine") -> Address:
+    """Return the address of HOST:PORT, which an option names.
 
     Raises:
         ConfigError: not of this form, or an unknown host.
     """
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise ConfigError(f"--machine: got {text!r}; expected HOST:PORT, such as 127.0.0.1:7000")
+        raise ConfigError(f"{option}: got {text!r}; expected HOST:PORT, such as 127.0.0.1:7000")
     with contextlib.suppress(OSError, UnicodeError):
         return socket.gethostbyname(host), int(port)
-    raise ConfigError(f"--machine: got {text!r}; expected the name or address of a host")
+    raise ConfigError(f"{option}: got {text!r}; expected the name or address of a host")
 
 
 def open_endpoint(address: Address, key: bytes | None) -> Endpoint:

@@ -15,11 +15,14 @@ import numpy as np
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.channel import Packets
 from stewart_drake.law.core_law import serving
+from stewart_drake.law.limited import LimitedLqi
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.live.contact import Link
 from stewart_drake.live.protocol import (
     MOST_HISTORY,
@@ -29,9 +32,10 @@ from stewart_drake.live.protocol import (
 )
 from stewart_drake.loop.law_design import control_law, first_queue
 from stewart_drake.loop.preparation import Experiment, prepare
-from stewart_drake.scenario.config import Scenario
+from stewart_drake.loop.servos import commands_in_flight, servo_law
+from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.dependencies import differing
-from stewart_drake.scenario.link_config import NetworkConfig
+from stewart_drake.scenario.link_config import NetworkConfig, WireConfig
 from stewart_drake.scenario.packets import default_bound
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
@@ -41,8 +45,12 @@ _ROOM: Final = 0.25
 """Allowance for a longer round trip, as a share of the measured jitter."""
 _COMPUTING: Final = 0.01
 """Time for a step of the law and for waking up, s."""
+BUDGET: Final = 0.5
+"""Share of a period after which a plan within limits is late, and the last one goes on."""
 _TRIED: Final = 5
 """Number of steps whose shortest is reported."""
+_PLAN: Final = 16
+"""Number of setpoints of a plan for servos."""
 _LEAST_LOSS: Final = 0.01
 """Smallest assumed loss of packets: the call takes a few seconds only."""
 
@@ -52,31 +60,49 @@ class Design(NamedTuple):
 
     Attributes:
         experiment: experiment of the scenario over the measured link.
-        law: control law.
+        law: control law, `PredictiveLqi` or `ServoPreview`.
         planned: its reference from the scenario's start.
         queue: torques (L, 6) in flight at the begin.
         repeats: number of torques that a packet repeats.
         torque_limit: tighter limit of the scenario and the machine, N m.
         step: time of a step of the law here, s, and the name of its implementation.
+        rows: number of setpoints of a plan for servos.
     """
 
     experiment: Experiment
-    law: PredictiveLqi
+    law: Any
     planned: Trajectory
     queue: Array
     repeats: int
     torque_limit: float
     step: tuple[float, str]
+    rows: int = 1
+
+    @property
+    def cranks(self) -> bool:
+        """Whether setpoints of servos are sent."""
+        return isinstance(self.law, ServoPreview)
+
+    @property
+    def sends(self) -> bool:
+        """Whether plans are sent, to a buffer."""
+        return self.rows > 1 if self.cranks else isinstance(self.law.channel, Packets)
 
 
 def check_controller(scenario: Scenario) -> None:
-    """Refuse a scenario with a tuner or servos.
+    """Refuse a scenario with a tuner, or with servos that need more than a setpoint.
 
     Raises:
         ConfigError: such a scenario.
     """
-    if found := differing(scenario, {"tuner.kind": "fixed", "actuator.kind": "torque"}):
+    accepted = {"tuner.kind": "fixed", "actuator.kind": ("torque", "position_servo")}
+    if found := differing(scenario, accepted):
         raise ConfigError(found.problem("for live"))
+    if scenario.controller.command == "cranks" and scenario.controller.estimate:
+        raise ConfigError(
+            f"controller.estimate: got {scenario.controller.estimate} for live with servos, which "
+            "report no torques; expected []"
+        )
 
 
 def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario:
@@ -111,19 +137,27 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
         dry="hold" if MachineFlags.HOLDS in machine.flags else "zero",
     )
     eta, period = _whole_delay(scenario, network), c.period
+    if c.command == "cranks":
+        _check_delay(eta, longest, period, 0)
+        delay = DelayConfig(steps=round(eta / period))
+        return replace(seen, link=WireConfig(), delay=delay)
     repeats = max(0, min(c.packet_repeats, math.floor((eta - longest) / period + 1e-9)))
-    if eta < longest:
-        raise ConfigError(
-            f"delay.steps: got {eta:g} s from a measurement to its torque; the link takes up to "
-            f"{longest:.3g} s there and back: expected at least --set delay.steps="
-            f"{math.ceil(longest / period) + c.packet_repeats}"
-        )
+    _check_delay(eta, longest, period, c.packet_repeats)
     network = replace(network, playout=round(eta - repeats * period, 9))
     torques = min(c.packet_torques, MOST_ROWS - repeats)
     controller = replace(
         c, delay_steps=None, delay_fraction=None, packet_repeats=repeats, packet_torques=torques
     )
     return replace(seen, link=network, controller=controller)
+
+
+def _check_delay(eta: float, longest: float, period: float, repeats: int) -> None:
+    if eta < longest:
+        raise ConfigError(
+            f"delay.steps: got {eta:g} s from a measurement to its torque; the link takes up to "
+            f"{longest:.3g} s there and back: expected at least --set delay.steps="
+            f"{math.ceil(longest / period) + repeats}"
+        )
 
 
 def _whole_delay(scenario: Scenario, found: NetworkConfig) -> float:
@@ -142,14 +176,38 @@ def design(scenario: Scenario, machine: MachineMessage) -> Design:
     Raises:
         ConfigError: see `loop.preparation.prepare` and `control_law`.
     """
+    if scenario.controller.learned is not None:
+        raise ConfigError(
+            "controller.learned: got a file; expected null: live has no fixed time of the motion"
+        )
     experiment = prepare(scenario)
+    if scenario.controller.command == "cranks":
+        return _of_cranks(experiment, machine)
     law, planned, _ = control_law(experiment)
     limit = min(law.plant.motors.limit, machine.torque_limit)
     law = replace(law, plant=replace(law.plant, motors=TorqueLimit(limit)))
+    if isinstance(law, LimitedLqi):
+        law = replace(law, limits=replace(law.limits, budget=BUDGET * scenario.controller.period))
     repeats = scenario.controller.packet_repeats if scenario.link.kind == "network" else 0
     queue = first_queue(experiment, law)
     assert law.kept < MOST_HISTORY
     return Design(experiment, law, planned, queue, repeats, limit, _step_time(law, planned, queue))
+
+
+def _of_cranks(experiment: Experiment, machine: MachineMessage) -> Design:
+    """Return the law for servos; its queue is the command (18,) before the first sample."""
+    law, planned, _ = servo_law(experiment)
+    limit = min(experiment.torque_limit, machine.torque_limit)
+    first, _ = commands_in_flight(experiment, law, experiment.scenario.true_delay)
+    served, backend = serving(law)
+    motion, report = KnownMotion(planned, planned, 0.0), np.full(law.reports.size, np.nan)
+    measured = Measurement.of(law.sensing.seen(evaluate(planned, 0.0)[:NUM_STATE]))
+    rows = 1 if MachineFlags.WIRE in machine.flags else _PLAN
+    memory, started = served.initial_memory(first), clock.thread_time()
+    for _ in range(rows):
+        memory = served.step(memory, measured, motion, report)
+    step = clock.thread_time() - started, backend
+    return Design(experiment, law, planned, first, 0, limit, step, rows)
 
 
 def _step_time(law: PredictiveLqi, motion: Trajectory, queue: Array) -> tuple[float, str]:

@@ -17,18 +17,23 @@ under g + k (target - g) keeps to the limits (scalar reference governor; Garone,
 Kolmanovsky, "Reference and command governors for systems with constraints", Automatica 75, 2017).
 k = 0 is the future that was checked before, so that a solution always exists: the plate stays
 within the limits and can come to rest at g at any time.
+
+A step takes torque in proportion to w^2. At each period w is therefore the fastest pace whose whole
+future keeps to the torque limit. A slower w than before makes a moving plate stop later, possibly
+beyond g, so that it is taken only if it makes no rate change its sign.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
 from typing import Final, NamedTuple
 
 import numpy as np
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.dynamics.workspace import PITCH_LIMIT, home_sign, margin, measures_at
+from stewart_drake.dynamics.workspace import PITCH_LIMIT, home_sign, margins, measures_at
+from stewart_drake.law.catch_up import Model
 from stewart_drake.law.motion import between
 from stewart_drake.law.startup import sizes
 from stewart_drake.scenario.signals import (
@@ -43,7 +48,11 @@ from stewart_drake.scenario.trajectories import evaluate, through_states
 from stewart_drake.types import Array
 
 PACE: Final = 4.0
-"""Pole w, 1/s: a step is complete to 5 % after 6.3 / w = 1.6 s."""
+"""Slowest pole w, 1/s: a step is 3 / w = 0.75 s late, and complete to 5 % after 6.3 / w = 1.6 s."""
+FASTEST: Final = 10.0
+"""Fastest pole w, 1/s: 0.3 s and 0.63 s."""
+_PACES: Final = 5
+"""Number of paces that are tried."""
 LEAST_MARGIN: Final = 0.05
 """Smallest workspace margin (`dynamics.workspace.margin`) of a motion by hand."""
 TORQUE_SHARE: Final = 0.8
@@ -56,6 +65,12 @@ _SETTLED: Final = 18.0
 """w t after which 2e-6 of a step are left."""
 _FINE, _COARSE, _UNTIL = 0.1, 0.5, 6.0
 """Steps of w t at which the future is checked, before and after `_UNTIL`."""
+_PHASES: Final = np.concatenate(
+    [np.arange(_FINE, _UNTIL, _FINE), np.arange(_UNTIL, _SETTLED, _COARSE)]
+)
+"""w t at which the future is checked."""
+_STILL: Final = 1e-9
+"""Rate without a sign, rad/s and m/s."""
 _RESOLUTION: Final = 2e-4
 """Accuracy of the applied target, rad and shares of the reach."""
 _FARTHEST: Final = 4.0
@@ -90,6 +105,25 @@ def response(state: Array, applied: Array, pace: float, times: Array) -> Array:
     return out
 
 
+def stop_pose(state: Array, pace: float) -> Array:
+    """Return the target (6,) at which a motion (18,) stops soonest without turning back.
+
+    The rates are [v + (a + w v) t - w c2 t^2] exp(-w t). With c2 = 0 they keep their sign if
+    a + w v has the sign of v; otherwise they do with -4 w c2 v = (a + w v)^2.
+    """
+    q, v, a = state[POSE], state[RATES], state[ACCELERATIONS]
+    slope, c2 = a + pace * v, np.zeros(NUM_COORDINATES)
+    back = slope * v < 0
+    c2[back] = -(slope[back] ** 2) / (4 * pace * v[back])
+    return q - (2 * c2 - a - 2 * pace * v) / pace**2
+
+
+def _turns(states: Array) -> Array:
+    """Return how often each rate of successive states (n, 18) changes its sign, (6,)."""
+    signs = [np.sign(v[np.abs(v) > _STILL]) for v in states[:, RATES].T]
+    return np.array([np.count_nonzero(np.diff(sign)) for sign in signs])
+
+
 class GovernorState(NamedTuple):
     """State of a governor at the beginning of a period.
 
@@ -98,12 +132,14 @@ class GovernorState(NamedTuple):
         applied: applied target g (6,), at which the reference comes to rest.
         limit: limit that keeps g from the target, in words, or None.
         turn: coordinate that moves alone next if all together cannot.
+        pace: pole w, 1/s.
     """
 
     state: Array
     applied: Array
     limit: str | None = None
     turn: int = 0
+    pace: float = PACE
 
 
 class Blend(NamedTuple):
@@ -125,17 +161,23 @@ class Governor:
     Attributes:
         dynamics: nominal dynamics.
         torque_limit: limit of each motor, N m, of which TORQUE_SHARE is used.
-        pace: pole w, 1/s.
+        fastest: fastest pole w, 1/s. Without a torque limit it is PACE.
     """
 
     dynamics: StewartDynamics
     torque_limit: float = np.inf
-    pace: float = PACE
+    fastest: float = FASTEST
 
     @cached_property
-    def _times(self) -> Array:
-        fine = np.arange(_FINE, _UNTIL, _FINE)
-        return np.concatenate([fine, np.arange(_UNTIL, _SETTLED, _COARSE)]) / self.pace
+    def paces(self) -> tuple[float, ...]:
+        """Possible poles w, fastest first, 1/s."""
+        if np.isinf(self.torque_limit) or self.fastest <= PACE:
+            return (PACE,)
+        return tuple(np.geomspace(self.fastest, PACE, _PACES).tolist())
+
+    @cached_property
+    def _model(self) -> Model:
+        return Model(self.dynamics)
 
     @cached_property
     def _size(self) -> Array:
@@ -146,103 +188,110 @@ class Governor:
         if self._within(states):
             return None
         mechanism = self.dynamics.mechanism
-        margins = [margin(mechanism, state[POSE]) for state in states]
-        if min(margins) >= LEAST_MARGIN + _GUARD:
+        found = margins(mechanism, states[:, POSE])
+        if found.min() >= LEAST_MARGIN + _GUARD:
             return self._torque_problem(states)
-        found, sign = (
-            measures_at(mechanism, states[int(np.argmin(margins)), POSE]),
-            home_sign(mechanism),
-        )
-        leg = int(found.sines.argmin())
+        worst = measures_at(mechanism, states[int(np.argmin(found)), POSE])
+        leg = int(worst.sines.argmin())
         limits = {
-            f"leg {LEGS[leg]} comes to the end of its reach": found.sines[leg],
-            "the pitch comes near 90 degrees": PITCH_LIMIT - abs(found.pitch),
-            "the cranks would hardly hold the plate there": sign * found.parallel,
+            f"leg {LEGS[leg]} comes to the end of its reach": worst.sines[leg],
+            "the pitch comes near 90 degrees": PITCH_LIMIT - abs(worst.pitch),
+            "the cranks would hardly hold the plate there": home_sign(mechanism) * worst.parallel,
         }
         return min(limits, key=lambda limit: limits[limit])
 
     def _within(self, states: Array) -> bool:
-        """Return whether `problem` finds none; tries the end and every eighth state first."""
-        mechanism, least = self.dynamics.mechanism, LEAST_MARGIN + _GUARD
-        ordered = chain(states[::-8], states[::-1])
-        inside = all(margin(mechanism, state[POSE]) >= least for state in ordered)
-        return inside and self._torque_problem(states) is None
+        """Return whether `problem` finds none."""
+        found = margins(self.dynamics.mechanism, states[:, POSE])
+        return found.min() >= LEAST_MARGIN + _GUARD and self._torque_problem(states) is None
 
     def _torque_problem(self, states: Array) -> str | None:
         limit = TORQUE_SHARE * self.torque_limit
         if np.isinf(limit):
             return None
-        torques = np.abs(
-            [self.dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS]) for x in states]
-        ).max(axis=0)
+        torques = np.abs(self._model.torques(states)).max(axis=0)
         motor = int(np.argmax(torques))
         if torques[motor] <= _TORQUE_GUARD * limit:
             return None
         return f"motor {LEGS[motor]} would take {torques[motor]:.3g} N m of {limit:.3g}"
 
-    def future(self, state: Array, applied: Array) -> Array:
-        """Return the checked states (n, 18) from a state (18,) to rest at g (6,)."""
-        return response(state, applied, self.pace, self._times)
+    def future(self, state: Array, applied: Array, pace: float) -> Array:
+        """Return the checked states (n, 18) from a state (18,) to rest at g (6,), w in 1/s."""
+        return response(state, applied, pace, _PHASES / pace)
 
     def follow(self, governed: GovernorState, target: Array) -> GovernorState:
-        """Move g towards a target (6,) as far as the limits allow; the reference stays."""
+        """Move g towards a target (6,) as far and as fast as the limits allow.
+
+        Pose, rates and accelerations stay.
+        """
         # Unclipped, a huge target would take a bisection per factor of two, and overflow.
         reach, home = _FARTHEST * self._size, self.dynamics.mechanism.home
         target = np.clip(target, home - reach, home + reach)
         step = target - governed.applied
-        limit = None
-        if np.abs(step / self._size).max() > _REACHED:
-            limit = self.problem(self.future(governed.state, target))
-        if limit is None:
-            return governed._replace(applied=np.array(target), limit=None)
+        if np.abs(step / self._size).max() <= _REACHED:
+            return governed._replace(applied=target, limit=None)
+        there = governed._replace(applied=target)
+        pace = next(self._possible(there, self.paces), None)
+        if pace is not None:
+            return there._replace(limit=None, pace=pace)
+        # The slowest pace leaves the most torque for the share of the step.
+        governed = governed._replace(
+            pace=next(self._possible(governed, self.paces[::-1]), governed.pace)
+        )
+        limit = self.problem(self.future(governed.state, target, governed.pace))
         share = self._share(governed, step)
         if share == 0:  # try one coordinate alone, another one each time
             alone = np.zeros(NUM_COORDINATES)
             alone[governed.turn] = step[governed.turn]
             step, share = alone, self._share(governed, alone)
             governed = governed._replace(turn=(governed.turn + 1) % NUM_COORDINATES)
-        return governed._replace(applied=governed.applied + share * step, limit=limit)
+        moved = governed._replace(applied=governed.applied + share * step, limit=limit)
+        return moved._replace(pace=next(self._possible(moved, self.paces), moved.pace))
+
+    def _possible(self, governed: GovernorState, paces: Sequence[float]) -> Iterator[float]:
+        """Yield those of some paces that keep to the limits on the way to g.
+
+        A slower one than the present one is left out if it makes a rate change its sign.
+        """
+        turns = _turns(self.future(*governed[:2], governed.pace))
+        for pace in paces:
+            states = self.future(*governed[:2], pace)
+            no_more = pace >= governed.pace or np.all(_turns(states) <= turns)
+            if no_more and self._within(states):
+                yield pace
 
     def _share(self, governed: GovernorState, step: Array) -> float:
         low, high, size = 0.0, 1.0, np.abs(step / self._size).max()
         while (high - low) * size > _RESOLUTION:
             middle = (low + high) / 2
-            future = self.future(governed.state, governed.applied + middle * step)
+            applied = governed.applied + middle * step
+            future = self.future(governed.state, applied, governed.pace)
             low, high = (middle, high) if self._within(future) else (low, middle)
         return low
 
     def after(self, governed: GovernorState, time: float) -> GovernorState:
         """Advance the reference by `time` s."""
-        state = response(governed.state, governed.applied, self.pace, np.array([time]))[0]
-        return governed._replace(state=state)
-
-    def stop_pose(self, state: Array) -> Array:
-        """Return the target (6,) at which a motion (18,) stops soonest without turning back.
-
-        The rates are [v + (a + w v) t - w c2 t^2] exp(-w t). With c2 = 0 they keep their sign if
-        a + w v has the sign of v; otherwise they do with -4 w c2 v = (a + w v)^2.
-        """
-        q, v, a = state[POSE], state[RATES], state[ACCELERATIONS]
-        w, slope = self.pace, a + self.pace * v
-        c2 = np.zeros(NUM_COORDINATES)
-        back = slope * v < 0
-        c2[back] = -(slope[back] ** 2) / (4 * w * v[back])
-        return q - (2 * c2 - a - 2 * w * v) / w**2
+        way = response(governed.state, governed.applied, governed.pace, np.array([time]))
+        return governed._replace(state=way[0])
 
     def begin(self, state: Array) -> GovernorState | str:
         """Return a governor that stops a motion (18,), or the limit that prevents it.
 
-        Tries to stop at once, then at poses nearer and nearer to home.
+        Tries to stop at the slowest pace, then faster, then at poses nearer and nearer to home.
         """
-        stop, home = self.stop_pose(state), self.dynamics.mechanism.home
-        first = self.problem(self.future(state, stop))
-        if first is None:
-            return GovernorState(state, stop)
+        stops = [
+            GovernorState(state, stop_pose(state, pace), pace=pace) for pace in self.paces[::-1]
+        ]
+        for stop in stops:
+            if self._within(self.future(*stop[:2], stop.pace)):
+                return stop
+        slowest, home = stops[0], self.dynamics.mechanism.home
+        limit = self.problem(self.future(*slowest[:2], slowest.pace)) or ""
         for share in (0.1, 0.25, 0.5, 0.75, 1.0):
-            applied = stop + share * (home - stop)
-            if self._within(self.future(state, applied)):
-                return GovernorState(state, applied, first)
-        return first
+            applied = slowest.applied + share * (home - slowest.applied)
+            if self._within(self.future(state, applied, slowest.pace)):
+                return slowest._replace(applied=applied, limit=limit)
+        return limit
 
     def onto(self, state: Array, time: float, motion: Trajectory) -> Blend | str:
         """Return the shortest blend from a state (18,) at `time` s onto a motion within the limits.

@@ -9,9 +9,6 @@ process is killed. An error, such as a full disk, is reported once; the run goes
 
 import math
 import os
-import queue
-import tempfile
-import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
@@ -24,8 +21,8 @@ from stewart_drake.law.measurement import Measurement
 from stewart_drake.loop.controller import held_by
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.recording import Record, Table
-from stewart_drake.reporting.csv_file import headings
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.run_log import Background, CsvFile, RunLog, channels_of, csv_heads
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, TUNER_INPUTS, ports_of
 from stewart_drake.types import Array
 
@@ -35,12 +32,10 @@ _LATEST: Final = 0.5
 """Longest wait, s."""
 _KEPT: Final = 96
 """Number of periods whose applied torques are kept."""
-_QUEUE: Final = 4096
-"""Largest number of rows that wait for the disk."""
 
 
 class RowFile:
-    """A CSV file of rows of numbers, which read back exactly; empty cells are not finite.
+    """A CSV file of rows of numbers that a thread writes, to be read back at the end.
 
     Args:
         path: file, which is replaced; None for a temporary one.
@@ -54,71 +49,29 @@ class RowFile:
     def __init__(
         self, path: Path | None, header: Sequence[str], say: Callable[[str], None]
     ) -> None:
-        self._name, self._width, self._say = str(path or "the log"), len(header), say
-        flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
+        name, self._width = str(path or "the log"), len(header)
         try:
-            if path is None:
-                with tempfile.TemporaryFile() as file:
-                    self._file = os.dup(file.fileno())
-            else:
-                self._file = os.open(path, flags, 0o666)
+            file = CsvFile(path, header)
+            self._written = os.dup(file.descriptor)
         except OSError as error:
             raise ConfigError(
-                f"{self._name}: cannot be written ({error.strerror}); expected room for a log"
+                f"{name}: cannot be written ({error.strerror}); expected room for a log"
             ) from None
-        self._whole, self._failed = 0, False
-        self._write(",".join(header) + "\n")
-        self._start = self._whole
-        self._rows: queue.Queue[Array | None] = queue.Queue(_QUEUE)
-        self._writer = threading.Thread(target=self._work, daemon=True)
+        self._log = Background(file, name, say)
 
     def append(self, row: Array) -> None:
         """Add a row (columns,), without waiting."""
-        if not self._writer.is_alive():
-            # Started here it has the priority of the loop, which waits for the GIL.
-            self._writer.start()
-        try:
-            self._rows.put_nowait(row)
-        except queue.Full:
-            self._fail("the disk is too slow")
+        self._log.write(row.tolist())
 
     def close(self) -> Array:
         """Write the waiting rows and close the file; return all rows (n, columns)."""
-        if self._writer.is_alive():
-            self._rows.put(None)
-            self._writer.join()
-        try:
-            os.lseek(self._file, self._start, os.SEEK_SET)
-            with os.fdopen(self._file, encoding="ascii") as file:
-                cells = (line.split(",") for line in file)
-                rows = [np.array([float(cell.strip() or "nan") for cell in row]) for row in cells]
-        except OSError as error:
-            self._fail(str(error.strerror))
-            rows = []
+        self._log.close()
+        os.lseek(self._written, 0, os.SEEK_SET)
+        with os.fdopen(self._written, encoding="ascii") as file:
+            next(file)
+            cells = (line.split(",") for line in file)
+            rows = [np.array([float(cell.strip() or "nan") for cell in row]) for row in cells]
         return np.array(rows).reshape(-1, self._width)
-
-    def _work(self) -> None:
-        while (row := self._rows.get()) is not None:
-            if not self._failed:
-                cells = (repr(x) if math.isfinite(x) else "" for x in row.tolist())
-                self._write(",".join(cells) + "\n")
-
-    def _write(self, text: str) -> None:
-        """Write a line, or leave the file as it was."""
-        data = text.encode("ascii")
-        try:
-            done = 0
-            while done < len(data):
-                done += os.write(self._file, data[done:])
-            self._whole += done
-        except OSError as error:
-            os.ftruncate(self._file, self._whole)
-            self._fail(str(error.strerror))
-
-    def _fail(self, reason: str) -> None:
-        if not self._failed:
-            self._failed = True
-            self._say(f"{self._name}: {reason}; the run goes on, the file ends here")
 
 
 class LiveRecord(Record):
@@ -132,6 +85,7 @@ class LiveRecord(Record):
         limit: torque limit, N m.
         path: file; None for a temporary one.
         say: prints a line.
+        logs: further logs, with the same rows.
 
     Attributes:
         applied: reported torques (6,), N m, by the period that they began in.
@@ -144,8 +98,9 @@ class LiveRecord(Record):
         limit: float,
         path: Path | None,
         say: Callable[[str], None],
+        logs: Sequence[RunLog] = (),
     ) -> None:
-        super().__init__(experiment)
+        super().__init__(experiment, logs)
         self._held = held_by(experiment.nominal)
         self._period, self._limit = experiment.scenario.controller.period, limit
         self._waits = max(1, min(_WAITS, round(_LATEST / self._period)))
@@ -157,11 +112,7 @@ class LiveRecord(Record):
         self.applied: dict[int, Array] = {}
         self.latest: Array = np.zeros(NUM_TORQUES)
         self._acts: Array = np.full(NUM_TORQUES, np.nan)
-        header = ["time[s]"]
-        for signal in self._recorded:
-            dimension = signal.quantity.dimension
-            labels = () if dimension is None else self._dimensions[dimension].labels
-            header += headings(signal.name, labels, signal.quantity.units)
+        header = csv_heads(channels_of(experiment.scenario.sensor.samples))
         self._file = RowFile(path, [*header, "step[s]", "late[s]"], say)
 
     def acted(self, torques: dict[int, Array]) -> None:
@@ -254,6 +205,7 @@ class LiveRecord(Record):
         row["torque_applied"] = self._acts
         parts = [row[signal.exported][signal.part] for signal in self._recorded]
         self._file.append(np.concatenate([[number * self._period], *parts, row["step"]]))
+        self.mirror(number * self._period, row)
 
 
 _HELD: Final = tuple(ports_of("controller").values())

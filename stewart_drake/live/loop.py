@@ -9,7 +9,8 @@ the same, one after the other, until the loop has caught up.
 
 import math
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -17,7 +18,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from stewart_drake.dynamics.workspace import Failure, diagnose
-from stewart_drake.law.channel import Packets, Report, Wire
+from stewart_drake.law.belief import Belief
+from stewart_drake.law.channel import Report
 from stewart_drake.law.core_law import AnyMemory, serving
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.timeline import Timeline, TorqueSchedule
@@ -35,12 +37,24 @@ from stewart_drake.live.protocol import (
     MachineMessage,
     Refusal,
 )
-from stewart_drake.live.steering import Request, Steering
+from stewart_drake.live.steering import Request, Steering, Way
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.peer import Fault
 from stewart_drake.loop.recording import has_measured
-from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, PACKETS, POSE, RATES
-from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.mechanism.kinematics import UnreachablePoseError
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.run_log import RunLog
+from stewart_drake.scenario.signals import (
+    ACCELERATIONS,
+    MODEL_TORQUE,
+    NUM_REFERENCE,
+    NUM_STATE,
+    NUM_TORQUES,
+    PACKETS,
+    POSE,
+    RATES,
+)
+from stewart_drake.scenario.trajectories import catch_up, evaluate
 from stewart_drake.types import Array
 
 REPLAN_ERROR: Final = 0.08
@@ -67,6 +81,20 @@ _FURTHEST: Final = 4096
 """Largest number of samples by which a measurement may be ahead of the next one."""
 _KEPT: Final = 64
 """Number of past samples whose messages are kept."""
+_SOFT_STARTS: Final = (1.0, 2.0, 4.0, 8.0)
+"""Durations of a path from elsewhere onto the reference, s, tried in this order."""
+
+
+_ADVICE: Final = {
+    "left_workspace": "Bring the plate back to its start and start live again. With --out the log "
+    "shows the loss: stewart-drake replay LOG, stewart-drake identify LOG.",
+    "lost_contact": "Check the sensor and its connection: datagrams arrive, usable measurements do "
+    "not. --max-missing allows longer gaps.",
+    "lost_machine": "Check the machine's process and the network, then start live again. The "
+    "machine goes to its safe torque by itself.",
+    "refused": "Correct what is named, then start live again.",
+}
+"""What to do after a run, by its status."""
 
 
 class End(NamedTuple):
@@ -80,6 +108,11 @@ class End(NamedTuple):
         """Status and failure in words."""
         status = self.status.replace("_", " ")
         return status if self.stopped is None else f"{status}: {self.stopped}"
+
+    @property
+    def advice(self) -> str:
+        """What to do next; empty after a run that was not lost."""
+        return _ADVICE.get(self.status, "")
 
 
 class Snapshot(NamedTuple):
@@ -130,7 +163,7 @@ class Viewer:
         """Return whether an immediate stop is requested."""
         return False
 
-    def ended(self, words: str) -> None:
+    def ended(self, end: End) -> None:
         """Show how the run ended; the last call."""
 
 
@@ -183,6 +216,7 @@ class LiveLoop:
         max_missing: longest gap of usable measurements, s. By default as long as the estimator's
             uncertainty allows (`live.checks`).
         log: CSV file of the record, written as the run goes on; a temporary one by default.
+        logs: further logs of the same rows.
 
     Attributes:
         record: record of the run.
@@ -201,12 +235,14 @@ class LiveLoop:
         say: Callable[[str], None],
         max_missing: float | None = None,
         log: Path | None = None,
+        logs: Sequence[RunLog] = (),
     ) -> None:
         self._design, self._steering, self._contact = design, steering, contact
         self._viewer, self._say, self._max_missing = viewer, say, max_missing
         self._law: Any
         self._law = serving(design.law).law
-        self.record = LiveRecord(design.experiment, design.torque_limit, log, say)
+        self._limit = design.torque_limit
+        self.record = LiveRecord(design.experiment, design.torque_limit, log, say, logs)
         self.timing = Timing()
         self.memory: AnyMemory = self._law.initial_memory(design.queue)
         self.recoveries, self.taken_over = 0, False
@@ -214,16 +250,21 @@ class LiveLoop:
         c = design.experiment.scenario.controller
         self._period, self._weights = c.period, np.array([c.w_Q, c.w_R])
         self._size = 2 * design.experiment.motion_scale
-        self._sends = isinstance(design.law.channel, Packets)
-        # Of the next torque alone: the planned ones after it may still change.
-        self._horizon = float(replace(design.law, channel=Wire()).preview_times.max())
+        self._sends = design.sends
+        self._horizon = self._ahead()
         self._began, self._came = 0, dict[int, MachineMessage]()
         self._sequences = dict[int, int]()
         self._flags, self._silent_since = MachineFlags(0), 0
         self._asked, self._recording = NOTHING, True
         self._parked = self._leads = self._stalled = False
         self._safe: str | None = None
-        self._check = ReportCheck(design.torque_limit)
+        self._check = ReportCheck(self._limit)
+
+    def _ahead(self) -> float:
+        """Return how far ahead of a sample the reference is fixed, s."""
+        # The next torque needs the reference up to the end of the hold after its own. Later torques
+        # may still change. Within a hold the reference has no jump of its third derivative.
+        return float(self._design.law.timeline.holds(0, 2)[-1])
 
     # -------------------------------------------------------------- begin
 
@@ -300,7 +341,7 @@ class LiveLoop:
         except KeyboardInterrupt:
             end = self._end("interrupted", k, "stopped")
         self.stop()
-        self._viewer.ended(end.words)
+        self._viewer.ended(end)
         return end
 
     def _end(self, status: str, k: int, reason: str, leg: int | None = None) -> End:
@@ -401,8 +442,7 @@ class LiveLoop:
             problem = self._check.problem(acted) if self._sends else None
             if problem is not None:
                 return self._end("refused", k, problem)
-            self.record.acted(acted)
-            report = self._report(k)
+            report = self._heard(k, acted)
         if not self._leads:
             if not measurement.complete and not self._parked:  # the pose is unknown
                 self._contact.send(begin=self._began, flags=self._asked)
@@ -416,15 +456,10 @@ class LiveLoop:
         self._steering = self._steering.on(t + self._horizon, request)
         way = self._steering.way
         started = clock.perf_counter()
-        self.memory = self._law.step(
-            self.memory,
-            measurement,
-            lambda times: np.array([way.at(t + ahead) for ahead in times]),
-            self._weights,
-            report if self._sends else None,
-        )
+        self.memory = self._stepped(t, measurement, report if self._sends else None)
+        packet, first = self._packet(k)
         seconds = clock.perf_counter() - started
-        self._send(k)
+        self._send(k, packet, first)
         self._note_timing(k)
         wanted = way.at(t)
         if self._recording:
@@ -474,11 +509,22 @@ class LiveLoop:
     def _by_hand(self) -> bool:
         return self._steering.governed is not None
 
-    def _send(self, k: int) -> None:
-        packet = self.memory.in_flight[-1:]
-        first = k
+    def _stepped(self, t: float, measurement: Measurement, report: Report | None) -> Any:
+        """Return the memory after the law's step at t in s."""
+        way = self._steering.way
+
+        def ahead(times: Array) -> Array:
+            return np.array([way.at(t + one) for one in times])
+
+        return self._law.step(self.memory, measurement, ahead, self._weights, report)
+
+    def _packet(self, k: int) -> tuple[Array, int]:
+        """Return the rows (n, 6) to send, and the sample that the first one is of."""
         if self._sends:
-            packet, first = self.memory.sent.packets[-1], k - self._design.repeats
+            return self.memory.sent.packets[-1], k - self._design.repeats
+        return self.memory.in_flight[-1:], k
+
+    def _send(self, k: int, packet: Array, first: int) -> None:
         P = round(self._period * SECOND)
         eta = round(self.memory.belief.timeline.eta * SECOND)
         self._sequences[k] = self._contact.send(
@@ -487,6 +533,7 @@ class LiveLoop:
             playout=self._began + first * P + eta,
             begin=self._began,
             flags=self._asked,
+            cranks=self._design.cranks,
         )
         self._sequences.pop(k - 2 * _KEPT, None)
         timeline = self._design.law.timeline
@@ -510,18 +557,19 @@ class LiveLoop:
         newest = round((message.acted_from - message.begin - fraction) / P)
         return {newest - i: torque for i, torque in enumerate(message.acted)}
 
-    def _report(self, k: int) -> Report:
-        """Return the report on packets and torques for the law."""
+    def _heard(self, k: int, acted: dict[int, Array]) -> Report | None:
+        """Record the torques that have acted, and return the report on them for the law."""
+        self.record.acted(acted)
         number = reported(self._design.law.kept)
         packets = [self._sequences.get(k - 1 - i) for i in range(number)]
         arrived = np.array([n is not None and self._contact.has_arrived(n) for n in packets])
-        acted = list[Array]()
+        rows = list[Array]()
         for i in range(number):
             torque = self.record.applied.get(k - 1 - i)
             if torque is None:
                 break
-            acted.append(torque)
-        return Report(arrived, np.array(acted).reshape(-1, NUM_TORQUES))
+            rows.append(torque)
+        return Report(arrived, np.array(rows).reshape(-1, NUM_TORQUES))
 
     def _packets(self, k: int, message: MachineMessage | None) -> Array:
         """Return the counts of `scenario.signals.PACKETS`; only the machine knows the late ones."""
@@ -574,7 +622,7 @@ class LiveLoop:
         )
         t = k * self._period
         ahead = law.plant.predict(belief.state, schedule, belief.parameters)[-1]
-        wanted = self._steering.way.at(t + belief.timeline.eta + self._period)[:NUM_STATE]
+        wanted = self._held_state(t, in_flight[-1], belief)
         away = np.abs(ahead - wanted) / np.tile(self._size, 2)
         if not away.max() > REPLAN_ERROR:  # or NaN
             return
@@ -583,6 +631,22 @@ class LiveLoop:
             return  # tried again at the next sample
         self._steering, self.memory = steering, self.memory.without_error()
         self.recoveries += 1
+
+    def _held_state(self, t: float, torque: Array, belief: Belief) -> Array:
+        """Return the state (12,) that the reference asks for at the end of the next torque's hold.
+
+        Held torques meet the poses there. The rates differ by equation (rates) of `law.holds`.
+        """
+        law, way, timeline = self._design.law, self._steering.way, belief.timeline
+        end = t + timeline.eta + self._period
+        wanted = way.at(end)[:NUM_STATE].copy()
+        nodes = [way.at(t + node) for node in law.feedforward.nodes(timeline, 0)]
+        dynamics = law.plant.dynamics
+        changes = law.feedforward.held(np.array(nodes), dynamics, belief.parameters).changes
+        with suppress(ArithmeticError, np.linalg.LinAlgError):
+            B = law.model.at(wanted, torque, belief.parameters, law.plant).B[RATES]
+            wanted += law.feedforward.offset(changes[1:], B, replace(timeline, delay=Delay(1)))
+        return wanted
 
     def _replanned(
         self, t: float, state: Array, schedule: TorqueSchedule, parameters: Array | None
@@ -627,6 +691,80 @@ class LiveLoop:
             by_hand=self._by_hand,
             limit=self._steering.limit,
         )
+
+
+class CrankLoop(LiveLoop):
+    """Runs the law for servos given by their stiffness, which sends plans of setpoints.
+
+    Row i of a plan is the setpoint that the plan of i samples later will begin with.
+    """
+
+    def __init__(self, design: Design, *args: Any, **kwargs: Any) -> None:
+        super().__init__(design, *args, **kwargs)
+        self._servos: Any = design.law
+        self.memory: Any
+        self._check = ReportCheck(math.inf)
+        self._no_report = np.full(self._servos.reports.size, np.nan)
+
+    def _ahead(self) -> float:
+        return float(self._design.law.preview_times.max())
+
+    def _heard(self, k: int, acted: dict[int, Array]) -> None:
+        self.record.latest = self.memory.command[MODEL_TORQUE]  # the servos' own is not known
+
+    def _stepped(self, t: float, measurement: Measurement, report: Report | None) -> Any:
+        wanted = self._steering.way.at(t + self._horizon)[None]
+        return self._law.step(self.memory, measurement, lambda times: wanted, self._no_report)
+
+    def _packet(self, k: int) -> tuple[Array, int]:
+        law, command, t = self._servos, self.memory.command, k * self._period + self._horizon
+        rows = [command[POSE]]
+        for i in range(1, self._design.rows):
+            wanted = self._steering.way.at(t + i * self._period)
+            try:
+                further = law.command(wanted, self.memory.belief.parameters)[POSE]
+            except UnreachablePoseError:
+                break  # the plan ends before
+            rows.append(law.servo.limited(further, rows[-1]))
+        return np.array(rows), k
+
+    def _start(
+        self, t: float, measurement: Measurement, message: MachineMessage | None
+    ) -> str | None:
+        first = self._servos.sensing.start(measurement) if measurement.complete else None
+        if first is None:
+            return None
+        pose = first.state[POSE]
+        away = np.abs(pose - self._design.experiment.start[POSE]) / self._size
+        if away.max() <= START_ERROR:
+            return None
+        begun = np.concatenate([pose, np.zeros(NUM_REFERENCE - len(pose))])
+        begins, motion, rest = t + self._horizon, self._steering.motion, np.zeros(len(pose))
+        for duration in _SOFT_STARTS:
+            way = Way.along(catch_up(pose, rest, motion, begins, duration))
+            if self._keeps_limits(way, begins, duration):
+                self.taken_over = True
+                command = self._servos.command(begun, self._servos.plant.dynamics.parameters)
+                self.memory = self._law.initial_memory(command)
+                self._steering = replace(self._steering, way=way)
+                self._say("the plate is not where the scenario begins: it is led there first")
+                return None
+        return "no motion of up to 8 s from the present pose to the reference keeps the limits"
+
+    def _keeps_limits(self, way: Way, begins: float, duration: float) -> bool:
+        """Return whether the start of a way is within reach and torque."""
+        plant = self._servos.plant
+        for t in np.arange(begins, begins + duration, self._period):
+            x = way.at(t)
+            if diagnose(plant.mechanism, t, x[POSE]):
+                return False
+            torque = plant.dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
+            if np.abs(torque).max() > self._limit:
+                return False
+        return True
+
+    def _recover(self, k: int) -> None:
+        """Do nothing: servos follow the reference by themselves."""
 
 
 def _until_next(timeline: Timeline, flying: Array) -> TorqueSchedule:

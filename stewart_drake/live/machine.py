@@ -7,6 +7,7 @@ The only wait is in `select`.
 """
 
 import heapq
+import math
 import select
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -33,12 +34,22 @@ from stewart_drake.live.protocol import (
     MachineMessage,
     Refusal,
 )
-from stewart_drake.live.simulated import Body, MeasurementFields, Motors, Plan, body_of, link_times
+from stewart_drake.live.simulated import (
+    Body,
+    MeasurementFields,
+    Motors,
+    Plan,
+    body_of,
+    first_rows,
+    link_times,
+)
 from stewart_drake.loop.peer import FAULTS, Fault, Reason, identity_of, in_words
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing
-from stewart_drake.scenario.signals import NUM_TORQUES
+from stewart_drake.scenario.run_log import Background, RunLog, open_log
+from stewart_drake.scenario.signals import NUM_TORQUES, POSE, RATES
+from stewart_drake.types import Array
 
 RECENT: Final = 10 * SECOND
 """Time for which a past fault counts as preceding the next one, ns."""
@@ -52,9 +63,9 @@ def check_scenario(scenario: Scenario) -> None:
     """Refuse a scenario that the protocol does not cover.
 
     Raises:
-        ConfigError: servos, or too many samples of encoders.
+        ConfigError: servos given by their bandwidth, or too many samples of encoders.
     """
-    if found := differing(scenario, {"actuator.kind": "torque"}):
+    if found := differing(scenario, {"actuator.kind": ("torque", "position_servo")}):
         raise ConfigError(found.problem("for a machine", ", which a controller sends"))
     samples = scenario.sensor.samples
     if samples is not None and samples > MOST_SAMPLES:
@@ -76,10 +87,15 @@ def open_machine(
     check_scenario(scenario)
     experiment = prepare(scenario)
     endpoint = Endpoint(ControllerMessage, options.host, options.port, read_key(options.key))
+    log = None
     try:
-        yield Machine(experiment, endpoint, options, say), endpoint.address
+        if options.log is not None:
+            log = Background(open_log(options.log, scenario), str(options.log), say)
+        yield Machine(experiment, endpoint, options, say, log=log), endpoint.address
     finally:
         endpoint.close()
+        if log is not None:
+            log.close()
 
 
 def reason_of(failure: Failure) -> Reason:
@@ -99,6 +115,9 @@ class Machine:
         settings: see `Settings`.
         say: prints a line.
         clock: monotonic clock, ns.
+        log: gets the true state, the acting torque and the measurement at each sample of a run, by
+            the machine's clock; or None.
+        body: makes plant and sensor, and their name; those of the scenario by default.
 
     Attributes:
         session: present or last session.
@@ -120,7 +139,10 @@ class Machine:
         settings: Settings | None = None,
         say: Callable[[str], None] = print,
         clock: Callable[[], int] = now,
+        log: RunLog | None = None,
+        body: tuple[Callable[[], Body], str] | None = None,
     ) -> None:
+        self._log = log
         self._experiment, self._endpoint = experiment, endpoint
         self._settings, self._say, self._clock = settings or Settings(), say, clock
         self._started = clock()
@@ -128,7 +150,8 @@ class Machine:
         self.period = round(sc.controller.period * SECOND)
         self.watchdog = round(self._settings.watchdog * SECOND)
         self._times, self._fields = link_times(sc), MeasurementFields(sc)
-        self._make, self.simulated_by = body_of(experiment)
+        self._make, self.simulated_by = body or body_of(experiment)
+        self._queue = first_rows(experiment)
         self.session: Session | None = None
         self.identity, self.offers = identity_of(sc), Offers()
         self._refusal_said = 0
@@ -143,12 +166,15 @@ class Machine:
     def _at_rest(self) -> None:
         """Reset the plate to the scenario's start, with brakes on."""
         self._body: Body = self._make()
-        self._motors: Motors = Motors.of(self._experiment)
+        self._motors: Motors = self._new_motors()
         self.begin = self._origin = NEVER
         self.failure: Failure | None = None
         self._running = False
         self.reason = self.before = Reason()
         self._preceded = 0
+
+    def _new_motors(self) -> Motors:
+        return Motors.of(self._experiment)
 
     # -------------------------------------------------------------- time
 
@@ -285,13 +311,15 @@ class Machine:
             self._say("no controller was heard at the begin of the run: still parked")
             return
         sc, delay = self._experiment.scenario, self._experiment.scenario.true_delay
-        queue = self._experiment.torques_in_flight(delay)
         early = delay.fraction - 1 if delay.fraction > 0 else 0.0
         playout = self.begin + round(early * sc.controller.period * SECOND)
         self._running, self._origin, self._safe = True, time, False
-        self._motors.begin(Plan(0, time, 0, playout, queue))
+        self._motors.begin(Plan(0, time, 0, playout, self._first_rows()))
         self.counts["runs"] += 1
         self._say(f"{time / SECOND:.3f} s: the run began")
+
+    def _first_rows(self) -> Array:
+        return self._queue
 
     def _change(self, time: int) -> None:
         self._follow(time)
@@ -305,6 +333,11 @@ class Machine:
         self._follow(time)
         values = self._body.measurement()
         number = 0
+        if self._running and self._log is not None:
+            state, torque = np.array(self._body.state), self._motors.torque
+            torque = torque * math.nan if self._motors.cranks else torque  # servos know theirs
+            row = {"pose": state[POSE], "rates": state[RATES], "torque_applied": torque}
+            self._log.write(time / SECOND, row | {"measurement": np.array(values)})
         if self._running:
             number = max(0, round((time - self._origin) / self.period))
         waits = self._times.sensor(number)
@@ -331,9 +364,10 @@ class Machine:
         self.counts["silences"] += 1
         self._go_safe(time)
         self._fail(Reason(Fault.SILENCE, lasted=self.watchdog), time)
-        self._say(
-            f"{time / SECOND:.3f} s: {self.reason}: the safe torque ({self._settings.safe}) acts"
-        )
+        safe = f"the safe torque ({self._settings.safe}) acts"
+        if self._motors.cranks:
+            safe = "the cranks are held"
+        self._say(f"{time / SECOND:.3f} s: {self.reason}: {safe}")
 
     def _go_safe(self, time: int) -> None:
         self._follow(time)
@@ -424,7 +458,9 @@ class Machine:
             self.begin = -(-asked // self.period) * self.period
             if not self._running:
                 self._at(self.begin, 0, self._begin)
-        if self.failure is None and self.begin != NEVER and len(message.torques):
+        if len(message.torques) and message.cranks != self._motors.cranks:
+            self._refuse(Refusal.MALFORMED, "torques for servos, or crank angles for motors")
+        elif self.failure is None and self.begin != NEVER and len(message.torques):
             sample = max(0, round((message.sampled - self.begin) / self.period))
             rows = message.torques
             plan = Plan(message.head.sequence, message.sampled, sample, message.playout, rows)
@@ -459,7 +495,7 @@ class Machine:
             MachineFlags.HOLDS: self._motors.holds,
             MachineFlags.WIRE: self._motors.is_wire,
             MachineFlags.RESETS: self._settings.restart == "rest",
-            MachineFlags.SAFE_HOLDS: self._settings.safe == "hold",
+            MachineFlags.SAFE_HOLDS: self._settings.safe == "hold" or self._motors.cranks,
         }
         return MachineFlags(sum(flag for flag, there in states.items() if there))
 
@@ -493,6 +529,7 @@ class Machine:
             refused=sum(self._endpoint.refused.values()),
             reason=self.reason,
             before=self.before,
+            cranks=self._motors.cranks,
             **fields,
         )
 

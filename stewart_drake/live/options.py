@@ -26,6 +26,10 @@ class MachineOptions(Settings):
     host: str = option("127.0.0.1", "Address to listen at; beyond loopback with a key.")
     key: Path | None = option(None, "File with the shared key.", "FILE")
     duration: float = option(0.0, "Seconds after which the machine ends; 0: at Ctrl-C.", ge=0)
+    log: Path | None = option(None, "Log to write during the run, .mcap or .csv.", "FILE")
+    reachy: str | None = option(
+        None, "Drive Reachy Mini through its daemon instead of a simulation.", "HOST:PORT"
+    )
 
 
 class LiveOptions(Options):
@@ -44,4 +48,8 @@ class LiveOptions(Options):
     )
     accept_jitter: bool = option(
         False, "Start without the question that a large jitter raises.", name="yes"
+    )
+    log: Path | None = option(None, "Log to write during the run, .mcap or .csv.", "FILE")
+    mirror: str | None = option(
+        None, "Send each sample as JSON over UDP, for PlotJuggler.", "HOST:PORT"
     )

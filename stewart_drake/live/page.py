@@ -1,31 +1,28 @@
 """The page of a live run: the machine in Meshcat, readouts, sliders and a stop button.
 
 A separate process serves it, so that neither drawing nor a browser delays the loop. Both servers
-listen on this computer only. A request to the machine must carry the token of the page's address,
-which other pages in the same browser do not know.
+listen on this computer only (`reporting.local_page`).
 """
 
 import json
 import logging
 import multiprocessing
 import secrets
-import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from multiprocessing.connection import Connection
 from typing import Any, Final, NamedTuple
-from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import jsonable
-from stewart_drake.live.loop import Snapshot, Viewer
+from stewart_drake.live.loop import End, Snapshot, Viewer
 from stewart_drake.live.steering import Request
 from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.reporting.local_page import LocalHandler, LocalServer
 from stewart_drake.reporting.page import environment
 from stewart_drake.reporting.style import FACTORS
 from stewart_drake.reporting.viewer import slider_range
@@ -40,8 +37,6 @@ _LAST: Final = 0.5
 """Time for which the page is served after the end of the loop, s."""
 _START: Final = 60.0
 """Longest wait for the page, s."""
-_LONGEST: Final = 4096
-"""Longest request of a browser, bytes."""
 _AHEAD: Final = 0.2
 """Longest extrapolation of the pose between two samples, s."""
 
@@ -50,12 +45,6 @@ class Opened(NamedTuple):
     """The address of the page, once its process serves it."""
 
     url: str
-
-
-class Ended(NamedTuple):
-    """How the run ended, in words."""
-
-    words: str
 
 
 class PageRequest(NamedTuple):
@@ -107,11 +96,11 @@ class PageViewer(Viewer):
     def stopped(self) -> bool:
         return self._stop
 
-    def ended(self, words: str) -> None:
+    def ended(self, end: End) -> None:
         self._read()
         if self._open:
             with self._until_closed():
-                self._connection.send(Ended(words))
+                self._connection.send(end)
 
     def close(self) -> None:
         """End the page's process."""
@@ -191,10 +180,10 @@ def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
     ]
     page = environment().get_template("live.html.j2")
     text = page.render(title=title, meshcat=meshcat.web_url(), token=token, sliders=sliders)
-    server = _Server(("127.0.0.1", 0), _handler(text, token, readouts, ask))
+    server = LocalServer(_handler(text, token, readouts, ask))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     with lock:
-        connection.send(Opened(f"http://127.0.0.1:{server.server_port}/?token={token}"))
+        connection.send(Opened(server.url))
     with suppress(EOFError, OSError):
         _draw(connection, lock, scene, readouts)
     time.sleep(_LAST)  # for browsers to receive the end
@@ -212,8 +201,8 @@ def _draw(connection: Connection, lock: threading.Lock, scene: Any, readouts: Re
         started = time.monotonic()
         if connection.poll(_FRAME if seen is None else 0):
             received = connection.recv()
-            if isinstance(received, Ended):
-                ended = {"ended": received.words}
+            if isinstance(received, End):
+                ended = {"ended": received.words, "advice": received.advice}
                 readouts.put(ended if seen is None else _values(seen) | ended)
                 continue
             seen, came = received, started
@@ -252,71 +241,13 @@ def _values(seen: Snapshot) -> dict[str, Any]:
     }
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
+def _handler(page: str, secret: str, readouts: Readouts, ask: Any) -> type[LocalHandler]:
+    class Handler(LocalHandler):
+        token, text = secret, page
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Report an error, except that a browser has closed its connection."""
-        if not isinstance(sys.exception(), ConnectionError):
-            super().handle_error(request, client_address)
-
-
-def _handler(text: str, token: str, readouts: Readouts, ask: Any) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        def log_message(self, *_: Any) -> None:
-            pass
-
-        def _allowed(self, given: str) -> bool:
-            # The host name is checked too: a foreign name may resolve to this address.
-            host = self.headers.get("Host", "").rpartition(":")[0]
-            good = host in ("127.0.0.1", "localhost") and secrets.compare_digest(
-                given.encode(), token.encode()
-            )
-            if not good:
-                self.send_error(403)
-            return good
-
-        def do_GET(self) -> None:
-            try:
-                parts = urlsplit(self.path)
-            except ValueError:  # such as http://[
-                self.send_error(400)
-                return
-            if not self._allowed(parse_qs(parts.query).get("token", [""])[0]):
-                return
-            if parts.path == "/":
-                self._answer("text/html; charset=utf-8", text.encode())
-            elif parts.path == "/events":
-                self._events()
-            else:
-                self.send_error(404)
-
-        def do_POST(self) -> None:
-            if not self._allowed(self.headers.get("X-Token", "")):
-                return
-            length = self.headers.get("Content-Length", "")
-            # Python refuses to convert thousands of digits.
-            few = len(length) <= len(str(_LONGEST))
-            if not (few and length.isdecimal() and int(length) <= _LONGEST):
-                self.send_error(413)
-                return
-            request = read_request(self.rfile.read(int(length)))
-            if request is None:
-                self.send_error(400)
-                return
-            ask(request)
-            self._answer("application/json", b"{}")
-
-        def _answer(self, kind: str, data: bytes) -> None:
-            self.send_response(200)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(data)))
-            self.send_header("Cache-Control", "no-store")
-            self.send_header("Referrer-Policy", "no-referrer")
-            self.end_headers()
-            self.wfile.write(data)
-
-        def _events(self) -> None:
+        def get(self, path: str) -> bool:
+            if path != "/events":
+                return False
             self.send_response(200)
             self.send_header("Content-Type", "text/event-stream")
             self.send_header("Cache-Control", "no-store")
@@ -327,6 +258,14 @@ def _handler(text: str, token: str, readouts: Readouts, ask: Any) -> type[BaseHT
                     text, number = readouts.after(number)
                     self.wfile.write(f"data: {text}\n\n".encode())
                     self.wfile.flush()
+            return True
+
+        def post(self, path: str, data: bytes) -> bytes | None:
+            request = read_request(data)
+            if request is None:
+                return None
+            ask(request)
+            return b"{}"
 
     return Handler
 

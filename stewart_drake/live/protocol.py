@@ -30,7 +30,7 @@ from stewart_drake.loop.peer import (
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE, NUM_TORQUES
 from stewart_drake.types import Array
 
-VERSION: Final = 2
+VERSION: Final = 3
 MAGIC_MACHINE: Final = b"STWM"
 MAGIC_CONTROLLER: Final = b"STWC"
 TAG: Final = 16
@@ -53,13 +53,17 @@ SECOND: Final = 10**9
 # echo, held, flags
 _HEAD: Final = struct.Struct("<4sBBHQQIIQQQI")
 # kind, samples, bits, history; sampled, begin, period, watchdog, rate, torque_limit, arrived,
-# acted_from; played, dry, refused; reason, leg, before, reserved; their durations
+# acted_from; played, dry, refused; reason, leg, before, content; their durations
 _MACHINE: Final = struct.Struct("<BBBBQQQQddQQIIIBBBBQQ")
 # rows, content, reserved (2); sampled, playout, begin
 _CONTROLLER: Final = struct.Struct("<BB2xQQQ")
 _PART: Final = struct.Struct(f"<{DIGEST}s{NAME}s")
 _PADDING: Final = bytes(_MACHINE.size - _CONTROLLER.size)
 """Padding that makes a request as long as its answer."""
+_REQUEST: Final = 1
+"""Content of a controller's datagram with an identity."""
+_CRANKS: Final = 2
+"""Content of a datagram whose rows are crank angles."""
 _OFFERS: Final = 3
 """Kind of a machine's datagram with its identity instead of a measurement."""
 
@@ -166,6 +170,7 @@ class MachineMessage:
         arrived: whether the datagram `acknowledged` - i has arrived, (64,).
         acted_from: time at which the first row of `acted` began to act, ns; NEVER without rows.
         acted: torques (h, 6) that acted, N m; row i acted i periods before the first.
+        cranks: whether the rows of `acted` are setpoints of the cranks, rad.
         played: number of periods with a torque of a plan.
         dry: number of periods without one.
         refused: number of refused datagrams.
@@ -199,6 +204,7 @@ class MachineMessage:
     identity: Identity | None = None
     reason: Reason = NO_FAULT
     before: Reason = NO_FAULT
+    cranks: bool = False
 
     def __eq__(self, other: object) -> bool:
         return _equal(self, other)
@@ -229,6 +235,7 @@ class ControllerMessage:
         begin: requested begin of the run, ns, or NEVER; every datagram with torques has it.
         torques: torques (rows, 6), N m; without rows the datagram only shows presence.
         identity: identity of the machine that the controller is designed for, in a request.
+        cranks: whether the rows of `torques` are setpoints of the cranks, rad.
     """
 
     head: Head
@@ -238,6 +245,7 @@ class ControllerMessage:
     begin: int = NEVER
     torques: Array = field(default_factory=lambda: np.empty((0, NUM_TORQUES)))
     identity: Identity | None = None
+    cranks: bool = False
 
     def __eq__(self, other: object) -> bool:
         return _equal(self, other)
@@ -305,15 +313,16 @@ def _machine_body(m: MachineMessage) -> bytes:
     packed = _MACHINE.pack(
         *(kind, samples, m.bits, len(m.acted), *times, m.rate, m.torque_limit),
         *(arrived, m.acted_from, m.played, m.dry, m.refused),
-        *(m.reason.fault, m.reason.leg, m.before.fault, 0, m.reason.lasted, m.before.lasted),
+        *(m.reason.fault, m.reason.leg, m.before.fault, _CRANKS * m.cranks),
+        *(m.reason.lasted, m.before.lasted),
     )
     return packed + measured + np.asarray(m.acted, "<f8").tobytes()
 
 
 def _controller_body(m: ControllerMessage) -> bytes:
     _check(m.torques, "torques", MOST_ROWS)
-    asks = m.identity is not None
-    packed = _CONTROLLER.pack(len(m.torques), asks, m.sampled, m.playout, m.begin)
+    content = _CRANKS * m.cranks if m.identity is None else _REQUEST
+    packed = _CONTROLLER.pack(len(m.torques), content, m.sampled, m.playout, m.begin)
     if m.identity is not None:
         if len(m.torques):
             raise ValueError("torques: got some in a request; expected none")
@@ -377,7 +386,7 @@ def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
         raise RefusedError(Refusal.MALFORMED, "a short body")
     kind, samples, bits, history, *rest = _MACHINE.unpack_from(body)
     sampled, begin, period, watchdog, rate, limit, arrived, acted_from, *counts = rest
-    played, dry, refused, fault, leg, before, zero, lasted, before_lasted = counts
+    played, dry, refused, fault, leg, before, content, lasted, before_lasted = counts
     fits = {
         0: samples == 0 and bits == 0,
         1: samples == 1 and bits == 0,
@@ -386,7 +395,8 @@ def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
     }
     encoders = 8 * NUM_LEGS + 4 * NUM_LEGS * samples
     sizes = {0: 0, 1: 8 * NUM_STATE, 2: encoders, _OFFERS: _PART.size * len(Identity._fields)}
-    plausible = rate > 0 and math.isfinite(rate) and limit > 0 and period > 0 and zero == 0
+    plausible = rate > 0 and math.isfinite(rate) and limit > 0 and period > 0
+    plausible = plausible and content in (0, _CRANKS)
     plausible = plausible and max(fault, before) < len(Fault) and leg <= NUM_LEGS
     if not (fits.get(kind) and history <= MOST_HISTORY and plausible and flags < 1024):
         raise RefusedError(Refusal.MALFORMED, "a number outside its range")
@@ -427,6 +437,7 @@ def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
         identity=identity,
         reason=Reason(Fault(fault), leg, lasted),
         before=Reason(Fault(before), 0, before_lasted),
+        cranks=content == _CRANKS,
     )
 
 
@@ -443,8 +454,9 @@ def _identity(data: bytes) -> Identity:
 def _controller(head: Head, flags: int, body: bytes) -> ControllerMessage:
     if len(body) < _CONTROLLER.size:
         raise RefusedError(Refusal.MALFORMED, "a short body")
-    rows, asks, sampled, playout, begin = _CONTROLLER.unpack_from(body)
-    if rows > MOST_ROWS or asks > 1 or (asks and rows) or flags > 3 or any(body[2:4]):
+    rows, content, sampled, playout, begin = _CONTROLLER.unpack_from(body)
+    asks = content == _REQUEST
+    if rows > MOST_ROWS or content > _CRANKS or (asks and rows) or flags > 3 or any(body[2:4]):
         raise RefusedError(Refusal.MALFORMED, "a number outside its range")
     if asks:
         size = _PART.size * len(Identity._fields)
@@ -461,7 +473,9 @@ def _controller(head: Head, flags: int, body: bytes) -> ControllerMessage:
         raise RefusedError(Refusal.MALFORMED, "a torque that is not finite")
     if rows and begin == NEVER:
         raise RefusedError(Refusal.MALFORMED, "torques for no run")
-    return ControllerMessage(head, ControllerFlags(flags), sampled, playout, begin, torques)
+    numbers = (sampled, playout, begin, torques)
+    cranks = content == _CRANKS
+    return ControllerMessage(head, ControllerFlags(flags), *numbers, cranks=cranks)
 
 
 def _rows(data: bytes) -> Array:

@@ -4,18 +4,19 @@ import contextlib
 import math
 import os
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from stewart_drake.dynamics.native_functions import one_blas_thread
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.live.contact import Contact, call, open_endpoint
+from stewart_drake.live.contact import Contact, address_of, call, open_endpoint
 from stewart_drake.live.design import Design, as_seen, check_controller, design
 from stewart_drake.live.endpoint import Address, Endpoint
-from stewart_drake.live.governor import Governor
-from stewart_drake.live.loop import LiveLoop, Viewer
+from stewart_drake.live.governor import FASTEST, Governor
+from stewart_drake.live.loop import CrankLoop, LiveLoop, Viewer
+from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerFlags, MachineFlags
 from stewart_drake.live.steering import Steering, Way
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
@@ -25,6 +26,7 @@ from stewart_drake.loop.recording import summarize
 from stewart_drake.loop.results import LiveSummary, SimulationResult
 from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.link_config import WireConfig
+from stewart_drake.scenario.run_log import Background, RunLog, UdpMirror, open_log
 from stewart_drake.studies.verdict import milliseconds
 from stewart_drake.types import Array
 
@@ -122,14 +124,20 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
     if sc.link.kind == "network":
         c = sc.controller
         packets = f"packets of {c.packet_repeats + c.packet_torques} torques"
+    acts, what = "torques act", "torque"
+    if made.cranks:
+        acts, what = "setpoints act", "setpoint"
+        packets = (
+            f"plans of {made.rows} setpoints" if made.sends else packets.replace("torque", what)
+        )
     until = "until it is stopped" if math.isinf(duration) else f"for {duration:g} s"
-    safe = "the last torque" if MachineFlags.SAFE_HOLDS in machine.flags else "no torque"
+    safe = f"the last {what}" if MachineFlags.SAFE_HOLDS in machine.flags else "no torque"
     return [
         f"machine at {host}:{port}: {kind}{rate}",
         f"link: {1e3 * link.typical:.0f} ms there and back ({1e3 * link.shortest:.0f} to "
         f"{1e3 * link.longest:.0f}), {100 * link.loss_there:.0f} % lost there, "
         f"{100 * link.loss_back:.0f} % back",
-        f"torques act {eta:g} s after the measurement that they rest on: {packets}, every "
+        f"{acts} {eta:g} s after the measurement that they rest on: {packets}, every "
         f"{1e3 * sc.controller.period:g} ms, motors {limit}",
         f"motion: {scenario}, {until}; after {machine.watchdog / SECOND:g} s without a word the "
         f"machine goes to {safe}",
@@ -234,6 +242,25 @@ def before_others() -> Iterator[str]:
         os.sched_setscheduler(0, policy, given)
 
 
+def open_logs(ready: Ready, options: LiveOptions, say: Callable[[str], None]) -> list[RunLog]:
+    """Open the logs that a run is asked for.
+
+    Args:
+        ready: result of `prepare_session`.
+        options: `log` and `mirror`.
+        say: prints a line.
+
+    Raises:
+        ConfigError: a file that cannot be written, or no such host.
+    """
+    scenario, logs = ready.design.experiment.scenario, list[RunLog]()
+    if options.mirror is not None:
+        logs.append(UdpMirror(address_of(options.mirror, "--mirror"), scenario))
+    if options.log is not None:
+        logs.append(Background(open_log(options.log, scenario), str(options.log), say))
+    return logs
+
+
 def drive(
     ready: Ready,
     duration: float = math.inf,
@@ -245,6 +272,7 @@ def drive(
     say: Callable[[str], None] = print,
     max_missing: float | None = None,
     log: Path | None = None,
+    logs: Sequence[RunLog] = (),
 ) -> SimulationResult:
     """Run the loop; the machine moves.
 
@@ -258,6 +286,7 @@ def drive(
         say: prints a line.
         max_missing: see `LiveLoop`.
         log: see `LiveLoop`.
+        logs: further logs, written while the run goes on; closed at the end.
 
     Raises:
         ConfigError: not armed for a real machine, too much jitter, or a machine that does not
@@ -266,9 +295,11 @@ def drive(
     check_armed(ready, armed)
     check_jitter(ready, accept_jitter)
     made, contact = ready.design, ready.contact
-    governor = Governor(made.law.plant.dynamics, made.torque_limit)
+    fastest = min(FASTEST, 1 / made.law.timeline.period)  # holds of a period follow no faster one
+    governor = Governor(made.law.plant.dynamics, made.torque_limit, fastest)
     steering = Steering(governor, made.experiment.reference, Way.along(made.planned))
-    loop = LiveLoop(made, steering, contact, viewer or Viewer(), say, max_missing, log)
+    kind = CrankLoop if made.cranks else LiveLoop
+    loop = kind(made, steering, contact, viewer or Viewer(), say, max_missing, log, logs)
     started = clock.perf_counter()
     try:
         with one_blas_thread, before_others() as scheduled:
@@ -279,6 +310,8 @@ def drive(
     finally:
         ready.endpoint.close()
         late = loop.record.finish()
+        for one in logs:
+            one.close()
     wall, samples = clock.perf_counter() - started, loop.record.sampled
     period = made.experiment.scenario.controller.period
     as_run = replace(made.experiment.scenario, duration=max(samples - 1, 1) * period)

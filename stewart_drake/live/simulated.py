@@ -13,9 +13,10 @@ import numpy as np
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from stewart_drake.core.link import Link
-from stewart_drake.dynamics.open_loop import Drive, IntegrationError, integrate
+from stewart_drake.dynamics.open_loop import Course, Drive, IntegrationError, follow, integrate
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.protocol import MISSING, MOST_HISTORY, NEVER, SECOND, Refusal
 from stewart_drake.loop.bulk import LONGEST_STEP, SHARE
 from stewart_drake.loop.diagram import build_machine
@@ -23,6 +24,7 @@ from stewart_drake.loop.exact import set_accuracy
 from stewart_drake.loop.peer import code_bits
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sensor import white_noise
+from stewart_drake.loop.servos import commands_in_flight, compose_servo_law, position_servo
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.link import forward_times, return_times, sensor_times, torque_delays
@@ -100,6 +102,10 @@ class Motors:
         period: dt.
         holds: whether a dry buffer holds the last torque; otherwise it outputs zero.
         delay_of: delay of the torque of sample k on a wire; None for a buffer.
+        cranks: whether rows are setpoints of servos, in rad, which are never zero for lack of one.
+
+    Attributes:
+        cranks: see above.
     """
 
     def __init__(
@@ -108,8 +114,11 @@ class Motors:
         period: int,
         holds: bool = True,
         delay_of: Callable[[int], int] | None = None,
+        cranks: bool = False,
     ) -> None:
-        self.holds, self.is_wire, self._delay_of = holds, delay_of is not None, delay_of
+        self.holds, self.is_wire, self._delay_of = holds or cranks, delay_of is not None, delay_of
+        self.cranks = cranks
+        limit, holds = (math.inf, True) if cranks else (limit, holds)
         given, history = (NUM_TORQUES, MOST_WAITING, period), MOST_HISTORY
         self._link = Link(
             *given, is_wire=self.is_wire, hold_when_dry=holds, history=history, limit=limit
@@ -120,16 +129,18 @@ class Motors:
     def of(cls, experiment: Experiment) -> "Motors":
         """Return the motors of a scenario: a buffer over a network, otherwise a wire."""
         sc, limit = experiment.scenario, experiment.torque_limit
-        period = round(sc.controller.period * SECOND)
+        period, cranks = round(sc.controller.period * SECOND), sc.controller.command == "cranks"
         if sc.link.kind == "network":
-            return cls(limit, period, sc.link.dry == "hold")
+            return cls(limit, period, sc.link.dry == "hold", cranks=cranks)
         delays = torque_delays(replace(sc, duration=_TIMES * sc.controller.period))
         last = len(delays) - 1
-        return cls(limit, period, delay_of=lambda k: round(delays[min(k, last)] * SECOND))
+        return cls(
+            *(limit, period, True, lambda k: round(delays[min(k, last)] * SECOND)), cranks=cranks
+        )
 
     @property
     def torque(self) -> Array:
-        """Torque (6,) that acts, N m."""
+        """Torque (6,) that acts, N m, or setpoint, rad."""
         return self._link.acted(self._memory)[0, 1:].copy()
 
     @property
@@ -180,7 +191,17 @@ class Motors:
 
     def safe(self, time: int, holds: bool) -> None:
         """Drop what waits; hold the torque, or output zero, until the next plan."""
-        self._link.reset(self._memory, time, holds)
+        self._link.reset(self._memory, time, holds or self.cranks)
+
+
+def first_rows(experiment: Experiment) -> Array:
+    """Return the torques or setpoints (n, 6) in flight at the begin of a run."""
+    sc = experiment.scenario
+    if sc.controller.command == "torque":
+        return experiment.torques_in_flight(sc.true_delay)
+    law = compose_servo_law(experiment)
+    first, flying = commands_in_flight(experiment, law, sc.true_delay)
+    return (flying if len(flying) else first[None])[:, POSE]
 
 
 # ---------------------------------------------------------------- plant and sensor
@@ -197,7 +218,10 @@ class Body(Protocol):
         ...
 
     def advance(self, time: float, torque: Array) -> Failure | None:
-        """Advance to `time` s under a torque (6,), N m; return why the plate left, or None."""
+        """Advance to `time` s under a torque (6,), N m; return why the plate left, or None.
+
+        Servos get a setpoint (6,) in rad instead.
+        """
         ...
 
     def measurement(self) -> Array:
@@ -211,32 +235,54 @@ class NativeBody:
     def __init__(self, experiment: Experiment) -> None:
         sc, sensor = experiment.scenario, experiment.scenario.sensor
         assert sensor.kind == "state"
-        parameters = np.array(sc.plant.parameters)
+        parameters = np.array(sc.plant_parameters)
         self._bias = parameters[BIAS].copy()
         parameters[BIAS] = 0.0  # added to the torque that acts, as in the diagram
-        self._dynamics = StewartDynamics(experiment.truth, sc.plant.gravity, parameters)
+        self._push = sc.plant.push
+        self._free, self._pushed = (
+            StewartDynamics(experiment.truth, sc.plant.gravity, np.append(parameters, wrench))
+            for wrench in ([0.0] * 6, self._push.wrench)
+        )
         self._accuracy = SHARE * sc.plant.accuracy
         self._noise, self._seed = np.array(sensor.noise_std), sensor.seed
         self._period, self.state, self.time = sc.controller.period, experiment.start.copy(), 0.0
 
     def advance(self, time: float, torque: Array) -> Failure | None:
+        push = self._push
+        for change in (push.start, push.end):  # integrate up to each
+            if self.time < change < time and (failure := self.advance(change, torque)):
+                return failure
         if time <= self.time:
             return None
-        drives, span = (Drive(torque + self._bias),), (time - self.time,)
+        dynamics = self._pushed if any(push.at(self.time)) else self._free
         try:
-            course = integrate(
-                self._dynamics, self.state, drives, span, self._accuracy, LONGEST_STEP
-            )
+            course = self._course(dynamics, torque, time - self.time)
         except IntegrationError as error:
             return Failure(self.time, None, np.nan, str(error))
-        self.state, began, self.time = course.final, self.time, self.time + course.end
-        left = course.failure
+        began, left = self.time, course.failure
+        self.state, self.time = course.final, time if left is None else began + course.end
         return None if left is None else left._replace(time=began + left.time)
+
+    def _course(self, dynamics: StewartDynamics, torque: Array, span: float) -> Course:
+        drives = (Drive(torque + self._bias),)
+        return integrate(dynamics, self.state, drives, (span,), self._accuracy, LONGEST_STEP)
 
     def measurement(self) -> Array:
         if not self._noise.any():
             return self.state
         return self.state + self._noise * white_noise(self._seed, round(self.time / self._period))
+
+
+class ServoBody(NativeBody):
+    """The exact plant under servos given by their stiffness, and the same sensor."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        super().__init__(experiment)
+        self._servo = position_servo(experiment).compiled
+
+    def _course(self, dynamics: StewartDynamics, torque: Array, span: float) -> Course:
+        args = (self._servo, torque, span, self._accuracy, LONGEST_STEP)
+        return follow(dynamics, self.state, *args)
 
 
 class DrakeBody:
@@ -290,8 +336,11 @@ class DrakeBody:
 def body_of(experiment: Experiment) -> tuple[Callable[[], Body], str]:
     """Return a factory of the plant and sensor of an experiment, and the integrator's name."""
     found = differing(experiment.scenario, _WITHOUT_DRAKE)
+    cranks = experiment.scenario.controller.command == "cranks"
     if found is None:
-        return lambda: NativeBody(experiment), "DOP853"
+        return lambda: (ServoBody if cranks else NativeBody)(experiment), "DOP853"
+    if cranks:
+        raise ConfigError(found.problem("for a machine with servos"))
     return lambda: DrakeBody(experiment), f"Drake ({found.field})"
 
 

@@ -29,6 +29,7 @@ from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.law_design import (
     compose_law,
@@ -41,6 +42,7 @@ from stewart_drake.loop.link import buffer_places, measurement_link
 from stewart_drake.loop.preparation import Experiment, assemble, network_of, prepare
 from stewart_drake.loop.results import Figures, SimulationResult, accumulated_error, figures
 from stewart_drake.loop.sensor import white_noises
+from stewart_drake.loop.servos import commands_in_flight, position_servo, servo_law
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.loop.tuner import weights_source
 from stewart_drake.mechanism.geometry import Mechanism
@@ -54,7 +56,14 @@ from stewart_drake.scenario.link import (
     torque_delays,
 )
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE, TUNER_INPUTS, WEIGHTS
+from stewart_drake.scenario.signals import (
+    NUM_REFERENCE,
+    NUM_STATE,
+    NUM_TORQUES,
+    POSE,
+    TUNER_INPUTS,
+    WEIGHTS,
+)
 from stewart_drake.scenario.timing import event_time, instants, look_time
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.tuner.source import Decision, WeightsSource
@@ -67,14 +76,14 @@ LONGEST_STEP: Final = np.inf
 """s; the state is recorded every 20 ms for steps of any length."""
 COVERED: Final[Accepted] = {
     "plant.kind": "exact",
-    "actuator.kind": "torque",
+    "actuator.kind": ("torque", "position_servo"),
     "sensor.kind": "state",
     "sensor.faults": [],
 }
 """Values of the fields that the loop in C covers."""
 _DRAWN: Final = (
     *(("plant", name) for name in ("payload_mass", "torque_bias", "joint_damping")),
-    ("plant", "coulomb_friction"),
+    *(("plant", name) for name in ("coulomb_friction", "push")),
     *(("sensor", name) for name in ("noise_std", "seed", "loss")),
     ("actuator", "torque_limit"),
     *(("controller", name) for name in ("w_Q", "w_R", "delay_steps", "delay_fraction")),
@@ -128,6 +137,12 @@ def instants_of(duration: float, period: float) -> Instants:
 def uncovered(scenario: Scenario) -> str | None:
     """Return the field of a scenario that needs Drake's loop, or None."""
     found = differing(scenario, COVERED)
+    servos = scenario.actuator.kind == "position_servo"
+    if found is None and servos:
+        if scenario.link.kind == "network":
+            return "link.kind"
+        if scenario.controller.estimate:
+            return "controller.estimate"
     return found and found.field
 
 
@@ -177,7 +192,7 @@ class Prepared(NamedTuple):
     """
 
     experiment: Experiment
-    law: PredictiveLqi
+    law: PredictiveLqi | ServoPreview
     planned: Trajectory
     previews: Array
     tuner: WeightsSource | None
@@ -224,6 +239,9 @@ class Preparation:
         Raises:
             ConfigError: as `law_design.control_law`.
         """
+        if experiment.scenario.controller.command == "cranks":
+            servos, motion, _ = servo_law(experiment)
+            return Prepared(experiment, servos, motion, self._preview(motion, servos), None)
         law = compose_law(experiment, self._sizing)
         queue = experiment.torques_in_flight(law.timeline.delay).tobytes()
         if queue not in self._ways:
@@ -238,7 +256,7 @@ class Preparation:
         motions = tuple(self._pieces(one, followed) for one in followed)
         return Prepared(experiment, law, motion, previews, source, motions)
 
-    def _preview(self, motion: Trajectory, law: PredictiveLqi) -> Array:
+    def _preview(self, motion: Trajectory, law: PredictiveLqi | ServoPreview) -> Array:
         """Return the rows (k, p, 18) of `loop.controller.Reference` at all samples."""
         if id(motion) not in self._previews:  # kept with its motion, which keeps the id
             times = np.maximum(0.0, self.when.samples[:, None] + law.preview_times)
@@ -400,6 +418,54 @@ class CompiledController:
         return counts.summary() | {"tuner_fallbacks": fallbacks}
 
 
+class CompiledServo:
+    """Law for servos in C, without estimates.
+
+    Args:
+        prepared: a run with such a law.
+
+    Attributes:
+        weights, rows: as of `CompiledController`, NaN and empty.
+    """
+
+    def __init__(self, prepared: Prepared) -> None:
+        c, law, experiment = core(), prepared.law, prepared.experiment
+        assert isinstance(law, ServoPreview)
+        first, believed = commands_in_flight(experiment, law, law.timeline.delay)
+        self._compiled = CompiledLaw(law)
+        self._memory = self._compiled.start(believed[-1] if len(believed) else first)
+        samples = len(prepared.previews)
+        self.weights, self.rows = np.full((samples, len(WEIGHTS)), np.nan), np.empty((samples, 0))
+        previews = np.ascontiguousarray(prepared.previews)
+        scratch = np.empty(self._compiled.scratch)
+        self._servo, self._saturated = position_servo(experiment).compiled, 0
+        self._kept = previews, scratch, np.full(law.reports.size, np.nan)
+        self.data = c.ffi.new(
+            "stewart_servo_in_loop *",
+            {
+                "law": self._compiled.data,
+                "memory": c.at(self._memory),
+                "scratch": c.at(scratch),
+                "previews": c.at(previews),
+                "report": c.at(self._kept[2]),
+            },
+        )
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of survived problems by cause, after the run."""
+        counts = CoreMemory(self._memory, self._compiled).counts
+        survived = counts.plus(*["saturated_steps"] * self._saturated)
+        return survived.summary() | {"tuner_fallbacks": 0}
+
+    def run(self, plant: NativePlant, loop: Any) -> Ended:
+        """Run a plant with its servos in the loop."""
+        loop.servo = self._servo
+        ended = plant.call("closed_loop_of_servo", loop, self.data)
+        self._saturated = loop.saturated
+        return ended
+
+
 Controller = Callable[[int, Measurement, Report | None], tuple[Array, Array]]
 """(sample, measurement, report) -> torque (6,) without limit, torques (n, 6) to send."""
 
@@ -414,8 +480,9 @@ class PythonController:
 
     def __init__(self, prepared: Prepared, when: Instants, wanted: Array) -> None:
         experiment, law = prepared.experiment, prepared.law
+        assert isinstance(law, PredictiveLqi)
         c = experiment.scenario.controller
-        self._prepared, self._when, self._wanted = prepared, when, wanted
+        self._prepared, self._law, self._when, self._wanted = prepared, law, when, wanted
         self._followed = followed_motion(law, prepared.planned, experiment.reference)
         self._served = core_law.serving(law).law
         self._memory: Any = self._served.initial_memory(first_queue(experiment, law))
@@ -428,7 +495,7 @@ class PythonController:
     def __call__(
         self, sample: int, measured: Measurement, report: Report | None
     ) -> tuple[Array, Array]:
-        law, source = self._prepared.law, self._prepared.tuner
+        law, source = self._law, self._prepared.tuner
         motion: Motion = Preview(law.preview_times, self._prepared.previews[sample])
         if self._followed is not None:
             motion = KnownMotion(*self._followed, self._when.samples[sample])
@@ -452,8 +519,8 @@ class PythonController:
 def run_loop(
     experiment: Experiment,
     when: Instants,
-    controller: CompiledController | Controller,
-    law: PredictiveLqi | None = None,
+    controller: CompiledController | CompiledServo | Controller,
+    law: PredictiveLqi | ServoPreview | None = None,
 ) -> Course:
     """Run an experiment to its end.
 
@@ -473,8 +540,13 @@ def run_loop(
     plant = NativePlant(truth, experiment.start, when.looks, accuracy, LONGEST_STEP)
     noise, c = np.array(sensor.noise_std), core()
     drawn = noise * white_noises(sensor.seed, number) if noise.any() else None
-    packets = law.channel if law is not None and isinstance(law.channel, Packets) else None
-    link, memory, transit = _motor_link(experiment, law, packets, number)
+    of_torques = law if isinstance(law, PredictiveLqi) else None
+    packets = of_torques.channel if of_torques is not None else None
+    packets = packets if isinstance(packets, Packets) else None
+    if isinstance(law, ServoPreview):
+        link, memory, transit = _servo_link(experiment, law, number)
+    else:
+        link, memory, transit = _motor_link(experiment, of_torques, packets, number)
     reports = link.history if packets is not None and sc.link.acknowledged else 0
     late = np.zeros(number)
     if sensor.delay or sensor.loss or sc.link.back is not None:
@@ -483,6 +555,8 @@ def run_loop(
     back = measurement_link(sc.controller.period, late, size)
     back_memory = back.start()
     rows, repeats = (1, 0) if packets is None else (_rows(packets), packets.repeats)
+    if isinstance(law, ServoPreview):
+        rows = NUM_REFERENCE // NUM_TORQUES
     scratch = np.empty(size + NUM_TORQUES * rows)
     measured, asked = np.empty((number, NUM_STATE)), np.empty((number, NUM_TORQUES))
     loop = c.ffi.new(
@@ -503,6 +577,10 @@ def run_loop(
             "back_transit": c.at(late),
             "reported": reports,
             "bias": list(sc.plant.torque_bias),
+            "push": sc.plant.push.wrench,
+            "push_from": sc.plant.push.start,
+            "push_to": sc.plant.push.end,
+            "wrench": c.at(plant.wrench),
             "scratch": c.at(scratch),
             "measured": c.at(measured),
             "asked": c.at(asked),
@@ -511,6 +589,8 @@ def run_loop(
     if isinstance(controller, CompiledController):
         controller.data.rows = rows
         ended = plant.call("closed_loop_of_law", loop, controller.data)
+    elif isinstance(controller, CompiledServo):
+        ended = controller.run(plant, loop)
     else:
         ended = _call_back(plant, loop, controller)
     if ended == Ended.TOO_SHORT_STEPS:
@@ -548,9 +628,7 @@ def _motor_link(
         rows = 1 if packets is None else _rows(packets)
         kept = buffer_places(delay, rows)
     else:
-        if not sc.delay.constant:
-            drawn = torque_delays(sc)
-            transit = drawn[np.minimum(np.arange(number), len(drawn) - 1)]
+        transit = _wire_times(sc, number)
         kept = len(queue) + int(transit.max(initial=0.0) / period) + 2
     link = Link(
         *(NUM_TORQUES, kept, period),
@@ -565,6 +643,30 @@ def _motor_link(
         link.assume(memory, first, queue[0])
         link.preload(memory, first, queue)
     return link, memory, transit
+
+
+def _servo_link(
+    experiment: Experiment, law: ServoPreview, number: int
+) -> tuple[Link, Array, Array]:
+    """Return the wire to servos, its memory at t = 0, and the transit times (number,) in s."""
+    sc, delay = experiment.scenario, experiment.scenario.true_delay
+    period, (_, queue) = sc.controller.period, commands_in_flight(experiment, law, delay)
+    transit = _wire_times(sc, number)
+    kept = len(queue) + int(transit.max(initial=0.0) / period) + 2
+    link = Link(NUM_REFERENCE, kept, period, is_wire=True, time_tolerance=SIMULTANEOUS * period)
+    memory, first = link.start(), (delay.periods - len(queue)) * period
+    if len(queue):
+        link.assume(memory, first, queue[0])
+        link.preload(memory, first, queue)
+    return link, memory, transit
+
+
+def _wire_times(sc: Scenario, number: int) -> Array:
+    """Return the transit times (number,) of a wire, s."""
+    if sc.delay.constant:
+        return np.full(number, sc.true_delay.eta(sc.controller.period))
+    drawn = torque_delays(sc)
+    return np.asarray(drawn[np.minimum(np.arange(number), len(drawn) - 1)])
 
 
 def _call_back(plant: NativePlant, loop: Any, controller: Controller) -> Ended:
@@ -655,8 +757,11 @@ def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
     wanted = preparation.references[when.sampled]
     field, tuner = core_law.uncovered(law), None if source is None else source.compiled
     experiment = prepared.experiment
-    controller: CompiledController | PythonController
-    if field is None:
+    controller: CompiledController | CompiledServo | PythonController
+    if isinstance(law, ServoPreview):
+        loop, controller = "native", CompiledServo(prepared)
+        course = run_loop(experiment, when, controller, law)
+    elif field is None:
         loop, controller = "native", CompiledController(prepared, tuner, wanted)
         course = run_loop(experiment, when, controller, law)
     else:

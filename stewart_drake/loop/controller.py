@@ -24,6 +24,7 @@ from stewart_drake.scenario.signals import (
     NUM_TORQUES,
     PARAMETERS,
     WEIGHTS,
+    WRENCHES,
     ports_of,
 )
 from stewart_drake.scenario.trajectories import evaluate
@@ -75,6 +76,8 @@ HELD: Final[dict[str, Callable[[AnyMemory], Array]]] = {
     "state_estimate": lambda memory: memory.belief.state,
     "parameters": lambda memory: memory.belief.parameters,
     "parameter_std": lambda memory: memory.belief.estimate.parameter_std,
+    "wrench_estimate": lambda memory: memory.belief.parameters,
+    "wrench_std": lambda memory: memory.belief.estimate.parameter_std,
     "delay_estimate": lambda memory: memory.belief.delay,
     "delay_std": lambda memory: np.array([memory.belief.delay_std]),
 }
@@ -84,16 +87,25 @@ HELD: Final[dict[str, Callable[[AnyMemory], Array]]] = {
 def held_by(dynamics: StewartDynamics) -> dict[str, Callable[[AnyMemory], Array]]:
     """Return HELD for the law of a plant, with its parameters at their places in the record.
 
-    A parameter that is not estimated is recorded with its assumed value, without a deviation.
+    A parameter that is not estimated is recorded with its assumed value, without a deviation; a
+    wrench that is not estimated is NaN.
     """
-    place = np.array([_place(name, dynamics.free) for name in PARAMETERS])
-    known, unknown = dynamics.plant_parameters[:NUM_PARAMETERS], np.full(NUM_PARAMETERS, np.nan)
+    known = dynamics.plant_parameters[:NUM_PARAMETERS]
+    unknown, nothing = np.full(NUM_PARAMETERS, np.nan), np.full(len(WRENCHES), np.nan)
 
-    def recorded(signal: str, otherwise: Array) -> Callable[[AnyMemory], Array]:
+    def recorded(
+        signal: str, names: Sequence[str], otherwise: Array
+    ) -> Callable[[AnyMemory], Array]:
+        place = np.array([_place(name, dynamics.free) for name in names])
         return lambda memory: np.where(place < 0, otherwise, HELD[signal](memory)[place])
 
-    own = {"parameters": known, "parameter_std": unknown}
-    return HELD | {signal: recorded(signal, otherwise) for signal, otherwise in own.items()}
+    own = {
+        "parameters": recorded("parameters", PARAMETERS, known),
+        "parameter_std": recorded("parameter_std", PARAMETERS, unknown),
+        "wrench_estimate": recorded("wrench_estimate", WRENCHES, nothing),
+        "wrench_std": recorded("wrench_std", WRENCHES, nothing),
+    }
+    return HELD | own
 
 
 def _place(name: str, names: Sequence[str]) -> int:
@@ -134,6 +146,8 @@ class DelayLqiController(SteppedLaw):
     | state_estimate | output | 12 | rad, m, rad/s, m/s | held, NaN before the first sample |
     | parameters | output | 8 | N m, kg, N m s/rad | held; as assumed by the law |
     | parameter_std | output | 8 | the same | held; NaN without estimator |
+    | wrench_estimate | output | 6 | N m, N | held; NaN where none is estimated |
+    | wrench_std | output | 6 | the same | held; NaN where none is estimated |
     | delay_estimate | output | 1 | s | held; as assumed by the law |
     | delay_std | output | 1 | s | held; NaN without delay estimator |
 

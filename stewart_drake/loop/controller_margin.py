@@ -35,11 +35,12 @@ import numpy as np
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.cost import law_gain
 from stewart_drake.law.delay_model import chain
 from stewart_drake.law.encoder_sensing import EncoderSensing
 from stewart_drake.law.error_model import ContinuousModel, linear_model
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.law.riccati import RiccatiError, law_gain
+from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.law.stability import (
     LinearLoop,
     Margins,
@@ -271,7 +272,7 @@ def _loops(
 
 
 def _gain(experiment: Experiment, truth: StewartDynamics, law: PredictiveLqi, time: float) -> Array:
-    """Return `law_gain` of a law about the reference at `time` in s."""
+    """Return `law.cost.law_gain` of a law about the reference at `time` in s."""
     plant, timeline, c = law.plant, law.timeline, experiment.scenario.controller
     known = plant.dynamics
     theta = known.free_of(truth.plant_parameters) if law.estimates else known.parameters
@@ -281,8 +282,8 @@ def _gain(experiment: Experiment, truth: StewartDynamics, law: PredictiveLqi, ti
     forward = law.feedforward.at(x, plant.dynamics, theta)
     design = law.model.about(x, forward, theta, plant)
     predictor = law.predictor.model(design, x, current, theta, plant)
-    weights = law.cost.matrices(np.array([c.w_Q, c.w_R]))
-    return law_gain(design, predictor, timeline.period, timeline.delay, weights)
+    weights = np.array([c.w_Q, c.w_R])
+    return law_gain(law.cost, design, predictor, timeline, weights)
 
 
 class LinearModels(NamedTuple):

@@ -16,6 +16,7 @@ from pydrake.systems.primitives import Adder, ConstantVectorSource, Saturation
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.channel import Channel, Wire
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.controller import (
@@ -31,9 +32,23 @@ from stewart_drake.loop.law_design import control_law, first_queue, followed_mot
 from stewart_drake.loop.link import LateMeasurements
 from stewart_drake.loop.platforms import MultibodyStewart, StartCheck, add_to_torque
 from stewart_drake.loop.preparation import Experiment, concrete
-from stewart_drake.loop.servos import Servos, commands_in_flight, servo_law, servo_loop
+from stewart_drake.loop.push import Push
+from stewart_drake.loop.servos import (
+    PositionServos,
+    Servos,
+    commands_in_flight,
+    position_servo,
+    servo_law,
+    servo_loop,
+)
 from stewart_drake.loop.tuner import AnnTuner, DensityWindow, LawTuner, weights_source
-from stewart_drake.scenario.config import Scenario, ServoActuatorConfig, TorqueActuatorConfig
+from stewart_drake.scenario.config import (
+    PositionServoConfig,
+    Scenario,
+    ServoActuatorConfig,
+    TorqueActuatorConfig,
+)
+from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.link import measurement_times
 from stewart_drake.scenario.signals import NUM_TORQUES, RATES, SIGNALS, exported_ports
 from stewart_drake.tuner.source import DensityFeatures, PaperPolicy
@@ -52,11 +67,13 @@ class ClosedLoop(Diagram):
 
     Subsystems: `reference`, `sensor`, `weights` or `tuner`, `controller`, `saturation`,
     `delay_chain`, `torque_bias`, `plant`, `density`; with servos `servos`, without `weights` and
-    `saturation`; with the user's own `own_controller`, `disturbance`, `disturbed_torque`. Output
-    ports: `state`, `reference`, `torque_commanded` (of law or servos, without limit),
+    `saturation`; with a push `push`; with the user's own `own_controller`, `disturbance`,
+    `disturbed_torque`; with a wrench `wrench`, the sum of them.
+    Output ports: `state`, `reference`, `torque_commanded` (of law or servos, without limit),
     `torque_applied` (limited and delayed, before the bias), `integral`, `weights_used`,
-    `parameters`, `parameter_std`, `density`, `measurement` (held, as the controller read it),
-    `state_estimate`, `delay_estimate`, `delay_std`, `delay_true` (of the newest torque), `packets`.
+    `parameters`, `parameter_std`, `wrench_estimate`, `wrench_std`, `density`, `measurement` (held,
+    as the controller read it), `state_estimate`, `delay_estimate`, `delay_std`, `delay_true` (of
+    the newest torque), `packets`.
 
     Attributes:
         experiment: the experiment.
@@ -76,6 +93,23 @@ class ClosedLoop(Diagram):
         plant: Any = self.GetSubsystemByName("plant")
         plant.set_state(plant.GetMyMutableContextFromRoot(context), self.experiment.start)
         return context
+
+    def SetParameters(self, context: Context, **parameters: Any) -> None:
+        """Change mass, payload and friction of the plant in the root context.
+
+        The controller does not know of it. Arguments and errors are those of
+        `StewartPlatform.SetParameters`.
+
+        Raises:
+            ConfigError: also for a plant of kind `paper`, which has none of them.
+        """
+        plant: Any = self.GetSubsystemByName("plant")
+        if (kind := self.experiment.scenario.plant.kind) == "paper":
+            raise ConfigError(f"plant.kind: got {kind}; expected exact or multibody")
+        if isinstance(plant, ExactPlant):
+            plant.set_parameters(plant.GetMyMutableContextFromRoot(context), **parameters)
+        else:
+            plant.platform.SetParameters(context, **parameters)
 
 
 def build_closed_loop(
@@ -129,6 +163,7 @@ def build_machine(experiment: Experiment) -> Diagram:
     builder = DiagramBuilder()
     plant = builder.AddNamedSystem("plant", _plant(experiment, None))
     builder.AddNamedSystem("sensor", _sensor(experiment))
+    _push(builder, experiment)
     _connect(builder, "plant.state", "sensor.state")
     builder.ExportInput(plant.GetInputPort("torque"), "torque")
     builder.ExportOutput(_output(builder, "plant.state"), "state")
@@ -182,6 +217,9 @@ def _add_torques(builder: DiagramBuilder, experiment: Experiment) -> float:
 def _add_servos(builder: DiagramBuilder, experiment: Experiment) -> float:
     """Add the law for servos, the delay of its commands, and the servos; return its catch-up, s."""
     sc, machine = experiment.scenario, StewartDynamics(experiment.truth)
+    if found := differing(sc, {"link.kind": "wire"}):
+        hint = ", or a machine and live, which send plans of setpoints over a network"
+        raise ConfigError(found.problem("with servos in a simulation", hint))
     law, planned, catch_up = servo_law(experiment)
     first, believed = commands_in_flight(experiment, law, law.timeline.delay)
     last = believed[-1] if len(believed) else first
@@ -189,22 +227,29 @@ def _add_servos(builder: DiagramBuilder, experiment: Experiment) -> float:
     _add_reference(builder, experiment, planned, law.preview_times)
     _, in_flight = commands_in_flight(experiment, law, sc.true_delay)
     builder.AddNamedSystem("delay_chain", wire(experiment, in_flight, "command"))
-    servos = Servos(servo_loop(experiment), machine, first, sc.controller.period, law.reports)
+    rest = machine, first, sc.controller.period, law.reports
+    servos: Servos | PositionServos
+    if law.servo is None:
+        servos = Servos(servo_loop(experiment), *rest)
+    else:
+        servos = PositionServos(position_servo(experiment), *rest)
     builder.AddNamedSystem("servos", servos)
     for source, target in (
         ("reference.preview", "controller.preview"),
         ("controller.command", "delay_chain.commanded"),
         ("delay_chain.command", "servos.command"),
-        ("delay_chain.arrived", "servos.arrived"),
         ("plant.state", "servos.state"),
     ):
         _connect(builder, source, target)
+    if servos.HasInputPort("arrived"):
+        _connect(builder, "delay_chain.arrived", "servos.arrived")
     return catch_up
 
 
 _ACTUATORS: Final[Mapping[type, Callable[[DiagramBuilder, Experiment], float]]] = {
     TorqueActuatorConfig: _add_torques,
     ServoActuatorConfig: _add_servos,
+    PositionServoConfig: _add_servos,
 }
 """Functions that add controller, link and motors to a loop, and return its catch-up in s."""
 
@@ -215,9 +260,13 @@ def _sensor(experiment: Experiment) -> System:
 
 
 def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | MultibodyStewart:
-    disturbance = experiment.own.systems.get("disturbance")
-    wrench = disturbance is not None and disturbance.HasOutputPort("wrench")
-    return PLANTS[experiment.scenario.plant.kind](experiment, wrench, meshcat)
+    plant = experiment.scenario.plant
+    wrench = any(plant.push.wrench) or _has_wrench(experiment.own.systems.get("disturbance"))
+    return PLANTS[plant.kind](experiment, wrench, meshcat)
+
+
+def _has_wrench(disturbance: System | None) -> bool:
+    return disturbance is not None and disturbance.HasOutputPort("wrench")
 
 
 def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
@@ -230,6 +279,7 @@ def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
     bias = builder.GetSubsystemByName("torque_bias")
     builder.Connect(_output(builder, f"{motors}.torque"), bias.get_input_port())
     _disturb(builder, own.get("disturbance"), bias.get_output_port())
+    _push(builder, experiment)
     _connect(builder, "plant.state", "sensor.state")
     measures_state = experiment.scenario.sensor.measures_state
     _connect(builder, measured if measures_state else "controller.estimate", "density.measurement")
@@ -318,14 +368,28 @@ def _disturb(builder: DiagramBuilder, disturbance: System | None, torque: Output
     """Connect the arriving torque with the plant, through a disturbance if there is one."""
     if disturbance is not None:
         builder.AddNamedSystem("disturbance", disturbance)
-        if disturbance.HasOutputPort("wrench"):
-            _connect(builder, "disturbance.wrench", "plant.wrench")
         if disturbance.HasOutputPort("torque"):
             total = builder.AddNamedSystem("disturbed_torque", Adder(2, NUM_TORQUES))
             builder.Connect(torque, total.get_input_port(0))
             builder.Connect(_output(builder, "disturbance.torque"), total.get_input_port(1))
             torque = total.get_output_port()
     _connect(builder, torque, "plant.torque")
+
+
+def _push(builder: DiagramBuilder, experiment: Experiment) -> None:
+    """Connect the plant with the wrenches of the scenario and of the user's disturbance."""
+    push, wrenches = experiment.scenario.plant.push, []
+    if any(push.wrench):
+        wrenches.append(builder.AddNamedSystem("push", Push(push)))
+    if builder.HasSubsystemNamed("disturbance"):
+        disturbance = builder.GetSubsystemByName("disturbance")
+        wrenches += [disturbance] if _has_wrench(disturbance) else []
+    if not wrenches:
+        return
+    total = builder.AddNamedSystem("wrench", Adder(len(wrenches), len(push.wrench)))
+    for i, system in enumerate(wrenches):
+        builder.Connect(system.GetOutputPort("wrench"), total.get_input_port(i))
+    _connect(builder, total.get_output_port(), "plant.wrench")
 
 
 def _tuner(builder: DiagramBuilder, experiment: Experiment, law: PredictiveLqi) -> System:

@@ -2,24 +2,62 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc"
 # A Drake class template over scalar types has no static type.
 
+from dataclasses import replace
+
 import numpy as np
-from numpy.typing import ArrayLike
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.common.value import Value
 from pydrake.systems.analysis import ApplySimulatorConfig, ExtractSimulatorConfig, Simulator
 from pydrake.systems.framework import (
     BasicVector_,
     EventStatus,
     LeafSystem_,
     PublishEvent,
+    ValueProducer,
     WitnessFunctionDirection,
 )
 from pydrake.systems.scalar_conversion import TemplateSystem
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, Limits, Workspace
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.sampling import weak
-from stewart_drake.scenario.signals import NUM_TORQUES, POSE, RATES
+from stewart_drake.mechanism.geometry import Body, Mechanism
+from stewart_drake.scenario.config import PlantConfig
+from stewart_drake.scenario.signals import CONSTANTS, NUM_TORQUES, PLANT_PARAMETERS, POSE, RATES
 from stewart_drake.scenario.timing import METRIC_PERIOD
+from stewart_drake.types import ArrayLike
+
+CHANGEABLE = (
+    *("payload_mass", "payload_position", "joint_damping"),
+    *("coulomb_friction", "coulomb_speed"),
+)
+"""Fields of `PlantConfig` that `set_parameters` of every plant accepts."""
+
+
+def checked_loads(loads) -> PlantConfig:
+    """Return the checked changes of a plant's parameters.
+
+    Raises:
+        ConfigError: a name out of `CHANGEABLE`, or a value out of its bounds.
+    """
+    for name in loads:
+        if name not in CHANGEABLE:
+            expected = ", ".join(("plate_mass", *CHANGEABLE))
+            raise ConfigError(f"parameter: got {name!r}; expected {expected}")
+    return PlantConfig(**loads)
+
+
+def plate_of_mass(mechanism: Mechanism, mass: float) -> Body:
+    """Return the plate with another mass in kg and the same moments of inertia.
+
+    Raises:
+        ConfigError: a mass that is not positive.
+    """
+    plate = replace(mechanism.plate, mass=float(mass))
+    if (problem := plate.problem("plate")) is not None:
+        raise ConfigError(problem)
+    return plate
 
 
 @TemplateSystem.define("ExactPlant_", T_list=(float, AutoDiffXd))
@@ -41,12 +79,17 @@ def ExactPlant_(T):
         | wrench | input | 6 | N m, N, in W at the plate's COM | continuous, only if asked for |
         | state | output | 12 | rad, m, rad/s, m/s | continuous |
 
+        | numeric parameter | size | contents |
+        | --- | --- | --- |
+        | 0 | 22 | `scenario.signals.PLANT_PARAMETERS`: friction, payload, torque bias and so on |
+        | 1 | 4 | mass of the plate, kg, and its moments of inertia, kg m^2 |
+
         In a diagram of your own, call `set_accuracy` on its simulator. Drake isolates the witness
         only if the accuracy is set on the context too, and stops with an error otherwise. With
-        AutoDiffXd, derivatives are exact and end at first order.
+        AutoDiffXd, derivatives by state, inputs and parameter 0 are exact and end at first order.
 
         Args:
-            dynamics: equations of motion, with gravity and the true parameters.
+            dynamics: equations of motion, with gravity and the default parameters.
             initial_state: (12,) default of the continuous state; at home and at rest if None.
             wrench: whether there is an input for a wrench on the plate; unconnected it is zero.
             limits: limits of the plate's motion; its machine's workspace if None.
@@ -72,6 +115,14 @@ def ExactPlant_(T):
             # Only if needed: `HasValue` of an input costs a tenth of the derivatives.
             self._wrench = self.DeclareVectorInputPort("wrench", 6) if wrench else None
             self.DeclareStateOutputPort("state", state)
+            plate = dynamics.mechanism.plate
+            for values in (dynamics.plant_parameters, [plate.mass, *plate.inertia]):
+                self.DeclareNumericParameter(BasicVector_[T]([T(value) for value in values]))
+            self._dynamics = self.DeclareCacheEntry(
+                "dynamics",
+                ValueProducer(allocate=lambda: Value[object](), calc=weak(self._calc_dynamics)),
+                {self.all_parameters_ticket()},
+            )
             if T is float:
                 self._witness = self.MakeWitnessFunction(
                     "workspace margin",
@@ -88,25 +139,45 @@ def ExactPlant_(T):
 
         def DoCalcTimeDerivatives(self, context, derivatives) -> None:
             x = context.get_continuous_state_vector().CopyToVector()
-            torque = self._torque.Eval(context)
+            torque, dynamics = self._torque.Eval(context), self._dynamics.Eval(context)
             wrench = None
             if self._wrench is not None and self._wrench.HasValue(context):
                 wrench = self._wrench.Eval(context)
             if T is float:
-                change = self.dynamics.change(x, torque)
+                change = dynamics.change(x, torque)
                 if wrench is not None:
-                    change[RATES] += self.dynamics.wrench_accelerations(x[POSE], wrench)
+                    change[RATES] += dynamics.wrench_accelerations(x[POSE], wrench)
             else:
-                change = self._with_gradient(x, torque, wrench)
+                parameters = context.get_numeric_parameter(0).CopyToVector()
+                change = self._with_gradient(dynamics, x, torque, parameters, wrench)
             derivatives.SetFromVector(change)
 
-        def _with_gradient(self, x, torque, wrench):
-            """Return d(x_dot) = A dx + B dT + (M N)^-1 dF, F the wrench."""
-            value, tau, d = ExtractValue(x).ravel(), ExtractValue(torque).ravel(), self.dynamics
+        def _calc_dynamics(self, context, result) -> None:
+            """Make the calculator of the context's parameters; the default one where they agree."""
+            parameters, plate = (context.get_numeric_parameter(i).CopyToVector() for i in (0, 1))
+            if T is not float:
+                if ExtractGradient(plate).any():
+                    raise ValueError(
+                        "parameter 1: got derivatives by mass or inertia of the plate; expected "
+                        "those by parameter 0, such as payload_mass"
+                    )
+                parameters, plate = ExtractValue(parameters).ravel(), ExtractValue(plate).ravel()
+            d, body = self.dynamics, self.dynamics.mechanism.plate
+            same = np.array_equal(plate, [body.mass, *body.inertia])
+            if T is not float or not same or not np.array_equal(parameters, d.plant_parameters):
+                plate = body if same else replace(body, mass=plate[0], inertia=plate[1:])
+                machine = d.mechanism if same else replace(d.mechanism, plate=plate)
+                d = type(d)(machine, d.gravity, parameters, PLANT_PARAMETERS)
+            result.set_value(d)
+
+        @staticmethod
+        def _with_gradient(d, x, torque, parameters, wrench):
+            """Return d(x_dot) = A dx + B dT + G dp + (M N)^-1 dF, F the wrench."""
+            value, tau = ExtractValue(x).ravel(), ExtractValue(torque).ravel()
             pose, rates = value[POSE], value[RATES]
             force = None if wrench is None else ExtractValue(wrench).ravel()
             at = d.derivatives(pose, rates, tau, wrench=force)
-            inputs, maps = [x, torque], [at.A, at.B]
+            inputs, maps = [x, torque, parameters], [at.A, at.B, at.G]
             a = d.accelerations(pose, rates, tau)
             if force is not None:
                 a += d.wrench_accelerations(pose, force)
@@ -119,6 +190,26 @@ def ExactPlant_(T):
         def set_state(self, context, state) -> None:
             """Put the plate, in this system's context, into [pose; rates] (12,)."""
             context.SetContinuousState(state)
+
+        def set_parameters(self, context, *, plate_mass=None, **loads) -> None:
+            """Change parameters in this system's context; others stay.
+
+            Args:
+                context: of this system.
+                plate_mass: kg; the plate's moments of inertia stay.
+                **loads: fields of `PlantConfig`, out of `CHANGEABLE`.
+
+            Raises:
+                ConfigError: another name, or a value out of its bounds.
+            """
+            values = checked_loads(loads).parameters
+            if plate_mass is not None:
+                mass = plate_of_mass(self.dynamics.mechanism, plate_mass).mass
+                context.get_mutable_numeric_parameter(1).SetAtIndex(0, mass)
+            vector = context.get_mutable_numeric_parameter(0)
+            for i, name in enumerate(CONSTANTS):
+                if name.startswith(tuple(loads)):
+                    vector.SetAtIndex(i, values[i])
 
         def margin(self, context) -> float:
             """Return a margin, positive inside the limits."""

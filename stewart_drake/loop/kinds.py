@@ -157,7 +157,8 @@ LINKS: Final[Mapping[type, LinkKind]] = {
 
 def _multibody(experiment: Experiment, wrench: bool, meshcat: Meshcat | None) -> MultibodyStewart:
     fields, start = asdict(experiment.scenario.plant), experiment.start[POSE]
-    del fields["mechanism"], fields["torque_bias"]  # the diagram adds the bias
+    for added in ("mechanism", "torque_bias", "push"):  # by the diagram
+        del fields[added]
     return MultibodyStewart(experiment.truth, meshcat=meshcat, start=start, wrench=wrench, **fields)
 
 

@@ -2,12 +2,11 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.trajectories import Trajectory
@@ -17,7 +16,8 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import validate
 from stewart_drake.law.catch_up import CatchUp
 from stewart_drake.law.channel import Packets
-from stewart_drake.law.cost import QuadraticCost
+from stewart_drake.law.clear_space import ClearSpace
+from stewart_drake.law.cost import Cost, QuadraticCost
 from stewart_drake.law.design_models import MultibodyModel, PaperModel
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
@@ -26,8 +26,12 @@ from stewart_drake.law.feedforward import (
     NoFeedforward,
 )
 from stewart_drake.law.filter_settings import ParameterSet, filter_settings, usual_parameters
+from stewart_drake.law.learned import LearnedLqi
+from stewart_drake.law.least_error import LeastError
+from stewart_drake.law.limited import LimitedLqi, QpLimits
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver, DelaySettings
+from stewart_drake.law.pd import PdGain, pd_gains
 from stewart_drake.law.planner import NoPlanner, Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.predictors import (
@@ -36,7 +40,9 @@ from stewart_drake.law.predictors import (
     NonlinearPredictor,
     Predictor,
 )
+from stewart_drake.law.stability import fastest_pole
 from stewart_drake.law.startup import (
+    STILL,
     choose_substeps,
     machine_torque,
     reference_torque,
@@ -46,8 +52,9 @@ from stewart_drake.law.startup import (
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import DelayLqiController, Reference
 from stewart_drake.loop.kinds import LINKS, REPORTS, SENSORS
+from stewart_drake.loop.learned import learned_torque
 from stewart_drake.loop.own import Own, own_motion
-from stewart_drake.loop.preparation import Experiment, calibration_of
+from stewart_drake.loop.preparation import Experiment, calibration_of, check_instants
 from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.scenario.calibration import OFFSETS, believed_delay
 from stewart_drake.scenario.config import ControllerConfig, Scenario
@@ -55,16 +62,49 @@ from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.field_types import MOST_PERIODS
 from stewart_drake.scenario.packets import times_under_way
-from stewart_drake.scenario.signals import BIAS, DAMPING, NUM_STATE, PARAMETERS, PAYLOAD, POSE
+from stewart_drake.scenario.signals import (
+    BIAS,
+    DAMPING,
+    NUM_STATE,
+    PARAMETERS,
+    PAYLOAD,
+    POSE,
+    WRENCHES,
+)
 from stewart_drake.scenario.trajectories import evaluate, motion_range
-from stewart_drake.types import Array
+from stewart_drake.types import Array, ArrayLike
 
 GENTLE = 3.0
 """Largest torque predicted with the default substeps, over that of the reference."""
 _MOST = 0.999
 """Share of the measurements that arrive within the wait."""
+_POSES = 500
+"""Poses of a reference that are looked at for distances to keep."""
 _PATIENCE = 10
 """Further periods of waiting for a measurement before the model replaces it."""
+
+
+def cost_of(experiment: Experiment, peak_torque: float) -> Cost:
+    """Return the part of a law that computes its gain; `peak_torque` of the reference, N m."""
+    c = experiment.scenario.controller
+    return quadratic_cost(experiment, peak_torque) if c.kind == "lqi" else pd_gain(experiment)
+
+
+def pd_gain(experiment: Experiment) -> PdGain:
+    """Return the gains of a scenario with `controller.kind: pd`.
+
+    Null gains follow equation (pd) of `law.pd`. The uncompensated delay is the true one less the
+    assumed one, and half a period for the hold. The pole is that of the plate held still at the
+    reference's first pose. One given gain sets the other for critical damping, kd^2 = 4 kp.
+    """
+    sc = experiment.scenario
+    c = sc.controller
+    if c.kp is None and c.kd is None:
+        late = max(0.0, sc.eta - believed_delay(sc).eta(c.period)) + c.period / 2
+        pole = fastest_pole(experiment.nominal.linearize(experiment.start[POSE])[0])
+        return PdGain(*pd_gains(late, pole), c.period)
+    kp = (c.kd or 0.0) ** 2 / 4 if c.kp is None else c.kp
+    return PdGain(kp, 2 * math.sqrt(kp) if c.kd is None else c.kd, c.period)
 
 
 def quadratic_cost(experiment: Experiment, peak_torque: float) -> QuadraticCost:
@@ -132,7 +172,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     substeps, peak_torque, least = sizing or sizing_of(experiment)
     torque_scale = max(least, peak_torque)
     plate, asked = experiment.mechanism.plate.mass, experiment.planned_limit
-    parameters = estimated_parameters(experiment, torque_scale)
+    parameters = estimated_parameters(experiment, torque_scale, max(STILL * least, peak_torque))
     settings = filter_settings(motion, plate, torque_scale, asked, c.period, parameters)
     gaps = sc.sensor.kind == "state" and sc.sensor.loss > 0
     observer = CoreObserver(settings if c.estimate else None, gaps=gaps)
@@ -148,7 +188,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         predictor=_PREDICTORS[c.prediction],
         feedforward=_FEEDFORWARDS[c.feedforward],
         model=PaperModel(c.torque_map) if c.model == "paper" else MultibodyModel(),
-        cost=quadratic_cost(experiment, peak_torque),
+        cost=cost_of(experiment, peak_torque),
         channel=channel,
         longest_wait=waits,
         kept=waits + (REPORTS if isinstance(channel, Packets) else 0),
@@ -164,11 +204,34 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
             planner=Replan(c.replan, experiment.scale) if c.replan > 0 else NoPlanner(),
             silence=0,  # until the delay is found
         )
+    if c.limits == "qp":
+        law = LimitedLqi(**law.parts, limits=QpLimits(c.horizon, clear_space(experiment)))
+    if (learned := learned_torque(experiment)) is not None:
+        law = LearnedLqi(**law.parts, learned=learned)
     return experiment.own.revised(law)
 
 
-def estimated_parameters(experiment: Experiment, torque_scale: float) -> ParameterSet:
-    """Return the estimated parameters and their prior; `torque_scale` of the motion, N m.
+def clear_space(experiment: Experiment) -> ClearSpace:
+    """Return the distances that plans keep, by machine and reference, to the last horizon's end."""
+    sc = experiment.scenario
+    period = sc.controller.period
+    ahead = believed_delay(sc).eta(period) + sc.controller.horizon * period
+    instants = check_instants(sc.duration + ahead)
+    few = instants[:: max(1, len(instants) // _POSES)]
+    poses = np.array([experiment.reference.value(t)[:, 0] for t in few])
+    return ClearSpace.along(experiment.mechanism, poses)
+
+
+def estimated_parameters(
+    experiment: Experiment, torque_scale: float, motion_torque: float
+) -> ParameterSet:
+    """Return the estimated parameters and their prior.
+
+    Args:
+        experiment: of the scenario.
+        torque_scale: of machine and motion, N m.
+        motion_torque: largest torque that the motion takes, N m; it sets the scale of a wrench,
+            with its force at the tip of the shortest crank.
 
     Raises:
         ConfigError: the calibration is beyond the bounds of such a machine.
@@ -180,6 +243,7 @@ def estimated_parameters(experiment: Experiment, torque_scale: float) -> Paramet
         experiment.planned_limit,
         plate_radius(machine),
         experiment.nominal.free,
+        wrench=(motion_torque, motion_torque / machine.crank_lengths.min()),
     )
     if experiment.calibration is not None:
         try:
@@ -193,7 +257,17 @@ def estimated_parameters(experiment: Experiment, torque_scale: float) -> Paramet
         PARAMETERS[DAMPING]: prior.damping,
         **dict.fromkeys(OFFSETS, prior.offsets),
     }
-    return found.trusting({name: std for name, std in stds.items() if std is not None})
+    found = found.trusting({name: std for name, std in stds.items() if std is not None})
+    if WRENCHES[0] not in found.names:
+        return found
+    return found.changing(_of_wrench(prior.wrench_walk), _of_wrench(prior.wrench))
+
+
+def _of_wrench(moment_and_force: Sequence[float] | None) -> dict[str, float]:
+    """Return two numbers, of moment and force, by the names of a wrench; none for None."""
+    if moment_and_force is None:
+        return {}
+    return dict(zip(WRENCHES, np.repeat(moment_and_force, 3).tolist(), strict=True))
 
 
 def _until_seen(delay: Delay, waits: int) -> int:
@@ -237,12 +311,23 @@ def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, floa
 def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
     """Return the plans onto the reference after a start from rest, or None without them."""
     sc, nominal, timeline = experiment.scenario, experiment.nominal, law.timeline
-    if sc.start != "rest" or sc.controller.catch_up == 0:
+    c = sc.controller
+    if sc.start != "rest" or c.catch_up == 0:
         return None
+    if c.catch_up is None and c.limits == "qp" and experiment.planned_limit is not None:
+        return None  # the quadratic program plans the way
     state, queue = experiment.start, experiment.torques_in_flight(timeline.delay)
     if len(queue):
         state = nominal.predict(state, *timeline.until_next(queue), law.plant.substeps)[-1]
-    return CatchUp(nominal, experiment.reference, state, timeline.eta, sc.controller.period)
+    given = nominal, experiment.reference, state, timeline.eta, c.period
+    if not isinstance(law.cost, QuadraticCost):
+        return CatchUp(*given)
+    Q, R = law.cost.matrices(np.array([c.w_Q, c.w_R]))
+
+    def least() -> LeastError:
+        return LeastError(law.plant, clear_space(experiment), np.diag(Q)[POSE], R)
+
+    return CatchUp(*given, least)
 
 
 def first_queue(experiment: Experiment, law: PredictiveLqi) -> Array:

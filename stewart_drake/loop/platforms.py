@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydrake.common.value import AbstractValue, Value
 from pydrake.geometry import Meshcat, MeshcatVisualizer, SceneGraph
 from pydrake.math import RigidTransform
@@ -43,7 +42,7 @@ from pydrake.systems.primitives import AffineSystem
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose, margin
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.loop.exact import ExactPlant
+from stewart_drake.loop.exact import ExactPlant, checked_loads, plate_of_mass
 from stewart_drake.loop.sampling import weak
 from stewart_drake.mechanism.assembly import joint_state
 from stewart_drake.mechanism.files import as_mechanism
@@ -60,7 +59,7 @@ from stewart_drake.scenario.signals import (
     POSITION,
     RATES,
 )
-from stewart_drake.types import Array
+from stewart_drake.types import Array, ArrayLike
 
 
 def add_mechanism(
@@ -118,12 +117,10 @@ def add_model(
         plant.WeldFrames(parent or plant.world_frame(), under, X_PB or RigidTransform())
     joint = plant.AddJoint(RpyFloatingJoint("plate", under, plate.body_frame()))
     floating = cast(RpyFloatingJoint, joint)
-    if payload_mass > 0:
-        place, point = np.array(payload_position), UnitInertia.PointMass
-        payload = plant.AddRigidBody(
-            "payload", model, SpatialInertia(payload_mass, place, point(place))
-        )
-        plant.WeldFrames(plate.body_frame(), payload.body_frame())
+    # Also without mass, which a context may change.
+    point_mass = _point_mass(payload_mass, payload_position)
+    payload = plant.AddRigidBody("payload", model, point_mass)
+    plant.WeldFrames(plate.body_frame(), payload.body_frame())
     pose = mechanism.home if start is None else start
     joints = joint_state(mechanism, pose, np.zeros(6))
     floating.set_default_angles(pose[ANGLES])
@@ -135,6 +132,11 @@ def add_model(
         universal = cast(UniversalJoint, plant.GetJointByName(f"universal_{leg}", model))
         universal.set_default_angles(joints.universal[i])
     return model
+
+
+def _point_mass(mass: float, place: Sequence[float]) -> SpatialInertia:
+    """Return the inertia of a mass in kg at a place (3,) in m, about the frame's origin."""
+    return SpatialInertia(mass, np.array(place), UnitInertia.PointMass(np.array(place)))
 
 
 def set_pose(
@@ -235,8 +237,8 @@ class CoulombFriction(LeafSystem):
     Args:
         plant: finalized.
         model: the machine in it, needed for several.
-        friction: N m.
-        speed: rad/s.
+        friction: N m, element 0 of the numeric parameter.
+        speed: rad/s, element 1.
     """
 
     def __init__(
@@ -247,7 +249,7 @@ class CoulombFriction(LeafSystem):
         speed: float,
     ) -> None:
         super().__init__()
-        self._friction, self._speed = friction, speed
+        self.DeclareNumericParameter(BasicVector([friction, speed]))
         motors = [plant.GetJointByName(f"motor_{leg}", model) for leg in LEGS]
         self._rates = [plant.num_positions() + motor.velocity_start() for motor in motors]
         self._torque = self.DeclareVectorInputPort("torque", NUM_TORQUES)
@@ -256,7 +258,8 @@ class CoulombFriction(LeafSystem):
 
     def _actuation(self, context: Context, output: BasicVector) -> None:
         rates = np.asarray(self._tree.Eval(context))[self._rates]
-        friction = self._friction * np.tanh(rates / self._speed)
+        size, speed = context.get_numeric_parameter(0).value()
+        friction = size * np.tanh(rates / speed)
         output.SetFromVector(np.asarray(self._torque.Eval(context)) - friction)
 
 
@@ -387,6 +390,55 @@ class StewartPlatform:
         else:
             set_pose(self.plant, own, self.mechanism, x[POSE], x[RATES], self.model)
 
+    def SetParameters(
+        self, context: Context, *, plate_mass: float | None = None, **loads: Any
+    ) -> None:
+        """Change mass, payload and friction in the diagram's root context; others stay.
+
+        A multibody plant has them as parameters of its bodies `plate` and `payload`, of its joints
+        `motor_1` to `motor_6`, and of `CoulombFriction`.
+
+        Args:
+            context: root context.
+            plate_mass: kg; the plate's moments of inertia stay.
+            **loads: fields of `PlantConfig`: payload_mass, payload_position, joint_damping,
+                coulomb_friction, coulomb_speed.
+
+        Raises:
+            ConfigError: another name, a value out of its bounds, or Coulomb friction of a multibody
+                plant that was built without it.
+        """
+        own = self.plant.GetMyMutableContextFromRoot(context)
+        if self.model is None:
+            self.plant.set_parameters(own, plate_mass=plate_mass, **loads)
+            return
+        new = checked_loads(loads)
+        shafts = [name for name in loads if name.startswith("coulomb")]
+        if shafts and "coulomb_friction" not in self._added:
+            raise ConfigError(
+                f"{shafts[0]}: got a platform without Coulomb friction; expected one built with "
+                "PlantConfig(coulomb_friction=...) above 0"
+            )
+        if plate_mass is not None:
+            body, centre = plate_of_mass(self.mechanism, plate_mass), np.zeros(3)
+            inertia = SpatialInertia(body.mass, centre, UnitInertia(*body.inertia / body.mass))
+            plate = self.plant.GetBodyByName("plate", self.model)
+            plate.SetSpatialInertiaInBodyFrame(own, inertia)
+        payload = self.plant.GetBodyByName("payload", self.model)
+        if "payload_position" in loads:
+            point_mass = _point_mass(payload.get_mass(own), new.payload_position)
+            payload.SetSpatialInertiaInBodyFrame(own, point_mass)
+        if "payload_mass" in loads:
+            payload.SetMass(own, new.payload_mass)
+        if "joint_damping" in loads:
+            for leg in LEGS:
+                motor = self.plant.GetJointByName(f"motor_{leg}", self.model)
+                motor.SetDamping(own, new.joint_damping)
+        for name in shafts:
+            shaft: Context = self._added["coulomb_friction"].GetMyMutableContextFromRoot(context)
+            parameter = shaft.get_mutable_numeric_parameter(0)
+            parameter.SetAtIndex(int(name == "coulomb_speed"), getattr(new, name))
+
     def _check_finalized(self) -> None:
         if not self.plant.is_finalized():
             raise ConfigError(
@@ -474,6 +526,11 @@ def AddStewartPlatform(
         raise ConfigError(
             "plant.kind: got 'paper', a model without legs; expected 'multibody' or 'exact'"
         )
+    if any(config.push.wrench):
+        raise ConfigError(
+            f"plant.push.wrench: got {config.push.wrench} for a platform in a diagram of its own; "
+            "expected zeros, and a source for the platform's input wrench"
+        )
     if config.kind == "exact":
         for name, given in (("plant", plant), ("parent", parent), ("X_PB", X_PB)):
             if given is not None:
@@ -557,7 +614,7 @@ class MultibodyStewart(Diagram):
         if meshcat is not None:
             MeshcatVisualizer.AddToBuilder(builder, platform.scene_graph, meshcat)
         builder.BuildInto(self)
-        self.mechanism, self.tree = mechanism, platform.plant
+        self.mechanism, self.tree, self.platform = mechanism, platform.plant, platform
 
     def set_state(self, context: Context, state: Array) -> None:
         """Put the machine, in its own context, into [pose; rates] (12,), all loops closed.

@@ -13,6 +13,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
 from stewart_drake.law.startup import STILL, initial_queue
 from stewart_drake.loop.own import NOTHING, Own, own_motion, take
+from stewart_drake.machines import reachy_moves  # noqa: F401 registers its kind of reference
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint, with_rotors
 from stewart_drake.scenario.calibration import (
@@ -32,6 +33,8 @@ from stewart_drake.scenario.signals import (
     PLANT_PARAMETERS,
     POSE,
     POSITION,
+    SHAFTS,
+    WRENCHES,
 )
 from stewart_drake.scenario.trajectories import evaluate, make_reference, motion_range, peak_to_peak
 from stewart_drake.tuner.network import DEFAULT, Network, load_network
@@ -46,6 +49,7 @@ _ESTIMATED = {
     "payload": (PARAMETERS[PAYLOAD],),
     "damping": (PARAMETERS[DAMPING],),
     "coulomb": (PLANT_PARAMETERS[COULOMB],),
+    "wrench": WRENCHES,
     "offsets": OFFSETS,
 }
 """Parameters for each word of `controller.estimate`."""
@@ -128,7 +132,7 @@ class Experiment(NamedTuple):
         is added before the plant, after the torques are recorded.
         """
         plant = self.scenario.plant
-        parameters = np.array(plant.parameters)
+        parameters = np.array(self.scenario.plant_parameters)
         parameters[BIAS] *= biased
         return type(self.nominal)(self.truth, plant.gravity, parameters)
 
@@ -181,7 +185,8 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
     """
     experiment = assemble(scenario, truth, own)
     failure = experiment.reference_failure()
-    if failure is not None:
+    governed = scenario.controller.limits == "qp"
+    if failure is not None and not (governed and failure.time > 0):
         first = experiment.reference.value(0.0)[:, 0]
         short = failure.leg is not None and failure.margin < 0
         raise ConfigError(
@@ -247,6 +252,8 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
     if scenario.start == "rest":
         start[6:] = 0.0
     parameters = plant_parameters()
+    if scenario.actuator.shafts is not None:
+        parameters[SHAFTS] = scenario.actuator.shafts
     for i, name in enumerate(PLANT_PARAMETERS):
         value = None if calibration is None else calibration.value(name)
         parameters[i] = parameters[i] if value is None else value

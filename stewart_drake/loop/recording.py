@@ -1,8 +1,7 @@
 """The record of a running loop, and the summary of a run."""
 
-import json
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,12 +19,11 @@ from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.results import DelaySummary, RunSummary, waits_at_rest
 from stewart_drake.loop.tuner import AnnTuner, LawTuner
 from stewart_drake.scenario.loading import scenario_to_dict, scenario_yaml
+from stewart_drake.scenario.run_log import RunLog, dataset_of
 from stewart_drake.scenario.signals import (
     NUM_STATE,
     POSE,
-    Signal,
     exported_ports,
-    run_dimensions,
     run_signals,
 )
 from stewart_drake.scenario.timing import Instant
@@ -70,6 +68,7 @@ class Record:
 
     Args:
         experiment: the experiment.
+        logs: to be written while the run goes on.
 
     Attributes:
         on_grid: time, pose error (6) and reference (6) on the metric's grid and at the end.
@@ -83,11 +82,10 @@ class Record:
         delay: at the last sample, s: true, assumed or estimated, standard deviation.
     """
 
-    def __init__(self, experiment: Experiment) -> None:
-        self._scenario = experiment.scenario
+    def __init__(self, experiment: Experiment, logs: Sequence[RunLog] = ()) -> None:
+        self._logs, self._scenario = logs, experiment.scenario
         samples = experiment.scenario.sensor.samples
-        self._signals, self._dimensions = run_signals(samples), run_dimensions(samples)
-        self._recorded = [signal for signal in self._signals.values() if signal.source]
+        self._recorded = [one for one in run_signals(samples).values() if one.source]
         self._log = Table(1 + sum(signal.size for signal in self._recorded))
         self.on_grid, self.samples = Table(13), Table(19)
         self.peak_applied = 0.0
@@ -100,6 +98,7 @@ class Record:
         """Add a row to the log: a time in s, and the value of each exported port."""
         row = [seen[signal.exported][signal.part] for signal in self._recorded]
         self._log.append(time, *row)
+        self.mirror(time, seen)
 
     def count(self, memory: Any) -> bool:
         """Take the counts of a sample from the controller's memory; return `has_measured`."""
@@ -114,30 +113,22 @@ class Record:
         for signal in self._recorded:
             stop = start + signal.size
             values[signal.name], start = self._log.columns(slice(start, stop)), stop
-        values["error"] = values["pose"] - values["reference"]
-        variables = {
-            name: _variable(signal, values[name]) for name, signal in self._signals.items()
-        }
-        coordinates: dict[str, Any] = {
-            name: (name, list(dimension.labels), {"long_name": dimension.long_name})
-            for name, dimension in self._dimensions.items()
-        }
-        time = self._log.column(0)
-        coordinates["time"] = ("time", time, {"units": "s", "long_name": "time"})
-        attributes = {
-            "title": "closed loop of a rotary Stewart platform with delayed torques",
-            "scenario": scenario_yaml(self._scenario),
-            "versions": json.dumps(versions()),
-        }
-        return xr.Dataset(variables, coordinates, attributes)
+        text, samples = scenario_yaml(self._scenario), self._scenario.sensor.samples
+        return dataset_of(self._log.column(0), values, text, samples)
+
+    def mirror(self, time: float, seen: Mapping[str, Array]) -> None:
+        """Write a row to the logs: a time in s, and the value of each exported port."""
+        row = {signal.name: seen[signal.exported][signal.part] for signal in self._recorded}
+        for log in self._logs:
+            log.write(time, row)
 
 
 class Recorder(Record):
     """Record of a simulated loop: `look` reads the plant, `keep` adds it and the held signals."""
 
-    def __init__(self, loop: ClosedLoop) -> None:
+    def __init__(self, loop: ClosedLoop, logs: Sequence[RunLog] = ()) -> None:
         controller: Any = loop.GetSubsystemByName("controller")
-        super().__init__(loop.experiment)
+        super().__init__(loop.experiment, logs)
         self._loop, self._controller = loop, controller
         self._ports: dict[str, Any] = {}
         tuner = loop.GetSubsystemByName("tuner") if loop.HasSubsystemNamed("tuner") else None
@@ -203,15 +194,6 @@ def has_measured(memory: Any, before: Counts) -> bool:
     partial = 0 if belief is None else belief.partial
     more: int = memory.counts.bad_measurements - before.bad_measurements
     return more <= partial
-
-
-def _variable(signal: Signal, values: Array) -> tuple[tuple[str, ...], Array, dict[str, str]]:
-    """Return dimensions, values and attributes of a signal in the record."""
-    dimension = signal.quantity.dimension
-    attributes = {"units": signal.unit, "long_name": signal.long_name}
-    if dimension is None:
-        return ("time",), values[:, 0], attributes
-    return ("time", dimension), values, attributes
 
 
 def summarize(

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -20,7 +20,7 @@ from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.scenario.field_types import SPIKE
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS, NUM_STATE, POSE
 from stewart_drake.scenario.timing import event_time
-from stewart_drake.types import Array
+from stewart_drake.types import Array, ArrayLike
 
 _EARLY = 1e-9
 """Tolerance of the instants of a fault, s."""

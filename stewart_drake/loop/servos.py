@@ -1,27 +1,38 @@
-"""Servos: the local loops at the motors as a Drake system, and the design of their law."""
+"""Servos: the local loops at the motors as Drake systems, and the design of their law."""
 
 import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from pydrake.systems.framework import Context
+from pydrake.common.value import AbstractValue, Value
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    ContinuousState,
+    LeafSystem,
+    State,
+    ValueProducer,
+)
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.catch_up import PIECE, shortest
+from stewart_drake.law.feedforward import NoFeedforward
 from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.law.servos import (
+    PositionServo,
     ReportLayout,
     Segment,
     ServoLoop,
+    Stiffness,
     crank_mobility,
     mean_inertia,
     still,
@@ -31,7 +42,8 @@ from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.own import NOTHING
 from stewart_drake.loop.preparation import Experiment
-from stewart_drake.loop.sampling import SteppedLaw
+from stewart_drake.loop.sampling import SteppedLaw, update_every, weak
+from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.config import Scenario, compatible_actuator
 from stewart_drake.scenario.delay import Delay
@@ -152,8 +164,99 @@ class Servos(SteppedLaw):
         return np.concatenate([angles, rates])
 
 
+class PositionServos(LeafSystem):
+    """Servos given by their stiffness: the newest setpoint acts, with the torque
+
+        asked  = k (u - a(x)) - k_v a'(x),
+        torque = asked within the limit,
+
+    x the state, u the angles of the command. Damping, Coulomb friction and armature are those of
+    the plant.
+
+    Dynamics:  d[p; q]/dt = [torque; sum |asked - torque|].
+    Update:    every part of a period, keep p and q, from which the report has mean torques.
+
+    | port | direction | size | unit | rate |
+    | --- | --- | --- | --- | --- |
+    | command | input | 18, of which angles are used | rad | piecewise constant |
+    | state | input | 12 | rad, m, rad/s, m/s | continuous |
+    | torque | output | 6 | N m | continuous, direct feedthrough |
+    | report | output | of `law.servos.ReportLayout` | N m | to be read at samples |
+
+    Args:
+        servo: stiffness, velocity gain and torque limit.
+        dynamics: of the true machine, for its geometry.
+        command: (18,) held until the first one arrives.
+        period: of the commands, s.
+        reports: layout of the report.
+    """
+
+    def __init__(
+        self,
+        servo: PositionServo,
+        dynamics: StewartDynamics,
+        command: Array,
+        period: float,
+        reports: ReportLayout,
+    ) -> None:
+        super().__init__()
+        self._geometry, self._first = geometry_of(dynamics.mechanism), command
+        self._servo, self.reports, self._part = servo, reports, period / reports.parts
+        self._command = self.DeclareVectorInputPort("command", NUM_REFERENCE)
+        self._state = self.DeclareVectorInputPort("state", NUM_STATE)
+        self.DeclareContinuousState(NUM_TORQUES + 1)
+        parts = reports.periods * reports.parts
+        # Integrals at the ends of the reported parts, the oldest first.
+        self._ends = self.DeclareAbstractState(Value(np.full((parts, NUM_TORQUES + 1), np.nan)))
+        inputs = {self.input_port_ticket(p.get_index()) for p in (self._command, self._state)}
+        self._acting = self.DeclareCacheEntry(
+            "torques",
+            ValueProducer(allocate=lambda: Value(np.empty((2, 6))), calc=weak(self._torques)),
+            inputs,
+        )
+        self.DeclareVectorOutputPort(
+            "torque", NUM_TORQUES, weak(self._torque), {self._acting.ticket()}
+        )
+        kept = {self.abstract_state_ticket(self._ends), self.xc_ticket(), self._acting.ticket()}
+        self.DeclareVectorOutputPort("report", reports.size, weak(self._report), kept)
+        update_every(self, self._part, self._keep, servo_time)
+
+    def _torques(self, context: Context, result: AbstractValue) -> None:
+        command = np.array(self._command.Eval(context))
+        if not np.all(np.isfinite(command)):
+            command = self._first
+        state = np.array(self._state.Eval(context))
+        result.set_value(self._servo.torques(self._geometry, command[POSE], state))
+
+    def _torque(self, context: Context, output: BasicVector) -> None:
+        acting: Any = self._acting.Eval(context)
+        output.SetFromVector(acting[1])
+
+    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
+        acting: Any = self._acting.Eval(context)
+        cut = np.abs(acting[0] - acting[1]).sum()
+        derivatives.SetFromVector(np.append(acting[1], cut))
+
+    def _impulses(self, context: Context) -> Array:
+        """Return the integrals at the ends of all reported parts and now (n + 1, 7)."""
+        value: Any = context.get_abstract_state(int(self._ends))
+        now = context.get_continuous_state_vector().CopyToVector()
+        return np.vstack([value.get_value(), now])
+
+    def _keep(self, context: Context, state: State) -> None:
+        state.get_mutable_abstract_state(int(self._ends)).set_value(self._impulses(context)[1:])
+
+    def _report(self, context: Context, output: BasicVector) -> None:
+        parts = np.diff(self._impulses(context), axis=0) / self._part
+        acting: Any = self._acting.Eval(context)
+        output.SetFromVector(self.reports.of_means(parts[:, :-1], parts[:, -1] > 0, acting[0]))
+
+
 _PART: Final = 0.005
 """Approximate length of the parts of a period with a reported mean torque, s."""
+_FINE_PART: Final = 0.001
+"""The same of servos given by their stiffness, s. Their torque changes faster: with parts of 5 ms
+the estimator rejects measurements."""
 _REPORTED: Final = 10
 """Periods in a report."""
 
@@ -185,6 +288,34 @@ def servo_loop(experiment: Experiment) -> ServoLoop:
     return loop
 
 
+def position_servo(experiment: Experiment) -> PositionServo:
+    """Return the servos of the machine that is simulated."""
+    actuator = experiment.scenario.actuator
+    assert actuator.kind == "position_servo"
+    limit = experiment.torque_limit
+    return PositionServo(actuator.stiffness, actuator.velocity_gain, limit)
+
+
+def _part(scenario: Scenario) -> float:
+    """Return the approximate length of the parts of a report, s."""
+    if scenario.actuator.kind != "position_servo":
+        return _PART
+    return _FINE_PART if scenario.controller.estimate else scenario.controller.period
+
+
+def known_stiffness(scenario: Scenario) -> Stiffness | None:
+    """Return servos given by their stiffness as the controller knows them; None for others."""
+    actuator = scenario.actuator
+    if actuator.kind != "position_servo":
+        return None
+    given = actuator.angle_range
+    ranges = np.array([-math.inf, math.inf] if given is None else given)
+    low, high = np.broadcast_to(ranges, (NUM_TORQUES, 2)).T.copy()
+    speed = math.inf if actuator.speed_limit is None else actuator.speed_limit
+    most = speed * scenario.controller.period
+    return Stiffness(actuator.stiffness, actuator.velocity_gain, low, high, most)
+
+
 def quickest_crank(dynamics: StewartDynamics, experiment: Experiment) -> float:
     """Return the largest acceleration per torque, rad/s^2 per N m, at home and along the reference.
 
@@ -204,7 +335,7 @@ def compose_servo_law(experiment: Experiment) -> ServoPreview:
     """Compose the law for servos; it shares most parts with the law for torques."""
     like = _law_for_torques(experiment)
     period, ticks = like.timeline.period, _ticks(experiment.scenario)
-    wanted = max(1, round(period / _PART))
+    wanted = max(1, round(period / _part(experiment.scenario)))
     parts = next(n for n in range(min(wanted, ticks), 0, -1) if ticks % n == 0)
     observer = like.observer
     if isinstance(observer, CoreObserver) and observer.settings is not None:
@@ -217,6 +348,7 @@ def compose_servo_law(experiment: Experiment) -> ServoPreview:
         observer=observer,
         feedforward=like.feedforward,
         reports=ReportLayout(parts, _REPORTED),
+        servo=known_stiffness(experiment.scenario),
     )
     return experiment.own.revised(law)
 
@@ -268,10 +400,12 @@ def commands_in_flight(
     wanted[0, RATES] = experiment.start[RATES]
     if sc.queue == "reference":
         ends = delay.eta(law.timeline.period) - law.timeline.period * np.arange(length)[::-1]
+        if law.servo is not None:  # it holds a setpoint, which is that of the middle of the period
+            ends = ends - law.timeline.period / 2
         moving = 1 if sc.start == "rest" else 0  # at rest the plate is not yet on the reference
         for row, t in zip(wanted[moving:], [0.0, *ends][moving:], strict=True):
             row[:] = evaluate(experiment.reference, t)
-    commands = np.array([law.command(x, law.plant.dynamics.parameters) for x in wanted])
     if sc.queue == "zero":
-        commands[:, MODEL_TORQUE] = 0.0
+        law = replace(law, feedforward=NoFeedforward())
+    commands = np.array([law.command(x, law.plant.dynamics.parameters) for x in wanted])
     return commands[0], commands[1:]

@@ -1,7 +1,7 @@
 """Simulation of a scenario."""
 
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from traceback import walk_tb
 from typing import Any, Final
@@ -26,6 +26,7 @@ from stewart_drake.loop.scene import Live
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.run_log import RunLog, open_log
 from stewart_drake.scenario.timing import instants, look_time
 
 _PACKAGE: Final = __name__.partition(".")[0]
@@ -47,6 +48,7 @@ def simulate(
     meshcat: Meshcat | None = None,
     true_mechanism: Mechanism | None = None,
     judge_stability: ControllerMargin | bool = True,
+    log: str | Path | None = None,
 ) -> SimulationResult:
     """Run a scenario from t = 0 to its duration, or until the plate leaves its workspace.
 
@@ -85,6 +87,7 @@ def simulate(
         judge_stability: whether to judge the loop before the run, in some tenths of a second, for
             `controller_margin` (else None) and `warnings` of the summary; or its known
             `controller_margin`.
+        log: file that is written while the run goes on, .mcap or .csv; see `scenario.run_log`.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
@@ -115,7 +118,12 @@ def simulate(
             judged = controller_margin(experiment) if judgeable else None
         else:
             judged = judge_stability
-        return _run(experiment, judged, progress, meshcat)
+        logs = [] if log is None else [open_log(Path(log), experiment.scenario)]
+        try:
+            return _run(experiment, judged, progress, meshcat, logs)
+        finally:
+            for one in logs:
+                one.close()
 
 
 def _run(
@@ -123,6 +131,7 @@ def _run(
     margin: ControllerMargin | None,
     progress: Progress | None,
     meshcat: Meshcat | None,
+    logs: Sequence[RunLog],
 ) -> SimulationResult:
     started, scenario = clock.perf_counter(), experiment.scenario
     loop = build_closed_loop(experiment)
@@ -130,7 +139,7 @@ def _run(
     live = None if meshcat is None else Live(loop, meshcat)
     if live is not None:
         progress = _shown(simulator, live, progress)
-    recorder = Recorder(loop)
+    recorder = Recorder(loop, logs)
     try:
         status, stopped = _advance(simulator, recorder, loop, progress)
         wall = clock.perf_counter() - started

@@ -10,6 +10,7 @@ from itertools import combinations
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stewart_drake.mechanism.kinematics import LegGeometry, Legs
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS, POSITION
@@ -19,6 +20,7 @@ LINKS: Final = tuple(f"{kind} {leg}" for kind in ("crank", "rod") for leg in LEG
 """Names of the links, in the order of `center_lines`."""
 APART: Final = tuple((i, j) for i, j in combinations(range(2 * NUM_LEGS), 2) if j - i != NUM_LEGS)
 """Pairs (60) of links without a common joint: all but a crank and its own rod."""
+_APART: Final = np.array(APART)
 
 
 class Proportions(NamedTuple):
@@ -75,9 +77,14 @@ def segment_distances(p: Array, u: Array, q: Array, v: Array) -> Array:
     return np.sqrt(_dot(d := r + s[..., None] * u - t[..., None] * v, d))
 
 
-def clearances(mechanism: Legs, poses: Array, legs: LegGeometry) -> Array:
-    """Return lower bounds (n, 60) of the distances of the pairs `APART`, m; may be negative."""
-    first, second = np.array(APART).T
+def clearances(
+    mechanism: Legs, poses: Array, legs: LegGeometry, pairs: NDArray[np.intp] | None = None
+) -> Array:
+    """Return lower bounds (n, 60) of the distances of the pairs `APART`, m; may be negative.
+
+    `pairs` (k,) chooses some of them.
+    """
+    first, second = (_APART if pairs is None else _APART[pairs]).T
     start, along = center_lines(mechanism, poses, legs)
     lines = start[:, first], along[:, first], start[:, second], along[:, second]
     radii = capsule_radii(mechanism)

@@ -16,6 +16,7 @@ from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import load_yaml, one_message, validate, yaml_text
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism, bar_inertia, disc_inertia
 from stewart_drake.mechanism.kinematics import Legs, UnreachablePoseError
+from stewart_drake.scenario.signals import LEGS
 from stewart_drake.types import Array
 
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -23,6 +24,7 @@ _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 # Limits far beyond any platform keep squares and products finite.
 _SHORTEST, _LONGEST = 1e-6, 1e3
 _MOST_LEAN = 2e-3  # rad; directions written with three decimals are off the right angle by less
+_UNLIKE = 20  # lengths of one machine that differ by more are in different units
 _PAPER = 0.1  # kg/m^2, a sheet of paper; a lighter plate has its lengths in millimetres
 
 
@@ -55,6 +57,7 @@ Joint = Annotated[int, Field(ge=0, le=5)]
 Order = Annotated[list[Joint], Field(min_length=6, max_length=6), AfterValidator(_each_joint_once)]
 Branch = Annotated[int, AfterValidator(_one_of_two), one_message("-1 or 1")]
 Branches = Annotated[list[Branch], Field(min_length=6, max_length=6)]
+LegNumbers = Annotated[list[Annotated[int, Field(ge=1, le=6)]], Field(max_length=6)]
 Length = Annotated[
     Radius | Annotated[list[Radius], Field(min_length=6, max_length=6)],
     one_message(f"a positive number, or a list of six, metres of {_SHORTEST:g} to {_LONGEST:g}"),
@@ -101,6 +104,19 @@ class MotorSpec:
     """
 
     effort_limit: Annotated[float, Field(gt=0, le=1e6)] | None = None
+
+
+@dataclass(config=_STRICT)
+class BallJointSpec:
+    """Ball joints with the friction of a scenario's `plant.ball_joint_...`.
+
+    Attributes:
+        crank: numbers of the legs, 1 to 6, whose joint between crank and rod has it.
+        plate: those whose joint between rod and plate has it.
+    """
+
+    crank: LegNumbers = Field(default_factory=lambda: list(LEGS))
+    plate: LegNumbers = Field(default_factory=lambda: list(LEGS))
 
 
 @dataclass(config=_STRICT)
@@ -156,6 +172,7 @@ class MechanismSpec:
     crank: LinkSpec
     rod: LinkSpec
     motor: MotorSpec = Field(default_factory=MotorSpec)
+    ball_joints: BallJointSpec = Field(default_factory=BallJointSpec)
     pattern: PatternSpec | None = None
     legs: Annotated[list[LegSpec], Field(min_length=6, max_length=6)] | None = None
 
@@ -212,6 +229,10 @@ def mechanism_yaml(mechanism: Mechanism) -> str:
     def link(one: Link, lengths: Array) -> dict[str, object]:
         return body(one, length=lengths.tolist(), center=float(one.center))
 
+    rubbing = {
+        end: [leg for leg, rubs in zip(LEGS, row, strict=True) if rubs]
+        for end, row in zip(("crank", "plate"), m.ball_joints, strict=True)
+    }
     return yaml_text(
         {
             "name": m.name,
@@ -222,6 +243,7 @@ def mechanism_yaml(mechanism: Mechanism) -> str:
             "crank": link(m.crank, m.crank_lengths),
             "rod": link(m.rod, m.rod_lengths),
             "motor": {"effort_limit": None if m.effort_limit is None else float(m.effort_limit)},
+            **({} if np.all(m.ball_joints) else {"ball_joints": rubbing}),
         }
     )
 
@@ -235,6 +257,7 @@ def build_mechanism(spec: MechanismSpec) -> Mechanism:
     else:
         given = "neither" if spec.pattern is None else "both"
         raise ConfigError(f"pattern, legs: got {given}; expected exactly one of the two")
+    ends = spec.ball_joints
     base_radius, plate_radius = (
         float(np.hypot(p[:, 0], p[:, 1]).max()) for p in (legs.p_WS, legs.p_PQ)
     )
@@ -243,16 +266,34 @@ def build_mechanism(spec: MechanismSpec) -> Mechanism:
             f"plate.mass: got {spec.plate.mass:g} kg on a radius of {plate_radius:g} m, lighter "
             "than paper; expected lengths in metres (are these millimetres?)"
         )
-    return Mechanism(
-        **vars(legs),
-        name=spec.name,
-        home=np.array(spec.home),
-        base=_disc(spec.base, base_radius),
-        plate=_disc(spec.plate, plate_radius),
-        crank=_bar(spec.crank, "crank"),
-        rod=_bar(spec.rod, "rod"),
-        effort_limit=spec.motor.effort_limit,
-    )
+    try:
+        return Mechanism(
+            **vars(legs),
+            name=spec.name,
+            home=np.array(spec.home),
+            base=_disc(spec.base, base_radius),
+            plate=_disc(spec.plate, plate_radius),
+            crank=_bar(spec.crank, "crank"),
+            rod=_bar(spec.rod, "rod"),
+            effort_limit=spec.motor.effort_limit,
+            ball_joints=np.array(
+                [[leg in rubs for leg in LEGS] for rubs in (ends.crank, ends.plate)]
+            ),
+        )
+    except UnreachablePoseError:
+        anchors = "legs" if spec.pattern is None else "pattern"
+        sizes = {
+            "crank.length, rod.length": max(np.max(spec.crank.length), np.max(spec.rod.length)),
+            anchors: max(base_radius, plate_radius),
+            "home": float(np.linalg.norm(spec.home[3:])),
+        }
+        largest, other, _ = sorted(sizes, key=lambda name: -sizes[name])
+        if largest == "home" or sizes[largest] < _UNLIKE * sizes[other]:
+            raise
+        raise ConfigError(
+            f"{largest}: got up to {sizes[largest]:g} m, {sizes[largest] / sizes[other]:.0f} times "
+            f"the size of {other}; expected metres (are these millimetres?)"
+        ) from None
 
 
 def _disc(spec: BodySpec, radius: float) -> Body:

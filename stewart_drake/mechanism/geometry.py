@@ -13,18 +13,17 @@ Frames, in Drake's monogram notation, leg by leg (leading axis of length six):
 
 import hashlib
 import re
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from stewart_drake.core.library import core
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism import kinematics
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS
-from stewart_drake.types import Array
+from stewart_drake.types import Array, ArrayLike
 
 RESERVED_NAMES: Final = ("world", "WorldModelInstance", "DefaultModelInstance")
 """Names that SDFormat and Drake keep for themselves."""
@@ -101,6 +100,9 @@ class Mechanism(kinematics.Legs):
         base, plate, crank, rod: masses and inertias; the six cranks are alike, so are the rods.
         effort_limit: of each motor in N m, written to SDFormat and the default of a scenario's
             `actuator.torque_limit`; or None.
+        ball_joints: (2, 6) of 0 or 1, whether the joints at the crank tips (first row) and at the
+            plate have the friction of a scenario's `plant.ball_joint_friction` and
+            `ball_joint_damping`; by default all.
 
     Raises:
         ConfigError: naming the field, its value and what is allowed.
@@ -114,14 +116,16 @@ class Mechanism(kinematics.Legs):
     crank: Link
     rod: Link
     effort_limit: float | None = None
+    ball_joints: Array = field(default_factory=lambda: np.ones((2, NUM_LEGS)))
 
     def __post_init__(self) -> None:
-        for field, shape in (
+        for name, shape in (
             ("home", (6,)),
+            ("ball_joints", (2, NUM_LEGS)),
             *(("p_WS", (NUM_LEGS, 3)), ("R_WS", (NUM_LEGS, 3, 3)), ("p_PQ", (NUM_LEGS, 3))),
             *((name, (NUM_LEGS,)) for name in ("crank_lengths", "rod_lengths", "branches")),
         ):
-            object.__setattr__(self, field, _fixed(field, getattr(self, field), shape))
+            object.__setattr__(self, name, _fixed(name, getattr(self, name), shape))
         self._check()
 
     def __repr__(self) -> str:
@@ -262,13 +266,15 @@ def plate_radius(mechanism: kinematics.Legs) -> float:
 def geometry_of(mechanism: Mechanism) -> Array:
     """Return the numbers of a machine as the core takes them, see `core.layout`.
 
-    Leg by leg within each number: lengths of crank and rod, branch, R_WS by columns, p_PQ, p_WS.
+    Leg by leg within each number: lengths of crank and rod, branch, R_WS by columns, p_PQ, p_WS,
+    friction at crank tip and plate joint.
     Then mass and inertia of the plate; mass, centre and inertia about the motor axis of the crank;
     mass, centre and inertia of the rod; the plate's mean radius.
     """
     m = mechanism
     R_WS = m.R_WS.transpose(0, 2, 1).reshape(NUM_LEGS, 9)
-    legs = np.column_stack([m.crank_lengths, m.rod_lengths, m.branches, R_WS, m.p_PQ, m.p_WS])
+    lengths = m.crank_lengths, m.rod_lengths, m.branches
+    legs = np.column_stack([*lengths, R_WS, m.p_PQ, m.p_WS, m.ball_joints.T])
     crank = [m.crank.mass, m.crank.center, m.crank.inertia[2]]
     rod = [m.rod.mass, m.rod.center, *m.rod.inertia]
     plate = [m.plate.mass, *m.plate.inertia]
@@ -287,6 +293,8 @@ def fingerprint(mechanism: Mechanism) -> str:
     for body in (m.plate, m.crank, m.rod):
         words += [f"{x:.8e}" for x in (body.mass, *body.inertia)]
     words += [f"{link.center:.9f}" for link in (m.crank, m.rod)]
+    if not np.all(m.ball_joints):
+        words += [f"{x:.0f}" for x in m.ball_joints.ravel()]
     return hashlib.sha256(" ".join(words).encode()).hexdigest()[:16]
 
 

@@ -78,6 +78,16 @@ ANALYSES: Final = {
         exact=True,
         second="runs",
     ),
+    "learn": Analysis(
+        "Learn a torque from repetitions of a motion.\n\n"
+        "Simulates the motion again and again, as after a return to its start. Writes learned.npz\n"
+        "for controller.learned, and a page with the error of each repetition.",
+        ("learn paper --set plant.coulomb_friction=1e-4 --out out/learn",),
+        counts="repetitions",
+        controller=True,
+        alone=True,
+        second="repetitions",
+    ),
     "layout": Analysis(
         "Search the layout and lengths of a machine for a motion.\n\n"
         "Writes the best few as machine files, and a page that compares them. With --out the same\n"
@@ -93,7 +103,8 @@ ANALYSES: Final = {
     ),
 }
 """By name. Each has a module in `studies` with a function `study_...`, a module in this room with a
-function `document`, and a class `...Options` in `studies.study_options`."""
+function `document`, and a class `...Options` in `studies.study_options`. A function `write` of that
+module writes further files."""
 
 
 def words_of(name: str) -> tuple[str, ...]:
@@ -140,8 +151,9 @@ def analyze(
     if row.counts:
         given |= {"options": options or options_of(name)(), "progress": progress}
     study = getattr(import_module(f"stewart_drake.studies.{name}"), f"study_{name}")
-    document = import_module(f"stewart_drake.reporting.{name}").document
-    found = analysis_result(lambda: study(scenario, **given), document, command)
+    room = import_module(f"stewart_drake.reporting.{name}")
+    write = getattr(room, "write", None)
+    found = analysis_result(lambda: study(scenario, **given), room.document, command, write)
     facts = {"link": text} if (text := link_text(scenario)) else {}
     return replace(
         found,

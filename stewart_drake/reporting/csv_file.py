@@ -2,7 +2,6 @@
 
 import csv
 import io
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -12,9 +11,10 @@ import xarray as xr
 from stewart_drake.files.arrayio import load_netcdf
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
-from stewart_drake.scenario.signals import COORDINATE_NAMES, COORDINATES, SIGNALS
+from stewart_drake.scenario.run_log import headings
+from stewart_drake.scenario.signals import SIGNALS
+from stewart_drake.types import Array
 
-_NAMES: Final = dict(zip(COORDINATES, COORDINATE_NAMES, strict=True))
 _EXPECTED: Final = "a file that simulate saved (.nc)"
 
 
@@ -26,6 +26,17 @@ def signals_csv(signals: xr.Dataset) -> str:
     Args:
         signals: of a `SimulationResult`, over `time`.
     """
+    header, rows = columns_of(signals)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    for row in rows:
+        writer.writerow(f"{value:.12g}" if np.isfinite(value) else "" for value in row)
+    return text.getvalue()
+
+
+def columns_of(signals: xr.Dataset) -> tuple[list[str], Array]:
+    """Return the heads of `signals_csv` and its numbers (instants, columns)."""
     header, columns = ["time[s]"], [signals.time.values[:, None]]
     for name, signal in signals.data_vars.items():
         others = [dimension for dimension in signal.dims if dimension != "time"]
@@ -37,20 +48,7 @@ def signals_csv(signals: xr.Dataset) -> str:
             units = list(known.quantity.units) if known else ["1"] * max(1, len(labels))
         header += headings(str(name), labels, units)
         columns.append(signal.transpose("time", *others).values.reshape(len(signal.time), -1))
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    for row in np.hstack(columns):
-        writer.writerow(f"{value:.12g}" if np.isfinite(value) else "" for value in row)
-    return text.getvalue()
-
-
-def headings(name: str, labels: Iterable[str | int], units: Iterable[str]) -> list[str]:
-    """Return the column heads of a signal, such as `error_roll[rad]`; labels may be none."""
-    spoken = ("_".join(_NAMES.get(word, word) for word in str(one).split("_")) for one in labels)
-    columns = [f"{name}_{label}" for label in spoken] or [name]
-    pairs = zip(columns, units, strict=True)
-    return [f"{column}[{'-' if unit == '1' else unit}]" for column, unit in pairs]
+    return header, np.hstack(columns)
 
 
 def write_csv(signals: xr.Dataset, path: Path) -> Path:

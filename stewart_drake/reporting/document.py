@@ -231,11 +231,19 @@ class Listing:
 
 @dataclass(frozen=True)
 class Frame:
-    """An HTML page inside a page, on screen only; its scripts reach nothing outside."""
+    """An HTML page inside a page, on screen only; its scripts reach nothing outside.
 
-    html: str
+    Attributes:
+        source: the page, or a function that makes it when it is written.
+    """
+
+    source: str | Callable[[], str]
     brief: ClassVar = False
     kind: ClassVar = "frame"
+
+    @property
+    def html(self) -> str:
+        return self.source if isinstance(self.source, str) else self.source()
 
 
 Block = Paragraph | Caution | Values | Table | Picture | Listing | Frame

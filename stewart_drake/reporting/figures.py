@@ -26,7 +26,7 @@ from stewart_drake.scenario.signals import (
     POSITION,
     WEIGHTS,
 )
-from stewart_drake.studies.compare import ADAPTIVE, LABELS, SERVOS
+from stewart_drake.studies.compare import ADAPTIVE, GRAVITY, LABELS, SERVOS
 from stewart_drake.studies.compare import label as spoken
 from stewart_drake.types import Array
 
@@ -69,7 +69,7 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
     lines = style.controller_lines(results)
     runs = {spoken(name): (result, lines[name]) for name, result in results.items()}
     own = (name for name in results if name not in LABELS)
-    shown = (*TORQUE_CONTROLLERS, ADAPTIVE, *SERVOS, *own)
+    shown = (*TORQUE_CONTROLLERS, ADAPTIVE, *GRAVITY, *SERVOS, *own)
     aware = {name: results[name] for name in shown if name in results}
     figures = {"states": _states(runs), "errors": _errors(runs)}
     for name, result in aware.items():
@@ -192,7 +192,7 @@ def _parameters(run: SimulationResult) -> Figure:
     true, values, widths = (
         _PARAMETER_FACTORS * data
         for data in (
-            np.array(run.scenario.plant.parameters[:NUM_PARAMETERS]),
+            np.array(run.scenario.plant_parameters[:NUM_PARAMETERS]),
             run.signals.parameters.values,
             2 * run.signals.parameter_std.values,
         )

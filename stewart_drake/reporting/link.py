@@ -30,6 +30,8 @@ def document(study: LinkStudy) -> Document:
         "good" if own else "bad",
         study=study,
         mean=_mean,
+        spread=lambda cell: float(np.std(cell.errors, ddof=1)),
+        alike=", ".join(f"{bound:g}" for bound in study.alike),
         most=lambda cell: max(cell.errors, default=math.nan),
         assured=_ASSURED,
         wanted=math.ceil(math.log(1 - CONFIDENCE) / math.log(_ASSURED)),

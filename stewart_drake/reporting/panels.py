@@ -12,7 +12,6 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import ScalarFormatter
-from numpy.typing import ArrayLike
 
 from stewart_drake.reporting.style import (
     BAND_ALPHA,
@@ -25,6 +24,7 @@ from stewart_drake.reporting.style import (
     plain_log_ticks,
     powers_of_ten,
 )
+from stewart_drake.types import ArrayLike
 
 Scale = Literal["linear", "log", "powers"]
 """Scale of an axis: `log` has ticks such as 20 and 50, `powers` such as 10⁻³."""

@@ -9,14 +9,17 @@ import xarray as xr
 from pydrake.geometry import Meshcat, MeshcatParams, Rgba
 from pydrake.math import RotationMatrix
 
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.versions import versions
+from stewart_drake.loop.preparation import simulated_machine
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.scene import TORQUE_COLORS, Scene, crank_paths, full_color, torque_shares
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.reporting.document import number
 from stewart_drake.reporting.page import environment
+from stewart_drake.scenario.run_log import EXPECTED, read_log, scenario_of
 from stewart_drake.scenario.signals import ANGLES, LEGS, POSITION
 from stewart_drake.types import Array
 
@@ -54,16 +57,44 @@ def replay(signals: xr.Dataset, mechanism: Mechanism, meshcat: Meshcat | None = 
 
 def replay_html(result: SimulationResult, mechanism: Mechanism, title: str) -> str:
     """Return a run as one HTML page that plays without a server or a network."""
-    meshcat = replay(result.signals, mechanism)
-    shown = _thinned(result.signals)
-    torque = shown.torque_applied.values
-    largest = np.abs(torque).max(axis=1, initial=0.0)
-    full = full_color(largest)
     outcome = result.status.replace("_", " ")
     if result.stopped is not None:
         outcome += f" at {result.stopped.time:.2f} s"
     else:
         outcome += f", E_ac {number(result.accumulated_error)} % s"
+    return _html(result.signals, mechanism, title, outcome)
+
+
+def log_html(path: Path) -> str:
+    """Return a log as a page like that of `replay_html`; it needs the scenario of the run.
+
+    A row without a pose is left out, and without a reference the pose counts as it.
+
+    Raises:
+        ConfigError: no log of a run, or one without a scenario or poses.
+    """
+    signals = read_log(path)
+    scenario = scenario_of(signals, path)
+    for name in ("pose", "torque_applied"):
+        if name not in signals:
+            raise ConfigError(f"{path}: has no {name}; expected {EXPECTED}")
+    if "reference" not in signals:
+        signals["reference"] = signals.pose
+    poses = np.hstack([signals.pose.values, signals.reference.values])
+    signals = signals.isel(time=np.isfinite(poses).all(axis=1))
+    if signals.sizes["time"] == 0:
+        raise ConfigError(f"{path}: has no pose in any row; expected {EXPECTED}")
+    signals["error"] = signals.pose - signals.reference
+    outcome = f"log of {signals.time.values[-1] - signals.time.values[0]:.1f} s"
+    return _html(signals.fillna(0.0), simulated_machine(scenario), path.stem, outcome)
+
+
+def _html(signals: xr.Dataset, mechanism: Mechanism, title: str, outcome: str) -> str:
+    meshcat = replay(signals, mechanism)
+    shown = _thinned(signals)
+    torque = shown.torque_applied.values
+    largest = np.abs(torque).max(axis=1, initial=0.0)
+    full = full_color(largest)
     data = {
         "time": np.round(shown.time.values, 4).tolist(),
         "position": np.round(

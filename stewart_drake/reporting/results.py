@@ -17,6 +17,8 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.studies.compare import save_comparison
 
 if TYPE_CHECKING:
+    import pandas
+    import xarray
     from matplotlib.figure import Figure
     from pydrake.geometry import Meshcat
 
@@ -67,6 +69,19 @@ class SimulationResult(loop_results.SimulationResult):
         from stewart_drake.reporting.run import run_document
 
         return run_document(self).plain()
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """Return the signals over `time[s]`, with a column per component as in the CSV file."""
+        import pandas
+
+        from stewart_drake.reporting.csv_file import columns_of
+
+        header, rows = columns_of(self.signals)
+        return pandas.DataFrame(rows, columns=header).set_index(header[0])
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """Return a copy of the signals, over `time` in s."""
+        return self.signals.copy(deep=True)
 
     def plot(self, directory: str | Path | None = None) -> Figures:
         """Return figures by name.
@@ -132,6 +147,28 @@ class ComparisonResult(Mapping[str, SimulationResult]):
 
         return comparison_document(self).plain()
 
+    def to_pandas(self) -> "pandas.DataFrame":
+        """Return a row per controller with the numbers and words of its summary.
+
+        A nested entry is the column `counts.saturated_steps`, an item `peak_error.0`. Scenario,
+        versions and warnings are left out.
+        """
+        import pandas
+
+        rows = {name: dict(_flat(run.summary)) for name, run in self.items()}
+        return pandas.DataFrame.from_dict(rows, orient="index").rename_axis("controller")
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """Return the signals of all runs over `controller` and `time`.
+
+        A run that ended early has NaN afterwards.
+        """
+        import xarray
+
+        runs = [run.signals.drop_attrs(deep=False) for run in self.values()]
+        whole = xarray.concat(runs, "controller", join="outer", combine_attrs="drop")
+        return whole.assign_coords(controller=list(self))
+
     def plot(self, directory: str | Path | None = None) -> Figures:
         """Return figures by name; see `SimulationResult.plot`."""
         from stewart_drake.reporting.figures import draw_comparison
@@ -148,6 +185,23 @@ class ComparisonResult(Mapping[str, SimulationResult]):
     def save(self, directory: str | Path) -> None:
         """Write NAME.nc of every controller, then summary.json; the directory is made."""
         save_comparison(self, directory)
+
+
+_LEFT_OUT: Final = ("scenario", "versions", "warnings")
+"""Entries of a summary that are not figures of the run."""
+
+
+def _flat(entries: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the numbers and words of nested entries with dotted names."""
+    for name, value in entries.items():
+        if isinstance(value, list | tuple):
+            value = dict(zip(map(str, range(len(value))), value, strict=True))
+        if not above and name in _LEFT_OUT:
+            continue
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{above}{name}.")
+        else:
+            yield f"{above}{name}", value
 
 
 @dataclass(frozen=True, repr=False)

@@ -55,7 +55,9 @@ def comparison_document(results: _Runs, tuned: _Runs | None = None) -> Document:
             "room": largest_factor(whole.mechanism, whole.reference, instants).value,
         }
     runs = [(label(name), name, run) for name, run in results.items()]
-    runs += [(f"{label(name)}, tuned", name, run) for name, run in (tuned or {}).items()]
+    runs += [
+        (f"{label(name)}, tuned", f"{name}, tuned", run) for name, run in (tuned or {}).items()
+    ]
     loops = {name: loop_word(run.summary["controller_margin"]) for name, run in results.items()}
     return from_template(
         "comparison",
@@ -63,7 +65,7 @@ def comparison_document(results: _Runs, tuned: _Runs | None = None) -> Document:
         papers=not table_two
         and any(is_papers(run.scenario, any_size=True) for run in results.values()),
         runs=[_row(title, name, run) for title, name, run in runs],
-        loops=[f"{label(name)}: {text}" for name, text in loops.items()],
+        loops=[f"{name} ({label(name)}): {text}" for name, text in loops.items()],
         cautions=[Caution(text) for text in _shared_warnings(results)],
         **context,
     )
@@ -72,7 +74,7 @@ def comparison_document(results: _Runs, tuned: _Runs | None = None) -> Document:
 def _row(title: str, name: str, run: SimulationResult) -> dict[str, Any]:
     """Return a row of the comparison; a run that ended early shows how, not its errors."""
     s, stopped = run.summary, run.stopped
-    row = {"title": title, "paper": _paper_error(name, run), "s": s}
+    row = {"title": title, "name": name, "paper": _paper_error(name, run), "s": s}
     if stopped is None:
         return row | {"error": s["accumulated_error"], "floor": s["delay_floor"], "cost": s["cost"]}
     leg = "" if stopped.leg is None else f", leg {stopped.leg}"

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydrake.geometry import Cylinder, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 
@@ -18,7 +17,7 @@ from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.reporting.style import FACTORS
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.studies.workspace_map import travel
-from stewart_drake.types import Array
+from stewart_drake.types import Array, ArrayLike
 
 SLIDERS: Final = ("roll [deg]", "pitch [deg]", "yaw [deg]", "x [mm]", "y [mm]", "z [mm]")
 STOP: Final = "Stop viewing"

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
-import pydantic.dataclasses
 from pydantic import AfterValidator
 
 from stewart_drake.files.errors import ConfigError
@@ -13,14 +12,19 @@ from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.yamlio import brief, load_yaml, validate, yaml_text
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.field_types import STRICT
-from stewart_drake.scenario.signals import COULOMB_SPEED, LEGS, PLANT_PARAMETERS
+from stewart_drake.scenario.field_types import section
+from stewart_drake.scenario.signals import (
+    BALL_JOINT_FRICTION_SPEED,
+    CONSTANTS,
+    COULOMB_SPEED,
+    LEGS,
+)
 from stewart_drake.types import Array
 
 DELAY: Final = "delay"  # name of the delay of a torque, s
 OFFSETS: Final = tuple(f"offset_A{leg}" for leg in LEGS)
 """Names of the encoders' offsets: reading minus crank angle, rad."""
-CALIBRATED: Final = (*PLANT_PARAMETERS, DELAY, *OFFSETS)
+CALIBRATED: Final = (*CONSTANTS, DELAY, *OFFSETS)
 """Names of all parameters that a calibration can have."""
 ROUNDING: Final = 1e-9  # relative error of a covariance that counts as rounding
 
@@ -54,7 +58,10 @@ class Calibration:
             if not np.all(np.isfinite(value)):
                 raise ConfigError(f"{field}: got {brief(value.tolist())}; expected finite numbers")
         self._check_covariance(P)
-        least = {PLANT_PARAMETERS[COULOMB_SPEED]: (1e-300, "above 0"), DELAY: (0.0, "0 or more")}
+        least = {DELAY: (0.0, "0 or more")} | {
+            CONSTANTS[speed]: (1e-300, "above 0")
+            for speed in (COULOMB_SPEED, BALL_JOINT_FRICTION_SPEED)
+        }
         for name, (low, accepted) in least.items():
             found = self.value(name)
             if found is not None and found < low:
@@ -95,7 +102,7 @@ def _check_names(names: list[str]) -> list[str]:
     return names
 
 
-@pydantic.dataclasses.dataclass(config=STRICT)
+@section
 class _File:
     mechanism: str
     names: Annotated[list[str], AfterValidator(_check_names)]

@@ -5,11 +5,11 @@ here needs a mechanism. `scenario.loading` reads scenarios from files.
 """
 
 import dataclasses
+import math
 from dataclasses import field
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field
-from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.schema import ByKind
@@ -18,7 +18,7 @@ from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.dependencies import contradiction
 from stewart_drake.scenario.field_types import (
     MOST_PERIODS,
-    STRICT,
+    AngleRange,
     Deviation,
     Fraction,
     LegFault,
@@ -33,6 +33,7 @@ from stewart_drake.scenario.field_types import (
     Steps,
     TorqueLimit,
     Weight,
+    section,
 )
 from stewart_drake.scenario.link_config import (
     ASSUMED_TIMES,
@@ -42,14 +43,53 @@ from stewart_drake.scenario.link_config import (
 )
 from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig
 from stewart_drake.scenario.renames import CONTROLLER
-from stewart_drake.scenario.signals import DEFAULT_COULOMB_SPEED
+from stewart_drake.scenario.signals import DEFAULT_BALL_JOINT_SPEED, DEFAULT_COULOMB_SPEED, SHAFTS
 from stewart_drake.scenario.timing import METRIC_PERIOD, log_problem, step_problem
 
 _Friction = Annotated[float, Field(ge=0, le=1e3)]
+_Wrench = Annotated[
+    list[Annotated[float, Field(ge=-1e9, le=1e9)]], Field(min_length=6, max_length=6)
+]
+_MomentAndForce = Annotated[list[Positive], Field(min_length=2, max_length=2)]
+_Speed = Annotated[float, Field(ge=1e-6, le=1e3)]
 _SensorDelay = Annotated[float, Field(ge=0, le=100)]
 
 
-@dataclass(config=STRICT)
+@section
+class PushConfig:
+    """A constant wrench on the plate for a while, unknown to the controller.
+
+    Attributes:
+        wrench: moment in N m, then force in N, in the world at the plate's centre of mass.
+        start: `from` in files, s after the begin of the run. A multibody plant has it from its next
+            step on.
+        to: end of the push, s; null is the end of the run.
+    """
+
+    wrench: _Wrench = field(default_factory=lambda: [0.0] * 6)
+    start: Seconds = Field(default=0.0, alias="from")
+    to: Seconds | None = None
+
+    @property
+    def end(self) -> float:
+        """End of the push, s; infinite without one."""
+        return math.inf if self.to is None else self.to
+
+    def at(self, time: float) -> list[float]:
+        """Return the wrench (6,) at a time in s."""
+        return self.wrench if self.start <= time < self.end else [0.0] * 6
+
+    def problem(self) -> str | None:
+        """Return the problem with the times, or None."""
+        if self.start < self.end:
+            return None
+        return (
+            f"plant.push.to: got {self.to:g} s; expected more than plant.push.from, "
+            f"{self.start:g} s, or null"
+        )
+
+
+@section
 class PlantConfig:
     """The simulated platform; fields from the payload on are unknown to the controller.
 
@@ -69,6 +109,12 @@ class PlantConfig:
         coulomb_friction: on each crank shaft, N m, times tanh(rate / coulomb_speed).
         coulomb_speed: scale of the rate in that, rad/s.
         payload_position: of the payload in the plate's frame, from its centre of mass, m.
+        push: section of a wrench on the plate for a while.
+        ball_joint_damping: viscous damping of each ball joint between crank, rod and plate, N m
+            s/rad; a mechanism's `ball_joints` lists those that have it.
+        ball_joint_friction: Coulomb friction of each, N m, times
+            tanh(w / ball_joint_friction_speed), w its angular speed without the rod's spin.
+        ball_joint_friction_speed: scale of the speed in that, rad/s.
     """
 
     kind: Literal["multibody", "exact", "paper"] = "multibody"
@@ -80,16 +126,30 @@ class PlantConfig:
     joint_damping: _Friction = 0.0
     mechanism: Name | None = None
     coulomb_friction: _Friction = 0.0
-    coulomb_speed: Annotated[float, Field(ge=1e-6, le=1e3)] = DEFAULT_COULOMB_SPEED
+    coulomb_speed: _Speed = DEFAULT_COULOMB_SPEED
     payload_position: Annotated[list[Length], Field(min_length=3, max_length=3)] = field(
         default_factory=lambda: [0.0] * 3
     )
+    push: PushConfig = field(default_factory=PushConfig)
+    ball_joint_damping: _Friction = 0.0
+    ball_joint_friction: _Friction = 0.0
+    ball_joint_friction_speed: _Speed = DEFAULT_BALL_JOINT_SPEED
 
     @property
     def parameters(self) -> list[float]:
-        """All parameters, in the order of `scenario.signals.PLANT_PARAMETERS`."""
+        """All constants, in the order of `scenario.signals.CONSTANTS`."""
         shafts = (self.joint_damping, self.coulomb_friction, self.coulomb_speed)
-        return [*self.torque_bias, self.payload_mass, *shafts, *self.payload_position]
+        loads = [*self.torque_bias, self.payload_mass, *shafts, *self.payload_position]
+        return [*loads, *self.ball_joints]
+
+    @property
+    def ball_joints(self) -> list[float]:
+        """Damping, Coulomb friction and its speed of each ball joint."""
+        return [
+            self.ball_joint_damping,
+            self.ball_joint_friction,
+            self.ball_joint_friction_speed,
+        ]
 
     @property
     def step(self) -> float | None:
@@ -104,7 +164,7 @@ class PlantConfig:
         return dataclasses.replace(self, kind="exact")
 
 
-@dataclass(config=STRICT)
+@section
 class DelayConfig:
     """The true delay of a torque, by the time t at which it is computed.
 
@@ -139,7 +199,7 @@ class DelayConfig:
         return self.drift == self.swing == self.jump == self.jitter_std == 0
 
 
-@dataclass(config=STRICT)
+@section
 class PriorConfig:
     """Prior standard deviations of the estimated parameters.
 
@@ -152,6 +212,11 @@ class PriorConfig:
         rates: of the plate at the first sample, which encoders do not measure, rad/s and m/s; null
             is half the motion's peak to peak per second.
         offsets: mounting of an encoder, rad; null is 0.1 degrees.
+        wrench: sudden wrench on the plate, [moment in N m, force in N]; null is 0.4 of the torque
+            that the motion takes, and 0.4 of that torque's force at the tip of the shortest crank.
+            A number given here also holds at the start, where null is `wrench_walk`.
+        wrench_walk: its slow change per root second, in the same units; null is a thousandth of
+            that torque and force.
     """
 
     torque_bias: Positive | None = None
@@ -159,13 +224,15 @@ class PriorConfig:
     damping: Positive | None = None
     rates: Annotated[list[Positive], Field(min_length=6, max_length=6)] | None = None
     offsets: Positive | None = None
+    wrench: _MomentAndForce | None = None
+    wrench_walk: _MomentAndForce | None = None
 
 
 ESTIMATED: Final = ["torque_bias", "payload", "damping"]  # parameters that are estimated by default
 
 
 def _check_estimate(names: list[str]) -> list[str]:
-    order = [*ESTIMATED, "coulomb", "offsets"]
+    order = [*ESTIMATED, "coulomb", "wrench", "offsets"]
     if not (len({*names}) == len(names) and {*names} <= {*order}):
         raise ValueError(f"[], or some of {', '.join(order)}")
     return sorted(names, key=order.index)
@@ -181,11 +248,16 @@ Estimate = Annotated[list[str], AfterValidator(_check_estimate)]
 """Names of estimated parameters, in a fixed order."""
 
 
-@dataclass(config=STRICT)
+@section
 class ControllerConfig:
     """The controller and its assumptions.
 
     Attributes:
+        kind: of the feedback, `lqi` (optimal for w_Q and w_R, linearised again at each sample) or
+            `pd` (constant kp and kd on the errors of pose and rates, times the plate's inertia;
+            without integral).
+        kp: of `pd`, 1/s^2; null is by kd, or by the uncompensated delay and gravity: `law.pd`.
+        kd: of `pd`, 1/s; null is by kp, for critical damping, or as that.
         period: between two torques, s.
         integral: whether the error is also integrated.
         delay_steps: whole periods of the assumed delay, 0 for none; null is the true delay.
@@ -197,8 +269,9 @@ class ControllerConfig:
         torque_map: of the paper's model, from `virtual_work` or as `printed`.
         estimate: estimated parameters of the machine: `torque_bias`, `payload` and `damping`, with
             or without `coulomb`, the Coulomb friction of the shafts at the `coulomb_speed` of the
-            calibration, else 0.02 rad/s, and `offsets`, the mounting of encoders, for
-            `sensor.kind` encoders and a known delay; empty for none.
+            calibration, else 0.02 rad/s, `wrench`, a wrench on the plate that changes, and
+            `offsets`, the mounting of encoders, for `sensor.kind` encoders and a known delay; empty
+            for none.
         w_Q: weight of the errors.
         w_R: weight of the torques.
         integral_weight: weight of the integrals relative to the errors.
@@ -207,8 +280,9 @@ class ControllerConfig:
             network, where `delay_steps` is not 0.
         packet_repeats: number of earlier torques that a packet repeats, each for a period more of
             delay.
-        catch_up: blend onto the reference after a start from rest, s; 0 is none, null the shortest
-            one that respects `actuator.torque_limit`, where that is a number, else 0.3 s.
+        catch_up: blend onto the reference after a start from rest, s; 0 is none, null the one
+            of least error (for servos the shortest) within `actuator.torque_limit`, where that is a
+            number, else 0.3 s.
         command: sent to the motors: a `torque` each, or for servos `cranks`: crank angles and
             rates of the reference for the time of arrival, and the torque of `feedforward`. With
             `cranks` there is no feedback but the result of `estimate`, and only period, delay,
@@ -222,12 +296,20 @@ class ControllerConfig:
         replan: duration of a plan back onto the reference, s; 0 for none. Planned with a delay
             estimator where the prediction is off the reference, as after a jump of the delay.
         prior: section of prior standard deviations; null is the default of each.
+        limits: of torque, reach and clearance, `ignore`: torques are cut, or `qp`: where a limit
+            binds within the horizon, a quadratic program plans the torques within all of them.
+        horizon: of these plans, periods.
         calibration: a file of the machine's parameters with their covariance, as `identify` writes
             it: means and covariance of the estimated ones, values of the others. Its delay is
             assumed where `delay_steps` is null.
+        learned: a file of `learn`: a torque that the same motion of the same machine took before,
+            with the same period and delay. It is added to the torque of the law.
     """
 
     renamed = CONTROLLER  # not annotated: no field
+    kind: Literal["lqi", "pd"] = "lqi"
+    kp: Annotated[float, Field(gt=0, le=1e9)] | None = None
+    kd: Annotated[float, Field(gt=0, le=1e6)] | None = None
     period: Annotated[float, Field(ge=1e-4, le=10)] = 0.1
     integral: bool = True
     delay_steps: Steps | None = None
@@ -251,10 +333,13 @@ class ControllerConfig:
     open_loop_start: bool = True
     replan: Annotated[float, Field(ge=0, le=10)] = 0.6
     prior: PriorConfig = field(default_factory=PriorConfig)
+    limits: Literal["ignore", "qp"] = "ignore"
+    horizon: Annotated[int, Field(ge=2, le=100)] = 20
     calibration: Name | None = None
+    learned: Name | None = None
 
 
-@dataclass(config=STRICT)
+@section
 class TorqueActuatorConfig:
     """Motors that apply the torque that arrives, within their limit.
 
@@ -264,14 +349,14 @@ class TorqueActuatorConfig:
             `none` no limit. The catch-up respects a number only, see `ControllerConfig.catch_up`.
     """
 
-    reflected_inertia = 0.0  # not annotated: no field
+    reflected_inertia, shafts = 0.0, None  # not annotated: no fields
     kind: Literal["torque"] = "torque"
     torque_limit: TorqueLimit = None
 
 
-@dataclass(config=STRICT)
+@section
 class ServoActuatorConfig:
-    """Position servos: a local loop at each motor that follows the commanded crank angle.
+    """Servos given by their bandwidth: a local loop at each motor follows the commanded angle.
 
     Its torque is J (w^2 (a_r - a) + 2 d w (a_r' - a')) plus the torque of the command, computed at
     least 1000 times a second; w = 2 pi bandwidth, d the damping, J the mean inertia per motor at
@@ -287,6 +372,7 @@ class ServoActuatorConfig:
         torque_limit: at the crank, as of `TorqueActuatorConfig`.
     """
 
+    shafts = None  # not annotated: no field
     kind: Literal["servo"] = "servo"
     bandwidth: Annotated[float, Field(ge=0.01, le=1e3)] = 10.0
     damping: Annotated[float, Field(ge=0.01, le=100)] = 0.7
@@ -301,14 +387,62 @@ class ServoActuatorConfig:
         return self.gear_ratio**2 * self.rotor_inertia
 
 
-AnyActuator = TorqueActuatorConfig | ServoActuatorConfig
+@section
+class PositionServoConfig:
+    """Servos given by their stiffness, as hobby servos are: the newest setpoint u acts, held.
+
+    The torque at a crank of angle a is clip(stiffness (u - a) - velocity_gain a', torque_limit)
+    - crank_damping a' - friction tanh(a' / friction_speed) - armature a''. The controller knows
+    these numbers, unless its `calibration` has others. See `law.servos`.
+
+    Attributes:
+        kind: `position_servo`.
+        stiffness: N m/rad.
+        velocity_gain: of the servo's own loop, within the torque limit, N m s/rad.
+        crank_damping: viscous, of motor and gear, N m s/rad.
+        friction: Coulomb friction, N m.
+        friction_speed: rate scale of the Coulomb friction, rad/s.
+        armature: inertia of the rotor behind its gear, at the crank, kg m^2.
+        torque_limit: at the crank, as of `TorqueActuatorConfig`.
+        angle_range: of each crank, [low, high] in rad, or six of these; setpoints stay within it.
+        speed_limit: of the setpoint, rad/s; null is none.
+    """
+
+    kind: Literal["position_servo"] = "position_servo"
+    stiffness: Positive = 10.0
+    velocity_gain: _Friction = 0.1
+    crank_damping: _Friction = 0.15
+    friction: _Friction = 0.1
+    friction_speed: _Speed = 0.05
+    armature: Annotated[float, Field(ge=0, le=1e3)] = 0.001
+    torque_limit: TorqueLimit = None
+    angle_range: AngleRange = None
+    speed_limit: Positive | None = None
+
+    @property
+    def reflected_inertia(self) -> float:
+        """Inertia of the rotor at its crank, kg m^2."""
+        return self.armature
+
+    @property
+    def shafts(self) -> tuple[float, float, float]:
+        """Damping, Coulomb friction and its speed at each crank."""
+        return self.crank_damping, self.friction, self.friction_speed
+
+
+_OF_STIFFNESS: Final = {f.name for f in dataclasses.fields(PositionServoConfig)} - {
+    f.name for f in dataclasses.fields(ServoActuatorConfig)
+}
+AnyActuator = TorqueActuatorConfig | ServoActuatorConfig | PositionServoConfig
 ActuatorConfig = Annotated[AnyActuator, ByKind()]
 
 
 def compatible_actuator(command: str, actuator: AnyActuator) -> AnyActuator:
     """Return these motors, or others with their limit that accept a controller's command."""
     wanted = TorqueActuatorConfig if command == "torque" else ServoActuatorConfig
-    return actuator if actuator.kind == wanted.kind else wanted(torque_limit=actuator.torque_limit)
+    if (actuator.kind == "torque") == (command == "torque"):
+        return actuator
+    return wanted(torque_limit=actuator.torque_limit)
 
 
 def with_actuator(given: dict[str, Any], change: Any, where: str) -> AnyActuator:
@@ -317,7 +451,7 @@ def with_actuator(given: dict[str, Any], change: Any, where: str) -> AnyActuator
     return validate(Scenario, {"actuator": laid}, where).actuator
 
 
-@dataclass(config=STRICT)
+@section
 class StateSensorConfig:
     """The measurement of pose and rates.
 
@@ -341,7 +475,7 @@ class StateSensorConfig:
     faults: list[SensorFault] = field(default_factory=list)
 
 
-@dataclass(config=STRICT)
+@section
 class EncoderSensorConfig:
     """The measurement of the six crank angles, by an encoder at each motor.
 
@@ -370,7 +504,7 @@ class EncoderSensorConfig:
 SensorConfig = Annotated[StateSensorConfig | EncoderSensorConfig, ByKind()]
 
 
-@dataclass(config=STRICT)
+@section
 class FixedTunerConfig:
     """Constant w_Q and w_R, those of the controller.
 
@@ -381,7 +515,7 @@ class FixedTunerConfig:
     kind: Literal["fixed"] = "fixed"
 
 
-@dataclass(config=STRICT)
+@section
 class AnnTunerConfig:
     """A neural network that sets w_Q and w_R at run time.
 
@@ -396,7 +530,7 @@ class AnnTunerConfig:
     weights: Name | None = None
 
 
-@dataclass(config=STRICT)
+@section
 class RuleTunerConfig:
     """A piecewise linear rule for w_Q / w_R: constant for small innovations, then falling.
 
@@ -418,7 +552,7 @@ class RuleTunerConfig:
 TunerConfig = Annotated[FixedTunerConfig | AnnTunerConfig | RuleTunerConfig, ByKind()]
 
 
-@dataclass(config=STRICT)
+@section
 class Scenario:
     """One closed-loop experiment; the defaults are the paper's.
 
@@ -456,6 +590,14 @@ class Scenario:
 
     def __repr__(self) -> str:
         return f"Scenario({differences(self, Scenario())})"
+
+    @property
+    def plant_parameters(self) -> list[float]:
+        """All parameters of the simulated plant, with the friction of its servos."""
+        parameters = self.plant.parameters
+        if self.actuator.shafts is not None:
+            parameters[SHAFTS] = self.actuator.shafts
+        return parameters
 
     @property
     def assumed_link(self) -> WireConfig | NetworkConfig:
@@ -539,10 +681,12 @@ class Scenario:
             return problem
         if self.true_delay.steps <= MOST_PERIODS:
             return None
-        bound = "null" if link.playout is None else f"{link.playout:g} s"
+        given = {"link.playout": link.playout, "link.high": link.high, "link.median": link.median}
+        given["delay.steps"] = self.delay.steps
+        field, got = next(one for one in given.items() if one[1] is not None)
         return (
-            f"link.playout: got {bound}, a delay of more than {MOST_PERIODS} periods; expected a "
-            "shorter bound, or a faster network"
+            f"{field}: got {got:g}, a delay of more than {MOST_PERIODS} periods of "
+            f"{self.controller.period:g} s; expected less, in s (are these milliseconds?)"
         )
 
     def check(self, where: str = "scenario") -> None:
@@ -560,6 +704,7 @@ class Scenario:
         step = self.plant.step
         problem = (
             self.reference.problem()
+            or self.plant.push.problem()
             or contradiction(self)
             or self._network_problem()
             or self.delay_max_problem()
@@ -577,7 +722,10 @@ class Scenario:
             controller = fields.pop("controller", row)
             if not isinstance(controller, str):
                 raise ConfigError(f"{place}: controller: got {brief(controller)}; expected text")
-            with_actuator({"kind": "servo"}, fields.pop("actuator", {}), place)  # has every field
+            laid = fields.pop("actuator", {})
+            by_stiffness = isinstance(laid, dict) and laid.keys() & _OF_STIFFNESS
+            kind = "position_servo" if by_stiffness else "servo"  # which has all other fields
+            with_actuator({"kind": kind}, laid, place)
             validate(ControllerConfig, fields, place)
 
     def step_problem(self, step: float) -> str | None:

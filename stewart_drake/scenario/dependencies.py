@@ -17,23 +17,47 @@ _DELAYS: Final = ("constant", "drifting")
 REQUIRES: Final[tuple[tuple[str, Any, Accepted], ...]] = (
     ("controller.delay_steps", None, {"controller.delay_fraction": None}),
     ("controller.prediction", "linear", {"controller.delay_estimator": "none"}),
-    ("controller.delay_estimator", _DELAYS, {"sensor.delay": 0.0}),
+    ("controller.delay_estimator", _DELAYS, {"sensor.delay": 0.0, "controller.learned": None}),
     ("controller.estimate", [], {"controller.delay_estimator": "none"}),
     (
         *("controller.estimate", "offsets"),
         {"sensor.kind": "encoders", "controller.delay_estimator": "none"},
     ),
+    ("controller.estimate", "wrench", {"plant.kind": ("multibody", "exact")}),
     ("controller.model", "multibody", {"controller.torque_map": "virtual_work"}),
     (
         *("controller.command", "cranks"),
         {
-            "actuator.kind": "servo",
-            "link.kind": "wire",
+            "actuator.kind": ("servo", "position_servo"),
             "tuner.kind": "fixed",
             "controller.delay_estimator": "none",
+            "controller.learned": None,
         },
     ),
-    ("actuator.kind", "servo", {"controller.command": "cranks"}),
+    ("actuator.kind", ("servo", "position_servo"), {"controller.command": "cranks"}),
+    ("actuator.kind", "servo", {"link.kind": "wire"}),
+    (
+        *("actuator.kind", "position_servo"),
+        {"plant.kind": "exact", "plant.joint_damping": 0.0, "plant.coulomb_friction": 0.0},
+    ),
+    (
+        *("plant.kind", ("multibody", "paper")),
+        {"plant.ball_joint_damping": 0.0, "plant.ball_joint_friction": 0.0},
+    ),
+    (
+        *("controller.limits", "qp"),
+        {
+            "controller.kind": "lqi",
+            "controller.command": "torque",
+            "controller.prediction": "nonlinear",
+            "controller.feedforward": "inverse_dynamics",
+            "controller.model": "multibody",
+            "controller.delay_estimator": "none",
+            "controller.learned": None,
+            "plant.kind": ("multibody", "exact"),
+        },
+    ),
+    ("tuner.kind", ("ann", "rule"), {"controller.learned": None}),
     (
         *("plant.kind", "paper"),
         {
@@ -41,22 +65,31 @@ REQUIRES: Final[tuple[tuple[str, Any, Accepted], ...]] = (
             "plant.payload_mass": 0.0,
             "plant.joint_damping": 0.0,
             "plant.coulomb_friction": 0.0,
+            "plant.push.wrench": [0.0] * 6,
             "sensor.kind": "state",
             "actuator.kind": "torque",
+            "controller.learned": None,
         },
     ),
     (
         *("link.kind", "network"),
-        {"controller.delay_estimator": "none", "controller.delay_steps": (None, 0)},
+        {
+            "controller.delay_estimator": "none",
+            "controller.delay_steps": (None, 0),
+            "controller.learned": None,
+        },
     ),
 )
 """Where the first field has the value, other fields must have accepted ones."""
-_HINTS: Final = {
+_HINTS: Final[dict[str | tuple[str, str], str]] = {
     "controller.command": ", as of the controllers servo_preview and servo_feedforward",
+    ("actuator.kind", "plant.joint_damping"): "; the servos have their own, actuator.crank_damping",
+    ("actuator.kind", "plant.coulomb_friction"): "; the servos have their own, actuator.friction",
     "controller.delay_steps": ": the play-out bound sets the delay, and 0 is a controller without "
     "one",
 }
-"""End of a message about a field of REQUIRES; by default another value of the first field."""
+"""End of a message about a field of REQUIRES, with or without the first field; by default another
+value of the first field."""
 
 
 class Needs(NamedTuple):
@@ -72,6 +105,8 @@ def _needs(names: str, other: str, accepted: Any) -> Needs:
 
 
 NEEDS: Final = (
+    _needs("kp kd", "controller.kind", "pd"),
+    _needs("integral integral_weight weight_scaling w_Q w_R", "controller.kind", "lqi"),
     _needs("integral_weight", "controller.integral", True),
     *(
         _needs(f"prior.{name}", "controller.estimate", name)
@@ -80,15 +115,17 @@ NEEDS: Final = (
     _needs(
         "prior.rates",
         "controller.estimate",
-        ("torque_bias", "payload", "damping", "coulomb", "offsets"),
+        ("torque_bias", "payload", "damping", "coulomb", "wrench", "offsets"),
     ),
     _needs("prior.rates", "sensor.kind", "encoders"),
     _needs("prior.offsets", "controller.estimate", "offsets"),
+    _needs("prior.wrench prior.wrench_walk", "controller.estimate", "wrench"),
+    _needs("horizon", "controller.limits", "qp"),
     _needs("delay_std delay_max replan", "controller.delay_estimator", _DELAYS),
     _needs("w_Q w_R", "tuner.kind", ("fixed", "ann")),
     _needs(
-        "integral integral_weight prediction model weight_scaling w_Q w_R packet_torques "
-        "packet_repeats open_loop_start",
+        "kind kp kd integral integral_weight prediction model weight_scaling w_Q w_R "
+        "packet_torques packet_repeats open_loop_start limits",
         "controller.command",
         "torque",
     ),
@@ -126,7 +163,8 @@ def contradiction(scenario: Any) -> str | None:
             place = _place(scenario, field)
             assert place is not None
             condition = f"with {field} {_spelled(getattr(*place))}"
-            return found.problem(condition, _HINTS.get(found.field, f", or another {field}"))
+            usual = _HINTS.get(found.field, f", or another {field}")
+            return found.problem(condition, _HINTS.get((field, found.field), usual))
     return None
 
 

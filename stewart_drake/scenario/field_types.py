@@ -1,17 +1,32 @@
 """Types of the scenario's fields, each with its range; shared by the sections."""
 
-from typing import Annotated, Any, Final, Literal, NotRequired
+import dataclasses
+from typing import Annotated, Any, Final, Literal, NotRequired, TypeVar, dataclass_transform
 
+import pydantic
 from pydantic import AfterValidator, ConfigDict, Field, with_config
 from typing_extensions import TypedDict  # which pydantic wants before Python 3.12
 
-from stewart_drake.files.yamlio import one_message
+from stewart_drake.files.yamlio import in_one_line, one_message
 from stewart_drake.scenario.timing import LEAST_FRACTION
 
+_T = TypeVar("_T")
 STRICT: Final = ConfigDict(
-    extra="forbid", strict=True, allow_inf_nan=False, validate_assignment=True
+    extra="forbid",
+    strict=True,
+    allow_inf_nan=False,
+    validate_assignment=True,
+    populate_by_name=True,
 )
 """Configuration of every section: nothing is guessed, and assignments are checked too."""
+
+
+@dataclass_transform(field_specifiers=(dataclasses.field, Field))
+def section(cls: type[_T]) -> type[_T]:
+    """Return a strict dataclass; a wrong argument or assignment raises ConfigError."""
+    return in_one_line(pydantic.dataclasses.dataclass(config=STRICT)(cls))
+
+
 MOST_PERIODS: Final = 1000
 """Largest delay in periods, which is the number of torques in flight."""
 
@@ -34,6 +49,24 @@ Steps = Annotated[int, Field(ge=0, le=MOST_PERIODS)]
 Row = Annotated[list[float], Field(min_length=6, max_length=6)]
 Six = Annotated[list[Length], Field(min_length=6, max_length=6)]
 Name = Annotated[str, Field(min_length=1)]
+
+
+def _check_range(low_high: list[float]) -> list[float]:
+    if not low_high[0] < low_high[1]:
+        raise ValueError
+    return low_high
+
+
+_Range = Annotated[
+    list[Annotated[float, Field(ge=-10, le=10)]],
+    Field(min_length=2, max_length=2),
+    AfterValidator(_check_range),
+]
+AngleRange = Annotated[
+    _Range | Annotated[list[_Range], Field(min_length=6, max_length=6)] | None,
+    one_message("[low, high] in rad with low below high, or a list of six of these, or null"),
+]
+"""Range of crank angles, one for all cranks or one for each."""
 
 SPIKE: Final = 10.0
 """Default `size` of a spike."""

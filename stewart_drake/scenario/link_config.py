@@ -2,17 +2,16 @@
 
 from typing import Annotated, Final, Literal
 
-from pydantic import ConfigDict, Field
-from pydantic.dataclasses import dataclass
+from pydantic import Field
 
 from stewart_drake.files.schema import ByKind
-from stewart_drake.scenario.field_types import STRICT, Loss, Positive, Seconds, Seed
+from stewart_drake.scenario.field_types import Loss, Positive, Seconds, Seed, section
 
 ASSUMED_TIMES: Final = (0.8, 1.2)
 """Shortest and longest transit time, in delays, of a network without `low` and `high`."""
 
 
-@dataclass(config=STRICT)
+@section
 class WireConfig:
     """A link that delays every torque by `delay`, and loses none.
 
@@ -24,7 +23,7 @@ class WireConfig:
     kind: Literal["wire"] = "wire"
 
 
-@dataclass(config=STRICT)
+@section
 class PacketsConfig:
     """Transit times and losses of packets.
 
@@ -61,7 +60,7 @@ class PacketsConfig:
         return None
 
 
-@dataclass(config=STRICT | ConfigDict(populate_by_name=True))
+@section
 class NetworkConfig(PacketsConfig):
     """Packets of torques with the times at which they shall act, and a buffer at the machine.
 

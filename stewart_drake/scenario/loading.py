@@ -25,7 +25,11 @@ from stewart_drake.scenario.config import (
 from stewart_drake.scenario.dependencies import Idle, idle_fields, reset
 
 _SETTINGS = "settings"
-_FILES = ("file", "calibration")  # fields that are always a path; others may be a shipped name
+_FILES = (
+    "file",
+    "calibration",
+    "learned",
+)  # fields that are always a path; others may be a shipped name
 _OVERLAY = "overlay"
 _KINDS = sections(Scenario)
 
@@ -168,9 +172,10 @@ def load_controller(name_or_path: str | Path) -> dict[str, Any]:
 
 def load_comparison(
     name_or_path: str | Path,
-    controllers: Iterable[str],
+    controllers: Iterable[str | Path],
     settings: Iterable[str] = (),
     refuse_idle: bool = True,
+    further: bool = True,
 ) -> dict[str, Scenario]:
     """Read a scenario once for every controller, and for every further row of its `compare`.
 
@@ -179,21 +184,29 @@ def load_comparison(
 
     Args:
         name_or_path, settings: as of `load_scenario`.
-        controllers: names or paths.
+        controllers: shipped names, rows of the scenario's `compare`, or paths; the row of a path
+            is named after its file.
         refuse_idle: whether to refuse a field that has an effect in no row.
+        further: whether to add the rows of `compare` that are not among the controllers.
 
     Returns:
         Scenarios by row: the controllers, then the further rows in the file's order.
+
+    Raises:
+        ConfigError: bad input, or two controllers of one name.
     """
     settings = tuple(settings)
     others = tuple(s for s in settings if not s.strip().startswith("controller.delay_"))
     read = read_scenario(name_or_path, settings=settings)
     read.scenario.check_rows(read.where)
     changes, rows = read.scenario.compare, {}
+    named = _rows_of(controllers)
     everywhere = {one.field for one in idle_fields(read.scenario)}
-    for row in dict.fromkeys([*controllers, *changes]):
-        where, change = f"{name_or_path}: compare.{row}", dict(changes.get(row, {}))
-        controller, actuator = change.pop("controller", row), change.pop("actuator", {})
+    for row in dict.fromkeys([*named, *(changes if further else ())]):
+        given = named.get(row, row)
+        where = f"{name_or_path}: compare.{row}"
+        change = {} if is_path(given) else dict(changes.get(row, {}))
+        controller, actuator = change.pop("controller", given), change.pop("actuator", {})
         ignores_delay = load_controller(controller).get("delay_steps") == 0
         own = others if ignores_delay else settings
         scenario = read_scenario(name_or_path, controller, own).scenario
@@ -210,6 +223,26 @@ def load_comparison(
     for one in idle_fields(read.scenario) if refuse_idle else ():
         if one.field in everywhere and (place := read.place_to_mend(one)):
             raise ConfigError(f"{place}: {one.problem}")
+    return rows
+
+
+def _rows_of(controllers: Iterable[str | Path]) -> dict[str, str | Path]:
+    """Return controllers by the name of their row.
+
+    Raises:
+        ConfigError: a name occurs twice, or a file has the name of a shipped controller.
+    """
+    rows: dict[str, str | Path] = {}
+    for one in controllers:
+        row = Path(one).stem if is_path(one) else str(one)
+        if row in rows:
+            raise ConfigError(f"controllers: got {row!r} twice; expected different names")
+        if is_path(one) and row in shipped("controller"):
+            raise ConfigError(
+                f"controllers: got {str(one)!r}, named as a shipped controller; expected another "
+                "file name"
+            )
+        rows[row] = one
     return rows
 
 
@@ -318,6 +351,6 @@ def _make_paths_absolute(data: dict[str, Any], folder: Path) -> None:
     resolved(data, "mechanism")
     resolved(data.get("plant", {}), "mechanism")
     for fields in (data.get("controller", {}), *data.get("compare", {}).values()):
-        resolved(fields, "calibration", "controller")  # the latter in a row of `compare`
+        resolved(fields, "calibration", "learned", "controller")  # the latter in a row of `compare`
     resolved(data.get("reference", {}), "file")
     resolved(data.get("tuner", {}), "weights")

@@ -9,11 +9,11 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from stewart_drake.scenario.field_types import MOST_PERIODS
 from stewart_drake.scenario.link_config import PacketsConfig
-from stewart_drake.types import Array
+from stewart_drake.types import Array, ArrayLike
 
 FORWARD, BACK, SENSOR = range(3)  # streams of random numbers of one seed
 RARE: Final = 1.5  # accepted share of missing torques, relative to that without late packets

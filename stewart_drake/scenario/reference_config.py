@@ -8,10 +8,10 @@ from dataclasses import field
 from typing import Annotated, Literal
 
 from pydantic import Field
-from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.schema import ByKind
-from stewart_drake.scenario.field_types import STRICT, Name, Row, Seconds, Six
+from stewart_drake.files.yamlio import one_message
+from stewart_drake.scenario.field_types import Name, Row, Seconds, Six, section
 
 
 def _pitch_problem(largest: float) -> str | None:
@@ -21,7 +21,14 @@ def _pitch_problem(largest: float) -> str | None:
     return f"reference.offset: the pitch reaches {largest:.4g} rad; expected {expected}"
 
 
-@dataclass(config=STRICT)
+_Frequency = Annotated[float, Field(gt=0, le=1e4)]
+_Frequencies = Annotated[
+    _Frequency | Annotated[list[_Frequency], Field(min_length=6, max_length=6)],
+    one_message("a number above 0 and of at most 1e4, or six of them"),
+]
+
+
+@section
 class SineConfig:
     """offset + amplitude sin(frequency t).
 
@@ -29,7 +36,7 @@ class SineConfig:
         kind: `sine`.
         amplitude: [roll, pitch, yaw, x, y, z] in rad and m.
         offset: middle of the motion, rad and m.
-        frequency: in `frequency_unit`.
+        frequency: in `frequency_unit`; one for all coordinates, or a list of six.
         frequency_unit: `rad/s` or `Hz`.
     """
 
@@ -38,20 +45,21 @@ class SineConfig:
         default_factory=lambda: [0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08]
     )
     offset: Six = field(default_factory=lambda: [0.0, 0.0, 0.0, 0.0, 0.0, 0.38])
-    frequency: Annotated[float, Field(gt=0, le=1e4)] = 1.0
+    frequency: _Frequencies = 1.0
     frequency_unit: Literal["rad/s", "Hz"] = "rad/s"
 
     @property
-    def angular_frequency(self) -> float:
-        """Frequency in rad/s."""
-        return self.frequency * (2 * math.pi if self.frequency_unit == "Hz" else 1.0)
+    def angular_frequency(self) -> list[float]:
+        """Frequency of each coordinate, rad/s."""
+        six = self.frequency if isinstance(self.frequency, list) else [self.frequency] * 6
+        return [one * (2 * math.pi if self.frequency_unit == "Hz" else 1.0) for one in six]
 
     def problem(self) -> str | None:
         """Return the first rule between the fields that is broken, or None."""
         return _pitch_problem(abs(self.amplitude[1]) + abs(self.offset[1]))
 
 
-@dataclass(config=STRICT)
+@section
 class HoldConfig:
     """One constant pose.
 
@@ -67,7 +75,7 @@ class HoldConfig:
         return _pitch_problem(abs(self.offset[1]))
 
 
-@dataclass(config=STRICT)
+@section
 class WaypointsConfig:
     """A smooth motion through poses, at rest in the first and the last; in lists or in a file.
 
@@ -97,7 +105,7 @@ class WaypointsConfig:
         return None
 
 
-@dataclass(config=STRICT)
+@section
 class CsvConfig:
     """A sampled motion.
 
@@ -115,4 +123,24 @@ class CsvConfig:
         return None
 
 
-ReferenceConfig = Annotated[SineConfig | HoldConfig | WaypointsConfig | CsvConfig, ByKind()]
+@section
+class ReachyMoveConfig:
+    """A recorded move of Reachy Mini, in the format of its SDK.
+
+    Attributes:
+        kind: `reachy_move`.
+        file: JSON of `time` and `set_target_data`, see `machines.reachy_moves.read_move`.
+    """
+
+    kind: Literal["reachy_move"] = "reachy_move"
+    file: Name | None = None
+
+    def problem(self) -> str | None:
+        if self.file is None:
+            return "reference.file: got None; expected the JSON file of a recorded move"
+        return None
+
+
+ReferenceConfig = Annotated[
+    SineConfig | HoldConfig | WaypointsConfig | CsvConfig | ReachyMoveConfig, ByKind()
+]

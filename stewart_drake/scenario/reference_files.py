@@ -103,39 +103,59 @@ def read_csv(path: str | Path) -> tuple[Array, Array]:
             f"{table.place(0, 'time')}: got {float(times[0])!r}; expected 0 in the first sample, "
             "subtract it from every time"
         )
-    _check_samples(times, poses, table.place, table.scales)
+    check_motion(path, times, poses, table.place, table.scales)
+    times[0] = 0.0
+    return times, poses
+
+
+Place = Callable[[int, str], str]
+"""Opening of a message about a row and a column, `time` or a coordinate."""
+
+
+def check_motion(
+    path: Path, times: Array, poses: Array, place: Place, scales: Mapping[str, float]
+) -> None:
+    """Check that samples are dense and smooth enough for a spline through them.
+
+    Args:
+        path: of the file.
+        times: (n,) s.
+        poses: (n, 6) rad and m.
+        place: see `Place`.
+        scales: by coordinate, the SI units in the unit of the file.
+
+    Raises:
+        ConfigError: too few samples, a gap, a jump or a kink.
+    """
+    _check_samples(times, poses, place, scales)
     if len(times) < _MIN_ROWS:
         raise ConfigError(f"{path}: got {len(times)} samples; expected at least {_MIN_ROWS}")
     steps = np.diff(times)
     widest, median = int(np.argmax(steps)), float(np.median(steps))
     if steps[widest] > _MAX_GAP * median:
         raise ConfigError(
-            f"{table.place(widest + 1, 'time')}: got a gap of {steps[widest]:.6g} s; "
+            f"{place(widest + 1, 'time')}: got a gap of {steps[widest]:.6g} s; "
             f"expected steps near the median of {median:.6g} s, fill the gap by resampling"
         )
-    times[0] = 0.0
     kink = _worst_kink(times, poses)
     if kink is not None:
         row, axis, size = kink
         name = COORDINATE_NAMES[axis]
-        scale = table.scales[name]
+        scale = scales[name]
         raise ConfigError(
-            f"{table.place(row, name)}: got {size / scale:.3g} {_unit(name, scale)} off "
+            f"{place(row, name)}: got {size / scale:.3g} {_unit(name, scale)} off "
             "the cubic through its neighbours; expected a smooth motion with some ten samples per "
             "swing, filter or resample it"
         )
-    return times, poses
 
 
-def _check_samples(
-    times: Array, poses: Array, place: Callable[[int, str], str], scales: Mapping[str, float]
-) -> None:
+def _check_samples(times: Array, poses: Array, place: Place, scales: Mapping[str, float]) -> None:
     """Check that times (n,) increase, and that poses (n, 6) are unique and do not jump by a turn.
 
     Args:
         times: s.
         poses: rad and m.
-        place: returns the opening of a message about a row and a column.
+        place: see `Place`.
         scales: by coordinate, the SI units in the unit of the file.
     """
 

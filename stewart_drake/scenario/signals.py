@@ -40,19 +40,38 @@ BIAS: Final = slice(0, 6)
 PAYLOAD: Final = 6
 DAMPING: Final = 7
 
-PLANT_PARAMETERS: Final = (
+CONSTANTS: Final = (
     *PARAMETERS,
     "coulomb_friction",
     "coulomb_speed",
     *(f"payload_position_{axis}" for axis in "xyz"),
+    "ball_joint_damping",
+    "ball_joint_friction",
+    "ball_joint_friction_speed",
 )
 """All constants of the equations of motion that are not the mechanism's."""
-PLANT_PARAMETER_UNITS: Final = (*PARAMETER_UNITS, "N m", "rad/s", "m", "m", "m")
+CONSTANT_UNITS: Final = (
+    *(*PARAMETER_UNITS, "N m", "rad/s", "m", "m", "m"),
+    *("N m s/rad", "N m", "rad/s"),
+)
+NUM_CONSTANTS: Final = len(CONSTANTS)
+WRENCHES: Final = tuple(f"wrench_{kind}_{axis}" for kind in ("moment", "force") for axis in "xyz")
+"""Wrench on the plate in the world at its centre of mass, moment then force; it may change."""
+WRENCH_UNITS: Final = (*("N m",) * 3, *("N",) * 3)
+PLANT_PARAMETERS: Final = (*CONSTANTS, *WRENCHES)
+"""All parameters of the equations of motion that are not the mechanism's."""
+PLANT_PARAMETER_UNITS: Final = (*CONSTANT_UNITS, *WRENCH_UNITS)
 NUM_PLANT_PARAMETERS: Final = len(PLANT_PARAMETERS)
 COULOMB: Final = 8
 COULOMB_SPEED: Final = 9
+SHAFTS: Final = slice(7, 10)  # damping, Coulomb friction and its speed
 PAYLOAD_POSITION: Final = slice(10, 13)
+WRENCH: Final = slice(NUM_CONSTANTS, NUM_PLANT_PARAMETERS)
+BALL_JOINTS: Final = slice(13, 16)  # damping, Coulomb friction and its speed
+BALL_JOINT_FRICTION_SPEED: Final = 15
+NUM_BALL_JOINT_PARAMETERS: Final = 3
 DEFAULT_COULOMB_SPEED: Final = 0.02  # rad/s
+DEFAULT_BALL_JOINT_SPEED: Final = 0.1  # rad/s
 
 WEIGHTS: Final = ("w_Q", "w_R")
 
@@ -85,6 +104,7 @@ DIMENSIONS: Final[dict[str, Dimension]] = {
     "leg": Dimension(LEGS, "legs and their motors, numbered from one"),
     "weight": Dimension(WEIGHTS, "weight of the errors, weight of the torques"),
     "parameter": Dimension(PARAMETERS, "parameters that are unknown to the controller"),
+    "wrench": Dimension(WRENCHES, "moment, then force, in the world at the plate's centre of mass"),
     "tuner_input": Dimension(TUNER_INPUTS, "inputs of a density"),
     "state": Dimension(STATE, "coordinates, then their time derivatives"),
     "packet": Dimension(PACKETS, "counts of packets, and of periods"),
@@ -153,6 +173,7 @@ _INTEGRAL: Final = Quantity("coordinate", tuple(f"{unit} s" for unit in COORDINA
 _TORQUE: Final = Quantity("leg", ("N m",) * NUM_TORQUES)
 _WEIGHTS: Final = Quantity("weight", ("1",) * len(WEIGHTS))
 _PARAMETERS: Final = Quantity("parameter", PARAMETER_UNITS)
+_WRENCH: Final = Quantity("wrench", WRENCH_UNITS)
 _DENSITY: Final = Quantity("tuner_input", ("1",) * len(TUNER_INPUTS))
 _SECONDS: Final = Quantity(None, ("s",))
 _STATE: Final = Quantity("state", COORDINATE_UNITS + RATE_UNITS)
@@ -170,6 +191,8 @@ _TABLE: Final = (
     Signal("weights", _WEIGHTS, "weights that the controller used", "controller", "weights_used"),
     Signal("parameters", _PARAMETERS, "estimate of the plant's parameters", "controller"),
     Signal("parameter_std", _PARAMETERS, "standard deviation of that estimate", "controller"),
+    Signal("wrench_estimate", _WRENCH, "estimate of a wrench on the plate", "controller"),
+    Signal("wrench_std", _WRENCH, "standard deviation of that estimate", "controller"),
     Signal("density", _DENSITY, "density (45)", "density"),
     Signal("measurement", _STATE, "measured pose and rates", "controller.measurement_used"),
     Signal("state_estimate", _STATE, "estimated pose and rates", "controller"),

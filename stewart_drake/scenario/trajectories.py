@@ -10,7 +10,6 @@ from functools import singledispatch
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydrake.trajectories import (
     BezierCurve,
     CompositeTrajectory,
@@ -36,7 +35,7 @@ from stewart_drake.scenario.signals import (
     POSITION,
     RATES,
 )
-from stewart_drake.types import Array
+from stewart_drake.types import Array, ArrayLike
 
 _CONSTANT: Final = 1e-9
 """Range in rad, or relative to the largest position, below which a coordinate is constant."""
@@ -80,9 +79,9 @@ def _sine(config: SineConfig, duration: float) -> Trajectory:
 
     def derivative(t: float, order: int) -> Array:
         # d/dt sin = cos, then -sin, -cos, sin
-        waves = (math.sin, math.cos)
+        wave = (math.sin, math.cos)[order % 2]
         sign = -1.0 if order % 4 in (2, 3) else 1.0
-        return sign * omega**order * waves[order % 2](omega * t) * amplitude
+        return np.array([[sign * w**order * wave(w * t)] for w in omega]) * amplitude
 
     trajectory = FunctionHandleTrajectory(lambda t: offset + derivative(t, 0), 6, 1, 0.0, math.inf)
     trajectory.set_derivative(derivative)
@@ -98,7 +97,7 @@ def _constant(config: HoldConfig, duration: float) -> Trajectory:
 def _sampled(config: CsvConfig, duration: float) -> Trajectory:
     if config.file is None:
         raise ConfigError(config.problem() or "")
-    return _through_samples(*read_csv(config.file), duration, config.file)
+    return through_samples(*read_csv(config.file), duration, config.file)
 
 
 def evaluate(trajectory: Trajectory, t: float) -> Array:
@@ -248,7 +247,12 @@ def _through_waypoints(config: WaypointsConfig, duration: float) -> Trajectory:
     return CompositeTrajectory([*segments, _hold(poses[-1], times[-1], math.inf)])
 
 
-def _through_samples(times: Array, poses: Array, duration: float, file: str) -> Trajectory:
+def through_samples(times: Array, poses: Array, duration: float, file: str) -> Trajectory:
+    """Return the cubic spline through samples (n,), (n, 6), followed by the last pose.
+
+    Raises:
+        ConfigError: the samples end before `duration`, in s, while they still move.
+    """
     from scipy.interpolate import CubicSpline  # slow to import
 
     # The free ends follow the samples; prescribed rest would bend the first and last interval of

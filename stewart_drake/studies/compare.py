@@ -3,7 +3,7 @@
 import math
 import pickle
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
@@ -19,11 +19,12 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials
 from stewart_drake.files.jsonio import write_json
 from stewart_drake.files.resources import resolve
+from stewart_drake.files.yamlio import brief
 from stewart_drake.loop.own import OwnReference
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.calibration import believed_delay
-from stewart_drake.scenario.config import Scenario, ServoActuatorConfig
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_comparison, load_compatible, read_scenario
 from stewart_drake.studies.jobs import run_jobs
 
@@ -31,6 +32,10 @@ ADAPTIVE: Final = "adaptive_lqi"
 """Added if the delay of the others is not the true one."""
 CONTROLLERS: Final = ("lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi")
 """Shipped names, in the order of tables and legends: the paper's four, and ours."""
+GRAVITY: Final = ("pd_gravity", "lqr_gravity")
+"""Added if gravity acts: baselines that compensate gravity and ignore the delay."""
+LIMITED: Final = "predictor_mpc"
+"""Shown where it is chosen."""
 SERVOS: Final = ("servo_preview", "servo_feedforward")
 """Added if the machine has servos."""
 LABELS: Final = {
@@ -40,6 +45,9 @@ LABELS: Final = {
     "delay_lqi": "LQI, delay-aware",
     "predictor_lqi": "LQI, predictor",
     "adaptive_lqi": "LQI, delay found",
+    "predictor_mpc": "LQI, limits by QP",
+    "pd_gravity": "PD + gravity",
+    "lqr_gravity": "LQR + gravity",
     "servo_preview": "servos",
     "servo_feedforward": "servos + torque",
 }
@@ -61,7 +69,7 @@ def compare(
     settings: Iterable[str] = (),
     progress: Progress | None = None,
     *,
-    controllers: Mapping[str, Callable[[], System]] | None = None,
+    controllers: Mapping[str, Callable[[], System]] | Sequence[str | Path] | None = None,
     reference: OwnReference | None = None,
     disturbance: Callable[[], System] | None = None,
 ) -> dict[str, SimulationResult]:
@@ -77,22 +85,29 @@ def compare(
         scenario_name: a shipped name or a path; its start, plant and tuner stay as they are.
         settings: as `load_scenario` takes them.
         progress: called for each running simulation, ten times a second.
-        controllers: your own by name, with the ports listed at `simulate`.
+        controllers: names or files, for these in this order; or your own systems by name, in
+            addition to the shipped ones, with the ports listed at `simulate`.
         reference, disturbance: for all runs, as of `simulate`.
 
     Returns:
-        Results by controller, in the order of `shown`, then your own.
+        Results by controller, in the order of `shown`, then your own. A file is named by its name
+        without the suffix.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
     """
-    settings, controllers = tuple(settings), dict(controllers or {})
-    scenarios = shown(scenario_name, settings)
-    _check_makers(controllers, reference, disturbance, taken={*LABELS, *scenarios})
-    scenarios |= {name: load_compatible(scenario_name, settings=settings) for name in controllers}
+    settings, chosen = tuple(settings), None
+    makers: dict[str, Callable[[], System]] = {}
+    if isinstance(controllers, Mapping):
+        makers = dict(controllers)
+    elif controllers is not None:
+        chosen = _chosen(controllers)
+    scenarios = shown(scenario_name, settings, chosen)
+    _check_makers(makers, reference, disturbance, taken={*LABELS, *scenarios})
+    scenarios |= {name: load_compatible(scenario_name, settings=settings) for name in makers}
     given = {
         name: {
-            "controller": controllers.get(name),
+            "controller": makers.get(name),
             "reference": reference,
             "disturbance": disturbance,
         }
@@ -108,7 +123,7 @@ def compare(
             for i, (key, name) in enumerate(zip(keys, scenarios, strict=True))
         }
         # Own controllers first: what runs in this process does so while workers do the others.
-        jobs = dict(sorted(jobs.items(), key=lambda job: job[1][0] not in controllers))
+        jobs = dict(sorted(jobs.items(), key=lambda job: job[1][0] not in makers))
         # Ctrl-C reaches this thread only, which notifies the processes by the board.
         run: Callable[..., dict[str, SimulationResult | None]] = run_jobs
         runs = thread.submit(
@@ -130,27 +145,51 @@ def compare(
     return {name: one for name, one in results.items() if one is not None}
 
 
-def shown(scenario_name: str | Path, settings: Iterable[str] = ()) -> dict[str, Scenario]:
-    """Return scenarios of the shipped controllers, then of the rows in the scenario's `compare`.
+def shown(
+    scenario_name: str | Path,
+    settings: Iterable[str] = (),
+    controllers: Sequence[str | Path] | None = None,
+) -> dict[str, Scenario]:
+    """Return scenarios by controller.
 
-    ADAPTIVE is added if the others' delay is not the true one, or changes, and the scenario
-    supports it; SERVOS if the scenario's motors are servos.
+    These are the given controllers in their order. Without them, they are the shipped ones, then
+    the rows in the scenario's `compare`. ADAPTIVE is added then if the others' delay is not the
+    true one, or changes, and the scenario supports it; GRAVITY if gravity acts; SERVOS if the
+    scenario's motors are servos.
 
     Raises:
         ConfigError: bad input.
     """
     settings = tuple(settings)
+    if controllers is not None:
+        return load_comparison(scenario_name, controllers, settings, further=False)
     rows, further = load_comparison(scenario_name, CONTROLLERS, settings, False), list[str]()
     aware = rows["predictor_lqi"]
     known = aware.delay.constant and believed_delay(aware) == aware.true_delay
     at_once = aware.link.kind == "wire" and aware.sensor.delay == 0
     if not known and at_once and "offsets" not in aware.controller.estimate:
         further.append(ADAPTIVE)
-    if isinstance(
-        read_scenario(scenario_name, settings=settings).scenario.actuator, ServoActuatorConfig
-    ):
+    if aware.plant.gravity:
+        further += GRAVITY
+    if read_scenario(scenario_name, settings=settings).scenario.actuator.kind != "torque":
         further += SERVOS
     return load_comparison(scenario_name, (*CONTROLLERS, *further), settings)
+
+
+def _chosen(controllers: Sequence[str | Path]) -> Sequence[str | Path]:
+    """Check the names or files of controllers.
+
+    Raises:
+        ConfigError: none, or an item of another kind.
+    """
+    few = isinstance(controllers, str) or len(controllers) == 0
+    wrong = [] if few else [one for one in controllers if not isinstance(one, str | Path)]
+    if few or wrong:
+        raise ConfigError(
+            f"controllers: got {brief(wrong[0] if wrong else controllers)}; expected a list of "
+            "names or files, or a mapping of names to systems"
+        )
+    return controllers
 
 
 def label(name: str) -> str:

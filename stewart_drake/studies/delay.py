@@ -11,9 +11,10 @@ from threadpoolctl import threadpool_limits
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import diagnose
+from stewart_drake.law.cost import law_gain
 from stewart_drake.law.delay_model import DelayedModel
 from stewart_drake.law.error_model import double_integrators, linear_model
-from stewart_drake.law.riccati import RiccatiError, law_gain
+from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.law.stability import (
     LinearLoop,
     Peak,
@@ -27,8 +28,9 @@ from stewart_drake.law.stability import (
     spectral_radius,
     worst_margins,
 )
+from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
-from stewart_drake.loop.law_design import quadratic_cost
+from stewart_drake.loop.law_design import cost_of
 from stewart_drake.loop.preparation import assemble
 from stewart_drake.loop.results import delay_floor, waits_at_rest
 from stewart_drake.mechanism.assembly import torque_map
@@ -372,13 +374,14 @@ def loop_margins(found: Assessment, delays: Iterable[int] = DELAYS) -> list[Loop
         design = double_integrators(torque_map(experiment.mechanism, pose, c.torque_map))
     if c.prediction == "linear":
         predictor = design
-    weights = quadratic_cost(experiment, found.torque).matrices(np.array([c.w_Q, c.w_R]))
-    judged = []
+    weights, judged = np.array([c.w_Q, c.w_R]), []
     for steps in sorted({*delays, sc.delay.steps}):
-        believed = believed_delay(replace(sc, delay=replace(sc.delay, steps=steps)))
-        K = law_gain(design, predictor, c.period, believed, weights)
-        loop = LinearLoop(plant, K, c.period, Delay(steps, sc.delay.fraction), c.integral)
-        judged.append(_margins_of(loop))
+        at = replace(sc, delay=replace(sc.delay, steps=steps))
+        cost = cost_of(experiment._replace(scenario=at), found.torque)
+        timeline = Timeline(c.period, believed_delay(at))
+        K = law_gain(cost, design, predictor, timeline, weights)
+        delay = Delay(steps, sc.delay.fraction)
+        judged.append(_margins_of(LinearLoop(plant, K, c.period, delay, cost.integrates)))
     return judged
 
 

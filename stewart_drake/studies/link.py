@@ -8,11 +8,13 @@ too good there.
 """
 
 import math
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from scipy import stats
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.config import Scenario
@@ -25,7 +27,7 @@ from stewart_drake.scenario.packets import (
 )
 from stewart_drake.studies.jobs import Progress, part_of
 from stewart_drake.studies.runs import run_scenarios
-from stewart_drake.studies.statistics import least_share
+from stewart_drake.studies.statistics import CONFIDENCE, least_share
 from stewart_drake.studies.study_options import LinkOptions
 
 LOSSES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4)
@@ -34,6 +36,8 @@ _FEW: Final = 0.4
 _NEARLY_ALL: Final = 0.999
 """Shares of the packets that arrive within the shortest and the longest bound tried."""
 _MOST_BOUNDS: Final = 12
+_SAME: Final = 0.01
+"""Relative difference of E_ac that does not matter."""
 
 
 class Cell(NamedTuple):
@@ -107,6 +111,32 @@ class LinkStudy:
         return best_of(self.bounds)
 
     @property
+    def alike(self) -> list[float]:
+        """Bounds whose E_ac the seeds do not tell from that of the best, s.
+
+        They lost no more runs, and their mean is less than 1 % larger, or not larger at 5 % by a
+        one-sided t-test: of the differences, as the runs have the same seeds, or of two samples
+        where some runs were lost.
+        """
+        best, found = self.best, list[float]()
+        for cell in self.bounds:
+            if best is None or cell is best or len(cell.errors) < len(best.errors):
+                continue
+            worse, errors = (
+                np.mean(cell.errors) / np.mean(best.errors) - 1,
+                (cell.errors, best.errors),
+            )
+            with warnings.catch_warnings(), np.errstate(all="ignore"):
+                warnings.simplefilter("ignore", RuntimeWarning)  # of errors that hardly differ
+                if cell.completed == best.completed == 1:
+                    p = stats.ttest_rel(*errors, alternative="greater").pvalue
+                else:
+                    p = stats.ttest_ind(*errors, alternative="greater").pvalue
+            if worse < _SAME or not p < 1 - CONFIDENCE:
+                found.append(cell.bound)
+        return found
+
+    @property
     def checked(self) -> Cell | None:
         """The best bound at the scenario's loss with new seeds, or None."""
         link = self.scenario.link
@@ -127,6 +157,7 @@ class LinkStudy:
     def summary(self) -> dict[str, Any]:
         return {
             "best_bound": None if self.best is None else self.best.bound,
+            "alike_bounds": self.alike,
             "usual_bound": self.usual,
             "survivable_loss": self.survivable,
             "runs": self.runs,

@@ -5,9 +5,10 @@ The command line, the Python signature and the command that a page names follow 
 
 import functools
 import inspect
+import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -28,19 +29,48 @@ def option(
     name: str = "",
     read: "Callable[[list[str], Callable[[str], Scenario]], Any] | None" = None,
     recorded: bool = True,
+    unit: str | None = None,
     **bounds: Any,
 ) -> Any:
     """Return the field of an option that the command line has too.
 
     Args:
         default: `...` for none.
-        help, metavar, read, recorded: see `Option`.
+        help, metavar, read, recorded, unit: see `Option`.
         name: on the command line, if it differs from the field's.
         bounds: as `pydantic.Field` takes them.
     """
     extra = {"flag": name, "metavar": metavar, "read": read, "recorded": recorded}
+    extra["unit"] = unit
     more: dict[str, Any] = {"description": help, "json_schema_extra": extra, **bounds}
     return Field(default, **more)
+
+
+_UNITS: Final[Mapping[str, Mapping[str, float]]] = {
+    "m": {"mm": 1e-3, "cm": 1e-2, "m": 1.0},
+    "kg": {"g": 1e-3, "kg": 1.0},
+}
+
+
+def quantity(name: str, text: str, unit: str) -> float:
+    """Return a text such as `300 mm`, `0.3 m` or `0.3` in a unit, m or kg.
+
+    Raises:
+        ConfigError: no number, or another unit; the message begins with the name.
+    """
+    number, word = re.fullmatch(r"\s*(.*?)\s*([^\W\d_]*)\s*", text, re.DOTALL).groups()  # type: ignore[union-attr]
+    smallest, factor = next(iter(_UNITS[unit])), _UNITS[unit].get(word or unit)
+    try:
+        value = float(number)
+    except ValueError:
+        factor = None
+    if factor is None:
+        size = f"{0.3 / _UNITS[unit][smallest]:g}"
+        raise ConfigError(
+            f"{name}: got {text!r}; expected a number with {', '.join(_UNITS[unit])} or without, "
+            f"such as {size} {smallest} or 0.3 {unit}; without a unit it is in {unit}"
+        )
+    return float(f"{value * factor:.15g}")
 
 
 class Option(NamedTuple):
@@ -56,6 +86,7 @@ class Option(NamedTuple):
         read: makes the value from the texts of a repeatable option. Its second argument loads the
             scenario with another controller.
         recorded: whether the command on a page contains the option.
+        unit: of the value; a text such as `300 mm` is accepted too, see `quantity`.
     """
 
     name: str
@@ -66,6 +97,7 @@ class Option(NamedTuple):
     metavar: str | None = None
     read: "Callable[[list[str], Callable[[str], Scenario]], Any] | None" = None
     recorded: bool = True
+    unit: str | None = None
 
     @property
     def required(self) -> bool:
@@ -79,6 +111,9 @@ class Options(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     def __init__(self, **values: Any) -> None:
+        for one in type(self).described():
+            if one.unit and isinstance(values.get(one.name), str):
+                values[one.name] = quantity(one.name, values[one.name], one.unit)
         try:
             super().__init__(**values)
         except ValidationError as caught:

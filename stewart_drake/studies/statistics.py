@@ -20,13 +20,13 @@ from itertools import combinations, product
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import brentq
 from scipy.special import ndtri
 from scipy.stats import hypergeom, mannwhitneyu
 
-from stewart_drake.types import Array
+from stewart_drake.types import Array, ArrayLike
 
 CONFIDENCE: Final = 0.95
 """Default of every interval."""

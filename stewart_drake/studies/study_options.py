@@ -97,6 +97,12 @@ class DelayOptions(Options):
     ] = True
 
 
+class LearnOptions(Options):
+    """Options of `study_learn`."""
+
+    repetitions: int = option(6, "Largest number of repetitions.", "N", ge=1, le=1000)
+
+
 class LinkOptions(Options):
     """Options of `study_link`."""
 
@@ -204,18 +210,20 @@ _Mass = Annotated[float, Field(gt=0, lt=1e6)]
 
 
 class Measurements(Options):
-    """Measurements of a machine with a ruler and scales, lengths in m and masses in kg."""
+    """Measurements of a machine with a ruler and scales, in m and kg, or as `300 mm`, `250 g`."""
 
-    base_radius: _Length = option(..., "Radius of the circle of the motor shafts, m.")
-    shaft_distance: _Length = option(..., "Distance of the two shafts of a pair, m.")
-    plate_radius: _Length = option(..., "Radius of the circle of the plate's joints, m.")
-    joint_distance: _Length = option(..., "Distance of two neighbouring joints of the plate, m.")
-    crank: _Length = option(..., "Crank, from shaft to rod, m.")
-    rod: _Length = option(..., "Rod, from joint to joint, m.")
-    plate_mass: _Mass = option(..., "Mass of the plate with its load, kg.")
-    crank_mass: _Mass = option(..., "Mass of a crank, kg.")
-    rod_mass: _Mass = option(..., "Mass of a rod, kg.")
-    shaft_height: float = option(0.0, "Height of the shafts, m.", ge=-LARGEST, le=LARGEST)
+    base_radius: _Length = option(..., "Radius of the circle of the motor shafts, m.", unit="m")
+    shaft_distance: _Length = option(..., "Distance of the two shafts of a pair, m.", unit="m")
+    plate_radius: _Length = option(..., "Radius of the circle of the plate's joints, m.", unit="m")
+    joint_distance: _Length = option(
+        ..., "Distance of two neighbouring joints of the plate, m.", unit="m"
+    )
+    crank: _Length = option(..., "Crank, from shaft to rod, m.", unit="m")
+    rod: _Length = option(..., "Rod, from joint to joint, m.", unit="m")
+    plate_mass: _Mass = option(..., "Mass of the plate with its load, kg.", unit="kg")
+    crank_mass: _Mass = option(..., "Mass of a crank, kg.", unit="kg")
+    rod_mass: _Mass = option(..., "Mass of a rod, kg.", unit="kg")
+    shaft_height: float = option(0.0, "Height of the shafts, m.", unit="m", ge=-LARGEST, le=LARGEST)
     upright: float = option(
         90.0, "Degrees from the horizon of the planes the cranks turn in.", ge=-180, le=180
     )

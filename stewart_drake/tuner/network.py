@@ -31,7 +31,6 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import pydantic.dataclasses
-from numpy.typing import ArrayLike
 from pydantic import ConfigDict
 from scipy.special import expit
 
@@ -41,7 +40,7 @@ from stewart_drake.files.jsonio import load_json
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import brief, validate
 from stewart_drake.scenario.signals import TUNER_INPUTS, WEIGHTS
-from stewart_drake.types import Array
+from stewart_drake.types import Array, ArrayLike
 
 Kind = Literal["magnitude", "signed"]
 

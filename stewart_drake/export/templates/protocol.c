@@ -305,6 +305,9 @@ unsigned stewart_differing(const stewart_identity *one, const stewart_identity *
 
 #define MACHINE_BODY 100
 
+/* Contents of a datagram; 0: torques. */
+enum { REQUEST = 1, CRANKS = 2 };
+
 size_t stewart_write_measured(const stewart_measured *m, stewart_key key, uint8_t *data)
 {
     uint8_t *at = data;
@@ -327,7 +330,7 @@ size_t stewart_write_measured(const stewart_measured *m, stewart_key key, uint8_
     put(&at, m->reason.fault, 1);
     put(&at, m->reason.leg, 1);
     put(&at, m->before.fault, 1);
-    put(&at, 0, 1);
+    put(&at, m->cranks ? CRANKS : 0, 1);
     put(&at, m->reason.lasted, 8);
     put(&at, m->before.lasted, 8);
     if (m->kind == STEWART_OFFER)
@@ -344,7 +347,7 @@ size_t stewart_write_measured(const stewart_measured *m, stewart_key key, uint8_
     return finish(data, at, key);
 }
 
-static int plausible(const stewart_measured *m, uint64_t zero)
+static int plausible(const stewart_measured *m, uint64_t content)
 {
     int fits = (m->kind == STEWART_NOTHING && m->samples == 0 && m->bits == 0) ||
                (m->kind == STEWART_OFFER && m->samples == 0 && m->bits == 0 && m->history == 0) ||
@@ -352,7 +355,8 @@ static int plausible(const stewart_measured *m, uint64_t zero)
                (m->kind == STEWART_ENCODERS && m->samples >= 1 && m->samples <= STEWART_SAMPLES &&
                 m->bits >= 1 && m->bits <= STEWART_BITS);
     return fits && m->history <= STEWART_HISTORY && m->rate > 0 && isfinite(m->rate) &&
-           m->torque_limit > 0 && m->period > 0 && zero == 0 && m->head.flags < 1024 &&
+           m->torque_limit > 0 && m->period > 0 && (content == 0 || content == CRANKS) &&
+           m->head.flags < 1024 &&
            m->reason.fault < STEWART_FAULTS && m->reason.leg <= 6 && m->before.fault < STEWART_FAULTS;
 }
 
@@ -382,10 +386,11 @@ int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key, ste
     m->reason.fault = (uint8_t)get(&at, 1);
     m->reason.leg = (uint8_t)get(&at, 1);
     m->before.fault = (uint8_t)get(&at, 1);
-    uint64_t zero = get(&at, 1);
+    uint64_t content = get(&at, 1);
+    m->cranks = content == CRANKS;
     m->reason.lasted = get(&at, 8);
     m->before.lasted = get(&at, 8);
-    if (!plausible(m, zero))
+    if (!plausible(m, content))
         return STEWART_MALFORMED;
     size_t measured = m->kind == STEWART_STATE      ? 96u
                       : m->kind == STEWART_OFFER    ? IDENTITY
@@ -420,7 +425,7 @@ size_t stewart_write_plan(const stewart_plan *m, stewart_key key, uint8_t *data)
     uint8_t *at = data;
     put_head(&at, "STWC", &m->head, key);
     put(&at, m->asks ? 0 : m->rows, 1);
-    put(&at, m->asks, 1);
+    put(&at, m->asks ? REQUEST : m->cranks ? CRANKS : 0, 1);
     put(&at, 0, 2);
     put(&at, m->sampled, 8);
     put(&at, m->playout, 8);
@@ -444,12 +449,13 @@ int stewart_read_plan(const uint8_t *data, size_t size, stewart_key key, stewart
     if (refused)
         return refused;
     m->rows = (uint8_t)get(&at, 1);
-    m->asks = (uint8_t)get(&at, 1);
-    uint64_t zero = get(&at, 2);
+    uint64_t content = get(&at, 1), zero = get(&at, 2);
+    m->asks = content == REQUEST;
+    m->cranks = content == CRANKS;
     m->sampled = get(&at, 8);
     m->playout = get(&at, 8);
     m->begin = get(&at, 8);
-    if (m->rows > STEWART_ROWS || m->asks > 1 || (m->asks && m->rows) || zero || m->head.flags > 3 ||
+    if (m->rows > STEWART_ROWS || content > CRANKS || (m->asks && m->rows) || zero || m->head.flags > 3 ||
         body != CONTROLLER_BODY + (m->asks ? IDENTITY + PADDING : 48u * m->rows))
         return STEWART_MALFORMED;
     if (m->asks) {

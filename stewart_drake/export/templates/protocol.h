@@ -7,7 +7,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#define STEWART_PROTOCOL 2 /* version of the protocol */
+#define STEWART_PROTOCOL 3 /* version of the protocol */
 #define STEWART_LONGEST 1452
 #define STEWART_HEAD 60
 #define STEWART_TAG 16
@@ -105,12 +105,14 @@ typedef struct {
     stewart_identity identity;     /* of an offer */
     double state[12], zeros[6]; /* the one or the other, by kind */
     int32_t codes[STEWART_SAMPLES][6];
+    uint8_t cranks; /* rows of `acted` are setpoints of the cranks, rad; 0: torques */
     double acted[STEWART_HISTORY][6];
 } stewart_measured;
 
 typedef struct {
     stewart_head head;
     uint8_t rows, asks; /* asks: a request, with an identity and no rows */
+    uint8_t cranks;     /* rows are setpoints of the cranks, rad; 0: torques */
     uint64_t sampled, playout, begin;
     stewart_identity identity;
     double torques[STEWART_ROWS][6];

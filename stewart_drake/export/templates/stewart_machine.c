@@ -110,7 +110,8 @@ static uint8_t plate_fault(const machine *m, uint8_t *leg)
 static void plate_follow(machine *m, uint64_t time)
 {
     const stewart_law *c = &stewart_configuration;
-    stewart_plant plant = {c->machine.geometry, c->machine.parameters, &c->machine.gravity};
+    stewart_plant plant = {c->machine.geometry, c->machine.parameters, &c->machine.gravity,
+                           c->machine.joints};
     real torque[6];
     for (int i = 0; i < 6; i++)
         torque[i] = (real)stewart_link_current(m->link)[i];
@@ -284,7 +285,7 @@ static int greet(machine *m, const stewart_plan *request, const struct sockaddr_
 /* Take a plan; return the cause of its refusal, or STEWART_TAKEN. */
 static int plan_ahead(machine *m, const stewart_plan *plan, uint64_t now)
 {
-    if (plan->playout > now + FURTHEST ||
+    if (plan->cranks || plan->playout > now + FURTHEST ||
         (plan->begin != STEWART_NEVER && plan->begin > now + FURTHEST))
         return STEWART_MALFORMED;
     if (plan->begin != STEWART_NEVER && m->begin == STEWART_NEVER && !m->running) {

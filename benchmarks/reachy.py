@@ -1,0 +1,193 @@
+"""Setpoints for Reachy Mini, judged in the robot's own MuJoCo model.
+
+    REACHY_PYTHON=PATH python benchmarks/reachy.py
+
+PATH is the Python of an environment with `mujoco==3.3.0`, and `reachy-mini==1.13.0` installed
+without its dependencies (`pip install --no-deps`). Without it the benchmark is skipped.
+
+The head turns by 0.2 rad and moves by 5 mm about and along three axes each. Setpoints come from
+`sd.setpoints`, at 50 Hz. The error is the angle between the head and the motion at the end of each
+period, rms from 2 s to 8 s.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _bench import table, write
+
+import stewart_drake as sd
+from stewart_drake.machines.reachy_mini import pose_of_head
+from stewart_drake.mechanism.kinematics import rotation
+
+PLAYER = Path(__file__).with_name("reachy_player.py")
+PERIOD, DURATION, SETTLED = 0.02, 8.0, 2.0
+FREQUENCIES = (0.5, 1.0)
+SERVOS = {
+    "perfect": (10.0, 0.1, 0.15, 0.1, 0.001, 20.0),
+    "xc330": (2.54, 0.0, 0.095, 0.058, 0.0018, 0.8),
+}
+"""Classes of the robot's MJCF: kp, kv, damping, friction, armature, force limit."""
+WRONG = np.array([1.1, 0.9, 0.9, 0.9, 1.1])
+"""Factors of the numbers that the setpoints assume, in the row `10 % wrong`."""
+BALL = {"ball_joint_damping": 0.15, "ball_joint_friction": 0.1 * 4 / np.pi}
+"""Of each ball joint as shipped. MuJoCo limits the friction about each axis of a joint by itself:
+for turns about two axes at random, 4 / pi times the friction against the whole turn."""
+PREVIEW, PLAN = 0.25, 16
+"""s from a plan to its first setpoint, and setpoints of a plan."""
+
+
+def head_at(times: np.ndarray, frequency: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the head's rotations (n, 3, 3) and positions (n, 3) in m, from rest at t = 0."""
+    w, s = 2 * np.pi * frequency, np.clip(times, 0, 1)
+    # Three times differentiable, so that the torque has no jumps: 10 s^3 - 15 s^4 + 6 s^5
+    g = (s**3 * (10 - 15 * s + 6 * s**2))[:, None]
+    angles = 0.2 * g * np.sin(w * times[:, None] + [0.0, 1.0, 2.0])
+    moved = [np.sin(w * times), np.cos(w * times), np.sin(w * times + 0.5)]
+    rotations = np.array([rotation(one) for one in angles])
+    return rotations, 0.005 * g * np.stack(moved, axis=1)
+
+
+def motion_file(frequency: float, folder: Path) -> Path:
+    """Write the motion as CSV, as a reference of `kind: csv` reads it."""
+    times = np.arange(0.0, DURATION + 1.0, 0.005)
+    rows = ["time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m]"]
+    for t, R, p in zip(times, *head_at(times, frequency), strict=True):
+        head = np.eye(4)
+        head[:3, :3], head[:3, 3] = R, p
+        rows.append(",".join(f"{x:.15g}" for x in (t, *pose_of_head(head))))
+    path = folder / f"motion_{frequency:g}.csv"
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def setpoints(motion: Path, servo: Any, ball: float = 0.0, *, plain: bool = False) -> np.ndarray:
+    """Return the setpoints (n, 6) for assumed servos and ball joints."""
+    kp, kv, damping, friction, armature, force = servo
+    fields = {
+        "stiffness": kp,
+        "velocity_gain": kv,
+        "crank_damping": damping,
+        "friction": friction,
+        "armature": armature,
+        "torque_limit": force,
+    }
+    settings = [f"actuator.{name}={value:.9g}" for name, value in fields.items()]
+    if ball > 0:
+        settings += [f"plant.{name}={ball * value:.9g}" for name, value in BALL.items()]
+    settings += [f"reference={{kind: csv, file: {motion}}}", f"duration={DURATION}"]
+    settings += ["start=on_reference", "actuator.angle_range=null"]
+    return sd.setpoints("reachy_mini", 1 / PERIOD, plain=plain, settings=settings).angles
+
+
+def errors(servo: Any, ball: float, rows: np.ndarray, first: np.ndarray, frequency: float) -> float:
+    """Return the rms error of the head's angle in degrees, played in the robot's model."""
+    with tempfile.TemporaryDirectory() as folder:
+        job, result = Path(folder) / "job.npz", Path(folder) / "result.npz"
+        np.savez(job, servo=np.array(servo), ball=ball, setpoints=np.vstack([first, rows]))
+        command = [os.environ["REACHY_PYTHON"], str(PLAYER), str(job), str(result)]
+        own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        subprocess.run(command, check=True, env=own)
+        found = np.load(result)["rotations"]
+    times = PERIOD * (1 + np.arange(len(rows)))
+    wanted, _ = head_at(times, frequency)
+    cosine = (np.einsum("nij,nij->n", wanted, found) - 1) / 2
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))[times > SETTLED + PERIOD / 2]
+    return float(np.sqrt(np.mean(angle**2)))
+
+
+def arrivals(number: int, seed: int) -> np.ndarray:
+    """Return arrival times over Wi-Fi: 20 ms and lognormal 30 ms, 5 % lost."""
+    rng = np.random.default_rng(seed)
+    sent = PERIOD * np.arange(number)
+    found = sent + 0.02 + 0.03 * np.exp(rng.standard_normal(number))
+    found[rng.random(number) < 0.05] = np.inf
+    return found
+
+
+def send_now(rows: np.ndarray, first: np.ndarray, arrived: np.ndarray) -> np.ndarray:
+    """Return the servos' setpoints (n, 6) if the newest one that has arrived acts at once."""
+    setpoints = []
+    for k in range(len(rows)):
+        there = np.flatnonzero(arrived[: k + 1] <= PERIOD * k)
+        setpoints.append(rows[there.max()] if len(there) else first)
+    return np.array(setpoints)
+
+
+def played(rows: np.ndarray, arrived: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the setpoints (n, 6) from plans in a play-out buffer, and the number of dry periods.
+
+    A plan sent at s has the setpoints of PLAN periods from s + PREVIEW on. The first ones were sent
+    before the motion. A dry buffer holds the last setpoint.
+    """
+    sent, setpoints, dry = PERIOD * np.arange(len(rows)), list[np.ndarray](), 0
+    for k, row in enumerate(rows):
+        t = PERIOD * k
+        begins = sent + PREVIEW
+        covers = (begins <= t + 1e-9) & (t <= begins + (PLAN - 1) * PERIOD + 1e-9)
+        there = t < PREVIEW or bool(np.any(covers & (arrived <= t)))
+        dry += not there
+        setpoints.append(row if there or not setpoints else setpoints[-1])
+    return np.array(setpoints), dry
+
+
+def judge(servo: Any, first: np.ndarray, frequency: float, rows: np.ndarray, ball: float) -> str:
+    """Return the error in degrees as text."""
+    return f"{errors(servo, ball, rows, first, frequency):.2f}"
+
+
+def results(folder: Path) -> str:
+    """Return the table of results as Markdown."""
+    motions = {f: motion_file(f, folder) for f in FREQUENCIES}
+    header = [f"{name} {f:g} Hz" for name in SERVOS for f in FREQUENCIES]
+    cells: dict[str, list[str]] = {}
+    for servo in SERVOS.values():
+        for f, motion in motions.items():
+            plain = setpoints(motion, servo, plain=True)
+            first = plain[0]
+
+            judged = partial(judge, servo, first, f)
+
+            def row(name: str, value: str) -> None:
+                cells.setdefault(name, []).append(value)
+                print(name, value, flush=True)
+
+            row("free ball joints, plain setpoints", judged(plain, 0.0))
+            true = setpoints(motion, servo)
+            row("free, true numbers", judged(true, 0.0))
+            guess = (*(WRONG * servo[:5]), servo[5])
+            row("free, all numbers 10 % wrong", judged(setpoints(motion, guess), 0.0))
+            row("as shipped, plain setpoints", judged(plain, 1.0))
+            row("as shipped, ball friction not modelled", judged(true, 1.0))
+            try:
+                modelled = judged(setpoints(motion, servo, 1.0), 1.0)
+            except sd.ConfigError as error:
+                print(error)
+                beyond = (*servo[:5], 1e3)
+                modelled = f"refused: torque (else {judged(setpoints(motion, beyond, 1.0), 1.0)})"
+            row("as shipped, ball friction modelled", modelled)
+            arrived = [arrivals(len(plain), seed) for seed in range(5)]
+            now = [errors(servo, 0.0, send_now(plain, first, one), first, f) for one in arrived]
+            row("free, over Wi-Fi, newest setpoint at once, mean of 5", f"{np.mean(now):.2f}")
+            plans = [played(true, one) for one in arrived]
+            buffered = [errors(servo, 0.0, rows, first, f) for rows, _ in plans]
+            dry = sum(number for _, number in plans)
+            row(
+                "free, over Wi-Fi, plans 0.25 s ahead, mean (worst) of 5",
+                f"{np.mean(buffered):.2f} ({max(buffered):.2f})",
+            )
+            print("dry periods", dry, flush=True)
+    return table(["rms, deg", *header], [[name, *row] for name, row in cells.items()])
+
+
+if __name__ == "__main__":
+    if not os.environ.get("REACHY_PYTHON"):
+        sys.exit("skipped: REACHY_PYTHON is not set, see the head of this file")
+    with tempfile.TemporaryDirectory() as folder:
+        title = "Error of Reachy Mini's head in its own simulator"
+        write(__file__, title, [results(Path(folder))], ", mujoco 3.3.0, reachy-mini 1.13.0")

@@ -1,0 +1,20 @@
+/* Friction of the ball joints between cranks, rods and plate, by virtual work. */
+
+#pragma once
+
+#include "dynamics.h"
+
+/* Let w_1 be the angular velocity of a rod against its crank, w_2 that of the plate against the rod. A
+   joint resists with the torque
+
+       tau(w) = (c + f tanh(|w| / s) / |w|) w,     the slope of c |w|^2 / 2 + f s log cosh(|w| / s).
+
+   The rod may spin about itself, and spins such that the sum of these potentials of its joints is least:
+   with one joint that has friction the spin is that joint's own, and costs nothing. Virtual work,
+
+       F' [delta w; delta v] = sum tau_1' delta w_1 + tau_2' delta w_2,
+
+   gives the force F (6), moment and force at the plate's COM, that the plate feels against its motion:
+   it joins h of the equations of motion. */
+
+extern const stewart_joint_friction stewart_ball_joints;

@@ -1,0 +1,283 @@
+"""Setpoints of position servos: crank angles to send, checked and compensated."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import diagnose
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import write_whole
+from stewart_drake.files.yamlio import load_yaml, validate
+from stewart_drake.law.servos import Stiffness, turned
+from stewart_drake.loop.preparation import Experiment, prepare
+from stewart_drake.loop.servos import known_stiffness
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.field_types import section
+from stewart_drake.scenario.signals import (
+    ACCELERATIONS,
+    CONSTANTS,
+    LEGS,
+    NUM_TORQUES,
+    POSE,
+    RATES,
+)
+from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.types import Array
+
+SHORTEST_BLEND: Final = 1.0
+"""Shortest soft start, s; it is doubled until the motion keeps its limits."""
+_LARGEST_RATE: Final = 1000.0  # Hz
+_ROUNDING: Final = 1e-12
+
+
+@section
+class ServoUnits:
+    """Units of servos: value = offset + sign * angle, in that unit.
+
+    Attributes:
+        unit: `rad`, `deg` or `ticks`; ticks are rounded.
+        ticks_per_turn: of a crank.
+        offset: at a crank angle of 0, in the unit, one or six.
+        sign: 1 or -1, one or six.
+    """
+
+    unit: Literal["rad", "deg", "ticks"] = "rad"
+    ticks_per_turn: Annotated[float, Field(gt=0, le=1e9)] = 4096.0
+    offset: float | Annotated[list[float], Field(min_length=6, max_length=6)] = 0.0
+    sign: Literal[1, -1] | Annotated[list[Literal[1, -1]], Field(min_length=6, max_length=6)] = 1
+
+    def converted(self, angles: Array) -> Array:
+        """Return angles (..., 6) in rad as values of the servos."""
+        per_rad = {
+            "rad": 1.0,
+            "deg": 180 / math.pi,
+            "ticks": self.ticks_per_turn / (2 * math.pi),
+        }[self.unit]
+        values = np.asarray(self.offset) + np.asarray(self.sign) * per_rad * angles
+        return np.rint(values) if self.unit == "ticks" else values
+
+
+def load_units(path: str | Path) -> ServoUnits:
+    """Read a YAML file with the fields of `ServoUnits`.
+
+    Raises:
+        ConfigError: one line.
+    """
+    return validate(ServoUnits, load_yaml(Path(path)), str(path))
+
+
+@dataclass(frozen=True)
+class Setpoints:
+    """Setpoints, each to be held until the next one.
+
+    Attributes:
+        times: (n,) s, at which each is sent.
+        angles: (n, 6) setpoints, rad.
+        cranks: (n, 6) angles of the cranks in the middle of each period, rad.
+        crank_rates: (n, 6) rad/s.
+        torques: (n, 6) that the motion takes there from the servos, N m.
+        blend: length of the soft start, s; 0 without one.
+    """
+
+    times: Array
+    angles: Array
+    cranks: Array
+    crank_rates: Array
+    torques: Array
+    blend: float
+
+    def csv(self, units: ServoUnits | None = None) -> str:
+        """Return a header `time[s],setpoint_1[rad],...` and a line per setpoint."""
+        units = ServoUnits() if units is None else units
+        header = ["time[s]", *(f"setpoint_{leg}[{units.unit}]" for leg in LEGS)]
+        digits = "{:.0f}" if units.unit == "ticks" else "{:.9g}"
+        rows = zip(self.times, units.converted(self.angles), strict=True)
+        lines = (
+            ",".join([f"{time:.9g}", *(digits.format(value + 0.0) for value in row)])
+            for time, row in rows
+        )
+        return "\n".join([",".join(header), *lines]) + "\n"
+
+    def save(self, path: str | Path, units: ServoUnits | None = None) -> None:
+        """Write `csv` to a file."""
+        write_whole(Path(path), self.csv(units))
+
+
+def make_setpoints(
+    scenario: Scenario,
+    rate: float = 50.0,
+    *,
+    plain: bool = False,
+    start: Sequence[float] | Array | None = None,
+) -> Setpoints:
+    """Return the setpoints of a scenario's motion.
+
+    Setpoint k is held for a period h = 1 / rate from t_k = k h on. With the motion taken in the
+    middle of that, it is (setpoint) of `law.servos`: the crank angle, plus torque and velocity gain
+    over the stiffness. The torque is that of the exact inverse dynamics, with the scenario's
+    `actuator` and `plant`; values of a `controller.calibration` replace those of the plant.
+
+    A motion that does not begin at rest where the plate is, starts softly. From the pose x_0, which
+    is `start`, or for `start: rest` the first pose of the reference r, the motion is
+
+        x(t) = x_0 + g(t / T) (r(t) - x_0),   g(s) = 10 s^3 - 15 s^4 + 6 s^5 up to s = 1, then 1.
+
+    T is 1 s, or 2, 4, .. s if the limits need it.
+
+    Args:
+        scenario: whose motors are position servos.
+        rate: of the setpoints, Hz.
+        plain: whether to send the crank angles alone.
+        start: (6,) pose at which the plate rests at t = 0, rad and m.
+
+    Raises:
+        ConfigError: bad input, or a motion beyond reach, or beyond the range, speed or torque of a
+            motor; with its time and motor.
+    """
+    if not (0 < rate <= _LARGEST_RATE):
+        raise ConfigError(f"rate: got {rate:g} Hz; expected above 0 and at most {_LARGEST_RATE:g}")
+    if not plain and scenario.actuator.kind != "position_servo":
+        raise ConfigError(
+            f"actuator.kind: got {scenario.actuator.kind!r}; expected 'position_servo', whose "
+            "stiffness the setpoints compensate, or plain setpoints"
+        )
+    experiment = prepare(scenario)
+    if start is None and scenario.start == "on_reference":
+        return _along(experiment, None, 0.0, rate, plain)
+    pose = experiment.start[POSE] if start is None else _checked(start, experiment)
+    blend = SHORTEST_BLEND
+    while True:
+        try:
+            return _along(experiment, pose, blend, rate, plain)
+        except _BrokenLimit as broken:
+            # A slower start does not mend what the motion itself breaks later.
+            if broken.time > blend or 2 * blend > scenario.duration:
+                raise ConfigError(str(broken)) from None
+            blend *= 2
+
+
+class _BrokenLimit(ConfigError):
+    """Error for a limit that a motion breaks, at a time in s."""
+
+    def __init__(self, time: float, message: str) -> None:
+        self.time = time
+        super().__init__(message)
+
+
+def _checked(start: Sequence[float] | Array, experiment: Experiment) -> Array:
+    pose = np.asarray(start, dtype=np.float64)
+    if pose.shape != (6,) or not np.all(np.isfinite(pose)):
+        raise ConfigError(
+            f"from: got {np.asarray(start).tolist()}; expected roll, pitch, yaw in rad and x, y, z "
+            "in m"
+        )
+    if failure := diagnose(experiment.mechanism, 0.0, pose):
+        raise ConfigError(f"from: got a pose out of the workspace: {failure.reason}")
+    return pose
+
+
+def _known_dynamics(experiment: Experiment) -> StewartDynamics:
+    """Return the dynamics with the numbers of the scenario, or of its calibration."""
+    parameters = np.array(experiment.scenario.plant_parameters)
+    if experiment.calibration is not None:
+        for i, name in enumerate(CONSTANTS):
+            value = experiment.calibration.value(name)
+            parameters[i] = parameters[i] if value is None else value
+    return StewartDynamics(experiment.mechanism, experiment.scenario.plant.gravity, parameters)
+
+
+def softened(wanted: Array, pose: Array, time: float, blend: float) -> Array:
+    """Return pose, rates and accelerations (18,) of a soft start.
+
+    Args:
+        wanted: (18,) of the reference at `time`.
+        pose: (6,) at which the plate rests at t = 0.
+        time: s.
+        blend: T, s.
+    """
+    s = min(time / blend, 1.0)
+    g = s**3 * (10 - 15 * s + 6 * s**2)
+    g_dot = 30 * s**2 * (1 - s) ** 2 / blend
+    g_ddot = 60 * s * (1 - s) * (1 - 2 * s) / blend**2
+    apart, rates, accelerations = wanted[POSE] - pose, wanted[RATES], wanted[ACCELERATIONS]
+    return np.concatenate(
+        [
+            pose + g * apart,
+            g_dot * apart + g * rates,
+            g_ddot * apart + 2 * g_dot * rates + g * accelerations,
+        ]
+    )
+
+
+def _along(
+    experiment: Experiment, start: Array | None, blend: float, rate: float, plain: bool
+) -> Setpoints:
+    """Return the setpoints of the motion, checked at the middle of each period.
+
+    Raises:
+        _BrokenLimit: the first limit that it breaks.
+    """
+    mechanism, dynamics = experiment.mechanism, _known_dynamics(experiment)
+    servo = known_stiffness(experiment.scenario)
+    number = max(1, math.ceil(experiment.scenario.duration * rate - 1e-9))
+    times, (cranks, rates, torques) = np.arange(number) / rate, np.empty((3, number, NUM_TORQUES))
+    for k, t in enumerate(times):
+        middle = t + 0.5 / rate
+        x = evaluate(experiment.reference, middle)
+        if start is not None:
+            x = softened(x, start, middle, blend)
+        if failure := diagnose(mechanism, middle, x[POSE]):
+            raise _BrokenLimit(middle, f"motion: {failure.reason} at t = {middle:.2f} s")
+        angles = mechanism.crank_angles(x[POSE])
+        cranks[k] = turned(angles, cranks[k - 1] if k else np.zeros(NUM_TORQUES))
+        rates[k] = mechanism.jacobian(x[POSE]) @ x[RATES]
+        torques[k] = dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
+    setpoints = cranks
+    if not plain:
+        assert servo is not None
+        setpoints = servo.setpoint(cranks, rates, torques)
+    found = Setpoints(times, setpoints, cranks, rates, torques, blend)
+    _check(found, servo, experiment, rate)
+    return found
+
+
+class _Limit(NamedTuple):
+    """Values (n, 6) of the motors and their bounds, scalars or (6,)."""
+
+    name: str
+    unit: str
+    values: Array
+    least: Array | float
+    most: Array | float
+
+
+def _check(found: Setpoints, servo: Stiffness | None, experiment: Experiment, rate: float) -> None:
+    """Raise _BrokenLimit for the first setpoint beyond a limit."""
+    speed = getattr(experiment.scenario.actuator, "speed_limit", None) or math.inf
+    low, high = (-math.inf, math.inf) if servo is None else (servo.low, servo.high)
+    moved = np.diff(found.angles, axis=0, prepend=found.angles[:1]) * rate
+    torque = experiment.torque_limit
+    for limit in (
+        _Limit("setpoint", "rad", found.angles, low, high),
+        _Limit("speed of the setpoint", "rad/s", moved, -speed, speed),
+        _Limit("torque", "N m", found.torques, -torque, torque),
+    ):
+        name, unit, values, least, most = limit
+        excess = np.maximum(values - most, least - values)
+        if np.any(excess > _ROUNDING):
+            k = int(np.argmax(np.any(excess > _ROUNDING, axis=1)))
+            motor = int(np.argmax(excess[k]))
+            ends = (float(np.broadcast_to(end, NUM_TORQUES)[motor]) for end in (least, most))
+            raise _BrokenLimit(
+                float(found.times[k]),
+                f"motor {LEGS[motor]} at t = {found.times[k]:.2f} s: got a {name} of "
+                f"{values[k, motor]:.3g} {unit}; expected "
+                + " to ".join(f"{end:.3g}" for end in ends)
+                + f" {unit}",
+            )

@@ -1,0 +1,437 @@
+"""Numbers of position servos from a log of setpoints and crank angles (theory.md, section 42).
+
+A servo at each crank a has the torque clip(k (u(t - d) - a)) - D a' - F tanh(a' / s) - I a'': its
+stiffness k, damping D (with its velocity gain), friction F with the speed s, armature I, and the
+sum d of all delays. The ball joints have the friction f and the damping c.
+
+Regression. Along the measured motion, smoothed by a filter that smooths u alike,
+
+    u(t - d) - a = (tau + D a' + F tanh(a' / s) + I a'' + f b_f + c b_c) / k
+
+is linear but in d, which is scanned: tau is the torque of the bodies, b_f and b_c those of unit
+friction of the ball joints.
+
+Output error. The exact plant under the setpoints of the log has crank angles a(t; theta); the least
+squares of their deviations r = a(theta) - measured begin at the regression.
+
+Intervals. Residuals are correlated in time, most of all those that the model leaves, which differ
+from one kind of motion to another: the covariance of white noise is far too small. The log is cut
+into B blocks, about as long as a kind of motion. With J = dr/dtheta,
+H = J'J and g_b = J_b' r_b, whose sum is 0 at the fit, the fit without block b differs by
+
+    delta_b = (H - H_b)^-1 g_b,   P = (B - 1) / B sum_b delta_b delta_b'       (jackknife)
+
+and the interval is t(B - 1) sqrt(P), with Student's t. Blocks may have any correlation inside.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
+from scipy.signal import butter, sosfiltfilt
+from scipy.stats import t as student
+
+from stewart_drake.core.layout import DEFAULT_GRAVITY
+from stewart_drake.core.library import core
+from stewart_drake.dynamics.open_loop import Ended, NativePlant
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification.servo_logs import ServoLog
+from stewart_drake.law.servos import PositionServo, turned
+from stewart_drake.mechanism.geometry import Mechanism, with_rotors
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.signals import (
+    BALL_JOINTS,
+    DEFAULT_BALL_JOINT_SPEED,
+    NUM_PLANT_PARAMETERS,
+    NUM_STATE,
+    NUM_TORQUES,
+    PLANT_PARAMETERS,
+    POSE,
+    SHAFTS,
+)
+from stewart_drake.types import Array
+
+NAMES: Final = (
+    "delay",
+    "stiffness",
+    "damping",
+    "friction",
+    "friction_speed",
+    "armature",
+    "ball_joint_friction",
+    "ball_joint_damping",
+)
+UNITS: Final = ("s", "N m/rad", "N m s/rad", "N m", "rad/s", "kg m^2", "N m", "N m s/rad")
+"""Of the unknowns theta."""
+D, K, DAMPING, FRICTION, SPEED, ARMATURE, BALL_FRICTION, BALL_DAMPING = range(len(NAMES))
+OF_BALL_JOINTS: Final = (BALL_FRICTION, BALL_DAMPING)
+WEAK: Final = 0.2
+"""Half width of an interval, as a share of the value, above which a number is weak."""
+WEAK_DELAY: Final = 3e-3  # s
+CODES: Final = 3.0
+"""Residual over that of rounding above which friction of the ball joints is tried."""
+GAIN: Final = 0.9
+"""Share of the residual that must remain at most, for ball joints to be kept."""
+WRONG: Final = 0.3
+"""Residual over the servos' deviation u(t - d) - a above which the fit is wrong."""
+
+_LOW: Final = np.array([0.0, 1e-3, 0.0, 0.0, 2e-3, 0.0, 0.0, 0.0])
+_HIGH: Final = np.array([0.5, 1e4, 1e3, 1e2, 2.0, 10.0, 1e2, 1e3])
+_SETTLING: Final = 0.5  # s, until the unknown first rates are forgotten
+_ACCURACY: Final = 1e-7  # of the integration
+_BLOCK: Final = 3.0  # s
+_FEWEST_BLOCKS: Final = 4
+_ITERATIONS: Final = 20
+_CONVERGED: Final = 1e-5  # relative change of the sum of squares
+_DELAY_STEP: Final = 5e-5  # s, of differences
+_STEP: Final = 3e-3  # of other unknowns, relative to their scale
+_GRID: Final = 2e-3  # s, of the regression
+_CUTOFF: Final = 6.0  # Hz
+_DELAYS: Final = np.arange(0.0, 0.3, 1e-3)  # s
+_START_SPEED: Final = 0.05  # rad/s
+
+
+@dataclass(frozen=True)
+class ServoModel:
+    """Machine with position servos under the setpoints of a log.
+
+    Attributes:
+        log: setpoints, and the measured crank angles.
+        mechanism: without armature.
+        torque_limit: of each motor, N m, infinite for none.
+        gravity: m/s^2 along -z.
+    """
+
+    log: ServoLog
+    mechanism: Mechanism
+    torque_limit: float
+    gravity: float = DEFAULT_GRAVITY
+
+    def states(self, theta: Array) -> Array | None:
+        """Return states (n, 12) at the times of the log, from rest; None if the plate leaves."""
+        parameters = np.zeros(NUM_PLANT_PARAMETERS)
+        parameters[SHAFTS] = theta[[DAMPING, FRICTION, SPEED]]
+        ball = theta[[BALL_DAMPING, BALL_FRICTION]]
+        parameters[BALL_JOINTS] = [*ball, DEFAULT_BALL_JOINT_SPEED]
+        machine = with_rotors(self.mechanism, theta[ARMATURE])
+        dynamics = StewartDynamics(machine, self.gravity, parameters, PLANT_PARAMETERS)
+        times = self.log.times - self.log.times[0]
+        start = np.concatenate([self.log.poses[0], np.zeros(NUM_STATE // 2)])
+        plant = NativePlant(dynamics, start, times, _ACCURACY, math.inf)
+        servo = PositionServo(theta[K], 0.0, self.torque_limit)
+        # The first setpoint acts from the start on.
+        acts, setpoints = times + theta[D], np.ascontiguousarray(self.log.setpoints)
+        ended = plant.call(
+            "servo_run", servo.compiled, len(acts), core().at(acts), core().at(setpoints)
+        )
+        return plant.states if ended == Ended.INSIDE else None
+
+    @cached_property
+    def counted(self) -> Any:
+        """(n,) rows whose residuals count."""
+        return self.log.times - self.log.times[0] >= _SETTLING
+
+    def residuals(self, theta: Array) -> Array:
+        """Return crank angles minus measured ones (m, 6), rad; 1 if the plate leaves."""
+        states, measured = self.states(theta), self.log.cranks[self.counted]
+        if states is None:
+            return np.ones_like(measured)
+        angles = np.array([self.mechanism.crank_angles(x[POSE]) for x in states[self.counted]])
+        return turned(angles, measured) - measured
+
+    def jacobian(self, theta: Array, free: NDArray[np.intp]) -> Array:
+        """Return the derivatives (m, 6, k) of the residuals by the free unknowns."""
+        scale, here, columns = scale_of(theta), self.residuals(theta), list[Array]()
+        for k in free:
+            moved = theta.copy()
+            moved[k] += _DELAY_STEP if k == D else _STEP * scale[k]
+            columns.append((self.residuals(moved) - here) / (moved[k] - theta[k]))
+        return np.stack(columns, axis=2)
+
+
+def scale_of(theta: Array) -> Array:
+    """Return the size (8,) of each unknown, also where it is 0, from the others."""
+    k = theta[K]
+    least = np.array([1e-2, k, 1e-3 * k, 1e-3 * k, 1e-2, 1e-5 * k, 1e-3 * k, 1e-3 * k])
+    return np.maximum(theta, least)
+
+
+@dataclass(frozen=True)
+class ServoIdentification:
+    """Position servos identified from a log.
+
+    Attributes:
+        model: with the log.
+        theta: (8,) values found, of NAMES.
+        residuals: (m, 6) rad.
+        jacobian: (m, 6, k) by the free unknowns.
+        free: (k,) places of those in theta.
+        rounding: standard deviation of the rounding of a measured angle, rad.
+        ball_joints_tried: whether friction of the ball joints was fitted.
+        iterations: evaluations of the fit.
+    """
+
+    model: ServoModel
+    theta: Array
+    residuals: Array
+    jacobian: Array
+    free: NDArray[np.intp]
+    rounding: float
+    ball_joints_tried: bool
+    iterations: int
+
+    @property
+    def residual(self) -> float:
+        """Root mean square of the residuals, rad."""
+        return float(np.sqrt(np.mean(self.residuals**2)))
+
+    @cached_property
+    def deviation(self) -> float:
+        """Root mean square of u(t - d) - a, rad: what the servos leave."""
+        log = self.model.log
+        newest = np.searchsorted(log.times + self.theta[D], log.times, side="right") - 1
+        apart = log.setpoints[np.maximum(newest, 0)] - log.cranks
+        return float(np.sqrt(np.mean(apart[self.model.counted] ** 2)))
+
+    @property
+    def right(self) -> bool:
+        """Whether the fit explains the log."""
+        return self.residual <= WRONG * self.deviation
+
+    @cached_property
+    def blocks(self) -> int:
+        """Number B of blocks."""
+        log = self.model.log
+        return max(_FEWEST_BLOCKS, round((log.times[-1] - log.times[0] - _SETTLING) / _BLOCK))
+
+    @cached_property
+    def covariance(self) -> Array:
+        """P (8, 8), (jackknife); 0 for unknowns that are not free or at their bound."""
+        inner = self.free[(self.theta > _LOW)[self.free]]
+        scale = scale_of(self.theta)[inner]
+        J = self.jacobian[:, :, np.isin(self.free, inner)] * scale
+        parts = zip(*(np.array_split(one, self.blocks) for one in (J, self.residuals)), strict=True)
+        pairs = [(np.vstack(list(j)), r.ravel()) for j, r in parts]
+        H = sum(j.T @ j for j, _ in pairs)
+        deltas = np.array([np.linalg.lstsq(H - j.T @ j, j.T @ r)[0] for j, r in pairs])
+        deltas -= deltas.mean(axis=0)
+        B, P = self.blocks, np.zeros((len(NAMES), len(NAMES)))
+        P[np.ix_(inner, inner)] = (B - 1) / B * (scale * deltas).T @ (scale * deltas)
+        return P
+
+    def interval(self, slope: Array) -> float:
+        """Return the half width of the 95 % interval of a function with this slope (8,)."""
+        variance = float(slope @ self.covariance @ slope)
+        return float(student.ppf(0.975, self.blocks - 1)) * math.sqrt(variance)
+
+    @cached_property
+    def intervals(self) -> Array:
+        """(8,) half widths of the 95 % intervals; NaN of a wrong fit and for fixed values."""
+        widths = np.array([self.interval(unit) for unit in np.eye(len(NAMES))])
+        return np.where(self.right & (widths > 0), widths, np.nan)
+
+    @cached_property
+    def combined(self) -> dict[str, tuple[float, float, str]]:
+        """Value, half width and unit of the combinations that a log shows best."""
+        found = {}
+        k, size = self.theta[K], len(NAMES)
+        for name, place, unit in (
+            ("delay + damping/stiffness", DAMPING, "s"),
+            ("friction/stiffness", FRICTION, "rad"),
+        ):
+            slope = np.zeros(size)
+            slope[place], slope[K] = 1 / k, -self.theta[place] / k**2
+            slope[D] = float(place == DAMPING)
+            value = self.theta[place] / k + slope[D] * self.theta[D]
+            found[name] = (float(value), self.interval(slope) if self.right else math.nan, unit)
+        return found
+
+    @property
+    def weak(self) -> list[str]:
+        """Names of the numbers that the log determines badly."""
+        limits = np.where(np.arange(len(NAMES)) == D, WEAK_DELAY, WEAK * self.theta)
+        return [NAMES[k] for k in self.free if not self.intervals[k] <= limits[k]]
+
+    @property
+    def overlay(self) -> dict[str, Any]:
+        """Fields of a scenario with the numbers found, for `--set overlay=FILE`."""
+        period = float(np.median(np.diff(self.model.log.times)))
+        value = [float(f"{x:.6g}") for x in self.theta]
+        delay = Delay.of(value[D], period)
+        return {
+            "actuator": {
+                "kind": "position_servo",
+                "stiffness": value[K],
+                "velocity_gain": 0.0,
+                "crank_damping": value[DAMPING],
+                "friction": value[FRICTION],
+                "friction_speed": value[SPEED],
+                "armature": value[ARMATURE],
+            },
+            "plant": {
+                "ball_joint_friction": value[BALL_FRICTION],
+                "ball_joint_damping": value[BALL_DAMPING],
+            },
+            "delay": {"steps": delay.steps, "fraction": float(f"{delay.fraction:.6g}")},
+            "controller": {"period": float(f"{period:.6g}")},
+        }
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Content of `summary.json`; intervals are null if the fit is wrong."""
+        return {
+            "logs": [self.model.log.name],
+            "mechanism": self.model.mechanism.name,
+            "intervals": self.right,
+            "parameters": {
+                NAMES[k]: {
+                    "value": float(self.theta[k]),
+                    "interval": float(self.intervals[k]),
+                    "unit": UNITS[k],
+                    "weak": NAMES[k] in self.weak,
+                }
+                for k in range(len(NAMES))
+            },
+            "combined": {
+                name: {"value": value, "interval": width, "unit": unit}
+                for name, (value, width, unit) in self.combined.items()
+            },
+            "known_mass_kg": self.model.mechanism.plate.mass,
+            "torque_limit": self.model.torque_limit,
+            "residual_rad": self.residual,
+            "rounding_rad": self.rounding,
+            "ball_joints_tried": self.ball_joints_tried,
+            "iterations": self.iterations,
+        }
+
+
+def regression(model: ServoModel, ball_joints: bool) -> Array:
+    """Return theta (8,) by regression; s is a guess."""
+    log, machine = model.log, model.mechanism
+    times = log.times - log.times[0]
+    grid = np.arange(0.0, times[-1], _GRID)
+    held = log.setpoints[np.searchsorted(times, grid, side="right") - 1]
+    filtering = butter(4, _CUTOFF * 2 * _GRID, output="sos")
+    u, a = (
+        CubicSpline(grid, sosfiltfilt(filtering, one, axis=0))
+        for one in (held, CubicSpline(times, log.cranks)(grid))
+    )
+    pose = CubicSpline(grid, sosfiltfilt(filtering, CubicSpline(times, log.poses)(grid), axis=0))
+    looks = np.arange(_SETTLING, times[-1] - _SETTLING, 5 * _GRID)
+    motion = np.hstack([pose(looks, order) for order in range(3)])
+    units = np.zeros((2, NUM_PLANT_PARAMETERS))
+    units[:, SHAFTS] = 0.0, 0.0, _START_SPEED
+    units[:, BALL_JOINTS] = [(0, 1, DEFAULT_BALL_JOINT_SPEED), (1, 0, DEFAULT_BALL_JOINT_SPEED)]
+    dynamics = StewartDynamics(machine, model.gravity)
+    tau = np.array([dynamics.inverse_dynamics(*np.split(x, 3)) for x in motion])
+    columns = [tau, a(looks, 1), np.tanh(a(looks, 1) / _START_SPEED), a(looks, 2)]
+    for parameters in units if ball_joints else ():
+        rubbing = StewartDynamics(machine, model.gravity, parameters, PLANT_PARAMETERS)
+        columns.append(np.array([rubbing.inverse_dynamics(*np.split(x, 3)) for x in motion]) - tau)
+    X = np.stack(columns, axis=2).reshape(-1, len(columns))
+    best, found = math.inf, np.zeros(len(columns))
+    delay = 0.0
+    for one in _DELAYS[times[-1] / 4 > _DELAYS]:
+        y = (u(looks - one) - a(looks)).ravel()
+        b = np.linalg.lstsq(X, y)[0]
+        left = float(np.sum((y - X @ b) ** 2))
+        if left < best:
+            best, delay, found = left, float(one), b
+    theta = np.zeros(len(NAMES))
+    stiffness = 1 / found[0] if found[0] > 0 else 1.0
+    theta[[D, K, SPEED]] = delay, stiffness, _START_SPEED
+    places = (DAMPING, FRICTION, ARMATURE, *OF_BALL_JOINTS)
+    theta[list(places[: len(found) - 1])] = stiffness * found[1:]
+    return np.clip(theta, _LOW, _HIGH)
+
+
+def identify_servos(
+    log: ServoLog,
+    mechanism: Mechanism,
+    rounding: float,
+    gravity: float = DEFAULT_GRAVITY,
+) -> ServoIdentification:
+    """Return the servos that explain a log best.
+
+    Friction of the ball joints is fitted if residuals without it are more than rounding, and kept
+    if it explains a part of them.
+
+    Args:
+        log: of the machine.
+        mechanism: with its masses; `effort_limit` is the motors' torque limit.
+        rounding: standard deviation of the rounding of a measured angle, rad.
+        gravity: m/s^2 along -z.
+
+    Raises:
+        ConfigError: no motion, or no numbers with which the plate stays in its workspace.
+    """
+    if not np.ptp(log.setpoints, axis=0).max() > 20 * rounding:
+        raise ConfigError(f"{log.name}: got setpoints that hardly change; expected a motion")
+    limit = mechanism.effort_limit
+    model = ServoModel(log, mechanism, math.inf if limit is None else limit, gravity)
+    found = _fitted(model, regression(model, False), np.arange(BALL_FRICTION), rounding)
+    if found.residual < CODES * rounding:
+        return found
+    rubbing = _fitted(model, regression(model, True), np.arange(len(NAMES)), rounding)
+    if rubbing.residual < GAIN * found.residual:
+        return rubbing
+    return replace(found, ball_joints_tried=True)
+
+
+def _fitted(
+    model: ServoModel, start: Array, free: NDArray[np.intp], rounding: float
+) -> ServoIdentification:
+    """Return the fit of the free unknowns by output error."""
+    first, scale = _in_reach(model, start), scale_of(start)[free]
+
+    def whole(x: Array) -> Array:
+        theta = first.copy()
+        theta[free] = x * scale
+        return theta
+
+    def residuals(x: Array) -> Array:
+        return model.residuals(whole(x)).ravel()
+
+    def jacobian(x: Array) -> Array:
+        return model.jacobian(whole(x), free).reshape(-1, len(free)) * scale
+
+    found = least_squares(
+        residuals,
+        np.maximum(first[free], _LOW[free] + 1e-2 * scale) / scale,
+        jac=jacobian,
+        bounds=(_LOW[free] / scale, _HIGH[free] / scale),
+        ftol=_CONVERGED,
+        xtol=1e-4,
+        max_nfev=_ITERATIONS,
+    )
+    J: Any = found.jac
+    return ServoIdentification(
+        model=model,
+        theta=whole(found.x),
+        residuals=found.fun.reshape(-1, NUM_TORQUES),
+        jacobian=J.reshape(-1, NUM_TORQUES, len(free)) / scale,
+        free=free,
+        rounding=rounding,
+        ball_joints_tried=bool(np.isin(BALL_FRICTION, free)),
+        iterations=int(found.nfev),
+    )
+
+
+def _in_reach(model: ServoModel, start: Array) -> Array:
+    """Return the start, stiffer if the plate leaves its workspace under it."""
+    for factor in (1.0, 2.0, 4.0, 8.0):
+        theta = start.copy()
+        theta[K] *= factor
+        theta[DAMPING] = max(theta[DAMPING], 1e-3 * theta[K])
+        if model.states(theta) is not None:
+            return theta
+    raise ConfigError(
+        f"{model.log.name}: got setpoints under which the plate of {model.mechanism.name} leaves "
+        "its workspace with any servos; expected a log of this machine"
+    )

@@ -1,0 +1,262 @@
+"""Linear model of the plant about a plan over a horizon, and its finite-horizon Riccati equation.
+
+A plan has N holds of a period each. With x_j the state at the beginning of hold j, T_j its torque,
+and a deviation (dx, dT) of both,
+
+    dx_{j+1} = Phi_j dx_j + Gamma_j dT_j + f_j,   f_j = F(x_j, T_j) - x_{j+1}.          (plan)
+
+The defects f vanish where the plan is a motion of the plant. A plan about a reference that the
+plant cannot follow has some.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from stewart_drake.core.library import core
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law.compiled import Once, machine_of
+from stewart_drake.law.holds import GAUSS_NODES
+from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.scenario.signals import (
+    BIAS,
+    NUM_COORDINATES,
+    NUM_PLANT_PARAMETERS,
+    NUM_STATE,
+    NUM_TORQUES,
+    PARAMETERS,
+    POSE,
+)
+from stewart_drake.types import Array
+
+NODES = len(GAUSS_NODES)
+"""Instants within a hold at which the cost sees the pose error."""
+
+
+class Plan(NamedTuple):
+    """States and torques of N holds, with the feedback that keeps the plant to them.
+
+    Attributes:
+        states: (N + 1, 12).
+        torques: (N, 6) N m.
+        gains: (N, 6, 12), torque T_j - K_j (x - x_j) for a state x off the plan.
+    """
+
+    states: Array
+    torques: Array
+    gains: Array
+
+    def later(self, state: Array, torque: Array) -> "Plan":
+        """Return the plan without its first hold, and with a last one of this state and torque."""
+        return Plan(
+            np.vstack([self.states[1:], state]),
+            np.vstack([self.torques[1:], torque]),
+            np.concatenate([self.gains[1:], self.gains[-1:]]),
+        )
+
+
+class Linearised(NamedTuple):
+    """Model (plan) of N holds.
+
+    Attributes:
+        Phi, Gamma: (N, 12, 12) and (N, 12, 6).
+        defects: (N, 12).
+        nodes: (N, 2, 6) poses of the plan at the Gauss nodes of each hold.
+        node_maps: (N, 2, 6, 18) of [dx_j; dT_j] to the poses there.
+    """
+
+    Phi: Array
+    Gamma: Array
+    defects: Array
+    nodes: Array
+    node_maps: Array
+
+
+class HoldModel:
+    """Motion of the plant over single holds, and its derivatives.
+
+    Derivatives by the torque are those by the torque bias, which `stewart_transitions` has.
+
+    Args:
+        plant: model of the plant.
+        parameters: (p,) free parameters of its dynamics, as they are believed.
+        period: of a hold, s.
+    """
+
+    def __init__(self, plant: NominalPlant, parameters: Array, period: float) -> None:
+        c, dynamics = core(), plant.dynamics
+        by_bias = _by_bias(plant)
+        whole = dynamics.complete(parameters)
+        machine = c.ffi.new("stewart_machine *", machine_of(by_bias).it[0])
+        for i in range(NUM_PLANT_PARAMETERS):
+            machine.parameters[i] = whole[i]
+        self._core, self._machine = c, machine
+        first, last = period * GAUSS_NODES
+        self._xi = np.concatenate([np.zeros(NUM_STATE), whole[BIAS]])
+        self._theta = self._xi[NUM_STATE:]
+        self._torques = np.zeros((NODES + 1, NUM_TORQUES))
+        self._durations = np.array([first, last - first, period - last])
+        self._whole = np.array([period])
+        self._states = np.empty((NODES + 1, NUM_STATE))
+        self._H = np.empty((NODES + 1, NUM_STATE, NUM_STATE + NUM_TORQUES))
+        at = c.at(self._torques)
+        self._once = c.ffi.new("stewart_schedule *", [1, at, c.at(self._whole), 0])
+        parts = NODES + 1, at, c.at(self._durations), plant.substeps
+        self._parts = c.ffi.new("stewart_schedule *", parts)
+        self._scratch = c.scratch(c.lib.stewart_transitions_scratch(NUM_TORQUES))
+        self._given = c.at(self._xi), c.at(self._theta), c.at(self._states), c.at(self._H)
+
+    def after(self, state: Array, torque: Array) -> Array:
+        """Return the state (12,) after a hold of a torque (6,)."""
+        xi, theta, states, _ = self._given
+        self._xi[:NUM_STATE], self._torques[0] = state, torque
+        self._core.lib.stewart_predict(self._machine, theta, self._once, xi, states)
+        return self._states[0].copy()
+
+    def linearised(self, states: Array, torques: Array) -> Linearised:
+        """Return the model about states (N + 1, 12) and torques (N, 6).
+
+        Raises:
+            ArithmeticError: the derivatives do not exist, as at a dead centre.
+        """
+        n, size = len(torques), NUM_STATE + NUM_TORQUES
+        ends, H = np.empty((n, NODES + 1, NUM_STATE)), np.empty((n, NODES + 1, NUM_STATE, size))
+        xi, theta, at, maps = self._given
+        lib = self._core.lib
+        for j, (state, torque) in enumerate(zip(states[:-1], torques, strict=True)):
+            self._xi[:NUM_STATE], self._torques[:] = state, torque
+            lib.stewart_predict(self._machine, theta, self._parts, xi, at)
+            given = self._machine, xi, self._parts, 0, at, maps, self._scratch
+            if not lib.stewart_transitions(*given):
+                raise ArithmeticError("plan: no derivatives at a state of it")
+            ends[j], H[j] = self._states, self._H
+        steepest = np.abs(H[..., :NUM_STATE]).max()  # those by torques depend on the machine's size
+        if not (np.isfinite(H).all() and steepest < _STEEPEST):
+            raise ArithmeticError("plan: next to a dead centre")
+        Phi, Gamma = np.split(H[:, -1], [NUM_STATE], axis=2)
+        return Linearised(
+            Phi,
+            Gamma,
+            ends[:, -1] - states[1:],
+            ends[:, :NODES, POSE],
+            H[:, :NODES, POSE],
+        )
+
+
+_STEEPEST = 1e6
+"""Largest derivative of a state by another one over a hold; next to a dead centre they diverge."""
+
+
+@Once
+def _by_bias(plant: NominalPlant) -> NominalPlant:
+    """Return the plant with the torque biases as its only free parameters."""
+    d = plant.dynamics
+    own = StewartDynamics(d.mechanism, d.gravity, d.plant_parameters, PARAMETERS[BIAS])
+    return NominalPlant(own, plant.substeps, plant.coarse_torque_limit, plant.motors)
+
+
+class HorizonCost(NamedTuple):
+    """Cost of a plan: the law's, with the pose error at the Gauss nodes of each hold.
+
+        J = sum_j [ (|e_{j,1}|_Q^2 + |e_{j,2}|_Q^2) / 2 + |T_j - T_ff,j|_R^2 ] + |e_N|_P^2
+
+    Two Gauss nodes integrate the squared error of a motion between samples. A cost at the samples
+    alone allows large torques of alternating sign there.
+
+    Attributes:
+        wanted: (N, 2, 6) poses of the reference at the nodes.
+        end: (12,) reference at the end of the last hold.
+        torques: (N, 6) feedforward, N m.
+        Q: (6,) diagonal.
+        R: (6, 6).
+        P: (12, 12).
+    """
+
+    wanted: Array
+    end: Array
+    torques: Array
+    Q: Array
+    R: Array
+    P: Array
+
+
+class Policy(NamedTuple):
+    """Solution of the Riccati equation without limits: dT_j = d_j - K_j dx_j.
+
+    A further c_j on dT_j costs c_j' S_j c_j / 2 more, S_j = L_j L_j'.
+
+    Attributes:
+        K, d, L: (N, 6, 12), (N, 6), (N, 6, 6).
+    """
+
+    K: Array
+    d: Array
+    L: Array
+
+
+def riccati(model: Linearised, cost: HorizonCost, states: Array, torques: Array) -> Policy:
+    """Solve the time-varying linear quadratic problem about a plan.
+
+    With y = [dx_j; dT_j], M = [Phi_j Gamma_j] and W_g the map of y to the pose at node g,
+
+        H = sum_g W_g' Q W_g / 2 + diag(0, R) + M' P_{j+1} M,
+        g = sum_g W_g' Q e_g / 2 + [0; R (T_j - T_ff,j)] + M' (P_{j+1} f_j + p_{j+1}).
+
+    In blocks of dx and dT, S = H_TT, K = S^-1 H_Tx, d = -S^-1 g_T,
+    P_j = H_xx - H_xT K,  p_j = g_x - K' g_T.
+
+    Raises:
+        np.linalg.LinAlgError: a matrix S is not positive definite.
+    """
+    n, x = len(torques), NUM_STATE
+    K, d, S = np.empty((n, 6, x)), np.empty((n, 6)), np.empty((n, 6, 6))
+    weights = np.tile(cost.Q, NODES) / NODES
+    P, p = cost.P, cost.P @ (states[-1] - cost.end)
+    maps = model.node_maps.reshape(n, NODES * NUM_COORDINATES, -1)
+    errors = (model.nodes - cost.wanted).reshape(n, -1)
+    M = np.concatenate([model.Phi, model.Gamma], axis=2)
+    for j in range(n - 1, -1, -1):
+        weighted = maps[j].T * weights
+        H = weighted @ maps[j] + M[j].T @ P @ M[j]
+        g = weighted @ errors[j] + M[j].T @ (P @ model.defects[j] + p)
+        H[x:, x:] += cost.R
+        g[x:] += cost.R @ (torques[j] - cost.torques[j])
+        S[j] = H[x:, x:]
+        solved = np.linalg.solve(S[j], np.column_stack([H[x:, :x], g[x:]]))
+        K[j], d[j] = solved[:, :x], -solved[:, x]
+        P, p = H[:x, :x] - H[:x, x:] @ K[j], g[:x] - K[j].T @ g[x:]
+        P = (P + P.T) / 2
+    return Policy(K, d, np.linalg.cholesky(S))
+
+
+class Condensed(NamedTuple):
+    """Deviations of a plan by v (6 N,), c_j = L_j^-T v_j: an affine map.
+
+    The cost is |v|^2 / 2 and a constant.
+
+    Attributes:
+        states, torques: (N + 1, 12) and (N, 6) at v = 0, deviations from the plan.
+        state_map, torque_map: (N + 1, 12, 6 N) and (N, 6, 6 N).
+    """
+
+    states: Array
+    torques: Array
+    state_map: Array
+    torque_map: Array
+
+
+def condense(model: Linearised, policy: Policy, offset: Array) -> Condensed:
+    """Return the deviations that begin at `offset` (12,), as functions of v."""
+    n, u = len(policy.d), NUM_TORQUES
+    states, torques = np.zeros((n + 1, NUM_STATE)), np.zeros((n, u))
+    by_v, torque_by_v = np.zeros((n + 1, NUM_STATE, n * u)), np.zeros((n, u, n * u))
+    states[0], inverses = offset, np.linalg.inv(policy.L).swapaxes(1, 2)
+    for j in range(n):
+        here, used = slice(u * j, u * (j + 1)), u * (j + 1)  # v_j acts from hold j on
+        torques[j] = policy.d[j] - policy.K[j] @ states[j]
+        torque_by_v[j, :, :used] = -policy.K[j] @ by_v[j, :, :used]
+        torque_by_v[j, :, here] += inverses[j]
+        Phi, Gamma = model.Phi[j], model.Gamma[j]
+        states[j + 1] = Phi @ states[j] + Gamma @ torques[j] + model.defects[j]
+        by_v[j + 1, :, :used] = Phi @ by_v[j, :, :used] + Gamma @ torque_by_v[j, :, :used]
+    return Condensed(states, torques, by_v, torque_by_v)

@@ -1,0 +1,175 @@
+"""Way of least error onto a moving reference within a torque limit.
+
+The shortest plan along a quintic (`law.catch_up`) reaches the torque limit at one instant only, and
+counts its length instead of its error. With the torques T of N holds free, the least error is
+
+    minimise   sum_j [ (|e_{j,1}|_Q^2 + |e_{j,2}|_Q^2) / 2 + |T_j - T_ff,j|_R^2 ]
+    subject to |T_j| <= limit,  distances kept,  x_N on the reference,                    (least)
+
+with the cost of `law.horizon` and the torques T_ff of the reference. It is solved by a series of
+the quadratic programs of `law.horizon_qp`, each linearised about the motion that the last one
+found, with the end state as a further constraint. A fixed point meets (least) and the equations of
+motion.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from pydrake.trajectories import Trajectory
+
+from stewart_drake.dynamics.workspace import margins
+from stewart_drake.law.clear_space import ClearSpace
+from stewart_drake.law.holds import (
+    GAUSS_NODES,
+    mean_torques,
+    means_and_changes,
+    rates_at_samples,
+    torques_at_nodes,
+)
+from stewart_drake.law.horizon import HoldModel, HorizonCost, condense, riccati
+from stewart_drake.law.horizon_qp import LeastDistance, problem_of, solve_by_daqp
+from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, POSE, RATES
+from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.types import Array
+
+_LONGER: Final = 1.2
+"""Length over that of the shortest plan; longer ones differ by less than 0.1 %."""
+_MOST_HOLDS: Final = 40
+"""Torques of a plan; each is held for several periods if there are more."""
+_PARTS: Final = 4
+"""Pieces of a hold."""
+_ROUNDS: Final = 20
+"""Quadratic programs; some 8 are usual."""
+_MISSED: Final = 1e-7
+"""By how much a plan may miss the reference, in motions of size 1 by the weights Q."""
+_BEYOND: Final = 0.05
+"""Use of the distances to keep, in cranks, that a step of the series may have."""
+
+
+@dataclass(frozen=True)
+class LeastError:
+    """Plans of least error.
+
+    Attributes:
+        plant: model of the plant.
+        space: distances to keep.
+        Q: (6,) weights of the pose error.
+        R: (6, 6) weights of the torques.
+    """
+
+    plant: NominalPlant
+    space: ClearSpace
+    Q: Array
+    R: Array
+
+    def pieces(
+        self,
+        motion: Trajectory,
+        reference: Trajectory,
+        start: Array,
+        begin: float,
+        period: float,
+        periods: int,
+        limit: float,
+    ) -> Array | None:
+        """Return the pieces (n, 38) of (least), see core/planning.h, or None without a solution.
+
+        Args:
+            motion: from the start onto the reference within the limit, then the reference.
+            reference: the motion to reach.
+            start: (12,) state at `begin`, s.
+            period: of the controller, s.
+            periods: until `motion` reaches the reference.
+            limit: of each motor, N m.
+        """
+        # At least four periods more, in holds of a whole number of periods.
+        longer = max(int(_LONGER * periods), periods + 4)
+        each = -(-longer // _MOST_HOLDS)
+        number, hold = -(-longer // each), each * period
+        edges = begin + hold * np.arange(number + 1)
+        torques = mean_torques(self.plant.dynamics, motion, edges[:-1], edges[1:])
+        nodes = edges[:-1, None] + hold * GAUSS_NODES
+        cost = HorizonCost(
+            wanted=np.array([[evaluate(reference, t)[POSE] for t in pair] for pair in nodes]),
+            end=self._end(reference, edges[-1], period),
+            torques=mean_torques(self.plant.dynamics, reference, edges[:-1], edges[1:]),
+            Q=self.Q,
+            R=self.R,
+            P=np.diag(np.tile(self.Q, 2)),
+        )
+        try:
+            found = self._solved(start, np.clip(torques, -limit, limit), hold, limit, cost)
+        except (ArithmeticError, np.linalg.LinAlgError):
+            return None
+        return None if found is None else self._as_pieces(begin, hold, *found)
+
+    def _end(self, reference: Trajectory, time: float, period: float) -> Array:
+        """Return the state (12,) at which held torques take the reference over: (rates), holds."""
+        dynamics, state = self.plant.dynamics, evaluate(reference, time)[:NUM_STATE].copy()
+        after = np.array([time, time + period])
+        means, changes = means_and_changes(
+            torques_at_nodes(dynamics, reference, after[:1], after[1:])
+        )
+        B = dynamics.linearize(state[POSE], state[RATES], means[0])[1][RATES]
+        state[RATES] += rates_at_samples(np.array([np.zeros(6), changes[0]]), B, period)
+        return state
+
+    def _solved(
+        self, start: Array, torques: Array, hold: float, limit: float, cost: HorizonCost
+    ) -> tuple[Array, Array] | None:
+        """Return states (N _PARTS + 1, 12) and torques (N, 6) of the last program, or None."""
+        holds = HoldModel(self.plant, self.plant.dynamics.parameters, hold)
+        fine, size = self._motion(start, torques, hold), np.sqrt(np.tile(self.Q, 2))
+        for _ in range(_ROUNDS):
+            states = fine[::_PARTS]
+            model = holds.linearised(states, torques)
+            model = model._replace(defects=np.zeros_like(model.defects))  # a motion has none
+            m = condense(model, riccati(model, cost, states, torques), np.zeros(NUM_STATE))
+            problem = problem_of(m, states[1:, POSE], torques, limit, self.space)
+            missing = cost.end - states[-1] - m.states[-1]
+            problem = _ending(problem, size * m.state_map[-1].T, size * missing)
+            change = m.torques + m.torque_map @ solve_by_daqp(problem)[problem.slacks :]
+            for share in (1.0, 0.5, 0.25, 0.1):
+                tried = np.clip(torques + share * change, -limit, limit)
+                fine = self._motion(start, tried, hold)
+                room = self.space.room(fine[::_PARTS, POSE])
+                if np.isfinite(fine).all() and room.min() > -_BEYOND:
+                    break
+            else:
+                return None
+            torques = tried
+            if np.abs(size * (fine[-1] - cost.end)).max() <= _MISSED:
+                inside = margins(self.plant.mechanism, fine[:, POSE]).min() > 0
+                return (fine, torques) if inside else None
+        return None
+
+    def _motion(self, start: Array, torques: Array, hold: float) -> Array:
+        """Return the states (N _PARTS + 1, 12) under torques (N, 6)."""
+        fine, step = np.repeat(torques, _PARTS, axis=0), hold / _PARTS
+        substeps = self.plant.substeps_for(fine)
+        return np.vstack([start, self.plant.dynamics.predict(start, fine, step, substeps)])
+
+    def _as_pieces(self, begin: float, hold: float, states: Array, torques: Array) -> Array:
+        """Return the pieces (N _PARTS, 38) of a motion."""
+        dynamics, number = self.plant.dynamics, len(states) - 1
+        times = begin + hold / _PARTS * np.arange(number + 1)
+        pieces = np.empty((number, 2 + 2 * NUM_REFERENCE))
+        pieces[:, 0], pieces[:, 1] = times[:-1], times[1:]
+        for i in range(number):
+            for x, first in ((states[i], 2), (states[i + 1], 2 + NUM_REFERENCE)):
+                torque = torques[i // _PARTS]
+                row = np.append(x, dynamics.accelerations(x[POSE], x[RATES], torque))
+                pieces[i, first : first + NUM_REFERENCE] = row
+        return pieces
+
+
+def _ending(problem: LeastDistance, by_v: Array, missing: Array) -> LeastDistance:
+    """Return a problem whose end state (12,) changes by `missing`; `by_v` (6 N, 12)."""
+    rows = np.hstack([np.zeros((len(missing), problem.slacks)), by_v.T])
+    return problem._replace(
+        A=np.vstack([problem.A, rows]),
+        lower=np.append(problem.lower, missing),
+        upper=np.append(problem.upper, missing),
+    )

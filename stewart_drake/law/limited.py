@@ -1,0 +1,355 @@
+"""The predictive law within limits of torque, reach and clearance.
+
+At each sample `PredictiveLqi` computes its torque. From the predicted state at t + eta, where that
+torque begins to act, its plan for N further periods follows: the same gain and feedforward. If this
+plan meets all limits, its torque is sent, unchanged. Otherwise the plan is replaced by a
+solution of the quadratic program (qp), linearised a few times about the plan found so far.
+
+1. The first plan is the last one without its first hold, or else the reference, shrunk into the
+   workspace where it leaves it.
+2. Linearise (plan), solve the Riccati equation, condense, solve (qp).
+3. Integrate the equations of motion under the new torques and the gains of 2, within the torque
+   limit. A step that leads to the end of a leg's reach is shortened. Then repeat from 2.
+
+The cost at the end of the horizon is TERMINAL times the Riccati solution for torques that cost
+TERMINAL_R times as much. No terminal set exists: around a reference that takes more than the limits
+no set is invariant. The two factors stand for the limits beyond the horizon, which no Riccati
+solution knows (theory.md).
+"""
+
+import math
+import time
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from stewart_drake.law.belief import Belief
+from stewart_drake.law.channel import Report, Sent
+from stewart_drake.law.clear_space import RESERVE, ClearSpace
+from stewart_drake.law.core_law import AnyMemory, CoreMemory, serving
+from stewart_drake.law.cost import QuadraticCost
+from stewart_drake.law.holds import GAUSS_NODES
+from stewart_drake.law.horizon import NODES, HoldModel, HorizonCost, Plan, condense, riccati
+from stewart_drake.law.horizon_qp import QpError, Solver, problem_of, solve_by_daqp
+from stewart_drake.law.limited_memory import LimitedMemory
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.motion import Motion, Preview
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.riccati import lqr_by_doubling
+from stewart_drake.law.timeline import Timeline
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import reach_margins
+from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE, POSE
+from stewart_drake.types import Array
+
+TERMINAL: Final = 3.0
+"""Cost at the end of the horizon over the Riccati solution."""
+TERMINAL_R: Final = 100.0
+"""Weight of torques in that Riccati equation over the law's."""
+LINEARISATIONS: Final = 2
+"""Quadratic programs per sample."""
+_STEPS: Final = (1.0, 0.5, 0.25, 0.1)
+"""Shares of the way to a solution that are tried."""
+_INTO_RESERVE: Final = 0.5
+"""Share of the distances to keep that the free law may use up before a plan replaces it."""
+_EDGE: Final = 0.25
+"""Least reach margin of a plan, as a share of the distance to keep."""
+
+
+@dataclass(frozen=True, eq=False)
+class QpLimits:
+    """Limits that a plan keeps.
+
+    Attributes:
+        horizon: N, number of periods.
+        space: distances to keep.
+        solver: of (qp).
+        budget: time for a step, s, infinite in a simulation. Beyond it the last plan is continued.
+    """
+
+    horizon: int
+    space: ClearSpace
+    solver: Solver = solve_by_daqp
+    budget: float = math.inf
+
+
+class _Ahead(NamedTuple):
+    """Reference over the horizon.
+
+    Attributes:
+        rows: (N + 1, 18) at the beginning of each hold and the end of the last.
+        nodes: (2 (N + 2), 18) at the Gauss nodes of the holds and a neighbour on each side.
+        share: factor on its distance from home that keeps the reach, at most 1.
+        torques: (N, 6) feedforward of the shrunk reference, N m.
+    """
+
+    rows: Array
+    nodes: Array
+    share: float
+    torques: Array
+
+    def states(self, mechanism: Mechanism) -> Array:
+        """Return the states (N + 1, 12) of the shrunk reference."""
+        return _shrunk(self.rows, self.share, mechanism)[:, :NUM_STATE]
+
+
+@dataclass(frozen=True)
+class LimitedLqi(PredictiveLqi):
+    """`PredictiveLqi` whose torques come from a quadratic program where a limit binds.
+
+    Attributes:
+        limits: to keep.
+    """
+
+    limits: QpLimits = field(kw_only=True)
+
+    @cached_property
+    def free(self) -> PredictiveLqi:
+        """The law without limits."""
+        return PredictiveLqi(**self.parts)
+
+    @cached_property
+    def _served(self) -> Any:
+        return serving(self.free).law
+
+    def times_for(self, timeline: Timeline) -> Array:
+        """Return the times (p,) of a preview: those of the free law, then those of the horizon."""
+        n = self.limits.horizon
+        ends = timeline.holds(0, n)
+        nodes = timeline.holds(-1, n)[:, None] + timeline.period * GAUSS_NODES
+        return np.concatenate([self.free.times_for(timeline), ends, nodes.ravel()])
+
+    def initial_memory(self, queue: Array) -> Any:
+        """Return the memory before the first sample; see `PredictiveLqi.initial_memory`."""
+        return LimitedMemory(self._served.initial_memory(queue))
+
+    def step(
+        self,
+        memory: Any,
+        measurement: Measurement,
+        motion: Motion,
+        weights: Array,
+        report: Report | None = None,
+    ) -> Any:
+        """Compute the torque of one sample; see `PredictiveLqi.step`.
+
+        Returns:
+            The new memory. Its torque is that of the free law where its plan meets the limits.
+        """
+        begun, before = time.perf_counter(), memory.free
+        rows, own = np.asarray(motion(self.preview_times)), len(self.free.preview_times)
+        given = Preview(self.free.preview_times, rows[:own])
+        after = self._served.step(before, measurement, given, weights, report)
+        quiet, further = before.silence > 0 and after.silence > 0, rows[own:]
+        if quiet or not after.belief.feeds_back or not np.isfinite(further).all():
+            return memory.following(after)
+        belief, timeline = after.belief, after.belief.timeline
+        start, flying = belief.state, after.in_flight[:-1]
+        queue = flying[len(flying) - timeline.queue_length :]
+        if len(queue):
+            schedule = timeline.until_next(queue)
+            start = self.plant.predict(start, schedule, belief.parameters)[-1]
+        holds = HoldModel(self.plant, belief.parameters, timeline.period)
+        ahead = self._ahead(further, belief)
+        if self._meets_limits(after, ahead, start, holds):
+            return memory.following(after)
+        until = begun + self.limits.budget
+        weighted = weights * [1.0, belief.caution]
+        reference = self._reference_plan(ahead)
+        last = self._continued(memory.plan, reference, start, holds)
+        plan, cause = last, None
+        try:
+            cost = self._cost(after, ahead, holds, weighted)
+            try:
+                plan = self._plan_within(last or reference, reference, start, holds, cost, until)
+            except (ArithmeticError, np.linalg.LinAlgError):
+                if last is None:
+                    raise
+                plan = self._plan_within(reference, reference, start, holds, cost, until)
+        except (ArithmeticError, np.linalg.LinAlgError) as error:  # the last plan goes on
+            cause = "qp_late" if isinstance(error, QpError) and error.late else "qp_failures"
+        torques = after.plan if plan is None else self._sent(plan.torques, after.plan)
+        return memory.limited(_sending(after, torques, before.integral), plan, cause)
+
+    def _sent(self, torques: Array, free: Array) -> Array:
+        """Return the torques of a plan (N, 6) for the rows of a packet, then those of `free`."""
+        return np.vstack([torques[: len(free)], free[len(torques) :]])
+
+    def _ahead(self, further: Array, belief: Belief) -> "_Ahead":
+        n, space, dynamics = self.limits.horizon, self.limits.space, self.plant.dynamics
+        rows, nodes = further[: n + 1], further[n + 1 :]
+        share = space.shrunk(further[:, POSE])
+        within = _shrunk(nodes, share, space.mechanism)
+        held = self.feedforward.held(within, dynamics, belief.parameters)
+        return _Ahead(rows, nodes, share, held.torques)
+
+    def _meets_limits(self, after: Any, ahead: "_Ahead", start: Array, holds: HoldModel) -> bool:
+        """Return whether the plan of the free law meets the limits: gain and feedforward go on.
+
+        The integral goes on by the trapezoid rule.
+        """
+        gain, motors, dt = after.gain, self.plant.motors, self.timeline.period
+        size = NUM_STATE + NUM_COORDINATES * self.cost.integrates
+        if ahead.share < 1 or not np.isfinite(gain).all():
+            return False
+        torque, state, integral = after.torque, start, after.integral
+        wanted = ahead.rows[:, :NUM_STATE]
+        error, states = state - wanted[0], []
+        for j in range(self.limits.horizon):
+            if j > 0:
+                regulated = np.concatenate([error, self.cost.regulated(integral)])
+                torque = ahead.torques[j] - gain[:, :size] @ regulated
+            if not np.abs(torque).max() <= motors.limit:
+                return False
+            last, state = error, holds.after(state, torque)
+            error = state - wanted[j + 1]
+            integral = integral + dt / 2 * (last[POSE] + error[POSE])
+            states.append(state)
+        space, poses = self.limits.space, np.array(states)[:, POSE]
+        return bool(np.all(space.room(poses) >= -_INTO_RESERVE * space.least))
+
+    def _cost(
+        self,
+        after: Any,
+        ahead: "_Ahead",
+        holds: HoldModel,
+        weights: Array,
+    ) -> HorizonCost:
+        """Return the cost of a plan, with TERMINAL times the Riccati solution at its end.
+
+        The integral is constant in a plan; its share of the law's torque joins the feedforward.
+        """
+        assert isinstance(self.cost, QuadraticCost)  # of `controller.kind: lqi`
+        Q, R = self.cost.matrices(weights)
+        errors = np.zeros(NUM_STATE)
+        errors[POSE] = np.diag(Q)[:NUM_COORDINATES]
+        ends = np.tile(ahead.states(self.plant.mechanism)[-1], (2, 1))
+        last = holds.linearised(ends, ahead.torques[-1:])
+        _, P = lqr_by_doubling(last.Phi[0], last.Gamma[0], np.diag(errors), TERMINAL_R * R)
+        torques = ahead.torques
+        if self.cost.integrates and np.isfinite(after.gain).all():
+            size = NUM_STATE + NUM_COORDINATES
+            torques = torques - after.gain[:, NUM_STATE:size] @ after.integral
+        nodes = ahead.nodes[NODES:-NODES, POSE].reshape(-1, NODES, NUM_COORDINATES)
+        end = ahead.rows[-1, :NUM_STATE]
+        return HorizonCost(nodes, end, torques, errors[POSE], R, TERMINAL * P)
+
+    def _reference_plan(self, ahead: "_Ahead") -> Plan:
+        """Return the shrunk reference, with its torques within the limit."""
+        torques = self.plant.motors.saturate(ahead.torques)
+        gains = np.zeros((len(torques), 6, NUM_STATE))
+        return Plan(ahead.states(self.plant.mechanism), torques, gains)
+
+    def _continued(
+        self, last: Plan | None, reference: Plan, start: Array, holds: HoldModel
+    ) -> Plan | None:
+        """Return the motion of the plant along the last plan a hold later, or None without one."""
+        if last is None:
+            return None
+        later = last.later(reference.states[-1], reference.torques[-1])
+        moved = self._along(later, start, holds, reference, 0)
+        return later if moved is None else moved
+
+    def _plan_within(
+        self,
+        plan: Plan,
+        reference: Plan,
+        start: Array,
+        holds: HoldModel,
+        cost: HorizonCost,
+        until: float,
+    ) -> Plan:
+        """Return the plan after LINEARISATIONS quadratic programs, fewer if time is short.
+
+        Raises:
+            QpError: the first one has no solution.
+            ArithmeticError: the model or its Riccati equation does not exist.
+        """
+        limits, motors = self.limits, self.plant.motors
+        for number in range(LINEARISATIONS):
+            left = until - time.perf_counter()
+            if left <= 0:
+                if number > 0:
+                    break
+                raise QpError("QP: no time is left", late=True)
+            try:
+                model = holds.linearised(plan.states, plan.torques)
+                policy = riccati(model, cost, plan.states, plan.torques)
+                m = condense(model, policy, start - plan.states[0])
+                poses = plan.states[1:, POSE]
+                problem = problem_of(m, poses, plan.torques, motors.limit, limits.space)
+                v = limits.solver(problem, left)[problem.slacks :]
+            except (ArithmeticError, np.linalg.LinAlgError):
+                if number > 0:
+                    break
+                raise
+            change = Plan(m.states + m.state_map @ v, m.torques + m.torque_map @ v, policy.K)
+            plan = self._towards(plan, change, start, holds, reference)
+        return plan
+
+    def _towards(
+        self, plan: Plan, change: Plan, start: Array, holds: HoldModel, reference: Plan
+    ) -> Plan:
+        """Return the motion of the plant for the largest step that stays within the first half."""
+        for share in _STEPS:
+            least = 0 if share == _STEPS[-1] else self.limits.horizon // 2
+            wanted = Plan(
+                plan.states + share * change.states,
+                plan.torques + share * change.torques,
+                change.gains,
+            )
+            moved = self._along(wanted, start, holds, reference, least)
+            if moved is not None:
+                return moved
+        raise QpError("QP: no step keeps the plate in its workspace")
+
+    def _along(
+        self, plan: Plan, start: Array, holds: HoldModel, reference: Plan, least: int
+    ) -> Plan | None:
+        """Return the motion of the plant along a plan; the reference replaces it after an edge.
+
+        None if one of the first `least` holds leads to the edge of the workspace.
+        """
+        states, torques = plan.states.copy(), plan.torques.copy()
+        states[0], mechanism = start, self.plant.mechanism
+        for j, (torque, K) in enumerate(zip(plan.torques, plan.gains, strict=True)):
+            torques[j] = self.plant.motors.saturate(torque - K @ (states[j] - plan.states[j]))
+            states[j + 1] = holds.after(states[j], torques[j])
+        edge = _EDGE * RESERVE * mechanism.crank_lengths.min()
+        beyond = ~(reach_margins(mechanism, states[1:, POSE]).min(axis=1) > edge)
+        if beyond[:least].any():
+            return None
+        if beyond.any():
+            first = int(np.argmax(beyond))
+            states[first + 1 :] = reference.states[first + 1 :]
+            torques[first + 1 :] = reference.torques[first + 1 :]
+        finite = np.isfinite(states).all() and np.isfinite(torques).all()
+        return Plan(states, torques, plan.gains) if finite else None
+
+
+def _shrunk(rows: Array, share: float, mechanism: Mechanism) -> Array:
+    """Return rows (n, 18) of a motion with its distance from home, and its rates, times a share."""
+    if share == 1.0:
+        return rows
+    shrunk = share * rows
+    shrunk[:, POSE] += (1 - share) * mechanism.home
+    return shrunk
+
+
+def _sending(memory: AnyMemory, torques: Array, integral: Array) -> AnyMemory:
+    """Return the memory of the free law with other torques (n, 6) sent, and its last integral."""
+    if isinstance(memory, CoreMemory):
+        after: Any = CoreMemory(memory.data.copy(), memory.compiled)
+        after.field("torque")[:], after.in_flight[-1] = torques[0], torques[0]
+        after.field("integral")[:] = integral
+    else:
+        sent = Sent(memory.sent.memory.copy(), memory.sent.rows)
+        in_flight = np.vstack([memory.in_flight[:-1], torques[:1]])
+        new = {"in_flight": in_flight, "integral": integral, "plan": torques, "sent": sent}
+        after = replace(memory, torque=torques[0], **new)
+    packets = after.sent.packets
+    if len(packets):
+        packets[-1, -len(torques) :] = torques
+    return after

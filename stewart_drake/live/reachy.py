@@ -1,0 +1,410 @@
+"""The machine's end in front of Reachy Mini's daemon: plans over UDP, setpoints to the robot.
+
+The daemon's WebSocket sends the positions of the joints, without time stamps, and takes setpoints
+that act at once. This process, beside the daemon, stamps positions on arrival, keeps plans until
+their time, and sends one setpoint per period. `live` drives it as any other machine.
+"""
+
+import asyncio
+import json
+import math
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from stewart_drake.dynamics.workspace import Failure
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.yamlio import brief
+from stewart_drake.law.servos import Stiffness
+from stewart_drake.live.contact import address_of
+from stewart_drake.live.endpoint import Address, Endpoint, now, read_key
+from stewart_drake.live.machine import Machine, check_scenario, open_machine
+from stewart_drake.live.options import MachineOptions
+from stewart_drake.live.protocol import SECOND, ControllerMessage, MachineFlags
+from stewart_drake.live.simulated import Motors
+from stewart_drake.loop.peer import Fault, Reason
+from stewart_drake.loop.preparation import Experiment, prepare
+from stewart_drake.loop.servos import known_stiffness
+from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import ForwardKinematicsError
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.dependencies import differing
+from stewart_drake.scenario.run_log import Background, open_log
+from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE, POSE
+from stewart_drake.types import Array
+
+JOINTS: Final = 1 + NUM_LEGS
+"""Joints of the head: the body's yaw, then the cranks."""
+SOFT_START: Final = 1.0
+"""Time for joining a plan from rest, s."""
+_REJOIN: Final = 0.2
+"""The same after a gap of at most this length, s."""
+_DECAY: Final = 0.08
+"""Time constant in which a crank comes to rest where plans end, s."""
+_STILL: Final = 1e-4
+"""Rate below which a crank is at rest, rad/s."""
+STALE: Final = 0.5
+"""Time without positions after which the daemon counts as lost, s."""
+_RETRY: Final = 0.5
+"""Time between two attempts to connect, s."""
+_PATIENCE: Final = 5.0
+"""Longest wait for the first positions, s."""
+_AHEAD: Final = 0.05
+"""Longest time for which a position is extrapolated, s."""
+_KEPT: Final = 4
+"""Number of positions from which rates are computed; they come in bursts."""
+_LEAST_SPAN: Final = 0.03
+"""Shortest time between the first and the last of them, s."""
+_LONGEST: Final = 1 << 20
+"""Longest message of the daemon, bytes."""
+
+
+class Positions(NamedTuple):
+    """Positions (7,) of the joints, rad, and when they came, ns of the own clock."""
+
+    stamp: int
+    joints: Array
+
+
+class Daemon:
+    """Connection to the daemon, in a thread of its own. It connects anew whenever it is lost.
+
+    Args:
+        address: of the daemon.
+
+    Attributes:
+        positions: the last ones, the newest last.
+        simulated: whether the daemon reports that it simulates the robot.
+        lines: messages to print, each event once.
+    """
+
+    def __init__(self, address: Address) -> None:
+        self._where = f"{address[0]}:{address[1]}"
+        self._url = f"ws://{self._where}/ws/sdk"
+        self.positions: deque[Positions] = deque(maxlen=_KEPT)
+        self.simulated, self.lines = False, deque[str]()
+        self._told = self._odd = self._closed = False
+        self._motors_on, self._setpoint = True, ""
+        self._loop, self._wake = asyncio.new_event_loop(), asyncio.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    @property
+    def ready(self) -> bool:
+        """Whether positions come."""
+        there = self.positions
+        return bool(there) and now() - there[-1].stamp < STALE * SECOND
+
+    def send(self, joints: Array) -> None:
+        """Send a setpoint (7,) in rad; one that is not sent yet is replaced."""
+        text = json.dumps({"type": "set_head_joints", "joints": joints.tolist()})
+
+        def replace() -> None:
+            self._setpoint = text
+            self._wake.set()
+
+        with suppress(RuntimeError):  # closed
+            self._loop.call_soon_threadsafe(replace)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._closed = True
+        with suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(lambda: [one.cancel() for one in asyncio.all_tasks()])
+        self._thread.join(2.0)
+
+    def _run(self) -> None:
+        with suppress(asyncio.CancelledError):
+            self._loop.run_until_complete(self._work())
+        self._loop.close()
+
+    async def _work(self) -> None:
+        from websockets.asyncio.client import connect
+        from websockets.exceptions import WebSocketException
+
+        while not self._closed:
+            try:
+                async with connect(
+                    self._url, max_size=_LONGEST, open_timeout=2.0, close_timeout=0.2, proxy=None
+                ) as socket:
+                    self._setpoint, self._odd = "", False
+                    writer = asyncio.create_task(self._write(socket))
+                    try:
+                        await self._read(socket)
+                    finally:
+                        writer.cancel()
+            except TimeoutError:
+                self._lose(f"sent no positions for {STALE:g} s")
+            except (OSError, WebSocketException) as error:
+                self._lose(" ".join(str(error).split()) or type(error).__name__)
+            await asyncio.sleep(_RETRY)
+
+    def _lose(self, problem: str) -> None:
+        self.positions.clear()
+        if not self._told:
+            self._told = True
+            self.lines.append(f"daemon at {self._where}: {problem}; the head is held, trying again")
+
+    async def _write(self, socket: Any) -> None:
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            text, self._setpoint = self._setpoint, ""
+            if text:
+                await socket.send(text)
+
+    async def _read(self, socket: Any) -> None:
+        """Take messages until no positions have come for STALE seconds."""
+        last = now()
+        while True:
+            left = STALE - (now() - last) / SECOND
+            if left <= 0:
+                raise TimeoutError
+            data = await asyncio.wait_for(socket.recv(), left)
+            if self._take(data):
+                last = now()
+
+    def _take(self, data: str | bytes) -> bool:
+        """Take a message; return whether it has positions."""
+        try:
+            message = json.loads(data)
+            kind = message["type"]
+            if kind == "daemon_status":
+                self._note(message)
+            if kind != "joint_positions":
+                return False
+            joints = np.array(message["head_joint_positions"], np.float64)
+            if joints.shape != (JOINTS,) or not np.all(np.abs(joints) < 2 * math.pi):
+                raise ValueError
+        except (ValueError, KeyError, TypeError, RecursionError):
+            if not self._odd:
+                self._odd = True
+                self.lines.append(
+                    f"daemon at {self._where}: sent {brief(data)}; expected a message such as "
+                    f"joint_positions with {JOINTS} angles in rad; ignored"
+                )
+            return False
+        self.positions.append(Positions(now(), joints))
+        if self._told:
+            self._told = False
+            self.lines.append(f"daemon at {self._where}: positions come again")
+        return True
+
+    def _note(self, status: dict[str, Any]) -> None:
+        self.simulated = any(
+            status.get(name) is True for name in ("simulation_enabled", "mockup_sim_enabled")
+        )
+        mode = (status.get("backend_status") or {}).get("motor_control_mode", "enabled")
+        if (mode == "enabled") != self._motors_on:
+            self._motors_on = mode == "enabled"
+            effect = "act" if self._motors_on else "have no effect"
+            self.lines.append(f"daemon at {self._where}: motors {mode}: setpoints {effect}")
+
+
+class SoftSetpoints:
+    """Setpoints without jumps, from plans that begin, end and begin again.
+
+    With h coasting to rest from where plans ended, w the planned setpoint, and g the quintic of a
+    soft start over T,
+
+        u = h + g(s / T) (w - h),   g(s) = 10 s^3 - 15 s^4 + 6 s^5,
+
+    within range and speed of the servos. T is SOFT_START, or less after a short gap.
+
+    Args:
+        servo: range and speed.
+        period: s.
+        angles: (6,) of the cranks, at rest, rad.
+    """
+
+    def __init__(self, servo: Stiffness, period: float, angles: Array) -> None:
+        self._servo, self._period = servo, period
+        self.u = self._held = np.array(angles)
+        self.rate = self._coasting = np.zeros(NUM_LEGS)
+        self._since, self._gap = 0.0, math.inf
+
+    def step(self, wanted: Array | None) -> Array:
+        """Return the next setpoint (6,) for the planned one, None where there is none; rad."""
+        if wanted is None:
+            if self._since > 0:
+                self._held, self._coasting, self._since, self._gap = self.u, self.rate, 0.0, 0.0
+            self._gap += self._period
+        self._coasting = self._coasting * math.exp(-self._period / _DECAY)
+        self._held = next_one = self._held + self._coasting * self._period
+        if wanted is not None:
+            self._since += self._period
+            s = min(1.0, self._since / (_REJOIN if self._gap <= _REJOIN else SOFT_START))
+            next_one = self._held + s**3 * (10 - 15 * s + 6 * s**2) * (wanted - self._held)
+        before, self.u = self.u, self._servo.limited(next_one, self.u)
+        self.rate = (self.u - before) / self._period
+        return self.u
+
+
+class Robot:
+    """The robot as a machine's plant and sensor, a `live.simulated.Body`."""
+
+    def __init__(self, daemon: Daemon, mechanism: Mechanism, measures_state: bool) -> None:
+        self._daemon, self._mechanism, self._measures_state = daemon, mechanism, measures_state
+        self.time, self._pose = 0.0, mechanism.home
+
+    @property
+    def state(self) -> Array:
+        """Pose and rates (12,) of the last positions, extrapolated to now; NaN without any."""
+        there = list(self._daemon.positions)
+        nothing = np.full(NUM_STATE, np.nan)
+        if not there or not self._daemon.ready:
+            return nothing
+        times = np.array([one.stamp - there[-1].stamp for one in there]) / SECOND
+        angles, rates = there[-1].joints[1:], np.zeros(NUM_LEGS)
+        if times[0] <= -_LEAST_SPAN:  # the line through all of them, at the newest
+            rates, angles = np.polyfit(times, [one.joints[1:] for one in there], 1)
+        age = min((now() - there[-1].stamp) / SECOND, _AHEAD)
+        try:
+            self._pose = self._mechanism.forward_kinematics(angles + age * rates, self._pose)
+        except ForwardKinematicsError:
+            self._pose = self._mechanism.home
+            return nothing
+        return np.append(self._pose, np.linalg.solve(self._mechanism.jacobian(self._pose), rates))
+
+    def advance(self, time: float, torque: Array) -> Failure | None:
+        self.time = time
+        return None
+
+    def measurement(self) -> Array:
+        state = self.state
+        if self._measures_state:
+            return state
+        if not np.all(np.isfinite(state)):
+            return np.full(NUM_LEGS, np.nan)
+        return self._mechanism.crank_angles(state[POSE])
+
+
+class RobotMachine(Machine):
+    """A machine whose motors are those of the robot behind a daemon."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        endpoint: Endpoint,
+        options: MachineOptions,
+        daemon: Daemon,
+        say: Callable[[str], None] = print,
+        **kwargs: Any,
+    ) -> None:
+        scenario = experiment.scenario
+        servo = known_stiffness(scenario)
+        assert servo is not None
+        self._daemon, self._servo, self._yaw = daemon, servo, 0.0
+        self._soft: SoftSetpoints | None = None
+        robot = Robot(daemon, experiment.mechanism, scenario.sensor.measures_state)
+        settings = options.model_copy(update={"restart": "motion", "safe": "hold", "rate": 1.0})
+        body = (lambda: robot), "the robot"
+        super().__init__(experiment, endpoint, settings, say, body=body, **kwargs)
+        self._at(0, 4, self._drive)
+
+    def _new_motors(self) -> Motors:
+        return Motors(math.inf, self.period, cranks=True)
+
+    def _first_rows(self) -> Array:
+        return np.empty((0, NUM_LEGS))
+
+    def _flags(self) -> MachineFlags:
+        flags = super()._flags()
+        return flags if self._daemon.simulated else flags & ~MachineFlags.SIMULATION
+
+    def _obey(self, message: ControllerMessage, time: int) -> None:
+        if self._daemon.ready or not len(message.torques):
+            super()._obey(message, time)
+
+    def _drive(self, time: int) -> None:
+        """Send the setpoint of a period."""
+        self._at(time + self.period, 4, self._drive)
+        while self._daemon.lines:
+            self._say(f"{time / SECOND:.3f} s: {self._daemon.lines.popleft()}")
+        if not self._daemon.ready:
+            self._soft = None
+            if self._running and self.reason.fault != Fault.DRIVE:
+                self._go_safe(time)
+                self._fail(Reason(Fault.DRIVE), time)
+            return
+        playing = self._running and not self._safe and self._motors.fed
+        if self._soft is None:
+            if not playing:
+                return
+            joints = self._daemon.positions[-1].joints
+            self._yaw = joints[0]
+            self._soft = SoftSetpoints(self._servo, self.period / SECOND, joints[1:])
+        setpoint = self._soft.step(self._motors.torque if playing else None)
+        self._daemon.send(np.append(self._yaw, setpoint))
+        if not playing and np.abs(self._soft.rate).max() < _STILL:
+            self._soft = None  # the daemon holds the last setpoint
+
+
+def check_robot(scenario: Scenario) -> None:
+    """Refuse a scenario that the robot cannot be driven with.
+
+    Raises:
+        ConfigError: motors other than position servos, or more samples than the daemon sends.
+    """
+    wanted = {"actuator.kind": "position_servo", "sensor.samples": (None, 1)}
+    if found := differing(scenario, wanted):
+        raise ConfigError(found.problem("with --reachy"))
+
+
+def open_chosen(
+    scenario: Scenario, options: MachineOptions, say: Callable[[str], None] = print
+) -> AbstractContextManager[tuple[Machine, Address]]:
+    """Open the robot behind `options.reachy`, or a simulated machine; as `open_machine`."""
+    return (open_robot if options.reachy else open_machine)(scenario, options, say)
+
+
+@contextmanager
+def open_robot(
+    scenario: Scenario, options: MachineOptions, say: Callable[[str], None] = print
+) -> Iterator[tuple[RobotMachine, Address]]:
+    """Yield the machine of a robot, and the address at which it listens.
+
+    Raises:
+        ConfigError: another machine than such a robot, no package websockets, no daemon that sends
+            positions, or an address in use.
+    """
+    check_scenario(scenario)
+    check_robot(scenario)
+    try:
+        import websockets  # noqa: F401
+    except ImportError:
+        raise ConfigError(
+            "--reachy: needs the package websockets; expected pip install 'stewart_drake[reachy]'"
+        ) from None
+    assert options.reachy is not None
+    address, experiment = address_of(options.reachy, "--reachy"), prepare(scenario)
+    endpoint = Endpoint(ControllerMessage, options.host, options.port, read_key(options.key))
+    log, daemon = None, Daemon(address)
+    try:
+        _await_positions(daemon, options.reachy)
+        if options.log is not None:
+            log = Background(open_log(options.log, scenario), str(options.log), say)
+        yield RobotMachine(experiment, endpoint, options, daemon, say, log=log), endpoint.address
+    finally:
+        daemon.close()
+        endpoint.close()
+        if log is not None:
+            log.close()
+
+
+def _await_positions(daemon: Daemon, where: str) -> None:
+    began, waiting = now(), threading.Event()
+    while not daemon.ready:
+        if now() - began > _PATIENCE * SECOND:
+            said = f" ({daemon.lines[0]})" if daemon.lines else ""
+            raise ConfigError(
+                f"--reachy: got {where}, which sent no positions for {_PATIENCE:g} s{said}; "
+                "expected the daemon of the robot, usually at port 8000"
+            )
+        waiting.wait(0.05)
+    daemon.lines.clear()
+    waiting.wait(2.5 * STALE)  # its status comes once a second

@@ -1,0 +1,121 @@
+"""The file of a learned torque, and the check that it belongs to a scenario."""
+
+import io
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from stewart_drake.files.arrayio import load_npz
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import write_whole
+from stewart_drake.law.learned import LearnedTorque
+from stewart_drake.loop.preparation import Experiment
+from stewart_drake.mechanism.geometry import fingerprint
+from stewart_drake.scenario.calibration import believed_delay
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.types import Array
+
+HARMONICS: Final = 8
+"""Harmonics of the motion in a learned torque; those above half the control rate are zero."""
+_POSES: Final = 32
+"""Number of poses of the motion that a file has, over one period."""
+_SAME: Final = 1e-9
+"""Largest difference of two motions that are the same, rad and m, and of two times, s."""
+
+
+def motion_period(scenario: Scenario) -> float:
+    """Return the period of a scenario's motion, s.
+
+    Raises:
+        ConfigError: the motion does not repeat, or too fast for the controller.
+    """
+    reference, dt = scenario.reference, scenario.controller.period
+    if reference.kind != "sine":
+        raise ConfigError(
+            f"reference.kind: got {reference.kind}; expected sine: only a motion that repeats is "
+            "learned"
+        )
+    both = zip(reference.angular_frequency, reference.amplitude, strict=True)
+    found = {frequency for frequency, amplitude in both if amplitude != 0}
+    if len(found) != 1:
+        got = "several frequencies" if found else "a motion without amplitude"
+        raise ConfigError(
+            f"reference.frequency: got {got}; expected one, for a motion that repeats"
+        )
+    period = 2 * np.pi / found.pop()
+    if period < 4 * dt:
+        raise ConfigError(
+            f"reference.frequency: got a period of {period:.3g} s; expected at least four of "
+            f"controller.period, {4 * dt:g} s"
+        )
+    return float(period)
+
+
+def harmonics_below(period: float, dt: float) -> int:
+    """Return the number of harmonics of a motion that torques of dt s each can have."""
+    return min(HARMONICS, int((period / dt - 1) / 2))
+
+
+def save_learned(path: Path, torque: LearnedTorque, experiment: Experiment) -> None:
+    """Write a learned torque with machine, motion, period and delay to a .npz file."""
+    buffer = io.BytesIO()
+    np.savez(buffer, coefficients=torque.coefficients, **_marks(experiment))
+    write_whole(path, buffer.getvalue())
+
+
+def learned_torque(experiment: Experiment) -> LearnedTorque | None:
+    """Return the torque of `controller.learned`, or None without a file.
+
+    Raises:
+        ConfigError: unreadable, or of another machine, motion, period or delay.
+    """
+    file = experiment.scenario.controller.learned
+    if file is None:
+        return None
+    try:
+        own = _marks(experiment)
+        shapes = {name: (np.asarray(one).dtype.kind, np.shape(one)) for name, one in own.items()}
+        shapes["coefficients"] = ("f", (1 + 2 * HARMONICS, 6))
+        found = load_npz(Path(file), shapes, "a file that the command learn wrote")
+    except ConfigError as error:
+        raise ConfigError(f"controller.learned: {error}") from None
+    for name, value in own.items():
+        same = found[name] == value if name == "machine" else _near(found[name], value)
+        if not same:
+            numbers = "" if np.ndim(value) else f" ({found[name]}); expected {value}"
+            raise ConfigError(
+                f"controller.learned: got {file}, learned with another {_TEXTS[name]}{numbers}"
+                + (", as in the scenario" if numbers else "; expected that of the scenario")
+            )
+    coefficients = found["coefficients"]
+    if not np.all(np.isfinite(coefficients)):
+        raise ConfigError(f"controller.learned: got {file} with NaN; expected finite torques")
+    return LearnedTorque(motion_period(experiment.scenario), coefficients)
+
+
+_TEXTS: Final = {
+    "machine": "machine",
+    "motion": "motion",
+    "motion_period": "period of the motion, s",
+    "period": "controller.period, s",
+    "delay": "delay, s",
+}
+
+
+def _near(a: Array, b: Array) -> bool:
+    return bool(np.allclose(a, b, rtol=0, atol=_SAME))
+
+
+def _marks(experiment: Experiment) -> dict[str, Array]:
+    """Return the arrays by which a file names machine, motion, period and delay."""
+    sc = experiment.scenario
+    period = motion_period(sc)
+    times = period / _POSES * np.arange(_POSES)
+    return {
+        "machine": np.array(fingerprint(experiment.mechanism)),
+        "motion_period": np.array(period),
+        "motion": np.array(experiment.reference.vector_values(times).T),
+        "period": np.array(sc.controller.period),
+        "delay": np.array(believed_delay(sc).eta(sc.controller.period)),
+    }

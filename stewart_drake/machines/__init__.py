@@ -1,0 +1,1 @@
+"""Machines of others: their coordinates, and adapters to their software."""

@@ -1,0 +1,71 @@
+"""Document, figure and file of learning from repetitions."""
+
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from stewart_drake.loop.learned import save_learned
+from stewart_drake.reporting.document import Document, Frame, from_template
+from stewart_drake.reporting.panels import Curve, Panel, draw
+from stewart_drake.reporting.replay import replay_html
+from stewart_drake.reporting.style import line
+from stewart_drake.studies.learn import LearnStudy, Repetition
+
+LEARNED: Final = "learned.npz"
+
+
+def document(study: LearnStudy) -> Document:
+    """Return the error of each repetition, and replays of the first and the best one."""
+    first, best = study.repetitions[0], study.best
+    numbers = {id(one): k for k, one in enumerate(study.repetitions, 1)}
+    shown = [first] if best is first else [first, best]
+    machine = study.experiment.truth
+    return from_template(
+        "learn",
+        "bad" if best.result.stopped else "plain" if best is first else "good",
+        study=study,
+        first=first,
+        best=best,
+        learned=best is not first,
+        repetitions=study.repetitions,
+        number=lambda one: numbers[id(one)],
+        films=[
+            Frame(partial(replay_html, one.result, machine, f"repetition {numbers[id(one)]}"))
+            for one in shown
+        ],
+        errors=partial(error_figure, study),
+        over_time=partial(time_figure, study),
+    )
+
+
+def write(study: LearnStudy, folder: Path) -> list[str]:
+    """Write the learned torque of the best repetition, if any; return the name of its file."""
+    (folder / LEARNED).unlink(missing_ok=True)  # of an earlier command
+    learned = study.best.learned
+    if learned is None:
+        return []
+    save_learned(folder / LEARNED, learned, study.experiment)
+    return [LEARNED]
+
+
+def error_figure(study: LearnStudy) -> Figure:
+    """Draw the error of each repetition."""
+    errors = [one.error for one in study.repetitions]
+    curve = Curve(np.arange(1, len(errors) + 1), errors, "", line(0))
+    return draw([Panel("E of a period  [% s]", [curve], "repetition", yscale="log", height=2.5)])
+
+
+def time_figure(study: LearnStudy) -> Figure:
+    """Draw the mean error of each repetition over time."""
+
+    def curve(k: int, one: Repetition) -> Curve:
+        signals = one.result.signals
+        mean = 100 * np.mean(np.abs(signals.error.values) / study.experiment.scale, axis=1)
+        return Curve(signals.time.values, mean, f"repetition {k + 1}", line(k, marked=False))
+
+    curves = [curve(k, one) for k, one in enumerate(study.repetitions)]
+    marks = {study.repetitions[0].result.scenario.duration - study.period: "last period begins"}
+    return draw([Panel("mean error  [%]", curves, marks=marks, yscale="powers", height=2.5)])

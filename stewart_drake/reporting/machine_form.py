@@ -1,0 +1,196 @@
+"""Form for the measurements of a machine, a page on this computer with a drawing that follows."""
+
+import json
+import re
+import secrets
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final, Literal, get_args, get_origin
+
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.kinematics import UnreachablePoseError
+from stewart_drake.reporting.local_page import LocalHandler, LocalServer
+from stewart_drake.reporting.mechanism import mechanism_figure
+from stewart_drake.reporting.page import environment, source
+from stewart_drake.studies.new_machine import machine_text
+from stewart_drake.studies.options import Option
+from stewart_drake.studies.study_options import Measurements
+
+_ANY_MASS: Final = 1e-3
+"""Mass of a part in a drawing before the mass is given, kg."""
+_PATIENCE: Final = 10.0
+"""Longest wait for a browser that fetches the report, s."""
+
+
+class Entries:
+    """Texts of a form as measurements; an empty text is a missing one.
+
+    Args:
+        texts: by the measurement's name.
+    """
+
+    def __init__(self, texts: Mapping[str, str]) -> None:
+        self._given = {name: text.strip() for name, text in texts.items() if text.strip()}
+
+    def measurements(self) -> Measurements:
+        """Return the measurements.
+
+        Raises:
+            ConfigError: the first problem; it begins with the measurement's name.
+        """
+        for one in Measurements.described():
+            if one.required and one.name not in self._given:
+                raise ConfigError(f"{one.name}: is missing")
+        return Measurements(**self._given)
+
+    def drawn(self) -> str:
+        """Return the drawing as a data URI; masses that are missing do not matter.
+
+        Raises:
+            ConfigError: the lengths are missing, or fit no machine.
+        """
+        masses = dict.fromkeys(("plate_mass", "crank_mass", "rod_mass"), _ANY_MASS)
+        lengths = Entries({**self._given, **{name: str(m) for name, m in masses.items()}})
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "machine.yaml"
+            path.write_text(machine_text(lengths.measurements(), "machine"))
+            try:
+                return source(mechanism_figure(load_mechanism(path)))
+            except UnreachablePoseError as error:
+                raise ConfigError(f"rod: {error}") from None
+
+    def answer(self) -> dict[str, Any]:
+        """Return what the page shows: `drawing` or null, `field` and `problem` or null."""
+        found: dict[str, Any] = {"drawing": None, "field": None, "problem": None}
+        try:
+            found["drawing"] = self.drawn()
+            self.measurements()
+        except ConfigError as error:
+            name, _, words = str(error).partition(": ")
+            known = name in Measurements.model_fields
+            found["field"], found["problem"] = (name, words) if known else (None, str(error))
+        return found
+
+
+def read_entries(data: bytes) -> Entries | None:
+    """Return the entries of a browser's request, or None for anything else."""
+    try:
+        found = json.loads(data)
+    except (ValueError, RecursionError):  # thousands of brackets
+        return None
+    known = isinstance(found, dict) and found.keys() <= Measurements.model_fields.keys()
+    if not known or not all(isinstance(text, str) for text in found.values()):
+        return None
+    return Entries(found)
+
+
+class MachineForm:
+    """The form, served until it is closed.
+
+    Args:
+        given: measurements that the form begins with, by name.
+        title: of the page.
+    """
+
+    def __init__(self, given: Mapping[str, Any], title: str) -> None:
+        self._entries: Entries | None = None
+        self._asked, self._ready, self._fetched = (threading.Event() for _ in range(3))
+        self._report = ""
+        fields = [_field(one, given.get(one.name)) for one in Measurements.described()]
+        page = environment().get_template("machine_form.html.j2")
+        secret = secrets.token_urlsafe(24)
+        self._server = LocalServer(
+            _handler(self, page.render(title=title, token=secret, fields=fields), secret)
+        )
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    @property
+    def url(self) -> str:
+        """Address of the form."""
+        return self._server.url
+
+    def take(self, entries: Entries) -> dict[str, Any]:
+        """Take complete entries; return `Entries.answer`."""
+        found = entries.answer()
+        if found["problem"] is None:
+            self._entries = entries
+            self._asked.set()
+        return found
+
+    def wait(self) -> Measurements:
+        """Wait for complete measurements."""
+        while not self._asked.wait(0.2):  # short, so that Ctrl-C ends it
+            pass
+        assert self._entries is not None
+        return self._entries.measurements()
+
+    def report(self) -> str:
+        """Wait for the page that follows the form."""
+        self._ready.wait()
+        self._fetched.set()
+        return self._report
+
+    def show(self, page: str) -> None:
+        """Show a page in place of the form, and wait until a browser has fetched it."""
+        self._report = page
+        self._ready.set()
+        self._fetched.wait(_PATIENCE)
+
+    def close(self) -> None:
+        """End the server."""
+        self._ready.set()
+        self._server.shutdown()
+        self._server.server_close()
+
+
+@contextmanager
+def machine_form(given: Mapping[str, Any], title: str) -> Iterator[MachineForm]:
+    """Serve a form; close it at the end."""
+    form = MachineForm(given, title)
+    try:
+        yield form
+    finally:
+        form.close()
+
+
+def _handler(form: MachineForm, page: str, secret: str) -> type[LocalHandler]:
+    class Handler(LocalHandler):
+        token, text = secret, page
+
+        def get(self, path: str) -> bool:
+            if path == "/report":
+                self._answer("text/html; charset=utf-8", form.report().encode())
+            return path == "/report"
+
+        def post(self, path: str, data: bytes) -> bytes | None:
+            entries = read_entries(data)
+            if entries is None or path not in ("/check", "/write"):
+                return None
+            found = entries.answer() if path == "/check" else form.take(entries)
+            return json.dumps(found).encode()
+
+    return Handler
+
+
+def _field(one: Option, given: Any) -> dict[str, Any]:
+    """Return an input of the form: name, label, example, value and choices."""
+    choices = ["true", "false"] if one.annotation is bool else []
+    if get_origin(one.annotation) is Literal:
+        choices = list(get_args(one.annotation))
+    default = "" if one.required or one.default is None else one.default
+    value = default if given is None else given
+    text = str(value).lower() if isinstance(value, bool) else f"{value}"
+    label = re.sub(r", (m|kg)\.$", ".", one.help).removesuffix(".")
+    example = {"m": "300 mm", "kg": "250 g"}.get(one.unit or "", "")
+    return {
+        "name": one.name,
+        "label": label,
+        "example": example,
+        "value": text,
+        "choices": choices,
+        "required": one.required,
+    }

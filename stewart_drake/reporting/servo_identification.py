@@ -1,0 +1,129 @@
+"""Documents and figures of identified position servos, and of a planned log of them."""
+
+from functools import partial
+from typing import Final
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from stewart_drake.identification.servo_fit import (
+    BALL_FRICTION,
+    NAMES,
+    UNITS,
+    D,
+    K,
+    ServoIdentification,
+)
+from stewart_drake.identification.servo_plan import SETPOINTS_FILE, ServoPlan
+from stewart_drake.reporting.document import Caution, Document, Table, Tone, from_template, number
+from stewart_drake.reporting.panels import Curve, Panel, draw
+from stewart_drake.reporting.style import LEG_LINES
+from stewart_drake.scenario.signals import LEGS
+from stewart_drake.types import Array
+
+_UNITS: Final = {"s": ("ms", 1e3), "rad": ("mrad", 1e3), "kg m^2": ("g m^2", 1e3)}
+"""Unit in which a number is shown, and the factor, by its SI unit; others are shown as they are."""
+
+
+def document(found: ServoIdentification) -> Document:
+    """Return the numbers found, their intervals, and the fit."""
+    notes = _cautions(found) if found.right else []
+    return _document(
+        found,
+        "bad" if not found.right else "fair" if notes else "good",
+        plan=None,
+        cautions=[Caution(one) for one in notes],
+        found=_table(found, weak=True),
+        log=found.model.log.name,
+        motion=partial(_figure, found, found.model.log.cranks),
+        residuals=partial(_residual_figure, found),
+    )
+
+
+def plan_document(plan: ServoPlan) -> Document:
+    """Return the setpoints, and the accuracy that their log will allow."""
+    names, notes = ("sine", "sines", "steps"), []
+    smaller = [
+        f"{name} {100 * share:.0f} %"
+        for name, share in zip(names, plan.shares, strict=True)
+        if share < 1
+    ]
+    if smaller:
+        notes.append(f"reduced to keep the limits: {', '.join(smaller)}")
+    return _document(
+        plan.expected,
+        "plain",
+        plan=plan,
+        file=SETPOINTS_FILE,
+        duration=plan.log.times[-1],
+        torque=number(plan.peak_torque, 2),
+        speed=number(plan.peak_speed, 2),
+        cautions=[Caution(one) for one in notes],
+        found=_table(plan.expected, weak=False),
+        log="",
+        motion=partial(_figure, plan.expected, plan.log.setpoints),
+        residuals=None,
+    )
+
+
+def _document(identified: ServoIdentification, tone: Tone, **more: object) -> Document:
+    limit = identified.model.torque_limit
+    rows = [_row(name, *one) for name, one in identified.combined.items()]
+    return from_template(
+        "servo_identification",
+        tone,
+        right=identified.right,
+        mechanism=identified.model.mechanism.name,
+        limit="none" if np.isinf(limit) else f"{limit:g} N m",
+        mass=number(identified.model.mechanism.plate.mass),
+        stiffness=number(identified.theta[K]),
+        delay=number(1e3 * identified.theta[D]),
+        residual=number(np.degrees(identified.residual), 2),
+        deviation=number(np.degrees(identified.deviation), 2),
+        rounding=number(np.degrees(identified.rounding), 2),
+        combined=Table(("number", "unit", "found", "±"), rows, brief=True),
+        **more,
+    )
+
+
+def _cautions(found: ServoIdentification) -> list[str]:
+    notes = []
+    if weak := found.weak:
+        names = ", ".join(name.replace("_", " ") for name in weak)
+        notes.append(f"weak, so use them together only: {names}")
+    if found.ball_joints_tried and BALL_FRICTION not in found.free:
+        notes.append("friction of the ball joints does not explain the residual")
+    return notes
+
+
+def _row(name: str, value: float, width: float, unit: str) -> tuple[str, ...]:
+    shown, factor = _UNITS.get(unit, (unit, 1.0))
+    numbers = number(factor * value, 4), number(factor * width, 2)
+    return (name.replace("_", " "), shown, *numbers)
+
+
+def _table(found: ServoIdentification, weak: bool) -> Table:
+    head = ("number", "unit", "found", "±", "") if weak else ("number", "unit", "assumed", "±")
+    rows = []
+    for k in found.free:
+        mark = ("weak" if NAMES[k] in found.weak else "",) if weak else ()
+        rows.append((*_row(NAMES[k], found.theta[k], found.intervals[k], UNITS[k]), *mark))
+    return Table(head, rows, brief=True)
+
+
+def _curves(times: Array, values: Array) -> list[Curve]:
+    pairs = zip(LEGS, LEG_LINES, strict=True)
+    return [Curve(times, values[:, i], f"crank {leg}", look) for i, (leg, look) in enumerate(pairs)]
+
+
+def _figure(found: ServoIdentification, angles: Array) -> Figure:
+    """Draw crank angles (n, 6) over the log, in degrees."""
+    curves = _curves(found.model.log.times, np.degrees(angles))
+    return draw([Panel("crank angles  [deg]", curves, legend="panel", height=2.5)])
+
+
+def _residual_figure(found: ServoIdentification) -> Figure:
+    """Draw the residuals of the crank angles, in degrees."""
+    model = found.model
+    curves = _curves(model.log.times[model.counted], np.degrees(found.residuals))
+    return draw([Panel("residuals  [deg]", curves, legend="panel", height=2.5)])

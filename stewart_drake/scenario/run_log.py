@@ -1,0 +1,524 @@
+"""Logs that are written while a run goes on: MCAP, CSV, and JSON over UDP; and their reading.
+
+A log has a channel for each signal of `scenario.signals`, with a field for each component. In MCAP
+the messages are JSON with a JSON schema, as Foxglove, rerun and PlotJuggler read them, and the
+metadata record `stewart_drake` has the scenario. A CSV file has one column per component, and its
+scenario in a file of the same name that ends in .yaml. A killed run leaves a readable file.
+"""
+
+import contextlib
+import copy
+import csv
+import json
+import math
+import os
+import queue
+import re
+import socket
+import struct
+import tempfile
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
+import xarray as xr
+
+from stewart_drake.files.arrayio import load_netcdf
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import write_whole
+from stewart_drake.files.versions import versions
+from stewart_drake.files.yamlio import parse_yaml, validate
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import scenario_yaml
+from stewart_drake.scenario.renames import with_new_names
+from stewart_drake.scenario.signals import (
+    COORDINATE_NAMES,
+    COORDINATES,
+    NUM_LEGS,
+    Signal,
+    run_dimensions,
+    run_signals,
+)
+from stewart_drake.types import Array
+
+EXPECTED: Final = "signals.nc, a log (.mcap, .csv) or the folder of a run"
+_NAMES: Final = dict(zip(COORDINATES, COORDINATE_NAMES, strict=True))
+_METADATA: Final = "stewart_drake"
+_CHUNK: Final = 1 << 16
+"""Bytes of JSON after which an MCAP file is written on."""
+_QUEUE: Final = 4096
+"""Largest number of rows that wait for a slow disk."""
+_ENCODER: Final = re.compile(r"measurement_A\d")
+
+
+class Channel(NamedTuple):
+    """A signal in a log.
+
+    Attributes:
+        name: of the signal.
+        fields: names of its components in JSON.
+        heads: of its columns in CSV, with units.
+        meaning: in words.
+    """
+
+    name: str
+    fields: tuple[str, ...]
+    heads: tuple[str, ...]
+    meaning: str
+
+
+def headings(name: str, labels: Iterable[str | int], units: Iterable[str]) -> list[str]:
+    """Return the column heads of a signal, such as `error_roll[rad]`; labels may be none."""
+    spoken = ("_".join(_NAMES.get(word, word) for word in str(one).split("_")) for one in labels)
+    columns = [f"{name}_{label}" for label in spoken] or [name]
+    pairs = zip(columns, units, strict=True)
+    return [f"{column}[{'-' if unit == '1' else unit}]" for column, unit in pairs]
+
+
+def channels_of(samples: int | None) -> list[Channel]:
+    """Return the recorded signals of a run with this number of encoder readings a period."""
+    dimensions, found = run_dimensions(samples), []
+    for signal in run_signals(samples).values():
+        if signal.source:
+            dimension = signal.quantity.dimension
+            labels = () if dimension is None else dimensions[dimension].labels
+            fields = tuple(_field(label) for label in labels) or ("value",)
+            heads = tuple(headings(signal.name, labels, signal.quantity.units))
+            found.append(Channel(signal.name, fields, heads, signal.long_name))
+    return found
+
+
+def _field(label: str | int) -> str:
+    """Return a label as the name of a JSON field: `roll`, `rate_roll`, `leg_1`, `A1_0`."""
+    if isinstance(label, int):
+        return f"leg_{label}"
+    words = "_".join(_NAMES.get(word, word) for word in label.split("_"))
+    return re.sub(r"\W+", "_", words).strip("_")
+
+
+class RunLog(Protocol):
+    """A log that is being written."""
+
+    def write(self, time: float, values: Mapping[str, Array]) -> None:
+        """Add the values of channels at a time in s; others have none then."""
+        ...
+
+    def close(self) -> None:
+        """Complete the log."""
+        ...
+
+
+def open_log(path: Path, scenario: Scenario) -> RunLog:
+    """Open a log for writing.
+
+    Args:
+        path: ends in .mcap or .csv.
+        scenario: of the run.
+
+    Raises:
+        ConfigError: another suffix, no package mcap, or a file that cannot be written.
+    """
+    kinds: dict[str, Callable[[Path, Scenario], RunLog]] = {".mcap": McapLog, ".csv": CsvLog}
+    if path.suffix not in kinds:
+        raise ConfigError(f"--log: got {str(path)!r}; expected a file that ends in .mcap or .csv")
+    try:
+        return kinds[path.suffix](path, scenario)
+    except OSError as error:
+        raise ConfigError(
+            f"--log: {path} cannot be written ({error.strerror}); expected a file"
+        ) from None
+
+
+def _members(channel: Channel, values: Array) -> dict[str, float]:
+    """Return the finite components by field; JSON has no NaN."""
+    pairs = zip(channel.fields, np.atleast_1d(values).tolist(), strict=True)
+    return {field: value for field, value in pairs if math.isfinite(value)}
+
+
+class McapLog:
+    """An MCAP file, with one topic for each signal.
+
+    Args:
+        path: file, which is replaced.
+        scenario: of the run.
+    """
+
+    def __init__(self, path: Path, scenario: Scenario) -> None:
+        writer = _mcap("mcap.writer")
+        self._file = open(path, "wb")  # noqa: SIM115 (closed by `close`)
+        self._writer = writer.Writer(self._file, chunk_size=_CHUNK)
+        self._writer.start(profile="", library=f"stewart_drake {versions()['stewart-drake']}")
+        about = {"scenario": scenario_yaml(scenario), "versions": json.dumps(versions())}
+        self._writer.add_metadata(_METADATA, about)
+        self._channels: dict[str, tuple[int, Channel]] = {}
+        for channel in channels_of(scenario.sensor.samples):
+            properties = {"time": {"type": "number", "description": "s"}}
+            for field, head in zip(channel.fields, channel.heads, strict=True):
+                unit = head.partition("[")[2].removesuffix("]")
+                properties[field] = {"type": "number", "description": unit}
+            schema = {
+                "title": channel.name,
+                "description": channel.meaning,
+                "type": "object",
+                "properties": properties,
+            }
+            number = self._writer.register_schema(
+                f"stewart_drake.{channel.name}", "jsonschema", json.dumps(schema).encode()
+            )
+            topic = self._writer.register_channel(f"/{channel.name}", "json", number)
+            self._channels[channel.name] = topic, channel
+        self._row = 0
+
+    def write(self, time: float, values: Mapping[str, Array]) -> None:
+        at = round(time * 1e9)
+        for name, components in values.items():
+            topic, channel = self._channels[name]
+            data = json.dumps({"time": time} | _members(channel, components)).encode()
+            self._writer.add_message(topic, at, data, at, self._row)
+        self._row += 1
+
+    def close(self) -> None:
+        self._writer.finish()
+        self._file.close()
+
+
+class CsvFile:
+    """A CSV file of rows of numbers, which read back exactly; empty cells are not finite.
+
+    Each row is written whole or not at all.
+
+    Args:
+        path: file, which is replaced; None for a temporary one without a name.
+        heads: cells of the first line.
+
+    Attributes:
+        descriptor: of the open file.
+    """
+
+    def __init__(self, path: Path | None, heads: Iterable[str]) -> None:
+        if path is None:
+            with tempfile.TemporaryFile() as file:
+                self.descriptor = os.dup(file.fileno())
+        else:
+            flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
+            self.descriptor = os.open(path, flags, 0o666)
+        self._whole = 0
+        self._add(heads)
+
+    def write(self, row: Iterable[float]) -> None:
+        """Add a row of numbers."""
+        self._add(repr(x) if math.isfinite(x) else "" for x in row)
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self.descriptor)
+
+    def _add(self, cells: Iterable[str]) -> None:
+        data = (",".join(cells) + "\n").encode("ascii")
+        try:
+            done = 0
+            while done < len(data):
+                done += os.write(self.descriptor, data[done:])
+        except OSError:
+            os.ftruncate(self.descriptor, self._whole)
+            raise
+        self._whole += done
+
+
+class CsvLog:
+    """A CSV file with a line per instant.
+
+    Args:
+        path: file, which is replaced; its scenario is in a file that ends in .yaml.
+        scenario: of the run.
+    """
+
+    def __init__(self, path: Path, scenario: Scenario) -> None:
+        self._channels = channels_of(scenario.sensor.samples)
+        write_whole(path.with_suffix(".yaml"), scenario_yaml(scenario))
+        self._file = CsvFile(path, csv_heads(self._channels))
+
+    def write(self, time: float, values: Mapping[str, Array]) -> None:
+        numbers = [time]
+        for channel in self._channels:
+            found = values.get(channel.name)
+            width = len(channel.fields)
+            numbers += [math.nan] * width if found is None else np.atleast_1d(found).tolist()
+        self._file.write(numbers)
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def csv_heads(channels: Iterable[Channel]) -> list[str]:
+    """Return the first line of a CSV log."""
+    return ["time[s]", *(head for channel in channels for head in channel.heads)]
+
+
+class UdpMirror:
+    """JSON over UDP, one datagram per instant, for PlotJuggler's UDP server.
+
+    Args:
+        address: host and port to send to.
+        scenario: of the run.
+    """
+
+    def __init__(self, address: tuple[str, int], scenario: Scenario) -> None:
+        self._channels = {one.name: one for one in channels_of(scenario.sensor.samples)}
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._address = address
+
+    def write(self, time: float, values: Mapping[str, Array]) -> None:
+        row: dict[str, Any] = {"timestamp": time}
+        for name, components in values.items():
+            row[name] = _members(self._channels[name], components)
+        with contextlib.suppress(OSError):  # nothing listens, or the network is full
+            self._socket.sendto(json.dumps(row).encode(), self._address)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class Background:
+    """A log or file that a thread writes, for a loop in real time; an error is reported once.
+
+    Args:
+        log: to write.
+        name: in the report.
+        say: prints a line.
+    """
+
+    def __init__(self, log: RunLog | CsvFile, name: str, say: Callable[[str], None]) -> None:
+        self._log: Any = log
+        self._name, self._say, self._failed = name, say, False
+        self._rows: queue.Queue[tuple[Any, ...] | None] = queue.Queue(_QUEUE)
+        self._thread = threading.Thread(target=self._work, daemon=True)
+
+    def write(self, *row: Any) -> None:
+        """Add what the log's `write` takes, without waiting."""
+        if not self._thread.is_alive():
+            # Started here it has the priority of the loop, which waits for the GIL.
+            self._thread.start()
+        try:
+            self._rows.put_nowait(copy.deepcopy(row))
+        except queue.Full:
+            self._fail("the disk is too slow")
+
+    def close(self) -> None:
+        """Write the waiting rows and close the log."""
+        if self._thread.is_alive():
+            self._rows.put(None)
+            self._thread.join()
+        with self._reported():
+            self._log.close()
+
+    def _work(self) -> None:
+        while (row := self._rows.get()) is not None:
+            if not self._failed:
+                with self._reported():
+                    self._log.write(*row)
+
+    @contextlib.contextmanager
+    def _reported(self) -> Any:
+        try:
+            yield
+        except OSError as error:
+            self._fail(str(error.strerror))
+
+    def _fail(self, reason: str) -> None:
+        if not self._failed:
+            self._failed = True
+            self._say(f"{self._name}: {reason}; the run goes on, the file ends here")
+
+
+# ---------------------------------------------------------------- reading
+
+
+def dataset_of(
+    times: Array, values: Mapping[str, Array], scenario: str | None, samples: int | None
+) -> xr.Dataset:
+    """Return signals (n, size) by name as a Dataset over `time` (n,) in s, with the error.
+
+    Args:
+        times: s.
+        values: of the recorded signals; a missing one is left out.
+        scenario: YAML, or None.
+        samples: encoder readings per period, None for a measured state.
+    """
+    values = dict(values)
+    if "pose" in values and "reference" in values:
+        values["error"] = values["pose"] - values["reference"]
+    known = run_signals(samples)
+    variables = {name: _variable(known[name], values[name]) for name in known if name in values}
+    coordinates: dict[str, Any] = {
+        name: (name, list(dimension.labels), {"long_name": dimension.long_name})
+        for name, dimension in run_dimensions(samples).items()
+    }
+    coordinates["time"] = ("time", times, {"units": "s", "long_name": "time"})
+    attributes = {
+        "title": "closed loop of a rotary Stewart platform with delayed torques",
+        "versions": json.dumps(versions()),
+    } | ({} if scenario is None else {"scenario": scenario})
+    return xr.Dataset(variables, coordinates, attributes)
+
+
+def _variable(signal: Signal, values: Array) -> tuple[tuple[str, ...], Array, dict[str, str]]:
+    """Return dimensions, values and attributes of a signal in the record."""
+    dimension = signal.quantity.dimension
+    attributes = {"units": signal.unit, "long_name": signal.long_name}
+    if dimension is None:
+        return ("time",), values[:, 0], attributes
+    return ("time", dimension), values, attributes
+
+
+def is_run(path: Path) -> bool:
+    """Return whether a file or folder is of a run, not the CSV log of a real machine."""
+    if path.suffix != ".csv" or path.is_dir():
+        return path.suffix in (".nc", ".mcap") or path.is_dir()
+    with contextlib.suppress(OSError, UnicodeDecodeError), open(path, encoding="utf-8") as file:
+        return file.readline(1 << 16).startswith("time[s],pose_roll[rad]")
+    return False
+
+
+def read_log(path: str | Path) -> xr.Dataset:
+    """Return the signals of a run as `SimulationResult.signals` has them.
+
+    Args:
+        path: signals.nc, a log (.mcap or .csv), or the folder of a run, whose signals.nc is taken
+            before its logs. A log without an end, of a run that was killed, is read up to there.
+
+    Raises:
+        ConfigError: no such file, or not of a run; one line.
+    """
+    path = Path(path)
+    if path.is_dir():
+        found = [*path.glob("signals.nc"), *sorted(path.glob("*.mcap")), *path.glob("log.csv")]
+        if not found:
+            raise ConfigError(f"{path}: has no signals.nc, .mcap or log.csv; expected {EXPECTED}")
+        return read_log(found[0])
+    if not path.exists():
+        raise ConfigError(f"{path}: no such file; expected {EXPECTED}")
+    if path.suffix == ".nc":
+        return load_netcdf(path, EXPECTED)
+    readers = {".mcap": _read_mcap, ".csv": _read_csv}
+    if path.suffix not in readers:
+        raise ConfigError(f"{path}: got a file of another kind; expected {EXPECTED}")
+    try:
+        return readers[path.suffix](path)
+    except (OSError, ValueError, KeyError) as error:
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise ConfigError(f"{path}: cannot be read ({reason}); expected {EXPECTED}") from None
+
+
+def scenario_of(signals: xr.Dataset, path: Path) -> Scenario:
+    """Return the scenario of a log; `path` is for messages.
+
+    Raises:
+        ConfigError: it has none, or a bad one.
+    """
+    text = signals.attrs.get("scenario")
+    if text is None:
+        raise ConfigError(
+            f"{path}: has no scenario; expected it in {path.with_suffix('.yaml').name} or "
+            "summary.json in the same folder"
+        )
+    place = f"{path}: scenario"
+    return validate(Scenario, with_new_names(parse_yaml(text, place)), place)
+
+
+def _read_mcap(path: Path) -> xr.Dataset:
+    records, errors = _mcap("mcap.records"), _mcap("mcap.exceptions")
+    topics: dict[int, str] = {}
+    times: dict[int, float] = {}
+    messages: dict[str, dict[int, dict[str, float]]] = {}
+    scenario = None
+    with open(path, "rb") as file:
+        reader = _mcap("mcap.stream_reader").StreamReader(file)
+        try:
+            for record in reader.records:
+                if isinstance(record, records.Metadata) and record.name == _METADATA:
+                    scenario = record.metadata["scenario"]
+                elif isinstance(record, records.Channel):
+                    topics[record.id] = record.topic.removeprefix("/")
+                elif isinstance(record, records.Message):
+                    found = json.loads(record.data)
+                    times[record.sequence] = float(found["time"])
+                    messages.setdefault(topics[record.channel_id], {})[record.sequence] = found
+        except (errors.McapError, struct.error, EOFError, OSError) as error:  # cut in a record
+            if not times:
+                raise ValueError(str(error) or "no MCAP file") from None
+    if not times:
+        raise ValueError("no messages")
+    if scenario is None:
+        raise ValueError("no metadata of stewart_drake")
+    samples = _samples(scenario, f"{path}: scenario")
+    values = {}
+    for channel in channels_of(samples):
+        if rows := messages.get(channel.name):
+            values[channel.name] = np.array(
+                [
+                    [rows.get(row, {}).get(field, math.nan) for field in channel.fields]
+                    for row in sorted(times)
+                ]
+            )
+    return dataset_of(np.array([times[row] for row in sorted(times)]), values, scenario, samples)
+
+
+def _samples(scenario: str, place: str) -> int | None:
+    """Return the encoder readings per period of a scenario in YAML."""
+    sensor = parse_yaml(scenario, place).get("sensor", {})
+    return int(sensor.get("samples", 1)) if sensor.get("kind") == "encoders" else None
+
+
+def _read_csv(path: Path) -> xr.Dataset:
+    with open(path, encoding="utf-8", newline="") as file:
+        lines = csv.reader(file)
+        heads, rows = next(lines, []), [*lines]
+    encoders = sum(bool(_ENCODER.match(head)) for head in heads)
+    samples = encoders // NUM_LEGS or None
+    channels = channels_of(samples)
+    expected = csv_heads(channels)
+    if heads[: len(expected)] != expected:
+        wrong = next((a for a, b in zip(heads, expected, strict=False) if a != b), "")
+        raise ValueError(f"column {wrong!r}, which a log of a run does not have there")
+    if rows and len(rows[-1]) < len(heads):
+        del rows[-1]  # of a run that was killed
+    for number, row in enumerate(rows, 2):
+        if len(row) != len(heads):
+            raise ValueError(f"line {number} has {len(row)} cells in place of {len(heads)}")
+    if not rows:
+        raise ValueError("no rows")
+    table = np.array([[float(cell.strip() or "nan") for cell in row] for row in rows])
+    values, at = {}, 1
+    for channel in channels:
+        width = len(channel.fields)
+        part, at = table[:, at : at + width], at + width
+        values[channel.name] = part
+    return dataset_of(table[:, 0], values, _scenario_near(path), samples)
+
+
+def _scenario_near(path: Path) -> str | None:
+    """Return the scenario of a CSV log as YAML: from NAME.yaml or summary.json."""
+    sidecar, summary = path.with_suffix(".yaml"), path.parent / "summary.json"
+    if sidecar.exists():
+        return sidecar.read_text("utf-8")
+    if summary.exists():
+        found = json.loads(summary.read_text("utf-8")).get("scenario")
+        return None if found is None else json.dumps(found)
+    return None
+
+
+def _mcap(module: str) -> Any:
+    """Import a module of the package mcap."""
+    import importlib
+
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise ConfigError(
+            ".mcap: needs the package mcap; expected pip install 'stewart_drake[log]', or a .csv "
+            "file"
+        ) from None

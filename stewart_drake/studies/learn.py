@@ -1,0 +1,289 @@
+"""Learning a torque from repetitions of a motion.
+
+Each repetition simulates the scenario for some periods of its motion. From the states x_k at the
+samples and the torques u_k that acted between them follows the torque d_k that the model lacks:
+with f the prediction of the model, with the parameters estimated in the last period, the rates are
+those of
+
+    x_{k+1} = f(x_k, u_k + d_k).
+
+The fit of -d_k by harmonics of the motion has coefficients g(c), where c are those of the learned
+torque in the repetition. Without a model error that depends on the motion g would not depend on c,
+and g(c) would be right at once. In general c = g(c) is solved by Anderson's method (theory.md).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.learned import LearnedLqi, LearnedTorque, harmonics
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.timeline import Timeline, TorqueSchedule
+from stewart_drake.loop.learned import HARMONICS, harmonics_below, motion_period
+from stewart_drake.loop.preparation import Experiment, prepare
+from stewart_drake.loop.results import SimulationResult, accumulated_error
+from stewart_drake.loop.simulation import simulate
+from stewart_drake.scenario.calibration import believed_delay
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.signals import NUM_PARAMETERS, POSE, RATES
+from stewart_drake.studies.jobs import Progress
+from stewart_drake.studies.study_options import LearnOptions
+from stewart_drake.types import Array
+
+_NEWTON: Final = 2
+"""Steps of Newton's method for a lacking torque, which is nearly linear in the rates."""
+_SETTLING: Final = 5.0
+"""Time before the last period of a repetition, in delays."""
+_DEPTH: Final = 3
+"""Largest number of differences of repetitions in a step of Anderson's method."""
+_POINTS: Final = 100
+"""Instants of a period at which a learned torque is looked at."""
+_PATIENCE: Final = 2
+"""Repetitions without a smaller error, one after the other, that end learning."""
+
+
+@dataclass(frozen=True, eq=False)
+class Repetition:
+    """One repetition of a motion.
+
+    Attributes:
+        learned: torque that was used, or None in the first one.
+        result: the run.
+        error: E of its last period, % s; infinite if it did not complete.
+    """
+
+    learned: LearnedTorque | None
+    result: SimulationResult
+    error: float
+
+    @property
+    def largest(self) -> float:
+        """Largest learned torque, N m."""
+        if self.learned is None:
+            return 0.0
+        times = np.linspace(0.0, self.learned.period, _POINTS)
+        return float(np.abs(self.learned(times)).max())
+
+
+@dataclass(frozen=True)
+class LearnStudy:
+    """Result of learning.
+
+    Attributes:
+        experiment: of the scenario.
+        period: of the motion, s.
+        repetitions: in order.
+        asked: number of repetitions that were asked for.
+        interrupted: whether Ctrl-C ended it early.
+    """
+
+    experiment: Experiment
+    period: float
+    repetitions: Sequence[Repetition]
+    asked: int
+    interrupted: bool
+
+    @property
+    def best(self) -> Repetition:
+        """Repetition with the least error."""
+        return min(self.repetitions, key=lambda one: one.error)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether it ended because the error no longer fell."""
+        return len(self.repetitions) < self.asked and not self.interrupted
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        return {
+            "period": self.period,
+            "errors": [one.error for one in self.repetitions],
+            "statuses": [one.result.status for one in self.repetitions],
+            "best": 1 + list(self.repetitions).index(self.best),
+            "stopped": self.stopped,
+            "interrupted": self.interrupted,
+        }
+
+
+def study_learn(
+    scenario: Scenario, options: LearnOptions, progress: Progress | None = None
+) -> LearnStudy:
+    """Repeat the motion of a scenario, and learn from each repetition.
+
+    Learning ends early after two repetitions without a smaller error. Each repetition has
+    other noise.
+
+    Args:
+        scenario: with a periodic motion and torques over a wire of known delay.
+        options: see `LearnOptions`.
+        progress: called for each repetition.
+
+    Raises:
+        ConfigError: a scenario whose motion or controller cannot use a learned torque.
+    """
+    if scenario.controller.learned is not None:
+        raise ConfigError("controller.learned: got a file; expected null, where learning begins")
+    period = motion_period(scenario)
+    # The rules for a file hold for the torque that is learned.
+    asking = replace(scenario, controller=replace(scenario.controller, learned="learned.npz"))
+    asking.check()
+    dt = scenario.controller.period
+    eta = believed_delay(scenario).eta(dt)
+    periods = 1 + math.ceil(max(1.0, _SETTLING * eta / period))
+    run = replace(scenario, duration=dt * math.ceil(periods * period / dt - 1e-9), log_period=None)
+    experiment = prepare(run)
+    number = harmonics_below(period, dt)
+    done: list[Repetition] = []
+    learned: LearnedTorque | None = None
+    steps, interrupted = _Anderson(), False
+    for k in range(options.repetitions):
+        sensor = replace(run.sensor, seed=run.sensor.seed + k)
+        result = simulate(
+            replace(run, sensor=sensor),
+            modify_law=partial(_learning, learned=learned),
+            judge_stability=False,
+        )
+        if interrupted := result.status == "interrupted":
+            break
+        done.append(Repetition(learned, result, last_error(result, experiment.scale, period)))
+        if progress is not None:
+            progress(k + 1, options.repetitions)
+        times, torques = lacking_torques(experiment, result, period)
+        errors = [one.error for one in done]
+        if len(done) - 1 - np.argmin(errors) >= _PATIENCE or len(times) < 2 * (1 + 2 * number):
+            break
+        learned = LearnedTorque(period, steps.after(fit(times, -torques, period, number)))
+    if not done:
+        raise KeyboardInterrupt
+    return LearnStudy(experiment, period, done, options.repetitions, interrupted)
+
+
+def _learning(law: PredictiveLqi, learned: LearnedTorque | None) -> PredictiveLqi:
+    return law if learned is None else LearnedLqi(**law.parts, learned=learned)
+
+
+def last_error(result: SimulationResult, scale: Array, period: float) -> float:
+    """Return E of the last period of a run, % s, infinite if it did not complete."""
+    if result.status != "completed":
+        return math.inf
+    time, error = result.signals.time.values, result.signals.error.values
+    begin = time[-1] - period
+    first = [np.interp(begin, time, column) for column in error.T]
+    later = time > begin
+    at, errors = np.append(begin, time[later]), np.vstack([first, error[later]])
+    return accumulated_error(at, errors, scale)
+
+
+def lacking_torques(
+    experiment: Experiment, result: SimulationResult, period: float
+) -> tuple[Array, Array]:
+    """Return the torques that the model lacks in the last period of a motion.
+
+    Args:
+        experiment: of the scenario.
+        result: a run of it.
+        period: of the motion, s.
+
+    Returns:
+        Middles (n,) of the controller's periods, s, and torques (n, 6), N m.
+    """
+    sc = experiment.scenario
+    dt, delay = sc.controller.period, believed_delay(sc)
+    signals, samples = result.signals, _samples(result, dt)
+    first = max(0, len(samples) - 1 - round(period / dt))
+    parameters = experiment.nominal.plant_parameters.copy()
+    parameters[:NUM_PARAMETERS] = signals.parameters.values[samples[first:]].mean(axis=0)
+    dynamics = StewartDynamics(experiment.mechanism, sc.plant.gravity, parameters)
+    measured = sc.sensor.measures_state and sc.sensor.delay == 0
+    states = (signals.measurement if measured else signals.state_estimate).values[samples]
+    limit = experiment.torque_limit
+    sent = np.clip(signals.torque_commanded.values[samples], -limit, limit)
+    in_flight = np.vstack([experiment.torques_in_flight(delay), sent])
+    acted = Timeline(dt, delay).schedule(in_flight)
+    parts = 1 if delay.fraction == 0 else 2
+    times, found = [], []
+    for k in range(first, len(samples) - 1):
+        if np.all(np.isfinite(states[k : k + 2])):
+            part = slice(parts * k, parts * (k + 1))
+            schedule = TorqueSchedule(acted.torques[part], acted.durations[part])
+            times.append(dt * (k + 0.5))
+            found.append(_lacking(dynamics, states[k], states[k + 1], schedule))
+    return np.array(times), np.reshape(found, (-1, 6))
+
+
+def _samples(result: SimulationResult, dt: float) -> Array:
+    """Return the rows (n,) of the controller's samples."""
+    time = result.signals.time.values
+    wanted = dt * np.arange(math.floor(time[-1] / dt + 1e-9) + 1)
+    return np.asarray(np.searchsorted(time, wanted - 1e-6))
+
+
+def _lacking(
+    dynamics: StewartDynamics, begin: Array, end: Array, schedule: TorqueSchedule
+) -> Array:
+    """Return the constant torque (6,) that explains the rates at the end of a schedule."""
+    torques, durations = schedule
+    lacking = np.zeros(6)
+    for _ in range(_NEWTON):
+        missed = end - dynamics.predict(begin, torques + lacking, durations, 4)[-1]
+        B = dynamics.derivatives(begin[POSE], begin[RATES], torques[0]).B[RATES]
+        lacking = lacking + np.linalg.solve(B * durations.sum(), missed[RATES])
+    return lacking
+
+
+class Fit(NamedTuple):
+    """Least-squares fit of torques by harmonics of a motion.
+
+    Attributes:
+        coefficients: (1 + 2 H, 6), N m, as of `law.learned.LearnedTorque`.
+        variance: sum of the variances of all coefficients, N^2 m^2.
+    """
+
+    coefficients: Array
+    variance: float
+
+
+def fit(times: Array, torques: Array, period: float, number: int) -> Fit:
+    """Fit torques (n, 6) at times (n,) by the first `number` harmonics; the others are 0."""
+    basis = harmonics(2 * np.pi / period * times, number)
+    found = np.linalg.lstsq(basis, torques, rcond=None)[0]
+    left = np.sum((torques - basis @ found) ** 2) / (len(times) - len(found))
+    coefficients = np.zeros((1 + 2 * HARMONICS, 6))
+    sines = 1 + HARMONICS
+    coefficients[: 1 + number] = found[: 1 + number]
+    coefficients[sines : sines + number] = found[1 + number :]
+    return Fit(coefficients, float(left * np.trace(np.linalg.inv(basis.T @ basis))))
+
+
+class _Anderson:
+    """Solution of c = g(c) by Anderson's method, for g with noise.
+
+    With f = g(c) - c, and dF, dG the last differences of f and g,
+
+        c+ = g - dG y,   y = argmin |f - dF y|^2 + s |y|^2,
+
+    s the energy of the noise in a difference, so that noise alone is not extrapolated.
+    """
+
+    def __init__(self) -> None:
+        self._used: Array = np.zeros((1 + 2 * HARMONICS, 6))
+        self._found: list[tuple[Array, Array]] = []
+
+    def after(self, fitted: Fit) -> Array:
+        """Return the coefficients of the next repetition, from the fit after the last one."""
+        g, f = fitted.coefficients, fitted.coefficients - self._used
+        self._found = [*self._found, (g, f)][-1 - _DEPTH :]
+        dG, dF = (
+            np.diff([one.ravel() for one in column], axis=0).T
+            for column in zip(*self._found, strict=True)
+        )
+        noise = 2 * fitted.variance * np.eye(dF.shape[1])
+        y = np.linalg.lstsq(dF.T @ dF + noise, dF.T @ f.ravel(), rcond=None)[0]
+        self._used = g - (dG @ y).reshape(g.shape)
+        return self._used

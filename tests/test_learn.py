@@ -1,0 +1,241 @@
+"""Learning from repetitions: the law with a learned torque, its file, and the study."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import LeafSystem
+
+import stewart_drake as sd
+from stewart_drake.cli import main
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.learned import LearnedLqi, LearnedTorque
+from stewart_drake.loop.learned import HARMONICS, save_learned
+from stewart_drake.loop.preparation import prepare
+from stewart_drake.studies.learn import Fit, _Anderson, fit, study_learn
+from stewart_drake.studies.study_options import LearnOptions
+
+EXACT = ("plant.kind=exact", "start=on_reference", "queue=reference")
+AMPLITUDE = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
+UNMODELLED = (
+    f"reference.amplitude={(0.7 * AMPLITUDE).tolist()}",
+    "plant.coulomb_friction=1e-4",
+    "plant.payload_mass=0.2",
+    "plant.payload_position=[0.01, -0.008, 0.02]",
+    "plant.torque_bias=[3e-4, -3e-4, 3e-4, -3e-4, 3e-4, -3e-4]",
+    "controller.estimate=[]",
+    "controller.integral=false",
+    "controller.w_R=100",
+)
+"""Coulomb friction, a payload off the centre and biases, none of which the law can estimate."""
+
+
+def scenario(*settings):
+    return sd.load_scenario("paper", settings=(*EXACT, *settings))
+
+
+def some_torque(period=2 * np.pi, size=1e-3):
+    coefficients = np.zeros((1 + 2 * HARMONICS, 6))
+    coefficients[[0, 1, 2, 1 + HARMONICS]] = size * np.random.default_rng(1).standard_normal((4, 6))
+    return LearnedTorque(period, coefficients)
+
+
+class Opposite(LeafSystem):
+    """Torque at the shafts: minus a learned torque, held over each period of the controller."""
+
+    def __init__(self, learned, dt):
+        super().__init__()
+        self._learned, self._dt = learned, dt
+        self.DeclareVectorOutputPort("torque", 6, self._torque)
+
+    def _torque(self, context, output):
+        middle = (np.floor(context.get_time() / self._dt + 1e-6) + 0.5) * self._dt
+        output.SetFromVector(-self._learned(np.array([middle]))[0])
+
+
+def add(learned):
+    return lambda law: LearnedLqi(**law.parts, learned=learned)
+
+
+def test_a_learned_torque_cancels_its_opposite_and_nothing_is_left_to_estimate():
+    """The plant with the disturbance -l is the model, for torques without l."""
+    learned = some_torque(size=2e-4)
+    sc = scenario("duration=6")
+    disturbed = {"disturbance": Opposite(learned, 0.1), "judge_stability": False}
+    found = sd.simulate(sc, modify_law=add(learned), **disturbed).signals
+    after = found.sel(time=slice(5.0, None))
+    assert np.abs(found.parameters.values[:, :6]).max() < 1e-5
+    disturbed["disturbance"] = Opposite(learned, 0.1)
+    without = sd.simulate(sc, **disturbed).signals
+    assert np.abs(without.parameters.values[:, :6]).max() > 1e-4
+    missed = np.abs(without.error.sel(time=slice(5.0, None)).values).max()
+    assert np.abs(after.error.values).max() < 0.02 * missed
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.4])
+def test_the_python_law_takes_the_same_torque_as_the_core(fraction):
+    learned = some_torque()
+    sc = scenario("duration=2", f"delay.fraction={fraction}")
+
+    def mine(law):
+        class Mine(type(law.feedforward)):
+            pass
+
+        return LearnedLqi(**law.parts | {"feedforward": Mine()}, learned=learned)
+
+    runs = [sd.simulate(sc, modify_law=one, judge_stability=False) for one in (add(learned), mine)]
+    a, b = (one.signals.torque_commanded.values for one in runs)
+    assert np.abs(a - b).max() < 1e-9 * np.abs(a).max()
+
+
+def test_the_motors_limit_is_on_the_sum():
+    learned = some_torque(size=1e-2)
+    sc = scenario("duration=2", "actuator.torque_limit=0.012")
+    found = sd.simulate(sc, modify_law=add(learned), judge_stability=False)
+    asked = found.signals.torque_commanded.values[::5]
+    assert np.abs(asked).max() > 0.012 >= found.summary["peak_torque_applied"]
+    assert 0 < found.summary["counts"]["saturated_steps"] < 21
+
+
+def test_a_fit_finds_the_harmonics_of_a_motion_that_is_no_multiple_of_the_period():
+    learned = some_torque()
+    times = 0.1 * np.arange(62) + 0.05
+    found = fit(times, learned(times), 2 * np.pi, HARMONICS)
+    np.testing.assert_allclose(found.coefficients, learned.coefficients, atol=1e-15)
+    assert found.variance < 1e-30
+
+
+def test_andersons_method_solves_what_repetition_does_not():
+    """g(c) = b + A c with eigenvalues of -1.5 and 0.3: plain repetition diverges."""
+    shape = (1 + 2 * HARMONICS, 6)
+    b, size = np.random.default_rng(2).standard_normal(shape), np.prod(shape)
+    slope = np.where(np.arange(size) % 2, -1.5, 0.3).reshape(shape)
+    steps, used = _Anderson(), np.zeros(shape)
+    for _ in range(4):
+        used = steps.after(Fit(b + slope * used, 0.0))
+    np.testing.assert_allclose(used, b / (1 - slope), rtol=1e-9)
+
+
+def test_differences_that_are_noise_are_not_extrapolated():
+    shape, rng = (1 + 2 * HARMONICS, 6), np.random.default_rng(3)
+    b, steps = rng.standard_normal(shape), _Anderson()
+    for _ in range(6):
+        noise = 0.01 * rng.standard_normal(shape)
+        used = steps.after(Fit(b + noise, 1e-4 * np.prod(shape)))
+    assert np.std(used - b) < 0.012
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("learned") / "learned.npz"
+    save_learned(path, some_torque(), prepare(scenario()))
+    return path
+
+
+def test_a_file_gives_the_torque_that_was_saved(file):
+    sc = scenario("duration=1", f"controller.learned={file}")
+    read = sd.simulate(sc, judge_stability=False).signals
+    given = sd.simulate(
+        scenario("duration=1"), modify_law=add(some_torque()), judge_stability=False
+    ).signals
+    np.testing.assert_array_equal(read.torque_commanded.values, given.torque_commanded.values)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("controller.period=0.05", "another controller.period, s"),
+        ("delay.steps=7", "another delay, s"),
+        ("reference.frequency=1.1", "another period of the motion"),
+        ("reference.amplitude=[0.1, 0, 0, 0, 0, 0]", "another motion"),
+        ("reference.kind=hold", r"^controller\.learned: .*only a motion that repeats"),
+        ("reference.frequency=[1, 1, 1, 1, 1, 0.9]", "several frequencies"),
+        ("controller.limits=qp", "controller.learned"),
+        ("link.kind=network", "controller.learned"),
+        ("tuner.kind=rule", "controller.learned"),
+        ("controller.delay_estimator=constant", "controller.learned"),
+    ],
+)
+def test_a_file_is_refused_elsewhere_in_one_line(file, setting, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        prepare_law(scenario(f"controller.learned={file}", setting))
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_of_another_machine_or_damaged_is_refused(file, tmp_path):
+    own = prepare(scenario())
+    other = dataclasses.replace(own.mechanism, crank_lengths=1.01 * own.mechanism.crank_lengths)
+    save_learned(tmp_path / "other.npz", some_torque(), own._replace(mechanism=other))
+    bad = some_torque()
+    bad.coefficients[0, 0] = np.nan
+    save_learned(tmp_path / "nan.npz", bad, own)
+    (tmp_path / "text.npz").write_text("text")
+    for name, message in (
+        *(("other.npz", "another machine"), ("nan.npz", "NaN"), ("text.npz", "cannot be read")),
+        ("none.npz", "cannot be read"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            prepare_law(scenario(f"controller.learned={tmp_path / name}"))
+
+
+def prepare_law(sc):
+    from stewart_drake.loop.law_design import compose_law
+
+    return compose_law(prepare(sc))
+
+
+def test_a_board_does_not_get_a_learned_torque(file, tmp_path):
+    sc = scenario(f"controller.learned={file}")
+    with pytest.raises(ConfigError, match=r"^controller\.learned: "):
+        sd.export_c(sc, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "settings", [("reference.kind=hold",), ("link.kind=network",), ("controller.limits=qp",)]
+)
+def test_what_cannot_be_learned_is_refused(settings):
+    with pytest.raises(ConfigError) as error:
+        study_learn(scenario(*settings), LearnOptions())
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frequency", [2 * np.pi / 6, 1.0])
+def test_four_corrections_remove_friction_payload_and_bias(frequency):
+    sc = scenario(*UNMODELLED, f"reference.frequency={frequency}")
+    found = study_learn(sc, LearnOptions(repetitions=5))
+    errors = [one.error for one in found.repetitions]
+    assert 13 < errors[0] < 15 and found.best.error < 0.1
+    assert found.summary["best"] == 5
+
+
+@pytest.mark.slow
+def test_learning_leaves_to_the_estimator_what_it_finds():
+    """Payload and biases are estimated: there is next to nothing to learn."""
+    settings = (
+        "plant.payload_mass=0.4",
+        "plant.torque_bias=[3e-4, -3e-4, 3e-4, -3e-4, 3e-4, -3e-4]",
+    )
+    found = study_learn(scenario(*settings), LearnOptions(repetitions=3))
+    assert max(one.error for one in found.repetitions) < 0.02
+
+
+@pytest.mark.slow
+def test_the_command_writes_what_a_run_uses(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    settings = [word for one in (*EXACT, *UNMODELLED) for word in ("--set", one)]
+    out = Path("out")
+    assert main(["learn", "paper", *settings, "--repetitions", "2", "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert "Learning lowers E" in text and "learned.npz" in text
+    assert max(map(len, text.splitlines())) <= 80
+    page = (out / "report.html").read_text()
+    assert page.count("<iframe") == 2
+    errors = []
+    for more in ([], ["--set", f"controller.learned={out / 'learned.npz'}"]):
+        run = f"run{len(more)}"
+        assert main(["simulate", "paper", *settings, *more, "--quiet", "--out", run]) == 0
+        errors.append(sd.read_log(run).error)
+    before, after = (np.abs(one.sel(time=slice(5, None)).values).max() for one in errors)
+    assert after < 0.25 * before

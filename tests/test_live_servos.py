@@ -1,0 +1,199 @@
+"""Servos over a network: plans of setpoints between `live` and a machine."""
+
+import threading
+from collections import Counter
+
+import numpy as np
+import pytest
+
+import stewart_drake as sd
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.live.design import check_controller
+from stewart_drake.live.endpoint import Endpoint
+from stewart_drake.live.machine import Machine, Settings
+from stewart_drake.live.protocol import (
+    ControllerFlags,
+    ControllerMessage,
+    Head,
+    MachineFlags,
+    Refusal,
+)
+from stewart_drake.live.session import drive, plans, prepare_session
+from stewart_drake.loop.peer import identity_of
+from stewart_drake.loop.preparation import prepare
+from stewart_drake.loop.servos import servo_law
+from stewart_drake.scenario.run_log import open_log, read_log
+from stewart_drake.scenario.signals import POSE
+from stewart_drake.scenario.trajectories import evaluate
+from tests.live_driver import Clock, in_real_time
+from tests.test_live import Running
+
+NETWORK = "link={kind: network, low: 0, high: 0, loss: 0, playout: 0.1}"
+SESSION, NONCE, ADDRESS = 7, 9, ("127.0.0.1", 50000)
+STEPS = 5  # of delay
+SETTINGS = (f"delay.steps={STEPS}", "plant.accuracy=1e-9")
+
+
+class Wire:
+    """Keeps what a machine sends."""
+
+    def __init__(self):
+        self.said, self.refused, self.unsent = [], Counter(), 0
+
+    def send(self, message, to):
+        self.said.append(message)
+
+    def refuse(self, cause, detail=""):
+        self.refused[cause] += 1
+
+
+class Fed:
+    """A machine that is fed plans by hand, at the instants of its samples."""
+
+    def __init__(self, *settings, rows=16):
+        scenario = sd.load_scenario("reachy_mini", settings=(*SETTINGS, *settings))
+        self.experiment = prepare(scenario)
+        known = prepare(sd.load_scenario("reachy_mini", settings=SETTINGS))
+        self.law, self.motion, _ = servo_law(known)
+        self.clock, self.wire, self.rows = Clock(), Wire(), rows
+        self.machine = Machine(
+            self.experiment, self.wire, Settings(), lambda line: None, self.clock
+        )
+        self.period, self.sequence, self.zero = self.machine.period, 0, self.clock.time
+        self.machine.offers.nonce = lambda *_: NONCE
+        self.begin = 2 * self.period
+        self.say(0, np.empty((0, 6)))
+
+    def say(self, sampled, rows, cranks=True):
+        self.sequence += 1
+        head = Head(SESSION, NONCE, self.sequence, 0, 1, 0, 0)
+        playout = sampled + STEPS * self.period
+        numbers = (sampled, playout, self.begin, rows)
+        message = ControllerMessage(head, ControllerFlags(0), *numbers, cranks=cranks)
+        self.machine._arrive(message, ADDRESS, self.clock.time - self.zero)
+
+    def plan(self, k):
+        """Return the setpoints (n, 6) of sample k, and of those after it."""
+        first = float(self.law.preview_times[0])
+        times = 0.02 * (k + np.arange(self.rows)) + first
+        none = self.law.plant.dynamics.parameters
+        return np.array([self.law.command(evaluate(self.motion, t), none)[POSE] for t in times])
+
+    def run(self, samples, lost=()):
+        """Return the states (n, 12) at the samples, without the plans of some of them."""
+        states = []
+        for k in range(samples):
+            time = self.begin + k * self.period
+            self.clock.time = self.zero + time
+            self.machine.advance(time)
+            states.append(np.array(self.machine._body.state))
+            if k not in lost:
+                self.say(time, self.plan(k))
+        return np.array(states)
+
+
+@pytest.mark.parametrize("link", [(), (NETWORK,)])
+def test_a_machine_with_servos_moves_as_in_the_simulation(link):
+    signals = sd.simulate(
+        sd.load_scenario("reachy_mini", settings=(*SETTINGS, "duration=1")),
+        judge_stability=False,
+    ).signals
+    kept = signals.sel(time=0.02 * np.arange(50), method="nearest")
+    states = Fed(*link).run(50)
+    assert np.ptp(states[:, 0]) > 0.02
+    assert states[:, :6] == pytest.approx(kept.pose.values, abs=1e-5)
+    assert states[:, 6:] == pytest.approx(kept.rates.values, abs=1e-4)
+
+
+def test_a_plan_replaces_those_that_are_lost():
+    """All but each eighth plan lost, up to 15 in a row, change nothing."""
+    lost = {k for k in range(100) if k % 8} | set(range(65, 80))
+    fed = Fed(NETWORK)
+    assert fed.run(100, lost) == pytest.approx(Fed(NETWORK).run(100), abs=1e-12)
+    assert fed.machine.summary()["dry"] == 0
+
+
+def test_a_gap_holds_the_cranks_and_is_reported():
+    fed = Fed(NETWORK)
+    states = fed.run(100, set(range(30, 100)))
+    assert fed.machine.reason.fault  # silence
+    assert MachineFlags.SAFE_HOLDS in fed.wire.said[-1].flags
+    held = fed.plan(29)[-1]
+    found = fed.experiment.mechanism.crank_angles(states[-1, POSE])
+    assert found == pytest.approx(held, abs=0.05)  # the sag of gravity and friction
+    assert fed.wire.said[-1].cranks
+    assert fed.wire.said[-1].acted[0] == pytest.approx(held, abs=1e-12)
+
+
+def test_rows_of_the_other_kind_are_refused():
+    fed = Fed(NETWORK)
+    fed.say(0, np.zeros((1, 6)), cranks=False)
+    assert fed.wire.refused == {Refusal.MALFORMED: 1}
+
+
+def test_the_controller_of_motors_is_refused():
+    servos, motors = (identity_of(sd.load_scenario(name)) for name in ("reachy_mini", "paper"))
+    differing = servos.differing(motors)
+    assert differing is not None and "actuator position_servo" in differing[0]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (("controller.estimate=[payload]",), r"controller\.estimate: got \['payload'\] for live"),
+        (("actuator.kind=servo",), r"actuator\.kind: got 'servo' for live"),
+    ],
+)
+def test_what_a_plan_cannot_carry_is_refused(settings, message):
+    scenario = sd.load_scenario("reachy_mini", settings=settings)
+    with pytest.raises(ConfigError, match=message) as said:
+        check_controller(scenario)
+    assert "\n" not in str(said.value)
+
+
+@pytest.mark.slow
+@in_real_time
+def test_live_drives_servos_over_a_network_that_loses_packets(monkeypatch, tmp_path):
+    """Measured by the true state in the machine's log."""
+    monkeypatch.setattr(Machine, "stop", lambda self: None)
+    way = "low: 0.02, high: 0.1, loss: 0.1"
+    network = f"link={{kind: network, {way}, playout: 0.2, return: {{{way}}}}}"
+    wanted = sd.load_scenario("reachy_mini", settings=("delay.steps=13",))
+    machine = sd.load_scenario("reachy_mini", settings=(network,))
+    running = Running.__new__(Running)
+    with sd_machine(running, machine, tmp_path / "true.csv"):
+        ready = prepare_session(wanted, running.address)
+        said = "\n".join(plans(ready, 3.0, "reachy_mini"))
+        assert "setpoints act 0.26 s" in said and "plans of 16 setpoints" in said
+        result = drive(ready, 3.0, accept_jitter=True, say=lambda line: None)
+    assert result.status == "completed"
+    assert result.summary["live"]["periods_dry"] < 20
+    true = read_log(tmp_path / "true.csv")
+    motion = servo_law(prepare(wanted))[1]
+    began = running.machine.begin / 1e9
+    late = true.sel(time=slice(began + 1.5, began + 2.9))
+    assert late.sizes["time"] > 60
+    expected = np.array([evaluate(motion, t - began)[:3] for t in late.time.values])
+    assert np.abs(late.pose.values[:, :3] - expected).max() < 0.02
+
+
+class sd_machine:
+    """A machine of any scenario in a thread, with a log of its true state."""
+
+    def __init__(self, running, scenario, path):
+        running.lines, running.endpoint = [], Endpoint(ControllerMessage, "127.0.0.1", 0)
+        running.machine = Machine(
+            prepare(scenario), running.endpoint, Settings(), running.lines.append
+        )
+        self.log = running.machine._log = open_log(path, scenario)
+        running.address = running.endpoint.address
+        self.running = running
+
+    def __enter__(self):
+        self.running._stopping = threading.Event()
+        self.running._thread = threading.Thread(target=self.running._run)
+        return self.running.__enter__()
+
+    def __exit__(self, *args):
+        self.running.__exit__(*args)
+        self.log.close()

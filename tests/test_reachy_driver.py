@@ -1,0 +1,255 @@
+"""The driver of Reachy Mini, against a stand-in for the robot's daemon on loopback."""
+
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+
+import stewart_drake as sd
+from stewart_drake.cli import main
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.servos import Stiffness
+from stewart_drake.live.machine import Machine
+from stewart_drake.live.options import MachineOptions
+from stewart_drake.live.protocol import SECOND, ControllerMessage, Head, MachineFlags
+from stewart_drake.live.reachy import Daemon, RobotMachine, SoftSetpoints, open_robot
+from stewart_drake.live.session import drive, prepare_session
+from stewart_drake.loop.peer import Fault
+from stewart_drake.loop.preparation import prepare
+from stewart_drake.loop.servos import servo_law
+from stewart_drake.scenario.signals import POSE
+from stewart_drake.scenario.trajectories import evaluate
+from tests.live_driver import Clock, in_real_time
+from tests.test_live_servos import Wire
+
+server = pytest.importorskip("websockets.sync.server")
+
+ROBOT = sd.load_mechanism("reachy_mini")
+SLEEP = ROBOT.crank_angles(ROBOT.home + [0.0, 0.2, 0.0, 0.0, 0.0, -0.01])
+STATUS = {
+    "type": "daemon_status",
+    "state": "running",
+    "simulation_enabled": True,
+    "backend_status": {"motor_control_mode": "enabled", "error": None},
+}
+
+
+class StandIn:
+    """A daemon whose head is at once where the last setpoint was; it sends recorded messages."""
+
+    def __init__(self, port=0):
+        self.joints, self.sent = np.append(0.1, SLEEP), []
+        self.says = "positions"  # or garbage, nothing
+        self._server = server.serve(self._serve, "127.0.0.1", port)
+        self.port = self._server.socket.getsockname()[1]
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread.start()
+
+    def _serve(self, socket):
+        socket.send(json.dumps(STATUS))
+        while not self._closing.is_set():
+            if self.says == "positions":
+                joints = self.joints.tolist()
+                message = {"head_joint_positions": joints, "antennas_joint_positions": [-3.0, 3.0]}
+                socket.send(json.dumps({"type": "joint_positions"} | message))
+                socket.send(json.dumps({"type": "head_pose", "head_pose": np.eye(4).tolist()}))
+            elif self.says == "garbage":
+                for text in ("{", b"\0\1", "[]", '{"type": "joint_positions"}'):
+                    socket.send(text)
+                nan = [float("nan")] * 7
+                odd = {"type": "joint_positions", "head_joint_positions": nan}
+                socket.send(json.dumps(odd))
+            self._take(socket, time.monotonic() + 0.02)
+
+    def _take(self, socket, until):
+        while (left := until - time.monotonic()) > 0:
+            try:
+                message = json.loads(socket.recv(timeout=left))
+            except TimeoutError:
+                return
+            assert message["type"] == "set_head_joints" and len(message["joints"]) == 7
+            self.joints = np.array(message["joints"])
+            self.sent.append((time.monotonic(), self.joints))
+
+    def close(self):
+        self._closing.set()
+        self._server.shutdown()
+        self._thread.join()
+
+
+@pytest.fixture
+def daemon():
+    made = StandIn()
+    yield made
+    made.close()
+
+
+def until(condition, seconds=10.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+# ---------------------------------------------------------------- setpoints without jumps
+
+
+def soft(low=-10.0, high=10.0, most=np.inf):
+    servo = Stiffness(10.0, 0.1, np.full(6, low), np.full(6, high), most)
+    return SoftSetpoints(servo, 0.02, np.zeros(6))
+
+
+def test_setpoints_start_and_end_softly():
+    """Rates and their changes stay those of a soft start and of an exponential stop."""
+    made, planned = soft(), 0.4 + 0.3 * np.sin(np.pi * 0.02 * np.arange(200))
+    rows = [made.step(np.full(6, w)) for w in planned] + [made.step(None) for _ in range(60)]
+    u = np.array(rows)[:, 0]
+    assert u[60:200] == pytest.approx(planned[60:], abs=1e-12)
+    assert abs(u[0]) < 1e-4
+    rates = np.diff(u, prepend=0.0) / 0.02
+    assert np.abs(np.diff(rates)).max() < 0.25
+    assert abs(rates[-1]) < 1e-5
+    assert abs(u[-1] - u[199]) < 0.08 * abs(rates[199]) * 1.2
+
+
+def test_a_short_gap_is_joined_without_a_jump():
+    made, planned = soft(), 0.5 * np.sin(np.pi * 0.02 * np.arange(200))
+    gap = range(100, 105)
+    u = np.array([made.step(None if k in gap else np.full(6, w)) for k, w in enumerate(planned)])
+    assert u[116:, 0] == pytest.approx(planned[116:], abs=1e-12)
+    assert np.abs(np.diff(u[:, 0])).max() / 0.02 < 4.0
+
+
+def test_setpoints_keep_range_and_speed():
+    made = soft(-0.2, 0.3, 0.01)
+    u = np.array([made.step(np.full(6, 1.0)) for _ in range(100)])
+    assert u.max() == 0.3
+    assert np.diff(u[:, 0]).max() < 0.01 + 1e-12
+
+
+# ---------------------------------------------------------------- the connection
+
+
+def test_positions_are_stamped_and_garbage_is_one_line(daemon):
+    link = Daemon(("127.0.0.1", daemon.port))
+    try:
+        until(lambda: link.ready and link.simulated)
+        assert link.positions[-1].joints == pytest.approx(np.append(0.1, SLEEP))
+        assert abs(time.monotonic_ns() - link.positions[-1].stamp) < 1e9
+        daemon.says = "garbage"
+        until(lambda: not link.ready)
+        until(lambda: len(link.lines) == 2)
+        odd, lost = link.lines
+        assert "sent '{'; expected a message such as joint_positions" in odd
+        assert lost.endswith("sent no positions for 0.5 s; the head is held, trying again")
+        daemon.says = "positions"
+        until(lambda: link.ready)
+        until(lambda: "positions come again" in link.lines[-1])
+    finally:
+        link.close()
+
+
+def test_a_daemon_that_stops_is_found_again():
+    first = StandIn()
+    link = Daemon(("127.0.0.1", first.port))
+    try:
+        until(lambda: link.ready)
+        first.close()
+        until(lambda: not link.ready)
+        time.sleep(1.2)  # more than one attempt
+        assert len(link.lines) == 1 and "the head is held, trying again" in link.lines[0]
+        second = StandIn(first.port)
+        until(lambda: link.ready)
+        second.close()
+    finally:
+        link.close()
+
+
+def test_no_daemon_is_one_line(capsys):
+    assert main(["machine", "reachy_mini", "--reachy", "127.0.0.1:9", "--port", "0"]) == 2
+    said = capsys.readouterr().err.strip()
+    assert said.count("\n") == 0
+    assert said.startswith("error: --reachy: got 127.0.0.1:9, which sent no positions for 5 s")
+
+
+@pytest.mark.parametrize(
+    ("name", "reachy", "message"),
+    [
+        ("paper", "127.0.0.1:9", "actuator.kind: got 'torque' with --reachy"),
+        ("reachy_mini", "nowhere", "--reachy: got 'nowhere'; expected HOST:PORT"),
+    ],
+)
+def test_another_machine_or_address_is_refused(name, reachy, message):
+    options = MachineOptions(reachy=reachy, port=0)
+    with pytest.raises(ConfigError, match=message), open_robot(sd.load_scenario(name), options):
+        pass
+
+
+class Lost:
+    """A daemon without positions."""
+
+    ready, simulated, lines, positions = False, False, (), ()
+
+    def send(self, joints):
+        raise AssertionError("a setpoint for a lost daemon")
+
+
+def test_without_a_daemon_the_drives_have_failed_and_plans_are_not_taken():
+    experiment, clock, said = prepare(sd.load_scenario("reachy_mini")), Clock(), []
+    options = MachineOptions(reachy="127.0.0.1:9", port=0)
+    machine = RobotMachine(experiment, Wire(), options, Lost(), said.append, clock=clock)
+    machine._running, machine.begin = True, 0
+    machine.advance(SECOND)
+    assert machine.reason.fault == Fault.DRIVE
+    assert MachineFlags.SAFE in machine._flags() and MachineFlags.SIMULATION not in machine._flags()
+    rows = ControllerMessage(
+        Head(1, 1, 1, 0, 1, 0, 0), begin=0, torques=np.ones((1, 6)), cranks=True
+    )
+    machine._obey(rows, SECOND)
+    machine.advance(2 * SECOND)
+    assert machine._motors.played == 0
+    assert np.all(np.isnan(machine._body.measurement()))
+
+
+# ---------------------------------------------------------------- a whole run
+
+
+@pytest.mark.slow
+@in_real_time
+def test_live_moves_the_head(daemon, monkeypatch):
+    monkeypatch.setattr(Machine, "stop", lambda self: None)
+    scenario = sd.load_scenario("reachy_mini", settings=("delay.steps=13",))
+    lines, over = [], threading.Event()
+    with open_robot(
+        scenario, MachineOptions(reachy=f"127.0.0.1:{daemon.port}", port=0), lines.append
+    ) as (running, address):
+
+        def run():
+            while not over.is_set():
+                running.run(running.time() / 1e9 + 0.05)
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        try:
+            ready = prepare_session(scenario, address)
+            result = drive(ready, 4.0, accept_jitter=True, say=lambda line: None)
+            began = (running._started + running.begin) / 1e9
+        finally:
+            over.set()
+            thread.join()
+    assert result.status == "completed" and result.summary["live"]["taken_over"]
+    times, joints = (np.array(part) for part in zip(*daemon.sent, strict=True))
+    assert np.abs(joints[0, 1:] - SLEEP).max() < 0.02  # it begins where the head is
+    assert np.all(joints[:, 0] == 0.1)  # the body keeps its yaw
+    assert np.abs(np.diff(joints[:, 1:], axis=0)).max() < 0.1
+    experiment = prepare(scenario)
+    law, reference = servo_law(experiment)[0], experiment.reference
+    none = law.plant.dynamics.parameters
+    at = (times - began > 2.5) & (times - began < 3.9)
+    assert at.sum() > 40
+    for time_, row in zip(times[at][::5], joints[at][::5], strict=True):
+        wanted = law.command(evaluate(reference, time_ - began + 0.01), none)[POSE]
+        assert row[1:] == pytest.approx(wanted, abs=0.05)

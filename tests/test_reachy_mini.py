@@ -1,0 +1,236 @@
+"""Reachy Mini: its machine against the robot's own kinematics, and the shipped scenario."""
+
+import json
+from importlib import metadata, resources, util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import stewart_drake as sd
+from stewart_drake.dynamics.workspace import margin
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.servos import turned
+from stewart_drake.loop.bulk import run_in_bulk
+from stewart_drake.machines.reachy_mini import HEAD_HEIGHT, head_of_pose, pose_of_head
+from stewart_drake.machines.reachy_moves import read_move
+from stewart_drake.mechanism.kinematics import legs_along, reach_margins, rotation
+from stewart_drake.scenario.trajectories import make_reference
+
+ROBOT = sd.load_mechanism("reachy_mini")
+POSES = 10_000
+RUST = "reachy_mini_rust_kinematics"
+
+
+MOVES = Path(__file__).parents[1] / "diagrams" / "moves"
+
+
+def reachable_heads(number, seed):
+    """Return heads (n, 4, 4) with body yaws (n,) and poses (n, 6), all within the workspace."""
+    rng = np.random.default_rng(seed)
+    heads, yaws, poses = [], [], []
+    while len(poses) < number:
+        pose = ROBOT.home + rng.uniform(-1, 1, 6) * [0.5, 0.5, 0.8, 0.02, 0.02, 0.025]
+        if margin(ROBOT, pose) > 0 and legs_are_far_from_their_limits(pose):
+            yaw = rng.uniform(-1, 1)
+            heads.append(head_of_pose(pose, yaw))
+            yaws.append(yaw)
+            poses.append(pose)
+    return np.array(heads), np.array(yaws), np.array(poses)
+
+
+def legs_are_far_from_their_limits(pose):
+    """Off dead centres acos resolves a crank's angle to rounding."""
+    return reach_margins(ROBOT, pose).min() > 2e-3 and (
+        np.abs(legs_along(ROBOT, pose).transmission).min() > 0.2
+    )
+
+
+def test_poses_of_the_head_return():
+    heads, yaws, poses = reachable_heads(50, 1)
+    for head, yaw, pose in zip(heads, yaws, poses, strict=True):
+        assert pose_of_head(head, yaw) == pytest.approx(pose, abs=1e-14)
+        assert pose_of_head(head.ravel().tolist(), yaw) == pytest.approx(pose, abs=1e-14)
+    assert head_of_pose(ROBOT.home) == pytest.approx(np.eye(4), abs=1e-15)
+    turned_body = pose_of_head(np.eye(4), 0.3)  # the head looks ahead, the body to its left
+    assert turned_body[2] == pytest.approx(-0.3)
+
+
+@pytest.mark.parametrize("head", [np.eye(3), np.full((4, 4), np.nan), 2 * np.eye(4)])
+def test_what_is_no_pose_is_refused(head):
+    with pytest.raises(ConfigError, match="head: got"):
+        pose_of_head(head)
+
+
+def test_forward_kinematics_from_home_finds_every_pose():
+    _, _, poses = reachable_heads(POSES, 2)
+    angles = legs_along(ROBOT, poses).crank_angles
+    wrong = [
+        i
+        for i in range(POSES)
+        if np.abs(ROBOT.forward_kinematics(angles[i]) - poses[i]).max() > 1e-9
+    ]
+    assert not wrong
+
+
+def test_crank_angles_are_those_of_the_robot():
+    """Their inverse kinematics in Rust, with the data of their package where it is installed."""
+    rust = pytest.importorskip(RUST)
+    theirs = rust.ReachyMiniRustKinematics(0.04, 0.085)
+    for joint, R_WS, p_WS, branch in zip(
+        ROBOT.p_PQ, ROBOT.R_WS, ROBOT.p_WS, ROBOT.branches, strict=True
+    ):
+        X_WS = np.eye(4)
+        X_WS[:3, :3], X_WS[:3, 3] = R_WS, p_WS
+        center = ROBOT.home[3:] - [0, 0, HEAD_HEIGHT]
+        theirs.add_branch((joint + center).tolist(), X_WS.tolist(), float(branch))
+    heads, yaws, poses = reachable_heads(POSES, 3)
+    ours, theirs_found = legs_along(ROBOT, poses).crank_angles, []
+    for head, yaw in zip(heads, yaws, strict=True):
+        head[2, 3] += HEAD_HEIGHT
+        theirs_found.append(theirs.inverse_kinematics(head.tolist(), float(yaw)))
+    found = turned(np.array(theirs_found), ours)
+    misfits = [rod_misfits(poses, angles) for angles in (ours, found)]
+    assert misfits[0].max() < 1e-15
+    # A few of their angles leave a rod too long or too short by up to 1e-13 m.
+    apart, exact = np.abs(found - ours), misfits[1] < 1e-14
+    assert exact.mean() > 0.999
+    assert apart[exact].max() < 1e-12
+    assert apart.max() < 1e-10
+
+
+def rod_misfits(poses, angles):
+    """Return by how much each rod (n, 6) would change its length, m."""
+    joints = poses[:, None, 3:] + ROBOT.p_PQ @ rotation(poses[:, :3]).swapaxes(-1, -2) - ROBOT.p_WS
+    x, y, z = np.moveaxis(np.einsum("lij,nli->nlj", ROBOT.R_WS, joints), -1, 0)
+    u = ROBOT.crank_lengths
+    lengths = np.sqrt((x - u * np.cos(angles)) ** 2 + (y - u * np.sin(angles)) ** 2 + z**2)
+    return np.abs(lengths - ROBOT.rod_lengths)
+
+
+def test_the_machine_is_that_of_the_robots_files():
+    """The package's data, if it is installed."""
+    if util.find_spec("reachy_mini") is None:
+        pytest.skip("package reachy-mini is not installed")
+    assert metadata.version("reachy_mini") == "1.13.0"
+    data = json.loads((resources.files("reachy_mini") / "assets/kinematics_data.json").read_text())
+    assert [data["motor_arm_length"]] * 6 == pytest.approx(ROBOT.crank_lengths)
+    assert [data["rod_length"]] * 6 == pytest.approx(ROBOT.rod_lengths)
+    for motor, p_WS in zip(data["motors"], ROBOT.p_WS, strict=True):
+        assert np.linalg.inv(motor["T_motor_world"])[:3, 3] == pytest.approx(p_WS, abs=1e-12)
+
+
+def test_the_scenario_follows_its_reference():
+    compensated = run_in_bulk(sd.load_scenario("reachy_mini"))
+    plain = run_in_bulk(sd.load_scenario("reachy_mini", "servo_preview"))
+    assert compensated.status == plain.status == "completed"
+    assert not any(compensated.counts.values())
+    settled = slice(-150, None)  # after the start from rest
+    errors = [np.abs(run.samples[settled, :3]).max() for run in (compensated, plain)]
+    assert errors[0] < 0.01 < 0.03 < errors[1]
+
+
+# ---------------------------------------------------------------- recorded moves
+
+
+def move(path, times, poses, yaws, flat=False):
+    """Write a move of poses (n, 6) of the plate, and return the reference."""
+    targets = [
+        {"head": (head.ravel() if flat else head).tolist(), "antennas": [0, 0], "body_yaw": yaw}
+        for head, yaw in zip(map(head_of_pose, poses, yaws), yaws, strict=True)
+    ]
+    data = {"description": "", "time": list(times), "set_target_data": targets}
+    path.write_text(json.dumps(data))
+    return sd.ReachyMoveConfig(file=str(path))
+
+
+def nod(number=51):
+    """Return times (n,), poses (n, 6) and body yaws of two seconds that end at rest."""
+    s = np.linspace(0, 1, number)
+    swell = (s * (1 - s)) ** 3
+    return 2 * s, ROBOT.home + 12 * swell[:, None] * [0.3, 0.5, -0.4, 0.01, 0.0, 0.02], 0.8 * s
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_a_recorded_move_is_the_motion_of_its_poses(tmp_path, flat):
+    times, poses, yaws = nod()
+    reference = move(tmp_path / "nod.json", times + 1.7e9, poses, yaws, flat)  # by their clock
+    motion = make_reference(reference, 3.0)
+    found = np.array([motion.value(t)[:, 0] for t in [*times, 3.0]])
+    # Seconds since 1970 are rounded to 2.4e-7 s.
+    assert found == pytest.approx(np.vstack([poses, poses[-1]]), abs=1e-6)
+
+
+def test_a_head_that_turns_past_half_a_turn_does_not_jump(tmp_path):
+    times = np.linspace(0, 2, 51)
+    yaws = np.pi + 0.5 * np.sin(times)
+    reference = move(tmp_path / "turn.json", times, np.tile(ROBOT.home, (51, 1)), yaws)
+    data = json.loads((tmp_path / "turn.json").read_text())
+    for target in data["set_target_data"]:
+        target["body_yaw"] = 0.0
+    Path(reference.file).write_text(json.dumps(data))
+    _, poses = read_move(reference.file)
+    assert np.abs(np.diff(poses[:, 2])).max() < 0.1
+    assert np.ptp(poses[:, 2]) == pytest.approx(np.ptp(yaws), abs=1e-9)
+
+
+def test_a_move_within_reach_gives_setpoints_and_one_beyond_is_refused():
+    def setpoints(name, *settings):
+        chosen = f"reference={{kind: reachy_move, file: {MOVES / name}}}"
+        return sd.setpoints("reachy_mini", settings=(chosen, "duration=2", *settings), plain=True)
+
+    times, poses = read_move(MOVES / "look_around.json")
+    k = int(np.argmin(np.abs(times - 1.8)))
+    cranks = legs_along(ROBOT, poses[k][None]).crank_angles[0]
+    found = setpoints("look_around.json").angles[[89, 90]].mean(axis=0)  # around 1.8 s
+    assert found == pytest.approx(cranks, abs=1e-3)
+    limits = {
+        "tall_bow.json": (r"leg 3 reached the end of its reach at t = 1\.36 s", ()),
+        "look_around.json": (r"motor \d at t = .* speed", ("actuator.speed_limit=0.3",)),
+    }
+    for name, (message, settings) in limits.items():
+        with pytest.raises(ConfigError, match=message) as said:
+            setpoints(name, *settings)
+        assert "\n" not in str(said.value)
+
+
+def changed(data, name, value, row=7):
+    if name in data:
+        return data | {name: value}
+    targets = [dict(target) for target in data["set_target_data"]]
+    targets[row][name] = value
+    return data | {"set_target_data": targets}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("head", [1.0] * 15, r"set_target_data\[7\].head: got .*; expected 4 rows"),
+        ("head", [[1.0], [2.0, 3.0]], r"set_target_data\[7\].head"),
+        ("head", ["a"] * 16, r"set_target_data\[7\].head"),
+        ("head", [0.0] * 16, r"set_target_data\[7\].head"),
+        ("head", None, r"set_target_data\[7\].head"),
+        ("head", head_of_pose(ROBOT.home + [0, 0.5, 0, 0, 0, 0]).tolist(), "sample 7, pitch: got"),
+        ("body_yaw", "left", r"set_target_data\[7\].body_yaw: got 'left'; expected a finite"),
+        ("body_yaw", float("nan"), r"set_target_data\[7\].body_yaw: got nan"),
+        ("time", [0.0] * 51, r"time\[1\]: got 0.0 after 0.0; expected increasing times"),
+        ("time", [0.0], "got 1 times and 51 targets"),
+        ("time", "now", "expected a recorded move"),
+        ("set_target_data", [3] * 51, r"set_target_data\[0\]: got 3; expected an object"),
+    ],
+)
+def test_a_bad_move_is_refused_in_one_line(tmp_path, name, value, message):
+    path = tmp_path / "nod.json"
+    reference = move(path, *nod())
+    path.write_text(json.dumps(changed(json.loads(path.read_text()), name, value)))
+    with pytest.raises(ConfigError, match=message) as said:
+        make_reference(reference, 2.0)
+    assert str(said.value).startswith(str(path)) and "\n" not in str(said.value)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"time": [], "set_target_data": []}'])
+def test_a_file_that_is_no_move_is_refused(tmp_path, text):
+    path = tmp_path / "none.json"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"none\.json"):
+        make_reference(sd.ReachyMoveConfig(file=str(path)), 2.0)

@@ -1,0 +1,255 @@
+"""Logs that are written during a run, and their reading."""
+
+import json
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+import xarray as xr
+from mcap.reader import make_reader
+
+import stewart_drake as sd
+from stewart_drake.cli import main
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.jsonio import write_json
+from stewart_drake.identification import logs
+from stewart_drake.scenario.run_log import (
+    Background,
+    UdpMirror,
+    channels_of,
+    open_log,
+    read_log,
+    scenario_of,
+)
+from stewart_drake.scenario.signals import SIGNALS
+from tests.mechanisms import PAPER
+
+SHORT = ("plant.kind=exact", "duration=2.5", "start=on_reference", "queue=reference")
+NOISE = f"sensor.noise_std={[1e-4] * 12}"
+KINDS = {
+    "state": (*SHORT, NOISE),
+    "encoders": (*SHORT, "sensor.kind=encoders", "sensor.samples=2"),
+    "network": (*SHORT, "link.kind=network", "link.loss=0.2"),
+}
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def run(request, tmp_path_factory):
+    """Return a run and its folder; each log is written during an own run of the scenario."""
+    folder = tmp_path_factory.mktemp(request.param)
+    scenario = sd.load_scenario("paper", None, KINDS[request.param])
+    for name in ("run.mcap", "run.csv"):
+        result = sd.simulate(scenario, judge_stability=False, log=folder / name)
+    result.save(folder)
+    return result, folder
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "run.csv", "signals.nc", ""])
+def test_a_log_has_the_signals_of_its_run_exactly(run, name):
+    result, folder = run
+    read = sd.read_log(folder / name)
+    xr.testing.assert_equal(read.drop_attrs(), result.signals.drop_attrs())
+    assert [*read.data_vars] == [*result.signals.data_vars]
+    for signal in ("pose", "measurement", "packets"):
+        assert read[signal].attrs == result.signals[signal].attrs
+    assert read.attrs["scenario"] == result.signals.attrs["scenario"]
+
+
+def test_the_reader_of_mcap_finds_schemas_that_fit_the_messages(run):
+    result, folder = run
+    with open(folder / "run.mcap", "rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        topics = {channel.topic for channel in summary.channels.values()}
+        assert topics == {f"/{name}" for name, signal in SIGNALS.items() if signal.source}
+        assert summary.statistics.message_count == len(result.signals.time) * len(topics)
+        times = []
+        for schema, channel, message in reader.iter_messages():
+            about, found = json.loads(schema.data), json.loads(message.data)
+            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            assert about["type"] == "object" and found.keys() <= about["properties"].keys()
+            assert all(isinstance(value, float | int) for value in found.values())
+            assert message.log_time == round(1e9 * found["time"])
+            if channel.topic == "/pose":
+                times.append(message.log_time)
+                assert about["properties"]["z"]["description"] == "m"
+    assert np.allclose(1e-9 * np.array(times), result.signals.time, atol=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.4, 0.7, 0.95])
+@pytest.mark.parametrize("name", ["run.mcap", "run.csv"])
+def test_a_run_that_was_killed_leaves_its_log_up_to_there(run, tmp_path, name, share):
+    result, folder = run
+    data = (folder / name).read_bytes()
+    (tmp_path / name).write_bytes(data[: int(share * len(data))])
+    (tmp_path / "run.yaml").write_bytes((folder / "run.yaml").read_bytes())
+    read = read_log(tmp_path / name)
+    whole = result.signals.isel(time=slice(len(read.time)))
+    assert 0.3 * share * len(result.signals.time) < len(read.time) <= len(result.signals.time)
+    assert np.array_equal(read.time, whole.time)
+    assert np.array_equal(read.pose[:-1], whole.pose[:-1])
+
+
+def test_identify_reads_the_same_from_every_kind_of_log(run):
+    _, folder = run
+    read = [
+        logs.read_log(folder / name, PAPER, logs.Precision())
+        for name in ("signals.nc", "run.mcap", "run.csv", ".")
+    ]
+    for other in read[1:]:
+        for field in ("sent", "torques", "times", "values", "std", "before"):
+            one, same = getattr(read[0], field), getattr(other, field)
+            assert one is same or np.array_equal(one, same, equal_nan=True)
+        assert (other.delay, other.gravity) == (read[0].delay, read[0].gravity)
+
+
+def test_a_csv_log_without_its_scenario_is_read_but_not_identified(run, tmp_path):
+    result, folder = run
+    alone = tmp_path / "alone.csv"
+    alone.write_bytes((folder / "run.csv").read_bytes())
+    assert "scenario" not in read_log(alone).attrs
+    with pytest.raises(
+        ConfigError, match=r"has no scenario; expected it in alone\.yaml or summary\.json"
+    ):
+        logs.read_log(alone, PAPER, logs.Precision())
+    write_json(tmp_path / "summary.json", result.summary)
+    assert scenario_of(read_log(alone), alone) == result.scenario
+
+
+@pytest.mark.slow
+def test_a_log_is_replayed(run, tmp_path):
+    _, folder = run
+    for name in ("run.mcap", "run.csv", ""):
+        page = tmp_path / "replay.html"
+        assert main(["replay", str(folder / name), "--out", str(page)]) == 0
+        assert "log of 2.5 s" in page.read_text() and page.stat().st_size > 100_000
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        ("log.mcap", b"not MCAP" * 9, "cannot be read"),
+        ("log.mcap", b"", "cannot be read"),
+        ("log.csv", b"a,b\n1,2\n", "column 'a'"),
+        ("log.csv", b"", "cannot be read"),
+        ("log.csv", b"\xff\xfe\n", "cannot be read"),
+        ("log.txt", b"", "file of another kind"),
+        ("log.nc", b"CDF", "cannot be read"),
+    ],
+)
+def test_what_is_no_log_is_said_in_a_line(tmp_path, name, data, words):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(ConfigError, match=words) as said:
+        sd.read_log(tmp_path / name)
+    assert "\n" not in str(said.value) and name in str(said.value)
+
+
+def test_missing_logs_and_other_suffixes_are_said_in_a_line(tmp_path, capsys):
+    with pytest.raises(ConfigError, match="no such file"):
+        sd.read_log(tmp_path / "none.mcap")
+    with pytest.raises(ConfigError, match=r"has no signals\.nc"):
+        sd.read_log(tmp_path)
+    for target, words in (("run.txt", "ends in .mcap or .csv"), (".", "a directory")):
+        arguments = ["simulate", "paper", *(f"--set={one}" for one in SHORT)]
+        assert main([*arguments, "--quiet", "--log", str(tmp_path / target)]) == 2
+        said = capsys.readouterr().err
+        assert words in said and said.count("\n") == 1
+    assert main(["live", "paper", "--machine", "127.0.0.1:1", "--mirror", "here", "--quiet"]) == 2
+
+
+# Live.
+
+
+def row(value):
+    return {one.name: np.full(len(one.fields), value) for one in channels_of(None)}
+
+
+def test_the_mirror_sends_every_row_as_json():
+    scenario = sd.load_scenario("paper")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(10)
+        mirror = UdpMirror(listener.getsockname(), scenario)
+        mirror.write(0.5, row(1.25))
+        found = json.loads(listener.recv(65536))
+        assert found["timestamp"] == 0.5 and found["torque_applied"]["leg_6"] == 1.25
+        assert set(found) == {"timestamp", *row(0)}
+        mirror.write(0.6, row(np.nan))
+        assert json.loads(listener.recv(65536))["pose"] == {}
+    for _ in range(5):
+        mirror.write(0.7, row(1.0))  # nothing listens any more
+    mirror.close()
+
+
+def test_a_full_disk_is_reported_once_and_the_loop_goes_on():
+    class Full:
+        closed = False
+
+        def write(self, time, values):
+            raise OSError(28, "No space left on device")
+
+        def close(self):
+            self.closed = True
+
+    said, full = [], Full()
+    log = Background(full, "run.mcap", said.append)
+    for k in range(50):
+        log.write(0.1 * k, row(1.0))
+    log.close()
+    assert said == ["run.mcap: No space left on device; the run goes on, the file ends here"]
+    assert full.closed
+
+
+def test_the_background_writes_all_rows_in_order(tmp_path):
+    scenario = sd.load_scenario("paper")
+    log = Background(open_log(tmp_path / "run.mcap", scenario), "run.mcap", print)
+    for k in range(200):
+        log.write(0.1 * k, {"pose": np.full(6, float(k))})
+    log.close()
+    read = sd.read_log(tmp_path / "run.mcap")
+    assert np.array_equal(read.pose[:, 2], np.arange(200.0)) and "rates" not in read
+
+
+@pytest.mark.slow
+def test_machine_and_controller_log_a_live_run(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    listener.bind(("127.0.0.1", 0))
+    scenario = sd.load_scenario("paper", None, ("plant.kind=exact",))
+    machine = threading.Thread(
+        target=sd.run_machine,
+        args=(scenario,),
+        kwargs={"port": port, "duration": 12.0, "log": tmp_path / "machine.csv"},
+    )
+    machine.start()
+    time.sleep(1.0)
+    result = sd.run_live(
+        scenario,
+        f"127.0.0.1:{port}",
+        duration=2.0,
+        accept_jitter=True,
+        log=tmp_path / "live.mcap",
+        mirror=f"127.0.0.1:{listener.getsockname()[1]}",
+    )
+    machine.join()
+    read = sd.read_log(tmp_path / "live.mcap")
+    assert len(read.time) == len(result.signals.time)
+    for name in ("pose", "torque_commanded", "torque_applied", "measurement"):
+        assert np.array_equal(read[name], result.signals[name], equal_nan=True)
+    listener.settimeout(5)
+    first = json.loads(listener.recv(65536))
+    listener.close()
+    assert first["pose"]["z"] == read.pose[0, 5]
+    true = sd.read_log(tmp_path / "machine.csv")
+    assert len(true.time) >= len(read.time) and np.isfinite(true.pose).all()
+    with pytest.raises(ConfigError, match=r"not those sent.*expected that of its controller"):
+        sd.identify(tmp_path / "machine.csv", "paper")
+    # The controller measures without noise what the machine's log has as true.
+    there = np.isfinite(read.measurement.values).all(axis=1)
+    seen = read.measurement.values[there]
+    distance = np.abs(seen[:, None, :6] - true.pose.values).max(axis=2).min(axis=1)
+    assert np.median(distance) < 1e-9

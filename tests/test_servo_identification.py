@@ -1,0 +1,247 @@
+"""Position servos from logs: of Drake's loop, with known statistics, and bad ones."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+import yaml
+
+import stewart_drake as sd
+from stewart_drake.cli import main
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification.logs import angle_std
+from stewart_drake.identification.servo_fit import (
+    NAMES,
+    ServoIdentification,
+    ServoModel,
+    identify_servos,
+    regression,
+)
+from stewart_drake.identification.servo_logs import ServoLog, read_servo_log, servo_log
+from stewart_drake.identification.servo_plan import mixed_motion, plan_servos
+from stewart_drake.loop.preparation import prepare
+from stewart_drake.loop.servos import servo_law
+from stewart_drake.scenario.trajectories import evaluate
+from tests.screen import too_long
+
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
+ROBOT = sd.load_mechanism("reachy_mini")
+CODE = 2 * math.pi / 2**12
+SERVO = {
+    "stiffness": 2.54,
+    "velocity_gain": 0.02,
+    "crank_damping": 0.075,
+    "friction": 0.058,
+    "armature": 0.0018,
+}
+DELAY = 0.0453
+TRUE = np.array([DELAY, 2.54, 0.095, 0.058, 0.05, 0.0018, 0.0, 0.0])
+
+
+def rounded(cranks, seed=0):
+    phase = np.random.default_rng(seed).uniform(-0.5, 0.5, 6)
+    return CODE * (np.round(cranks / CODE - phase) + phase)
+
+
+@pytest.fixture(scope="module")
+def drake_log(tmp_path_factory):
+    """Return times, setpoints and measured cranks (n, 6) of a run in Drake's loop."""
+    motion = np.vstack(mixed_motion(np.repeat([0.15, 0.004], 3), 9.0, 0.02)[:2])
+    motion = np.vstack([motion, np.zeros((20, 6))])
+    rows = [",".join(map(str, [0.02 * k, *x])) for k, x in enumerate(ROBOT.home + motion)]
+    path = tmp_path_factory.mktemp("motion") / "motion.csv"
+    path.write_text("\n".join(["time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m]", *rows]))
+    settings = (
+        *(f"actuator.{name}={value}" for name, value in SERVO.items()),
+        *(f"reference={{kind: csv, file: {path}}}", "duration=6", "start=on_reference"),
+        *("queue=reference", "delay.steps=2", f"delay.fraction={DELAY / 0.02 - 2:.9g}"),
+    )
+    sc = sd.load_scenario("reachy_mini", "servo_preview", settings)
+    result = sd.simulate(sc, judge_stability=False)
+    _, planned, _ = servo_law(prepare(sc))
+    times = 0.02 * np.arange(300)
+    # A setpoint is for the middle of its hold.
+    sent = [ROBOT.crank_angles(evaluate(planned, t + DELAY + 0.01)[:6]) for t in times]
+    poses = result.signals.pose.sel(time=times, method="nearest").values
+    cranks = np.array([ROBOT.crank_angles(pose) for pose in poses])
+    return times, np.array(sent), rounded(cranks)
+
+
+def as_csv(path, times, setpoints, cranks):
+    names = [f"{name}_{leg}[rad]" for name in ("setpoint", "crank") for leg in range(1, 7)]
+    rows = np.column_stack([times, setpoints, cranks])
+    lines = [",".join(["time[s]", *names]), *(",".join(f"{x:.9g}" for x in row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.slow
+def test_servos_of_a_run_in_drake_are_found(drake_log, tmp_path, capsys):
+    path = as_csv(tmp_path / "log.csv", *drake_log)
+    out = tmp_path / "out"
+    assert main(["identify", str(path), "--mechanism", "reachy_mini", "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert not too_long(said)
+    assert "mass of 0.280 kg is taken as known" in " ".join(said.split())
+    summary = json.loads((out / "summary.json").read_text())
+    found = summary["parameters"]
+    value = np.array([found[name]["value"] for name in NAMES])
+    assert abs(value[0] - DELAY) < 3e-3
+    assert value[1] == pytest.approx(2.54, rel=0.05)
+    assert value[0] + value[2] / value[1] == pytest.approx(DELAY + 0.095 / 2.54, abs=1e-3)
+    assert value[3] / value[1] == pytest.approx(0.058 / 2.54, rel=0.05)
+    assert not any(value[6:])
+    widths = np.array([found[name]["interval"] for name in NAMES[:6]], dtype=float)
+    assert np.all(np.abs(value - TRUE)[:6] < 2 * widths)
+    sc = sd.load_scenario("reachy_mini", None, (f"overlay={out / 'servos.yaml'}",))
+    assert sc.actuator.stiffness == pytest.approx(value[1], rel=1e-5)
+    assert sc.eta == pytest.approx(value[0], abs=1e-6)
+
+
+def test_the_regression_is_a_start(drake_log):
+    times, setpoints, cranks = drake_log
+    log = servo_log("log", times, setpoints, cranks, ROBOT)
+    theta = regression(ServoModel(log, ROBOT, 0.8), ball_joints=False)
+    assert theta[1] == pytest.approx(2.54, rel=0.1)
+    assert theta[0] + theta[2] / theta[1] == pytest.approx(DELAY + 0.095 / 2.54, abs=0.01)
+
+
+@pytest.mark.slow
+def test_friction_of_ball_joints_is_found():
+    """The log is of the same equations with friction; its numbers are unknown to the fit."""
+    true = TRUE.copy()
+    true[6:] = 0.0127, 0.015
+    motion = ROBOT.home + np.vstack(mixed_motion(np.repeat([0.2, 0.005], 3), 9.0, 0.02))
+    setpoints = np.array([ROBOT.crank_angles(pose) for pose in motion])
+    times = 0.02 * np.arange(len(setpoints))
+    given = ServoLog("log", times, setpoints, setpoints, ROBOT.home[None])
+    states = ServoModel(given, ROBOT, 0.8).states(true)
+    cranks = rounded(np.array([ROBOT.crank_angles(x[:6]) for x in states]))
+    found = identify_servos(servo_log("log", times, setpoints, cranks, ROBOT), ROBOT, angle_std(12))
+    assert found.theta[6:] == pytest.approx(true[6:], rel=0.1)
+    assert found.residual < 1.1 * angle_std(12)
+
+
+def with_known_statistics(rng, number, blocks):
+    """Return a linear fit under errors correlated over 0.3 s, and its error in every unknown."""
+    t = 0.02 * np.arange(number)
+    noise = np.zeros((number, 6))
+    for k in range(1, number):
+        noise[k] = 0.94 * noise[k - 1] + rng.standard_normal(6)
+    shapes = [np.sin(w * t[:, None] + rng.uniform(0, 6, 6)) for w in (0.9, 1.7, 3.1)]
+    jacobian = np.stack(shapes, axis=2)
+    flat = jacobian.reshape(-1, 3)
+    error = -np.linalg.lstsq(flat, noise.ravel())[0]
+    times = np.linspace(0.0, 0.5 + 3.0 * blocks, number)
+    log = ServoLog("log", times, *np.full((3, number, 6), [[[0.1]], [[0.0]], [[0.0]]]))
+    theta = np.ones(8)
+    fit = ServoIdentification(
+        ServoModel(log, ROBOT, 1.0),
+        theta,
+        (noise.ravel() + flat @ error).reshape(number, 6),
+        jacobian,
+        np.arange(1, 4),
+        rounding=1e-3,
+        ball_joints_tried=False,
+        iterations=1,
+    )
+    return fit, error
+
+
+@pytest.mark.parametrize("blocks", [4, 8])
+def test_intervals_cover_the_truth_under_correlated_errors(blocks):
+    rng, inside, white = np.random.default_rng(1), 0, 0
+    for _ in range(200):
+        fit, error = with_known_statistics(rng, 150 * blocks, blocks)
+        width = np.array([fit.interval(unit) for unit in np.eye(8)[1:4]])
+        inside += np.sum(np.abs(error) < width)
+        J = fit.jacobian.reshape(-1, 3)
+        naive = fit.residual * np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
+        white += np.sum(np.abs(error) < 1.96 * naive)
+    assert 0.93 < inside / 600 <= 0.995
+    assert white / 600 < 0.6  # the covariance alone
+
+
+def test_a_plan_keeps_the_limits():
+    settings = ("actuator.speed_limit=4", "actuator.torque_limit=0.6")
+    experiment = prepare(sd.load_scenario("reachy_mini", None, settings))
+    plan = plan_servos(experiment, angle_std(12), duration=6.0)
+    low, high = np.array(experiment.scenario.actuator.angle_range).T
+    setpoints = plan.log.setpoints
+    assert np.all((low <= setpoints) & (setpoints <= high))
+    assert np.abs(np.diff(setpoints, axis=0)).max() <= 4 * 0.02 + 1e-12
+    assert plan.peak_torque <= 0.6 and plan.peak_speed <= 4
+    assert np.isfinite(plan.expected.intervals[:6]).all()
+    lines = plan.csv.splitlines()
+    assert lines[0].startswith("time[s],setpoint_1[rad],") and len(lines) == 301
+
+
+# Bad logs.
+
+
+def small(folder, change=None, header=None):
+    t = 0.02 * np.arange(250)
+    cranks = np.tile(ROBOT.crank_angles(ROBOT.home), (250, 1))
+    path = as_csv(folder / "log.csv", t, cranks + 0.01 * np.sin(t)[:, None], cranks)
+    lines = path.read_text().splitlines()
+    lines = change(lines) if change else lines
+    path.write_text("\n".join([header(lines[0]) if header else lines[0], *lines[1:]]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "header", "message"),
+    [
+        (lambda x: x[:100], None, r"got 1\.96 s; expected at least 4 s"),
+        (lambda x: [*x[:3], *x[2:]], None, r"row 4, column time\[s\]: got 0\.02 s after 0\.02 s"),
+        (lambda x: [*x[:9], *x[40:]], None, r"row 10, column time.*at most 0\.1 s"),
+        (None, lambda h: h.replace("crank_6", "crank_7"), r"row 1: got an unknown column"),
+        (
+            None,
+            lambda h: h.replace("crank_6[rad]", "crank_6[V]"),
+            r"expected crank_6 in rad or deg",
+        ),
+        (
+            lambda x: [
+                *x[:5],
+                ",".join([*x[5].split(",")[:7], *["1.4"] * 6]),
+                *x[6:],
+            ],
+            None,
+            r"row 6: got crank angles .* without a pose; expected those of this mechanism",
+        ),
+        (lambda x: [*x[:5], x[5].replace("0.08", "nan"), *x[6:]], None, r"row 6.*finite number"),
+    ],
+)
+def test_a_bad_log_is_refused_with_its_place(tmp_path, change, header, message):
+    with pytest.raises(ConfigError, match=message) as said:
+        read_servo_log(small(tmp_path, change, header), ROBOT)
+    assert "\n" not in str(said.value)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--delay", "0.1"], "expected one log, whose delay is found"),
+        ([], "got setpoints that hardly change; expected a motion"),
+    ],
+)
+def test_bad_requests_are_one_line(tmp_path, capsys, more, message):
+    path = small(
+        tmp_path,
+        lambda x: [x[0], *(",".join([row.split(",")[0], *x[1].split(",")[1:]]) for row in x[1:])],
+    )
+    assert main(["identify", str(path), "--mechanism", "reachy_mini", *more]) == 2
+    said = capsys.readouterr().err
+    assert message in " ".join(said.split())
+
+
+def test_a_log_that_no_servo_explains_has_no_intervals():
+    rng = np.random.default_rng(0)
+    fit, _ = with_known_statistics(rng, 600, 4)
+    wrong = dataclasses.replace(fit, residuals=10 + fit.residuals)
+    assert not wrong.right and np.isnan(wrong.intervals).all()
+    assert yaml.safe_dump(wrong.overlay)

@@ -1,0 +1,160 @@
+"""Setpoints of position servos: the file, the checks, the soft start, the units."""
+
+import numpy as np
+import pytest
+
+import stewart_drake as sd
+from stewart_drake.cli import main
+from stewart_drake.export.setpoints import ServoUnits, load_units, softened
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.motion import Preview
+from stewart_drake.loop.preparation import prepare
+from stewart_drake.loop.servos import compose_servo_law
+from stewart_drake.scenario.signals import POSE, RATES
+from stewart_drake.scenario.trajectories import evaluate
+
+ROBOT = sd.load_mechanism("reachy_mini")
+ON = "start=on_reference"
+
+
+def made(*settings, **options):
+    return sd.setpoints("reachy_mini", 50, settings=("duration=2", *settings), **options)
+
+
+def test_they_are_the_commands_of_the_law():
+    """The law of the scenario, without delay and on the reference, for two seconds."""
+    scenario = sd.load_scenario("reachy_mini", None, ("delay.steps=0", ON, "duration=2"))
+    experiment = prepare(scenario)
+    law, motion = compose_servo_law(experiment), experiment.reference
+    start = law.command(evaluate(motion, 0.0), law.plant.dynamics.parameters)
+    memory, found = law.initial_memory(start), []
+    for k in range(100):
+        row = evaluate(motion, 0.02 * k + law.preview_times[0])
+        nothing = np.full(law.reports.size, np.nan)
+        seen = Measurement.of(experiment.start)
+        memory = law.step(memory, seen, Preview(law.preview_times, row[None]), nothing)
+        found.append(memory.command[POSE])
+    assert np.allclose(made(ON).angles, found, rtol=0, atol=1e-12)
+
+
+def test_plain_setpoints_are_the_crank_angles_of_the_motion():
+    plain, motion = made(ON, plain=True), prepare(sd.load_scenario("reachy_mini")).reference
+    for k in (0, 40, 99):
+        pose = evaluate(motion, 0.02 * k + 0.01)[POSE]
+        assert plain.angles[k] == pytest.approx(ROBOT.crank_angles(pose), abs=1e-12)
+    compensated = made(ON)
+    # Where cranks stand nearly still, the rest is torque over stiffness.
+    difference = compensated.angles - plain.angles
+    expected = (compensated.torques + 0.1 * compensated.crank_rates) / 10.0
+    assert np.allclose(difference, expected, atol=1e-12)
+
+
+def test_known_friction_of_ball_joints_is_compensated():
+    rubbing = made(ON, "plant.ball_joint_friction=0.05")
+    assert np.abs(rubbing.angles - made(ON).angles).max() > 1e-3
+
+
+def test_a_soft_start_begins_at_rest_where_the_head_is():
+    pose = ROBOT.home + [0.0, 0.2, 0.0, 0.0, 0.0, -0.01]
+    soft = made(start=pose, plain=True)
+    assert soft.blend == 1.0
+    assert soft.angles[0] == pytest.approx(ROBOT.crank_angles(pose), abs=1e-4)
+    assert np.abs(soft.crank_rates[0]).max() < 0.01
+    assert np.allclose(soft.angles[50:], made(ON, plain=True).angles[50:], atol=1e-12)
+    low = ROBOT.home + [0.0, 0.4, 0.0, 0.0, 0.0, -0.04]
+    assert np.abs(made(start=low, plain=True).crank_rates).max() > 1.8
+    slow = made("actuator.speed_limit=1.8", start=low, plain=True)
+    assert slow.blend == 2.0
+
+
+def test_the_soft_start_has_the_rates_of_its_pose():
+    rng, h, start = np.random.default_rng(2), 1e-6, np.zeros(6)
+    amplitude = rng.standard_normal(6)
+
+    def at(t):
+        sine, cosine = np.sin(2 * t), np.cos(2 * t)
+        wanted = np.concatenate([amplitude * x for x in (sine, 2 * cosine, -4 * sine)])
+        return softened(wanted, start, t, 1.5)
+
+    for t in (0.3, 1.2, 1.49, 2.0):
+        slope = (at(t + h) - at(t - h)) / (2 * h)
+        assert slope[:12] == pytest.approx(at(t)[6:], abs=1e-6)
+    assert not at(0.0)[RATES].any()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (("actuator.torque_limit=0.2",), r"motor \d at t = [\d.]+ s: got a torque of .*0\.2 N m"),
+        (("actuator.speed_limit=0.5",), r"motor \d at t = .* speed of the setpoint .* rad/s"),
+        (("actuator.angle_range=[-0.6, 1.0]",), r"motor \d at t = .* setpoint of .* -0\.6 to 1"),
+        (
+            ("reference.amplitude=[0.9, 0, 0, 0, 0, 0]",),
+            r"leg \d reached the end of its reach at t",
+        ),
+        (("actuator.kind=torque", "controller.command=torque"), "actuator.kind: got 'torque'"),
+    ],
+)
+def test_a_broken_limit_is_refused_with_time_and_motor(settings, message):
+    with pytest.raises(ConfigError, match=message) as said:
+        made(*settings)
+    assert "\n" not in str(said.value)
+
+
+@pytest.mark.parametrize("rate", [0, -50, 1e6, float("nan")])
+def test_a_rate_out_of_range_is_refused(rate):
+    with pytest.raises(ConfigError, match="rate: got"):
+        sd.setpoints("reachy_mini", rate)
+
+
+@pytest.mark.parametrize(
+    "pose", [[0, 0, 0], [np.nan] * 6, [0, 0, 0, 0, 0, 1.0], [0, 0, 0, 0.2, 0, 0.23]]
+)
+def test_a_pose_that_the_head_cannot_have_is_refused(pose):
+    with pytest.raises(ConfigError, match="from: got"):
+        made(start=pose)
+
+
+def test_units_are_those_of_the_servos(tmp_path):
+    angles = np.array([[np.pi / 2, -np.pi / 4, 0.0, 1.0, 0.1, np.pi]])
+    ticks = ServoUnits(unit="ticks", offset=2048.0, sign=[1, -1, 1, 1, 1, 1])
+    assert ticks.converted(angles)[0].tolist() == [3072, 2560, 2048, 2700, 2113, 4096]
+    degrees = ServoUnits(unit="deg", offset=[1.0, 0, 0, 0, 0, 0])
+    assert degrees.converted(angles)[0, :2] == pytest.approx([91.0, -45.0])
+    path = tmp_path / "units.yaml"
+    path.write_text("unit: ticks\noffset: 2048.0\n")
+    assert load_units(path) == ServoUnits(unit="ticks", offset=2048.0)
+    for wrong in (
+        "unit: turns\n",
+        "sign: 2\n",
+        "offset: [1.0, 2.0]\n",
+        "ticks: 3\n",
+        "sign: .nan\n",
+    ):
+        path.write_text(wrong)
+        with pytest.raises(ConfigError, match=r"units\.yaml: ") as said:
+            load_units(path)
+        assert "\n" not in str(said.value)
+
+
+def test_the_command_writes_the_file(tmp_path, capsys):
+    out, units = tmp_path / "made/setpoints.csv", tmp_path / "units.yaml"
+    units.write_text("unit: deg\n")
+    common = ["setpoints", "reachy_mini", "--out", str(out), "--set", "duration=1"]
+    assert main(common) == 0
+    assert "50 compensated setpoints at 50 Hz" in capsys.readouterr().out
+    header, *rows = out.read_text().splitlines()
+    assert header == "time[s]," + ",".join(f"setpoint_{leg}[rad]" for leg in range(1, 7))
+    table = np.array([[float(x) for x in row.split(",")] for row in rows])
+    again = sd.setpoints("reachy_mini", settings=("duration=1",))
+    assert np.allclose(table, np.column_stack([again.times, again.angles]), atol=1e-8)
+    home = ",".join(map(str, ROBOT.home))
+    assert main([*common, "--rate", "100", "--plain", "--from", home, "--units", str(units)]) == 0
+    header, *rows = out.read_text().splitlines()
+    assert "setpoint_6[deg]" in header and len(rows) == 100
+    kept = out.read_text()
+    for wrong in (["--from", "1,2"], ["--rate", "0"], ["--units", str(tmp_path / "none.yaml")]):
+        assert main([*common, *wrong]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    assert out.read_text() == kept
