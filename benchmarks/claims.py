@@ -334,18 +334,28 @@ def measurements() -> list[Row]:
     ]
 
 
+def timed(row: Row) -> Row:
+    """Return a row whose law is told that torques act at exact times."""
+    settings = (*row.settings, "controller.timing_std=1e-6")
+    return row._replace(
+        name=f"{row.name}-timed", words=f"{row.words}, exact timing told", settings=settings
+    )
+
+
 def gravity() -> list[Row]:
     """Full gravity across the delay, 6 s, noise 0.1 %."""
     rows, short = [], "duration=6"
     for eta in (0.10, 0.12, 0.14, 0.16, 0.20):
         settings = (short, f"delay.steps={round(100 * eta)}")
         words = f"full amplitude, {eta:.2f} s, noise"
-        rows.append(Row(f"gravity-{eta:.2f}-noise", words, settings, "noise", scenario="gravity"))
+        row = Row(f"gravity-{eta:.2f}-noise", words, settings, "noise", scenario="gravity")
+        rows += [row, timed(row)]
     for eta in (0.30, 0.60):
         settings = (short, f"delay.steps={round(100 * eta)}", HALF)
         words = f"half the amplitude, {eta:.2f} s, noise"
         row = Row(f"gravity-half-{eta:.2f}-noise", words, settings, "half_noise")
-        rows.append(row._replace(scenario="gravity"))
+        row = row._replace(scenario="gravity")
+        rows += [row, timed(row)]
     return rows
 
 

@@ -35,14 +35,16 @@ class FilterEstimate(Estimate):
     unseen: int
     partly: tuple[str, ...]
     root: Array
+    squares: float
+    values: float
 
     @classmethod
     def of(cls, memory: Array, n: int, m: int) -> "FilterEstimate":
         """Return the estimate that a `stewart_posterior` holds."""
         mean, root, outlier, counts = np.split(memory, [n, n + n * n, n + n * n + m])
-        L, (outliers, unseen, bits) = root.reshape(n, n), counts.astype(int)
+        L, (outliers, unseen, bits) = root.reshape(n, n), counts[:3].astype(int)
         partly = tuple(name for i, name in enumerate(FAULTS) if bits >> i & 1)
-        return cls(mean, L @ L.T, outlier, outliers, unseen, partly, L)
+        return cls(mean, L @ L.T, outlier, outliers, unseen, partly, L, *counts[3:])
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ class Filter:
         """Return the estimate from values (m,) alone."""
         it, _kept = self._filter()
         c, n, m = core(), 12 + len(parameters), self.sensing.size
-        memory = np.empty(c.lib.stewart_posterior_size(n, m))
+        memory = np.zeros(c.lib.stewart_posterior_size(n, m))
         given = map(c.at, (numbers(values), numbers(parameters), None, memory))
         assert c.lib.stewart_filter_start(it, *given, c.scratch(100_000))
         return FilterEstimate.of(memory, n, m)
@@ -91,11 +93,11 @@ class Filter:
         c, n, m = core(), len(estimate.mean), self.sensing.size
         if isinstance(estimate, FilterEstimate):
             bits = sum(1 << FAULTS.index(name) for name in estimate.partly)
-            counts = estimate.outliers, estimate.unseen, bits
+            counts = estimate.outliers, estimate.unseen, bits, estimate.squares, estimate.values
             root, outlier = estimate.root, estimate.outlier
         else:
             root, outlier = np.linalg.cholesky(estimate.covariance), np.full(m, np.nan)
-            counts = 0, 0, 0
+            counts = 0, 0, 0, 0, 0
         memory = np.concatenate([estimate.mean, root.ravel(), outlier, counts])
         torques, durations, following = map(numbers, period[:3])
         schedule = [len(torques), c.at(torques), c.at(durations), period.substeps]

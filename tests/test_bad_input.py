@@ -61,6 +61,8 @@ SCENARIO_RANGES = {
     "controller.delay_std": [0, 11.0],
     "controller.delay_max": [0, 11.0],
     "controller.replan": [-0.1, 11.0],
+    "controller.model_error": [0, -1.0],
+    "controller.timing_std": [-1e-3],
     **{f"controller.prior.{name}": [0, -1.0] for name in ("torque_bias", "payload", "damping")},
     "controller.prior.offsets": [0, -1.0],
     "actuator.torque_limit": [0, -1.0],

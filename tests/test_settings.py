@@ -172,6 +172,8 @@ OTHER = {
     "controller.delay_std": 0.1,
     "controller.delay_max": 2.5,
     "controller.replan": 0.3,
+    "controller.model_error": 0.05,
+    "controller.timing_std": 0.02,
     "controller.horizon": 10,
     "controller.calibration": "FILE",
     "controller.learned": "FILE",

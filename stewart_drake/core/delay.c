@@ -431,6 +431,8 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
         spread += 2 * REAL(log)(C[(m + 1) * i]);
     after->log_likelihood = -(distance + spread) / 2;
     after->outliers = 0;
+    after->squares += distance;
+    after->values += (real)m;
     after->heard += guess->numbers[n - 2] < STEWART_NEVER;
     if (is_precise(d, guess, n, std)) {
         const int judged = judge_timing(a, L, used, after, scratch);

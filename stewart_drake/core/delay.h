@@ -8,7 +8,7 @@
 #define STEWART_NEVER 1000000 /* s; the delay of torques that do not arrive */
 
 enum {
-    STEWART_GUESS = 9,        /* numbers of a hypothesis without its mean and root */
+    STEWART_GUESS = 11,        /* numbers of a hypothesis without its mean and root */
     STEWART_DELAY_NUMBERS = 16, /* numbers of the memory without its arrays */
     STEWART_MAX_SCHEDULE = 8,  /* torques that act in a period, at a rate of the delay within bounds */
 };
@@ -43,6 +43,8 @@ typedef struct {
     real torques;        /* number of torques in that estimate */
     real heard;          /* number of measurements after an own torque */
     real weight;         /* log of the odds */
+    real squares;        /* sum of nu' S^-1 nu of the measurements that were used */
+    real values;         /* number of values in them */
     real numbers[];      /* mean of xi = [x; theta; eta; eta_dot] (n), then the lower triangle of the
                             root of its covariance, by rows; its last two rows are 0, and eta is
                             NEVER, where nothing has arrived */

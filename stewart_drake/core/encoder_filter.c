@@ -237,6 +237,8 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
                                    a->prior->root, f->lower, f->upper, &s, rows_of_legs, settle_legs};
     if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &spread, scratch))
         return 0;
+    *a->after->squares += distance;
+    *a->after->values += (real)s.number;
     stewart_predict(f->machine, xi + X, schedule, xi, s.seen);
     stewart_copy(X, s.seen + X * (schedule->number - 1), a->end);
     return stewart_attempt_ended(a, scratch);

@@ -9,14 +9,14 @@
 
 int stewart_posterior_size(int n, int m)
 {
-    return n + n * n + m + 3;
+    return n + n * n + m + 5;
 }
 
 stewart_posterior stewart_posterior_at(real *numbers, int n, int m)
 {
     real *counts = numbers + n + n * n + m;
-    return (stewart_posterior){numbers, numbers + n,  numbers + n + n * n,
-                               counts,  counts + 1, counts + 2};
+    return (stewart_posterior){numbers,    numbers + n, numbers + n + n * n, counts,
+                               counts + 1, counts + 2,  counts + 3,          counts + 4};
 }
 
 static int size_of(const stewart_filter *filter) { return X + filter->machine->estimated; }
@@ -130,6 +130,8 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
                                    stewart_instant_rows, stewart_instant_settle};
     if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &spread, scratch))
         return 0;
+    *a->after->squares += distance;
+    *a->after->values += (real)m;
     return distance <= f->gate && stewart_attempt_ended(a, scratch); /* NaN is not */
 }
 
@@ -139,6 +141,8 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
 {
     a->left_out = a->gated = 0;
     stewart_copy(a->n, a->prior->mean, a->after->mean);
+    *a->after->squares = *a->prior->squares;
+    *a->after->values = *a->prior->values;
     return a->filter->legs ? a->filter->legs->attempt(a, scratch) : attempt_sample(a, scratch);
 }
 
@@ -203,6 +207,8 @@ static void accept(int n, int m, const stewart_posterior *found, stewart_posteri
     stewart_fill(m, (real)NAN, now->outlier);
     *now->outliers = *now->unseen = 0;
     *now->left_out = *found->left_out;
+    *now->squares = *found->squares;
+    *now->values = *found->values;
 }
 
 void stewart_filter_advance(const stewart_filter *filter, const stewart_interval *period,

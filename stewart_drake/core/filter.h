@@ -24,6 +24,8 @@ typedef struct {
     real *outliers; /* number in a row, up to the last measurement, that agree with each other */
     real *unseen;   /* periods since a measurement was last used */
     real *left_out;   /* reasons for left-out values of that measurement, bits as of a `fault` */
+    real *squares;  /* sum of nu' S^-1 nu of all measurements that were used, see stewart_kalman_update */
+    real *values;   /* number of values in them */
 } stewart_posterior;
 
 int stewart_posterior_size(int n, int m);

@@ -32,6 +32,8 @@ void stewart_filtered_start(const stewart_law *law, real *memory)
     const stewart_filter_settings *settings = law->estimation;
     stewart_fill(stewart_filtered_memory(law), (real)NAN, memory);
     stewart_filtered_restart(law, memory);
+    const stewart_posterior e = stewart_posterior_at(memory, X + estimated(law), law->measured);
+    *e.squares = *e.values = 0;
     stewart_copy(estimated(law), settings->prior, memory + X);
 }
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -10,6 +11,10 @@ from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array
 
 THETA = slice(NUM_STATE, None)
+TOLERATED: Final = 1.1
+"""Factor on the ratio up to which an estimator counts as consistent."""
+CHANCE: Final = 3.0
+"""Standard deviations of the ratio that chance explains."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,41 @@ class Estimate:
         return not np.isnan(self.covariance[0, 0])
 
 
+class Innovations(NamedTuple):
+    """What the measurements say about the stated uncertainty.
+
+    An innovation nu is a measurement minus its prediction, S its stated covariance. If both state
+    and covariance are right, nu' S^-1 nu of n values has the mean n: the normalised innovation
+    squared (Bar-Shalom, Li, Kirubarajan, Estimation with Applications, section 5.4).
+
+    Attributes:
+        squares: sum of nu' S^-1 nu over the measurements that were used.
+        values: number of values in them.
+    """
+
+    squares: float = 0.0
+    values: float = 0.0
+
+    @property
+    def ratio(self) -> float:
+        """Mean per value, 1 where the stated uncertainty is right; NaN without measurements."""
+        return self.squares / self.values if self.values else math.nan
+
+    @property
+    def verdict(self) -> Literal["consistent", "cautious", "overconfident"] | None:
+        """Result of the test, None with too few measurements.
+
+        The ratio is below 1 / TOLERATED (`cautious`) or above TOLERATED (`overconfident`) by more
+        than chance explains: its standard deviation is sqrt(2 / values).
+        """
+        chance = CHANCE * math.sqrt(2 / self.values) if self.values else math.inf
+        if not chance < 1:
+            return None
+        if self.ratio > TOLERATED * (1 + chance):
+            return "overconfident"
+        return "cautious" if self.ratio < (1 - chance) / TOLERATED else "consistent"
+
+
 @dataclass(frozen=True)
 class Belief:
     """Estimate after a sample, which the observer gets back at the next one.
@@ -61,6 +101,7 @@ class Belief:
         settled: whether the delay is known.
         found: whether the delay was found, or changed, at this sample.
         delay_mean, delay_std: s, of the delay; NaN where it is not estimated.
+        innovations: since the estimator's last start.
         memory: numbers of an observer of the core.
     """
 
@@ -75,6 +116,7 @@ class Belief:
     found: bool = False
     delay_mean: float = math.nan
     delay_std: float = math.nan
+    innovations: Innovations = field(default_factory=Innovations)
     memory: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod

@@ -162,7 +162,9 @@ WALK_SHARE = 0.001
 CHANCE = 3.0
 """Standard deviations by which an estimate may be beyond a bound."""
 MODEL_ERROR = 2e-4
-"""Error of one step of the model as a share of the motion: that of an engine with 1 ms."""
+"""Error of the model in a USUAL_PERIOD as a share of the motion: that of an engine with 1 ms."""
+USUAL_PERIOD = 0.1
+"""Period of MODEL_ERROR, s."""
 TIMING_ERROR = 0.01
 """Standard deviation of the delay, as a share of a period. With an exact delay the filter would
 attribute the effect of a late torque, large in a catch-up, to payload and bias."""
@@ -225,6 +227,32 @@ def usual_parameters(
     )
 
 
+def acceleration_noise(share: float, motion_scale: Array, period: float) -> Array:
+    """Return the model's error (12,) over a period, for white noise in the accelerations.
+
+    With the intensity sigma = share * motion_scale, rates are off by sigma sqrt(dt) and poses by
+    sigma sqrt(dt^3 / 3), as an integrated random walk is. One number so serves all periods.
+
+    Args:
+        share: of the motion, per s^1.5.
+        motion_scale: (6,) range of each coordinate, rad and m.
+        period: dt, s.
+    """
+    rates = share * math.sqrt(period) * motion_scale
+    return np.concatenate([rates * period / math.sqrt(3), rates])
+
+
+def usual_model_error(motion_scale: Array, period: float) -> Array:
+    """Return the model's error (12,) over a period where no number is given.
+
+    Poses and rates are off by MODEL_ERROR in a USUAL_PERIOD. In a shorter one they are off by less,
+    as with `acceleration_noise`.
+    """
+    share = period / USUAL_PERIOD
+    poses = MODEL_ERROR * share**1.5 * motion_scale
+    return np.concatenate([poses, poses / share])
+
+
 def filter_settings(
     motion_scale: Array,
     plate_mass: float,
@@ -232,6 +260,9 @@ def filter_settings(
     torque_limit: float | None,
     period: float,
     parameters: ParameterSet | None = None,
+    model_error: float | None = None,
+    timing_std: float | None = None,
+    white: bool = False,
 ) -> FilterSettings:
     """Return the settings for a machine.
 
@@ -242,9 +273,19 @@ def filter_settings(
         torque_limit: of the motors in N m, or None.
         period: between two torques, s.
         parameters: to estimate; `usual_parameters` if None.
+        model_error: share of the motion per s^1.5, see `acceleration_noise`; None:
+            `usual_model_error`.
+        timing_std: s, of the instant of a torque; None: TIMING_ERROR of the period.
+        white: whether the errors of model and sensor are white. Those of an engine's steps and of
+            rounded angles are not: they add up, and the default is then that of a USUAL_PERIOD.
     """
     if parameters is None:
         parameters = usual_parameters(plate_mass, torque_scale, torque_limit)
-    model_std = MODEL_ERROR * np.concatenate([motion_scale, motion_scale])
+    if model_error is None:
+        model_std = usual_model_error(motion_scale, period if white else USUAL_PERIOD)
+    else:
+        model_std = acceleration_noise(model_error, motion_scale, period)
+    if timing_std is None:
+        timing_std = TIMING_ERROR * period
     walk = None if parameters.walk is None else math.sqrt(period) * parameters.walk
-    return FilterSettings(parameters, model_std, TIMING_ERROR * period, walk, parameters.jump)
+    return FilterSettings(parameters, model_std, timing_std, walk, parameters.jump)

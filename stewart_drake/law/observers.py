@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from stewart_drake.core.library import core
-from stewart_drake.law.belief import Belief, Estimate
+from stewart_drake.law.belief import Belief, Estimate, Innovations
 from stewart_drake.law.compiled import Compiled, Once, machine_of, numbers
 from stewart_drake.law.encoder_sensing import EncoderSensing, encoders_of
 from stewart_drake.law.filter_settings import FilterSettings
@@ -349,8 +349,10 @@ def belief_of(
     measured = memory[last : last + m]
     if observer.settings is not None:
         mean, root, rest = np.split(memory[:last], [n, n + n * n])
-        L, partial = root.reshape(n, n), int(rest[-1]).bit_count()
-        return Belief(Estimate(mean, L @ L.T), timeline, measured, faults, partial, memory=memory)
+        L, (left_out, *innovations) = root.reshape(n, n), rest[-3:]
+        belief = Belief(Estimate(mean, L @ L.T), timeline, measured, faults, memory=memory)
+        partial = int(left_out).bit_count()
+        return replace(belief, partial=partial, innovations=Innovations(*map(float, innovations)))
     theta, std = np.empty(p), np.empty(p)
     law.observer.parameters(law, *map(c.at, (memory, theta, std)))
     belief = Belief.nothing(timeline, m, theta).at(memory[:NUM_STATE])
@@ -368,7 +370,8 @@ def _delay_belief(law: Any, memory: Array, timeline: Timeline, faults: tuple[str
         best, L = c.lib.stewart_delay_guess(p, m, flights, it, int(it.best)), np.zeros((n, n))
         c.lib.stewart_guess_root(best, n, c.at(L))
         mean, root = np.array(c.ffi.unpack(best.numbers, n))[:-2], L[:-2, :-2]
-        belief = replace(belief, estimate=Estimate(mean, root @ root.T))
+        seen = Innovations(best.squares, best.values)
+        belief = replace(belief, estimate=Estimate(mean, root @ root.T), innovations=seen)
     others = max(flights - 1, 1)
     before = memory[first : first + NUM_TORQUES * others].reshape(others, NUM_TORQUES)
     return replace(

@@ -19,6 +19,7 @@ from stewart_drake.live.loop import CrankLoop, LiveLoop, Viewer
 from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerFlags, MachineFlags
 from stewart_drake.live.steering import Steering, Way
+from stewart_drake.loop.cautions import overconfidence
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.preparation import Experiment
@@ -319,6 +320,7 @@ def drive(
     loop.record.ran(as_run)
     experiment = made.experiment._replace(scenario=as_run)
     summary = summarize(experiment, loop.record, status, stopped, wall, None)
+    summary["warnings"] += overconfidence(summary)
     if len(late) < samples:
         summary["warnings"].append(
             f"the log ends {(samples - len(late)) * period:.3g} s before the run; signals and "

@@ -3,6 +3,7 @@
 Those known before a run are printed then. All are in `summary.json` as `warnings`.
 """
 
+import math
 from collections.abc import Iterator
 from itertools import product
 from typing import Final
@@ -97,6 +98,19 @@ def _finer(scenario: Scenario) -> Iterator[float]:
             yield step
 
 
+def overconfidence(summary: RunSummary) -> list[str]:
+    """Return a warning if the estimator's standard deviations are too small."""
+    consistency = summary["estimator_consistency"]
+    if consistency["verdict"] != "overconfident":
+        return []
+    factor = math.sqrt(consistency["nis_ratio"])
+    return [
+        f"the estimator is overconfident: its prediction errors are {factor:.2g} times as large as "
+        "it states. The machine does what the model cannot explain, as friction, a payload off the "
+        "centre, a push or a wrong delay do: estimate that, or raise controller.model_error"
+    ]
+
+
 def cautions_after(experiment: Experiment, summary: RunSummary) -> list[str]:
     """Return the warnings after a run."""
     found, period = [], 1e3 * experiment.scenario.controller.period
@@ -112,6 +126,7 @@ def cautions_after(experiment: Experiment, summary: RunSummary) -> list[str]:
             f"{period:.3g} ms: the search for the delay takes as long as it has hypotheses, "
             "and a real machine would get the torques of such samples late"
         )
+    found += overconfidence(summary)
     margin = summary["controller_margin"]
     if summary["status"] == "completed" and margin is not None and margin["stable"] is False:
         found.append(

@@ -25,7 +25,11 @@ from stewart_drake.law.feedforward import (
     InverseDynamicsFeedforward,
     NoFeedforward,
 )
-from stewart_drake.law.filter_settings import ParameterSet, filter_settings, usual_parameters
+from stewart_drake.law.filter_settings import (
+    ParameterSet,
+    filter_settings,
+    usual_parameters,
+)
 from stewart_drake.law.learned import LearnedLqi
 from stewart_drake.law.least_error import LeastError
 from stewart_drake.law.limited import LimitedLqi, QpLimits
@@ -173,7 +177,12 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     torque_scale = max(least, peak_torque)
     plate, asked = experiment.mechanism.plate.mass, experiment.planned_limit
     parameters = estimated_parameters(experiment, torque_scale, max(STILL * least, peak_torque))
-    settings = filter_settings(motion, plate, torque_scale, asked, c.period, parameters)
+    settings = filter_settings(
+        *(motion, plate, torque_scale, asked, c.period, parameters),
+        model_error=c.model_error,
+        timing_std=c.timing_std,
+        white=sc.plant.kind == "exact" and sc.sensor.kind == "state",
+    )
     gaps = sc.sensor.kind == "state" and sc.sensor.loss > 0
     observer = CoreObserver(settings if c.estimate else None, gaps=gaps)
     quiet = c.open_loop_start and sc.start == "rest"

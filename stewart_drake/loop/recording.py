@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.schema import plain
 from stewart_drake.files.versions import versions
+from stewart_drake.law.belief import Innovations
 from stewart_drake.law.memory import Counts
 from stewart_drake.loop import results as metrics
 from stewart_drake.loop.controller_margin import ControllerMargin
@@ -78,6 +79,7 @@ class Record:
         counts: survived problems up to the last sample.
         sampled: number of the controller's samples.
         measured: number of samples with a usable measurement.
+        innovations: of the estimator, up to the last sample.
         tuner_fallbacks: number of fallbacks of the tuner.
         delay: at the last sample, s: true, assumed or estimated, standard deviation.
     """
@@ -91,6 +93,7 @@ class Record:
         self.peak_applied = 0.0
         self.counts, self.tuner_fallbacks = Counts(), 0
         self.sampled = self.measured = 0
+        self.innovations = Innovations()
         nan = float("nan")
         self.delay: DelaySummary = {"true_s": nan, "estimated_s": nan, "std_s": nan}
 
@@ -101,8 +104,10 @@ class Record:
         self.mirror(time, seen)
 
     def count(self, memory: Any) -> bool:
-        """Take the counts of a sample from the controller's memory; return `has_measured`."""
+        """Take counts and innovations from the controller's memory; return `has_measured`."""
         usable = has_measured(memory, self.counts)
+        belief = getattr(memory, "belief", None)  # missing in a controller of the user
+        self.innovations = Innovations() if belief is None else belief.innovations
         self.counts, self.sampled = memory.counts, self.sampled + 1
         self.measured += usable
         return usable
@@ -233,6 +238,10 @@ def summarize(
             "worst": float(1e3 * seconds.max()) if some else nan,
         },
         "delay": recorder.delay,
+        "estimator_consistency": {
+            "nis_ratio": recorder.innovations.ratio,
+            "verdict": recorder.innovations.verdict,
+        },
         "wall_s": wall,
         "counts": recorder.counts.summary() | {"tuner_fallbacks": recorder.tuner_fallbacks},
         "link": plain(sc.assumed_link),

@@ -152,6 +152,15 @@ class DelaySummary(TypedDict):
     """Standard deviation, 1.6 to 2.6 times too large in tests; NaN without an estimator."""
 
 
+class ConsistencySummary(TypedDict):
+    """Whether the estimator's stated uncertainty is right (`law.belief.Innovations`)."""
+
+    nis_ratio: float
+    """Mean of nu' S^-1 nu per measured value; 1 is right; NaN without an estimator."""
+    verdict: str | None
+    """`consistent`, `cautious` or `overconfident`; None with too few measurements."""
+
+
 class RunSummary(TypedDict):
     """Summary of a run: the content of `summary.json`, with null for NaN.
 
@@ -184,6 +193,7 @@ class RunSummary(TypedDict):
     """E_ac in % s of a plate that rests until a torque acts; 0 without rest."""
     controller_step_ms: StepTimes
     delay: DelaySummary
+    estimator_consistency: ConsistencySummary
     wall_s: float
     """Computing time of the run, s."""
     counts: dict[str, int]

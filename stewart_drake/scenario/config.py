@@ -295,6 +295,11 @@ class ControllerConfig:
             have acted.
         replan: duration of a plan back onto the reference, s; 0 for none. Planned with a delay
             estimator where the prediction is off the reference, as after a jump of the delay.
+        model_error: of the estimator's model: white noise of the accelerations, as a share of the
+            motion's range per s^1.5; null is 2e-4 of it in each period, and less in
+            a short one on an exact plant.
+        timing_std: standard deviation of the time at which a torque acts, s; null is 1 % of the
+            period, and with a delay estimator learnt.
         prior: section of prior standard deviations; null is the default of each.
         limits: of torque, reach and clearance, `ignore`: torques are cut, or `qp`: where a limit
             binds within the horizon, a quadratic program plans the torques within all of them.
@@ -332,6 +337,8 @@ class ControllerConfig:
     delay_max: Annotated[float, Field(gt=0, le=10)] = 1.5
     open_loop_start: bool = True
     replan: Annotated[float, Field(ge=0, le=10)] = 0.6
+    model_error: Positive | None = None
+    timing_std: Deviation | None = None
     prior: PriorConfig = field(default_factory=PriorConfig)
     limits: Literal["ignore", "qp"] = "ignore"
     horizon: Annotated[int, Field(ge=2, le=100)] = 20

@@ -113,11 +113,12 @@ NEEDS: Final = (
         for name in ("torque_bias", "payload", "damping")
     ),
     _needs(
-        "prior.rates",
+        "prior.rates model_error timing_std",
         "controller.estimate",
         ("torque_bias", "payload", "damping", "coulomb", "wrench", "offsets"),
     ),
     _needs("prior.rates", "sensor.kind", "encoders"),
+    _needs("timing_std", "controller.command", "torque"),
     _needs("prior.offsets", "controller.estimate", "offsets"),
     _needs("prior.wrench prior.wrench_walk", "controller.estimate", "wrench"),
     _needs("horizon", "controller.limits", "qp"),
