@@ -10,17 +10,15 @@ again.
 """
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from stewart_drake.law.channel import Report
-from stewart_drake.law.core_law import serving
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import Motion
-from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.outer import OuterLqi, OuterMemory
 from stewart_drake.types import Array
 
 
@@ -49,7 +47,7 @@ class LearnedTorque:
 
 
 @dataclass(frozen=True)
-class LearnedMemory:
+class LearnedMemory(OuterMemory):
     """Memory of `LearnedLqi`; other names are those of the free law's memory.
 
     Attributes:
@@ -60,16 +58,10 @@ class LearnedMemory:
         saturated_steps: as of `law.memory.Counts`, of the sum.
     """
 
-    free: Any
     in_flight: Array
     torque: Array
     samples: int = 0
     saturated_steps: int = 0
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_") or name == "free":
-            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
-        return getattr(self.free, name)
 
     @property
     def plan(self) -> Array:
@@ -84,7 +76,7 @@ class LearnedMemory:
 
 
 @dataclass(frozen=True)
-class LearnedLqi(PredictiveLqi):
+class LearnedLqi(OuterLqi):
     """`PredictiveLqi` with a learned torque.
 
     Attributes:
@@ -92,10 +84,6 @@ class LearnedLqi(PredictiveLqi):
     """
 
     learned: LearnedTorque = field(kw_only=True)
-
-    @cached_property
-    def _served(self) -> Any:
-        return serving(PredictiveLqi(**self.parts)).law
 
     def initial_memory(self, queue: Array) -> Any:
         """Return the memory before the first sample; see `PredictiveLqi.initial_memory`."""

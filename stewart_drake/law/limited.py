@@ -20,7 +20,6 @@ solution knows (theory.md).
 import math
 import time
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -28,7 +27,7 @@ import numpy as np
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.channel import Report, Sent
 from stewart_drake.law.clear_space import RESERVE, ClearSpace
-from stewart_drake.law.core_law import AnyMemory, CoreMemory, serving
+from stewart_drake.law.core_law import AnyMemory, CoreMemory
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.holds import GAUSS_NODES
 from stewart_drake.law.horizon import NODES, HoldModel, HorizonCost, Plan, condense, riccati
@@ -36,7 +35,7 @@ from stewart_drake.law.horizon_qp import QpError, Solver, problem_of, solve_by_d
 from stewart_drake.law.limited_memory import LimitedMemory
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Motion, Preview
-from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.outer import OuterLqi
 from stewart_drake.law.riccati import lqr_by_doubling
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.geometry import Mechanism
@@ -96,7 +95,7 @@ class _Ahead(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LimitedLqi(PredictiveLqi):
+class LimitedLqi(OuterLqi):
     """`PredictiveLqi` whose torques come from a quadratic program where a limit binds.
 
     Attributes:
@@ -104,15 +103,6 @@ class LimitedLqi(PredictiveLqi):
     """
 
     limits: QpLimits = field(kw_only=True)
-
-    @cached_property
-    def free(self) -> PredictiveLqi:
-        """The law without limits."""
-        return PredictiveLqi(**self.parts)
-
-    @cached_property
-    def _served(self) -> Any:
-        return serving(self.free).law
 
     def times_for(self, timeline: Timeline) -> Array:
         """Return the times (p,) of a preview: those of the free law, then those of the horizon."""

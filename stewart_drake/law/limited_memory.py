@@ -5,10 +5,11 @@ from typing import Any
 
 from stewart_drake.law.horizon import Plan
 from stewart_drake.law.memory import Counts
+from stewart_drake.law.outer import OuterMemory
 
 
 @dataclass(frozen=True)
-class LimitedMemory:
+class LimitedMemory(OuterMemory):
     """Memory of `law.limited.LimitedLqi`; other names are those of the free law's memory.
 
     Attributes:
@@ -17,16 +18,10 @@ class LimitedMemory:
         limited_steps, qp_failures, qp_late: as of `law.memory.Counts`.
     """
 
-    free: Any
     plan: Plan | None = None
     limited_steps: int = 0
     qp_failures: int = 0
     qp_late: int = 0
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_") or name == "free":
-            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
-        return getattr(self.free, name)
 
     @property
     def counts(self) -> Counts:
