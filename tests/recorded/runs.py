@@ -176,9 +176,12 @@ def load() -> dict[str, tuple[Array, Array]]:
 
 
 def main(rows: list[str]) -> None:
-    """Record rows anew; without any, those that are missing."""
-    kept = load()
-    for row in rows or [row for row in ROWS if row not in kept]:
+    """Record rows anew; without any, those that are missing.
+
+    All of them where the record was made elsewhere: its key holds for every row.
+    """
+    kept = load() if FILE.exists() and same_rounding() else {}
+    for row in rows if kept and rows else [row for row in ROWS if row not in kept]:
         kept[row] = run(closed_loop(row))
         print(row, len(kept[row][1]), "samples")
     arrays = {}
