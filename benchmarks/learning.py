@@ -27,8 +27,7 @@ from _bench import (
 from numpy.random import Generator, default_rng
 
 import stewart_drake as sd
-from stewart_drake.law.learned import LearnedLqi, LearnedTorque
-from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.learned import with_learned
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.learn import LearnStudy, last_error, study_learn
@@ -96,18 +95,13 @@ def errors(one: Scenario) -> list[float]:
     return [repetition.error for repetition in learnt(one).repetitions]
 
 
-def with_torque(law: PredictiveLqi, learned: LearnedTorque) -> PredictiveLqi:
-    """Return the law with a learned torque."""
-    return LearnedLqi(**law.parts, learned=learned)
-
-
 def on_fresh_noise(one: Scenario, seed: int) -> tuple[float, float]:
     """Return E without and with the best learned torque, with noise of another seed."""
     study = learnt(one)
     run = replace(study.repetitions[0].result.scenario, sensor=replace(one.sensor, seed=seed))
     changes = [None]
     if study.best.learned is not None:
-        changes.append(partial(with_torque, learned=study.best.learned))
+        changes.append(partial(with_learned, learned=study.best.learned))
     scale, found = study.experiment.scale, []
     for change in changes:
         result = sd.simulate(run, modify_law=change, judge_stability=False)

@@ -1,6 +1,7 @@
 """Learning from repetitions: the law with a learned torque, its file, and the study."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,10 @@ from pydrake.systems.framework import LeafSystem
 import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.learned import LearnedLqi, LearnedTorque
+from stewart_drake.law.learned import LearnedLqi, LearnedSignal, with_learned
 from stewart_drake.loop.learned import HARMONICS, save_learned
 from stewart_drake.loop.preparation import prepare
-from stewart_drake.studies.learn import Fit, _Anderson, fit, study_learn
+from stewart_drake.studies.learn import Anderson, Fit, corrected_setpoints, fit, study_learn
 from stewart_drake.studies.study_options import LearnOptions
 
 EXACT = ("plant.kind=exact", "start=on_reference", "queue=reference")
@@ -38,7 +39,7 @@ def scenario(*settings):
 def some_torque(period=2 * np.pi, size=1e-3):
     coefficients = np.zeros((1 + 2 * HARMONICS, 6))
     coefficients[[0, 1, 2, 1 + HARMONICS]] = size * np.random.default_rng(1).standard_normal((4, 6))
-    return LearnedTorque(period, coefficients)
+    return LearnedSignal(period, coefficients)
 
 
 class Opposite(LeafSystem):
@@ -55,7 +56,7 @@ class Opposite(LeafSystem):
 
 
 def add(learned):
-    return lambda law: LearnedLqi(**law.parts, learned=learned)
+    return partial(with_learned, learned=learned)
 
 
 def test_a_learned_torque_cancels_its_opposite_and_nothing_is_left_to_estimate():
@@ -111,7 +112,7 @@ def test_andersons_method_solves_what_repetition_does_not():
     shape = (1 + 2 * HARMONICS, 6)
     b, size = np.random.default_rng(2).standard_normal(shape), np.prod(shape)
     slope = np.where(np.arange(size) % 2, -1.5, 0.3).reshape(shape)
-    steps, used = _Anderson(), np.zeros(shape)
+    steps, used = Anderson(), np.zeros(shape)
     for _ in range(4):
         used = steps.after(Fit(b + slope * used, 0.0))
     np.testing.assert_allclose(used, b / (1 - slope), rtol=1e-9)
@@ -119,7 +120,7 @@ def test_andersons_method_solves_what_repetition_does_not():
 
 def test_differences_that_are_noise_are_not_extrapolated():
     shape, rng = (1 + 2 * HARMONICS, 6), np.random.default_rng(3)
-    b, steps = rng.standard_normal(shape), _Anderson()
+    b, steps = rng.standard_normal(shape), Anderson()
     for _ in range(6):
         noise = 0.01 * rng.standard_normal(shape)
         used = steps.after(Fit(b + noise, 1e-4 * np.prod(shape)))
@@ -239,3 +240,73 @@ def test_the_command_writes_what_a_run_uses(tmp_path, capsys, monkeypatch):
         errors.append(sd.read_log(run).error)
     before, after = (np.abs(one.sel(time=slice(5, None)).values).max() for one in errors)
     assert after < 0.25 * before
+
+
+SERVOS = ("reference.frequency=3", "queue=reference", "start=on_reference")
+FRICTION = ("plant.ball_joint_damping=0.02", "plant.ball_joint_friction=0.01")
+"""Of the ball joints of `reachy_mini`; the setpoints compensate it, unless they are plain."""
+
+
+def head(*settings):
+    return sd.load_scenario("reachy_mini", settings=(*SERVOS, *settings))
+
+
+def test_learned_setpoints_are_added_in_the_middle_of_the_period_in_which_they_act():
+    """Zero where l is; the law without l answers the rest."""
+    learned = some_torque(2 * np.pi / 3, 1e-3)
+    sc = head("duration=0.4", "actuator.angle_range=null")
+    dt, eta = 0.02, 0.04
+    commands = []
+    for change in (None, add(learned)):
+        found = []
+
+        def record(law, change=change, found=found):
+            changed = law if change is None else change(law)
+
+            class Recorded(type(changed)):
+                def step(self, *given):
+                    memory = super().step(*given)
+                    found.append(memory.command)
+                    return memory
+
+            return Recorded(**vars(changed))
+
+        sd.simulate(sc, modify_law=record, judge_stability=False)
+        commands.append(np.array(found))
+    plain, corrected = commands
+    acting = dt * np.arange(len(plain)) + eta + dt / 2
+    np.testing.assert_allclose((corrected - plain)[:, :6], learned(acting), atol=1e-15)
+    np.testing.assert_array_equal((corrected - plain)[:, 6:], 0)
+
+
+def test_a_late_servo_gets_its_setpoint_early():
+    """u + lag u' followed with that lag is u: a servo of first order needs one correction."""
+    period, lag, wanted = 2.0, 0.03, some_torque(2.0)
+    dt = 1e-4
+    at = dt * np.arange(round(period / dt))
+    slope = (wanted(at + 1e-6) - wanted(at - 1e-6)) / 2e-6
+    missed = fit(at, wanted(at), period, HARMONICS)
+    found = LearnedSignal(period, corrected_setpoints(0.0, missed, period, lag).coefficients)
+    np.testing.assert_allclose(found(at), wanted(at) + lag * slope, atol=1e-9)
+
+
+def test_setpoints_of_a_file_are_refused_where_torques_are_asked_for(tmp_path):
+    sc = head()
+    save_learned(tmp_path / "l.npz", some_torque(2 * np.pi / 3), prepare(sc))
+    with np.load(tmp_path / "l.npz") as arrays:
+        kept = dict(arrays) | {"command": np.array("torque")}
+    np.savez(tmp_path / "torque.npz", **kept)
+    assert sd.setpoints(head(f"controller.learned={tmp_path / 'l.npz'}"), 50.0) is not None
+    with pytest.raises(ConfigError, match=r"another controller\.command"):
+        sd.simulate(head(f"controller.learned={tmp_path / 'torque.npz'}"))
+    with pytest.raises(ConfigError, match="rate: got 40 Hz"):
+        sd.setpoints(head(f"controller.learned={tmp_path / 'l.npz'}"), 40.0)
+
+
+@pytest.mark.slow
+def test_learned_setpoints_remove_what_plain_setpoints_lack():
+    """Torque, velocity gain and damping, which no setpoint of these compensates."""
+    sc = head("controller.feedforward=none")
+    found = study_learn(sc, LearnOptions(repetitions=5))
+    errors = [one.error for one in found.repetitions]
+    assert found.best.error < 0.05 * errors[0]

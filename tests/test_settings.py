@@ -12,7 +12,7 @@ import pytest
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.schema import spelling
-from stewart_drake.law.learned import LearnedTorque
+from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.loop.learned import save_learned
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
@@ -293,7 +293,7 @@ def files(tmp_path_factory):
         elif name == "controller.learned":
             path = path.with_suffix(".npz")
             experiment = prepare(load_scenario("paper"))
-            save_learned(path, LearnedTorque(2 * np.pi, np.full((17, 6), 1e-4)), experiment)
+            save_learned(path, LearnedSignal(2 * np.pi, np.full((17, 6), 1e-4)), experiment)
         else:
             given = Path(scenario.reference.file)
             path = path.with_suffix(given.suffix)

@@ -15,6 +15,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.yamlio import load_yaml, validate
 from stewart_drake.law.servos import Stiffness, turned
+from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.servos import known_stiffness
 from stewart_drake.scenario.config import Scenario
@@ -120,15 +121,16 @@ def make_setpoints(
 
     Setpoint k is held for a period h = 1 / rate from t_k = k h on. With the motion taken in the
     middle of that, it is (setpoint) of `law.servos`: the crank angle, plus torque and velocity gain
-    over the stiffness. The torque is that of the exact inverse dynamics, with the scenario's
-    `actuator` and `plant`; values of a `controller.calibration` replace those of the plant.
+    over the stiffness. What was learned (`controller.learned`) is added. The torque is that of the
+    exact inverse dynamics, with the scenario's `actuator` and `plant`; values of a
+    `controller.calibration` replace those of the plant.
 
     A motion that does not begin at rest where the plate is, starts softly. From the pose x_0, which
     is `start`, or for `start: rest` the first pose of the reference r, the motion is
 
         x(t) = x_0 + g(t / T) (r(t) - x_0),   g(s) = 10 s^3 - 15 s^4 + 6 s^5 up to s = 1, then 1.
 
-    T is 1 s, or 2, 4, .. s if the limits need it.
+    T is 1 s, or 2, 4, .. s if the limits need it. What was learned is blended in alike.
 
     Args:
         scenario: whose motors are position servos.
@@ -148,6 +150,12 @@ def make_setpoints(
             "stiffness the setpoints compensate, or plain setpoints"
         )
     experiment = prepare(scenario)
+    learned, period = learned_signal(experiment), scenario.controller.period
+    if learned is not None and abs(rate * period - 1) > _ROUNDING:
+        raise ConfigError(
+            f"rate: got {rate:g} Hz; expected {1 / period:g} Hz, that of controller.period, for "
+            "which the setpoints were learned"
+        )
     if start is None and scenario.start == "on_reference":
         return _along(experiment, None, 0.0, rate, plain)
     pose = experiment.start[POSE] if start is None else _checked(start, experiment)
@@ -192,6 +200,12 @@ def _known_dynamics(experiment: Experiment) -> StewartDynamics:
     return StewartDynamics(experiment.mechanism, experiment.scenario.plant.gravity, parameters)
 
 
+def rise(times: Array) -> Array:
+    """Return g (n, 1) of a soft start at times (n,) in its length."""
+    s = np.clip(times, 0, 1)[:, None]
+    return np.asarray(s**3 * (10 - 15 * s + 6 * s**2))
+
+
 def softened(wanted: Array, pose: Array, time: float, blend: float) -> Array:
     """Return pose, rates and accelerations (18,) of a soft start.
 
@@ -202,7 +216,7 @@ def softened(wanted: Array, pose: Array, time: float, blend: float) -> Array:
         blend: T, s.
     """
     s = min(time / blend, 1.0)
-    g = s**3 * (10 - 15 * s + 6 * s**2)
+    g = rise(np.array([s]))[0, 0]
     g_dot = 30 * s**2 * (1 - s) ** 2 / blend
     g_ddot = 60 * s * (1 - s) * (1 - 2 * s) / blend**2
     apart, rates, accelerations = wanted[POSE] - pose, wanted[RATES], wanted[ACCELERATIONS]
@@ -242,6 +256,9 @@ def _along(
     if not plain:
         assert servo is not None
         setpoints = servo.setpoint(cranks, rates, torques)
+    if (learned := learned_signal(experiment)) is not None:
+        middles = times + 0.5 / rate
+        setpoints = setpoints + learned(middles) * (1 if start is None else rise(middles / blend))
     found = Setpoints(times, setpoints, cranks, rates, torques, blend)
     _check(found, servo, experiment, rate)
     return found

@@ -1,16 +1,19 @@
-"""The predictive law with a torque that was learned from repetitions of a periodic motion.
+"""Laws with a torque, or setpoints, learned from repetitions of a periodic motion.
 
-With T_k of `PredictiveLqi` and l the learned torque, the motors get
+*Torques.* With T_k of `PredictiveLqi` and l the learned torque, the motors get
 
     T_k + l(t_k + eta + dt/2),
 
 l at the middle of the hold of T_k, and the model of the plant gets T_k alone: l replaces what the
 model lacks. If the model got the sum, the observer would estimate l as a disturbance and remove it
 again.
+
+*Setpoints.* The setpoints of the law for position servos get the learned angle in the middle of the
+period in which they act. Nothing is fed back to them, so that nothing would remove it.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,7 +22,11 @@ from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import Motion
 from stewart_drake.law.outer import OuterLqi, OuterMemory
+from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
 from stewart_drake.types import Array
+
+Law = TypeVar("Law", PredictiveLqi, ServoPreview)
 
 
 def harmonics(phase: Array, number: int) -> Array:
@@ -29,19 +36,19 @@ def harmonics(phase: Array, number: int) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class LearnedTorque:
-    """Periodic torque l(t) = `harmonics`(2 pi t / T) @ coefficients, N m.
+class LearnedSignal:
+    """Periodic torque or angle l(t) = `harmonics`(2 pi t / T) @ coefficients, N m or rad.
 
     Attributes:
         period: T of the motion, s.
-        coefficients: (1 + 2 H, 6), N m.
+        coefficients: (1 + 2 H, 6), N m or rad.
     """
 
     period: float
     coefficients: Array
 
     def __call__(self, times: Array) -> Array:
-        """Return the torque (n, 6) at instants (n,) in s of the motion, N m."""
+        """Return the torque or angle (n, 6) at instants (n,) in s of the motion, N m or rad."""
         number = len(self.coefficients) // 2
         return harmonics(2 * np.pi / self.period * times, number) @ self.coefficients
 
@@ -83,7 +90,7 @@ class LearnedLqi(OuterLqi):
         learned: by the time of the motion, which begins with the first sample.
     """
 
-    learned: LearnedTorque = field(kw_only=True)
+    learned: LearnedSignal = field(kw_only=True)
 
     def initial_memory(self, queue: Array) -> Any:
         """Return the memory before the first sample; see `PredictiveLqi.initial_memory`."""
@@ -118,3 +125,49 @@ class LearnedLqi(OuterLqi):
             samples=memory.samples + 1,
             saturated_steps=memory.saturated_steps + bool(np.any(sent != torque)),
         )
+
+
+@dataclass(frozen=True)
+class LearnedServoMemory(ServoMemory):
+    """Memory of `LearnedPreview`.
+
+    Attributes:
+        samples: number of samples so far.
+    """
+
+    samples: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedPreview(ServoPreview):
+    """`ServoPreview` with learned setpoints.
+
+    Attributes:
+        learned: by the time of the motion, which begins with the first sample.
+    """
+
+    learned: LearnedSignal = field(kw_only=True)
+
+    def initial_memory(self, command: Array) -> ServoMemory:
+        """Return the memory before the first sample; see `ServoPreview.initial_memory`."""
+        return LearnedServoMemory(**vars(super().initial_memory(command)))
+
+    def correction(self, memory: Any) -> Array:
+        """Return the learned angles (6,) of the next command, rad."""
+        return self.learned(self.timeline.period * memory.samples + self.preview_times)[0]
+
+    def step(
+        self, memory: Any, measurement: Measurement, motion: Motion, report: Array
+    ) -> ServoMemory:
+        """Compute the command of one sample; see `ServoPreview.step`."""
+        stepped: Any = super().step(memory, measurement, motion, report)
+        return replace(stepped, samples=memory.samples + 1)
+
+
+def with_learned(law: Law, learned: LearnedSignal | None) -> Law:
+    """Return the law with a learned torque, or with learned setpoints; as it is for None."""
+    if learned is None:
+        return law
+    if isinstance(law, ServoPreview):
+        return LearnedPreview(**vars(law), learned=learned)
+    return LearnedLqi(**law.parts, learned=learned)

@@ -147,7 +147,7 @@ class ServoPreview:
             belief, lag = self._observe(belief, replace(measurement, age=0.0), reported), age
         else:
             belief = replace(belief, faults=("measurements_missing",))
-        command, cause = self._next(memory.command, motion(self.preview_times)[0], belief)
+        command, cause = self._next(memory, motion(self.preview_times)[0], belief)
         saturated = 0 if reported is None else reported.saturated
         torque = memory.torque if reported is None else reported.asked
         return replace(
@@ -176,8 +176,13 @@ class ServoPreview:
             belief = replace(fresh.assuming(belief.parameters), measured=belief.measured)
         return self.observer.observe(belief, measurement, torques, self.sensing, self.plant)
 
-    def _next(self, last: Array, wanted: Array, belief: Belief) -> tuple[Array, str | None]:
+    def correction(self, memory: ServoMemory) -> Array:
+        """Return what is added to the angles (6,) of the next command, rad."""
+        return np.zeros(NUM_TORQUES)
+
+    def _next(self, memory: ServoMemory, wanted: Array, belief: Belief) -> tuple[Array, str | None]:
         """Return the next command (18,); where there is none, the cranks stop, with the cause."""
+        last = memory.command
         stay = np.concatenate([last[POSE], np.zeros(NUM_COORDINATES), last[MODEL_TORQUE]])
         try:
             command = self.command(wanted, belief.parameters)
@@ -185,6 +190,7 @@ class ServoPreview:
             return stay, "unreachable"
         if not np.all(np.isfinite(command)):
             return stay, "nonfinite_torque"
+        command[POSE] += self.correction(memory)
         if self.servo is not None:
             command[POSE] = self.servo.limited(command[POSE], last[POSE])
         return command, None

@@ -30,7 +30,7 @@ from stewart_drake.law.filter_settings import (
     filter_settings,
     usual_parameters,
 )
-from stewart_drake.law.learned import LearnedLqi
+from stewart_drake.law.learned import with_learned
 from stewart_drake.law.least_error import LeastError
 from stewart_drake.law.limited import LimitedLqi, QpLimits
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
@@ -56,7 +56,7 @@ from stewart_drake.law.startup import (
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import DelayLqiController, Reference
 from stewart_drake.loop.kinds import LINKS, REPORTS, SENSORS
-from stewart_drake.loop.learned import learned_torque
+from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.own import Own, own_motion
 from stewart_drake.loop.preparation import Experiment, calibration_of, check_instants
 from stewart_drake.mechanism.geometry import plate_radius
@@ -215,8 +215,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         )
     if c.limits == "qp":
         law = LimitedLqi(**law.parts, limits=QpLimits(c.horizon, clear_space(experiment)))
-    if (learned := learned_torque(experiment)) is not None:
-        law = LearnedLqi(**law.parts, learned=learned)
+    law = with_learned(law, learned_signal(experiment))
     return experiment.own.revised(law)
 
 

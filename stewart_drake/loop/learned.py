@@ -1,4 +1,4 @@
-"""The file of a learned torque, and the check that it belongs to a scenario."""
+"""The file of a learned torque or setpoints, and the check that it belongs to a scenario."""
 
 import io
 from pathlib import Path
@@ -9,7 +9,7 @@ import numpy as np
 from stewart_drake.files.arrayio import load_npz
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
-from stewart_drake.law.learned import LearnedTorque
+from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.scenario.calibration import believed_delay
@@ -17,7 +17,7 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.types import Array
 
 HARMONICS: Final = 8
-"""Harmonics of the motion in a learned torque; those above half the control rate are zero."""
+"""Harmonics of the motion that are learned; those above half the control rate are zero."""
 _POSES: Final = 32
 """Number of poses of the motion that a file has, over one period."""
 _SAME: Final = 1e-9
@@ -53,22 +53,22 @@ def motion_period(scenario: Scenario) -> float:
 
 
 def harmonics_below(period: float, dt: float) -> int:
-    """Return the number of harmonics of a motion that torques of dt s each can have."""
+    """Return the number of harmonics of a motion that torques or setpoints every dt s can have."""
     return min(HARMONICS, int((period / dt - 1) / 2))
 
 
-def save_learned(path: Path, torque: LearnedTorque, experiment: Experiment) -> None:
-    """Write a learned torque with machine, motion, period and delay to a .npz file."""
+def save_learned(path: Path, learned: LearnedSignal, experiment: Experiment) -> None:
+    """Write what was learned, with machine, motion, period and delay, to a .npz file."""
     buffer = io.BytesIO()
-    np.savez(buffer, coefficients=torque.coefficients, **_marks(experiment))
+    np.savez(buffer, coefficients=learned.coefficients, **_marks(experiment))
     write_whole(path, buffer.getvalue())
 
 
-def learned_torque(experiment: Experiment) -> LearnedTorque | None:
-    """Return the torque of `controller.learned`, or None without a file.
+def learned_signal(experiment: Experiment) -> LearnedSignal | None:
+    """Return the torque or angles of `controller.learned`, or None without a file.
 
     Raises:
-        ConfigError: unreadable, or of another machine, motion, period or delay.
+        ConfigError: unreadable, or of another machine, motion, period, delay or command.
     """
     file = experiment.scenario.controller.learned
     if file is None:
@@ -81,7 +81,7 @@ def learned_torque(experiment: Experiment) -> LearnedTorque | None:
     except ConfigError as error:
         raise ConfigError(f"controller.learned: {error}") from None
     for name, value in own.items():
-        same = found[name] == value if name == "machine" else _near(found[name], value)
+        same = found[name] == value if value.dtype.kind == "U" else _near(found[name], value)
         if not same:
             numbers = "" if np.ndim(value) else f" ({found[name]}); expected {value}"
             raise ConfigError(
@@ -90,12 +90,13 @@ def learned_torque(experiment: Experiment) -> LearnedTorque | None:
             )
     coefficients = found["coefficients"]
     if not np.all(np.isfinite(coefficients)):
-        raise ConfigError(f"controller.learned: got {file} with NaN; expected finite torques")
-    return LearnedTorque(motion_period(experiment.scenario), coefficients)
+        raise ConfigError(f"controller.learned: got {file} with NaN; expected finite numbers")
+    return LearnedSignal(motion_period(experiment.scenario), coefficients)
 
 
 _TEXTS: Final = {
     "machine": "machine",
+    "command": "controller.command",
     "motion": "motion",
     "motion_period": "period of the motion, s",
     "period": "controller.period, s",
@@ -114,6 +115,7 @@ def _marks(experiment: Experiment) -> dict[str, Array]:
     times = period / _POSES * np.arange(_POSES)
     return {
         "machine": np.array(fingerprint(experiment.mechanism)),
+        "command": np.array(sc.controller.command),
         "motion_period": np.array(period),
         "motion": np.array(experiment.reference.vector_values(times).T),
         "period": np.array(sc.controller.period),

@@ -23,6 +23,7 @@ from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.catch_up import PIECE, shortest
 from stewart_drake.law.feedforward import NoFeedforward
+from stewart_drake.law.learned import with_learned
 from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
@@ -40,6 +41,7 @@ from stewart_drake.law.servos import (
 from stewart_drake.law.startup import INSTANTS
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.law_design import compose_law
+from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.own import NOTHING
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sampling import SteppedLaw, update_every, weak
@@ -350,12 +352,12 @@ def compose_servo_law(experiment: Experiment) -> ServoPreview:
         reports=ReportLayout(parts, _REPORTED),
         servo=known_stiffness(experiment.scenario),
     )
-    return experiment.own.revised(law)
+    return experiment.own.revised(with_learned(law, learned_signal(experiment)))
 
 
 def _law_for_torques(experiment: Experiment) -> PredictiveLqi:
     sc = experiment.scenario
-    controller = replace(sc.controller, command="torque")
+    controller = replace(sc.controller, command="torque", learned=None)
     actuator = compatible_actuator("torque", sc.actuator)
     alike = replace(sc, controller=controller, actuator=actuator)
     return compose_law(experiment._replace(scenario=alike, own=NOTHING))

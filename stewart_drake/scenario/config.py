@@ -307,8 +307,8 @@ class ControllerConfig:
         calibration: a file of the machine's parameters with their covariance, as `identify` writes
             it: means and covariance of the estimated ones, values of the others. Its delay is
             assumed where `delay_steps` is null.
-        learned: a file of `learn`: a torque that the same motion of the same machine took before,
-            with the same period and delay. It is added to the torque of the law.
+        learned: a file of `learn`: what the same motion of the same machine took before, with the
+            same period and delay. It is added to the torques of the law, or to its setpoints.
     """
 
     renamed = CONTROLLER  # not annotated: no field

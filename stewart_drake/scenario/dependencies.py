@@ -31,11 +31,10 @@ REQUIRES: Final[tuple[tuple[str, Any, Accepted], ...]] = (
             "actuator.kind": ("servo", "position_servo"),
             "tuner.kind": "fixed",
             "controller.delay_estimator": "none",
-            "controller.learned": None,
         },
     ),
     ("actuator.kind", ("servo", "position_servo"), {"controller.command": "cranks"}),
-    ("actuator.kind", "servo", {"link.kind": "wire"}),
+    ("actuator.kind", "servo", {"link.kind": "wire", "controller.learned": None}),
     (
         *("actuator.kind", "position_servo"),
         {"plant.kind": "exact", "plant.joint_damping": 0.0, "plant.coulomb_friction": 0.0},

@@ -1,14 +1,21 @@
-"""Learning a torque from repetitions of a motion.
+"""Learning a torque, or setpoints, from repetitions of a motion.
 
-Each repetition simulates the scenario for some periods of its motion. From the states x_k at the
-samples and the torques u_k that acted between them follows the torque d_k that the model lacks:
-with f the prediction of the model, with the parameters estimated in the last period, the rates are
-those of
+Each repetition simulates the scenario for some periods of its motion.
+
+*Torques.* From the states x_k at the samples and the torques u_k that acted between them follows
+the torque d_k that the model lacks: with f the prediction of the model, with the parameters
+estimated in the last period, the rates are those of
 
     x_{k+1} = f(x_k, u_k + d_k).
 
 The fit of -d_k by harmonics of the motion has coefficients g(c), where c are those of the learned
-torque in the repetition. Without a model error that depends on the motion g would not depend on c,
+torque in the repetition.
+
+*Setpoints.* A position servo whose velocity gain and damping are k_v, over its stiffness k, follows
+its setpoint late by tau = k_v / k. With e_k the crank angles that the motion lacks at the samples,
+the fit of e_k has coefficients e(c), and g(c) = c + e(c) + tau e'(c), e' those of the derivative.
+
+*Both.* Without a model error that depends on the motion g would not depend on c,
 and g(c) would be right at once. In general c = g(c) is solved by Anderson's method (theory.md).
 """
 
@@ -22,8 +29,7 @@ import numpy as np
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.learned import LearnedLqi, LearnedTorque, harmonics
-from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.learned import LearnedSignal, harmonics, with_learned
 from stewart_drake.law.timeline import Timeline, TorqueSchedule
 from stewart_drake.loop.learned import HARMONICS, harmonics_below, motion_period
 from stewart_drake.loop.preparation import Experiment, prepare
@@ -43,7 +49,7 @@ _SETTLING: Final = 5.0
 _DEPTH: Final = 3
 """Largest number of differences of repetitions in a step of Anderson's method."""
 _POINTS: Final = 100
-"""Instants of a period at which a learned torque is looked at."""
+"""Instants of a period at which a learned torque or angle is looked at."""
 _PATIENCE: Final = 2
 """Repetitions without a smaller error, one after the other, that end learning."""
 
@@ -53,18 +59,18 @@ class Repetition:
     """One repetition of a motion.
 
     Attributes:
-        learned: torque that was used, or None in the first one.
+        learned: torque or angles that were used, or None in the first one.
         result: the run.
         error: E of its last period, % s; infinite if it did not complete.
     """
 
-    learned: LearnedTorque | None
+    learned: LearnedSignal | None
     result: SimulationResult
     error: float
 
     @property
     def largest(self) -> float:
-        """Largest learned torque, N m."""
+        """Largest learned torque or angle, N m or rad."""
         if self.learned is None:
             return 0.0
         times = np.linspace(0.0, self.learned.period, _POINTS)
@@ -95,6 +101,11 @@ class LearnStudy:
         return min(self.repetitions, key=lambda one: one.error)
 
     @property
+    def setpoints(self) -> bool:
+        """Whether setpoints are learned, rather than torques."""
+        return self.experiment.scenario.controller.command == "cranks"
+
+    @property
     def stopped(self) -> bool:
         """Whether it ended because the error no longer fell."""
         return len(self.repetitions) < self.asked and not self.interrupted
@@ -120,7 +131,7 @@ def study_learn(
     other noise.
 
     Args:
-        scenario: with a periodic motion and torques over a wire of known delay.
+        scenario: with a periodic motion, over a wire of known delay.
         options: see `LearnOptions`.
         progress: called for each repetition.
 
@@ -130,7 +141,7 @@ def study_learn(
     if scenario.controller.learned is not None:
         raise ConfigError("controller.learned: got a file; expected null, where learning begins")
     period = motion_period(scenario)
-    # The rules for a file hold for the torque that is learned.
+    # The rules for a file hold for what is learned.
     asking = replace(scenario, controller=replace(scenario.controller, learned="learned.npz"))
     asking.check()
     dt = scenario.controller.period
@@ -140,13 +151,14 @@ def study_learn(
     experiment = prepare(run)
     number = harmonics_below(period, dt)
     done: list[Repetition] = []
-    learned: LearnedTorque | None = None
-    steps, interrupted = _Anderson(), False
+    learned: LearnedSignal | None = None
+    steps, interrupted = Anderson(), False
+    corrected = _setpoints if scenario.controller.command == "cranks" else _torques
     for k in range(options.repetitions):
         sensor = replace(run.sensor, seed=run.sensor.seed + k)
         result = simulate(
             replace(run, sensor=sensor),
-            modify_law=partial(_learning, learned=learned),
+            modify_law=partial(with_learned, learned=learned),
             judge_stability=False,
         )
         if interrupted := result.status == "interrupted":
@@ -154,18 +166,14 @@ def study_learn(
         done.append(Repetition(learned, result, last_error(result, experiment.scale, period)))
         if progress is not None:
             progress(k + 1, options.repetitions)
-        times, torques = lacking_torques(experiment, result, period)
+        fitted = corrected(experiment, result, period, number, steps.used)
         errors = [one.error for one in done]
-        if len(done) - 1 - np.argmin(errors) >= _PATIENCE or len(times) < 2 * (1 + 2 * number):
+        if len(done) - 1 - np.argmin(errors) >= _PATIENCE or fitted is None:
             break
-        learned = LearnedTorque(period, steps.after(fit(times, -torques, period, number)))
+        learned = LearnedSignal(period, steps.after(fitted))
     if not done:
         raise KeyboardInterrupt
     return LearnStudy(experiment, period, done, options.repetitions, interrupted)
-
-
-def _learning(law: PredictiveLqi, learned: LearnedTorque | None) -> PredictiveLqi:
-    return law if learned is None else LearnedLqi(**law.parts, learned=learned)
 
 
 def last_error(result: SimulationResult, scale: Array, period: float) -> float:
@@ -178,6 +186,81 @@ def last_error(result: SimulationResult, scale: Array, period: float) -> float:
     later = time > begin
     at, errors = np.append(begin, time[later]), np.vstack([first, error[later]])
     return accumulated_error(at, errors, scale)
+
+
+def _torques(
+    experiment: Experiment, result: SimulationResult, period: float, number: int, used: Array
+) -> "Fit | None":
+    """Return g(c) of torques, or None without enough samples."""
+    times, torques = lacking_torques(experiment, result, period)
+    return fit(times, -torques, period, number) if _enough(times, number) else None
+
+
+def _setpoints(
+    experiment: Experiment, result: SimulationResult, period: float, number: int, used: Array
+) -> "Fit | None":
+    """Return g(c) of setpoints, or None without enough samples."""
+    times, angles = lacking_angles(experiment, result, period)
+    actuator = experiment.scenario.actuator
+    assert actuator.kind == "position_servo"
+    lag = (actuator.velocity_gain + actuator.crank_damping) / actuator.stiffness
+    if not _enough(times, number):
+        return None
+    return corrected_setpoints(used, fit(times, angles, period, number), period, lag)
+
+
+def corrected_setpoints(used: Array, missed: "Fit", period: float, lag: float) -> "Fit":
+    """Return g(c) of setpoints.
+
+    Args:
+        used: (1 + 2 H, 6) c, rad.
+        missed: fit of the angles that the motion lacks.
+        period: of the motion, s.
+        lag: of the servos behind their setpoints, s.
+    """
+    e = missed.coefficients
+    turns = (lag * 2 * np.pi / period * np.arange(1, 1 + HARMONICS))[:, None]
+    cosines, sines = e[1 : 1 + HARMONICS], e[1 + HARMONICS :]
+    ahead = np.vstack([e[:1], cosines + turns * sines, sines - turns * cosines])
+    return Fit(used + ahead, missed.variance * (1 + float(np.mean(turns**2))))
+
+
+def _enough(times: Array, number: int) -> bool:
+    return len(times) >= 2 * (1 + 2 * number)
+
+
+def lacking_angles(
+    experiment: Experiment, result: SimulationResult, period: float
+) -> tuple[Array, Array]:
+    """Return the crank angles that the last period of a motion lacks, rad.
+
+    Args:
+        experiment: of the scenario.
+        result: a run of it.
+        period: of the motion, s.
+
+    Returns:
+        Samples (n,), s, and angles of the motion less those of the state there (n, 6).
+    """
+    dt, mechanism = experiment.scenario.controller.period, experiment.mechanism
+    samples = _samples(result, dt)
+    first = max(0, len(samples) - 1 - round(period / dt))
+    poses = _states(experiment, result, samples)[:, POSE]
+    times, found = [], []
+    for k in range(first, len(samples) - 1):
+        if np.all(np.isfinite(poses[k])):
+            wanted = mechanism.crank_angles(experiment.reference.value(dt * k)[:, 0])
+            times.append(dt * k)
+            found.append(wanted - mechanism.crank_angles(poses[k]))
+    return np.array(times), np.reshape(found, (-1, 6))
+
+
+def _states(experiment: Experiment, result: SimulationResult, samples: Array) -> Array:
+    """Return the states (n, 12) at samples (n,), measured or else estimated."""
+    sensor, signals = experiment.scenario.sensor, result.signals
+    measured = sensor.measures_state and sensor.delay == 0
+    states = (signals.measurement if measured else signals.state_estimate).values[samples]
+    return np.asarray(states)
 
 
 def lacking_torques(
@@ -200,8 +283,7 @@ def lacking_torques(
     parameters = experiment.nominal.plant_parameters.copy()
     parameters[:NUM_PARAMETERS] = signals.parameters.values[samples[first:]].mean(axis=0)
     dynamics = StewartDynamics(experiment.mechanism, sc.plant.gravity, parameters)
-    measured = sc.sensor.measures_state and sc.sensor.delay == 0
-    states = (signals.measurement if measured else signals.state_estimate).values[samples]
+    states = _states(experiment, result, samples)
     limit = experiment.torque_limit
     sent = np.clip(signals.torque_commanded.values[samples], -limit, limit)
     in_flight = np.vstack([experiment.torques_in_flight(delay), sent])
@@ -238,22 +320,22 @@ def _lacking(
 
 
 class Fit(NamedTuple):
-    """Least-squares fit of torques by harmonics of a motion.
+    """Least-squares fit of torques or angles by harmonics of a motion.
 
     Attributes:
-        coefficients: (1 + 2 H, 6), N m, as of `law.learned.LearnedTorque`.
-        variance: sum of the variances of all coefficients, N^2 m^2.
+        coefficients: (1 + 2 H, 6), as of `law.learned.LearnedSignal`.
+        variance: sum of the variances of all coefficients.
     """
 
     coefficients: Array
     variance: float
 
 
-def fit(times: Array, torques: Array, period: float, number: int) -> Fit:
-    """Fit torques (n, 6) at times (n,) by the first `number` harmonics; the others are 0."""
+def fit(times: Array, values: Array, period: float, number: int) -> Fit:
+    """Fit values (n, 6) at times (n,) by the first `number` harmonics; the others are 0."""
     basis = harmonics(2 * np.pi / period * times, number)
-    found = np.linalg.lstsq(basis, torques, rcond=None)[0]
-    left = np.sum((torques - basis @ found) ** 2) / (len(times) - len(found))
+    found = np.linalg.lstsq(basis, values, rcond=None)[0]
+    left = np.sum((values - basis @ found) ** 2) / (len(times) - len(found))
     coefficients = np.zeros((1 + 2 * HARMONICS, 6))
     sines = 1 + HARMONICS
     coefficients[: 1 + number] = found[: 1 + number]
@@ -261,7 +343,7 @@ def fit(times: Array, torques: Array, period: float, number: int) -> Fit:
     return Fit(coefficients, float(left * np.trace(np.linalg.inv(basis.T @ basis))))
 
 
-class _Anderson:
+class Anderson:
     """Solution of c = g(c) by Anderson's method, for g with noise.
 
     With f = g(c) - c, and dF, dG the last differences of f and g,
@@ -272,12 +354,12 @@ class _Anderson:
     """
 
     def __init__(self) -> None:
-        self._used: Array = np.zeros((1 + 2 * HARMONICS, 6))
+        self.used: Array = np.zeros((1 + 2 * HARMONICS, 6))
         self._found: list[tuple[Array, Array]] = []
 
     def after(self, fitted: Fit) -> Array:
         """Return the coefficients of the next repetition, from the fit after the last one."""
-        g, f = fitted.coefficients, fitted.coefficients - self._used
+        g, f = fitted.coefficients, fitted.coefficients - self.used
         self._found = [*self._found, (g, f)][-1 - _DEPTH :]
         dG, dF = (
             np.diff([one.ravel() for one in column], axis=0).T
@@ -285,5 +367,5 @@ class _Anderson:
         )
         noise = 2 * fitted.variance * np.eye(dF.shape[1])
         y = np.linalg.lstsq(dF.T @ dF + noise, dF.T @ f.ravel(), rcond=None)[0]
-        self._used = g - (dG @ y).reshape(g.shape)
-        return self._used
+        self.used = g - (dG @ y).reshape(g.shape)
+        return self.used
