@@ -243,8 +243,6 @@ def test_the_command_writes_what_a_run_uses(tmp_path, capsys, monkeypatch):
 
 
 SERVOS = ("reference.frequency=3", "queue=reference", "start=on_reference")
-FRICTION = ("plant.ball_joint_damping=0.02", "plant.ball_joint_friction=0.01")
-"""Of the ball joints of `reachy_mini`; the setpoints compensate it, unless they are plain."""
 
 
 def head(*settings):
@@ -252,7 +250,6 @@ def head(*settings):
 
 
 def test_learned_setpoints_are_added_in_the_middle_of_the_period_in_which_they_act():
-    """Zero where l is; the law without l answers the rest."""
     learned = some_torque(2 * np.pi / 3, 1e-3)
     sc = head("duration=0.4", "actuator.angle_range=null")
     dt, eta = 0.02, 0.04

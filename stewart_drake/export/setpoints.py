@@ -14,7 +14,8 @@ from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.yamlio import load_yaml, validate
-from stewart_drake.law.servos import Stiffness, turned
+from stewart_drake.law.learned import LearnedSignal
+from stewart_drake.law.servos import Stiffness, rise, turned
 from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.servos import known_stiffness
@@ -157,12 +158,12 @@ def make_setpoints(
             "which the setpoints were learned"
         )
     if start is None and scenario.start == "on_reference":
-        return _along(experiment, None, 0.0, rate, plain)
+        return _along(experiment, None, 0.0, rate, plain, learned)
     pose = experiment.start[POSE] if start is None else _checked(start, experiment)
     blend = SHORTEST_BLEND
     while True:
         try:
-            return _along(experiment, pose, blend, rate, plain)
+            return _along(experiment, pose, blend, rate, plain, learned)
         except _BrokenLimit as broken:
             # A slower start does not mend what the motion itself breaks later.
             if broken.time > blend or 2 * blend > scenario.duration:
@@ -200,12 +201,6 @@ def _known_dynamics(experiment: Experiment) -> StewartDynamics:
     return StewartDynamics(experiment.mechanism, experiment.scenario.plant.gravity, parameters)
 
 
-def rise(times: Array) -> Array:
-    """Return g (n, 1) of a soft start at times (n,) in its length."""
-    s = np.clip(times, 0, 1)[:, None]
-    return np.asarray(s**3 * (10 - 15 * s + 6 * s**2))
-
-
 def softened(wanted: Array, pose: Array, time: float, blend: float) -> Array:
     """Return pose, rates and accelerations (18,) of a soft start.
 
@@ -216,7 +211,7 @@ def softened(wanted: Array, pose: Array, time: float, blend: float) -> Array:
         blend: T, s.
     """
     s = min(time / blend, 1.0)
-    g = rise(np.array([s]))[0, 0]
+    g = rise(s)
     g_dot = 30 * s**2 * (1 - s) ** 2 / blend
     g_ddot = 60 * s * (1 - s) * (1 - 2 * s) / blend**2
     apart, rates, accelerations = wanted[POSE] - pose, wanted[RATES], wanted[ACCELERATIONS]
@@ -230,7 +225,12 @@ def softened(wanted: Array, pose: Array, time: float, blend: float) -> Array:
 
 
 def _along(
-    experiment: Experiment, start: Array | None, blend: float, rate: float, plain: bool
+    experiment: Experiment,
+    start: Array | None,
+    blend: float,
+    rate: float,
+    plain: bool,
+    learned: LearnedSignal | None,
 ) -> Setpoints:
     """Return the setpoints of the motion, checked at the middle of each period.
 
@@ -256,9 +256,10 @@ def _along(
     if not plain:
         assert servo is not None
         setpoints = servo.setpoint(cranks, rates, torques)
-    if (learned := learned_signal(experiment)) is not None:
+    if learned is not None:
         middles = times + 0.5 / rate
-        setpoints = setpoints + learned(middles) * (1 if start is None else rise(middles / blend))
+        share = 1.0 if start is None else rise(middles / blend)[:, None]
+        setpoints = setpoints + share * learned(middles)
     found = Setpoints(times, setpoints, cranks, rates, torques, blend)
     _check(found, servo, experiment, rate)
     return found

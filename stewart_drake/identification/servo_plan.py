@@ -26,7 +26,7 @@ from stewart_drake.identification.servo_fit import (
     ServoModel,
 )
 from stewart_drake.identification.servo_logs import SETPOINTS, ServoLog, servo_log
-from stewart_drake.law.servos import Stiffness
+from stewart_drake.law.servos import Stiffness, rise
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.servos import known_stiffness
 from stewart_drake.mechanism.geometry import Mechanism
@@ -97,8 +97,7 @@ def mixed_motion(scale: Array, duration: float, period: float, seed: int = 0) ->
     """
     rng, number = np.random.default_rng(seed), round(duration / 3 / period)
     t: Array = period * np.arange(number, dtype=np.float64)
-    s = np.clip(np.minimum(t, t[-1] - t) / _RISE, 0, 1)[:, None]
-    window = s**3 * (10 - 15 * s + 6 * s**2)
+    window = rise(np.minimum(t, t[-1] - t) / _RISE)[:, None]
     half = t[number // 2]
     phase = 2 * np.pi * (0.5 * np.minimum(t, half) + np.maximum(t - half, 0.0))
     sine = np.sin(phase[:, None] + np.arange(6) + rng.uniform(0, 2 * np.pi))

@@ -221,6 +221,12 @@ class Segment(NamedTuple):
         return Segment(begin, end, start, stop)
 
 
+def rise(share: Array | float) -> Array:
+    """Return 10 s^3 - 15 s^4 + 6 s^5 for the share s of a soft start; 0 before it, 1 after it."""
+    s = np.clip(share, 0, 1)
+    return np.asarray(s**3 * (10 - 15 * s + 6 * s**2))
+
+
 def still(command: Array, time: float) -> Segment:
     """Return the setpoint of a command (18,) that is reached at a time in s."""
     assert command.shape == (NUM_REFERENCE,)

@@ -19,7 +19,7 @@ import numpy as np
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import brief
-from stewart_drake.law.servos import Stiffness
+from stewart_drake.law.servos import Stiffness, rise
 from stewart_drake.live.contact import address_of
 from stewart_drake.live.endpoint import Address, Endpoint, now, read_key
 from stewart_drake.live.machine import Machine, check_scenario, open_machine
@@ -237,8 +237,8 @@ class SoftSetpoints:
         self._held = next_one = self._held + self._coasting * self._period
         if wanted is not None:
             self._since += self._period
-            s = min(1.0, self._since / (_REJOIN if self._gap <= _REJOIN else SOFT_START))
-            next_one = self._held + s**3 * (10 - 15 * s + 6 * s**2) * (wanted - self._held)
+            share = self._since / (_REJOIN if self._gap <= _REJOIN else SOFT_START)
+            next_one = self._held + rise(share) * (wanted - self._held)
         before, self.u = self.u, self._servo.limited(next_one, self.u)
         self.rate = (self.u - before) / self._period
         return self.u

@@ -19,6 +19,7 @@ the fit of e_k has coefficients e(c), and g(c) = c + e(c) + tau e'(c), e' those 
 and g(c) would be right at once. In general c = g(c) is solved by Anderson's method (theory.md).
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,6 +27,7 @@ from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
@@ -153,7 +155,8 @@ def study_learn(
     done: list[Repetition] = []
     learned: LearnedSignal | None = None
     steps, interrupted = Anderson(), False
-    corrected = _setpoints if scenario.controller.command == "cranks" else _torques
+    servos = scenario.actuator if scenario.actuator.kind == "position_servo" else None
+    lacking = lacking_torques if servos is None else lacking_angles
     for k in range(options.repetitions):
         sensor = replace(run.sensor, seed=run.sensor.seed + k)
         result = simulate(
@@ -166,10 +169,16 @@ def study_learn(
         done.append(Repetition(learned, result, last_error(result, experiment.scale, period)))
         if progress is not None:
             progress(k + 1, options.repetitions)
-        fitted = corrected(experiment, result, period, number, steps.used)
+        times, values = lacking(experiment, result, period)
         errors = [one.error for one in done]
-        if len(done) - 1 - np.argmin(errors) >= _PATIENCE or fitted is None:
+        if len(done) - 1 - np.argmin(errors) >= _PATIENCE or len(times) < 2 * (1 + 2 * number):
             break
+        if servos is None:
+            fitted = fit(times, -values, period, number)
+        else:
+            lag = (servos.velocity_gain + servos.crank_damping) / servos.stiffness
+            missed = fit(times, values, period, number)
+            fitted = corrected_setpoints(steps.used, missed, period, lag)
         learned = LearnedSignal(period, steps.after(fitted))
     if not done:
         raise KeyboardInterrupt
@@ -186,137 +195,6 @@ def last_error(result: SimulationResult, scale: Array, period: float) -> float:
     later = time > begin
     at, errors = np.append(begin, time[later]), np.vstack([first, error[later]])
     return accumulated_error(at, errors, scale)
-
-
-def _torques(
-    experiment: Experiment, result: SimulationResult, period: float, number: int, used: Array
-) -> "Fit | None":
-    """Return g(c) of torques, or None without enough samples."""
-    times, torques = lacking_torques(experiment, result, period)
-    return fit(times, -torques, period, number) if _enough(times, number) else None
-
-
-def _setpoints(
-    experiment: Experiment, result: SimulationResult, period: float, number: int, used: Array
-) -> "Fit | None":
-    """Return g(c) of setpoints, or None without enough samples."""
-    times, angles = lacking_angles(experiment, result, period)
-    actuator = experiment.scenario.actuator
-    assert actuator.kind == "position_servo"
-    lag = (actuator.velocity_gain + actuator.crank_damping) / actuator.stiffness
-    if not _enough(times, number):
-        return None
-    return corrected_setpoints(used, fit(times, angles, period, number), period, lag)
-
-
-def corrected_setpoints(used: Array, missed: "Fit", period: float, lag: float) -> "Fit":
-    """Return g(c) of setpoints.
-
-    Args:
-        used: (1 + 2 H, 6) c, rad.
-        missed: fit of the angles that the motion lacks.
-        period: of the motion, s.
-        lag: of the servos behind their setpoints, s.
-    """
-    e = missed.coefficients
-    turns = (lag * 2 * np.pi / period * np.arange(1, 1 + HARMONICS))[:, None]
-    cosines, sines = e[1 : 1 + HARMONICS], e[1 + HARMONICS :]
-    ahead = np.vstack([e[:1], cosines + turns * sines, sines - turns * cosines])
-    return Fit(used + ahead, missed.variance * (1 + float(np.mean(turns**2))))
-
-
-def _enough(times: Array, number: int) -> bool:
-    return len(times) >= 2 * (1 + 2 * number)
-
-
-def lacking_angles(
-    experiment: Experiment, result: SimulationResult, period: float
-) -> tuple[Array, Array]:
-    """Return the crank angles that the last period of a motion lacks, rad.
-
-    Args:
-        experiment: of the scenario.
-        result: a run of it.
-        period: of the motion, s.
-
-    Returns:
-        Samples (n,), s, and angles of the motion less those of the state there (n, 6).
-    """
-    dt, mechanism = experiment.scenario.controller.period, experiment.mechanism
-    samples = _samples(result, dt)
-    first = max(0, len(samples) - 1 - round(period / dt))
-    poses = _states(experiment, result, samples)[:, POSE]
-    times, found = [], []
-    for k in range(first, len(samples) - 1):
-        if np.all(np.isfinite(poses[k])):
-            wanted = mechanism.crank_angles(experiment.reference.value(dt * k)[:, 0])
-            times.append(dt * k)
-            found.append(wanted - mechanism.crank_angles(poses[k]))
-    return np.array(times), np.reshape(found, (-1, 6))
-
-
-def _states(experiment: Experiment, result: SimulationResult, samples: Array) -> Array:
-    """Return the states (n, 12) at samples (n,), measured or else estimated."""
-    sensor, signals = experiment.scenario.sensor, result.signals
-    measured = sensor.measures_state and sensor.delay == 0
-    states = (signals.measurement if measured else signals.state_estimate).values[samples]
-    return np.asarray(states)
-
-
-def lacking_torques(
-    experiment: Experiment, result: SimulationResult, period: float
-) -> tuple[Array, Array]:
-    """Return the torques that the model lacks in the last period of a motion.
-
-    Args:
-        experiment: of the scenario.
-        result: a run of it.
-        period: of the motion, s.
-
-    Returns:
-        Middles (n,) of the controller's periods, s, and torques (n, 6), N m.
-    """
-    sc = experiment.scenario
-    dt, delay = sc.controller.period, believed_delay(sc)
-    signals, samples = result.signals, _samples(result, dt)
-    first = max(0, len(samples) - 1 - round(period / dt))
-    parameters = experiment.nominal.plant_parameters.copy()
-    parameters[:NUM_PARAMETERS] = signals.parameters.values[samples[first:]].mean(axis=0)
-    dynamics = StewartDynamics(experiment.mechanism, sc.plant.gravity, parameters)
-    states = _states(experiment, result, samples)
-    limit = experiment.torque_limit
-    sent = np.clip(signals.torque_commanded.values[samples], -limit, limit)
-    in_flight = np.vstack([experiment.torques_in_flight(delay), sent])
-    acted = Timeline(dt, delay).schedule(in_flight)
-    parts = 1 if delay.fraction == 0 else 2
-    times, found = [], []
-    for k in range(first, len(samples) - 1):
-        if np.all(np.isfinite(states[k : k + 2])):
-            part = slice(parts * k, parts * (k + 1))
-            schedule = TorqueSchedule(acted.torques[part], acted.durations[part])
-            times.append(dt * (k + 0.5))
-            found.append(_lacking(dynamics, states[k], states[k + 1], schedule))
-    return np.array(times), np.reshape(found, (-1, 6))
-
-
-def _samples(result: SimulationResult, dt: float) -> Array:
-    """Return the rows (n,) of the controller's samples."""
-    time = result.signals.time.values
-    wanted = dt * np.arange(math.floor(time[-1] / dt + 1e-9) + 1)
-    return np.asarray(np.searchsorted(time, wanted - 1e-6))
-
-
-def _lacking(
-    dynamics: StewartDynamics, begin: Array, end: Array, schedule: TorqueSchedule
-) -> Array:
-    """Return the constant torque (6,) that explains the rates at the end of a schedule."""
-    torques, durations = schedule
-    lacking = np.zeros(6)
-    for _ in range(_NEWTON):
-        missed = end - dynamics.predict(begin, torques + lacking, durations, 4)[-1]
-        B = dynamics.derivatives(begin[POSE], begin[RATES], torques[0]).B[RATES]
-        lacking = lacking + np.linalg.solve(B * durations.sum(), missed[RATES])
-    return lacking
 
 
 class Fit(NamedTuple):
@@ -341,6 +219,118 @@ def fit(times: Array, values: Array, period: float, number: int) -> Fit:
     coefficients[: 1 + number] = found[: 1 + number]
     coefficients[sines : sines + number] = found[1 + number :]
     return Fit(coefficients, float(left * np.trace(np.linalg.inv(basis.T @ basis))))
+
+
+def corrected_setpoints(used: Array, missed: Fit, period: float, lag: float) -> Fit:
+    """Return g(c) of setpoints.
+
+    Args:
+        used: (1 + 2 H, 6) c, rad.
+        missed: fit of the angles that the motion lacks.
+        period: of the motion, s.
+        lag: of the servos behind their setpoints, s.
+    """
+    e = missed.coefficients
+    turns = (lag * 2 * np.pi / period * np.arange(1, 1 + HARMONICS))[:, None]
+    cosines, sines = e[1 : 1 + HARMONICS], e[1 + HARMONICS :]
+    ahead = np.vstack([e[:1], cosines + turns * sines, sines - turns * cosines])
+    return Fit(used + ahead, missed.variance * (1 + float(np.mean(turns**2))))
+
+
+def lacking_angles(
+    experiment: Experiment, result: SimulationResult, period: float
+) -> tuple[Array, Array]:
+    """Return the crank angles that the last period of a motion lacks, rad.
+
+    Args:
+        experiment: of the scenario.
+        result: a run of it.
+        period: of the motion, s.
+
+    Returns:
+        Samples (n,), s, and angles of the motion less those of the state there (n, 6).
+    """
+    dt, angles = experiment.scenario.controller.period, experiment.mechanism.crank_angles
+    first, _, states = _last_samples(experiment, result, period)
+    times, found = [], []
+    for k, state in enumerate(states[:-1], first):
+        if np.all(np.isfinite(state[POSE])):
+            wanted = experiment.reference.value(dt * k)[:, 0]
+            times.append(dt * k)
+            found.append(angles(wanted) - angles(state[POSE]))
+    return np.array(times), np.reshape(found, (-1, 6))
+
+
+class _Last(NamedTuple):
+    """Samples of the last period of a run.
+
+    Attributes:
+        first: number of the first one.
+        rows: (first + n,) of all samples up to the last one, in the signals.
+        states: (n, 12) of these, measured or else estimated.
+    """
+
+    first: int
+    rows: NDArray[np.intp]
+    states: Array
+
+
+def _last_samples(experiment: Experiment, result: SimulationResult, period: float) -> _Last:
+    sc, signals = experiment.scenario, result.signals
+    dt, time = sc.controller.period, signals.time.values
+    wanted = dt * np.arange(math.floor(time[-1] / dt + 1e-9) + 1)
+    rows = np.searchsorted(time, wanted - 1e-6)
+    first = max(0, len(rows) - 1 - round(period / dt))
+    measured = sc.sensor.measures_state and sc.sensor.delay == 0
+    states = (signals.measurement if measured else signals.state_estimate).values
+    return _Last(first, rows, states[rows[first:]])
+
+
+def lacking_torques(
+    experiment: Experiment, result: SimulationResult, period: float
+) -> tuple[Array, Array]:
+    """Return the torques that the model lacks in the last period of a motion.
+
+    Args:
+        experiment: of the scenario.
+        result: a run of it.
+        period: of the motion, s.
+
+    Returns:
+        Middles (n,) of the controller's periods, s, and torques (n, 6), N m.
+    """
+    sc = experiment.scenario
+    dt, delay = sc.controller.period, believed_delay(sc)
+    signals, (first, rows, states) = result.signals, _last_samples(experiment, result, period)
+    parameters = experiment.nominal.plant_parameters.copy()
+    parameters[:NUM_PARAMETERS] = signals.parameters.values[rows[first:]].mean(axis=0)
+    dynamics = StewartDynamics(experiment.mechanism, sc.plant.gravity, parameters)
+    limit = experiment.torque_limit
+    sent = np.clip(signals.torque_commanded.values[rows], -limit, limit)
+    in_flight = np.vstack([experiment.torques_in_flight(delay), sent])
+    acted = Timeline(dt, delay).schedule(in_flight)
+    parts = 1 if delay.fraction == 0 else 2
+    times, found = [], []
+    for k, (begin, end) in enumerate(itertools.pairwise(states), first):
+        if np.all(np.isfinite([begin, end])):
+            part = slice(parts * k, parts * (k + 1))
+            schedule = TorqueSchedule(acted.torques[part], acted.durations[part])
+            times.append(dt * (k + 0.5))
+            found.append(_lacking(dynamics, begin, end, schedule))
+    return np.array(times), np.reshape(found, (-1, 6))
+
+
+def _lacking(
+    dynamics: StewartDynamics, begin: Array, end: Array, schedule: TorqueSchedule
+) -> Array:
+    """Return the constant torque (6,) that explains the rates at the end of a schedule."""
+    torques, durations = schedule
+    lacking = np.zeros(6)
+    for _ in range(_NEWTON):
+        missed = end - dynamics.predict(begin, torques + lacking, durations, 4)[-1]
+        B = dynamics.derivatives(begin[POSE], begin[RATES], torques[0]).B[RATES]
+        lacking = lacking + np.linalg.solve(B * durations.sum(), missed[RATES])
+    return lacking
 
 
 class Anderson:

@@ -180,8 +180,11 @@ def main(rows: list[str]) -> None:
 
     All of them where the record was made elsewhere: its key holds for every row.
     """
-    kept = load() if FILE.exists() and same_rounding() else {}
-    for row in rows if kept and rows else [row for row in ROWS if row not in kept]:
+    if not (FILE.exists() and same_rounding()):
+        kept, rows = {}, []
+    else:
+        kept = load()
+    for row in rows or [row for row in ROWS if row not in kept]:
         kept[row] = run(closed_loop(row))
         print(row, len(kept[row][1]), "samples")
     arrays = {}
