@@ -300,6 +300,25 @@ def test_setpoints_of_a_file_are_refused_where_torques_are_asked_for(tmp_path):
         sd.setpoints(head(f"controller.learned={tmp_path / 'l.npz'}"), 40.0)
 
 
+def test_learned_torques_are_not_added_to_setpoints(file):
+    with pytest.raises(ConfigError, match=r"^controller\.learned: got .*torques"):
+        sd.setpoints(scenario(f"controller.learned={file}"), 10.0, plain=True)
+
+
+def test_setpoints_are_refused_where_they_were_learned_with_others(tmp_path):
+    file = tmp_path / "plain.npz"
+    plain = "controller.feedforward=none"
+    save_learned(file, some_torque(2 * np.pi / 3), prepare(head(plain)))
+    with pytest.raises(ConfigError, match=r"another controller\.command or feedforward"):
+        sd.setpoints(head(f"controller.learned={file}"), 50.0)
+    with pytest.raises(ConfigError, match=r"^controller\.feedforward: got none"):
+        sd.setpoints(head(plain, f"controller.learned={file}"), 50.0)
+    learned = sd.setpoints(head(plain, f"controller.learned={file}"), 50.0, plain=True)
+    without = sd.setpoints(head(plain), 50.0, plain=True)
+    added = some_torque(2 * np.pi / 3)(learned.times + 0.01)
+    np.testing.assert_allclose(learned.angles - without.angles, added, atol=1e-15)
+
+
 @pytest.mark.slow
 def test_learned_setpoints_remove_what_plain_setpoints_lack():
     """Torque, velocity gain and damping, which no setpoint of these compensates."""

@@ -151,12 +151,9 @@ def make_setpoints(
             "stiffness the setpoints compensate, or plain setpoints"
         )
     experiment = prepare(scenario)
-    learned, period = learned_signal(experiment), scenario.controller.period
-    if learned is not None and abs(rate * period - 1) > _ROUNDING:
-        raise ConfigError(
-            f"rate: got {rate:g} Hz; expected {1 / period:g} Hz, that of controller.period, for "
-            "which the setpoints were learned"
-        )
+    learned = learned_signal(experiment)
+    if learned is not None:
+        _check_learned(scenario, rate, plain)
     if start is None and scenario.start == "on_reference":
         return _along(experiment, None, 0.0, rate, plain, learned)
     pose = experiment.start[POSE] if start is None else _checked(start, experiment)
@@ -169,6 +166,28 @@ def make_setpoints(
             if broken.time > blend or 2 * blend > scenario.duration:
                 raise ConfigError(str(broken)) from None
             blend *= 2
+
+
+def _check_learned(scenario: Scenario, rate: float, plain: bool) -> None:
+    """Refuse setpoints other than those that were learned."""
+    c = scenario.controller
+    if c.command != "cranks":
+        raise ConfigError(
+            "controller.learned: got a file of learned torques; expected null, or learned "
+            "setpoints and the controller servo_feedforward"
+        )
+    wanted = "none" if plain else "inverse_dynamics"
+    if c.feedforward != wanted:
+        sent = "plain" if plain else "compensated"
+        raise ConfigError(
+            f"controller.feedforward: got {c.feedforward}, with which the setpoints were learned; "
+            f"expected {wanted} for {sent} setpoints"
+        )
+    if abs(rate * c.period - 1) > _ROUNDING:
+        raise ConfigError(
+            f"rate: got {rate:g} Hz; expected {1 / c.period:g} Hz, that of controller.period, for "
+            "which the setpoints were learned"
+        )
 
 
 class _BrokenLimit(ConfigError):

@@ -96,7 +96,7 @@ def learned_signal(experiment: Experiment) -> LearnedSignal | None:
 
 _TEXTS: Final = {
     "machine": "machine",
-    "command": "controller.command",
+    "command": "controller.command or feedforward",
     "motion": "motion",
     "motion_period": "period of the motion, s",
     "period": "controller.period, s",
@@ -108,6 +108,12 @@ def _near(a: Array, b: Array) -> bool:
     return bool(np.allclose(a, b, rtol=0, atol=_SAME))
 
 
+def _command(scenario: Scenario) -> str:
+    # Setpoints are learned on top of the feedforward; what a model lacks does not depend on it.
+    c = scenario.controller
+    return c.command if c.command == "torque" else f"{c.command} with feedforward {c.feedforward}"
+
+
 def _marks(experiment: Experiment) -> dict[str, Array]:
     """Return the arrays by which a file names machine, motion, period and delay."""
     sc = experiment.scenario
@@ -115,7 +121,7 @@ def _marks(experiment: Experiment) -> dict[str, Array]:
     times = period / _POSES * np.arange(_POSES)
     return {
         "machine": np.array(fingerprint(experiment.mechanism)),
-        "command": np.array(sc.controller.command),
+        "command": np.array(_command(sc)),
         "motion_period": np.array(period),
         "motion": np.array(experiment.reference.vector_values(times).T),
         "period": np.array(sc.controller.period),
