@@ -328,7 +328,7 @@ class ControllerConfig:
     w_R: Weight = 1.0
     integral_weight: Weight = 1.0
     weight_scaling: Literal["bryson", "identity"] = "bryson"
-    packet_torques: Annotated[int, Field(ge=1, le=100)] = 8
+    packet_torques: Annotated[int, Field(ge=1, le=100)] = 16
     packet_repeats: Annotated[int, Field(ge=0, le=100)] = 1
     catch_up: Annotated[float, Field(ge=0, le=10), AfterValidator(_check_catch_up)] | None = None
     command: Literal["torque", "cranks"] = "torque"
