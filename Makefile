@@ -5,6 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 INSTALLED_BENCH := $(VENV)/.installed-bench
 DOCS_VENV := .venv-docs
+REACHY_VENV := .venv-reachy
 
 # The pins in constraints.txt are for Python 3.11; a newer one is taken where there is no 3.11.
 ifeq ($(origin PYTHON),undefined)
@@ -21,7 +22,7 @@ PIP_INSTALL := $(BIN)/python -m pip install -qq --no-compile -c constraints.txt
 COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib >/dev/null || true
 
 .DEFAULT_GOAL := help
-.PHONY: generate demo docs test slow board lint format-check types wheel newest bench soak clean help
+.PHONY: generate demo docs test slow board lint format-check types wheel newest bench reachy soak clean help
 
 demo: $(INSTALLED)  ## the paper's comparison, from rest, on the reference, and with a delay of 0.8 s believed to be 0.6 s
 	$(BIN)/stewart-drake compare paper --out out/demo/rest
@@ -39,8 +40,8 @@ docs: $(DOCS_VENV)/.installed  ## the documentation as a site with search, in ou
 # Each takes a stretch of the files, so that what their tests share is made once, and who is done
 # takes from the other.
 WORKERS := -n logical --maxprocesses 4 --dist worksteal
-test slow board soak bench: export OMP_NUM_THREADS := 1
-test slow board soak bench: export OPENBLAS_NUM_THREADS := 1
+test slow board soak bench reachy: export OMP_NUM_THREADS := 1
+test slow board soak bench reachy: export OPENBLAS_NUM_THREADS := 1
 # Tests start commands, and each would compile all of the package anew.
 test slow board soak: export PYTHONDONTWRITEBYTECODE :=
 
@@ -72,6 +73,9 @@ wheel:  ## builds the wheel and tries it in a clean environment, from an empty f
 newest:  ## the tests with the newest Drake, on Python 3.12 or later, without torch
 	@bash .ci/newest $(ARGS)
 
+reachy: $(INSTALLED) $(REACHY_VENV)/.installed  ## Reachy Mini's own daemon in simulation, moved over a network like Wi-Fi
+	REACHY_DAEMON=$(REACHY_VENV)/bin/reachy-mini-daemon $(BIN)/python benchmarks/reachy_daemon.py
+
 # Without arguments a script runs all of its sections.
 bench: export QUICK := $(QUICK)
 bench: $(INSTALLED_BENCH)  ## every script in benchmarks/; QUICK=1: at the least size, pages in out/bench
@@ -83,7 +87,7 @@ generate: $(INSTALLED)  ## writes equations.h and models/*.sdf anew, and compile
 	$(BIN)/python -m stewart_drake.dynamics.generate
 	$(BIN)/python -m stewart_drake.core.build
 
-clean:  ## removes builds, caches and the demo's output, keeps .venv and .venv-docs
+clean:  ## removes builds, caches and the demo's output, keeps the environments
 	rm -rf build dist out/demo out/site .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	find . -path ./$(VENV) -prune -o -type d -name __pycache__ -exec rm -rf {} +
 
@@ -110,6 +114,24 @@ $(DOCS_VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) -m venv $(DOCS_VENV)
 	@$(DOCS_VENV)/bin/python -m pip install -qq -c constraints.txt $$($(PYTHON) -c 'import tomllib; \
 		print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"])')
+	@touch $@
+
+# The robot's package asks for more than its daemon needs in simulation, such as cameras.
+REACHY_DEBIAN := libcairo2-dev libgirepository1.0-dev pkg-config gstreamer1.0-plugins-base \
+	gir1.2-gstreamer-1.0 gir1.2-gst-plugins-base-1.0 gir1.2-gst-plugins-bad-1.0
+REACHY_PACKAGES := 'PyGObject<=3.46' 'websockets<16' 'huggingface-hub<2' mujoco==3.3.0 fastapi uvicorn \
+	aiohttp asgiref scipy pydantic toml psutil jinja2 requests python-multipart zeroconf questionary \
+	platformdirs pyserial pyusb libusb_package onnxruntime rich rustypot
+$(REACHY_VENV)/.installed:
+	@pkg-config --exists cairo gobject-introspection-1.0 || \
+		{ echo "missing Debian packages: expected $(REACHY_DEBIAN)"; exit 1; }
+	@echo "installing reachy-mini and what its daemon needs into $(REACHY_VENV)"
+	@$(PYTHON) -m venv $(REACHY_VENV)
+	@$(REACHY_VENV)/bin/python -m pip install -qq --no-deps reachy-mini==1.13.0 \
+		reachy-mini-rust-kinematics reachy_mini_motor_controller log-throttling==0.0.3
+	@$(REACHY_VENV)/bin/python -m pip install -qq $(REACHY_PACKAGES)
+	@$(REACHY_VENV)/bin/reachy-mini-daemon --help >/dev/null || \
+		{ echo "missing Debian packages: expected $(REACHY_DEBIAN)"; exit 1; }
 	@touch $@
 
 $(INSTALLED_BENCH): $(INSTALLED)

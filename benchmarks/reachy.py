@@ -58,9 +58,9 @@ def head_at(times: np.ndarray, frequency: float) -> tuple[np.ndarray, np.ndarray
     return rotations, 0.005 * g * np.stack(moved, axis=1)
 
 
-def motion_file(frequency: float, folder: Path) -> Path:
+def motion_file(frequency: float, folder: Path, duration: float = DURATION + 1.0) -> Path:
     """Write the motion as CSV, as a reference of `kind: csv` reads it."""
-    times = np.arange(0.0, DURATION + 1.0, 0.005)
+    times = np.arange(0.0, duration, 0.005)
     rows = ["time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m]"]
     for t, R, p in zip(times, *head_at(times, frequency), strict=True):
         head = np.eye(4)
@@ -71,7 +71,9 @@ def motion_file(frequency: float, folder: Path) -> Path:
     return path
 
 
-def setpoints(motion: Path, servo: Any, ball: float = 0.0, *, plain: bool = False) -> np.ndarray:
+def setpoints(
+    motion: Path, servo: Any, ball: float = 0.0, *, plain: bool = False, duration: float = DURATION
+) -> np.ndarray:
     """Return the setpoints (n, 6) for assumed servos and ball joints."""
     kp, kv, damping, friction, armature, force = servo
     fields = {
@@ -85,7 +87,7 @@ def setpoints(motion: Path, servo: Any, ball: float = 0.0, *, plain: bool = Fals
     settings = [f"actuator.{name}={value:.9g}" for name, value in fields.items()]
     if ball > 0:
         settings += [f"plant.{name}={ball * value:.9g}" for name, value in BALL.items()]
-    settings += [f"reference={{kind: csv, file: {motion}}}", f"duration={DURATION}"]
+    settings += [f"reference={{kind: csv, file: {motion}}}", f"duration={duration}"]
     settings += ["start=on_reference", "actuator.angle_range=null"]
     return sd.setpoints("reachy_mini", 1 / PERIOD, plain=plain, settings=settings).angles
 

@@ -2,13 +2,14 @@
 
 import threading
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.live.design import check_controller
+from stewart_drake.live.design import check_controller, design
 from stewart_drake.live.endpoint import Endpoint
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.protocol import (
@@ -149,6 +150,23 @@ def test_what_a_plan_cannot_carry_is_refused(settings, message):
     with pytest.raises(ConfigError, match=message) as said:
         check_controller(scenario)
     assert "\n" not in str(said.value)
+
+
+def test_live_compensates_what_the_scenario_says_of_the_plant():
+    """As the command `setpoints` does, which another test compares with MuJoCo."""
+    settings = ("plant.ball_joint_friction=0.05", "plant.payload_mass=0.1", "start=on_reference")
+    scenario = sd.load_scenario("reachy_mini", settings=settings)
+    machine = SimpleNamespace(torque_limit=np.inf, flags=MachineFlags(0))
+    law = design(scenario, machine).law
+    sent = sd.setpoints(scenario, 50.0).angles
+    plain = prepare(sd.load_scenario("reachy_mini"))
+    unaware = servo_law(plain)[0]
+    for k in (10, 57):
+        wanted = evaluate(plain.reference, 0.02 * (k + 0.5))
+        angles = law.command(wanted, law.plant.dynamics.parameters)[POSE]
+        assert angles == pytest.approx(sent[k], abs=1e-9)
+        before = unaware.command(wanted, unaware.plant.dynamics.parameters)[POSE]
+        assert np.abs(angles - before).max() > 1e-3
 
 
 @pytest.mark.slow

@@ -13,8 +13,14 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.servos import Stiffness
 from stewart_drake.live.machine import Machine
 from stewart_drake.live.options import MachineOptions
-from stewart_drake.live.protocol import SECOND, ControllerMessage, Head, MachineFlags
-from stewart_drake.live.reachy import Daemon, RobotMachine, SoftSetpoints, open_robot
+from stewart_drake.live.protocol import (
+    SECOND,
+    ControllerFlags,
+    ControllerMessage,
+    Head,
+    MachineFlags,
+)
+from stewart_drake.live.reachy import Daemon, Positions, RobotMachine, SoftSetpoints, open_robot
 from stewart_drake.live.session import drive, prepare_session
 from stewart_drake.loop.peer import Fault
 from stewart_drake.loop.preparation import prepare
@@ -212,6 +218,58 @@ def test_without_a_daemon_the_drives_have_failed_and_plans_are_not_taken():
     machine.advance(2 * SECOND)
     assert machine._motors.played == 0
     assert np.all(np.isnan(machine._body.measurement()))
+
+
+class There(Lost):
+    """A daemon whose head stays at home; it keeps setpoints with their time."""
+
+    ready, simulated = True, True
+
+    def __init__(self, clock):
+        self._clock, self.sent = clock, []
+        home = np.append(0.0, ROBOT.crank_angles(ROBOT.home))
+        self.positions = [Positions(clock.time, home)]
+
+    def send(self, joints):
+        self.sent.append((self._clock.time, joints[1:]))
+
+
+@pytest.mark.parametrize("ahead", [0.0, 0.03])
+def test_setpoints_go_ahead_by_the_delay_of_the_robot(ahead):
+    """And they are reported for the time that they are meant for."""
+    clock, wire = Clock(), Wire()
+    daemon, zero = There(clock), clock.time
+    options = MachineOptions(reachy="127.0.0.1:9", port=0, ahead=ahead)
+    experiment = prepare(sd.load_scenario("reachy_mini"))
+    machine = RobotMachine(experiment, wire, options, daemon, lambda line: None, clock=clock)
+    machine.offers.nonce = lambda *_: 9
+    P, home = machine.period, ROBOT.crank_angles(ROBOT.home)
+
+    def planned(time):
+        return home + 0.05 * time / SECOND
+
+    for k in range(100):
+        sampled, playout = k * P, (k + 13) * P
+        rows = np.array([planned(playout + i * P) for i in range(16)])
+        numbers = (sampled, playout, P, rows)
+        head = Head(7, 9, k + 1, 0, 1, 0, 0)
+        message = ControllerMessage(head, ControllerFlags(0), *numbers, cranks=True)
+        machine._arrive(message, ("127.0.0.1", 50000), sampled)
+        for step in range(4):
+            clock.time = zero + sampled + step * P // 4
+            machine.advance(sampled + step * P // 4)
+    sent = daemon.sent[-20:]
+    for time_, angles in sent:
+        meant = time_ - zero + round(ahead * SECOND)
+        assert meant % P == 0
+        assert angles == pytest.approx(planned(meant), abs=1e-9)
+    last = wire.said[-1]
+    assert last.acted[0] == pytest.approx(planned(last.acted_from), abs=1e-12)
+
+
+def test_setpoints_ahead_are_of_a_robot_only(capsys):
+    assert main(["machine", "reachy_mini", "--ahead", "0.1", "--port", "0"]) == 2
+    assert capsys.readouterr().err == "error: --ahead: got 0.1 s without --reachy; expected both\n"
 
 
 # ---------------------------------------------------------------- a whole run

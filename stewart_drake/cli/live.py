@@ -77,6 +77,10 @@ def live(
     delivery = Delivery(out, quiet, as_json)
     span = math.inf if options.duration is None else options.duration
     name = Path(scenario).stem
+    if options.learn:
+        if options.duration is not None or options.log is not None or options.mirror is not None:
+            raise ConfigError("--learn: expected none of --duration, --log and --mirror with it")
+        return _learn(scenario, loaded, machine, options, (controller, settings or ()), delivery)
 
     with contextlib.ExitStack() as running:
         viewer = None if no_browser else running.enter_context(_page(loaded, name))
@@ -112,6 +116,26 @@ def live(
             )
     if options.log is not None:
         delivery.say(f"log written to {options.log}")
+    return _delivered(delivery, result)
+
+
+def _learn(
+    scenario: str,
+    loaded: "Scenario",
+    machine: str | None,
+    options: LiveOptions,
+    more: tuple[str | None, Sequence[str]],
+    delivery: Delivery,
+) -> int:
+    """Learn setpoints, and deliver the best repetition."""
+    from stewart_drake.live.learning import check_learning, learn_setpoints
+
+    check_learning(loaded)
+    with contextlib.ExitStack() as running:
+        where = machine or running.enter_context(_demo_machine(scenario, loaded.eta, *more))
+        delivery.say(f"calling {where}")
+        consent = options if machine else options.model_copy(update={"accept_jitter": True})
+        result = learn_setpoints(loaded, where, consent, delivery.say_wrapped)
     return _delivered(delivery, result)
 
 

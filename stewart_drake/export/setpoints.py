@@ -9,7 +9,6 @@ from typing import Annotated, Final, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
@@ -17,13 +16,12 @@ from stewart_drake.files.yamlio import load_yaml, validate
 from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.servos import Stiffness, rise, turned
 from stewart_drake.loop.learned import learned_signal
-from stewart_drake.loop.preparation import Experiment, prepare
+from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
 from stewart_drake.loop.servos import known_stiffness
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.field_types import section
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
-    CONSTANTS,
     LEGS,
     NUM_TORQUES,
     POSE,
@@ -210,16 +208,6 @@ def _checked(start: Sequence[float] | Array, experiment: Experiment) -> Array:
     return pose
 
 
-def _known_dynamics(experiment: Experiment) -> StewartDynamics:
-    """Return the dynamics with the numbers of the scenario, or of its calibration."""
-    parameters = np.array(experiment.scenario.plant_parameters)
-    if experiment.calibration is not None:
-        for i, name in enumerate(CONSTANTS):
-            value = experiment.calibration.value(name)
-            parameters[i] = parameters[i] if value is None else value
-    return StewartDynamics(experiment.mechanism, experiment.scenario.plant.gravity, parameters)
-
-
 def softened(wanted: Array, pose: Array, time: float, blend: float) -> Array:
     """Return pose, rates and accelerations (18,) of a soft start.
 
@@ -256,7 +244,7 @@ def _along(
     Raises:
         _BrokenLimit: the first limit that it breaks.
     """
-    mechanism, dynamics = experiment.mechanism, _known_dynamics(experiment)
+    mechanism, dynamics = experiment.mechanism, known_dynamics(experiment)
     servo = known_stiffness(experiment.scenario)
     number = max(1, math.ceil(experiment.scenario.duration * rate - 1e-9))
     times, (cranks, rates, torques) = np.arange(number) / rate, np.empty((3, number, NUM_TORQUES))

@@ -17,6 +17,7 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.channel import Packets
 from stewart_drake.law.core_law import serving
+from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.limited import LimitedLqi
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import KnownMotion
@@ -31,7 +32,8 @@ from stewart_drake.live.protocol import (
     MachineMessage,
 )
 from stewart_drake.loop.law_design import control_law, first_queue
-from stewart_drake.loop.preparation import Experiment, prepare
+from stewart_drake.loop.learned import learned_signal
+from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
 from stewart_drake.loop.servos import commands_in_flight, servo_law
 from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.dependencies import differing
@@ -67,6 +69,7 @@ class Design(NamedTuple):
         torque_limit: tighter limit of the scenario and the machine, N m.
         step: time of a step of the law here, s, and the name of its implementation.
         rows: number of setpoints of a plan for servos.
+        learned: angles added to the law's setpoints, by the time of the motion, or None.
     """
 
     experiment: Experiment
@@ -77,6 +80,7 @@ class Design(NamedTuple):
     torque_limit: float
     step: tuple[float, str]
     rows: int = 1
+    learned: LearnedSignal | None = None
 
     @property
     def cranks(self) -> bool:
@@ -170,19 +174,27 @@ def _whole_delay(scenario: Scenario, found: NetworkConfig) -> float:
     return default_bound(found, c.packet_repeats, c.period) + c.packet_repeats * c.period
 
 
-def design(scenario: Scenario, machine: MachineMessage) -> Design:
+def design(
+    scenario: Scenario, machine: MachineMessage, learned: LearnedSignal | None = None
+) -> Design:
     """Return the law for a scenario over the measured link.
+
+    Args:
+        scenario: as `as_seen` returns it.
+        machine: message of the machine.
+        learned: angles to add to setpoints, instead of those of `controller.learned`.
 
     Raises:
         ConfigError: see `loop.preparation.prepare` and `control_law`.
     """
-    if scenario.controller.learned is not None:
-        raise ConfigError(
-            "controller.learned: got a file; expected null: live has no fixed time of the motion"
-        )
     experiment = prepare(scenario)
     if scenario.controller.command == "cranks":
-        return _of_cranks(experiment, machine)
+        return _of_cranks(experiment, machine, learned or learned_signal(experiment))
+    if scenario.controller.learned is not None:
+        raise ConfigError(
+            "controller.learned: got a file of torques; expected null: live has no fixed time of "
+            "the motion for them"
+        )
     law, planned, _ = control_law(experiment)
     limit = min(law.plant.motors.limit, machine.torque_limit)
     law = replace(law, plant=replace(law.plant, motors=TorqueLimit(limit)))
@@ -194,8 +206,18 @@ def design(scenario: Scenario, machine: MachineMessage) -> Design:
     return Design(experiment, law, planned, queue, repeats, limit, _step_time(law, planned, queue))
 
 
-def _of_cranks(experiment: Experiment, machine: MachineMessage) -> Design:
-    """Return the law for servos; its queue is the command (18,) before the first sample."""
+def _of_cranks(
+    experiment: Experiment, machine: MachineMessage, learned: LearnedSignal | None
+) -> Design:
+    """Return the law for servos; its queue is the command (18,) before the first sample.
+
+    Nothing is estimated, so that the law takes the numbers of the scenario's plant, as the command
+    `setpoints` does.
+    """
+    experiment = experiment._replace(nominal=known_dynamics(experiment))
+    sc = experiment.scenario
+    unlearned = replace(sc, controller=replace(sc.controller, learned=None))
+    experiment = experiment._replace(scenario=unlearned)
     law, planned, _ = servo_law(experiment)
     limit = min(experiment.torque_limit, machine.torque_limit)
     first, _ = commands_in_flight(experiment, law, experiment.scenario.true_delay)
@@ -207,7 +229,7 @@ def _of_cranks(experiment: Experiment, machine: MachineMessage) -> Design:
     for _ in range(rows):
         memory = served.step(memory, measured, motion, report)
     step = clock.thread_time() - started, backend
-    return Design(experiment, law, planned, first, 0, limit, step, rows)
+    return Design(experiment, law, planned, first, 0, limit, step, rows, learned)
 
 
 def _step_time(law: PredictiveLqi, motion: Trajectory, queue: Array) -> tuple[float, str]:

@@ -22,6 +22,7 @@ from stewart_drake.law.belief import Belief
 from stewart_drake.law.channel import Report
 from stewart_drake.law.core_law import AnyMemory, serving
 from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.servos import rise
 from stewart_drake.law.timeline import Timeline, TorqueSchedule
 from stewart_drake.live.checks import LONGEST_GAP, ReportCheck, stays_within_reach
 from stewart_drake.live.contact import Contact, await_free
@@ -696,7 +697,12 @@ class LiveLoop:
 class CrankLoop(LiveLoop):
     """Runs the law for servos given by their stiffness, which sends plans of setpoints.
 
-    Row i of a plan is the setpoint that the plan of i samples later will begin with.
+    Row i of a plan is the setpoint that the plan of i samples later will begin with. With w the
+    law's setpoint for the instant t of the motion, and l what was learned, it is
+
+        w(t) + g(s) l(t),   g that of a soft start.
+
+    s goes from 0 to 1 within a second on the motion, and back by hand or on the way to rest.
     """
 
     def __init__(self, design: Design, *args: Any, **kwargs: Any) -> None:
@@ -705,6 +711,8 @@ class CrankLoop(LiveLoop):
         self.memory: Any
         self._check = ReportCheck(math.inf)
         self._no_report = np.full(self._servos.reports.size, np.nan)
+        self._share = 0.0
+        self._last: Array | None = None
 
     def _ahead(self) -> float:
         return float(self._design.law.preview_times.max())
@@ -718,15 +726,31 @@ class CrankLoop(LiveLoop):
 
     def _packet(self, k: int) -> tuple[Array, int]:
         law, command, t = self._servos, self.memory.command, k * self._period + self._horizon
+        learned = self._learned(t)
         rows = [command[POSE]]
+        if self._design.learned is not None:
+            before = rows[0] if self._last is None else self._last
+            rows = [law.servo.limited(rows[0] + learned[0], before)]
+        self._last = rows[0]
         for i in range(1, self._design.rows):
             wanted = self._steering.way.at(t + i * self._period)
             try:
                 further = law.command(wanted, self.memory.belief.parameters)[POSE]
             except UnreachablePoseError:
                 break  # the plan ends before
-            rows.append(law.servo.limited(further, rows[-1]))
+            rows.append(law.servo.limited(further + learned[i], rows[-1]))
         return np.array(rows), k
+
+    def _learned(self, t: float) -> Array:
+        """Return what was learned for a plan from the instant t of the motion on, (n, 6), rad."""
+        rows, signal = self._design.rows, self._design.learned
+        if signal is None:
+            return np.zeros((rows, NUM_TORQUES))
+        later = self._period * np.arange(rows, dtype=np.float64)
+        sign = -1.0 if self._by_hand else 1.0  # also on the way to rest
+        share = self._share + sign * later / _SOFT_STARTS[0]
+        self._share = float(np.clip(self._share + sign * self._period / _SOFT_STARTS[0], 0, 1))
+        return rise(share)[:, None] * signal(t + later)
 
     def _start(
         self, t: float, measurement: Measurement, message: MachineMessage | None

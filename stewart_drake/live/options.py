@@ -30,6 +30,12 @@ class MachineOptions(Settings):
     reachy: str | None = option(
         None, "Drive Reachy Mini through its daemon instead of a simulation.", "HOST:PORT"
     )
+    ahead: float = option(
+        0.0,
+        "With --reachy: seconds by which setpoints go ahead, for the robot's delay.",
+        ge=0,
+        le=1,
+    )
 
 
 class LiveOptions(Options):
@@ -50,6 +56,10 @@ class LiveOptions(Options):
         False, "Start without the question that a large jitter raises.", name="yes"
     )
     log: Path | None = option(None, "Log to write during the run, .mcap or .csv.", "FILE")
+    learn: int = option(
+        0, "Repetitions of the motion from which the setpoints of servos are learned.", ge=0, le=100
+    )
+    learned: Path = option(Path("learned.npz"), "File for what was learned.", "FILE")
     mirror: str | None = option(
         None, "Send each sample as JSON over UDP, for PlotJuggler.", "HOST:PORT"
     )

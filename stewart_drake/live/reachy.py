@@ -12,6 +12,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -24,7 +25,13 @@ from stewart_drake.live.contact import address_of
 from stewart_drake.live.endpoint import Address, Endpoint, now, read_key
 from stewart_drake.live.machine import Machine, check_scenario, open_machine
 from stewart_drake.live.options import MachineOptions
-from stewart_drake.live.protocol import SECOND, ControllerMessage, MachineFlags
+from stewart_drake.live.protocol import (
+    NEVER,
+    SECOND,
+    ControllerMessage,
+    MachineFlags,
+    MachineMessage,
+)
 from stewart_drake.live.simulated import Motors
 from stewart_drake.loop.peer import Fault, Reason
 from stewart_drake.loop.preparation import Experiment, prepare
@@ -298,13 +305,14 @@ class RobotMachine(Machine):
         scenario = experiment.scenario
         servo = known_stiffness(scenario)
         assert servo is not None
+        self._ahead = round(options.ahead * SECOND)
         self._daemon, self._servo, self._yaw = daemon, servo, 0.0
         self._soft: SoftSetpoints | None = None
         robot = Robot(daemon, experiment.mechanism, scenario.sensor.measures_state)
         settings = options.model_copy(update={"restart": "motion", "safe": "hold", "rate": 1.0})
         body = (lambda: robot), "the robot"
         super().__init__(experiment, endpoint, settings, say, body=body, **kwargs)
-        self._at(0, 4, self._drive)
+        self._at(-self._ahead % self.period, 4, self._drive)
 
     def _new_motors(self) -> Motors:
         return Motors(math.inf, self.period, cranks=True)
@@ -317,8 +325,17 @@ class RobotMachine(Machine):
         return flags if self._daemon.simulated else flags & ~MachineFlags.SIMULATION
 
     def _obey(self, message: ControllerMessage, time: int) -> None:
-        if self._daemon.ready or not len(message.torques):
+        if not len(message.torques):
             super()._obey(message, time)
+        elif self._daemon.ready:
+            super()._obey(replace(message, playout=message.playout - self._ahead), time)
+
+    def _message(self, *args: Any) -> MachineMessage:
+        """Report setpoints by the times for which they are meant."""
+        message = super()._message(*args)
+        if message.acted_from == NEVER:
+            return message
+        return replace(message, acted_from=message.acted_from + self._ahead)
 
     def _drive(self, time: int) -> None:
         """Send the setpoint of a period."""
@@ -359,6 +376,8 @@ def open_chosen(
     scenario: Scenario, options: MachineOptions, say: Callable[[str], None] = print
 ) -> AbstractContextManager[tuple[Machine, Address]]:
     """Open the robot behind `options.reachy`, or a simulated machine; as `open_machine`."""
+    if options.ahead and not options.reachy:
+        raise ConfigError(f"--ahead: got {options.ahead:g} s without --reachy; expected both")
     return (open_robot if options.reachy else open_machine)(scenario, options, say)
 
 

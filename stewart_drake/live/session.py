@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 
 from stewart_drake.dynamics.native_functions import one_blas_thread
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.live.contact import Contact, address_of, call, open_endpoint
 from stewart_drake.live.design import Design, as_seen, check_controller, design
 from stewart_drake.live.endpoint import Address, Endpoint
@@ -74,13 +75,19 @@ class Ready(NamedTuple):
         )
 
 
-def prepare_session(scenario: Scenario, address: Address, key: bytes | None = None) -> Ready:
+def prepare_session(
+    scenario: Scenario,
+    address: Address,
+    key: bytes | None = None,
+    learned: LearnedSignal | None = None,
+) -> Ready:
     """Find a machine, measure the link and design the law for it.
 
     Args:
         scenario: law and motion.
         address: address of the machine.
         key: shared key; not needed on loopback.
+        learned: see `live.design.design`.
 
     Raises:
         ConfigError: no machine there, or one that does not fit the scenario.
@@ -91,7 +98,7 @@ def prepare_session(scenario: Scenario, address: Address, key: bytes | None = No
         machine = call(contact)
         check_controller(scenario)
         with one_blas_thread:
-            made = design(as_seen(scenario, contact.link, machine), machine)
+            made = design(as_seen(scenario, contact.link, machine), machine, learned)
             margin = controller_margin(_in_time(made.experiment))
         return Ready(endpoint, contact, made, margin)
     except BaseException:

@@ -26,6 +26,7 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
     BIAS,
+    CONSTANTS,
     COULOMB,
     DAMPING,
     PARAMETERS,
@@ -270,6 +271,18 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
         own=own,
         calibration=calibration,
     )
+
+
+def known_dynamics(experiment: Experiment) -> StewartDynamics:
+    """Return the dynamics with the numbers of the scenario's plant, or of its calibration."""
+    scenario = experiment.scenario
+    parameters = np.array(scenario.plant_parameters)
+    if experiment.calibration is not None:
+        for i, name in enumerate(CONSTANTS):
+            value = experiment.calibration.value(name)
+            parameters[i] = parameters[i] if value is None else value
+    names = _estimated(scenario)
+    return StewartDynamics(experiment.mechanism, scenario.plant.gravity, parameters, names)
 
 
 def _estimated(scenario: Scenario) -> tuple[str, ...]:

@@ -52,7 +52,7 @@ _DEPTH: Final = 3
 """Largest number of differences of repetitions in a step of Anderson's method."""
 _POINTS: Final = 100
 """Instants of a period at which a learned torque or angle is looked at."""
-_PATIENCE: Final = 2
+PATIENCE: Final = 2
 """Repetitions without a smaller error, one after the other, that end learning."""
 
 
@@ -171,7 +171,7 @@ def study_learn(
             progress(k + 1, options.repetitions)
         times, values = lacking(experiment, result, period)
         errors = [one.error for one in done]
-        if len(done) - 1 - np.argmin(errors) >= _PATIENCE or len(times) < 2 * (1 + 2 * number):
+        if len(done) - 1 - np.argmin(errors) >= PATIENCE or len(times) < 2 * (1 + 2 * number):
             break
         if servos is None:
             fitted = fit(times, -values, period, number)
