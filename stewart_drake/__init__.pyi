@@ -197,6 +197,8 @@ def run_live(
     max_missing: float | None = None,
     accept_jitter: bool = False,
     log: pathlib.Path | None = None,
+    learn: int = 0,
+    learned: pathlib.Path = PosixPath("learned.npz"),
     mirror: str | None = None,
 ) -> stewart_drake.reporting.results.SimulationResult: ...
 def run_machine(
@@ -212,6 +214,7 @@ def run_machine(
     duration: float = 0.0,
     log: pathlib.Path | None = None,
     reachy: str | None = None,
+    ahead: float = 0.0,
 ) -> dict[str, typing.Any]: ...
 def train_tuner(
     data: str | pathlib.Path,

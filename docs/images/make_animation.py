@@ -4,6 +4,7 @@ Two controllers on the paper's experiment, from rest, with every torque 0.8 s la
 of no delay, and `predictor_lqi`. The ring is where the plate should be.
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -46,9 +47,17 @@ PLATE_RADIUS: Final = 0.125
 
 
 class Studio:
-    """A mechanism and the ring of its reference before a camera."""
+    """A mechanism and the ring of its reference before a camera.
 
-    def __init__(self, mechanism: sd.Mechanism) -> None:
+    Args:
+        mechanism: that is drawn.
+        radius: of the ring, m; the plate is smaller.
+        distance: of the camera, relative to that for `paper`.
+    """
+
+    def __init__(
+        self, mechanism: sd.Mechanism, radius: float = PLATE_RADIUS, distance: float = 1.0
+    ) -> None:
         self.mechanism = mechanism
         builder = DiagramBuilder()
         self.plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
@@ -56,7 +65,7 @@ class Studio:
         self.wanted = builder.AddSystem(MultibodyPlant(time_step=1e-3))
         self.wanted.RegisterAsSourceForSceneGraph(scene_graph)
         self.ring = self.wanted.AddRigidBody("ring")
-        for name, shape in (("ring", ring(PLATE_RADIUS)), ("pointer", pointer(PLATE_RADIUS))):
+        for name, shape in (("ring", ring(radius)), ("pointer", pointer(radius))):
             self.wanted.RegisterVisualGeometry(
                 self.ring, RigidTransform(), mesh(*shape), name, GREEN
             )
@@ -74,7 +83,9 @@ class Studio:
         )
         self.camera = ColorRenderCamera(core, False)
         z = mechanism.home[5]
-        self.eye = looking_at(z * np.array([3.0, -2.3, 2.1]), np.array([0.0, 0.0, 0.62 * z]))
+        target = np.array([0.0, 0.0, 0.62 * z])
+        away = z * np.array([3.0, -2.3, 2.1]) - target
+        self.eye = looking_at(target + distance * away, target)
 
     def picture(self, pose: Array, wanted: Array) -> Image.Image:
         """Return the plate at a pose (6,) and the ring at another, rad and m."""
@@ -128,10 +139,10 @@ def lettering(size: int) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(font_manager.findfont("DejaVu Sans"), size)
 
 
-def write(path: Path) -> None:
-    """Write the animation."""
+def write(path: Path, films: Iterable[list[Image.Image]]) -> None:
+    """Write two films beside each other."""
     frames = []
-    for k, (left, right) in enumerate(zip(*map(film, SHOWN), strict=True)):
+    for k, (left, right) in enumerate(zip(*films, strict=True)):
         frame = Image.new("RGB", (2 * SIZE[0], left.height), "white")
         frame.paste(left, (0, 0))
         frame.paste(right, (SIZE[0], 0))
@@ -145,4 +156,4 @@ def write(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    write(Path(__file__).with_name("delay.gif"))
+    write(Path(__file__).with_name("delay.gif"), map(film, SHOWN))
