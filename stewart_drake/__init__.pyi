@@ -198,7 +198,7 @@ def run_live(
     accept_jitter: bool = False,
     log: pathlib.Path | None = None,
     learn: int = 0,
-    learned: pathlib.Path = PosixPath("learned.npz"),
+    learned: pathlib.Path | None = None,
     mirror: str | None = None,
 ) -> stewart_drake.reporting.results.SimulationResult: ...
 def run_machine(

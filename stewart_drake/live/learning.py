@@ -116,7 +116,7 @@ def learn_setpoints(
             break
         fitted = corrected_setpoints(steps.used, fit(times, missed, period, number), period, lag)
         learned = LearnedSignal(period, steps.after(fitted))
-    return _kept(done, options.learned, say) if done else result
+    return _kept(done, options.learned or Path("learned.npz"), say) if done else result
 
 
 def _kept(done: list[Repetition], file: Path, say: Callable[[str], None]) -> SimulationResult:

@@ -59,7 +59,9 @@ class LiveOptions(Options):
     learn: int = option(
         0, "Repetitions of the motion from which the setpoints of servos are learned.", ge=0, le=100
     )
-    learned: Path = option(Path("learned.npz"), "File for what was learned.", "FILE")
+    learned: Path | None = option(
+        None, "File for what was learned; learned.npz by default.", "FILE"
+    )
     mirror: str | None = option(
         None, "Send each sample as JSON over UDP, for PlotJuggler.", "HOST:PORT"
     )
