@@ -19,7 +19,6 @@ from stewart_drake.live.loop import End
 from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.session import drive, plans, prepare_session
 from stewart_drake.loop.learned import harmonics_below, motion_period, save_learned
-from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.learn import PATIENCE, Anderson, corrected_setpoints, fit, lacking_angles
@@ -34,15 +33,11 @@ class Repetition(NamedTuple):
     """One repetition in real time.
 
     Attributes:
-        learned: angles that were added to the setpoints, or None in the first one.
         error: rms of the angles that the cranks lacked in the last periods, rad.
-        experiment: of the scenario over the link that was found.
         result: the run.
     """
 
-    learned: LearnedSignal | None
     error: float
-    experiment: Experiment
     result: SimulationResult
 
 
@@ -84,6 +79,9 @@ def learn_setpoints(
         ConfigError: see `check_learning` and `live.session`.
     """
     check_learning(scenario)
+    file, learned, best = options.learned or Path("learned.npz"), None, 0
+    if not file.parent.is_dir():
+        raise ConfigError(f"--learned: got {file}; expected a file in a folder that is there")
     period, dt = motion_period(scenario), scenario.controller.period
     number, servo = harmonics_below(period, dt), scenario.actuator
     assert servo.kind == "position_servo"
@@ -93,7 +91,6 @@ def learn_setpoints(
     address, key = address_of(machine), read_key(options.key)
     how = options.model_dump(include={"armed", "accept_jitter", "max_missing"})
     done, steps = list[Repetition](), Anderson()
-    learned: LearnedSignal | None = None
     for k in range(1, options.learn + 1):
         ready = prepare_session(scenario, address, key, learned)
         if k == 1:
@@ -110,21 +107,19 @@ def learn_setpoints(
                 f"least {least}; learning ends"
             )
             break
-        done.append(Repetition(learned, float(np.sqrt(np.mean(missed**2))), experiment, result))
+        done.append(Repetition(float(np.sqrt(np.mean(missed**2))), result))
         say(f"repetition {k}: the cranks lack {np.degrees(done[-1].error):.3f} degrees rms")
-        if k - 1 - int(np.argmin([one.error for one in done])) >= PATIENCE:
+        best = int(np.argmin([one.error for one in done]))
+        if best == k - 1 and learned is not None:  # at once, so that Ctrl-C loses nothing
+            save_learned(file, learned, experiment)
+        if k - 1 - best >= PATIENCE:
             break
         fitted = corrected_setpoints(steps.used, fit(times, missed, period, number), period, lag)
         learned = LearnedSignal(period, steps.after(fitted))
-    return _kept(done, options.learned or Path("learned.npz"), say) if done else result
-
-
-def _kept(done: list[Repetition], file: Path, say: Callable[[str], None]) -> SimulationResult:
-    """Write what the best repetition used, and return its run."""
-    best = min(done, key=lambda one: one.error)
-    if best.learned is None:
-        say("nothing was learned: no repetition was better than the first one")
+    if not done:
+        return result
+    if best:
+        say(f"repetition {1 + best} is the best; {file} is for controller.learned")
     else:
-        save_learned(file, best.learned, best.experiment)
-        say(f"repetition {1 + done.index(best)} is the best; {file} is for controller.learned")
-    return best.result
+        say("nothing was learned: no repetition was better than the first one")
+    return done[best].result
