@@ -207,7 +207,7 @@ def test_what_the_controller_in_c_plans_ahead_acts_in_the_place_of_what_is_lost(
 def test_the_controller_in_c_hears_what_has_acted(soon, tmp_path):
     """Ten in a row are lost, so that the last torque is held: without being told, the filter would
     take that for a torque bias, which takes the plate four amplitudes away."""
-    settings = in_a_row(10, loss=0.2, seed=12)
+    settings = (*in_a_row(10, loss=0.2, seed=12), "controller.packet_torques=8")
     states, said = over(soon, settings, tmp_path / "log", SLOW)
     dry = int(re.search(r"(\d+) periods dry", said)[1])
     undisturbed = simulated(40, (*SETTINGS, "delay.steps=2"))
