@@ -6,17 +6,21 @@
 #define ITERATIONS 4 /* at the most; one does once the parameters are roughly known */
 #define KNOWN ((real)0.01) /* a constant is known when its deviation is this share of the usual one */
 #define LEARNT ((real)0.3) /* the same, for parameters that are good enough over a few periods */
+#define UNTIMELY 70 /* factor on the first variance of the timing, for a torque far too early or late */
+#define CHANGED ((real)1e-3) /* shares of `usual_std` by which parameters may have changed: the least, */
+#define MOST_CHANGED ((real)0.1)  /* the largest, */
+#define MOST_AGREEING ((real)0.3) /* and where the outlier before agrees with this one */
 
 int stewart_posterior_size(int n, int m)
 {
-    return n + n * n + m + 5;
+    return n + n * n + m + 5 + STEWART_NOISE;
 }
 
 stewart_posterior stewart_posterior_at(real *numbers, int n, int m)
 {
     real *counts = numbers + n + n * n + m;
-    return (stewart_posterior){numbers,    numbers + n, numbers + n + n * n, counts,
-                               counts + 1, counts + 2,  counts + 3,          counts + 4};
+    return (stewart_posterior){numbers,    numbers + n, numbers + n + n * n, counts, counts + 1,
+                               counts + 2, counts + 3,  counts + 4,          (stewart_noise *)(counts + 5)};
 }
 
 static int size_of(const stewart_filter *filter) { return X + filter->machine->estimated; }
@@ -59,11 +63,16 @@ void stewart_kicks(const stewart_machine *machine, const stewart_interval *perio
 void stewart_attempt_predicted(stewart_attempt *a)
 {
     const stewart_filter *f = a->filter;
-    real squares[X];
-    stewart_kicks(f->machine, a->period, a->end, a->after->mean + X, squares);
-    for (int i = 0; i < X; i++)
-        a->drift[i] = REAL(sqrt)(f->model_std[i] * f->model_std[i]
-                                 + f->timing_std * f->timing_std * squares[i]);
+    stewart_kicks(f->machine, a->period, a->end, a->after->mean + X, a->kicks);
+    for (int i = 0; i < X; i++) {
+        a->kicks[i] *= f->timing_std * f->timing_std;
+        a->drift[i] = REAL(sqrt)(f->model_std[i] * f->model_std[i] + a->prior->noise->timing * a->kicks[i]);
+    }
+}
+
+real stewart_filter_timing(const stewart_filter *filter, const stewart_posterior *now)
+{
+    return REAL(sqrt)(now->noise->timing) * filter->timing_std;
 }
 
 int stewart_attempt_ended(stewart_attempt *a, stewart_scratch scratch)
@@ -72,7 +81,12 @@ int stewart_attempt_ended(stewart_attempt *a, stewart_scratch scratch)
     const stewart_posterior *after = a->after;
     if (!a->values)
         stewart_copy(n * n, a->prior->root, after->root);
-    stewart_root_of_prediction(n, a->last, a->drift, a->filter->walk_std, after->root, scratch);
+    real walk[STEWART_MAX_ESTIMATED];
+    for (int i = 0; i < n - X; i++) {
+        const real own = a->filter->walk_std[i], wander = a->filter->wander_std[i];
+        walk[i] = REAL(sqrt)(own * own + after->noise->used * wander * wander);
+    }
+    stewart_root_of_prediction(n, a->last, a->drift, walk, after->root, scratch);
     stewart_copy(X, a->end, after->mean);
     *after->left_out = (real)a->left_out;
     return stewart_all_finite(n, after->mean) && stewart_all_finite(n * n, after->root);
@@ -104,6 +118,24 @@ static int linearize(void *about, const real *xi, real *last, stewart_scratch sc
                                s->fourth_order, s->states, s->H, scratch);
 }
 
+/* Learn the noise in `after` from whitened innovations (m) with their variances. */
+static void learn(const Sample *s, const real *innovations, const real *variances)
+{
+    const stewart_attempt *a = s->attempt;
+    const stewart_filter *f = a->filter;
+    const real nothing[X] = {0};
+    const int m = f->sensing->size;
+    real *K = s->instant.J; /* C^-1 dh/dx */
+    if (!f->sensing->jacobian) {
+        stewart_fill(m * X, 0, K);
+        for (int i = 0; i < m; i++)
+            K[(X + 1) * i] = 1;
+    }
+    stewart_whiten(m, X, s->instant.C, K);
+    stewart_noise_learn(m, innovations, variances, K, f->learns_timing ? a->kicks : nothing, a->n - X, a->last,
+                        f->wander_std, f->keep, a->after->noise);
+}
+
 static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
 {
     const stewart_filter *f = a->filter;
@@ -112,6 +144,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     /* Corrections of parameters that are known already are too small to need F to fourth order. */
     Sample s = {.attempt = a, .fourth_order = !is_known(f, prior->root, KNOWN)};
     real *xi = a->after->mean, distance = 0, spread;
+    real *innovations = stewart_take(&scratch, m), *variances = stewart_take(&scratch, m);
     s.instant = (stewart_instant){f->sensing, a->values, n,  a->end,  NULL,
                                   NULL,       NULL,      &s, predict, linearize};
     s.instant.C = stewart_take(&scratch, m * m);
@@ -127,12 +160,18 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     if (!stewart_innovation_root(f->sensing, a->end, 0, NULL, a->drift, s.instant.C, scratch))
         return 0;
     const stewart_kalman update = {n, m, ITERATIONS, prior->mean, prior->root, f->lower, f->upper, &s,
-                                   stewart_instant_rows, stewart_instant_settle};
+                                   stewart_instant_rows, stewart_instant_settle, innovations, variances};
     if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &spread, scratch))
+        return 0;
+    if (!(distance <= f->gate)) /* or NaN */
         return 0;
     *a->after->squares += distance;
     *a->after->values += (real)m;
-    return distance <= f->gate && stewart_attempt_ended(a, scratch); /* NaN is not */
+    a->likelihood = -(distance + spread) / 2;
+    for (int i = 0; i < m; i++)
+        a->likelihood -= REAL(log)(s.instant.C[(m + 1) * i]);
+    learn(&s, innovations, variances);
+    return stewart_attempt_ended(a, scratch);
 }
 
 /* Compute `after`; the attempt may be repeated with other values or another prior. Returns 0 for an
@@ -143,6 +182,7 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
     stewart_copy(a->n, a->prior->mean, a->after->mean);
     *a->after->squares = *a->prior->squares;
     *a->after->values = *a->prior->values;
+    *a->after->noise = *a->prior->noise;
     return a->filter->legs ? a->filter->legs->attempt(a, scratch) : attempt_sample(a, scratch);
 }
 
@@ -209,6 +249,40 @@ static void accept(int n, int m, const stewart_posterior *found, stewart_posteri
     *now->left_out = *found->left_out;
     *now->squares = *found->squares;
     *now->values = *found->values;
+    *now->noise = *found->noise;
+}
+
+/* Compute `after` of an outlier that the model explains after all: by a torque far too early or late, or
+   by parameters that changed, from `now` with more noise or widened variances in `before`. Of a change,
+   the least share that explains it counts. Returns 0 where none does. */
+static int explain(stewart_attempt *a, const stewart_posterior *now, const stewart_posterior *before,
+                   real most, stewart_scratch scratch)
+{
+    const stewart_filter *filter = a->filter;
+    const int p = a->n - X, size = stewart_posterior_size(a->n, filter->sensing->size);
+    real std[STEWART_MAX_ESTIMATED], late = -(real)INFINITY;
+    int found = 0;
+    a->prior = before;
+    stewart_copy(size, now->mean, before->mean);
+    if (filter->learns_timing && before->noise->timing < UNTIMELY) {
+        before->noise->timing = UNTIMELY;
+        if (attempt(a, scratch))
+            late = a->likelihood;
+    }
+    for (real share = CHANGED; !found && share <= most; share *= REAL(sqrt)(10)) {
+        for (int i = 0; i < p; i++)
+            std[i] = share * filter->usual_std[i];
+        stewart_copy(size, now->mean, before->mean);
+        stewart_widen_root(a->n, std, before->root, scratch);
+        found = attempt(a, scratch);
+    }
+    if (isfinite(late) && !(found && a->likelihood >= late)) {
+        stewart_copy(size, now->mean, before->mean);
+        before->noise->timing = UNTIMELY;
+        found = attempt(a, scratch);
+    }
+    a->prior = now;
+    return found;
 }
 
 void stewart_filter_advance(const stewart_filter *filter, const stewart_interval *period,
@@ -244,6 +318,11 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
         && attempt(&a, scratch))
         outliers += *now.outliers;
     a.prior = &now;
+    if (values && !filter->legs
+        && explain(&a, &now, &before, (outliers > 1 ? MOST_AGREEING : MOST_CHANGED) * (real)1.1, scratch)) {
+        accept(n, m, &after, &now);
+        return;
+    }
     a.values = NULL;
     const int alone = attempt(&a, scratch);
     if (values && (!alone || outliers >= STEWART_PATIENCE)
@@ -263,7 +342,7 @@ int stewart_filter_scratch(const stewart_filter *filter, int torques)
 {
     const stewart_legs *legs = filter->legs;
     const int n = size_of(filter), p = n - X, m = filter->sensing->size;
-    const int sample = m * (m + 1 + X) + X * (n + 1) * torques + stewart_kalman_scratch(n, m);
+    const int sample = m * (m + 3 + X) + X * (n + 1) * torques + stewart_kalman_scratch(n, m);
     const int step = legs ? legs->scratch(filter, torques) : sample;
     const int within = step + stewart_transitions_scratch(p) + 2 * n * n + (X + 2) * n;
     const int start = X * X + m + LEGS * (6 + p) + (legs ? legs->start_scratch(filter) : 0);

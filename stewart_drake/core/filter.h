@@ -12,6 +12,7 @@
 #pragma once
 
 #include "instant.h"
+#include "noise.h"
 
 #define STEWART_PATIENCE 3 /* outliers in a row, that agree with each other, after which they are believed */
 
@@ -26,6 +27,7 @@ typedef struct {
     real *left_out;   /* reasons for left-out values of that measurement, bits as of a `fault` */
     real *squares;  /* sum of nu' S^-1 nu of all measurements that were used, see stewart_kalman_update */
     real *values;   /* number of values in them */
+    stewart_noise *noise; /* factors of the assumed noise */
 } stewart_posterior;
 
 int stewart_posterior_size(int n, int m);
@@ -42,12 +44,15 @@ typedef struct {
                                  measurement of the sample alone */
     int offsets;            /* first of theta that are offsets of six encoders, or -1 for none */
     real gate;              /* nu' S^-1 nu of m values from which on they are an outlier */
-    real timing_std;        /* s by which a torque may come early or late */
+    real timing_std;        /* s by which a torque may come early or late, at first */
+    int learns_timing;      /* whether innovations correct that */
     const real *model_std;  /* (12) by which one step of the model may be off */
     const real *prior_root; /* (p, p) */
     const real *usual_std;  /* (p) before anything is known but the machine's drawing */
     const real *walk_std;   /* (p) by which a parameter changes in a period; 0 for a constant */
     const real *jump_std;   /* (p) by which one may change at once; 0 for a constant; NULL for none */
+    const real *wander_std; /* (p) assumed change of one in a period, where innovations ask for it */
+    real keep;              /* share of what is known of the noise that is kept in a period */
     const real *lower;      /* (n), infinite for the state */
     const real *upper;
 } stewart_filter;
@@ -80,7 +85,9 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
 
    If a measurement or one of its legs does not fit, parameters that walk may have jumped: the update is
    repeated with their variances widened by jump_std^2, then, unless a single leg does not fit, by 10 and
-   100 times jump_std. A measurement that does not fit then either (an outlier, or diverging iterations)
+   100 times jump_std. For a sensor of the state, the update is then repeated with a torque that came
+   far too early or late, and with all parameters changed by a growing share of `usual_std`; the likelier
+   of the two counts. A measurement that does not fit then either (an outlier, or diverging iterations)
    is left out, and the model predicts. If the plate was moved by hand, the outliers agree with each
    other under the model: after three of them, or where the model has no finite prediction, the estimate starts again from the
    measurement. So it does with the first measurement after three or more periods without any, if the
@@ -91,6 +98,9 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
 
 /* Numbers of scratch memory for both, with `torques` in a period at the most. */
 int stewart_filter_scratch(const stewart_filter *filter, int torques);
+
+/* Standard deviation of the instant of a torque as it is known, s. */
+real stewart_filter_timing(const stewart_filter *filter, const stewart_posterior *now);
 
 /* Sum over the changes of torque of the squared changes (12) of the last state, per s that the change
    comes early. To first order the acceleration differs by B dT for that time; this stays in the rates

@@ -14,6 +14,8 @@ typedef struct {
     stewart_posterior *after;   /* its mean is that of the prior to begin with */
     real end[STEWART_STATES];   /* state at the end of the period */
     real drift[STEWART_STATES]; /* standard deviation of the model's error there */
+    real kicks[STEWART_STATES]; /* its variance by the timing, as assumed at first */
+    real likelihood;            /* log of the density of the values, without a constant */
     const real *last;           /* (12, n) d[end]/d[xi] */
     int left_out;                 /* why values were left out */
     int gated;                    /* legs with a value that does not fit */

@@ -34,6 +34,7 @@ void stewart_filtered_start(const stewart_law *law, real *memory)
     stewart_filtered_restart(law, memory);
     const stewart_posterior e = stewart_posterior_at(memory, X + estimated(law), law->measured);
     *e.squares = *e.values = 0;
+    stewart_noise_start(e.noise);
     stewart_copy(estimated(law), settings->prior, memory + X);
 }
 

@@ -275,6 +275,10 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
         }
         for (int i = 0; i < m; i++)
             W[N * i + n] = e[i] + stewart_dot(n, H + n * i, moved);
+        for (int i = 0; i < m && filter->innovations; i++) {
+            filter->innovations[i] = W[N * i + n];
+            filter->variances[i] = 1 + stewart_dot(n, W + N * i, W + N * i);
+        }
         stewart_fill(N * N, 0, R);
         for (int i = 0; i < n; i++)
             R[(N + 1) * i] = 1;

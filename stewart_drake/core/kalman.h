@@ -23,6 +23,7 @@ typedef struct {
     void *model;
     int (*rows)(void *model, const real *xi, real *e, real *H, stewart_scratch scratch);
     int (*settle)(void *model, const real *xi, const real *better, stewart_scratch scratch);
+    real *innovations, *variances; /* (most) results, or NULL: nu and the diagonal of S, whitened by C */
 } stewart_kalman;
 
 /* Compute the mean xi (n), from a first guess in its place, and the root (n, n) of its covariance, which

@@ -142,6 +142,10 @@ class FilterSettings:
         timing_std: s, of the instant of a torque.
         walk_std: (p,) change of a parameter in a period; None: constants.
         jump_std: (p,) sudden change of a parameter; None: constants.
+        learns_timing: whether innovations correct `timing_std`.
+        wander: assumed change of a parameter in a period as a share of its usual standard
+            deviation, where innovations show that parameters change; 0: they do not.
+        keep: share of what innovations say about the noise that is kept in a period.
     """
 
     parameters: ParameterSet
@@ -149,6 +153,9 @@ class FilterSettings:
     timing_std: float
     walk_std: Array | None = None
     jump_std: Array | None = None
+    learns_timing: bool = False
+    wander: float = 0.0
+    keep: float = 1.0
 
 
 EXACT = 1e-6
@@ -163,11 +170,17 @@ CHANCE = 3.0
 """Standard deviations by which an estimate may be beyond a bound."""
 MODEL_ERROR = 2e-4
 """Error of the model in a USUAL_PERIOD as a share of the motion: that of an engine with 1 ms."""
+INTEGRATION_ERROR = 1e-5
+"""The same of an exact plant: that of the filter's own integration."""
 USUAL_PERIOD = 0.1
-"""Period of MODEL_ERROR, s."""
+"""Period of these errors, s."""
 TIMING_ERROR = 0.01
 """Standard deviation of the delay, as a share of a period. With an exact delay the filter would
 attribute the effect of a late torque, large in a catch-up, to payload and bias."""
+FIRST_TIMING_ERROR = 0.006
+"""The same where innovations correct it."""
+NOISE_MEMORY = 5.0
+"""Time over which innovations correct the noise, s."""
 
 
 def usual_parameters(
@@ -263,6 +276,8 @@ def filter_settings(
     model_error: float | None = None,
     timing_std: float | None = None,
     white: bool = False,
+    noisy: bool = False,
+    learns: bool = False,
 ) -> FilterSettings:
     """Return the settings for a machine.
 
@@ -275,17 +290,29 @@ def filter_settings(
         parameters: to estimate; `usual_parameters` if None.
         model_error: share of the motion per s^1.5, see `acceleration_noise`; None:
             `usual_model_error`.
-        timing_std: s, of the instant of a torque; None: TIMING_ERROR of the period.
+        timing_std: s, of the instant of a torque; None: TIMING_ERROR of the period, or learnt.
         white: whether the errors of model and sensor are white. Those of an engine's steps and of
             rounded angles are not: they add up, and the default is then that of a USUAL_PERIOD.
+        noisy: whether a white sensor has noise. The error of an exact model is then
+            INTEGRATION_ERROR; without noise the filter would follow each digit of it.
+        learns: whether innovations correct the noise, see core/noise.h.
     """
     if parameters is None:
         parameters = usual_parameters(plate_mass, torque_scale, torque_limit)
     if model_error is None:
         model_std = usual_model_error(motion_scale, period if white else USUAL_PERIOD)
+        if white and noisy:
+            model_std *= INTEGRATION_ERROR / MODEL_ERROR
     else:
         model_std = acceleration_noise(model_error, motion_scale, period)
-    if timing_std is None:
-        timing_std = TIMING_ERROR * period
-    walk = None if parameters.walk is None else math.sqrt(period) * parameters.walk
-    return FilterSettings(parameters, model_std, timing_std, walk, parameters.jump)
+    usual_timing = period * (FIRST_TIMING_ERROR if learns else TIMING_ERROR)
+    return FilterSettings(
+        parameters,
+        model_std,
+        usual_timing if timing_std is None else timing_std,
+        None if parameters.walk is None else math.sqrt(period) * parameters.walk,
+        parameters.jump,
+        learns_timing=learns and timing_std is None,
+        wander=math.sqrt(period) if learns else 0.0,
+        keep=math.exp(-period / NOISE_MEMORY),
+    )

@@ -213,7 +213,7 @@ _KALMAN: Final = ("sensing", "instant", "kalman")
 _SOURCES: Final[dict[str, tuple[str, ...]]] = {
     "state": ("observers", "sensing"),
     "differences": ("observers", "sensing", "encoders", "kinematics.c", "differences_observer.c"),
-    "filter": ("observers", "filter_observers", "filter", "filter_attempt.h", *_KALMAN),
+    "filter": ("observers", "filter_observers", "filter", "filter_attempt.h", "noise", *_KALMAN),
     "delay": ("delay_observer", "delay", "delay_search.c", "arrivals", *_KALMAN),
 }
 _SOURCES["gap"] = _SOURCES["filter"]
@@ -284,10 +284,12 @@ def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
         "prior_root": numbers(np.linalg.cholesky(known.covariance), p, p),
         "usual_std": numbers(known.usual_std, p),
         "walk_std": numbers(np.zeros(p) if settings.walk_std is None else settings.walk_std, p),
+        "wander_std": numbers(settings.wander * known.usual_std, p),
         "lower": numbers([*-free, *known.lower], NUM_STATE + p),
         "upper": numbers([*free, *known.upper], NUM_STATE + p),
     }
     it.prior, it.filter.gate, it.filter.timing_std = c.at(prior), _gate(size), settings.timing_std
+    it.filter.learns_timing, it.filter.keep = settings.learns_timing, settings.keep
     it.filter.offsets = known.names.index(OFFSETS[0]) if OFFSETS[0] in known.names else -1
     if settings.jump_std is not None:
         arrays["jump_std"] = numbers(settings.jump_std, p)
@@ -349,7 +351,7 @@ def belief_of(
     measured = memory[last : last + m]
     if observer.settings is not None:
         mean, root, rest = np.split(memory[:last], [n, n + n * n])
-        L, (left_out, *innovations) = root.reshape(n, n), rest[-3:]
+        L, (left_out, *innovations) = root.reshape(n, n), rest[m + 2 : m + 5]
         belief = Belief(Estimate(mean, L @ L.T), timeline, measured, faults, memory=memory)
         partial = int(left_out).bit_count()
         return replace(belief, partial=partial, innovations=Innovations(*map(float, innovations)))

@@ -61,7 +61,7 @@ from stewart_drake.loop.own import Own, own_motion
 from stewart_drake.loop.preparation import Experiment, calibration_of, check_instants
 from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.scenario.calibration import OFFSETS, believed_delay
-from stewart_drake.scenario.config import ControllerConfig, Scenario
+from stewart_drake.scenario.config import ControllerConfig, Scenario, StateSensorConfig
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.field_types import MOST_PERIODS
@@ -177,11 +177,14 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     torque_scale = max(least, peak_torque)
     plate, asked = experiment.mechanism.plate.mass, experiment.planned_limit
     parameters = estimated_parameters(experiment, torque_scale, max(STILL * least, peak_torque))
+    of_state = isinstance(sc.sensor, StateSensorConfig)
     settings = filter_settings(
         *(motion, plate, torque_scale, asked, c.period, parameters),
         model_error=c.model_error,
         timing_std=c.timing_std,
-        white=sc.plant.kind == "exact" and sc.sensor.kind == "state",
+        white=sc.plant.kind == "exact" and of_state,
+        noisy=isinstance(sc.sensor, StateSensorConfig) and all(sc.sensor.noise_std),
+        learns=of_state,
     )
     gaps = sc.sensor.kind == "state" and sc.sensor.loss > 0
     observer = CoreObserver(settings if c.estimate else None, gaps=gaps)

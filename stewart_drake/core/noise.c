@@ -1,0 +1,55 @@
+/* See noise.h. */
+
+#include "noise.h"
+#include "short.h"
+
+#define ONE_TORQUE ((real)0.5) /* its information about t = 1: 1 / (2 t^2) */
+#define SURE ((real)2.5)
+#define WIDER 6
+
+void stewart_noise_start(stewart_noise *noise)
+{
+    *noise = (stewart_noise){.timing = 1};
+}
+
+/* Fisher scoring of one factor; NaN leaves 0. */
+static real scored(real factor, real slope, real information)
+{
+    const real found = information > 0 ? factor + slope / information : 0;
+    return found > 0 ? found : 0;
+}
+
+void stewart_noise_learn(int m, const real *innovations, const real *variances, const real *H,
+                         const real *timing, int p, const real *G, const real *wander, real keep,
+                         stewart_noise *noise)
+{
+    real of_timing = 0, of_wander = 0;
+    noise->known_timing *= keep;
+    noise->known_wander *= keep;
+    for (int i = 0; i < m; i++) {
+        const real *h = H + X * i;
+        real K = 0, W = 0, S = variances[i];
+        for (int j = 0; j < X; j++)
+            K += h[j] * h[j] * timing[j];
+        for (int k = 0; k < p; k++) {
+            real change = 0;
+            for (int j = 0; j < X; j++)
+                change += h[j] * G[(X + p) * j + X + k];
+            change *= wander[k];
+            W += change * change;
+        }
+        const real found = S - (noise->used - noise->wander) * W; /* S at w instead of the one in use */
+        S = found > S / 10 ? found : S / 10;
+        const real off = (innovations[i] * innovations[i] / S - 1) / (2 * S);
+        of_timing += K * off;
+        of_wander += W * off;
+        noise->known_timing += K * K / (2 * S * S);
+        noise->known_wander += W * W / (2 * S * S);
+    }
+    noise->timing = scored(noise->timing, of_timing, noise->known_timing + ONE_TORQUE);
+    noise->wander = scored(noise->wander, of_wander, noise->known_wander);
+    const real sure = noise->wander - SURE / REAL(sqrt)(noise->known_wander);
+    noise->used *= REAL(sqrt)(keep);
+    if (WIDER * sure > noise->used) /* not for NaN */
+        noise->used = WIDER * sure;
+}
