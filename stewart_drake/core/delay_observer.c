@@ -99,6 +99,22 @@ void stewart_delayed_parameters(const stewart_law *law, const real *memory, real
             std[i - X] = stewart_norm(i + 1, row);
 }
 
+real stewart_delayed_uncertainty(const stewart_law *law, const real *memory, real *L)
+{
+    Sizes s;
+    sizes_of(law, &s);
+    const int n = X + s.p;
+    stewart_delay_memory *m = (stewart_delay_memory *)(uintptr_t)(memory + X);
+    const stewart_guess *best = stewart_delay_guess(s.p, s.m, s.flights, m, m->known > 0 ? (int)m->best : 0);
+    const real *row = best->numbers + n + 2; /* lower triangle, by rows; the last two are of the delay */
+    for (int i = 0; L && i < n; row += ++i) {
+        stewart_fill(n, m->known > 0 ? 0 : (real)NAN, L + n * i);
+        if (m->known > 0)
+            stewart_copy(i + 1, row, L + n * i);
+    }
+    return m->known > 0 ? REAL(sqrt)(best->timing) : 0;
+}
+
 void stewart_delayed_outlook(const stewart_law *law, const real *memory, int number,
                              const real *torques, stewart_outlook *outlook, stewart_scratch *scratch)
 {
@@ -147,4 +163,5 @@ const stewart_observer stewart_delay_observer = {
     stewart_delayed_memory,  stewart_delayed_scratch, stewart_delayed_start,
     stewart_delayed_observe, stewart_delayed_start,   stewart_delayed_parameters,
     stewart_state_sensing, stewart_delayed_outlook, stewart_delayed_last_period,
+    stewart_delayed_uncertainty,
 };

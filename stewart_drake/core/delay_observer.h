@@ -22,6 +22,7 @@ void stewart_delayed_start(const stewart_law *law, real *memory);
 int stewart_delayed_observe(const stewart_law *law, real *memory, int number, const real *torques,
                             const real *values, stewart_scratch scratch);
 void stewart_delayed_parameters(const stewart_law *law, const real *memory, real *theta, real *std);
+real stewart_delayed_uncertainty(const stewart_law *law, const real *memory, real *L);
 void stewart_delayed_outlook(const stewart_law *law, const real *memory, int number,
                              const real *torques, stewart_outlook *outlook, stewart_scratch *scratch);
 void stewart_delayed_last_period(const stewart_law *law, const real *memory, int number,

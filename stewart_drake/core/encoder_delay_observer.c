@@ -7,4 +7,5 @@ const stewart_observer stewart_encoder_delay_observer = {
     stewart_delayed_memory,  stewart_delayed_scratch, stewart_delayed_start,
     stewart_delayed_observe, stewart_delayed_start,   stewart_delayed_parameters,
     stewart_newest_encoders, stewart_delayed_outlook, stewart_delayed_last_period,
+    stewart_delayed_uncertainty,
 };

@@ -286,4 +286,5 @@ const stewart_observer stewart_encoder_observer = {
     stewart_filtered_memory,  stewart_filtered_scratch, stewart_filtered_start,
     stewart_filtered_observe, stewart_filtered_restart, stewart_filtered_parameters,
     sensing_with_legs,        NULL,                     NULL,
+    stewart_filtered_uncertainty,
 };

@@ -70,11 +70,6 @@ void stewart_attempt_predicted(stewart_attempt *a)
     }
 }
 
-real stewart_filter_timing(const stewart_filter *filter, const stewart_posterior *now)
-{
-    return REAL(sqrt)(now->noise->timing) * filter->timing_std;
-}
-
 int stewart_attempt_ended(stewart_attempt *a, stewart_scratch scratch)
 {
     const int n = a->n;
@@ -266,6 +261,7 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
     stewart_copy(size, now->mean, before->mean);
     if (filter->learns_timing && before->noise->timing < UNTIMELY) {
         before->noise->timing = UNTIMELY;
+        before->noise->known_timing = 0;
         if (attempt(a, scratch))
             late = a->likelihood;
     }
@@ -279,6 +275,7 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
     if (isfinite(late) && !(found && a->likelihood >= late)) {
         stewart_copy(size, now->mean, before->mean);
         before->noise->timing = UNTIMELY;
+        before->noise->known_timing = 0;
         found = attempt(a, scratch);
     }
     a->prior = now;

@@ -99,9 +99,6 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
 /* Numbers of scratch memory for both, with `torques` in a period at the most. */
 int stewart_filter_scratch(const stewart_filter *filter, int torques);
 
-/* Standard deviation of the instant of a torque as it is known, s. */
-real stewart_filter_timing(const stewart_filter *filter, const stewart_posterior *now);
-
 /* Sum over the changes of torque of the squared changes (12) of the last state, per s that the change
    comes early. To first order the acceleration differs by B dT for that time; this stays in the rates
    and moves the pose for the rest of the period. */

@@ -46,6 +46,16 @@ void stewart_filtered_parameters(const stewart_law *law, const real *memory, rea
         std[i - X] = stewart_norm(n, memory + n + n * i);
 }
 
+real stewart_filtered_uncertainty(const stewart_law *law, const real *memory, real *L)
+{
+    const int n = X + estimated(law);
+    const stewart_filter_settings *settings = law->estimation;
+    const stewart_noise *noise = (const stewart_noise *)(memory + estimate_numbers(law) - STEWART_NOISE);
+    if (L)
+        stewart_copy(n * n, memory + n, L);
+    return REAL(sqrt)(noise->timing) * settings->filter.timing_std;
+}
+
 static stewart_filter filter_of(const stewart_law *law, const stewart_sensing *sensing)
 {
     stewart_filter filter = ((const stewart_filter_settings *)law->estimation)->filter;
@@ -116,6 +126,7 @@ const stewart_observer stewart_filter_observer = {
     stewart_filtered_memory,  stewart_filtered_scratch,    stewart_filtered_start,
     stewart_filtered_observe, stewart_filtered_restart,    stewart_filtered_parameters,
     stewart_state_sensing,    NULL,                        NULL,
+    stewart_filtered_uncertainty,
 };
 
 /* ---- over gaps -----------------------------------------------------------------------------------
@@ -218,4 +229,5 @@ static int gap_scratch(const stewart_law *law)
 const stewart_observer stewart_gap_observer = {
     gap_memory,               gap_scratch,                 gap_start,             gap_observe,
     stewart_filtered_restart, stewart_filtered_parameters, stewart_state_sensing, NULL, NULL,
+    stewart_filtered_uncertainty,
 };

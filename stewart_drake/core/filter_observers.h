@@ -24,8 +24,8 @@ extern const stewart_observer stewart_encoder_observer;
 extern const stewart_legs stewart_encoder_legs; /* filter step with encoders, see filter_attempt.h */
 
 /* Callbacks of `stewart_observer` that these observers share: size of the memory, scratch numbers of
-   `observe`, start from the prior, one period of the filter, restart with the estimated parameters, and
-   parameters with their standard deviations. */
+   `observe`, start from the prior, one period of the filter, restart with the estimated parameters,
+   parameters with their standard deviations, and the covariance. */
 
 int stewart_filtered_memory(const stewart_law *law);
 int stewart_filtered_scratch(const stewart_law *law);
@@ -34,3 +34,4 @@ int stewart_filtered_observe(const stewart_law *law, real *memory, int number, c
                              const real *values, stewart_scratch scratch);
 void stewart_filtered_restart(const stewart_law *law, real *memory);
 void stewart_filtered_parameters(const stewart_law *law, const real *memory, real *theta, real *std);
+real stewart_filtered_uncertainty(const stewart_law *law, const real *memory, real *L);

@@ -157,11 +157,16 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
     outlook->feeds_back = outlook->settled = 1;
     outlook->found = 0;
     outlook->caution = 1;
+    outlook->observed = observed;
     if (observer->outlook)
         observer->outlook(law, observed, length, in_flight, outlook, scratch);
     else
         fixed_delay_outlook(law, in_flight, outlook, scratch);
     real std[STEWART_MAX_ESTIMATED];
+    if (law->tolerated_timing > 0 && observer->uncertainty) {
+        const real ratio = observer->uncertainty(law, observed, NULL) / law->tolerated_timing;
+        outlook->caution *= ratio > 1 ? ratio * ratio : 1; /* not for NaN */
+    }
     stewart_copy(X, observed, outlook->state);
     observer->parameters(law, observed, outlook->theta, std);
     if (behind > 0 && stewart_all_finite(X, outlook->state)) {

@@ -98,6 +98,7 @@ struct stewart_law {
     int kept;          /* torques that are remembered beyond the delay's */
     int longest_wait;  /* for a late measurement, periods */
     int silence;       /* samples at the start at which nothing is fed back */
+    real tolerated_timing; /* s, deviation of single torques from which on their weight grows; 0: it is given */
     int measured;      /* numbers of a measurement */
     int parts;         /* torques that a machine reports of each period; 0: they are the law's own */
     int rows;          /* of a preview, at the most */

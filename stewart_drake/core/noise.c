@@ -46,7 +46,8 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
         noise->known_timing += K * K / (2 * S * S);
         noise->known_wander += W * W / (2 * S * S);
     }
-    noise->timing = scored(noise->timing, of_timing, noise->known_timing + ONE_TORQUE);
+    const real t = noise->timing > 1 ? noise->timing : 1;
+    noise->timing = scored(noise->timing, of_timing, noise->known_timing + ONE_TORQUE / (t * t));
     noise->wander = scored(noise->wander, of_wander, noise->known_wander);
     const real sure = noise->wander - SURE / REAL(sqrt)(noise->known_wander);
     noise->used *= REAL(sqrt)(keep);

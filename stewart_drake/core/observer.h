@@ -29,6 +29,7 @@ typedef struct {
     real caution;       /* factor on the weight of torques */
     real state[STEWART_STATES]; /* now; NaN before there is any */
     real theta[STEWART_MAX_ESTIMATED];
+    const real *observed;   /* memory of the observer */
     real eta;               /* s until the torque that is computed now begins to act */
     real fraction;          /* of a period, of `eta` beyond the last of `times` */
     stewart_schedule until;   /* torques until then */
@@ -60,6 +61,9 @@ typedef struct {
     /* The same: torques since the last sample, and the next torque. */
     void (*last_period)(const stewart_law *law, const real *memory, int number, const real *torques,
                         stewart_schedule *schedule, const real **following, stewart_scratch *scratch);
+    /* NULL without a covariance. Root L (12 + p, 12 + p) of that of state and parameters, NaN before
+       there is any. Returns the standard deviation of the instant of a single torque, s; L may be NULL. */
+    real (*uncertainty)(const stewart_law *law, const real *memory, real *L);
 } stewart_observer;
 
 /* The sensor of the law: `described`, else `sensing` as its observer reads it. */

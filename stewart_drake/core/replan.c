@@ -5,20 +5,24 @@
 
 #define PIECE STEWART_PIECE
 
-/* Memory: samples since the plan was made, its pieces, how many. Times of pieces are from that sample. */
+/* Memory: samples since the plan was made or the start, number of pieces, samples since the start, pieces.
+   Times of pieces are from the sample of the plan. */
+#define HEAD 3
+#define LATEST ((real)1e6) /* samples that are counted */
 static int most_pieces(const stewart_law *law)
 {
     const stewart_replan *replan = law->planning;
     return replan->until + stewart_plan_pieces(law->period, replan->periods);
 }
 
-static int replan_memory(const stewart_law *law) { return 2 + PIECE * most_pieces(law); }
+static int replan_memory(const stewart_law *law) { return HEAD + PIECE * most_pieces(law); }
 
 static int replan_scratch(const stewart_law *law)
 {
     const stewart_replan *replan = law->planning;
-    return X * (replan->until + 1) + PIECE * most_pieces(law) +
-           stewart_plan_scratch(law->period, replan->periods);
+    const int p = law->machine.estimated, judged = (X + p) * (X + p) + stewart_sure_scratch(p, replan->until);
+    const int planned = PIECE * most_pieces(law) + stewart_plan_scratch(law->period, replan->periods);
+    return X * (replan->until + 1) + (judged > planned ? judged : planned);
 }
 
 static void replan_start(const stewart_law *law, real *memory)
@@ -36,7 +40,7 @@ static void look(const stewart_law *law, const real *memory, const stewart_sampl
         real *row = rows + ROW * i;
         if (pieces == 0)
             sample->reference(sample->about, 1, times + i, row);
-        else if (!stewart_along(pieces, memory + 2, now + times[i], row))
+        else if (!stewart_along(pieces, memory + HEAD, now + times[i], row))
             sample->goal(sample->about, 1, times + i, row);
     }
 }
@@ -59,7 +63,38 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
         return 0;
     memory[0] = 0;
     memory[1] = (real)(number + further);
-    stewart_copy(PIECE * (number + further), pieces, memory + 2);
+    stewart_copy(PIECE * (number + further), pieces, memory + HEAD);
+    return 1;
+}
+
+int stewart_sure_scratch(int estimated, int torques)
+{
+    const int n = X + estimated;
+    return X * n * torques + n + stewart_transitions_scratch(estimated);
+}
+
+int stewart_is_sure(const stewart_machine *machine, const stewart_schedule *schedule, const real *states,
+                    const real *theta, const real *L, const real *size, real sure, stewart_scratch scratch)
+{
+    const int p = machine->estimated, n = X + p, last = schedule->number - 1;
+    real *H = stewart_take(&scratch, X * n * schedule->number), *xi = stewart_take(&scratch, n);
+    if (last < 0)
+        return 1;
+    stewart_copy(X, states, xi);
+    stewart_copy(p, theta, xi + X);
+    if (!stewart_transitions(machine, xi, schedule, 0, states + X, H, scratch))
+        return 0;
+    for (int i = 0; i < 6; i++) {
+        real variance = 0;
+        for (int j = 0; j < n; j++) {
+            real off = 0;
+            for (int k = 0; k < n; k++)
+                off += H[X * n * last + n * i + k] * L[n * k + j];
+            variance += off * off;
+        }
+        if (!(REAL(sqrt)(variance) <= sure * size[i])) /* or NaN */
+            return 0;
+    }
     return 1;
 }
 
@@ -69,13 +104,26 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     const stewart_replan *replan = law->planning;
     real *states = stewart_take(&scratch, X * (outlook->until.number + 1)), wanted[ROW];
     memory[0] += 1;
+    memory[2] = memory[2] < LATEST ? memory[2] + 1 : LATEST;
     if (!sample->goal || !outlook->settled || !stewart_all_finite(X, outlook->state))
         return 0;
     stewart_copy(X, outlook->state, states);
     stewart_predict(&law->machine, outlook->theta, &outlook->until, states, states + X);
     look(law, memory, sample, 1, &outlook->eta, wanted);
-    if (!stewart_is_off(replan->size, states + X * outlook->until.number, wanted, outlook->found))
+    /* A delay that is known counts as found when the first torque has acted for a period. */
+    const real acted = outlook->eta / law->period + 2;
+    const int first = !law->observer->outlook && memory[2] >= acted && memory[2] - memory[0] < acted;
+    if (!stewart_is_off(replan->size, states + X * outlook->until.number, wanted, outlook->found || first))
         return 0;
+    if (law->observer->uncertainty) {
+        const int n = X + law->machine.estimated;
+        stewart_scratch own = scratch;
+        real *L = stewart_take(&own, n * n);
+        law->observer->uncertainty(law, outlook->observed, L);
+        if (!stewart_is_sure(&law->machine, &outlook->until, states, outlook->theta, L, replan->size,
+                             replan->sure, own))
+            return 0;
+    }
     return plan(law, outlook, sample, states, memory, scratch);
 }
 

@@ -265,7 +265,7 @@ def _surroundings(experiment: Experiment, recorded: Recorded, suffix: str) -> di
         rows = knots(motion, scenario.duration + max(0.0, float(times.max())))
     return {
         "DURATION": repr(float(scenario.duration)),
-        "OWN_WEIGHTS": numbers([c.w_Q, c.w_R], suffix),
+        "OWN_WEIGHTS": numbers(c.weights, suffix),
         "START": numbers(experiment.start, suffix),
         "LEAST": numbers(LEAST, suffix),
         "HOME_SIGN": numbers(home_sign(experiment.mechanism), suffix),

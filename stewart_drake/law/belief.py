@@ -101,6 +101,7 @@ class Belief:
         settled: whether the delay is known.
         found: whether the delay was found, or changed, at this sample.
         delay_mean, delay_std: s, of the delay; NaN where it is not estimated.
+        timing: s, standard deviation of the instant of a single torque; 0 where it is not learnt.
         innovations: since the estimator's last start.
         memory: numbers of an observer of the core.
     """
@@ -116,6 +117,7 @@ class Belief:
     found: bool = False
     delay_mean: float = math.nan
     delay_std: float = math.nan
+    timing: float = 0.0
     innovations: Innovations = field(default_factory=Innovations)
     memory: Array = field(default_factory=lambda: np.zeros(0))
 

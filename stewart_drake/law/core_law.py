@@ -4,6 +4,7 @@
 flat vector, and `CoreMemory` gives its fields the names of `law.memory.Memory`.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, NamedTuple
@@ -150,6 +151,7 @@ class CompiledLaw:
         d.cost.integrates = int(cost.integrals is not None)
         d.cost.integrals = (np.zeros(6) if cost.integrals is None else cost.integrals).tolist()
         d.kept, d.silence = law.kept, law.silence
+        d.tolerated_timing = 0.0 if math.isinf(law.tolerated_timing) else law.tolerated_timing
         d.longest_wait, observer = law.longest_wait, law.observer
         assert isinstance(observer, CoreObserver)
         if law.finds_delay:  # it finds steps and fraction itself
@@ -171,6 +173,7 @@ class CompiledLaw:
             until = law.observer.max_schedule_length(d.period)
         plan.periods, plan.until = periods_of(planner.duration, d.period), until
         plan.size, plan.sign = planner.size.tolist(), home_sign(law.plant.mechanism)
+        plan.sure = planner.sure
         d.planner, d.planning = c.ffi.addressof(c.lib, "stewart_replanner"), plan
         self.tables[address_of(d.planner)] = "stewart_replanner"
         self.keep.append(plan)

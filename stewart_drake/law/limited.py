@@ -146,7 +146,8 @@ class LimitedLqi(OuterLqi):
         if self._meets_limits(after, ahead, start, holds):
             return memory.following(after)
         until = begun + self.limits.budget
-        weighted = weights * [1.0, belief.caution]
+        caution = belief.caution * max(1.0, belief.timing / self.tolerated_timing) ** 2
+        weighted = weights * [1.0, caution]
         reference = self._reference_plan(ahead)
         last = self._continued(memory.plan, reference, start, holds)
         plan, cause = last, None

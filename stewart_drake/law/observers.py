@@ -352,7 +352,10 @@ def belief_of(
     if observer.settings is not None:
         mean, root, rest = np.split(memory[:last], [n, n + n * n])
         L, (left_out, *innovations) = root.reshape(n, n), rest[m + 2 : m + 5]
-        belief = Belief(Estimate(mean, L @ L.T), timeline, measured, faults, memory=memory)
+        timing = law.observer.uncertainty(law, c.at(memory), c.ffi.NULL)
+        belief = Belief(
+            Estimate(mean, L @ L.T), timeline, measured, faults, timing=timing, memory=memory
+        )
         partial = int(left_out).bit_count()
         return replace(belief, partial=partial, innovations=Innovations(*map(float, innovations)))
     theta, std = np.empty(p), np.empty(p)
@@ -385,6 +388,7 @@ def _delay_belief(law: Any, memory: Array, timeline: Timeline, faults: tuple[str
         caution=it.caution,
         settled=bool(it.settled),
         found=bool(it.found),
+        timing=law.observer.uncertainty(law, c.at(memory), c.ffi.NULL),
         delay_mean=it.mean,
         delay_std=it.std,
         memory=memory,

@@ -7,6 +7,7 @@ that held torques follow without error. The law then follows the predicted motio
 reference: no error is left to feed back, and the integral begins anew.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
@@ -15,8 +16,10 @@ import numpy as np
 from stewart_drake.core.library import core
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.catch_up import Model, periods_of
+from stewart_drake.law.compiled import machine_of, numbers
 from stewart_drake.law.motion import KnownMotion, Motion
 from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.timeline import TorqueSchedule
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array
 
@@ -80,10 +83,13 @@ class Replan:
     Attributes:
         duration: of the plan, s.
         size: (6,) of the motion, peak to peak, rad and m.
+        sure: largest standard deviation of the predicted pose at which a plan is made, as a share
+            of the size. A plan from an uncertain state can make things worse.
     """
 
     duration: float
     size: Array
+    sure: float = 0.03
 
     def follow(
         self,
@@ -104,8 +110,15 @@ class Replan:
         schedule = timeline.until_next(timeline.queue(in_flight))
         states = np.vstack([belief.state, plant.predict(belief.state, schedule, belief.parameters)])
         wanted = followed(np.array([timeline.eta]))[0, :NUM_STATE].copy()
-        where = c.at(np.array(self.size, np.float64)), c.at(states[-1]), c.at(wanted)
-        if not c.lib.stewart_is_off(*where, belief.found):
+        size = np.array(self.size, np.float64)
+        # A delay that is known counts as found when the first torque has acted for a period.
+        acted = timeline.eta + timeline.period - 1e-9
+        planned = 0.0 if path is None else path[0, 0]
+        first = math.isnan(belief.delay_mean) and motion.now >= acted > planned
+        where = c.at(size), c.at(states[-1]), c.at(wanted)
+        if not c.lib.stewart_is_off(*where, belief.found or first):
+            return before
+        if belief.estimate.uncertain and not self._is_sure(belief, schedule, states, plant):
             return before
         model = Model(plant.dynamics.assuming(belief.parameters))
         begin, periods = motion.now + timeline.eta, periods_of(self.duration, timeline.period)
@@ -114,3 +127,16 @@ class Replan:
             return before  # there is none from here; the next sample may find one
         pieces = np.vstack([model.way(schedule, states, motion.now), plan.pieces])
         return FollowedMotion(replace(motion, pieces=pieces), pieces, True)
+
+    def _is_sure(
+        self, belief: Belief, schedule: TorqueSchedule, states: Array, plant: NominalPlant
+    ) -> bool:
+        """Return whether the pose after the torques in flight is known well enough."""
+        c, machine, number = core(), machine_of(plant), len(schedule.torques)
+        w, U = np.linalg.eigh(belief.estimate.covariance)
+        L = U * np.sqrt(np.maximum(w, 0.0))
+        arrays = [numbers(a) for a in (*schedule, states, belief.parameters, L, self.size)]
+        torques, durations, *rest = map(c.at, arrays)
+        what = c.ffi.new("stewart_schedule *", [number, torques, durations, 0])
+        scratch = c.scratch(c.lib.stewart_sure_scratch(len(belief.parameters), number))
+        return bool(c.lib.stewart_is_sure(machine.it, what, *rest, self.sure, scratch))

@@ -11,6 +11,7 @@ with K from `law.riccati.reduced_gain` and T_ff the feedforward of the hold inte
 dynamics through the queue. Torques enter the linear parts as deviations from their feedforward.
 """
 
+import math
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -78,6 +79,8 @@ class PredictiveLqi:
         longest_wait: periods to wait for a late measurement before the model continues; 0:
             measurements are of the present.
         planner: of the way back, where the prediction is off the reference.
+        tolerated_timing: s, standard deviation of the instant of single torques from which on the
+            weight of the torques grows with its square; infinite: the weight is given.
         silence: samples at the start without feedback: until an own torque has acted, feedback
             only adds noise.
     """
@@ -95,6 +98,7 @@ class PredictiveLqi:
     longest_wait: int = 0
     planner: Planner = field(default_factory=NoPlanner)
     silence: int = 0
+    tolerated_timing: float = math.inf
 
     @property
     def parts(self) -> dict[str, Any]:
@@ -363,7 +367,8 @@ class PredictiveLqi:
             model = self.model.at(ahead.state, torque, belief.parameters, self.plant)
             error = error - self.feedforward.offset(changes, model.B[RATES], belief.timeline)
             delayed = self.cost.sampled(model, belief.timeline)
-            K = self.cost.gain(delayed, weights * [1.0, belief.caution])
+            caution = belief.caution * max(1.0, belief.timing / self.tolerated_timing) ** 2
+            K = self.cost.gain(delayed, weights * [1.0, caution])
             return error, self.predictor.gain(K, delayed), None
         except UnreachablePoseError:  # nothing to regulate: the feedforward acts alone
             return error, self._no_gain(belief.timeline), "unreachable"

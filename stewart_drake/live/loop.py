@@ -249,7 +249,7 @@ class LiveLoop:
         self.recoveries, self.taken_over = 0, False
         self._measured, self._known = -1, self.memory
         c = design.experiment.scenario.controller
-        self._period, self._weights = c.period, np.array([c.w_Q, c.w_R])
+        self._period, self._weights = c.period, np.array(c.weights)
         self._size = 2 * design.experiment.motion_scale
         self._sends = design.sends
         self._horizon = self._ahead()

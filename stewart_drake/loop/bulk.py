@@ -32,9 +32,11 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.law_design import (
+    REPLAN,
     compose_law,
     first_queue,
     followed_motion,
+    replanning,
     sizing_of,
     way_onto,
 )
@@ -249,7 +251,8 @@ class Preparation:
         way, motion = self._ways[queue], experiment.reference
         if way is not None:
             catch_up = experiment.scenario.controller.catch_up
-            motion, _ = way.plan(catch_up, experiment.planned_limit)
+            motion, length = way.plan(catch_up, experiment.planned_limit)
+            law = replanning(law, experiment, length)
         source = (tuner or weights_source)(experiment, law)
         previews = self._preview(motion, law)
         followed = followed_motion(law, motion, experiment.reference) or ()
@@ -268,7 +271,7 @@ class Preparation:
         if id(motion) not in self._motions:
             sc, c = self._base.scenario, self._base.scenario.controller
             delay = (c.delay_max or 0.0) + believed_delay(sc).eta(c.period)
-            until = sc.duration + 2 * (delay + c.replan + 20 * c.period)
+            until = sc.duration + 2 * (delay + (c.replan or REPLAN) + 20 * c.period)
             self._motions[id(motion)] = motion, pieces_of(motion, followed, until)
         return self._motions[id(motion)][1]
 
@@ -375,7 +378,7 @@ class CompiledController:
         self._memory = self._compiled.start(first_queue(prepared.experiment, prepared.law))
         samples = len(prepared.previews)
         self.weights, self.rows = (
-            np.tile([config.w_Q, config.w_R], (samples, 1)),
+            np.tile(config.weights, (samples, 1)),
             np.empty((samples, 0)),
         )
         self._tuned, scratch = np.empty(0), self._compiled.scratch
@@ -486,7 +489,7 @@ class PythonController:
         self._followed = followed_motion(law, prepared.planned, experiment.reference)
         self._served = core_law.serving(law).law
         self._memory: Any = self._served.initial_memory(first_queue(experiment, law))
-        self._fixed = Decision(np.array([c.w_Q, c.w_R]), False)
+        self._fixed = Decision(np.array(c.weights), False)
         source = prepared.tuner
         self._tuned: Any = None if source is None else source.start(self._memory)
         self.weights: list[Array] = []

@@ -282,7 +282,7 @@ def _gain(experiment: Experiment, truth: StewartDynamics, law: PredictiveLqi, ti
     forward = law.feedforward.at(x, plant.dynamics, theta)
     design = law.model.about(x, forward, theta, plant)
     predictor = law.predictor.model(design, x, current, theta, plant)
-    weights = np.array([c.w_Q, c.w_R])
+    weights = np.array(c.weights)
     return law_gain(law.cost, design, predictor, timeline, weights)
 
 

@@ -343,7 +343,7 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[Predictiv
     if tuner is None and experiment.tuned:
         tuner = _tuner(builder, experiment, law)
     if tuner is None:
-        weights = ConstantVectorSource(np.array([c.w_Q, c.w_R]))
+        weights = ConstantVectorSource(np.array(c.weights))
         builder.AddNamedSystem("weights", weights)
         _connect(builder, weights.get_output_port(), "controller.weights")
     else:

@@ -15,7 +15,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import validate
 from stewart_drake.law.catch_up import CatchUp
-from stewart_drake.law.channel import Packets
+from stewart_drake.law.channel import Packets, Wire
 from stewart_drake.law.clear_space import ClearSpace
 from stewart_drake.law.cost import Cost, QuadraticCost
 from stewart_drake.law.design_models import MultibodyModel, PaperModel
@@ -47,6 +47,7 @@ from stewart_drake.law.predictors import (
 from stewart_drake.law.stability import fastest_pole
 from stewart_drake.law.startup import (
     STILL,
+    TOLERANCE,
     choose_substeps,
     machine_torque,
     reference_torque,
@@ -67,6 +68,7 @@ from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.field_types import MOST_PERIODS
 from stewart_drake.scenario.packets import times_under_way
 from stewart_drake.scenario.signals import (
+    ACCELERATIONS,
     BIAS,
     DAMPING,
     NUM_STATE,
@@ -75,9 +77,19 @@ from stewart_drake.scenario.signals import (
     POSE,
     WRENCHES,
 )
-from stewart_drake.scenario.trajectories import evaluate, motion_range
+from stewart_drake.scenario.trajectories import evaluate, motion_range, spread_instants
 from stewart_drake.types import Array, ArrayLike
 
+REPLAN = 0.6
+"""Duration of a plan back onto the reference with a delay estimator, s."""
+TOLERATED = 0.006
+"""Standard deviation of torques' timing, as a share of the loop's time constant, up to which the
+weight of the torques stays: 1 ms for the motion of `paper`."""
+BIAS_SHARE = 0.05
+"""Prior standard deviation of torque bias and of damping at 1 rad/s, as a share of the torque that
+the motion takes."""
+PAYLOAD_SHARE = 0.1
+"""The same of the payload, as a share of the plate."""
 GENTLE = 3.0
 """Largest torque predicted with the default substeps, over that of the reference."""
 _MOST = 0.999
@@ -205,6 +217,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         longest_wait=waits,
         kept=waits + (REPORTS if isinstance(channel, Packets) else 0),
         silence=_until_seen(timeline.delay, waits) if quiet else 0,
+        tolerated_timing=tolerated_timing(experiment),
     )
     if c.delay_estimator != "none":
         prior = timeline.eta, c.delay_std, c.delay_max
@@ -213,7 +226,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
             law,
             observer=CoreObserver(settings, delay),
             predictor=ArrivalPredictor(),
-            planner=Replan(c.replan, experiment.scale) if c.replan > 0 else NoPlanner(),
+            planner=NoPlanner() if c.replan == 0 else Replan(c.replan or REPLAN, experiment.scale),
             silence=0,  # until the delay is found
         )
     if c.limits == "qp":
@@ -256,6 +269,12 @@ def estimated_parameters(
         experiment.nominal.free,
         wrench=(motion_torque, motion_torque / machine.crank_lengths.min()),
     )
+    by_motion = {
+        **dict.fromkeys(PARAMETERS[BIAS], BIAS_SHARE * motion_torque),
+        PARAMETERS[PAYLOAD]: PAYLOAD_SHARE * machine.plate.mass,
+        PARAMETERS[DAMPING]: BIAS_SHARE * motion_torque,
+    }
+    found = replace(found, usual=found.std).trusting(by_motion)
     if experiment.calibration is not None:
         try:
             found = found.knowing(experiment.calibration)
@@ -316,7 +335,38 @@ def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, floa
     way = way_onto(experiment, law)
     if way is None:
         return law, experiment.reference, 0.0
-    return law, *way.plan(sc.controller.catch_up, experiment.planned_limit)
+    motion, length = way.plan(sc.controller.catch_up, experiment.planned_limit)
+    return replanning(law, experiment, length), motion, length
+
+
+def replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> PredictiveLqi:
+    """Return the law for a start from rest with a catch-up of `length` s, 0 for none.
+
+    The catch-up goes out before anything is known of the machine. When payload and bias are known,
+    and the prediction so is certain, the law plans again. Where nothing is estimated, or the delay
+    is, where torques come in packets or measurements late, the law stays as it is.
+    """
+    asked = experiment.scenario.controller.replan
+    plain = isinstance(law.channel, Wire) and isinstance(law.predictor, NonlinearPredictor)
+    if not (length and law.estimates and plain) or law.longest_wait or asked == 0:
+        return law
+    return replace(law, planner=Replan(asked or length, experiment.scale))
+
+
+def tolerated_timing(experiment: Experiment) -> float:
+    """Return the standard deviation of single torques' timing that the loop tolerates, s.
+
+    A share of the time constant of the loop, 1 / bandwidth of theory.md, section 13. Infinite for
+    weights that are given or set by a tuner, and for laws without nonlinear prediction.
+    """
+    sc, c = experiment.scenario, experiment.scenario.controller
+    if c.w_R is not None or sc.tuner.kind != "fixed" or c.prediction != "nonlinear":
+        return math.inf
+    times = spread_instants(sc.duration, _POSES)
+    fastest = np.array([evaluate(experiment.reference, t)[ACCELERATIONS] for t in times])
+    moves = np.where(experiment.peak_to_peak > 0, experiment.peak_to_peak / 2, np.inf)
+    bandwidth = math.sqrt(float((np.abs(fastest).max(axis=0) / moves).max() / TOLERANCE))
+    return TOLERATED / bandwidth if bandwidth else math.inf
 
 
 def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
@@ -333,7 +383,7 @@ def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
     given = nominal, experiment.reference, state, timeline.eta, c.period
     if not isinstance(law.cost, QuadraticCost):
         return CatchUp(*given)
-    Q, R = law.cost.matrices(np.array([c.w_Q, c.w_R]))
+    Q, R = law.cost.matrices(np.array(c.weights))
 
     def least() -> LeastError:
         return LeastError(law.plant, clear_space(experiment), np.diag(Q)[POSE], R)
@@ -354,7 +404,7 @@ def followed_motion(
     law: PredictiveLqi, planned: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, Trajectory] | None:
     """Return the motions that a law with a delay estimator reads at any instant, or None."""
-    return (planned, reference) if law.finds_delay else None
+    return (planned, reference) if law.finds_delay or isinstance(law.planner, Replan) else None
 
 
 _HORIZON = 10.0
@@ -486,4 +536,4 @@ def design_law(
     law, planned, _ = control_law(experiment)
     c = scenario.controller
     flying = first_queue(experiment, law)
-    return DesignedLaw(law, motion, planned, flying, np.array([c.w_Q, c.w_R]))
+    return DesignedLaw(law, motion, planned, flying, np.array(c.weights))

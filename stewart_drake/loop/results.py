@@ -48,7 +48,7 @@ def figures(
         completed: whether the run completed; error and cost are NaN otherwise.
     """
     c, nan, some = controller, float("nan"), len(asked) > 0
-    cost = quadratic_cost(errors, sent, c.period, c.w_Q, c.w_R, c.integral) if completed else nan
+    cost = quadratic_cost(errors, sent, c.period, *c.weights, c.integral) if completed else nan
     return Figures(
         accumulated_error=accumulated_error(time, error, scale) if completed else nan,
         cost=cost,

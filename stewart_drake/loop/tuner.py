@@ -203,7 +203,7 @@ def _ann(config: AnnTunerConfig, experiment: Experiment, law: PredictiveLqi) -> 
     if network.features == "health":
         features = health_of(experiment, law)
     if network.start is None:
-        return WeightsSource(law.plant, features, PaperPolicy(network, np.array([c.w_Q, c.w_R])))
+        return WeightsSource(law.plant, features, PaperPolicy(network, np.array(c.weights)))
     return WeightsSource(law.plant, features, RatioPolicy(network))
 
 

@@ -244,7 +244,7 @@ def weights_figure(runs: Mapping[str, SimulationResult]) -> Figure:
     above, below = list[Panel](), list[Panel]()
     for title, run in runs.items():
         weights, c, end = run.signals.weights.values, run.scenario.controller, shown_until(run)
-        ratio, fixed = weights[:, 0] / weights[:, 1], c.w_Q / c.w_R
+        ratio, fixed = weights[:, 0] / weights[:, 1], c.weights[0] / c.weights[1]
         first, other = (
             _curves({name: (run, look)}, [data], True)[0]
             for name, look, data in (

@@ -206,9 +206,9 @@ class PriorConfig:
     A null is taken from `controller.calibration`, and without one from machine and motion.
 
     Attributes:
-        torque_bias: of each motor, N m; null is 0.3 of the torque that the motion takes.
-        payload: kg; null is a quarter of the plate.
-        damping: N m s/rad; null is 0.1 s/rad times the torque that the motion takes.
+        torque_bias: of each motor, N m; null is 0.05 of the torque that the motion takes.
+        payload: kg; null is a tenth of the plate.
+        damping: N m s/rad; null is 0.05 s/rad times the torque that the motion takes.
         rates: of the plate at the first sample, which encoders do not measure, rad/s and m/s; null
             is half the motion's peak to peak per second.
         offsets: mounting of an encoder, rad; null is 0.1 degrees.
@@ -273,7 +273,8 @@ class ControllerConfig:
             `offsets`, the mounting of encoders, for `sensor.kind` encoders and a known delay; empty
             for none.
         w_Q: weight of the errors.
-        w_R: weight of the torques.
+        w_R: weight of the torques; null is 1, and more where the timing of the torques varies by
+            more than the loop tolerates.
         integral_weight: weight of the integrals relative to the errors.
         weight_scaling: `bryson` (by the range of the reference) or `identity`.
         packet_torques: number of torques in a packet, for the next and further periods; over a
@@ -293,8 +294,9 @@ class ControllerConfig:
         delay_max: longest possible delay, s.
         open_loop_start: whether a start from rest has no feedback before the first own torque can
             have acted.
-        replan: duration of a plan back onto the reference, s; 0 for none. Planned with a delay
-            estimator where the prediction is off the reference, as after a jump of the delay.
+        replan: duration of a plan back onto the reference, s; 0 for none; null is that of the
+            catch-up, and with a delay estimator 0.6 s. It is made where the prediction is certain
+            and off the reference: after a start from rest, or a jump of an estimated delay.
         model_error: of the estimator's model: white noise of the accelerations, as a share of the
             motion's range per s^1.5; null is 2e-4 of it in each period, and less in
             a short one on an exact plant.
@@ -325,7 +327,7 @@ class ControllerConfig:
     torque_map: Literal["virtual_work", "printed"] = "virtual_work"
     estimate: Estimate = field(default_factory=lambda: [*ESTIMATED])
     w_Q: Weight = 1.0
-    w_R: Weight = 1.0
+    w_R: Weight | None = None
     integral_weight: Weight = 1.0
     weight_scaling: Literal["bryson", "identity"] = "bryson"
     packet_torques: Annotated[int, Field(ge=1, le=100)] = 16
@@ -336,7 +338,7 @@ class ControllerConfig:
     delay_std: Annotated[float, Field(ge=1e-3, le=10)] = 0.3
     delay_max: Annotated[float, Field(gt=0, le=10)] = 1.5
     open_loop_start: bool = True
-    replan: Annotated[float, Field(ge=0, le=10)] = 0.6
+    replan: Annotated[float, Field(ge=0, le=10)] | None = None
     model_error: Positive | None = None
     timing_std: Deviation | None = None
     prior: PriorConfig = field(default_factory=PriorConfig)
@@ -344,6 +346,11 @@ class ControllerConfig:
     horizon: Annotated[int, Field(ge=2, le=100)] = 20
     calibration: Name | None = None
     learned: Name | None = None
+
+    @property
+    def weights(self) -> tuple[float, float]:
+        """The weights w_Q and w_R; w_R is 1 where it is null."""
+        return self.w_Q, 1.0 if self.w_R is None else self.w_R
 
 
 @section

@@ -121,11 +121,11 @@ NEEDS: Final = (
     _needs("prior.offsets", "controller.estimate", "offsets"),
     _needs("prior.wrench prior.wrench_walk", "controller.estimate", "wrench"),
     _needs("horizon", "controller.limits", "qp"),
-    _needs("delay_std delay_max replan", "controller.delay_estimator", _DELAYS),
+    _needs("delay_std delay_max", "controller.delay_estimator", _DELAYS),
     _needs("w_Q w_R", "tuner.kind", ("fixed", "ann")),
     _needs(
         "kind kp kd integral integral_weight prediction model weight_scaling w_Q w_R "
-        "packet_torques packet_repeats open_loop_start limits",
+        "packet_torques packet_repeats open_loop_start replan limits",
         "controller.command",
         "torque",
     ),

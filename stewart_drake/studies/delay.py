@@ -374,7 +374,7 @@ def loop_margins(found: Assessment, delays: Iterable[int] = DELAYS) -> list[Loop
         design = double_integrators(torque_map(experiment.mechanism, pose, c.torque_map))
     if c.prediction == "linear":
         predictor = design
-    weights, judged = np.array([c.w_Q, c.w_R]), []
+    weights, judged = np.array(c.weights), []
     for steps in sorted({*delays, sc.delay.steps}):
         at = replace(sc, delay=replace(sc.delay, steps=steps))
         cost = cost_of(experiment._replace(scenario=at), found.torque)
