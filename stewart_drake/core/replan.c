@@ -8,6 +8,7 @@
 /* Memory: samples since the plan was made or the start, number of pieces, samples since the start, pieces.
    Times of pieces are from the sample of the plan. */
 #define HEAD 3
+#define EARLY ((real)0.5) /* share of the assumed delay, before which no torque arrives */
 #define LATEST ((real)1e6) /* samples that are counted */
 static int most_pieces(const stewart_law *law)
 {
@@ -105,7 +106,9 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     real *states = stewart_take(&scratch, X * (outlook->until.number + 1)), wanted[ROW];
     memory[0] += 1;
     memory[2] = memory[2] < LATEST ? memory[2] + 1 : LATEST;
-    if (!sample->goal || !outlook->settled || !stewart_all_finite(X, outlook->state))
+    /* While the delay is looked for, only what was there before the first torque can have acted counts. */
+    const int early = memory[2] * law->period <= EARLY * outlook->eta;
+    if (!sample->goal || !(outlook->settled || early) || !stewart_all_finite(X, outlook->state))
         return 0;
     stewart_copy(X, outlook->state, states);
     stewart_predict(&law->machine, outlook->theta, &outlook->until, states, states + X);

@@ -24,6 +24,10 @@ from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array
 
 
+EARLY = 0.5
+"""Share of an assumed delay before which no torque arrives."""
+
+
 class FollowedMotion(NamedTuple):
     """Motion to follow.
 
@@ -104,9 +108,11 @@ class Replan:
             return FollowedMotion(motion, path, False)
         followed = motion if path is None else replace(motion, pieces=path)
         before = FollowedMotion(followed, path, False)
-        if not (belief.has_state and belief.settled):
-            return before
         timeline, c = belief.timeline, core()
+        # While the delay is looked for, only what was there before a torque can have acted counts.
+        early = motion.now + timeline.period <= EARLY * timeline.eta
+        if not (belief.has_state and (belief.settled or early)):
+            return before
         schedule = timeline.until_next(timeline.queue(in_flight))
         states = np.vstack([belief.state, plant.predict(belief.state, schedule, belief.parameters)])
         wanted = followed(np.array([timeline.eta]))[0, :NUM_STATE].copy()
