@@ -35,35 +35,11 @@ static int is_known(const stewart_filter *filter, const real *root, real share)
     return 1;
 }
 
-void stewart_kicks(const stewart_machine *machine, const stewart_interval *period, const real *state,
-                   const real *theta, real *squares)
-{
-    const stewart_schedule *schedule = &period->schedule;
-    stewart_belief belief;
-    real before[6], after[6], left = 0;
-    stewart_believe(machine, theta, &belief);
-    stewart_fill(X, 0, squares);
-    for (int k = 0; k < schedule->number; k++)
-        left += schedule->durations[k];
-    stewart_accelerate(&belief, state, schedule->torques, before);
-    for (int k = 0; k < schedule->number; k++) {
-        const int last = k + 1 == schedule->number;
-        stewart_accelerate(&belief, state, last ? period->following : schedule->torques + U * (k + 1),
-                           after);
-        left = last ? 0 : left - schedule->durations[k];
-        for (int i = 0; i < 6; i++) {
-            const real change = after[i] - before[i];
-            squares[i] += left * change * left * change;
-            squares[6 + i] += change * change;
-            before[i] = after[i];
-        }
-    }
-}
-
 void stewart_attempt_predicted(stewart_attempt *a)
 {
     const stewart_filter *f = a->filter;
-    stewart_kicks(f->machine, a->period, a->end, a->after->mean + X, a->kicks);
+    stewart_kicks(f->machine, &a->period->schedule, a->period->following, a->end, a->after->mean + X,
+                  a->kicks);
     for (int i = 0; i < X; i++) {
         a->kicks[i] *= f->timing_std * f->timing_std;
         a->drift[i] = REAL(sqrt)(f->model_std[i] * f->model_std[i] + a->prior->noise->timing * a->kicks[i]);

@@ -98,9 +98,3 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
 
 /* Numbers of scratch memory for both, with `torques` in a period at the most. */
 int stewart_filter_scratch(const stewart_filter *filter, int torques);
-
-/* Sum over the changes of torque of the squared changes (12) of the last state, per s that the change
-   comes early. To first order the acceleration differs by B dT for that time; this stays in the rates
-   and moves the pose for the rest of the period. */
-void stewart_kicks(const stewart_machine *machine, const stewart_interval *period, const real *state,
-                   const real *theta, real *squares);

@@ -6,6 +6,7 @@
 #define ONE_TORQUE ((real)0.5) /* its information about t = 1: 1 / (2 t^2) */
 #define SURE ((real)2.5)
 #define WIDER 6
+#define LATEST 1000 /* largest t */
 
 void stewart_noise_start(stewart_noise *noise)
 {
@@ -47,10 +48,35 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
         noise->known_wander += W * W / (2 * S * S);
     }
     const real t = noise->timing > 1 ? noise->timing : 1;
-    noise->timing = scored(noise->timing, of_timing, noise->known_timing + ONE_TORQUE / (t * t));
+    const real found = scored(noise->timing, of_timing, noise->known_timing + ONE_TORQUE / (t * t));
+    noise->timing = found < LATEST ? found : LATEST;
     noise->wander = scored(noise->wander, of_wander, noise->known_wander);
     const real sure = noise->wander - SURE / REAL(sqrt)(noise->known_wander);
     noise->used *= REAL(sqrt)(keep);
     if (WIDER * sure > noise->used) /* not for NaN */
         noise->used = WIDER * sure;
+}
+
+void stewart_kicks(const stewart_machine *machine, const stewart_schedule *schedule, const real *following,
+                   const real *state, const real *theta, real *squares)
+{
+    stewart_belief belief;
+    real before[6], after[6], left = 0;
+    stewart_believe(machine, theta, &belief);
+    stewart_fill(X, 0, squares);
+    for (int k = 0; k < schedule->number; k++)
+        left += schedule->durations[k];
+    stewart_accelerate(&belief, state, schedule->torques, before);
+    for (int k = 0; k < schedule->number; k++) {
+        const int last = k + 1 == schedule->number;
+        stewart_accelerate(&belief, state, last ? following : schedule->torques + U * (k + 1),
+                           after);
+        left = last ? 0 : left - schedule->durations[k];
+        for (int i = 0; i < 6; i++) {
+            const real change = after[i] - before[i];
+            squares[i] += left * change * left * change;
+            squares[6 + i] += change * change;
+            before[i] = after[i];
+        }
+    }
 }

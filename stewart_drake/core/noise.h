@@ -19,7 +19,7 @@
 
 #pragma once
 
-#include "matrix.h"
+#include "machine.h"
 
 enum { STEWART_NOISE = 5 }; /* numbers of these */
 
@@ -38,3 +38,9 @@ void stewart_noise_start(stewart_noise *noise);
 void stewart_noise_learn(int m, const real *innovations, const real *variances, const real *H,
                          const real *timing, int p, const real *G, const real *wander, real keep,
                          stewart_noise *noise);
+
+/* Sum over the changes of torque in a period, the last to `following`, of the squared changes (12) of the last state, per s that the change
+   comes early. To first order the acceleration differs by B dT for that time; this stays in the rates
+   and moves the pose for the rest of the period. */
+void stewart_kicks(const stewart_machine *machine, const stewart_schedule *schedule, const real *following,
+                   const real *state, const real *theta, real *squares);

@@ -80,7 +80,7 @@ from stewart_drake.scenario.signals import (
 from stewart_drake.scenario.trajectories import evaluate, motion_range, spread_instants
 from stewart_drake.types import Array, ArrayLike
 
-REPLAN = 0.6
+REPLAN = 0.4
 """Duration of a plan back onto the reference with a delay estimator, s."""
 TOLERATED = 0.006
 """Standard deviation of torques' timing, as a share of the loop's time constant, up to which the
@@ -199,7 +199,10 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         learns=of_state,
     )
     gaps = sc.sensor.kind == "state" and sc.sensor.loss > 0
-    observer = CoreObserver(settings if c.estimate else None, gaps=gaps)
+    observer = CoreObserver(settings, gaps=gaps) if c.estimate else CoreObserver()
+    tolerated = tolerated_timing(experiment)
+    if not c.estimate and settings.learns_timing and math.isfinite(tolerated):
+        observer = CoreObserver(timing=settings)
     quiet = c.open_loop_start and sc.start == "rest"
     waits = longest_wait(sc)
     channel = link.channel(sc.link, experiment, timeline, waits)
@@ -217,7 +220,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         longest_wait=waits,
         kept=waits + (REPORTS if isinstance(channel, Packets) else 0),
         silence=_until_seen(timeline.delay, waits) if quiet else 0,
-        tolerated_timing=tolerated_timing(experiment),
+        tolerated_timing=tolerated,
     )
     if c.delay_estimator != "none":
         prior = timeline.eta, c.delay_std, c.delay_max
