@@ -82,7 +82,7 @@ from stewart_drake.types import Array, ArrayLike
 
 REPLAN = 0.4
 """Duration of a plan back onto the reference with a delay estimator, s."""
-TOLERATED = 0.006
+TOLERATED = 0.004
 """Standard deviation of torques' timing, as a share of the loop's time constant, up to which the
 weight of the torques stays: 1 ms for the motion of `paper`."""
 BIAS_SHARE = 0.05
