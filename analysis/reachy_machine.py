@@ -5,7 +5,8 @@
 
 Lengths, shafts and joints come from assets/kinematics_data.json; masses, inertias and the ranges of
 the cranks from the MJCF. The crank's inertia is the link's own: a servo's armature belongs to the
-scenario. The package is licensed under Apache-2.0 by Pollen Robotics; no file of it is copied.
+scenario. The package is licensed under Apache-2.0 by Pollen Robotics, its hardware design files
+under Creative Commons BY-NC-SA. Only numbers are taken; no file is copied.
 """
 
 import argparse

@@ -14,6 +14,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,32 +50,42 @@ PREVIEW, PLAN = 0.25, 16
 """s from a plan to its first setpoint, and setpoints of a plan."""
 
 
-def head_at(times: np.ndarray, frequency: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the head's rotations (n, 3, 3) and positions (n, 3) in m, from rest at t = 0."""
-    w, g = 2 * np.pi * frequency, rise(times)[:, None]  # accelerations, and so torques, do not jump
-    angles = 0.2 * g * np.sin(w * times[:, None] + [0.0, 1.0, 2.0])
-    moved = [np.sin(w * times), np.cos(w * times), np.sin(w * times + 0.5)]
-    rotations = np.array([rotation(one) for one in angles])
-    return rotations, 0.005 * g * np.stack(moved, axis=1)
+def head_at(times: np.ndarray, frequency: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the head's rotations (n, 3, 3) and positions (n, 3) in m, from rest at t = 0.
+
+    `frequency` in Hz is one number, or three of the axes.
+    """
+    phase = 2 * np.pi * np.broadcast_to(frequency, 3) * times[:, None]
+    g = rise(times)[:, None]  # accelerations, and so torques, do not jump
+    rotations = np.array([rotation(one) for one in 0.2 * g * np.sin(phase + [0.0, 1.0, 2.0])])
+    return rotations, 0.005 * g * np.sin(phase + [0.0, np.pi / 2, 0.5])
 
 
-def motion_file(frequency: float, folder: Path, duration: float = DURATION + 1.0) -> Path:
-    """Write the motion as CSV, as a reference of `kind: csv` reads it."""
+def motion_file(
+    frequency: Any, folder: Path, duration: float = DURATION + 1.0, ahead: float = 0.0
+) -> Path:
+    """Write the motion as CSV, as a reference of `kind: csv` reads it, ahead by a time in s."""
     times = np.arange(0.0, duration, 0.005)
     rows = ["time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m]"]
-    for t, R, p in zip(times, *head_at(times, frequency), strict=True):
+    for t, R, p in zip(times, *head_at(times + ahead, frequency), strict=True):
         head = np.eye(4)
         head[:3, :3], head[:3, 3] = R, p
         rows.append(",".join(f"{x:.15g}" for x in (t, *pose_of_head(head))))
-    path = folder / f"motion_{frequency:g}.csv"
+    path = folder / f"motion_{len(list(folder.iterdir()))}.csv"
     path.write_text("\n".join(rows) + "\n")
     return path
 
 
 def setpoints(
-    motion: Path, servo: Any, ball: float = 0.0, *, plain: bool = False, duration: float = DURATION
+    motion: Path,
+    servo: Any,
+    ball: float = 0.0,
+    *,
+    plain: bool = False,
+    duration: float = DURATION,
+    more: Sequence[str] = (),
 ) -> np.ndarray:
-    """Return the setpoints (n, 6) for assumed servos and ball joints."""
+    """Return the setpoints (n, 6) for assumed servos and ball joints, and `more` settings."""
     kp, kv, damping, friction, armature, force = servo
     fields = {
         "stiffness": kp,
@@ -88,15 +99,19 @@ def setpoints(
     if ball > 0:
         settings += [f"plant.{name}={ball * value:.9g}" for name, value in BALL.items()]
     settings += [f"reference={{kind: csv, file: {motion}}}", f"duration={duration}"]
-    settings += ["start=on_reference", "actuator.angle_range=null"]
+    settings += ["start=on_reference", "actuator.angle_range=null", *more]
     return sd.setpoints("reachy_mini", 1 / PERIOD, plain=plain, settings=settings).angles
 
 
-def play(servo: Any, ball: float, rows: np.ndarray, first: np.ndarray) -> Any:
-    """Return what the head did in the robot's model, as of `reachy_player.py`."""
+def play(servo: Any, ball: float, rows: np.ndarray, first: np.ndarray, **more: Any) -> Any:
+    """Return what the head did in the robot's model, as of `reachy_player.py`.
+
+    `more` are optional parts of its job.
+    """
     with tempfile.TemporaryDirectory() as folder:
         job, result = Path(folder) / "job.npz", Path(folder) / "result.npz"
-        np.savez(job, servo=np.array(servo), ball=ball, setpoints=np.vstack([first, rows]))
+        setpoints = np.vstack([first, rows])
+        np.savez(job, servo=np.array(servo), ball=ball, setpoints=setpoints, **more)
         command = [os.environ["REACHY_PYTHON"], str(PLAYER), str(job), str(result)]
         own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
         subprocess.run(command, check=True, env=own)
@@ -109,13 +124,29 @@ def errors(servo: Any, ball: float, rows: np.ndarray, first: np.ndarray, frequen
     return angle_error(play(servo, ball, rows, first)["rotations"], frequency)
 
 
-def angle_error(found: np.ndarray, frequency: float) -> float:
+def angle_error(found: np.ndarray, frequency: Any) -> float:
     """Return the rms error in degrees of the head's rotations (n, 3, 3) at the ends of periods."""
     times = PERIOD * (1 + np.arange(len(found)))
     wanted, _ = head_at(times, frequency)
     cosine = (np.einsum("nij,nij->n", wanted, found) - 1) / 2
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))[times > SETTLED + PERIOD / 2]
     return float(np.sqrt(np.mean(angle**2)))
+
+
+def wanted_cranks(times: np.ndarray, frequency: float) -> np.ndarray:
+    """Return the crank angles (n, 6) of the motion, rad."""
+    mechanism, heads = load_mechanism("reachy_mini"), np.tile(np.eye(4), (len(times), 1, 1))
+    heads[:, :3, :3], heads[:, :3, 3] = head_at(times, frequency)
+    return np.array([mechanism.crank_angles(pose_of_head(head)) for head in heads])
+
+
+def with_feedback(
+    servo: Any, rows: np.ndarray, first: np.ndarray, frequency: float, late: float
+) -> str:
+    """Return the error in degrees as text, with integral feedback on crank angles, late by s."""
+    wanted = wanted_cranks(PERIOD * (1 + np.arange(len(rows))), frequency)
+    job = {"wanted": wanted, "gain": 0.5 / late, "late": round(late / PERIOD)}
+    return f"{angle_error(play(servo, 0.0, rows, first, **job)['rotations'], frequency):.2f}"
 
 
 def learnt(
@@ -128,11 +159,7 @@ def learnt(
     """
     motion, found, steps = 1 / frequency, list[float](), Anderson()
     ends, middles = PERIOD * (1 + np.arange(len(rows))), PERIOD * (0.5 + np.arange(len(rows)))
-    rotations, positions = head_at(ends, frequency)
-    heads = np.tile(np.eye(4), (len(ends), 1, 1))
-    heads[:, :3, :3], heads[:, :3, 3] = rotations, positions
-    mechanism = load_mechanism("reachy_mini")
-    wanted = np.array([mechanism.crank_angles(pose_of_head(head)) for head in heads])
+    wanted = wanted_cranks(ends, frequency)
     last = slice(len(ends) - round(motion / PERIOD), None)
     lag = (assumed[1] + assumed[2]) / assumed[0]
     for _ in range(REPETITIONS):
@@ -215,6 +242,9 @@ def results(folder: Path) -> str:
             guess = (*(WRONG * servo[:5]), servo[5])
             wrong = setpoints(motion, guess)
             row("free, all numbers 10 % wrong", judged(wrong, 0.0))
+            for late in (0.04, 0.26):
+                name = f"10 % wrong, feedback on angles {1e3 * late:.0f} ms late"
+                row(name, with_feedback(servo, wrong, first, f, late))
             row("10 % wrong, after learning", best(servo, guess, 0.0, wrong, first, f))
             row("as shipped, plain setpoints", judged(plain, 1.0))
             row(

@@ -9,6 +9,9 @@ The job has `servo` (kp, kv, damping, friction, armature, force limit), `ball` (
 joints' damping and friction as shipped), and rows of setpoints (n, 6) in rad; the first one is held
 for 3 s before. It may have another `step` and `period` in s. The result has the head's rotation
 (n, 3, 3) and position (n, 3) in m at the end of each row, and the cranks' angles (n, 6).
+
+With crank angles `wanted` (n, 6) at the ends of the rows, their integrated errors are added to the
+setpoints, with the `gain` in 1/s. A measured angle is known `late` periods after it was taken.
 """
 
 import sys
@@ -45,7 +48,7 @@ def model_of(servo, ball):
     return model
 
 
-def play(servo, ball, setpoints, step=STEP, period=PERIOD):
+def play(servo, ball, setpoints, step=STEP, period=PERIOD, wanted=None, gain=0.0, late=0):
     """Return rotations, positions and crank angles after each row of setpoints."""
     model = model_of(servo, ball)
     model.opt.timestep = step
@@ -61,9 +64,11 @@ def play(servo, ball, setpoints, step=STEP, period=PERIOD):
             mujoco.mj_step(model, data)
 
     advance(setpoints[0], SETTLE)
-    found = [], [], []
-    for row in setpoints[1:]:
-        advance(row, period)
+    found, correction = ([], [], []), np.zeros(len(motors))
+    for k, row in enumerate(setpoints[1:]):
+        if wanted is not None and k > late:
+            correction += gain * period * (wanted[k - 1 - late] - found[2][k - 1 - late])
+        advance(row + correction, period)
         now = data.site_xmat[head].reshape(3, 3), data.site_xpos[head], data.qpos[cranks]
         for values, value in zip(found, now, strict=True):
             values.append(value.copy())
@@ -72,6 +77,6 @@ def play(servo, ball, setpoints, step=STEP, period=PERIOD):
 
 if __name__ == "__main__":
     job = np.load(sys.argv[1])
-    more = {name: float(job[name]) for name in ("step", "period") if name in job}
+    more = {name: job[name] for name in ("step", "period", "wanted", "gain", "late") if name in job}
     rotations, positions, angles = play(job["servo"], float(job["ball"]), job["setpoints"], **more)
     np.savez(sys.argv[2], rotations=rotations, positions=positions, cranks=angles)

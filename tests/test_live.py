@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import math
+import multiprocessing
 import os
 import signal
 import socket
@@ -34,7 +35,7 @@ from stewart_drake.live.endpoint import Endpoint
 from stewart_drake.live.governor import Governor
 from stewart_drake.live.loop import End, LiveLoop, Snapshot, Viewer
 from stewart_drake.live.machine import Machine, Settings
-from stewart_drake.live.page import PageRequest, PageViewer, Readouts, read_request
+from stewart_drake.live.page import PageRequest, PageViewer, Readouts, read_request, serve
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerMessage, MachineFlags
 from stewart_drake.live.session import _queue_advice, check_armed, drive, plans, prepare_session
 from stewart_drake.live.steering import Request, Steering, Way
@@ -757,6 +758,14 @@ def seen_at(time, error=0.1, torque=0.5):
     state = np.concatenate([load_mechanism("paper").home, np.zeros(6)])
     wanted, torques = np.append(state, np.zeros(6)), np.full(6, torque)
     return Snapshot(time, state, wanted, torques, error, *[0.1] * 4, 0, None, False, None)
+
+
+def test_a_page_whose_loop_has_ended_ends_without_a_traceback(monkeypatch):
+    """`live` with a machine that does not answer has ended before its page is there."""
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    loop, page = multiprocessing.Pipe()
+    loop.close()
+    serve(page, load_mechanism("paper"), "a test")
 
 
 @pytest.mark.slow

@@ -178,7 +178,8 @@ def test_no_daemon_is_one_line(capsys):
     assert main(["machine", "reachy_mini", "--reachy", "127.0.0.1:9", "--port", "0"]) == 2
     said = capsys.readouterr().err.strip()
     assert said.count("\n") == 0
-    assert said.startswith("error: --reachy: got 127.0.0.1:9, which sent no positions for 5 s")
+    assert said.startswith("error: --reachy: got 127.0.0.1:9, which sent no positions for 5 s (")
+    assert "trying again" not in said  # the command has ended
 
 
 @pytest.mark.parametrize(

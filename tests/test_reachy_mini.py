@@ -1,11 +1,13 @@
 """Reachy Mini: its machine against the robot's own kinematics, and the shipped scenario."""
 
 import json
-from importlib import metadata, resources, util
+import runpy
+from importlib import metadata, util
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 import stewart_drake as sd
 from stewart_drake.dynamics.workspace import margin
@@ -20,9 +22,8 @@ from stewart_drake.scenario.trajectories import make_reference
 ROBOT = sd.load_mechanism("reachy_mini")
 POSES = 10_000
 RUST = "reachy_mini_rust_kinematics"
-
-
-MOVES = Path(__file__).parents[1] / "diagrams" / "moves"
+ROOT = Path(__file__).parents[1]
+MOVES = ROOT / "diagrams" / "moves"
 
 
 def reachable_heads(number, seed):
@@ -109,15 +110,24 @@ def rod_misfits(poses, angles):
 
 
 def test_the_machine_is_that_of_the_robots_files():
-    """The package's data, if it is installed."""
-    if util.find_spec("reachy_mini") is None:
+    """The package's data, if it is installed, with its dependencies or without."""
+    if (spec := util.find_spec("reachy_mini")) is None:
         pytest.skip("package reachy-mini is not installed")
     assert metadata.version("reachy_mini") == "1.13.0"
-    data = json.loads((resources.files("reachy_mini") / "assets/kinematics_data.json").read_text())
-    assert [data["motor_arm_length"]] * 6 == pytest.approx(ROBOT.crank_lengths)
-    assert [data["rod_length"]] * 6 == pytest.approx(ROBOT.rod_lengths)
-    for motor, p_WS in zip(data["motors"], ROBOT.p_WS, strict=True):
-        assert np.linalg.inv(motor["T_motor_world"])[:3, 3] == pytest.approx(p_WS, abs=1e-12)
+    package = Path(spec.submodule_search_locations[0])
+    script = runpy.run_path(str(ROOT / "analysis/reachy_machine.py"))
+    shipped = yaml.safe_load((ROOT / "models/reachy_mini.yaml").read_text())
+    assert flat(script["machine"](package)) == pytest.approx(flat(shipped))
+    ranges = sd.load_scenario("reachy_mini").actuator.angle_range
+    assert np.allclose(script["crank_ranges"](package), ranges, rtol=0, atol=1e-6)
+
+
+def flat(content, name=""):
+    """Return the values of nested dictionaries and lists by their path."""
+    if not isinstance(content, (dict, list)):
+        return {name: content}
+    parts = content.items() if isinstance(content, dict) else enumerate(content)
+    return {k: v for key, part in parts for k, v in flat(part, f"{name}/{key}").items()}
 
 
 def test_the_scenario_follows_its_reference():

@@ -239,6 +239,14 @@ def test_bad_requests_are_one_line(tmp_path, capsys, more, message):
     assert message in " ".join(said.split())
 
 
+def test_a_log_of_motors_that_are_off_is_refused_at_once():
+    """Without this the fit searches for minutes."""
+    times, cranks = 0.02 * np.arange(300), np.tile(ROBOT.crank_angles(ROBOT.home), (300, 1))
+    log = servo_log("off", times, cranks + 0.2 * np.sin(times)[:, None], cranks, ROBOT)
+    with pytest.raises(ConfigError, match="off: got crank angles that hardly change; expected"):
+        identify_servos(log, ROBOT, angle_std(12))
+
+
 def test_a_log_that_no_servo_explains_has_no_intervals():
     rng = np.random.default_rng(0)
     fit, _ = with_known_statistics(rng, 600, 4)

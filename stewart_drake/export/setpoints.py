@@ -12,14 +12,14 @@ from pydantic import Field
 from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
-from stewart_drake.files.yamlio import load_yaml, validate
+from stewart_drake.files.yamlio import load_yaml, one_message, validate
 from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.servos import Stiffness, rise, turned
 from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
 from stewart_drake.loop.servos import known_stiffness
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.field_types import section
+from stewart_drake.scenario.field_types import Row, section
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     LEGS,
@@ -49,8 +49,11 @@ class ServoUnits:
 
     unit: Literal["rad", "deg", "ticks"] = "rad"
     ticks_per_turn: Annotated[float, Field(gt=0, le=1e9)] = 4096.0
-    offset: float | Annotated[list[float], Field(min_length=6, max_length=6)] = 0.0
-    sign: Literal[1, -1] | Annotated[list[Literal[1, -1]], Field(min_length=6, max_length=6)] = 1
+    offset: Annotated[float | Row, one_message("a finite number, or six of them")] = 0.0
+    sign: Annotated[
+        Literal[1, -1] | Annotated[list[Literal[1, -1]], Field(min_length=6, max_length=6)],
+        one_message("1 or -1, or six of these"),
+    ] = 1
 
     def converted(self, angles: Array) -> Array:
         """Return angles (..., 6) in rad as values of the servos."""

@@ -44,6 +44,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.servo_logs import ServoLog
 from stewart_drake.law.servos import PositionServo, turned
 from stewart_drake.mechanism.geometry import Mechanism, with_rotors
+from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
     BALL_JOINTS,
@@ -142,7 +143,7 @@ class ServoModel:
         states, measured = self.states(theta), self.log.cranks[self.counted]
         if states is None:
             return np.ones_like(measured)
-        angles = np.array([self.mechanism.crank_angles(x[POSE]) for x in states[self.counted]])
+        angles = legs_along(self.mechanism, states[self.counted][:, POSE]).crank_angles
         return turned(angles, measured) - measured
 
     def jacobian(self, theta: Array, free: NDArray[np.intp]) -> Array:
@@ -371,8 +372,9 @@ def identify_servos(
     Raises:
         ConfigError: no motion, or no numbers with which the plate stays in its workspace.
     """
-    if not np.ptp(log.setpoints, axis=0).max() > 20 * rounding:
-        raise ConfigError(f"{log.name}: got setpoints that hardly change; expected a motion")
+    for name, angles in (("setpoints", log.setpoints), ("crank angles", log.cranks)):
+        if not np.ptp(angles, axis=0).max() > 20 * rounding:
+            raise ConfigError(f"{log.name}: got {name} that hardly change; expected a motion")
     limit = mechanism.effort_limit
     model = ServoModel(log, mechanism, math.inf if limit is None else limit, gravity)
     found = _fitted(model, regression(model, False), np.arange(BALL_FRICTION), rounding)

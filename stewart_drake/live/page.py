@@ -182,9 +182,9 @@ def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
     text = page.render(title=title, meshcat=meshcat.web_url(), token=token, sliders=sliders)
     server = LocalServer(_handler(text, token, readouts, ask))
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    with lock:
-        connection.send(Opened(server.url))
-    with suppress(EOFError, OSError):
+    with suppress(EOFError, OSError):  # the loop is gone
+        with lock:
+            connection.send(Opened(server.url))
         _draw(connection, lock, scene, readouts)
     time.sleep(_LAST)  # for browsers to receive the end
     server.shutdown()

@@ -86,6 +86,7 @@ class Daemon:
     Attributes:
         positions: the last ones, the newest last.
         simulated: whether the daemon reports that it simulates the robot.
+        problem: why the last connection ended; empty before.
         lines: messages to print, each event once.
     """
 
@@ -93,7 +94,7 @@ class Daemon:
         self._where = f"{address[0]}:{address[1]}"
         self._url = f"ws://{self._where}/ws/sdk"
         self.positions: deque[Positions] = deque(maxlen=_KEPT)
-        self.simulated, self.lines = False, deque[str]()
+        self.simulated, self.lines, self.problem = False, deque[str](), ""
         self._told = self._odd = self._closed = False
         self._motors_on, self._setpoint = True, ""
         self._loop, self._wake = asyncio.new_event_loop(), asyncio.Event()
@@ -151,6 +152,7 @@ class Daemon:
             await asyncio.sleep(_RETRY)
 
     def _lose(self, problem: str) -> None:
+        self.problem = problem
         self.positions.clear()
         if not self._told:
             self._told = True
@@ -419,7 +421,7 @@ def _await_positions(daemon: Daemon, where: str) -> None:
     began, waiting = now(), threading.Event()
     while not daemon.ready:
         if now() - began > _PATIENCE * SECOND:
-            said = f" ({daemon.lines[0]})" if daemon.lines else ""
+            said = f" ({daemon.problem})" if daemon.problem else ""
             raise ConfigError(
                 f"--reachy: got {where}, which sent no positions for {_PATIENCE:g} s{said}; "
                 "expected the daemon of the robot, usually at port 8000"
