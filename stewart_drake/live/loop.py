@@ -568,7 +568,7 @@ class LiveLoop:
         """Return g(s) of this sample and those after it, (number, 1)."""
         change = self._period / _SOFT_STARTS[0]
         change = -change if self._by_hand else change  # also on the way to rest
-        share = self._share + change * np.arange(number)
+        share: Array = self._share + change * np.arange(number, dtype=np.float64)
         self._share = float(np.clip(self._share + change, 0, 1))
         return rise(share)[:, None]
 
@@ -800,7 +800,8 @@ class CrankLoop(LiveLoop):
         rows = self._design.rows
         if self._design.learned is None:
             return np.zeros((rows, NUM_TORQUES))
-        return self._shares(rows) * self._design.learned()(t + self._period * np.arange(rows))
+        times: Array = t + self._period * np.arange(rows, dtype=np.float64)
+        return np.asarray(self._shares(rows) * self._design.learned()(times))
 
     def _start(
         self, t: float, measurement: Measurement, message: MachineMessage | None
