@@ -5,7 +5,7 @@ the governor, where the plate rests. The torques that the model lacks in the las
 those of the next repetition, as in `studies.learn`. They are computed on the way back, some at each
 sample.
 
-*Setpoints.* Each repetition is a session of its own: a soft start, the motion, and rest. The angles
+*Setpoints.* Each repetition is another session: a soft start, the motion, and rest. The angles
 that the cranks lack in the last periods correct the setpoints of the next one.
 """
 
@@ -95,7 +95,7 @@ def learn_live(
         machine: HOST:PORT where it listens.
         options: `learn`, `learned`, `armed`, `key`, `max_missing`, `accept_jitter`.
         say: prints a line.
-        ending: whether to come to rest and end.
+        ending: returns whether to bring the plate to rest and end.
 
     Returns:
         The run of all repetitions. With setpoints the best repetition, or the last one if none
@@ -165,7 +165,7 @@ class TorqueLessons(Viewer):
 
     Attributes:
         experiment: of the scenario.
-        tried: torques of the repetitions so far, of which the first one has none.
+        tried: torques of the repetitions so far; zero in the first one.
         errors: E of the last period of each complete repetition, % s.
         done: whether learning has ended.
         pace: pole of the governor, 1/s.
@@ -230,7 +230,7 @@ class TorqueLessons(Viewer):
             return
         if not self._returns:
             self._share = float(rise((t - self._asked) / _SOFT))
-            if snapshot.by_hand:  # there is no way onto the motion yet
+            if snapshot.by_hand:  # no way onto the motion was found yet
                 self._until = self._end_of_motion(t)
                 if t - self._asked > _WAIT:
                     self._end(f"no way onto the motion within {_WAIT:g} s: {snapshot.limit}")
