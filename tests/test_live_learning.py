@@ -16,6 +16,7 @@ from stewart_drake.live import design as designing
 from stewart_drake.live import learning
 from stewart_drake.live.endpoint import Endpoint
 from stewart_drake.live.learning import learn_live
+from stewart_drake.live.log import LiveRecord
 from stewart_drake.live.loop import CrankLoop, LiveLoop
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.options import LiveOptions
@@ -116,11 +117,13 @@ def test_a_packet_has_the_sum_and_the_law_the_rest(limit):
 
         def __init__(self):
             self._design, self._period, self._share = made, 0.1, 0.0
-            self._added, self._saturated = {}, 0
+            self._added, self._saturated, self._sequences = {}, 0, {}
+            self.record, self._contact = LiveRecord(made.experiment, limit, None, print), None
             self.memory = law.initial_memory(made.queue)
 
-    loop, before, mean = Alone(), None, signal.coefficients[0]
-    eta, steps = made.law.timeline.eta, np.ones((2,))
+    loop, before, mean, acted, net = Alone(), None, signal.coefficients[0], {}, []
+    timeline, weights = made.law.timeline, np.ones(2)
+    eta = timeline.eta
     for k in range(40):
         on_hand[0] = k >= 25
         t = 0.1 * k
@@ -129,7 +132,7 @@ def test_a_packet_has_the_sum_and_the_law_the_rest(limit):
         def ahead(times, t=t):
             return np.array([evaluate(reference, t + one) for one in times])
 
-        loop.memory = law.step(loop.memory, state, ahead, steps)
+        loop.memory = law.step(loop.memory, state, ahead, weights)
         rows, asked = loop.memory.sent.packets[-1].copy(), np.array(loop.memory.torque)
         packet, first = loop._packet(k)
         share = rise(t if k < 25 else 1 - (t - 2.5))
@@ -145,6 +148,14 @@ def test_a_packet_has_the_sum_and_the_law_the_rest(limit):
             planned = mean + rise(t + later)[:, None] * (signal(t + eta + 0.05 + later) - mean)
             np.testing.assert_allclose(packet[own:], rows[own:] + planned, atol=1e-12)
         before = packet
+        acted[k + timeline.steps] = packet[own]
+        net.append(loop.memory.in_flight[-1].copy())
+    report = loop._heard(30, acted)
+    assert len(report.acted) > 5
+    for i, torque in enumerate(report.acted):
+        sent_at = 29 - i - timeline.steps
+        np.testing.assert_allclose(torque, net[sent_at], atol=1e-12)
+    loop.record.finish()
     assert loop._as_sent(39).counts.saturated_steps == loop._saturated
     assert (loop._saturated > 0) == (limit < 1)
     np.testing.assert_allclose(loop._as_sent(39).torque, asked + learned, atol=1e-12)
