@@ -334,18 +334,18 @@ def run_live(
         OPTIONS
 
     Returns:
-        The run; with `learn`, that of the best repetition.
+        The run. With `learn` it is that of all repetitions, or of the best one of setpoints.
 
     Raises:
         ConfigError: no such machine, or one that does not begin.
     """
     from stewart_drake.live.contact import address_of
     from stewart_drake.live.endpoint import read_key
-    from stewart_drake.live.learning import learn_setpoints
+    from stewart_drake.live.learning import learn_live
     from stewart_drake.live.session import drive, open_logs, prepare_session
 
     if options.learn:
-        learnt = learn_setpoints(as_scenario(scenario), machine, options, print)
+        learnt = learn_live(as_scenario(scenario), machine, options, print)
         return SimulationResult.of(learnt)
     ready = prepare_session(as_scenario(scenario), address_of(machine), read_key(options.key))
     how: Any = options.model_dump(include={"armed", "accept_jitter", "max_missing"})

@@ -1,5 +1,6 @@
-"""`live --learn`: setpoints of servos learned from a machine, in real time."""
+"""`live --learn`: torques, or setpoints of servos, learned from a machine, in real time."""
 
+import contextlib
 import threading
 
 import numpy as np
@@ -7,19 +8,22 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.core_law import serving
 from stewart_drake.law.learned import LearnedSignal
+from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.servos import rise
 from stewart_drake.live import design as designing
 from stewart_drake.live import learning
 from stewart_drake.live.endpoint import Endpoint
-from stewart_drake.live.learning import learn_setpoints
-from stewart_drake.live.loop import CrankLoop
+from stewart_drake.live.learning import learn_live
+from stewart_drake.live.log import LiveRecord
+from stewart_drake.live.loop import CrankLoop, LiveLoop
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.protocol import ControllerMessage, MachineFlags
-from stewart_drake.loop.learned import HARMONICS, save_learned
+from stewart_drake.loop.learned import HARMONICS, motion_period, save_learned
 from stewart_drake.loop.preparation import prepare
+from stewart_drake.scenario.trajectories import evaluate
 from tests.live_driver import in_real_time
 
 STEPS = "delay.steps=13"
@@ -32,15 +36,16 @@ class Message:
     torque_limit, flags = np.inf, MachineFlags(0)
 
 
-def some_angles(size=0.05):
+def some_signal(size=0.05, period=PERIOD):
     coefficients = np.zeros((1 + 2 * HARMONICS, 6))
     coefficients[[0, 1, 1 + HARMONICS]] = size * np.random.default_rng(3).standard_normal((3, 6))
-    return LearnedSignal(PERIOD, coefficients)
+    return LearnedSignal(period, coefficients)
 
 
 def loop_of(learned, by_hand=lambda: False):
     """Return a loop that has only what plans are made of."""
-    made = designing.design(sd.load_scenario("reachy_mini", settings=(STEPS,)), Message(), learned)
+    scenario = sd.load_scenario("reachy_mini", settings=(STEPS,))
+    made = designing.design(scenario, Message(), designing.always(learned))
 
     class Alone(CrankLoop):
         _by_hand = property(lambda self: by_hand())
@@ -52,7 +57,7 @@ def loop_of(learned, by_hand=lambda: False):
 
 
 def test_what_was_learned_begins_and_ends_softly_and_is_by_the_time_of_the_motion():
-    signal, on_hand = some_angles(), [False]
+    signal, on_hand = some_signal(), [False]
     loop = loop_of(signal, lambda: on_hand[0])
     plans = []
     for k in range(120):
@@ -68,19 +73,22 @@ def test_what_was_learned_begins_and_ends_softly_and_is_by_the_time_of_the_motio
     assert np.abs(first).max() > 0.05
 
 
-def test_a_file_gives_the_same_as_the_signal(tmp_path):
-    wanted, signal = sd.load_scenario("reachy_mini", settings=(STEPS,)), some_angles()
-    save_learned(tmp_path / "learned.npz", signal, prepare(wanted))
-    more = (STEPS, f"controller.learned={tmp_path / 'learned.npz'}")
-    made = designing.design(sd.load_scenario("reachy_mini", settings=more), Message())
-    np.testing.assert_array_equal(made.learned.coefficients, signal.coefficients)
-    assert not hasattr(made.law, "learned")  # it is added once
+@pytest.mark.parametrize(("name", "settings"), [("reachy_mini", (STEPS,)), ("paper", ())])
+def test_a_file_gives_the_same_as_the_signal(tmp_path, name, settings):
+    wanted = sd.load_scenario(name, settings=settings)
+    signal, file = some_signal(period=motion_period(wanted)), tmp_path / "learned.npz"
+    save_learned(file, signal, prepare(wanted))
+    given = sd.load_scenario(name, settings=(*settings, f"controller.learned={file}"))
+    bare, learned = designing.read_learned(given)
+    assert bare == wanted
+    np.testing.assert_array_equal(learned().coefficients, signal.coefficients)
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["paper"], "--learn: got a controller.command of 'torque'; expected 'cranks'"),
+        (["paper", "--set", "controller.limits=qp"], "controller.learned: got 'learned.npz' with"),
+        (["paper", "--set", "link.kind=network"], "controller.learned: got 'learned.npz' with"),
         (["reachy_mini", "--set", "reference.kind=hold"], "only a motion that repeats is learned"),
         (["reachy_mini", "--learned", "no/such/l.npz"], "--learned: got no/such/l.npz; expected"),
         (["reachy_mini", "--duration", "5"], "--learn: expected none of --duration, --log"),
@@ -93,10 +101,134 @@ def test_what_live_cannot_learn_is_one_line(words, message, capsys):
     assert message in said and said.count("\n") == 1
 
 
-def test_torques_are_not_taken_from_a_file(tmp_path):
-    scenario = sd.load_scenario("paper", settings=(f"controller.learned={tmp_path / 'none.npz'}",))
-    with pytest.raises(ConfigError, match=r"^controller\.learned: "):
-        designing.design(scenario, Message())
+@pytest.mark.parametrize("limit", [10.0, 0.005])
+def test_a_packet_has_the_sum_and_the_law_the_rest(limit):
+    """Each row is that of the law and the learned torque of its hold, within the limit."""
+    network = "link={kind: network, low: 0.1, high: 0.3, loss: 0.02}"
+    settings = ("plant.kind=exact", network, f"actuator.torque_limit={limit}")
+    signal, on_hand = some_signal(2e-3, 2 * np.pi), [False]
+    scenario = sd.load_scenario("paper", settings=settings)
+    made = designing.design(scenario, Message(), designing.always(signal))
+    law, reference = serving(made.law).law, made.experiment.reference
+
+    class Alone(LiveLoop):
+        _by_hand = property(lambda self: on_hand[0])
+        _sends = True
+
+        def __init__(self):
+            self._design, self._period, self._share = made, 0.1, 0.0
+            self._added, self._saturated, self._sequences = {}, 0, {}
+            self.record, self._contact = LiveRecord(made.experiment, limit, None, print), None
+            self.memory = law.initial_memory(made.queue)
+
+    loop, before, mean, acted, net = Alone(), None, signal.coefficients[0], {}, []
+    timeline, weights = made.law.timeline, np.ones(2)
+    eta = timeline.eta
+    for k in range(40):
+        on_hand[0] = k >= 25
+        t = 0.1 * k
+        state = Measurement.of(evaluate(reference, t)[:12])
+
+        def ahead(times, t=t):
+            return np.array([evaluate(reference, t + one) for one in times])
+
+        loop.memory = law.step(loop.memory, state, ahead, weights)
+        rows, asked = loop.memory.sent.packets[-1].copy(), np.array(loop.memory.torque)
+        packet, first = loop._packet(k)
+        share = rise(t if k < 25 else 1 - (t - 2.5))
+        learned = mean + share * (signal(np.array([t + eta + 0.05]))[0] - mean)
+        own = k - first
+        np.testing.assert_allclose(packet[own], np.clip(asked + learned, -limit, limit), atol=1e-12)
+        np.testing.assert_allclose(loop.memory.in_flight[-1] + learned, packet[own], atol=1e-12)
+        assert np.abs(packet).max() <= limit
+        if before is not None:
+            np.testing.assert_allclose(packet[:own], before[own : 2 * own], atol=1e-12)
+        if limit > 1 and k < 25:
+            later = 0.1 * np.arange(len(packet) - own)
+            planned = mean + rise(t + later)[:, None] * (signal(t + eta + 0.05 + later) - mean)
+            np.testing.assert_allclose(packet[own:], rows[own:] + planned, atol=1e-12)
+        before = packet
+        acted[k + timeline.steps] = packet[own]
+        net.append(loop.memory.in_flight[-1].copy())
+    report = loop._heard(30, acted)
+    assert len(report.acted) > 5
+    for i, torque in enumerate(report.acted):
+        sent_at = 29 - i - timeline.steps
+        np.testing.assert_allclose(torque, net[sent_at], atol=1e-12)
+    loop.record.finish()
+    assert loop._as_sent(39).counts.saturated_steps == loop._saturated
+    assert (loop._saturated > 0) == (limit < 1)
+    np.testing.assert_allclose(loop._as_sent(39).torque, asked + learned, atol=1e-12)
+
+
+AMPLITUDE = 0.7 * np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
+LAW = (
+    f"reference.amplitude={AMPLITUDE.tolist()}",
+    "plant.kind=exact",
+    "controller.estimate=[]",
+    "controller.integral=false",
+    "controller.w_R=100",
+)
+UNKNOWN = (
+    "plant.coulomb_friction=1e-4",
+    "plant.payload_mass=0.2",
+    "plant.payload_position=[0.01, -0.008, 0.02]",
+    "plant.torque_bias=[3e-4, -3e-4, 3e-4, -3e-4, 3e-4, -3e-4]",
+)
+WAY = "low: 0.1, high: 0.12, loss: 0.02"
+ON_A_WIRE = ("start=on_reference", "queue=reference")
+OVER_A_NETWORK = ("start=rest", "queue=zero", f"link={{kind: network, {WAY}, return: {{{WAY}}}}}")
+
+
+@contextlib.contextmanager
+def machine_of(name, *settings, **how):
+    """Run a machine in a thread; yield its address."""
+    over, endpoint = threading.Event(), Endpoint(ControllerMessage, "127.0.0.1", 0)
+    experiment = prepare(sd.load_scenario(name, settings=settings))
+    machine = Machine(experiment, endpoint, Settings(**how), lambda line: None)
+
+    def run():
+        while not over.is_set():
+            machine.run(machine.time() / 1e9 + 0.05)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield f"127.0.0.1:{endpoint.address[1]}"
+    finally:
+        over.set()
+        thread.join()
+        endpoint.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", [ON_A_WIRE, OVER_A_NETWORK])
+@in_real_time
+def test_torques_of_a_machine_with_friction_and_payload_are_learned(monkeypatch, tmp_path, way):
+    """Friction, a payload off its centre and biases; the machine's clock is 5 times as fast.
+
+    Between the repetitions the plate rests at the start. The file serves a simulation, too.
+    """
+    monkeypatch.setattr(Machine, "stop", lambda self: None)
+    said, file = [], tmp_path / "learned.npz"
+    wanted = sd.load_scenario("paper", settings=(*LAW, *way[:2]))
+    with machine_of("paper", *LAW, *UNKNOWN, *way, rate=5.0) as where:
+        options = LiveOptions(learn=3, learned=file, accept_jitter=True)
+        result = learn_live(wanted, where, options, said.append)
+    assert result.status == "completed"
+    errors = [float(line.split()[-3]) for line in said if "E of one period" in line]
+    assert len(errors) == 3
+    assert 13 < errors[0] < 16 and errors[2] < 0.5
+    assert "repetition 3 is the best" in said[-1]
+    begin = prepare(wanted).start[:6]
+    away = np.abs(result.signals.pose.values - begin).max(axis=1)
+    rates = np.abs(result.signals.rates.values / AMPLITUDE).max(axis=1)
+    resting = (away < 0.05) & (rates < 0.05)
+    assert np.count_nonzero(np.diff(resting.astype(int)) == 1) >= 2
+    run = (*LAW, *UNKNOWN, *ON_A_WIRE, "duration=12", f"controller.learned={file}")
+    learned = sd.simulate(sd.load_scenario("paper", settings=run), judge_stability=False)
+    after = learned.signals.error.sel(time=slice(6, None)).values
+    assert np.abs(after / AMPLITUDE).max() < 0.01
 
 
 @pytest.mark.slow
@@ -106,28 +238,13 @@ def test_setpoints_of_a_machine_with_other_servos_are_learned(monkeypatch, tmp_p
     monkeypatch.setattr(Machine, "stop", lambda self: None)
     monkeypatch.setattr(learning, "_SETTLING", 4.0)  # the soft starts here take a second
     network = "link={kind: network, low: 0.01, high: 0.05, loss: 0.03, playout: 0.26}"
-    other = ("actuator.friction=0.2", "actuator.stiffness=8", network)
-    lines, over = [], threading.Event()
-    endpoint = Endpoint(ControllerMessage, "127.0.0.1", 0)
-    experiment = prepare(sd.load_scenario("reachy_mini", settings=other))
-    machine = Machine(experiment, endpoint, Settings(), lines.append)
-
-    def run():
-        while not over.is_set():
-            machine.run(machine.time() / 1e9 + 0.05)
-
-    thread = threading.Thread(target=run)
-    thread.start()
     said, file = [], tmp_path / "learned.npz"
-    try:
+    with machine_of(
+        "reachy_mini", "actuator.friction=0.2", "actuator.stiffness=8", network
+    ) as where:
         options = LiveOptions(learn=3, learned=file, accept_jitter=True)
         wanted = sd.load_scenario("reachy_mini", settings=(STEPS,))
-        where = f"127.0.0.1:{endpoint.address[1]}"
-        result = learn_setpoints(wanted, where, options, said.append)
-    finally:
-        over.set()
-        thread.join()
-        endpoint.close()
+        result = learn_live(wanted, where, options, said.append)
     assert result.status == "completed"
     lacking = [float(line.split()[5]) for line in said if "degrees rms" in line]
     assert len(lacking) == 3

@@ -127,15 +127,17 @@ def _learn(
     more: tuple[str | None, Sequence[str]],
     delivery: Delivery,
 ) -> int:
-    """Learn setpoints, and deliver the best repetition."""
-    from stewart_drake.live.learning import check_learning, learn_setpoints
+    """Learn torques or setpoints, and deliver the run."""
+    from stewart_drake.live.learning import learn_live
+    from stewart_drake.studies.learn import check_learning
 
     check_learning(loaded)
     with contextlib.ExitStack() as running:
         where = machine or running.enter_context(_demo_machine(scenario, loaded.eta, *more))
         delivery.say(f"calling {where}")
         consent = options if machine else options.model_copy(update={"accept_jitter": True})
-        result = learn_setpoints(loaded, where, consent, delivery.say_wrapped)
+        with _Ending() as ending:
+            result = learn_live(loaded, where, consent, delivery.say_wrapped, ending)
     return _delivered(delivery, result)
 
 

@@ -40,8 +40,8 @@ _MOST_HOLDS: Final = 40
 """Torques of a plan; each is held for several periods if there are more."""
 _PARTS: Final = 4
 """Pieces of a hold."""
-_ROUNDS: Final = 20
-"""Quadratic programs; some 8 are usual."""
+_ROUNDS: Final = 40
+"""Quadratic programs; some 8 are usual, 24 where the torque limit is tight."""
 _MISSED: Final = 1e-7
 """By how much a plan may miss the reference, in motions of size 1 by the weights Q."""
 _BEYOND: Final = 0.05

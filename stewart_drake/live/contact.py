@@ -57,7 +57,8 @@ class Link:
     way back: the machine keeps no state of requests.
 
     Attributes:
-        trips: last round trips, s, without the time for which the machine held a datagram.
+        trips: last round trips, s of the machine's clock, without the time for which it held a
+            datagram.
         sent: number of datagrams whose fate is known.
         lost: number of them that did not arrive.
         missed: number of measurements that did not come, by their sequence.
@@ -225,7 +226,7 @@ class Contact:
         self._phases.append((time - message.sampled / message.rate) / SECOND)
         if head.acknowledged > self._newest:  # the first answer to a datagram
             self._newest = head.acknowledged
-            link.trips.append((time - head.echo - head.held / message.rate) / SECOND)
+            link.trips.append((message.rate * (time - head.echo) - head.held) / SECOND)
         self._acknowledge(message)
         for settled in [n for n in self._pending if n <= head.acknowledged - _SETTLED]:
             link.sent += 1

@@ -8,6 +8,7 @@ torques that come late or never (theory.md, section 25).
 
 import math
 import time as clock
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
@@ -56,6 +57,9 @@ _PLAN: Final = 16
 _LEAST_LOSS: Final = 0.01
 """Smallest assumed loss of packets: the call takes a few seconds only."""
 
+Learned = Callable[[], LearnedSignal] | None
+"""Returns what is added to the torques or setpoints of the law; None: nothing."""
+
 
 class Design(NamedTuple):
     """Law and settings of a controller before its start.
@@ -69,7 +73,7 @@ class Design(NamedTuple):
         torque_limit: tighter limit of the scenario and the machine, N m.
         step: time of a step of the law here, s, and the name of its implementation.
         rows: number of setpoints of a plan for servos.
-        learned: angles added to the law's setpoints, by the time of the motion, or None.
+        learned: see `Learned`.
     """
 
     experiment: Experiment
@@ -80,7 +84,7 @@ class Design(NamedTuple):
     torque_limit: float
     step: tuple[float, str]
     rows: int = 1
-    learned: LearnedSignal | None = None
+    learned: Learned = None
 
     @property
     def cranks(self) -> bool:
@@ -132,7 +136,7 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
             f"controller.delay_estimator: got {c.delay_estimator!r}; expected 'none' for a machine "
             "that keeps to the play-out times of torques"
         )
-    longest = link.longest + _ROOM * link.jitter + _COMPUTING
+    longest = link.longest + _ROOM * link.jitter + _COMPUTING * machine.rate
     network = NetworkConfig(
         low=link.shortest,
         high=longest,
@@ -174,27 +178,33 @@ def _whole_delay(scenario: Scenario, found: NetworkConfig) -> float:
     return default_bound(found, c.packet_repeats, c.period) + c.packet_repeats * c.period
 
 
-def design(
-    scenario: Scenario, machine: MachineMessage, learned: LearnedSignal | None = None
-) -> Design:
+def always(signal: LearnedSignal | None) -> Learned:
+    """Return a function that returns this signal, or None for None."""
+    return None if signal is None else lambda: signal
+
+
+def read_learned(scenario: Scenario) -> tuple[Scenario, Learned]:
+    """Return a scenario without `controller.learned`, and what is in that file."""
+    if scenario.controller.learned is None:
+        return scenario, None
+    without = replace(scenario, controller=replace(scenario.controller, learned=None))
+    return without, always(learned_signal(prepare(scenario)))
+
+
+def design(scenario: Scenario, machine: MachineMessage, learned: Learned = None) -> Design:
     """Return the law for a scenario over the measured link.
 
     Args:
         scenario: as `as_seen` returns it.
         machine: message of the machine.
-        learned: angles to add to setpoints, instead of those of `controller.learned`.
+        learned: see `Learned`.
 
     Raises:
         ConfigError: see `loop.preparation.prepare` and `control_law`.
     """
     experiment = prepare(scenario)
     if scenario.controller.command == "cranks":
-        return _of_cranks(experiment, machine, learned or learned_signal(experiment))
-    if scenario.controller.learned is not None:
-        raise ConfigError(
-            "controller.learned: got a file of torques; expected null: live has no fixed time of "
-            "the motion for them"
-        )
+        return _of_cranks(experiment, machine, learned)
     law, planned, _ = control_law(experiment)
     limit = min(law.plant.motors.limit, machine.torque_limit)
     law = replace(law, plant=replace(law.plant, motors=TorqueLimit(limit)))
@@ -203,21 +213,17 @@ def design(
     repeats = scenario.controller.packet_repeats if scenario.link.kind == "network" else 0
     queue = first_queue(experiment, law)
     assert law.kept < MOST_HISTORY
-    return Design(experiment, law, planned, queue, repeats, limit, _step_time(law, planned, queue))
+    step = _step_time(law, planned, queue)
+    return Design(experiment, law, planned, queue, repeats, limit, step, learned=learned)
 
 
-def _of_cranks(
-    experiment: Experiment, machine: MachineMessage, learned: LearnedSignal | None
-) -> Design:
+def _of_cranks(experiment: Experiment, machine: MachineMessage, learned: Learned) -> Design:
     """Return the law for servos; its queue is the command (18,) before the first sample.
 
     Nothing is estimated, so that the law takes the numbers of the scenario's plant, as the command
     `setpoints` does.
     """
     experiment = experiment._replace(nominal=known_dynamics(experiment))
-    sc = experiment.scenario
-    unlearned = replace(sc, controller=replace(sc.controller, learned=None))
-    experiment = experiment._replace(scenario=unlearned)
     law, planned, _ = servo_law(experiment)
     limit = min(experiment.torque_limit, machine.torque_limit)
     first, _ = commands_in_flight(experiment, law, experiment.scenario.true_delay)

@@ -161,19 +161,21 @@ class Governor:
     Attributes:
         dynamics: nominal dynamics.
         torque_limit: limit of each motor, N m, of which TORQUE_SHARE is used.
-        fastest: fastest pole w, 1/s. Without a torque limit it is PACE.
+        fastest: fastest pole w, 1/s. Without a torque limit the slowest one is used.
+        slowest: slowest pole w, 1/s. A blend takes at least 4 / w.
     """
 
     dynamics: StewartDynamics
     torque_limit: float = np.inf
     fastest: float = FASTEST
+    slowest: float = PACE
 
     @cached_property
     def paces(self) -> tuple[float, ...]:
         """Possible poles w, fastest first, 1/s."""
-        if np.isinf(self.torque_limit) or self.fastest <= PACE:
-            return (PACE,)
-        return tuple(np.geomspace(self.fastest, PACE, _PACES).tolist())
+        if np.isinf(self.torque_limit) or self.fastest <= self.slowest:
+            return (self.slowest,)
+        return tuple(np.geomspace(self.fastest, self.slowest, _PACES).tolist())
 
     @cached_property
     def _model(self) -> Model:
@@ -298,8 +300,8 @@ class Governor:
 
         Without any it returns the limit that the longest one exceeds.
         """
-        states = np.empty((0, NUM_REFERENCE))
-        for duration in _BLENDS:
+        states, least = np.empty((0, NUM_REFERENCE)), min(4 / self.slowest, _BLENDS[-1])
+        for duration in (one for one in _BLENDS if one >= least):
             goal = evaluate(motion, time + duration)
             shares = np.arange(0.0, 1.0, _BLEND_STEP / duration)
             states = np.array([between(state, goal, duration, share) for share in shares])

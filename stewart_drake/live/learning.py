@@ -1,32 +1,69 @@
-"""Learning the setpoints of a machine's servos from repetitions of its motion, in real time.
+"""Learning from repetitions of a motion of a machine, in real time.
 
-Each repetition is a session of its own: a soft start, the motion, and rest. The angles that the
-cranks lack in the last periods correct the setpoints of the next one, as in `studies.learn`.
+*Torques.* All repetitions are one run: the motion for some periods, then a way back to the start by
+the governor, where the plate rests. The torques that the model lacks in the last period correct
+those of the next repetition, as in `studies.learn`. They are computed on the way back, some at each
+sample.
+
+*Setpoints.* Each repetition is another session: a soft start, the motion, and rest. The angles
+that the cranks lack in the last periods correct the setpoints of the next one.
 """
 
 import math
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 
+from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.learned import LearnedSignal
+from stewart_drake.law.servos import rise
+from stewart_drake.law.timeline import Timeline
 from stewart_drake.live.contact import address_of
+from stewart_drake.live.design import always
 from stewart_drake.live.endpoint import read_key
-from stewart_drake.live.loop import End
+from stewart_drake.live.governor import PACE
+from stewart_drake.live.loop import REST_RATE, START_ERROR, End, Snapshot, Viewer
 from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.session import drive, plans, prepare_session
-from stewart_drake.loop.learned import harmonics_below, motion_period, save_learned
-from stewart_drake.loop.results import SimulationResult
+from stewart_drake.live.steering import Request
+from stewart_drake.loop.learned import HARMONICS, harmonics_below, motion_period, save_learned
+from stewart_drake.loop.preparation import Experiment, prepare
+from stewart_drake.loop.results import SimulationResult, accumulated_error
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.studies.learn import PATIENCE, Anderson, corrected_setpoints, fit, lacking_angles
+from stewart_drake.scenario.signals import NUM_PARAMETERS, POSE, RATES
+from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.studies.learn import (
+    PATIENCE,
+    Anderson,
+    check_learning,
+    corrected_setpoints,
+    fit,
+    lacking_angles,
+    lacking_torque,
+)
+from stewart_drake.types import Array
 
 _SETTLING: Final = 9.0
-"""Time before what is learned from, s: the longest soft start, and a second."""
+"""Time before what is learned from, s: the longest way onto the motion, and a second."""
+_DELAYS: Final = 5.0
+"""The same for torques, in delays after that way."""
 _LEARNED_FROM: Final = 4.0
-"""Least time that is learned from, s; whole periods."""
+"""Least time that setpoints are learned from, s; whole periods."""
+_WAIT: Final = 10.0
+"""Longest wait for a way onto the motion, s."""
+_PACE: Final = 2.0
+"""Pole of the governor over the motion's frequency: the way back takes little more torque."""
+_SOFT: Final = 2.0
+"""Time in which one learned torque replaces another, s."""
+_INSTANTS: Final = 200
+"""Instants of a period at which its rates are looked at."""
+_EACH: Final = 4
+"""Lacking torques that are computed at a sample; one takes some 0.7 ms."""
 
 
 class Repetition(NamedTuple):
@@ -41,47 +78,245 @@ class Repetition(NamedTuple):
     result: SimulationResult
 
 
-def check_learning(scenario: Scenario) -> None:
-    """Refuse a scenario whose setpoints cannot be learned in real time.
-
-    Raises:
-        ConfigError: torques, a file of learned setpoints, or a motion that does not repeat.
-    """
-    c = scenario.controller
-    if c.command != "cranks":
-        raise ConfigError(
-            f"--learn: got a controller.command of {c.command!r}; expected 'cranks': torques are "
-            "learned in a simulation, by the command learn"
-        )
-    if c.learned is not None:
-        raise ConfigError("controller.learned: got a file; expected null, where learning begins")
-    motion_period(scenario)
-
-
-def learn_setpoints(
-    scenario: Scenario, machine: str, options: LiveOptions, say: Callable[[str], None]
+def learn_live(
+    scenario: Scenario,
+    machine: str,
+    options: LiveOptions,
+    say: Callable[[str], None],
+    ending: Callable[[], bool] = lambda: False,
 ) -> SimulationResult:
     """Repeat a motion on a machine, learn from each repetition, and write what was learned.
 
-    Learning ends early after two repetitions without a smaller error, or with a run that does not
+    Learning ends early after two repetitions without a smaller error, or where one does not
     complete.
 
     Args:
-        scenario: that passes `check_learning`.
+        scenario: law and motion.
         machine: HOST:PORT where it listens.
         options: `learn`, `learned`, `armed`, `key`, `max_missing`, `accept_jitter`.
         say: prints a line.
+        ending: returns whether to bring the plate to rest and end.
 
     Returns:
-        The best repetition, or the last run if none completed.
+        The run of all repetitions. With setpoints the best repetition, or the last one if none
+        completed.
 
     Raises:
-        ConfigError: see `check_learning` and `live.session`.
+        ConfigError: see `studies.learn.check_learning` and `live.session`.
     """
     check_learning(scenario)
-    file, learned, best = options.learned or Path("learned.npz"), None, 0
+    file = options.learned or Path("learned.npz")
     if not file.parent.is_dir():
         raise ConfigError(f"--learned: got {file}; expected a file in a folder that is there")
+    learn = _learn_setpoints if scenario.controller.command == "cranks" else _learn_torques
+    return learn(scenario, machine, options, file, say, ending)
+
+
+def _said(best: int, file: Path) -> str:
+    if best == 0:
+        return "nothing was learned: no repetition was better than the first one"
+    return f"repetition {1 + best} is the best; {file} is for controller.learned"
+
+
+# ---------------------------------------------------------------- torques
+
+
+def _learn_torques(
+    scenario: Scenario,
+    machine: str,
+    options: LiveOptions,
+    file: Path,
+    say: Callable[[str], None],
+    ending: Callable[[], bool],
+) -> SimulationResult:
+    lessons = TorqueLessons(prepare(scenario), options.learn, say)
+    ready = prepare_session(scenario, address_of(machine), read_key(options.key), lessons)
+    for line in plans(ready, math.inf, scenario.mechanism):
+        say(line)
+    result = drive(
+        ready,
+        viewer=lessons,
+        ending=ending,
+        say=say,
+        logs=[lessons],
+        pace=lessons.pace,
+        **options.model_dump(include={"armed", "accept_jitter", "max_missing"}),
+    )
+    if result.status != "completed":
+        say(f"{End(result.status, result.stopped).words}; learning ends")
+    if lessons.errors:
+        best = lessons.best
+        if best:
+            save_learned(file, lessons.tried[best], lessons.experiment)
+        say(_said(best, file))
+    return result
+
+
+class TorqueLessons(Viewer):
+    """Asks for the repetitions of a motion, and learns torques from each.
+
+    It is the viewer of a run, and a log of it. Called, it returns what the loop adds: the torque of
+    the last repetition at first, then softly that of the present one.
+
+    Args:
+        experiment: of the scenario.
+        number: of repetitions.
+        say: prints a line.
+
+    Attributes:
+        experiment: of the scenario.
+        tried: torques of the repetitions so far; zero in the first one.
+        errors: E of the last period of each complete repetition, % s.
+        done: whether learning has ended.
+        pace: pole of the governor, 1/s.
+    """
+
+    def __init__(self, experiment: Experiment, number: int, say: Callable[[str], None]) -> None:
+        self.experiment, self._number, self._say = experiment, number, say
+        sc = experiment.scenario
+        self._dt, self._period = sc.controller.period, motion_period(sc)
+        self._harmonics = harmonics_below(self._period, self._dt)
+        none = LearnedSignal(self._period, np.zeros((1 + 2 * HARMONICS, 6)))
+        self.tried, self.errors, self.done = [none], list[float](), False
+        self._anderson = Anderson()
+        self._span = _SETTLING + _DELAYS * sc.eta + self._period
+        self._size = 2 * experiment.motion_scale
+        times = np.linspace(0.0, self._period, _INSTANTS, endpoint=False)
+        rates = [evaluate(experiment.reference, t)[RATES] / self._size for t in times]
+        self.pace = min(PACE, _PACE * 2 * np.pi / self._period)
+        self._slowest = float(times[np.argmin(np.abs(rates).max(axis=1))])
+        self._until, self._asked, self._returns = self._end_of_motion(0.0), 0.0, False
+        self._before, self._share = none, 0.0
+        self._left: Array = self.experiment.start[POSE]  # pose at which the motion ended
+        self._target = self._left
+        periods = round(self._period / self._dt)
+        self._rows = deque[tuple[float, Mapping[str, Array]]](maxlen=periods + 1)
+        self._whole = False
+        self._lacking: Iterator[tuple[float, Array]] | None = None
+        self._found: list[tuple[float, Array]] = []
+
+    @property
+    def best(self) -> int:
+        """Number of the repetition with the least error, from 0."""
+        return int(np.argmin(self.errors))
+
+    def __call__(self) -> LearnedSignal:
+        """Return the torque that is added."""
+        before, present = self._before.coefficients, self.tried[-1].coefficients
+        return LearnedSignal(self._period, before + self._share * (present - before))
+
+    def request(self) -> Request:
+        """Ask for the motion, or for a target that goes back to the start."""
+        return Request(target=self._target) if self._returns else Request()
+
+    def finished(self) -> bool:
+        """Return whether learning has ended."""
+        return self.done
+
+    def write(self, time: float, values: Mapping[str, Array]) -> None:
+        """Keep the samples of the last period of the motion."""
+        if not self._returns or time <= self._until + self._dt / 2:
+            self._rows.append((time, values))
+        else:
+            self._whole = True
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Go from the motion to the start, and from the start to the next repetition."""
+        t = snapshot.time
+        if self.done:
+            return
+        if not self._returns:
+            self._share = float(rise((t - self._asked) / _SOFT))
+            if snapshot.by_hand:  # no way onto the motion was found yet
+                self._until = self._end_of_motion(t)
+                if t - self._asked > _WAIT:
+                    self._end(f"no way onto the motion within {_WAIT:g} s: {snapshot.limit}")
+            self._returns = t >= self._until - self._dt / 2
+            self._left = self._target = snapshot.wanted[POSE]
+            return
+        share = rise(np.array([(t - self._until) / self._period]))[0]
+        self._target = self._left + share * (self.experiment.start[POSE] - self._left)
+        if self._lacking is None:
+            if self._whole:
+                self._judge()
+            return
+        more = list(islice(self._lacking, _EACH))
+        self._found += more
+        if not more and self._rests(snapshot):
+            self._begin(t)
+
+    def _end_of_motion(self, t: float) -> float:
+        """Return when a motion ends that begins at t s: where it is slowest, for a gentle stop."""
+        least = t + self._span
+        return least + (self._slowest - least) % self._period
+
+    def _judge(self) -> None:
+        """Take the error of the repetition, and end after the last one."""
+        times = np.array([time for time, _ in self._rows])
+        errors = np.array([row["pose"] - row["reference"] for _, row in self._rows])
+        self.errors.append(accumulated_error(times, errors, self.experiment.scale))
+        k = len(self.errors)
+        self._say(f"repetition {k}: E of one period is {self.errors[-1]:.3g} % s")
+        self.done = k == self._number or k - 1 - self.best >= PATIENCE
+        self._lacking = self._lacking_torques()
+
+    def _lacking_torques(self) -> Iterator[tuple[float, Array]]:
+        """Yield the middles of periods, s, and the torques (6,) that the model lacks there."""
+        sc, rows = self.experiment.scenario, list(self._rows)
+        parameters = self.experiment.nominal.plant_parameters.copy()
+        parameters[:NUM_PARAMETERS] = np.mean([row["parameters"] for _, row in rows], axis=0)
+        dynamics = StewartDynamics(self.experiment.mechanism, sc.plant.gravity, parameters)
+        timeline = Timeline(self._dt, sc.true_delay)
+        state = "measurement" if sc.sensor.measures_state else "state_estimate"
+        for (time, row), (_, after) in pairwise(rows):
+            begin, end = row[state], after[state]
+            if np.all(np.isfinite([begin, end])):
+                acted = np.array([row["torque_applied"], after["torque_applied"]])
+                schedule = timeline.next_period(acted)
+                yield time + self._dt / 2, lacking_torque(dynamics, begin, end, schedule)
+
+    def _rests(self, snapshot: Snapshot) -> bool:
+        """Return whether the plate rests at the start, or as near to it as a limit permits."""
+        wanted = snapshot.wanted
+        away = np.abs(wanted[POSE] - self.experiment.start[POSE]) / self._size
+        there = away.max() <= START_ERROR or snapshot.limit is not None
+        return bool(there and np.all(np.abs(wanted[RATES]) <= REST_RATE * self._size))
+
+    def _begin(self, t: float) -> None:
+        """Begin the next repetition, with what the last one has shown."""
+        least = 2 * (1 + 2 * self._harmonics)
+        if len(self._found) < least:
+            self._end(f"{len(self._found)} measurements of a period; expected at least {least}")
+            return
+        times, lacking = (np.array(column) for column in zip(*self._found, strict=True))
+        fitted = fit(times, -lacking, self._period, self._harmonics)
+        self._before = self.tried[-1]
+        self.tried.append(LearnedSignal(self._period, self._anderson.after(fitted)))
+        self._until, self._asked, self._returns = self._end_of_motion(t), t, False
+        self._share = 0.0
+        self._whole, self._lacking, self._found = False, None, []
+        self._rows.clear()
+
+    def _end(self, reason: str) -> None:
+        self._say(f"repetition {len(self.errors) + 1}: {reason}; learning ends")
+        self.done = True
+
+
+# ---------------------------------------------------------------- setpoints
+
+
+def _learn_setpoints(
+    scenario: Scenario,
+    machine: str,
+    options: LiveOptions,
+    file: Path,
+    say: Callable[[str], None],
+    ending: Callable[[], bool],
+) -> SimulationResult:
+    learned, best = None, 0
     period, dt = motion_period(scenario), scenario.controller.period
     number, servo = harmonics_below(period, dt), scenario.actuator
     assert servo.kind == "position_servo"
@@ -90,13 +325,14 @@ def learn_setpoints(
     duration, least = dt * math.ceil((_SETTLING + last) / dt + 1), 2 * (1 + 2 * number)
     address, key = address_of(machine), read_key(options.key)
     how = options.model_dump(include={"armed", "accept_jitter", "max_missing"})
-    done, steps = list[Repetition](), Anderson()
+    done, steps, own = list[Repetition](), Anderson(), prepare(scenario)
     for k in range(1, options.learn + 1):
-        ready = prepare_session(scenario, address, key, learned)
+        ready = prepare_session(scenario, address, key, always(learned))
         if k == 1:
             for line in plans(ready, duration, scenario.mechanism):
                 say(line)
-        experiment, result = ready.design.experiment, drive(ready, duration, say=say, **how)
+        experiment = ready.design.experiment
+        result = drive(ready, duration, ending=ending, say=say, **how)
         if result.status != "completed":
             say(f"repetition {k}: {End(result.status, result.stopped).words}; learning ends")
             break
@@ -111,15 +347,12 @@ def learn_setpoints(
         say(f"repetition {k}: the cranks lack {np.degrees(done[-1].error):.3f} degrees rms")
         best = int(np.argmin([one.error for one in done]))
         if best == k - 1 and learned is not None:  # at once, so that Ctrl-C loses nothing
-            save_learned(file, learned, experiment)
+            save_learned(file, learned, own)
         if k - 1 - best >= PATIENCE:
             break
         fitted = corrected_setpoints(steps.used, fit(times, missed, period, number), period, lag)
         learned = LearnedSignal(period, steps.after(fitted))
     if not done:
         return result
-    if best:
-        say(f"repetition {1 + best} is the best; {file} is for controller.learned")
-    else:
-        say("nothing was learned: no repetition was better than the first one")
+    say(_said(best, file))
     return done[best].result

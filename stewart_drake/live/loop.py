@@ -21,6 +21,7 @@ from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.channel import Report
 from stewart_drake.law.core_law import AnyMemory, serving
+from stewart_drake.law.learned import LearnedMemory
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.servos import rise
 from stewart_drake.law.timeline import Timeline, TorqueSchedule
@@ -164,6 +165,10 @@ class Viewer:
         """Return whether an immediate stop is requested."""
         return False
 
+    def finished(self) -> bool:
+        """Return whether the run is complete before its duration."""
+        return False
+
     def ended(self, end: End) -> None:
         """Show how the run ended; the last call."""
 
@@ -207,6 +212,12 @@ class Timing:
 
 class LiveLoop:
     """Runs a law against a machine.
+
+    A learned torque l is added as in `law.learned`. For the instant t of the motion it is
+
+        c + g(s) (l(t) - c),   c the mean of l, g that of a soft start.
+
+    s goes from 0 to 1 within a second on the motion, and back by hand or on the way to rest.
 
     Args:
         design: law and settings.
@@ -260,6 +271,8 @@ class LiveLoop:
         self._parked = self._leads = self._stalled = False
         self._safe: str | None = None
         self._check = ReportCheck(self._limit)
+        self._share = 0.0
+        self._added, self._saturated = dict[int, Array](), 0  # by sample
 
     def _ahead(self) -> float:
         """Return how far ahead of a sample the reference is fixed, s."""
@@ -284,7 +297,7 @@ class LiveLoop:
         self._parked = bool(last.flags & (MachineFlags.PARKED | MachineFlags.RESETS))
         # The machine's clock, or earlier by the way back.
         here = (clock.monotonic() - contact.due(0, last.rate)) * last.rate
-        lead = _LEAD + contact.link.longest
+        lead = _LEAD + contact.link.longest / last.rate
         asked, until = round((here + lead * last.rate) * SECOND), now() + round(_ANSWER * SECOND)
         step = round(min(self._period / last.rate, _REPEATED) * SECOND)
         self._asked = flags
@@ -298,6 +311,12 @@ class LiveLoop:
                 return
             if now() > until:
                 raise TimeoutError("got one that has not begun when it was asked to")
+
+    @property
+    def _real_period(self) -> float:
+        """Period of the controller, s of the own clock."""
+        last = self._contact.last
+        return self._period if last is None else self._period / last.rate
 
     def _take(self, message: MachineMessage) -> None:
         """Keep a measurement until its sample."""
@@ -330,13 +349,13 @@ class LiveLoop:
         """
         end, k = End("completed", None), 0
         try:
-            while k * self._period < duration - 1e-9 and not ending():
+            while not self._complete(k, duration) and not ending():
                 end = self._step(k)
                 if end.status != "completed":
                     break
                 k += 1
             if end.status == "completed":
-                if k * self._period < duration - 1e-9:
+                if not self._complete(k, duration):
                     end = self._end("interrupted", k, "ended")
                 self._come_to_rest(k)
         except KeyboardInterrupt:
@@ -344,6 +363,9 @@ class LiveLoop:
         self.stop()
         self._viewer.ended(end)
         return end
+
+    def _complete(self, k: int, duration: float) -> bool:
+        return k * self._period >= duration - 1e-9 or self._viewer.finished()
 
     def _end(self, status: str, k: int, reason: str, leg: int | None = None) -> End:
         return End(status, Failure(k * self._period, leg, math.nan, reason))
@@ -383,7 +405,7 @@ class LiveLoop:
         """Return the message with a sample's measurement, or None once it is too late."""
         for message in self._contact.receive():
             self._take(message)
-        usual = self._contact.lateness(self._period) + _SPARE
+        usual = self._contact.lateness(self._real_period) + _SPARE
         while self._came.get(k) is None:
             until = self._due(k) + round(usual * SECOND)
             if now() >= until:
@@ -396,7 +418,7 @@ class LiveLoop:
 
     def _report_stall(self, k: int) -> None:
         """Report once that this process is late by more than the jitter of the link."""
-        lag = now() - self._due(k) - self._contact.lateness(self._period) * SECOND
+        lag = now() - self._due(k) - self._contact.lateness(self._real_period) * SECOND
         if lag > STALL and not self._stalled:
             self._say(
                 f"at {k * self._period:.1f} s: stood still for {lag / SECOND:.1f} s; the machine "
@@ -468,7 +490,7 @@ class LiveLoop:
             judged = wanted if self._by_hand else evaluate(self._steering.motion, t)
             packets = self._packets(k, message)
             late = self.timing.late
-            self.record.sample(k, self.memory, measurement, judged, seconds, late, packets)
+            self.record.sample(k, self._as_sent(k), measurement, judged, seconds, late, packets)
         self._recover(k)
         self._viewer.show(self._snapshot(k, wanted))
         if has_measured(self.memory, counts):
@@ -521,9 +543,45 @@ class LiveLoop:
 
     def _packet(self, k: int) -> tuple[Array, int]:
         """Return the rows (n, 6) to send, and the sample that the first one is of."""
-        if self._sends:
-            return self.memory.sent.packets[-1], k - self._design.repeats
-        return self.memory.in_flight[-1:], k
+        memory, repeats, timeline = self.memory, self._design.repeats, self._design.law.timeline
+        rows = memory.sent.packets[-1] if self._sends else memory.in_flight[-1:]
+        if self._design.learned is None:
+            return rows, k - repeats
+        middle = k * self._period + timeline.eta + self._period / 2
+        signal = self._design.learned()
+        mean = signal.coefficients[0]
+        share = self._shares(len(rows) - repeats)
+        times = middle + self._period * np.arange(len(share))
+        learned = mean + share * (signal(times) - mean)
+        self._added[k] = learned[0]
+        self._added.pop(k - 2 * _KEPT, None)
+        earlier = [self._added_at(n) for n in range(k - repeats, k)]
+        asked = rows + np.vstack([*earlier, learned])
+        asked[repeats] = memory.torque + learned[0]
+        sent = self._design.law.plant.motors.saturate(asked)
+        self._saturated += bool(np.any(sent[repeats] != asked[repeats]))
+        rows[repeats:] = sent[repeats:] - learned  # the limit is on the sum
+        memory.in_flight[-1] = rows[repeats]
+        return sent, k - repeats
+
+    def _shares(self, number: int) -> Array:
+        """Return g(s) of this sample and those after it, (number, 1)."""
+        change = self._period / _SOFT_STARTS[0]
+        change = -change if self._by_hand else change  # also on the way to rest
+        share: Array = self._share + change * np.arange(number, dtype=np.float64)
+        self._share = float(np.clip(self._share + change, 0, 1))
+        return rise(share)[:, None]
+
+    def _added_at(self, k: int) -> Array:
+        """Return what was added to the torque of a sample, (6,) N m."""
+        return self._added.get(k, np.zeros(NUM_TORQUES))
+
+    def _as_sent(self, k: int) -> Any:
+        """Return the memory for the record, with the torque as it was sent."""
+        if k not in self._added:
+            return self.memory
+        torque = self.memory.torque + self._added[k]
+        return LearnedMemory(self.memory, self.memory.in_flight, torque, k, self._saturated)
 
     def _send(self, k: int, packet: Array, first: int) -> None:
         P = round(self._period * SECOND)
@@ -545,7 +603,7 @@ class LiveLoop:
         timing.samples, timing.late = timing.samples + 1, late
         if not self._recording:
             timing.resting.append(late)
-        timing.missed += late > self._period + self._contact.lateness(self._period)
+        timing.missed += late > self._real_period + self._contact.lateness(self._real_period)
 
     # -------------------------------------------------------------- reports
 
@@ -569,7 +627,7 @@ class LiveLoop:
             torque = self.record.applied.get(k - 1 - i)
             if torque is None:
                 break
-            rows.append(torque)
+            rows.append(torque - self._added_at(k - 1 - i - self._design.law.timeline.steps))
         return Report(arrived, np.array(rows).reshape(-1, NUM_TORQUES))
 
     def _packets(self, k: int, message: MachineMessage | None) -> Array:
@@ -698,11 +756,8 @@ class CrankLoop(LiveLoop):
     """Runs the law for servos given by their stiffness, which sends plans of setpoints.
 
     Row i of a plan is the setpoint that the plan of i samples later will begin with. With w the
-    law's setpoint for the instant t of the motion, and l what was learned, it is
-
-        w(t) + g(s) l(t),   g that of a soft start.
-
-    s goes from 0 to 1 within a second on the motion, and back by hand or on the way to rest.
+    law's setpoint for the instant t of the motion, l what was learned and g as of `LiveLoop`, it
+    is w(t) + g(s) l(t).
     """
 
     def __init__(self, design: Design, *args: Any, **kwargs: Any) -> None:
@@ -711,7 +766,6 @@ class CrankLoop(LiveLoop):
         self.memory: Any
         self._check = ReportCheck(math.inf)
         self._no_report = np.full(self._servos.reports.size, np.nan)
-        self._share = 0.0
         self._last: Array | None = None
 
     def _ahead(self) -> float:
@@ -743,14 +797,11 @@ class CrankLoop(LiveLoop):
 
     def _learned(self, t: float) -> Array:
         """Return what was learned for a plan from the instant t of the motion on, (n, 6), rad."""
-        rows, signal = self._design.rows, self._design.learned
-        if signal is None:
+        rows = self._design.rows
+        if self._design.learned is None:
             return np.zeros((rows, NUM_TORQUES))
-        later = self._period * np.arange(rows, dtype=np.float64)
-        sign = -1.0 if self._by_hand else 1.0  # also on the way to rest
-        share = self._share + sign * later / _SOFT_STARTS[0]
-        self._share = float(np.clip(self._share + sign * self._period / _SOFT_STARTS[0], 0, 1))
-        return rise(share)[:, None] * signal(t + later)
+        times: Array = t + self._period * np.arange(rows, dtype=np.float64)
+        return np.asarray(self._shares(rows) * self._design.learned()(times))
 
     def _start(
         self, t: float, measurement: Measurement, message: MachineMessage | None

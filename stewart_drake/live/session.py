@@ -11,11 +11,17 @@ from typing import Any, Final, NamedTuple
 
 from stewart_drake.dynamics.native_functions import one_blas_thread
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.live.contact import Contact, address_of, call, open_endpoint
-from stewart_drake.live.design import Design, as_seen, check_controller, design
+from stewart_drake.live.design import (
+    Design,
+    Learned,
+    as_seen,
+    check_controller,
+    design,
+    read_learned,
+)
 from stewart_drake.live.endpoint import Address, Endpoint
-from stewart_drake.live.governor import FASTEST, Governor
+from stewart_drake.live.governor import FASTEST, PACE, Governor
 from stewart_drake.live.loop import CrankLoop, LiveLoop, Viewer
 from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerFlags, MachineFlags
@@ -79,7 +85,7 @@ def prepare_session(
     scenario: Scenario,
     address: Address,
     key: bytes | None = None,
-    learned: LearnedSignal | None = None,
+    learned: Learned = None,
 ) -> Ready:
     """Find a machine, measure the link and design the law for it.
 
@@ -87,7 +93,7 @@ def prepare_session(
         scenario: law and motion.
         address: address of the machine.
         key: shared key; not needed on loopback.
-        learned: see `live.design.design`.
+        learned: see `live.design.Learned`; by default that of `controller.learned`.
 
     Raises:
         ConfigError: no machine there, or one that does not fit the scenario.
@@ -98,7 +104,8 @@ def prepare_session(
         machine = call(contact)
         check_controller(scenario)
         with one_blas_thread:
-            made = design(as_seen(scenario, contact.link, machine), machine, learned)
+            scenario, read = read_learned(scenario)
+            made = design(as_seen(scenario, contact.link, machine), machine, learned or read)
             margin = controller_margin(_in_time(made.experiment))
         return Ready(endpoint, contact, made, margin)
     except BaseException:
@@ -281,6 +288,7 @@ def drive(
     max_missing: float | None = None,
     log: Path | None = None,
     logs: Sequence[RunLog] = (),
+    pace: float | None = None,
 ) -> SimulationResult:
     """Run the loop; the machine moves.
 
@@ -295,6 +303,7 @@ def drive(
         max_missing: see `LiveLoop`.
         log: see `LiveLoop`.
         logs: further logs, written while the run goes on; closed at the end.
+        pace: pole of the governor, 1/s; by default it depends on the torque limit.
 
     Raises:
         ConfigError: not armed for a real machine, too much jitter, or a machine that does not
@@ -303,8 +312,11 @@ def drive(
     check_armed(ready, armed)
     check_jitter(ready, accept_jitter)
     made, contact = ready.design, ready.contact
-    fastest = min(FASTEST, 1 / made.law.timeline.period)  # holds of a period follow no faster one
-    governor = Governor(made.law.plant.dynamics, made.torque_limit, fastest)
+    # Holds of a period follow no faster one.
+    fastest, slowest = min(FASTEST, 1 / made.law.timeline.period), PACE
+    if pace is not None:
+        fastest = slowest = pace
+    governor = Governor(made.law.plant.dynamics, made.torque_limit, fastest, slowest)
     steering = Steering(governor, made.experiment.reference, Way.along(made.planned))
     kind = CrankLoop if made.cranks else LiveLoop
     loop = kind(made, steering, contact, viewer or Viewer(), say, max_missing, log, logs)

@@ -83,7 +83,12 @@ def learned_signal(experiment: Experiment) -> LearnedSignal | None:
     for name, value in own.items():
         same = found[name] == value if value.dtype.kind == "U" else _near(found[name], value)
         if not same:
-            numbers = "" if np.ndim(value) else f" ({found[name]}); expected {value}"
+            exact = "" if np.ndim(value) or value.dtype.kind == "U" else ".9g"
+            numbers = (
+                ""
+                if np.ndim(value)
+                else f" ({found[name][()]:{exact}}); expected {value[()]:{exact}}"
+            )
             raise ConfigError(
                 f"controller.learned: got {file}, learned with another {_TEXTS[name]}{numbers}"
                 + (", as in the scenario" if numbers else "; expected that of the scenario")

@@ -124,6 +124,20 @@ class LearnStudy:
         }
 
 
+def check_learning(scenario: Scenario) -> None:
+    """Refuse a scenario in which nothing can be learned.
+
+    Raises:
+        ConfigError: a motion that does not repeat, or a controller that takes no learned torque.
+    """
+    if scenario.controller.learned is not None:
+        raise ConfigError("controller.learned: got a file; expected null, where learning begins")
+    motion_period(scenario)
+    # The rules for a file hold for what is learned.
+    asking = replace(scenario, controller=replace(scenario.controller, learned="learned.npz"))
+    asking.check()
+
+
 def study_learn(
     scenario: Scenario, options: LearnOptions, progress: Progress | None = None
 ) -> LearnStudy:
@@ -138,14 +152,10 @@ def study_learn(
         progress: called for each repetition.
 
     Raises:
-        ConfigError: a scenario whose motion or controller cannot use a learned torque.
+        ConfigError: see `check_learning`.
     """
-    if scenario.controller.learned is not None:
-        raise ConfigError("controller.learned: got a file; expected null, where learning begins")
+    check_learning(scenario)
     period = motion_period(scenario)
-    # The rules for a file hold for what is learned.
-    asking = replace(scenario, controller=replace(scenario.controller, learned="learned.npz"))
-    asking.check()
     dt = scenario.controller.period
     eta = believed_delay(scenario).eta(dt)
     periods = 1 + math.ceil(max(1.0, _SETTLING * eta / period))
@@ -316,11 +326,11 @@ def lacking_torques(
             part = slice(parts * k, parts * (k + 1))
             schedule = TorqueSchedule(acted.torques[part], acted.durations[part])
             times.append(dt * (k + 0.5))
-            found.append(_lacking(dynamics, begin, end, schedule))
+            found.append(lacking_torque(dynamics, begin, end, schedule))
     return np.array(times), np.reshape(found, (-1, 6))
 
 
-def _lacking(
+def lacking_torque(
     dynamics: StewartDynamics, begin: Array, end: Array, schedule: TorqueSchedule
 ) -> Array:
     """Return the constant torque (6,) that explains the rates at the end of a schedule."""
