@@ -73,6 +73,8 @@ def live(
     if (machine is None) != demo:
         raise ConfigError("--machine: expected either --machine HOST:PORT or --demo")
     options = given.options()
+    with given.named():
+        options.check_learned()
     loaded = load_scenario(scenario, controller, settings or ())
     delivery = Delivery(out, quiet, as_json)
     span = math.inf if options.duration is None else options.duration
