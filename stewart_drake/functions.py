@@ -344,6 +344,7 @@ def run_live(
     from stewart_drake.live.learning import learn_live
     from stewart_drake.live.session import drive, open_logs, prepare_session
 
+    options.check_learned()
     if options.learn:
         learnt = learn_live(as_scenario(scenario), machine, options, print)
         return SimulationResult.of(learnt)

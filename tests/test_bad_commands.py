@@ -70,6 +70,9 @@ BAD_ARGUMENTS = [
     (["layout", "paper", "--goal", "beauty"], "--goal: got beauty"),
     (["layout", "paper", "--set", "plant.mechanism=desktop"], "plant.mechanism: got desktop"),
     (["export", "nowhere.nc"], "nowhere.nc"),
+    (["live", "--demo", "--log", "run.txt"], "--log: got 'run.txt'; expected a file that ends"),
+    (["live", "--demo", "--learned", "a.npz"], "--learned: got a.npz without --learn; expected"),
+    (["live", "--demo", "--mirror", "x"], "--mirror: got 'x'; expected HOST:PORT"),
     (["export"], "FILE"),
 ]
 

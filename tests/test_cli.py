@@ -271,6 +271,18 @@ def test_simulations_tell_their_time(capsys):
 
 
 @pytest.mark.usefixtures("often")
+def test_lines_of_many_runs_fit_a_terminal(capsys):
+    names = [f"controller_{k}" for k in range(9)]
+    with terminal.progress_bars(names, 2.0, False) as show:
+        for name in names:
+            show[name](1.5, 0.1)
+        time.sleep(0.12)
+    said = capsys.readouterr().err
+    assert "controller_8 1.5 of 2 s" in " ".join(said.split())
+    assert max(map(len, said.splitlines())) <= 80
+
+
+@pytest.mark.usefixtures("often")
 def test_quiet_is_quiet(capsys):
     with terminal.count_bar("a", True), terminal.progress_bars(["a"], 1.0, True):
         time.sleep(0.3)

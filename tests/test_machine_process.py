@@ -4,6 +4,7 @@ import json
 import os
 import random
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -15,7 +16,9 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+import stewart_drake as sd
 from stewart_drake.export import controller as export_c
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_scenario
 from tests.building import SANITIZED, c_compiler, make
@@ -228,6 +231,28 @@ def test_the_controller_in_python_drives_the_machine_in_c(folder):
         assert running.end(signal.SIGINT) == 0
     assert "32 torques played, 0 periods dry, 0 silences" in running.lines[-2]
     np.testing.assert_allclose(states, simulated(40), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_live_drives_a_board_of_ones_own_once_it_is_armed(folder, tmp_path):
+    """The board is the shipped one, but real: no simulation, and nothing in flight at its begin."""
+    own = shutil.copytree(folder, tmp_path / "own")
+    board = own / "stewart_board.c"
+    simulated_flags = "board_flags = STEWART_SIMULATION | STEWART_RESETS;"
+    assert simulated_flags in board.read_text()
+    board.write_text(board.read_text().replace(simulated_flags, "board_flags = STEWART_RESETS;"))
+    make(own, "stewart_machine", f"CFLAGS={' '.join(SANITIZED)}")
+    scenario, port = load_scenario("paper", settings=("plant.kind=exact",)), free_port()
+    with process([str(own / "stewart_machine"), str(port)]) as running:
+        running.until("a real machine at port")
+        where = f"127.0.0.1:{port}"
+        with pytest.raises(ConfigError, match=r"^--arm"):
+            sd.run_live(scenario, where, duration=5.0, accept_jitter=True)
+        run = sd.run_live(scenario, where, duration=5.0, accept_jitter=True, armed=True)
+        assert running.end(signal.SIGINT) == 0
+    assert run.status == "completed" and run.summary["live"]["periods_played"] >= 40
+    error = np.abs(run.signals.error.values) / np.array(scenario.reference.amplitude)
+    assert np.nanmax(error[-15:]) < 0.02
 
 
 @pytest.mark.slow

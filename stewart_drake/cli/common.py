@@ -129,10 +129,13 @@ def check_log(path: Path | None) -> None:
     """Make the directory of a file that `--log` names, if any.
 
     Raises:
-        ConfigError: see `check_file`.
+        ConfigError: see `check_file` and `kind_of_log`.
     """
     if path is not None:
+        from stewart_drake.scenario.run_log import kind_of_log
+
         check_file(path, "--log")
+        kind_of_log(path)
 
 
 def release() -> None:

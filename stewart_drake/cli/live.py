@@ -73,6 +73,8 @@ def live(
     if (machine is None) != demo:
         raise ConfigError("--machine: expected either --machine HOST:PORT or --demo")
     options = given.options()
+    with given.named():
+        options.check_learned()
     loaded = load_scenario(scenario, controller, settings or ())
     delivery = Delivery(out, quiet, as_json)
     span = math.inf if options.duration is None else options.duration
@@ -82,17 +84,23 @@ def live(
             raise ConfigError("--learn: expected none of --duration, --log and --mirror with it")
         return _learn(scenario, loaded, machine, options, (controller, settings or ()), delivery)
 
+    from stewart_drake.live.contact import address_of
+    from stewart_drake.live.endpoint import read_key
+
+    key = read_key(options.key)
+    check_log(options.log)
+    for option, address in (("--machine", machine), ("--mirror", options.mirror)):
+        if address is not None:
+            address_of(address, option)
     with contextlib.ExitStack() as running:
         viewer = None if no_browser else running.enter_context(_page(loaded, name))
         where = machine or running.enter_context(
             _demo_machine(scenario, loaded.eta, controller, settings or ())
         )
         from stewart_drake.live import session
-        from stewart_drake.live.contact import address_of
-        from stewart_drake.live.endpoint import read_key
 
         delivery.say(f"calling {where}")
-        ready = session.prepare_session(loaded, address_of(where), read_key(options.key))
+        ready = session.prepare_session(loaded, address_of(where), key)
         delivery.say_wrapped(*session.plans(ready, span, name))
         session.check_armed(ready, options.armed)
         # The demo's machine is simulated and needs no consent.
@@ -108,7 +116,6 @@ def live(
         delivery.discard("signals.nc")
         how: Any = {"armed": options.armed, "viewer": viewer, "max_missing": options.max_missing}
         how["log"] = None if out is None else out / LOG
-        check_log(options.log)
         how["logs"] = session.open_logs(ready, options, delivery.say_wrapped)
         with _Ending() as ending:
             result = session.drive(

@@ -57,6 +57,7 @@ MACHINE: Final = ("link.h", "link.c")
 EXAMPLES: Final = (
     *("protocol.c", "protocol.h", "protocol_test.c", "udp.c", "udp.h"),
     *("stewart_example.c", "stewart_example.h", "stewart_machine.c", "stewart_udp.c", *MACHINE),
+    *("stewart_board.c", "stewart_board.h"),
 )
 """Examples over UDP: for a measured state, a known delay, and one torque at a sample."""
 TEMPLATES: Final = Path(__file__).with_name("templates")

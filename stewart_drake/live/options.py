@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-from stewart_drake.studies.options import Options, option
+from stewart_drake.studies.options import Options, option, refuse
 
 
 class Settings(Options):
@@ -65,3 +65,12 @@ class LiveOptions(Options):
     mirror: str | None = option(
         None, "Send each sample as JSON over UDP, for PlotJuggler.", "HOST:PORT"
     )
+
+    def check_learned(self) -> None:
+        """Refuse a file for learned setpoints where none are learned.
+
+        Raises:
+            ConfigError: such a file.
+        """
+        if not self.learn:
+            refuse({"learned": self.learned}, "without --learn; expected both or neither")

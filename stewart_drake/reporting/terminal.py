@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 import typer
 
-from stewart_drake.reporting.document import rows
+from stewart_drake.reporting.document import rows, wrap
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -164,7 +164,7 @@ def _bars(quiet: bool, state: Callable[[], str]) -> "Iterator[Progress]":
         while not stop.wait(EVERY):
             with suppress(OSError, ValueError):  # the reader may have left
                 line = f"{state()}, after {_duration(time.monotonic() - start)}"
-                print(line, file=sys.stderr, flush=True)
+                print(wrap(line), file=sys.stderr, flush=True)
 
     if not (quiet or terminal or sys.stderr is None):
         threading.Thread(target=print_lines, daemon=True).start()

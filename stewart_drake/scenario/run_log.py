@@ -110,6 +110,20 @@ class RunLog(Protocol):
         ...
 
 
+def kind_of_log(path: Path) -> Callable[[Path, Scenario], RunLog]:
+    """Return the class of a log, by the suffix of its file.
+
+    Raises:
+        ConfigError: another suffix, or no package mcap.
+    """
+    if path.suffix == ".csv":
+        return CsvLog
+    if path.suffix != ".mcap":
+        raise ConfigError(f"--log: got {str(path)!r}; expected a file that ends in .mcap or .csv")
+    _mcap("mcap.writer")
+    return McapLog
+
+
 def open_log(path: Path, scenario: Scenario) -> RunLog:
     """Open a log for writing.
 
@@ -118,13 +132,11 @@ def open_log(path: Path, scenario: Scenario) -> RunLog:
         scenario: of the run.
 
     Raises:
-        ConfigError: another suffix, no package mcap, or a file that cannot be written.
+        ConfigError: see `kind_of_log`, or a file that cannot be written.
     """
-    kinds: dict[str, Callable[[Path, Scenario], RunLog]] = {".mcap": McapLog, ".csv": CsvLog}
-    if path.suffix not in kinds:
-        raise ConfigError(f"--log: got {str(path)!r}; expected a file that ends in .mcap or .csv")
+    kind = kind_of_log(path)
     try:
-        return kinds[path.suffix](path, scenario)
+        return kind(path, scenario)
     except OSError as error:
         raise ConfigError(
             f"--log: {path} cannot be written ({error.strerror}); expected a file"

@@ -1,9 +1,7 @@
-/* A machine behind a socket, as an example: what a board must do, with a simulated plate instead
-   of motors and sensors. See docs/protocol.md.
+/* A machine behind a socket: session, play-out buffer, watchdog and reports of the protocol. See
+   docs/protocol.md. Its motors and sensors are those of stewart_board.h.
 
-       ./stewart_machine PORT [SECONDS [KEYFILE]]
-
-   A board replaces `plate_follow` and `plate_read` by its own, and leaves out STEWART_SIMULATION. */
+       ./stewart_machine PORT [SECONDS [KEYFILE]] */
 
 #define _POSIX_C_SOURCE 200809L
 
@@ -13,12 +11,12 @@
 #include <string.h>
 
 #include "link.h"
+#include "stewart_board.h"
 #include "stewart_config.h"
 #include "stewart_example.h"
 #include "udp.h"
 
 #define WAITING 1024         /* largest number of waiting torques */
-#define FINEST 1000000u      /* ns, a step of the simulated plate */
 #define WATCHDOG SECOND      /* ns of silence */
 #define FURTHEST (3600ull * SECOND)
 #define STALL (SECOND / 5)   /* delay of the process that is reported, ns */
@@ -45,9 +43,7 @@ typedef struct {
     stewart_reason reason, before; /* why torques do not act, and the fault before that */
     uint64_t preceded, stalled_until; /* time of `before`; end of the last stall */
     unsigned refused[STEWART_REFUSALS], sent, silences;
-    /* the simulated plate */
-    uint64_t time;
-    real state[STEWART_STATES];
+    uint64_t time; /* of the plate */
 } machine;
 
 static uint64_t machine_now(const machine *m)
@@ -82,58 +78,19 @@ static const char *why(const machine *m)
     return text;
 }
 
-/* ---------------------------------------------------------------- the plate: yours */
-
-/* Return how the plate left its workspace, or STEWART_NO_FAULT. */
-static uint8_t plate_fault(const machine *m, uint8_t *leg)
+/* Stop if the plate left its workspace by a time. */
+static void watch(machine *m, uint64_t time)
 {
-    real measures[STEWART_MEASURES];
-    int worst = 0;
-    *leg = 0;
-    for (int i = 0; i < STEWART_STATES; i++)
-        if (!isfinite(m->state[i]))
-            return STEWART_NOT_FINITE;
-    stewart_measures(stewart_configuration.machine.geometry, m->state, NULL, measures);
-    measures[6] *= stewart_home_sign;
-    for (int i = 1; i < STEWART_MOTORS; i++)
-        worst = measures[i] < measures[worst] ? i : worst;
-    if (!(measures[worst] > stewart_least[worst])) {
-        *leg = (uint8_t)(worst + 1);
-        return STEWART_REACH;
-    }
-    if (!(measures[7] > stewart_least[7]))
-        return STEWART_PITCH;
-    return measures[6] > stewart_least[6] ? STEWART_NO_FAULT : STEWART_SINGULAR;
-}
-
-/* Advance the plate to a time under the torque that acts; brakes hold before the run. */
-static void plate_follow(machine *m, uint64_t time)
-{
-    const stewart_law *c = &stewart_configuration;
-    stewart_plant plant = {c->machine.geometry, c->machine.parameters, &c->machine.gravity,
-                           c->machine.joints};
-    real torque[6];
-    for (int i = 0; i < 6; i++)
-        torque[i] = (real)stewart_link_current(m->link)[i];
-    while (m->running && !m->left && m->time < time) {
-        uint64_t h = time - m->time < FINEST ? time - m->time : FINEST;
-        stewart_move(&plant, torque, (real)(1e-9 * (double)h), m->state);
-        m->time += h;
-        uint8_t leg, fault = plate_fault(m, &leg);
-        m->left = fault != STEWART_NO_FAULT;
-        if (m->left) {
-            fail(m, fault, leg, 0, m->time);
-            printf("the plate left its workspace at %.3f s: %s; stopped\n", 1e-9 * (double)m->time,
-                   why(m));
-        }
+    uint64_t left_at = time;
+    stewart_reason fault = {0, 0, 0};
+    if (m->running && !m->left)
+        fault = board_fault(time, &left_at);
+    if (fault.fault) {
+        m->left = 1;
+        fail(m, fault.fault, fault.leg, fault.lasted, left_at);
+        printf("the plate left its workspace at %.3f s: %s; stopped\n", 1e-9 * (double)left_at, why(m));
     }
     m->time = time > m->time ? time : m->time;
-}
-
-static void plate_read(const machine *m, double *state)
-{
-    for (int i = 0; i < STEWART_STATES; i++)
-        state[i] = (double)m->state[i];
 }
 
 /* ---------------------------------------------------------------- torques */
@@ -146,8 +103,9 @@ static uint64_t next_change(const machine *m)
 
 static void change(machine *m, uint64_t time)
 {
-    plate_follow(m, time);
+    watch(m, time);
     stewart_link_change(&m->buffer, m->link, (double)time);
+    board_drive(time, stewart_link_current(m->link));
     if (m->safe && m->link[STEWART_LINK_FED] > 0) {
         stewart_reason none = {0, 0, 0};
         precede(m, m->reason, time);
@@ -158,8 +116,9 @@ static void change(machine *m, uint64_t time)
 
 static void go_safe(machine *m, uint64_t time)
 {
-    plate_follow(m, time);
+    watch(m, time);
     stewart_link_reset(&m->buffer, m->link, (double)time, 0);
+    board_drive(time, stewart_link_current(m->link));
     m->safe = 1;
 }
 
@@ -167,7 +126,7 @@ static void go_safe(machine *m, uint64_t time)
 
 static void put_back(machine *m)
 {
-    memcpy(m->state, stewart_first_state, sizeof m->state);
+    board_park();
     stewart_link_start(&m->buffer, m->link);
     m->begin = STEWART_NEVER;
     m->running = m->safe = m->left = 0;
@@ -189,12 +148,13 @@ static void begin(machine *m)
         return;
     }
     const stewart_law *c = &stewart_configuration;
-    int number = stewart_queue_rows;
+    int number = board_flags & STEWART_SIMULATION ? stewart_queue_rows : 0;
     double early = ((double)c->fraction - (number > c->steps)) * (double)m->period;
     static double torques[6 * WAITING];
     m->time = m->begin;
     m->running = 1;
-    for (int i = 0; i < 6 * number; i++) /* what is in flight: a real machine has nothing */
+    board_release(m->begin);
+    for (int i = 0; i < 6 * number; i++) /* in flight; a real machine has nothing */
         torques[i] = (double)stewart_queue[i];
     stewart_link_preload(&m->buffer, m->link, floor((double)m->begin + early + 0.5), number, torques);
     printf("the run began at %.3f s\n", 1e-9 * (double)m->begin);
@@ -206,7 +166,7 @@ static void begin(machine *m)
 static void describe(const machine *m, uint64_t sampled, stewart_measured *s)
 {
     memset(s, 0, sizeof *s);
-    s->head.flags = STEWART_SIMULATION | STEWART_HOLDS | STEWART_RESETS;
+    s->head.flags = STEWART_HOLDS | board_flags;
     s->head.flags |= (uint32_t)(m->running ? STEWART_RUNNING : STEWART_PARKED);
     s->head.flags |= (uint32_t)((m->safe ? STEWART_SAFE : 0) | (m->left ? STEWART_LEFT : 0));
     s->sampled = sampled;
@@ -236,7 +196,7 @@ static void say(machine *m, uint64_t sampled)
     s.begin = m->begin;
     s.arrived = m->session.window.newest ? m->session.window.seen : 0;
     s.acted_from = s.history ? (uint64_t)m->link[STEWART_LINK_COMMANDS] : STEWART_NEVER;
-    plate_read(m, s.state);
+    board_measure(sampled, s.state);
     for (int i = 0; i < s.history; i++)
         memcpy(s.acted[i], m->link + STEWART_LINK_COMMANDS + 7 * i + 1, sizeof s.acted[i]);
     m->sent += (unsigned)udp_put(m->socket, data, stewart_write_measured(&s, m->key, data), &m->driver);
@@ -391,7 +351,7 @@ static uint64_t advance(machine *m, uint64_t now)
         } else if (next == starts) {
             begin(m);
         } else if (next == m->sample) {
-            plate_follow(m, next);
+            watch(m, next);
             if (m->driven)
                 say(m, next);
             m->sample += m->period;
@@ -421,8 +381,8 @@ int main(int argc, char **argv)
     m.buffer = (stewart_link){6, WAITING, STEWART_HISTORY, 0, 1, (double)m.period, 0,
                               stewart_configuration.machine.torque_limit};
     put_back(&m);
-    printf("a simulated machine at port %s, every %.4g ms; Ctrl-C ends it\n", argv[1],
-           1e-6 * (double)m.period);
+    printf("a %s machine at port %s, every %.4g ms; Ctrl-C ends it\n",
+           board_flags & STEWART_SIMULATION ? "simulated" : "real", argv[1], 1e-6 * (double)m.period);
     fflush(stdout);
     while (!udp_interrupted() && 1e-9 * (double)machine_now(&m) < seconds) {
         receive(&m);

@@ -1,0 +1,26 @@
+/* What stewart_machine.c asks of a machine: write these for your motors and sensors, in place of
+   stewart_board.c. Times are in ns of the clock of udp.c, from the start of the program. */
+
+#ifndef STEWART_BOARD_H
+#define STEWART_BOARD_H
+
+#include "protocol.h"
+
+extern const uint32_t board_flags; /* for each datagram: STEWART_SIMULATION, STEWART_RESETS */
+
+/* Put the plate at its start, and the brakes on. */
+void board_park(void);
+
+/* Take the brakes off. */
+void board_release(uint64_t time);
+
+/* Apply torques (6), N m, within their limits, from now on. */
+void board_drive(uint64_t time, const double *torque);
+
+/* Measure pose and rates (12), rad, m, rad/s and m/s, as roll, pitch, yaw, x, y, z. */
+void board_measure(uint64_t time, double *state);
+
+/* Return why the plate left its workspace, and set the time of that; STEWART_NO_FAULT if it did not. */
+stewart_reason board_fault(uint64_t time, uint64_t *left_at);
+
+#endif
