@@ -37,14 +37,16 @@ class FilterEstimate(Estimate):
     root: Array
     squares: float
     values: float
+    noise: Array
 
     @classmethod
     def of(cls, memory: Array, n: int, m: int) -> "FilterEstimate":
         """Return the estimate that a `stewart_posterior` holds."""
         mean, root, outlier, counts = np.split(memory, [n, n + n * n, n + n * n + m])
+        counts, noise = np.split(counts, [5])
         L, (outliers, unseen, bits) = root.reshape(n, n), counts[:3].astype(int)
         partly = tuple(name for i, name in enumerate(FAULTS) if bits >> i & 1)
-        return cls(mean, L @ L.T, outlier, outliers, unseen, partly, L, *counts[3:])
+        return cls(mean, L @ L.T, outlier, outliers, unseen, partly, L, *counts[3:], noise)
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,7 @@ class Filter:
         memory = np.zeros(c.lib.stewart_posterior_size(n, m))
         given = map(c.at, (numbers(values), numbers(parameters), None, memory))
         assert c.lib.stewart_filter_start(it, *given, c.scratch(100_000))
+        memory[-c.lib.STEWART_NOISE] = 1.0  # as stewart_noise_start
         return FilterEstimate.of(memory, n, m)
 
     def advance(self, estimate: Estimate, period: Period, values: Array | None) -> FilterEstimate:
@@ -94,11 +97,11 @@ class Filter:
         if isinstance(estimate, FilterEstimate):
             bits = sum(1 << FAULTS.index(name) for name in estimate.partly)
             counts = estimate.outliers, estimate.unseen, bits, estimate.squares, estimate.values
-            root, outlier = estimate.root, estimate.outlier
+            root, outlier, noise = estimate.root, estimate.outlier, estimate.noise
         else:
             root, outlier = np.linalg.cholesky(estimate.covariance), np.full(m, np.nan)
-            counts = 0, 0, 0, 0, 0
-        memory = np.concatenate([estimate.mean, root.ravel(), outlier, counts])
+            counts, noise = (0, 0, 0, 0, 0), np.array([1.0, 0.0, 0.0, 0.0, 0.0])
+        memory = np.concatenate([estimate.mean, root.ravel(), outlier, counts, noise])
         torques, durations, following = map(numbers, period[:3])
         schedule = [len(torques), c.at(torques), c.at(durations), period.substeps]
         interval = c.ffi.new("stewart_interval *", [schedule, c.at(following)])

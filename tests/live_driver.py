@@ -118,7 +118,7 @@ class Driver:
             report = self.report(newest, round((time - newest.sampled) / self.period))
         motion = KnownMotion(self.planned, self.experiment.reference, time_of(number, self.period))
         c = self.experiment.scenario.controller
-        weights = np.array([c.w_Q, c.w_R])
+        weights = np.array(c.weights)
         measured = Measurement.of(values, age)
         self.memory = self.served.step(self.memory, measured, motion, weights, report)
         self.torques.append(np.array(self.memory.torque))

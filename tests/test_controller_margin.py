@@ -71,7 +71,7 @@ def distances(sc, periods):
             times = k * sc.controller.period + law.preview_times
             rows = np.array([evaluate(experiment.reference, max(t, 0.0)) for t in times])
             preview = Preview(law.preview_times, rows)
-            weights = np.array([sc.controller.w_Q, sc.controller.w_R])
+            weights = np.array(sc.controller.weights)
             memory = law.step(memory, Measurement.of(x), preview, weights)
             sent.append(memory.torque)
             acting = np.array([sent[-mu - 2], sent[-mu - 1]])

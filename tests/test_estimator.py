@@ -223,9 +223,9 @@ def test_kicks_are_what_early_and_late_torques_do(split, tolerance, late):
     after = PLANT.predict(x, torques, durations, 8, theta)[-1]
     c, kick, following = core(), np.empty(12), three[1].copy()  # one change alone
     schedule = [len(torques), c.at(torques), c.at(durations), 8]
-    period = c.ffi.new("stewart_interval *", [schedule, c.at(following)])
+    period = c.ffi.new("stewart_schedule *", schedule)
     machine = machine_of(NominalPlant(PLANT, 1, np.inf, TorqueLimit())).it
-    c.lib.stewart_kicks(machine, period, c.at(after), c.at(theta), c.at(kick))
+    c.lib.stewart_kicks(machine, period, *map(c.at, (following, after, theta, kick)))
     kick = np.sqrt(kick)
 
     # The same second in three pieces, the first change `late` after its time.

@@ -219,7 +219,7 @@ class Pair:
         )
         self.states = [experiment.start]
         self.late = round(sc.sensor.delay / sc.controller.period)
-        self.weights = np.array([sc.controller.w_Q, sc.controller.w_R])
+        self.weights = np.array(sc.controller.weights)
 
     def step(self, k, noise, spoil, lose=None):
         """Return the difference of the torques; `lose` spoils the reference."""

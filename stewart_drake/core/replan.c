@@ -37,11 +37,11 @@ static void look(const stewart_law *law, const real *memory, const stewart_sampl
 {
     const int pieces = (int)memory[1];
     const real now = memory[0] * law->period;
-    for (int i = 0; i < number; i++) {
+    if (pieces == 0)
+        sample->reference(sample->about, number, times, rows);
+    for (int i = 0; i < number && pieces > 0; i++) {
         real *row = rows + ROW * i;
-        if (pieces == 0)
-            sample->reference(sample->about, 1, times + i, row);
-        else if (!stewart_along(pieces, memory + HEAD, now + times[i], row))
+        if (!stewart_along(pieces, memory + HEAD, now + times[i], row))
             sample->goal(sample->about, 1, times + i, row);
     }
 }

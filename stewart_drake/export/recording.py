@@ -76,9 +76,7 @@ class Recorded:
     def moves(self) -> bool:
         """Whether the law asks for the reference at instants that it finds itself."""
         law = self.law
-        return isinstance(law, PredictiveLqi) and (
-            law.finds_delay or isinstance(law.planner, Replan)
-        )
+        return isinstance(law, PredictiveLqi) and law.moves
 
     def tabulated(self, motion: Motion, duration: float) -> Motion:
         """Return the motion as its knots have it, which is what C follows."""

@@ -323,7 +323,7 @@ class CoreLqi:
         With a known delay the instants are known, too, and all rows are given beforehand.
         """
         law, c = self._law, core()
-        if not law.finds_delay and isinstance(law.planner, NoPlanner):
+        if not law.moves:
             rows = _row_major(motion(law.preview_times))
             _check_rows(law, rows)
             sample.reference, sample.about = c.lib.stewart_given_rows, c.at(rows)

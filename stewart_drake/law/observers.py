@@ -5,7 +5,7 @@ sensor and by what is to be estimated:
 
 | settings | delay | sensor of the state | encoders |
 | --- | --- | --- | --- |
-| None | None | the measurement as it comes; with `timing`, timing_observer.c | forward kinematics and differences |
+| None | None | the measurement as it comes (`timing`: and timing_observer.c) | forward kinematics |
 | given | None | filter of filter.h; with `gaps` one over gaps | encoder_filter.c |
 | given | given | delay.h and delay_search.c | the same, of the last sample of a period |
 """

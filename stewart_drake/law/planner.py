@@ -23,7 +23,6 @@ from stewart_drake.law.timeline import TorqueSchedule
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array
 
-
 EARLY = 0.5
 """Share of an assumed delay before which no torque arrives."""
 

@@ -115,6 +115,11 @@ class PredictiveLqi:
         """Whether the observer estimates the delay."""
         return isinstance(self.observer, CoreObserver) and self.observer.delay is not None
 
+    @property
+    def moves(self) -> bool:
+        """Whether the law reads the motion at instants that it chooses itself."""
+        return self.finds_delay or not isinstance(self.planner, NoPlanner)
+
     def require_age(self, measurement: Measurement) -> None:
         """Check that a measurement is of the present, unless the law waits for late ones.
 

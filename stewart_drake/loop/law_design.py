@@ -407,7 +407,7 @@ def followed_motion(
     law: PredictiveLqi, planned: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, Trajectory] | None:
     """Return the motions that a law with a delay estimator reads at any instant, or None."""
-    return (planned, reference) if law.finds_delay or isinstance(law.planner, Replan) else None
+    return (planned, reference) if law.moves else None
 
 
 _HORIZON = 10.0

@@ -105,7 +105,7 @@ def answers(loop: ClosedLoop, measurements: Array) -> Array:
     controller = loop.GetSubsystemByName("controller")
     reference = loop.GetSubsystemByName("reference")
     settings = loop.experiment.scenario.controller
-    weights = np.array([settings.w_Q, settings.w_R])
+    weights = np.array(settings.weights)
     context = controller.CreateDefaultContext()
     simulator = None
     torques = []
