@@ -194,6 +194,10 @@ def test_inverse_dynamics_inverts_accelerations(state, seed):
     accelerations = dynamics.accelerations(pose, rates, torque, parameters)
     found = dynamics.inverse_dynamics(pose, rates, accelerations, parameters)
     assert relative(found, torque) < 1e-10
+    home = np.append(dynamics.mechanism.home, np.zeros(12))
+    rows = np.array([home, np.concatenate([pose, rates, accelerations])])
+    still = dynamics.inverse_dynamics(*np.split(home, 3), parameters)
+    np.testing.assert_array_equal(dynamics.torques_along(rows, parameters), [still, found])
     again = dynamics.accelerations(pose, rates, found, parameters)
     assert relative(again, accelerations) < 1e-10
     jacobian = dynamics.mechanism.jacobian(pose)

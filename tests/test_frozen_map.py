@@ -40,6 +40,8 @@ def test_accelerations_are_the_map_at_home_wherever_the_plate_is(plant):
     a = plant.accelerations(pose, rates, torque)
     np.testing.assert_allclose(a, expected, rtol=1e-12)
     np.testing.assert_allclose(plant.inverse_dynamics(pose, rates, a), torque, rtol=1e-9)
+    rows = np.concatenate([pose, rates, a])[None]
+    np.testing.assert_allclose(plant.torques_along(rows), torque[None], rtol=1e-9)
     change = plant.change(np.concatenate([pose, rates]), torque)
     np.testing.assert_array_equal(change, [*rates, *a])
     plant.require_reach(pose)

@@ -18,6 +18,7 @@ from stewart_drake.mechanism.assembly import TorqueMap, torque_map
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import angle_rate_map, rotation
 from stewart_drake.scenario.signals import (
+    ACCELERATIONS,
     ANGLES,
     BIAS,
     NUM_COORDINATES,
@@ -49,6 +50,9 @@ class FrozenMap:
     def inverse_dynamics(self, *arguments: ArrayLike) -> Sequence[Array]:
         _, _, accelerations, parameters, _ = arguments
         return [np.linalg.solve(self.map, accelerations) - np.asarray(parameters)[BIAS]]
+
+    def torques(self, rows: Array, parameters: Array, gravity: float) -> Array:
+        return np.linalg.solve(self.map, rows[:, ACCELERATIONS].T).T - parameters[BIAS]
 
     def energy(self, *arguments: ArrayLike) -> Sequence[Array]:
         rates = np.asarray(arguments[1])

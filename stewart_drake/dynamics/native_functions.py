@@ -13,7 +13,15 @@ from stewart_drake.core.layout import SHAPES, SIGNATURES
 from stewart_drake.core.library import core
 from stewart_drake.mechanism.geometry import Mechanism, geometry_of
 from stewart_drake.mechanism.kinematics import angle_rate_map
-from stewart_drake.scenario.signals import ANGLES, NUM_PLANT_PARAMETERS, NUM_STATE, NUM_TORQUES
+from stewart_drake.scenario.signals import (
+    ACCELERATIONS,
+    ANGLES,
+    NUM_PLANT_PARAMETERS,
+    NUM_REFERENCE,
+    NUM_STATE,
+    NUM_TORQUES,
+    RATES,
+)
 from stewart_drake.types import Array, ArrayLike
 
 Call = Callable[..., Sequence[Array]]
@@ -129,6 +137,19 @@ class NativeFunctions:
         places[2][...], places[3][...] = parameters, gravity
         evaluate()
         return np.array(results[0])
+
+    def torques(self, rows: Array, parameters: Array, gravity: float) -> Array:
+        """Return `inverse_dynamics` (n, 6) of rows (n, 18), in a fifth of the time of `Call`s."""
+        c, function = core(), core().lib.stewart_inverse_dynamics
+        rows, given = np.array(rows, np.float64), np.array([*parameters, gravity])
+        torques = np.empty((len(rows), NUM_TORQUES))
+        plant = c.plant(self._first, c.at(given), c.at(given) + NUM_PLANT_PARAMETERS)
+        first, result = c.at(rows), c.at(torques)
+        for k in range(len(rows)):
+            pose = first + NUM_REFERENCE * k
+            rates, accelerations = pose + RATES.start, pose + ACCELERATIONS.start
+            function(plant, pose, rates, accelerations, result + NUM_TORQUES * k)
+        return torques
 
     def inertia(self, pose: ArrayLike, parameters: Array) -> tuple[Array, Array]:
         """Return M (6, 6) and B (6, 6) of M accelerations + h = B torque.

@@ -25,6 +25,7 @@ from stewart_drake.scenario.signals import (
     NUM_COORDINATES,
     NUM_PARAMETERS,
     NUM_PLANT_PARAMETERS,
+    NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
     PARAMETERS,
@@ -234,6 +235,11 @@ class StewartDynamics:
         return self._functions.inverse_dynamics(
             pose, rates, accelerations, self.complete(parameters), self.gravity
         )[0]
+
+    def torques_along(self, rows: Array, parameters: ArrayLike | None = None) -> Array:
+        """Return `inverse_dynamics` (n, 6) of poses, rates and accelerations (n, 18)."""
+        _shaped("rows", rows, (len(rows), NUM_REFERENCE))
+        return self._functions.torques(rows, self.complete(parameters), self.gravity)
 
     def equilibrium_torque(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> Array:
         """Return the motor torques (6,) in N m that hold the plate still.

@@ -96,7 +96,7 @@ class InverseDynamicsFeedforward(Feedforward):
 
     def held(self, wanted: Array, dynamics: StewartDynamics, parameters: Array) -> HeldTorques:
         """Return the torques of equation (hold)."""
-        torques = [self.at(node, dynamics, parameters) for node in wanted]
+        torques = dynamics.torques_along(wanted, parameters)
         means, changes = means_and_changes(np.reshape(torques, (-1, 2, NUM_TORQUES)))
         return HeldTorques(held_torques(means, changes), changes)
 
