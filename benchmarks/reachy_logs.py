@@ -12,6 +12,9 @@ and phase of the codes. The machine and the motors' torque limit are known.
 The head then follows a motion that is not in the log, of three frequencies. Its setpoints have the
 numbers found and are sent ahead by the delay found, so that an error of the delay shifts the
 motion. They are not checked against the torque limit, which the simulated servos have.
+
+MuJoCo limits the friction of a ball joint about each axis; its true value is the equivalent of
+`reachy.BALL`. The page in results/ has fewer than SEEDS logs where ball joints have friction.
 """
 
 import os
