@@ -12,6 +12,9 @@ and phase of the codes. The machine and the motors' torque limit are known.
 The head then follows a motion that is not in the log, of three frequencies. Its setpoints have the
 numbers found and are sent ahead by the delay found, so that an error of the delay shifts the
 motion. They are not checked against the torque limit, which the simulated servos have.
+
+MuJoCo limits the friction of a ball joint about each axis; its true value is the equivalent of
+`reachy.BALL`. The page in results/ has fewer than SEEDS logs where ball joints have friction.
 """
 
 import os
@@ -66,8 +69,8 @@ def log_of(planned: np.ndarray, servo: Any, ball: float, delay: float, seed: int
     """Return a log of the robot's model under setpoints (n, 6); `delay` is that of the log, s."""
     number = len(planned)
     instants = STEP * np.arange(round(number * PERIOD / STEP))
-    acting = np.floor((instants - (delay - READING)) / PERIOD + 1e-9).astype(int)
-    rows = planned[np.maximum(acting, 0)]
+    newest = np.floor((instants - (delay - READING)) / PERIOD + 1e-9).astype(int)
+    rows = planned[np.maximum(newest, 0)]
     cranks = play(servo, ball, rows, planned[0], step=STEP, period=STEP)["cranks"]
     times = PERIOD * np.arange(number)
     seen = np.round((times - READING) / STEP).astype(int) - 1  # row k ends at (k + 1) STEP
@@ -94,19 +97,19 @@ def identified(planned: np.ndarray, name: str, ball: float, seed: int) -> Found:
         if n in true
     }
     sums = (delay + (kv + damping) / kp, friction / kp)
-    for is_, (n, (value, width, unit)) in zip(sums, fit.combined.items(), strict=True):
-        found[n] = is_, value - is_, width, unit
+    for truth, (n, (value, width, unit)) in zip(sums, fit.combined.items(), strict=True):
+        found[n] = truth, value - truth, width, unit
     unlimited = 1e3
     with tempfile.TemporaryDirectory() as folder:
         motion = motion_file(OTHER, Path(folder))
         ahead = motion_file(OTHER, Path(folder), ahead=values["delay"] - delay)
         more = [f"plant.{n}={values[n]:.9g}" for n in BALL]
         more.append(f"actuator.friction_speed={values['friction_speed']:.9g}")
-        own = values["stiffness"], 0.0, *(values[n] for n in NUMBERS[2:]), unlimited
+        numbers = values["stiffness"], 0.0, *(values[n] for n in NUMBERS[2:]), unlimited
         sent = (
             setpoints(motion, servo, plain=True),
             setpoints(motion, (*servo[:5], unlimited), ball),
-            setpoints(ahead, own, more=more),
+            setpoints(ahead, numbers, more=more),
         )
     first = sent[0][0]
     plain, truly, mine = (
