@@ -185,7 +185,7 @@ def export_csv(signals: str | Path, out: str | Path | None = None) -> str:
     """Return saved signals as CSV, a line per instant; units are in the header.
 
     Args:
-        signals: file that a run saved.
+        signals: signals.nc, a log (.mcap, .csv) or the folder of a run.
         out: file to write, if not None.
 
     Raises:

@@ -98,6 +98,7 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(tmp_path, capsys):
         ({"delay": -1}, "--delay: got -1.0; expected greater than or equal to 0"),
         ({"torque_limit": 0}, "--torque-limit: got 0.0; expected greater than 0"),
         ({"rod": None, "plate_mass": None}, "got no --rod, --plate-mass;"),
+        ({"rod": 0.01}, "rod: got 0.01 m with cranks of"),
         ({"plate_mass": 2500}, "plate-mass: got 2500 kg; expected kilograms, 2.5 for 2500 g"),
         ({"cranks": "up"}, "--cranks"),
     ):

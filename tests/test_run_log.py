@@ -105,6 +105,12 @@ def test_identify_reads_the_same_from_every_kind_of_log(run):
         assert (other.delay, other.gravity) == (read[0].delay, read[0].gravity)
 
 
+def test_export_writes_the_same_from_every_kind_of_log(run):
+    _, folder = run
+    texts = {sd.export_csv(folder / name) for name in ("signals.nc", "run.mcap", "run.csv", ".")}
+    assert len(texts) == 1
+
+
 def test_a_csv_log_without_its_scenario_is_read_but_not_identified(run, tmp_path):
     result, folder = run
     alone = tmp_path / "alone.csv"

@@ -138,7 +138,9 @@ def _pictures(names: Iterable[str]) -> list[str]:
 
 
 def export(
-    signals: Annotated[Path, typer.Argument(metavar="FILE.nc", help="Signals that a run saved.")],
+    signals: Annotated[
+        Path, typer.Argument(metavar="FILE", help="signals.nc, log (.mcap, .csv), or run's folder.")
+    ],
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="File to write, in place of standard output."),

@@ -184,9 +184,9 @@ def read_key(path: Path | None) -> bytes | None:
         raise ConfigError(f"--key: got {str(path)!r} ({error.strerror}); expected a file") from None
     key = data.rstrip(b"\r\n")
     if not SHORTEST_KEY <= len(key) <= LONGEST_KEY:
+        size = f"more than {LONGEST_KEY}" if len(key) > LONGEST_KEY else len(key)
         raise ConfigError(
-            f"--key: got {str(path)!r} with {len(key)} bytes or more; expected {SHORTEST_KEY} to "
-            f"{LONGEST_KEY}"
+            f"--key: got {str(path)!r} with {size} bytes; expected {SHORTEST_KEY} to {LONGEST_KEY}"
         )
     return key
 

@@ -3,19 +3,15 @@
 import csv
 import io
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import xarray as xr
 
-from stewart_drake.files.arrayio import load_netcdf
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
-from stewart_drake.scenario.run_log import headings
+from stewart_drake.scenario.run_log import EXPECTED, headings, read_log
 from stewart_drake.scenario.signals import SIGNALS
 from stewart_drake.types import Array
-
-_EXPECTED: Final = "a file that simulate saved (.nc)"
 
 
 def signals_csv(signals: xr.Dataset) -> str:
@@ -58,15 +54,16 @@ def write_csv(signals: xr.Dataset, path: Path) -> Path:
 
 
 def read_signals(path: Path) -> xr.Dataset:
-    """Return the signals that `simulate` or `compare` saved.
+    """Return the signals of a run, which `columns_of` can write.
+
+    Args:
+        path: as `read_log` takes it.
 
     Raises:
-        ConfigError: no such file, or not a file of signals.
+        ConfigError: no such file, or not of a run.
     """
-    if not path.exists():
-        raise ConfigError(f"signals: no file {str(path)!r}; expected {_EXPECTED}")
     try:
-        signals = load_netcdf(path, _EXPECTED)
+        signals = read_log(path)
         for needed in ("time", "pose", "torque_applied"):
             signals[needed].values.astype(float)
         signals_csv(signals)
@@ -75,6 +72,6 @@ def read_signals(path: Path) -> xr.Dataset:
     except (KeyError, TypeError, ValueError, IndexError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(
-            f"signals: {path}: not the signals of a run ({reason}); expected {_EXPECTED}"
+            f"signals: {path}: not the signals of a run ({reason}); expected {EXPECTED}"
         ) from None
     return signals

@@ -241,6 +241,11 @@ class Measurements(Options):
                 raise ConfigError(
                     f"{name}: got {value:g} m; expected metres, {value / 1000:g} for {value:g} mm"
                 )
+        if self.rod <= self.crank:
+            raise ConfigError(
+                f"rod: got {self.rod:g} m with cranks of {self.crank:g} m; expected a rod longer "
+                "than its crank"
+            )
         for name, size in {
             "plate": self.plate_radius,
             "crank": self.crank,
@@ -252,11 +257,6 @@ class Measurements(Options):
                     f"{name}_mass: got {mass:g} kg; expected kilograms, {mass / 1000:g} for "
                     f"{mass:g} g"
                 )
-        if self.rod <= self.crank:
-            raise ConfigError(
-                f"rod: got {self.rod:g} m with cranks of {self.crank:g} m; expected a rod longer "
-                "than its crank"
-            )
         for name, radius in (("shaft", self.base_radius), ("joint", self.plate_radius)):
             distance = getattr(self, f"{name}_distance")
             if distance >= math.sqrt(3) * radius:
