@@ -114,11 +114,7 @@ def check_writable(directory: Path | None, *, alone: bool = True) -> None:
 
 
 def check_file(path: Path, option: str = "--out") -> None:
-    """Make the directory of a file that `--out`, or another option, names.
-
-    Raises:
-        ConfigError: a directory or a device, or not writable.
-    """
+    """Make the directory of a file that `--out`, or another option, names."""
     if path.exists() and not path.is_file():
         kind = "a directory" if path.is_dir() else "no regular file"
         raise ConfigError(f"{option}: got {str(path)!r}, {kind}; expected a file")
@@ -126,11 +122,7 @@ def check_file(path: Path, option: str = "--out") -> None:
 
 
 def check_log(path: Path | None) -> None:
-    """Make the directory of a file that `--log` names, if any.
-
-    Raises:
-        ConfigError: see `check_file`.
-    """
+    """Make the directory of a file that `--log` names, if any."""
     if path is not None:
         check_file(path, "--log")
 

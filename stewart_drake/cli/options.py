@@ -51,9 +51,6 @@ class Given:
         Args:
             load: loads the scenario with another controller.
             more: values by field, which replace typed ones.
-
-        Raises:
-            ConfigError: a bad value.
         """
         with self.named():
             values = {one.name: self._value(one, load) for one in _offered(self._kind)}

@@ -80,9 +80,6 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         scenario: whose controller it is.
         single: numbers of single precision.
         measured: whether it is compiled and run here, for what its README tells.
-
-    Raises:
-        ConfigError: see `recording.record`.
     """
     recorded, experiment = record(scenario), prepare(scenario)
     compiled, suffix = CompiledLaw(recorded.law), "f" if single else ""

@@ -29,47 +29,31 @@ MOST_SAMPLES: Final = 100
 
 
 class Step(NamedTuple):
-    """Input and result of one sample.
+    """Input and result of one sample."""
 
-    Attributes:
-        measurement: (m,), NaN where it is missing.
-        age: of it, periods.
-        preview: (p, 18) rows of the reference that were asked for; none where the law finds the
-            instants itself.
-        answer: (6,) torque as asked for, or (18,) command.
-        status: bits of the causes that were counted.
-        weights: (2,) w_Q and w_R.
-        sent: (6 N,) torques as limited, of this sample and of further ones.
-        report: that came with the measurement: packets, or (r,) of servos.
-    """
-
-    measurement: Array
-    age: int
+    measurement: Array  # (m,), NaN where it is missing
+    age: int  # of it, periods
+    # (p, 18) rows of the reference that were asked for; none where the law finds the instants
+    # itself
     preview: Array
-    answer: Array
-    status: int
-    weights: Array
-    sent: Array
-    report: Report | Array | None
+    answer: Array  # (6,) torque as asked for, or (18,) command
+    status: int  # bits of the causes that were counted
+    weights: Array  # (2,) w_Q and w_R
+    sent: Array  # (6 N,) torques as limited, of this sample and of further ones
+    report: Report | Array | None  # that came with the measurement: packets, or (r,) of servos
 
 
 @dataclass
 class Recorded:
-    """A recorded run.
+    """A recorded run."""
 
-    Attributes:
-        law: the law, without what records it.
-        steps: of it, MOST_SAMPLES at the most.
-        first: (n, 6) torques in flight, or (18,) the command before the first sample.
-        motion: times and reference (k, 19), if the law chooses the instants of the reference.
-        goal: the same of the motion that the law returns to.
-    """
-
-    law: PredictiveLqi | ServoPreview
-    steps: list[Step] = field(default_factory=list)
+    law: PredictiveLqi | ServoPreview  # the law, without what records it
+    steps: list[Step] = field(default_factory=list)  # of it, MOST_SAMPLES at the most
+    # (n, 6) torques in flight, or (18,) the command before the first sample
     first: Array = field(default_factory=lambda: np.empty(0))
+    # times and reference (k, 19), if the law chooses the instants of the reference
     motion: Array | None = None
-    goal: Array | None = None
+    goal: Array | None = None  # the same of the motion that the law returns to
     _along: tuple[Trajectory, Trajectory] | None = None
 
     @property

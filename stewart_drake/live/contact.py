@@ -55,20 +55,14 @@ class Link:
 
     A request without an answer counts as half a datagram lost there and half an answer lost on the
     way back: the machine keeps no state of requests.
-
-    Attributes:
-        trips: last round trips, s, without the time for which the machine held a datagram.
-        sent: number of datagrams whose fate is known.
-        lost: number of them that did not arrive.
-        missed: number of measurements that did not come, by their sequence.
-        came: number of measurements that came.
     """
 
+    # last round trips, s, without the time for which the machine held a datagram
     trips: deque[float] = field(default_factory=lambda: deque(maxlen=_TRIPS))
-    sent: int = 0
-    lost: float = 0
-    missed: float = 0
-    came: int = 0
+    sent: int = 0  # number of datagrams whose fate is known
+    lost: float = 0  # number of them that did not arrive
+    missed: float = 0  # number of measurements that did not come, by their sequence
+    came: int = 0  # number of measurements that came
 
     @property
     def typical(self) -> float:
@@ -254,11 +248,7 @@ class Contact:
         return max((p - soonest for p in self._phases if p - soonest <= longest), default=0.0)
 
     def _check_identity(self) -> None:
-        """Refuse a machine that the controller is not designed for.
-
-        Raises:
-            ConfigError: the parts that differ, of both sides.
-        """
+        """Refuse a machine that the controller is not designed for."""
         offered = None if self.last is None else self.last.identity
         differs = None if offered is None else offered.differing(self.identity)
         if differs is not None:
@@ -285,11 +275,7 @@ def address_of(text: str, option: str = "--machine") -> Address:
 
 
 def open_endpoint(address: Address, key: bytes | None) -> Endpoint:
-    """Return a socket for a controller of the machine at an address.
-
-    Raises:
-        ConfigError: an address beyond loopback without a key.
-    """
+    """Return a socket for a controller of the machine at an address."""
     if key is None and not is_loopback(address[0]):
         raise ConfigError(
             f"--machine: got {address[0]} without a key; expected a loopback address, or --key FILE"

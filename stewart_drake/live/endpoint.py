@@ -123,11 +123,7 @@ class Endpoint:
         self._socket.close()
 
     def send(self, message: Message, to: Address) -> bool:
-        """Send a message; return whether the system took it.
-
-        Raises:
-            ConfigError: an address beyond loopback without a key.
-        """
+        """Send a message; return whether the system took it."""
         self._check_reach(to[0], "machine")
         try:
             self._socket.sendto(encode(message, self._key), to)
@@ -201,15 +197,10 @@ def is_loopback(host: str) -> bool:
 
 @dataclass
 class Window:
-    """Sequence numbers that have come, of the last WINDOW.
+    """Sequence numbers that have come, of the last WINDOW."""
 
-    Attributes:
-        newest: the newest, 0 for none.
-        seen: bit i is set if `newest` - i has come.
-    """
-
-    newest: int = 0
-    seen: int = 0
+    newest: int = 0  # the newest, 0 for none
+    seen: int = 0  # bit i is set if `newest` - i has come
 
     def take(self, sequence: int) -> Refusal | None:
         """Note a number; return why it is refused, or None."""
@@ -228,21 +219,13 @@ class Window:
 
 @dataclass
 class Session:
-    """One side's view of a session.
+    """One side's view of a session."""
 
-    Attributes:
-        number: random number of the controller.
-        address: address of the other side.
-        nonce: random number of the machine; 0 before its offer.
-        window: sequence numbers that have come.
-        heard: own clock when the last datagram was accepted, ns; 0 for none.
-    """
-
-    number: int
-    address: Address
-    nonce: int = 0
-    window: Window = field(default_factory=Window)
-    heard: int = 0
+    number: int  # random number of the controller
+    address: Address  # address of the other side
+    nonce: int = 0  # random number of the machine; 0 before its offer
+    window: Window = field(default_factory=Window)  # sequence numbers that have come
+    heard: int = 0  # own clock when the last datagram was accepted, ns; 0 for none
     _sent: int = 0
     _echo: int = 0
     _got: int = 0

@@ -125,48 +125,29 @@ def _turns(states: Array) -> Array:
 
 
 class GovernorState(NamedTuple):
-    """State of a governor at the beginning of a period.
+    """State of a governor at the beginning of a period."""
 
-    Attributes:
-        state: pose, rates and accelerations (18,) of the reference, rad, m and per s, s^2.
-        applied: applied target g (6,), at which the reference comes to rest.
-        limit: limit that keeps g from the target, in words, or None.
-        turn: coordinate that moves alone next if all together cannot.
-        pace: pole w, 1/s.
-    """
-
-    state: Array
-    applied: Array
-    limit: str | None = None
-    turn: int = 0
-    pace: float = PACE
+    state: Array  # pose, rates and accelerations (18,) of the reference, rad, m and per s, s^2
+    applied: Array  # applied target g (6,), at which the reference comes to rest
+    limit: str | None = None  # limit that keeps g from the target, in words, or None
+    turn: int = 0  # coordinate that moves alone next if all together cannot
+    pace: float = PACE  # pole w, 1/s
 
 
 class Blend(NamedTuple):
-    """A blend onto a motion.
+    """A blend onto a motion."""
 
-    Attributes:
-        way: trajectory of the blend, then the motion.
-        end: time at which the motion is reached, s.
-    """
-
-    way: Trajectory
-    end: float
+    way: Trajectory  # trajectory of the blend, then the motion
+    end: float  # time at which the motion is reached, s
 
 
 @dataclass(frozen=True)
 class Governor:
-    """Keeps a reference set by hand within the workspace and the torque limits.
-
-    Attributes:
-        dynamics: nominal dynamics.
-        torque_limit: limit of each motor, N m, of which TORQUE_SHARE is used.
-        fastest: fastest pole w, 1/s. Without a torque limit it is PACE.
-    """
+    """Keeps a reference set by hand within the workspace and the torque limits."""
 
     dynamics: StewartDynamics
-    torque_limit: float = np.inf
-    fastest: float = FASTEST
+    torque_limit: float = np.inf  # limit of each motor, N m, of which TORQUE_SHARE is used
+    fastest: float = FASTEST  # fastest pole w, 1/s. Without a torque limit it is PACE.
 
     @cached_property
     def paces(self) -> tuple[float, ...]:

@@ -71,11 +71,7 @@ class PageViewer(Viewer):
         self._request, self._stop, self._open, self._ready = Request(), False, True, True
 
     def opened(self) -> str:
-        """Wait for the page; return its address with the token. To be called once.
-
-        Raises:
-            ConfigError: the page's process did not start.
-        """
+        """Wait for the page; return its address with the token. To be called once."""
         with suppress(EOFError):
             if self._connection.poll(_START):
                 return str(self._connection.recv().url)

@@ -39,19 +39,12 @@ _MOST: Final = 0.5
 
 
 class Ready(NamedTuple):
-    """A machine that was found, and the law for it, before anything moves.
-
-    Attributes:
-        endpoint: socket.
-        contact: contact with the machine.
-        design: law for the scenario over the link that was found.
-        margin: stability margin of the loop with a constant delay eta.
-    """
+    """A machine that was found, and the law for it, before anything moves."""
 
     endpoint: Endpoint
     contact: Contact
-    design: Design
-    margin: ControllerMargin
+    design: Design  # law for the scenario over the link that was found
+    margin: ControllerMargin  # stability margin of the loop with a constant delay eta
 
     @property
     def simulated(self) -> bool:
@@ -206,11 +199,7 @@ def _queue_advice(scenario: Scenario) -> str | None:
 
 
 def check_armed(ready: Ready, armed: bool) -> None:
-    """Refuse a real machine without --arm.
-
-    Raises:
-        ConfigError: a real machine, not armed.
-    """
+    """Refuse a real machine without --arm."""
     if not ready.simulated and not armed:
         ready.endpoint.close()
         raise ConfigError(
@@ -220,11 +209,7 @@ def check_armed(ready: Ready, armed: bool) -> None:
 
 
 def check_jitter(ready: Ready, accepted: bool) -> None:
-    """Refuse a link with more jitter than the loop is stable for, unless that is accepted.
-
-    Raises:
-        ConfigError: too much jitter, not accepted.
-    """
+    """Refuse a link with more jitter than the loop is stable for, unless that is accepted."""
     problem = ready.jitter_problem
     if problem is not None and not accepted:
         ready.endpoint.close()

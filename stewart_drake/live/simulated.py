@@ -74,21 +74,13 @@ def _by_number(times: Array) -> Callable[[int], int | None]:
 
 
 class Plan(NamedTuple):
-    """Torques of a datagram.
+    """Torques of a datagram."""
 
-    Attributes:
-        sequence: sequence of the datagram; 0 for torques in flight at the begin.
-        sampled: time of the sample that they were computed for.
-        sample: number of that sample, from the begin on.
-        playout: time at which the first row acts.
-        torques: torques (n, 6), N m.
-    """
-
-    sequence: int
-    sampled: int
-    sample: int
-    playout: int
-    torques: Array
+    sequence: int  # sequence of the datagram; 0 for torques in flight at the begin
+    sampled: int  # time of the sample that they were computed for
+    sample: int  # number of that sample, from the begin on
+    playout: int  # time at which the first row acts
+    torques: Array  # torques (n, 6), N m
 
 
 class Motors:

@@ -27,15 +27,10 @@ _CACHED: Final = 4096
 
 
 class Request(NamedTuple):
-    """Request of a person.
+    """Request of a person."""
 
-    Attributes:
-        target: pose (6,), rad and m, or None for the scenario's motion.
-        rest: whether to come to rest instead.
-    """
-
-    target: Array | None = None
-    rest: bool = False
+    target: Array | None = None  # pose (6,), rad and m, or None for the scenario's motion
+    rest: bool = False  # whether to come to rest instead
 
 
 class Segment(NamedTuple):
@@ -81,23 +76,15 @@ class Way:
 
 @dataclass(frozen=True)
 class Steering:
-    """The reference, and the governor that leads it.
+    """The reference, and the governor that leads it."""
 
-    Attributes:
-        governor: governor of a reference set by hand.
-        motion: motion of the scenario, a trajectory (6, 1).
-        way: reference.
-        governed: state of the governor at the time `until`; None while the motion leads.
-        until: time up to which the reference is fixed, s.
-        limit: limit that prevents the requested motion, in words, or None.
-    """
-
-    governor: Governor
-    motion: Trajectory
+    governor: Governor  # governor of a reference set by hand
+    motion: Trajectory  # motion of the scenario, a trajectory (6, 1)
     way: Way
+    # state of the governor at the time `until`; None while the motion leads
     governed: GovernorState | None = None
-    until: float = 0.0
-    limit: str | None = None
+    until: float = 0.0  # time up to which the reference is fixed, s
+    limit: str | None = None  # limit that prevents the requested motion, in words, or None
 
     def on(self, time: float, request: Request) -> "Steering":
         """Fix the reference up to `time` in s, and follow a request from there on."""

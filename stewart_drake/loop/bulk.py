@@ -102,21 +102,13 @@ MakeTuner = Callable[[Experiment, PredictiveLqi], WeightsSource | None]
 
 
 class Instants(NamedTuple):
-    """Instants of a run at which Drake's simulator records and samples.
+    """Instants of a run at which Drake's simulator records and samples."""
 
-    Attributes:
-        nominal: (n,) s, of the record.
-        looks: (n,) s, at which the state is recorded.
-        on_grid: (n,) whether the metric counts each.
-        sampled: (n,) whether the controller samples at each.
-        samples: (k,) s, of the controller's samples.
-    """
-
-    nominal: Array
-    looks: Array
-    on_grid: NDArray[np.bool_]
-    sampled: NDArray[np.bool_]
-    samples: Array
+    nominal: Array  # (n,) s, of the record
+    looks: Array  # (n,) s, at which the state is recorded
+    on_grid: NDArray[np.bool_]  # (n,) whether the metric counts each
+    sampled: NDArray[np.bool_]  # (n,) whether the controller samples at each
+    samples: Array  # (k,) s, of the controller's samples
 
 
 def instants_of(duration: float, period: float) -> Instants:
@@ -147,31 +139,22 @@ def uncovered(scenario: Scenario) -> str | None:
 
 
 class Ending(NamedTuple):
-    """End of a run.
+    """End of a run."""
 
-    Attributes:
-        status: as of `loop.results.RunSummary`.
-        stopped: when and why it did not complete, or None.
-        figures: figures of merit.
-        counts: number of survived problems by name, as in the summary.
-        samples: (k, 18) at the controller's samples [measurement - reference (12); torque that the
-            law asked for (6)], in rad, m, rad/s, m/s and N m.
-        error_so_far: E_ac in % s up to the end, complete or not; NaN where nothing ran.
-        weights: (k, 2) w_Q and w_R at the samples.
-        rows: (k, n) row of the tuner's window for each sample (core/tuner.c); n = 0 without a
-            tuner, and in Drake's loop.
-        loop: `native`, or the other loop and the field that made it necessary; empty if the true
-            machine cannot take the start pose.
-    """
-
-    status: str
-    stopped: Failure | None
+    status: str  # as of `loop.results.RunSummary`
+    stopped: Failure | None  # when and why it did not complete, or None
     figures: Figures
-    counts: dict[str, int]
+    counts: dict[str, int]  # number of survived problems by name, as in the summary
+    # (k, 18) at the controller's samples [measurement - reference (12); torque that the law asked
+    # for (6)], in rad, m, rad/s, m/s and N m
     samples: Array
-    error_so_far: float
-    weights: Array
+    error_so_far: float  # E_ac in % s up to the end, complete or not; NaN where nothing ran
+    weights: Array  # (k, 2) w_Q and w_R at the samples
+    # (k, n) row of the tuner's window for each sample (core/tuner.c); n = 0 without a tuner, and in
+    # Drake's loop
     rows: Array
+    # `native`, or the other loop and the field that made it necessary; empty if the true machine
+    # cannot take the start pose
     loop: str
 
 
@@ -179,23 +162,15 @@ class Ending(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """One run, ready to begin.
-
-    Attributes:
-        experiment: the experiment.
-        law: the control law.
-        planned: motion that it follows.
-        previews: (k, p, 18) rows of that motion at each sample.
-        tuner: tuner of the weights, None for fixed ones.
-        motions: pieces of `planned` and of the reference (`pieces_of`), for a law that reads them
-            at any instant, else empty.
-    """
+    """One run, ready to begin."""
 
     experiment: Experiment
     law: PredictiveLqi | ServoPreview
-    planned: Trajectory
-    previews: Array
-    tuner: WeightsSource | None
+    planned: Trajectory  # motion that it follows
+    previews: Array  # (k, p, 18) rows of that motion at each sample
+    tuner: WeightsSource | None  # tuner of the weights, None for fixed ones
+    # pieces of `planned` and of the reference (`pieces_of`), for a law that reads them at any
+    # instant, else empty
     motions: tuple[tuple[Array, Array], ...] = ()
 
 
@@ -208,9 +183,6 @@ class Preparation:
     Attributes:
         when: instants of a run.
         references: (n, 12) pose and rates of the reference at its looks.
-
-    Raises:
-        ConfigError: as `prepare`.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -224,21 +196,13 @@ class Preparation:
         self.references = np.array([evaluate(reference, t)[:NUM_STATE] for t in self.when.looks])
 
     def experiment(self, scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
-        """Return the result of `prepare` for a scenario.
-
-        Raises:
-            ConfigError: the scenario's fields contradict each other.
-        """
+        """Return the result of `prepare` for a scenario."""
         scenario.check()
         true = self._base.truth if truth is None else truth
         return self._base._replace(scenario=scenario, truth=true, network=network_of(scenario))
 
     def prepared(self, experiment: Experiment, tuner: MakeTuner | None = None) -> Prepared:
-        """Compose law, motion and tuner of a run; `tuner` replaces the scenario's.
-
-        Raises:
-            ConfigError: as `law_design.control_law`.
-        """
+        """Compose law, motion and tuner of a run; `tuner` replaces the scenario's."""
         if experiment.scenario.controller.command == "cranks":
             servos, motion, _ = servo_law(experiment)
             return Prepared(experiment, servos, motion, self._preview(motion, servos), None)
@@ -296,11 +260,7 @@ _prepared: dict[tuple[Any, ...], Preparation] = {}
 
 
 def preparation_of(scenario: Scenario) -> Preparation:
-    """Return the preparation of a scenario, made once for all scenarios that share it.
-
-    Raises:
-        ConfigError: as `prepare`.
-    """
+    """Return the preparation of a scenario, made once for all scenarios that share it."""
     key = _key(scenario)
     if key not in _prepared:
         with one_blas_thread:
@@ -339,21 +299,13 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 
 class Course(NamedTuple):
-    """Record of a loop.
+    """Record of a loop."""
 
-    Attributes:
-        states: (n, 12) at the looks up to the end.
-        measured: (k, 12) at the samples, as the controller got them.
-        asked: (k, 6) torques in N m that the law asked for there.
-        sent: (k, 6) the same within the limit.
-        stopped: reason of an early end, or None.
-    """
-
-    states: Array
-    measured: Array
-    asked: Array
-    sent: Array
-    stopped: Failure | None
+    states: Array  # (n, 12) at the looks up to the end
+    measured: Array  # (k, 12) at the samples, as the controller got them
+    asked: Array  # (k, 6) torques in N m that the law asked for there
+    sent: Array  # (k, 6) the same within the limit
+    stopped: Failure | None  # reason of an early end, or None
 
 
 class CompiledController:
@@ -748,11 +700,7 @@ def _outside(experiment: Experiment) -> Ending | None:
 
 
 def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
-    """Run a prepared run in C, with law and tuner in C if the core has all their parts.
-
-    Raises:
-        IntegrationError: as `run_loop`.
-    """
+    """Run a prepared run in C, with law and tuner in C if the core has all their parts."""
     law, when, source = prepared.law, preparation.when, prepared.tuner
     wanted = preparation.references[when.sampled]
     field, tuner = core_law.uncovered(law), None if source is None else source.compiled

@@ -27,11 +27,7 @@ class LinkSystem(LeafSystem):
     """A link with its memory as discrete state, which takes a command at each sample."""
 
     def _begin(self, link: Link, period: float, rows: int, delay: Delay, queue: Array) -> None:
-        """Declare input, state and samples; `queue` (L, size) is in flight at t = 0.
-
-        Raises:
-            ValueError: a queue of the wrong shape.
-        """
+        """Declare input, state and samples; `queue` (L, size) is in flight at t = 0."""
         queue, shape = np.asarray(queue, np.float64), (delay.queue_length, link.size)
         if queue.shape != shape:
             raise ValueError(f"queue: got shape {queue.shape}; expected {shape}")

@@ -92,19 +92,12 @@ _used: "WeakSet[Any]" = WeakSet()
 
 
 class Own(NamedTuple):
-    """Systems, reference and law of the user that replace the scenario's.
+    """Systems, reference and law of the user that replace the scenario's."""
 
-    Attributes:
-        systems: by their ROLES.
-        reference: a 6 x 1 trajectory of the pose with two derivatives.
-        law: changes the scenario's law.
-        instances: systems given as instances, which remain the user's.
-    """
-
-    systems: Mapping[str, System] = MappingProxyType({})
-    reference: Trajectory | None = None
-    law: OwnLaw | None = None
-    instances: tuple[System, ...] = ()
+    systems: Mapping[str, System] = MappingProxyType({})  # by their ROLES
+    reference: Trajectory | None = None  # a 6 x 1 trajectory of the pose with two derivatives
+    law: OwnLaw | None = None  # changes the scenario's law
+    instances: tuple[System, ...] = ()  # systems given as instances, which remain the user's
 
     @property
     def names(self) -> dict[str, str]:
@@ -124,11 +117,7 @@ class Own(NamedTuple):
         )
 
     def claim(self, scenario: Scenario) -> None:
-        """Reserve the systems for one loop of a scenario.
-
-        Raises:
-            ConfigError: one of them was in another loop, or contradicts the scenario.
-        """
+        """Reserve the systems for one loop of a scenario."""
         for role in self.systems:
             if found := differing(scenario, ROLES[role].accepted):
                 raise ConfigError(found.problem(f"with a {role} of your own"))
@@ -141,11 +130,7 @@ class Own(NamedTuple):
             _used.add(system)
 
     def revised(self, law: AnyLaw) -> AnyLaw:
-        """Return the law to use in place of the scenario's.
-
-        Raises:
-            ConfigError: the user's function returned something else.
-        """
+        """Return the law to use in place of the scenario's."""
         if self.law is None:
             return law
         made, kind = self.law(law), type(law)
@@ -166,9 +151,6 @@ def take(given: Mapping[str, Any]) -> Own:
 
     Args:
         given: values by the names of the arguments of `simulate`, None if not given.
-
-    Raises:
-        ConfigError: one line.
     """
     given = {name: thing for name, thing in given.items() if thing is not None}
     systems = {role: _make(role, given[role], System) for role in ROLES if role in given}
@@ -239,9 +221,6 @@ def own_motion(reference: Trajectory, duration: float) -> Trajectory:
 
     Returns:
         The trajectory, defined for t >= 0: the preview passes the end.
-
-    Raises:
-        ConfigError: one line.
     """
     name = f"reference: {type(reference).__name__}"
     shape = (reference.rows(), reference.cols())

@@ -183,11 +183,7 @@ RULES: Final = {True: Rule(-1.77, 2.35, 0.41), False: Rule(-0.82, 1.37, 0.33)}
 
 
 def weights_source(experiment: Experiment, law: PredictiveLqi) -> WeightsSource | None:
-    """Make features and policy of a scenario's tuner, None for fixed weights.
-
-    Raises:
-        ConfigError: the features need a measured state without delay.
-    """
+    """Make features and policy of a scenario's tuner, None for fixed weights."""
     config = experiment.scenario.tuner
     return TUNERS[type(config)](config, experiment, law)
 
@@ -223,11 +219,7 @@ TUNERS: Final[Mapping[type, Callable[[Any, Experiment, PredictiveLqi], WeightsSo
 
 
 def health_of(experiment: Experiment, law: PredictiveLqi) -> HealthFeatures:
-    """Return the features `health` of a law.
-
-    Raises:
-        ConfigError: the state is not measured, or late.
-    """
+    """Return the features `health` of a law."""
     sc = experiment.scenario
     sensing = law.sensing
     if not isinstance(sensing, StateSensing) or law.longest_wait:

@@ -48,11 +48,7 @@ class Entries:
         return Measurements(**self._given)
 
     def drawn(self) -> str:
-        """Return the drawing as a data URI; masses that are missing do not matter.
-
-        Raises:
-            ConfigError: the lengths are missing, or fit no machine.
-        """
+        """Return the drawing as a data URI; masses that are missing do not matter."""
         masses = dict.fromkeys(("plate_mass", "crank_mass", "rod_mass"), _ANY_MASS)
         lengths = Entries({**self._given, **{name: str(m) for name, m in masses.items()}})
         with TemporaryDirectory() as folder:

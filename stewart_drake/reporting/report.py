@@ -94,22 +94,16 @@ _PACKETS_BELOW: Final = (
 
 @dataclass(frozen=True)
 class ReportData:
-    """Content of a report.
-
-    Attributes:
-        scenario: as asked for.
-        failure: where the reference leaves the workspace; None with runs.
-        run: of the scenario; None with a `failure`.
-        comparison: runs of the shipped controllers, by name.
-        tuned: runs of the delay-aware controllers with the tuner's weights; none without a network.
-        analyses: results without their studies, by name in the order of ANALYSES.
-    """
+    """Content of a report."""
 
     scenario: Scenario
-    failure: Failure | None
-    run: SimulationResult | None = None
+    failure: Failure | None  # where the reference leaves the workspace; None with runs
+    run: SimulationResult | None = None  # of the scenario; None with a `failure`
+    # runs of the shipped controllers, by name
     comparison: dict[str, SimulationResult] = field(default_factory=dict)
+    # runs of the delay-aware controllers with the tuner's weights; none without a network
     tuned: dict[str, SimulationResult] = field(default_factory=dict)
+    # results without their studies, by name in the order of ANALYSES
     analyses: dict[str, AnalysisResult] = field(default_factory=dict)
 
 

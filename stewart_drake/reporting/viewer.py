@@ -35,17 +35,11 @@ _GHOST: Final = Rgba(0.80, 0.10, 0.10, 0.35)
 
 @dataclass(frozen=True)
 class Placement:
-    """A pose set by the sliders.
+    """A pose set by the sliders."""
 
-    Attributes:
-        pose: (6,) rad and m.
-        reach: reach margins (6,) in m, negative where a leg is short.
-        failure: why the pose is impossible, or None.
-    """
-
-    pose: Array
-    reach: Array
-    failure: Failure | None
+    pose: Array  # (6,) rad and m
+    reach: Array  # reach margins (6,) in m, negative where a leg is short
+    failure: Failure | None  # why the pose is impossible, or None
 
     def __str__(self) -> str:
         short = [

@@ -103,26 +103,18 @@ class MotorMargins(NamedTuple):
 
 @dataclass(frozen=True)
 class LoopMargins:
-    """Margins of the loop of one delay.
+    """Margins of the loop of one delay."""
 
-    Attributes:
-        steps: mu.
-        radius: spectral radius of the closed loop.
-        S, T: peaks of sensitivity and complementary sensitivity at the motors.
-        gain_up, gain_down: factors on the torques of all motors.
-        motor: classical margins of one motor at a time; None if the loop is unstable.
-        later, earlier: errors of the believed delay, s.
-    """
-
-    steps: int
-    radius: float
-    S: Peak
-    T: Peak
-    gain_up: float
-    gain_down: float
+    steps: int  # mu
+    radius: float  # spectral radius of the closed loop
+    S: Peak  # peaks of sensitivity and complementary sensitivity at the motors
+    T: Peak  # peaks of sensitivity and complementary sensitivity at the motors
+    gain_up: float  # factors on the torques of all motors
+    gain_down: float  # factors on the torques of all motors
+    # classical margins of one motor at a time; None if the loop is unstable
     motor: MotorMargins | None
-    later: float
-    earlier: float
+    later: float  # errors of the believed delay, s
+    earlier: float  # errors of the believed delay, s
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -142,52 +134,33 @@ class LoopMargins:
 
 
 class Cell(NamedTuple):
-    """Simulation with one delay and amplitude.
+    """Simulation with one delay and amplitude."""
 
-    Attributes:
-        steps: whole periods of delay.
-        factor: on the reference's amplitude.
-        status: as of a simulation, or `out_of_reach` if the reference leaves the workspace, or
-            `not_run` after Ctrl-C.
-        error: E_ac in % s, NaN for a run that did not complete.
-        time: s, when it ended early or the reference leaves the workspace; else NaN.
-    """
-
-    steps: int
-    factor: float
+    steps: int  # whole periods of delay
+    factor: float  # on the reference's amplitude
+    # as of a simulation, or `out_of_reach` if the reference leaves the workspace, or `not_run`
+    # after Ctrl-C
     status: str
-    error: float
-    time: float
+    error: float  # E_ac in % s, NaN for a run that did not complete
+    time: float  # s, when it ended early or the reference leaves the workspace; else NaN
 
 
 @dataclass(frozen=True)
 class DelayStudy:
-    """Result of the analysis of the delay.
-
-    Attributes:
-        assessment: of the scenario.
-        controller: the scenario's loop along the reference, as far as that can be followed; None if
-            it cannot be followed at all.
-        eta: total delay, s.
-        poles: along the reference, as far as it can be followed.
-        growths: simulated checks of e^(p eta); none if nothing grows.
-        floors: E_ac in % s of a plate that waits at rest, by whole periods of delay.
-        loops: the closed loop by delay; empty with a reason in `loop_problem`.
-        loop_problem: why the closed loop was not judged, or empty.
-        cells: simulations by delay and amplitude.
-        interrupted: whether Ctrl-C ended the simulations early.
-    """
+    """Result of the analysis of the delay."""
 
     assessment: Assessment
+    # the scenario's loop along the reference, as far as that can be followed; None if it cannot be
+    # followed at all
     controller: ControllerMargin | None
-    eta: float
-    poles: list[PolePoint]
-    growths: list[Growth]
-    floors: dict[int, float]
-    loops: list[LoopMargins]
-    loop_problem: str
-    cells: list[Cell]
-    interrupted: bool
+    eta: float  # total delay, s
+    poles: list[PolePoint]  # along the reference, as far as it can be followed
+    growths: list[Growth]  # simulated checks of e^(p eta); none if nothing grows
+    floors: dict[int, float]  # E_ac in % s of a plate that waits at rest, by whole periods of delay
+    loops: list[LoopMargins]  # the closed loop by delay; empty with a reason in `loop_problem`
+    loop_problem: str  # why the closed loop was not judged, or empty
+    cells: list[Cell]  # simulations by delay and amplitude
+    interrupted: bool  # whether Ctrl-C ended the simulations early
 
     @property
     def verdict(self) -> Verdict | None:

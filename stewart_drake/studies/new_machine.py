@@ -47,25 +47,17 @@ BODIES: Final = ("base", "plate", "crank", "rod")
 
 
 class MechanismCheck(NamedTuple):
-    """Check of a mechanism at rest at its home pose.
+    """Check of a mechanism at rest at its home pose."""
 
-    Attributes:
-        mechanism: that was checked.
-        failure: why the home pose is unusable, or None; then torque, poles and travel are empty.
-        measures: at home.
-        crank_angles: (6,) rad.
-        torque: (6,) N m that hold the plate under gravity.
-        poles: (12,) of the open loop under gravity, 1/s, the fastest growing first.
-        travel: of each coordinate.
-    """
-
-    mechanism: Mechanism
+    mechanism: Mechanism  # that was checked
+    # why the home pose is unusable, or None; then torque, poles and travel are empty
     failure: Failure | None
-    measures: Measures
-    crank_angles: Array
-    torque: Array
+    measures: Measures  # at home
+    crank_angles: Array  # (6,) rad
+    torque: Array  # (6,) N m that hold the plate under gravity
+    # (12,) of the open loop under gravity, 1/s, the fastest growing first
     poles: NDArray[np.complex128]
-    travel: list[Travel]
+    travel: list[Travel]  # of each coordinate
 
     @property
     def verdict(self) -> str:
@@ -252,11 +244,7 @@ delay: {{steps: {delay.steps}, fraction: {round(delay.fraction, 9)}}}   # of {m.
 
 
 def check_free(folder: Path) -> None:
-    """Refuse a folder that has one of MACHINE and SCENARIO.
-
-    Raises:
-        ConfigError: it has.
-    """
+    """Refuse a folder that has one of MACHINE and SCENARIO."""
     for file in (MACHINE, SCENARIO):
         if (folder / file).exists():
             raise ConfigError(f"{folder / file}: already exists; expected a folder without it")

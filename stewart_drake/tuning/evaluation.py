@@ -50,23 +50,15 @@ Runs = dict[str, NDArray[Any]]
 
 
 class Evaluation(NamedTuple):
-    """Results of all candidates under all conditions.
+    """Results of all candidates under all conditions."""
 
-    Attributes:
-        family: with its conditions.
-        names: of the candidates: the fixed gains, then the tuners.
-        cost: (c, n) J in % s.
-        error: (c, n) E_ac in % s, NaN for a run that did not complete.
-        ratios: by tuner, log10(w_Q / w_R) at the samples of each condition.
-        summary: content of `summary.json`.
-    """
-
-    family: Family
-    names: tuple[str, ...]
-    cost: Array
-    error: Array
+    family: Family  # with its conditions
+    names: tuple[str, ...]  # of the candidates: the fixed gains, then the tuners
+    cost: Array  # (c, n) J in % s
+    error: Array  # (c, n) E_ac in % s, NaN for a run that did not complete
+    # by tuner, log10(w_Q / w_R) at the samples of each condition
     ratios: dict[str, list[list[float]]]
-    summary: dict[str, Any]
+    summary: dict[str, Any]  # content of `summary.json`
 
     @property
     def tuners(self) -> tuple[str, ...]:
@@ -125,9 +117,6 @@ def evaluate(
         directory: of the runs, in fixed/, rule/ and NAME-HASH/, so that a second network needs its
             own runs only.
         workers, scheduler, progress: as `run_jobs` takes them.
-
-    Raises:
-        As `run_jobs` and `load_network`, and ConfigError for fewer than two conditions.
     """
     cells, gains = family.conditions, tuple(family.gains.values())
     if len(cells) < 2:

@@ -85,31 +85,22 @@ DECAY: Final = 1e-4
 
 @dataclass(frozen=True)
 class Training:
-    """A trained network and how it was trained.
+    """A trained network and how it was trained."""
 
-    Attributes:
-        network: with its card.
-        curve: one row per step. Labels: root mean square errors of training and test rows. Regret:
-            round, step, regret of the training and of the held-out rows.
-        targets: (N, 2) labels of the test rows, as the output layer gives them; empty for regret.
-        outputs: (N, 2) of the network there.
-    """
-
-    network: Network
+    network: Network  # with its card
+    # one row per step. Labels: root mean square errors of training and test rows. Regret: round,
+    # step, regret of the training and of the held-out rows.
     curve: Array
+    # (N, 2) labels of the test rows, as the output layer gives them; empty for regret
     targets: Array
-    outputs: Array
+    outputs: Array  # (N, 2) of the network there
 
 
 # ---------------------------------------------------------------- the network
 
 
 def require_torch() -> Any:
-    """Return the module torch, with one thread.
-
-    Raises:
-        ConfigError: it is not installed.
-    """
+    """Return the module torch, with one thread."""
     try:
         import torch
     except ImportError:
@@ -147,9 +138,6 @@ class TorchModel:
     """f and its Jacobian over rows of inputs, by torch in double precision.
 
     `outputs` is f (N, 2) of theta and inputs u (N, n), `jacobian` df/dtheta (N, 2, len(theta)).
-
-    Raises:
-        ConfigError: torch is not installed.
     """
 
     def __init__(self, inputs: int, hidden: int) -> None:
@@ -363,14 +351,10 @@ def train(
 
 
 class Curves(NamedTuple):
-    """Cost curves of conditions, and the features of their runs.
+    """Cost curves of conditions, and the features of their runs."""
 
-    Attributes:
-        J: (n, m) in % s, of m = 13 fixed ratios, or of 1 roll-out.
-        features: (n, m, k, 18) after each of k samples, NaN if they are not known.
-    """
-
-    J: Array
+    J: Array  # (n, m) in % s, of m = 13 fixed ratios, or of 1 roll-out
+    # (n, m, k, 18) after each of k samples, NaN if they are not known
     features: NDArray[np.float32]
 
     @property
