@@ -174,7 +174,6 @@ class Delivery:
             self.say(wrap(line))
 
     def say_link(self, scenario: "Scenario") -> None:
-        """Print the assumed network, if any."""
         from stewart_drake.scenario.link import link_text
 
         if text := link_text(scenario):
@@ -187,7 +186,6 @@ class Delivery:
                 (self.out / name).unlink(missing_ok=True)
 
     def write(self, summary: Mapping[str, Any]) -> None:
-        """Write summary.json."""
         from stewart_drake.files.jsonio import write_json
 
         if self.out is not None:
@@ -213,7 +211,6 @@ class Delivery:
             self.wrote(f"{len(found)} figures" if what == "figures" else what)
 
     def wrote(self, *names: str) -> None:
-        """Add names to the list of written files."""
         self._written += names
 
     def answer(self, found: "AnalysisResult", *files: str, interrupted: bool = False) -> int:

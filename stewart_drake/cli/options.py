@@ -111,7 +111,6 @@ def _offered(kind: type[Options], recorded: bool = False) -> list[Option]:
 
 
 def _parameter(one: Option) -> inspect.Parameter:
-    """Return the command line's parameter."""
     annotation, default, name = one.annotation, one.default, _dashed(one)
     if one.read:
         annotation, default = list[str] | None, None

@@ -124,7 +124,6 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
 
 
 def _estimates(scenario: Scenario) -> str:
-    """Return the names of the estimated parameters."""
     names = [name.replace("_", " ") for name in scenario.controller.estimate]
     if scenario.controller.delay_estimator != "none":
         names.append("delay")

@@ -102,7 +102,6 @@ class RecordedLqi(PredictiveLqi):
     duration: float = field(kw_only=True)
 
     def initial_memory(self, queue: Array) -> Memory:
-        """Begin anew."""
         self.record.steps.clear()
         self.record.first = queue
         return super().initial_memory(queue)
@@ -115,7 +114,6 @@ class RecordedLqi(PredictiveLqi):
         weights: Array,
         report: Report | None = None,
     ) -> Memory:
-        """Take one sample and remember it."""
         motion = self.record.tabulated(motion, self.duration)
         after = super().step(memory, measurement, motion, weights, report)
         if len(self.record.steps) < MOST_SAMPLES:
@@ -134,7 +132,6 @@ class RecordedServo(ServoPreview):
     record: Recorded = field(kw_only=True)
 
     def initial_memory(self, command: Array) -> ServoMemory:
-        """Begin anew."""
         self.record.steps.clear()
         self.record.first = command
         return super().initial_memory(command)
@@ -142,7 +139,6 @@ class RecordedServo(ServoPreview):
     def step(
         self, memory: ServoMemory, measurement: Measurement, motion: Motion, report: Array
     ) -> ServoMemory:
-        """Take one sample and remember it."""
         after = super().step(memory, measurement, motion, report)
         if len(self.record.steps) < MOST_SAMPLES:
             rows, given = motion(self.preview_times), _given(self, measurement, memory, after)

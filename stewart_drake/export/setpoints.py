@@ -92,7 +92,6 @@ class Setpoints:
         return "\n".join([",".join(header), *lines]) + "\n"
 
     def save(self, path: str | Path, units: ServoUnits | None = None) -> None:
-        """Write `csv` to a file."""
         write_whole(Path(path), self.csv(units))
 
 

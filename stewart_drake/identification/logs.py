@@ -122,7 +122,6 @@ def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bo
 
 
 def _of_run(path: Path, mechanism: Mechanism) -> Log:
-    """Return the log of a run's signals."""
     signals = read_run(path)
     scenario = scenario_of(signals, path)
     try:
@@ -208,7 +207,6 @@ def _measured(measured: Array, scenario: Scenario, samples: Array) -> tuple[Arra
 
 
 def _limited(torques: Array, limit: float | str | None) -> Array:
-    """Return torques (n, 6) within the motors' limit."""
     return torques if limit is None or isinstance(limit, str) else np.clip(torques, -limit, limit)
 
 

@@ -42,7 +42,6 @@ def is_servo_log(path: Path) -> bool:
 
 
 def read_servo_log(path: Path, mechanism: Mechanism) -> ServoLog:
-    """Read a log."""
     table = read_table(path, _EXPECTED, _HEADER, _UNITS)
     times = table.stacked(["time"])[:, 0]
     setpoints, cranks = table.stacked(SETPOINTS), table.stacked(CRANKS)

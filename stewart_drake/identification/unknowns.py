@@ -79,7 +79,6 @@ class Unknowns:
         return found
 
     def without_encoders(self) -> "Unknowns":
-        """Return the unknowns without offsets of encoders."""
         std = self.std.copy()
         std[OFFSETS] = 0.0
         return dataclasses.replace(self, std=std)

@@ -175,7 +175,6 @@ class Contact:
         return head.sequence
 
     def has_arrived(self, sequence: int) -> bool:
-        """Return whether the machine has acknowledged a datagram."""
         return self._pending.get(sequence, False)
 
     def wait(self, until: int) -> Iterator[MachineMessage]:

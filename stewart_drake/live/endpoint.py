@@ -110,16 +110,13 @@ class Endpoint:
 
     @property
     def address(self) -> Address:
-        """Address of the socket."""
         host, port = self._socket.getsockname()
         return host, port
 
     def fileno(self) -> int:
-        """Return the descriptor, for `select`."""
         return self._socket.fileno()
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
     def send(self, message: Message, to: Address) -> bool:
@@ -133,7 +130,6 @@ class Endpoint:
         return True
 
     def refuse(self, cause: Refusal, detail: str = "") -> None:
-        """Count a refused datagram."""
         self.refused[cause] += 1
         self.refusal = f"{cause.value}: {detail}" if detail else cause.value
 

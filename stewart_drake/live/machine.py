@@ -293,7 +293,6 @@ class Machine:
         )
 
     def _fail(self, reason: Reason, time: int) -> None:
-        """Set the reason why torques do not act."""
         if self.reason.fault:
             self._precede(self.reason, time)
         if time - self._preceded > RECENT:

@@ -99,7 +99,6 @@ class PageViewer(Viewer):
                 self._connection.send(end)
 
     def close(self) -> None:
-        """End the page's process."""
         self._connection.close()
         self._process.join(2.0)
         if self._process.is_alive():
@@ -135,7 +134,6 @@ class Readouts:
         self._text, self._number = "{}", 0
 
     def put(self, values: dict[str, Any]) -> None:
-        """Replace the readouts."""
         with self._changed:
             self._text = json.dumps(jsonable(values), allow_nan=False)
             self._number += 1

@@ -364,7 +364,6 @@ class CompiledController:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of survived problems by cause, after the run."""
         fallbacks = int(self._tuned[2]) if len(self._tuned) else 0
         counts = CoreMemory(self._memory, self._compiled).counts
         return counts.summary() | {"tuner_fallbacks": fallbacks}
@@ -405,7 +404,6 @@ class CompiledServo:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of survived problems by cause, after the run."""
         counts = CoreMemory(self._memory, self._compiled).counts
         survived = counts.plus(*["saturated_steps"] * self._saturated)
         return survived.summary() | {"tuner_fallbacks": 0}
@@ -463,7 +461,6 @@ class PythonController:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of survived problems by cause, so far."""
         fallbacks = 0 if self._tuned is None else self._tuned.fallbacks
         return self._memory.counts.summary() | {"tuner_fallbacks": fallbacks}
 

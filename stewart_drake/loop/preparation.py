@@ -93,7 +93,6 @@ class Experiment(NamedTuple):
 
     @property
     def tuned(self) -> bool:
-        """Whether a tuner of the scenario sets the weights."""
         return self.scenario.tuner.kind != "fixed"
 
     @property

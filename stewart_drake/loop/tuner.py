@@ -121,7 +121,6 @@ class AnnTuner(SteppedLaw):
         self._put_out("weights", len(WEIGHTS), lambda memory: memory[0], now=True)
 
     def fallbacks(self, context: Context) -> int:
-        """Return the number of fallbacks so far."""
         return int(self.sample(context).memory[1])
 
     def _prepared(self, context: Context) -> Callable[[], tuple[Array, int]]:
@@ -168,7 +167,6 @@ class LawTuner(SteppedLaw):
         self._put_out("weights", len(WEIGHTS), lambda memory: source.decide(memory).weights)
 
     def fallbacks(self, context: Context) -> int:
-        """Return the number of fallbacks so far."""
         return int(self.sample(context).memory.fallbacks)
 
     def _prepared(self, context: Context) -> Callable[[], TunerMemory]:

@@ -52,7 +52,6 @@ def columns_of(signals: xr.Dataset) -> tuple[list[str], Array]:
 
 
 def write_csv(signals: xr.Dataset, path: Path) -> Path:
-    """Write `signals_csv` to a file."""
     write_whole(path, signals_csv(signals))
     return path
 

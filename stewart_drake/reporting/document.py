@@ -75,7 +75,6 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def capital(text: str) -> str:
-    """Return a text with a capital first letter."""
     return text[:1].upper() + text[1:]
 
 
@@ -251,7 +250,6 @@ class Section:
         self.blocks = [Paragraph(part) if isinstance(part, str) else part for part in parts]
 
     def all(self, kind: type[_Kind]) -> list[_Kind]:
-        """Return the blocks of a kind."""
         return [block for block in self.blocks if isinstance(block, kind)]
 
 

@@ -29,7 +29,6 @@ class LocalServer(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """Address of the page, with the token."""
         return f"http://127.0.0.1:{self.server_port}/?token={self._token}"
 
     def handle_error(self, request: Any, client_address: Any) -> None:

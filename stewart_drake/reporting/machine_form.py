@@ -106,7 +106,6 @@ class MachineForm:
 
     @property
     def url(self) -> str:
-        """Address of the form."""
         return self._server.url
 
     def take(self, entries: Entries) -> dict[str, Any]:
@@ -137,7 +136,6 @@ class MachineForm:
         self._fetched.wait(_PATIENCE)
 
     def close(self) -> None:
-        """End the server."""
         self._ready.set()
         self._server.shutdown()
         self._server.server_close()

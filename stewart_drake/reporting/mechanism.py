@@ -104,7 +104,6 @@ def mechanism_figure(mechanism: Mechanism) -> Figure:
 
 
 def write_mechanism_figure(mechanism: Mechanism, directory: Path) -> list[Path]:
-    """Write mechanism.png and mechanism.svg."""
     return write_figures({"mechanism": mechanism_figure(mechanism)}, directory)
 
 

@@ -38,7 +38,6 @@ def html(document: Document, made: Provenance) -> str:
 
 
 def write_page(document: Document, made: Provenance, path: Path) -> Path:
-    """Write the page to a file."""
     write_whole(path, html(document, made))
     return path
 

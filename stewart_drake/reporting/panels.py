@@ -174,7 +174,6 @@ def _fill(ax: Axes, panel: Panel, last: bool, named: bool) -> None:
 
 
 def limit(ax: Axes, level: float, text: str, *, below: bool = False) -> None:
-    """Draw a limit with a text on it."""
     ax.axhline(level, label=None if text else "limit", **LIMIT._asdict())
     ax.annotate(
         text,

@@ -126,7 +126,6 @@ def _html(signals: xr.Dataset, mechanism: Mechanism, title: str, outcome: str) -
 
 
 def write_replay(result: SimulationResult, mechanism: Mechanism, path: Path, title: str) -> Path:
-    """Write `replay_html` to a file and return its path."""
     write_whole(path, replay_html(result, mechanism, title))
     return path
 

@@ -92,7 +92,6 @@ class PoseViewer:
         self.step(home)
 
     def close(self) -> None:
-        """Free the diagram."""
         dispose(self._diagram)
 
     def values(self) -> Array:

@@ -171,7 +171,6 @@ def shown(
 
 
 def _chosen(controllers: Sequence[str | Path]) -> Sequence[str | Path]:
-    """Check the names or files of controllers."""
     few = isinstance(controllers, str) or len(controllers) == 0
     wrong = [] if few else [one for one in controllers if not isinstance(one, str | Path)]
     if few or wrong:

@@ -191,7 +191,6 @@ class DelayStudy:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Content of `summary.json`."""
         verdict = self.verdict
         return {
             "eta": self.eta,

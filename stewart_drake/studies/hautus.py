@@ -150,7 +150,6 @@ class HautusStudy:
     skipped: dict[str, str]
 
     def family(self, name: str) -> list[System]:
-        """Return the systems of one family."""
         return [system for system in self.systems if system.family == name]
 
     @property

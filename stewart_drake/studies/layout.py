@@ -328,7 +328,6 @@ def problem_of(
     vary: Mapping[str, tuple[float, float]],
     keep: Sequence[str],
 ) -> Problem:
-    """Return the problem of a search."""
     for field, value in (
         ("plant.mechanism", scenario.plant.mechanism),
         ("controller.calibration", scenario.controller.calibration),

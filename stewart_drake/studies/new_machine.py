@@ -196,7 +196,6 @@ def best_height(pattern: PatternSpec, m: Measurements) -> float:
 
 
 def machine_text(m: Measurements, name: str) -> str:
-    """Return the machine's file."""
     pattern = proposed_pattern(m)
     rows = "\n".join(f"  {field.name}: {getattr(pattern, field.name)}" for field in fields(pattern))
     height = float(f"{best_height(pattern, m):.4g}")

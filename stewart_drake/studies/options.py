@@ -91,7 +91,6 @@ class Option(NamedTuple):
 
     @property
     def required(self) -> bool:
-        """Whether a value must be given."""
         return self.default is inspect.Parameter.empty
 
 

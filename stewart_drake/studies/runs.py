@@ -55,7 +55,6 @@ class _File:
 
 
 def outcome_of(ending: Ending) -> Outcome:
-    """Return how a run ended."""
     stopped = ending.stopped
     ended: dict[str, Any] = {}
     if stopped is not None:

@@ -47,7 +47,6 @@ class Variant:
     parts: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def as_scenario(self) -> Scenario:
-        """Return the scenario with the draw."""
         return validate(Scenario, self.fields, "drawn")
 
     def machine(self) -> Mechanism:

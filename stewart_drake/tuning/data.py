@@ -286,7 +286,6 @@ def load_data(path: str | Path) -> xr.Dataset:
 
 
 def hash_of(*arrays: Any) -> str:
-    """Return the SHA-256 of the values of arrays."""
     digest = hashlib.sha256()
     for array in arrays:
         values = np.ascontiguousarray(array, dtype="<f8")

@@ -62,7 +62,6 @@ class Evaluation(NamedTuple):
 
     @property
     def tuners(self) -> tuple[str, ...]:
-        """Names of the tuners."""
         return self.names[len(self.family.gains) :]
 
 

@@ -106,7 +106,6 @@ class Family:
 
 
 def with_gain(scenario: Scenario, w_Q: float, w_R: float) -> Scenario:
-    """Return the scenario with these fixed weights."""
     return replace(scenario, controller=replace(scenario.controller, w_Q=w_Q, w_R=w_R))
 
 

@@ -450,7 +450,6 @@ def train_by_regret(
         samples = data.sizes["sample"]
 
         def own_runs(network: Network, chosen: Indices, number: int) -> Curves:
-            """Run some of the conditions with a network."""
             key = _key(network)
             found = run_jobs(
                 {
