@@ -214,13 +214,7 @@ class Delivery:
         self._written += names
 
     def answer(self, found: "AnalysisResult", *files: str, interrupted: bool = False) -> int:
-        """Print an analysis, write summary.json and the page, and return the exit status.
-
-        Args:
-            found: the result.
-            files: names of further files that it wrote.
-            interrupted: whether Ctrl-C ended it.
-        """
+        """Print an analysis, write summary.json and the page, and return the exit status."""
         from stewart_drake.reporting.results import PAGE
 
         self.say(str(found))

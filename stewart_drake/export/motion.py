@@ -25,12 +25,7 @@ _LOOKS: Final = (0.21, 0.5, 0.79)
 
 
 def knots(motion: Trajectory, end: float) -> Array:
-    """Return times and motion (n, 19) at sufficiently close knots.
-
-    Args:
-        motion: a trajectory (6, 1), for t >= 0.
-        end: s.
-    """
+    """Return times and motion (n, 19) at sufficiently close knots."""
     number = max(1, int(np.ceil(end / LONGEST)))
     coarse = np.linspace(0.0, end, number + 1)
     rows = [_row(motion, t) for t in coarse]

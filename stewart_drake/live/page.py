@@ -55,12 +55,7 @@ class PageRequest(NamedTuple):
 
 
 class PageViewer(Viewer):
-    """The page, in a separate process.
-
-    Args:
-        mechanism: mechanism to draw.
-        title: title of the page.
-    """
+    """The page, in a separate process."""
 
     def __init__(self, mechanism: Mechanism, title: str) -> None:
         context = multiprocessing.get_context("spawn")

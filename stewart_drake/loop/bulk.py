@@ -38,7 +38,7 @@ from stewart_drake.loop.law_design import (
     sizing_of,
     way_onto,
 )
-from stewart_drake.loop.link import buffer_places, measurement_link
+from stewart_drake.loop.link import begun, buffer_places, measurement_link
 from stewart_drake.loop.preparation import Experiment, assemble, network_of, prepare
 from stewart_drake.loop.results import Figures, SimulationResult, accumulated_error, figures
 from stewart_drake.loop.sensor import white_noises
@@ -176,9 +176,6 @@ class Prepared(NamedTuple):
 
 class Preparation:
     """Common part of the runs of all scenarios that differ in `_DRAWN` and the true machine only.
-
-    Args:
-        scenario: one of them.
 
     Attributes:
         when: instants of a run.
@@ -372,9 +369,6 @@ class CompiledController:
 class CompiledServo:
     """Law for servos in C, without estimates.
 
-    Args:
-        prepared: a run with such a law.
-
     Attributes:
         weights, rows: as of `CompiledController`, NaN and empty.
     """
@@ -489,17 +483,13 @@ def run_loop(
     plant = NativePlant(truth, experiment.start, when.looks, accuracy, LONGEST_STEP)
     noise, c = np.array(sensor.noise_std), core()
     drawn = noise * white_noises(sensor.seed, number) if noise.any() else None
-    of_torques = law if isinstance(law, PredictiveLqi) else None
-    packets = of_torques.channel if of_torques is not None else None
-    packets = packets if isinstance(packets, Packets) else None
-    if isinstance(law, ServoPreview):
-        link, memory, transit = _servo_link(experiment, law, number)
-    else:
-        link, memory, transit = _motor_link(experiment, of_torques, packets, number)
+    channel = law.channel if isinstance(law, PredictiveLqi) else None
+    packets = channel if isinstance(channel, Packets) else None
+    link, memory, transit = _link(experiment, law, number)
     reports = link.history if packets is not None and sc.link.acknowledged else 0
     late = np.zeros(number)
     if sensor.delay or sensor.loss or sc.link.back is not None:
-        late = np.append(measurement_times(sc), np.full(number, np.inf))[:number]
+        late = _padded(measurement_times(sc), number)
     size = NUM_STATE + (1 + NUM_TORQUES) * reports
     back = measurement_link(sc.controller.period, late, size)
     back_memory = back.start()
@@ -556,66 +546,45 @@ def _rows(packets: Packets) -> int:
     return packets.repeats + packets.torques
 
 
-def _motor_link(
-    experiment: Experiment, law: PredictiveLqi | None, packets: Packets | None, number: int
+def _link(
+    experiment: Experiment, law: PredictiveLqi | ServoPreview | None, number: int
 ) -> tuple[Link, Array, Array]:
     """Return the link to the motors, its memory at t = 0, and the transit times (number,) in s.
 
     It is that of `loop.link`: a wire, or a play-out buffer.
     """
-    sc, delay, config = (
-        experiment.scenario,
-        experiment.scenario.true_delay,
-        experiment.scenario.link,
-    )
-    period, queue = sc.controller.period, experiment.torques_in_flight(delay)
-    transit = np.full(number, delay.eta(period))
-    history, rows, holds = 1, 1, True
-    if config.kind == "network":
-        transit = np.append(forward_times(sc, number), np.full(number, np.inf))[:number]
-        history, holds = 1 if law is None else reported(law.kept), config.dry == "hold"
-        rows = 1 if packets is None else _rows(packets)
+    sc, delay = experiment.scenario, experiment.scenario.true_delay
+    period, size = sc.controller.period, NUM_TORQUES
+    if isinstance(law, ServoPreview):
+        _, queue = commands_in_flight(experiment, law, delay)
+        size, limit = NUM_REFERENCE, np.inf
+    else:
+        queue, limit = experiment.torques_in_flight(delay), experiment.torque_limit
+    more: dict[str, Any] = {}
+    if sc.link.kind == "network":
+        transit, rows = _padded(forward_times(sc, number), number), 1
+        more["hold_when_dry"] = sc.link.dry == "hold"
+        if isinstance(law, PredictiveLqi):
+            more["history"] = reported(law.kept)
+            rows = _rows(law.channel) if isinstance(law.channel, Packets) else 1
         kept = buffer_places(delay, rows)
     else:
-        transit = _wire_times(sc, number)
+        drawn = [delay.eta(period)] if sc.delay.constant else torque_delays(sc)
+        transit = np.array(drawn)[np.minimum(np.arange(number), len(drawn) - 1)]
         kept = len(queue) + int(transit.max(initial=0.0) / period) + 2
     link = Link(
-        *(NUM_TORQUES, kept, period),
-        is_wire=config.kind == "wire",
-        hold_when_dry=holds,
-        history=history,
+        *(size, kept, period),
+        is_wire=sc.link.kind == "wire",
         time_tolerance=SIMULTANEOUS * period,
-        limit=experiment.torque_limit,
+        limit=limit,
+        **more,
     )
-    memory, first = link.start(), (delay.periods - len(queue)) * period
-    if len(queue):
-        link.assume(memory, first, queue[0])
-        link.preload(memory, first, queue)
-    return link, memory, transit
+    return link, begun(link, delay, period, queue), transit
 
 
-def _servo_link(
-    experiment: Experiment, law: ServoPreview, number: int
-) -> tuple[Link, Array, Array]:
-    """Return the wire to servos, its memory at t = 0, and the transit times (number,) in s."""
-    sc, delay = experiment.scenario, experiment.scenario.true_delay
-    period, (_, queue) = sc.controller.period, commands_in_flight(experiment, law, delay)
-    transit = _wire_times(sc, number)
-    kept = len(queue) + int(transit.max(initial=0.0) / period) + 2
-    link = Link(NUM_REFERENCE, kept, period, is_wire=True, time_tolerance=SIMULTANEOUS * period)
-    memory, first = link.start(), (delay.periods - len(queue)) * period
-    if len(queue):
-        link.assume(memory, first, queue[0])
-        link.preload(memory, first, queue)
-    return link, memory, transit
-
-
-def _wire_times(sc: Scenario, number: int) -> Array:
-    """Return the transit times (number,) of a wire, s."""
-    if sc.delay.constant:
-        return np.full(number, sc.true_delay.eta(sc.controller.period))
-    drawn = torque_delays(sc)
-    return np.asarray(drawn[np.minimum(np.arange(number), len(drawn) - 1)])
+def _padded(times: Array, number: int) -> Array:
+    """Return the first times (number,); missing ones are infinite."""
+    return np.append(times, np.full(number, np.inf))[:number]
 
 
 def _call_back(plant: NativePlant, loop: Any, controller: Controller) -> Ended:

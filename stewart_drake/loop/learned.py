@@ -81,7 +81,8 @@ def learned_signal(experiment: Experiment) -> LearnedSignal | None:
     except ConfigError as error:
         raise ConfigError(f"controller.learned: {error}") from None
     for name, value in own.items():
-        same = found[name] == value if value.dtype.kind == "U" else _near(found[name], value)
+        text = value.dtype.kind == "U"
+        same = found[name] == value if text else np.allclose(found[name], value, 0, _SAME)
         if not same:
             numbers = "" if np.ndim(value) else f" ({found[name]}); expected {value}"
             raise ConfigError(
@@ -102,10 +103,6 @@ _TEXTS: Final = {
     "period": "controller.period, s",
     "delay": "delay, s",
 }
-
-
-def _near(a: Array, b: Array) -> bool:
-    return bool(np.allclose(a, b, rtol=0, atol=_SAME))
 
 
 def _command(scenario: Scenario) -> str:

@@ -44,48 +44,38 @@ class."""
 AnyLaw = TypeVar("AnyLaw", PredictiveLqi, ServoPreview)
 
 
+_SIZES: Final[Mapping[str, int]] = {
+    "state": NUM_STATE,
+    "measurement": NUM_STATE,
+    "reference": NUM_REFERENCE,
+    "density": len(TUNER_INPUTS),
+    "weights": len(WEIGHTS),
+    "commanded": NUM_TORQUES,
+    "torque": NUM_TORQUES,
+    "wrench": 6,
+}
+"""Sizes of the ports in all roles."""
+
+
 class Role(NamedTuple):
-    """Place of a system in the loop: its ports with their sizes."""
+    """Place of a system in the loop, with the names of its ports."""
 
-    inputs: Mapping[str, int]
-    """Required inputs."""
-    may: Mapping[str, int]
-    """Optional inputs."""
-    outputs: Mapping[str, int]
-    """Outputs, at least one of them required."""
-    accepted: Accepted = MappingProxyType({})
-    """Accepted values of the scenario's fields."""
+    inputs: str  # required
+    may: str  # optional inputs
+    outputs: str  # at least one of them required
+    accepted: Accepted = MappingProxyType({})  # values of the scenario's fields
 
 
-ROLES: Final[Mapping[str, Role]] = MappingProxyType(
-    {
-        "controller": Role(
-            {"measurement": NUM_STATE},
-            {"reference": NUM_REFERENCE},
-            {"torque": NUM_TORQUES},
-            {"sensor.kind": "state", "tuner.kind": "fixed", "actuator.kind": "torque"},
-        ),
-        "disturbance": Role({}, {}, {"torque": NUM_TORQUES, "wrench": 6}),
-        "sensor": Role(
-            {"state": NUM_STATE}, {}, {"measurement": NUM_STATE}, {"sensor.kind": "state"}
-        ),
-        "link": Role(
-            {"commanded": NUM_TORQUES},
-            {},
-            {"torque": NUM_TORQUES},
-            {"link.kind": "wire", "actuator.kind": "torque"},
-        ),
-        "tuner": Role(
-            {},
-            {
-                "density": len(TUNER_INPUTS),
-                "measurement": NUM_STATE,
-                "reference": NUM_REFERENCE,
-            },
-            {"weights": len(WEIGHTS)},
-        ),
-    }
-)
+ROLES: Final[Mapping[str, Role]] = {
+    "controller": Role(
+        *("measurement", "reference", "torque"),
+        {"sensor.kind": "state", "tuner.kind": "fixed", "actuator.kind": "torque"},
+    ),
+    "disturbance": Role("", "", "torque wrench"),
+    "sensor": Role("state", "", "measurement", {"sensor.kind": "state"}),
+    "link": Role("commanded", "", "torque", {"link.kind": "wire", "actuator.kind": "torque"}),
+    "tuner": Role("", "density measurement reference", "weights"),
+}
 """Places in the loop that a system of the user's own may take."""
 
 _used: "WeakSet[Any]" = WeakSet()
@@ -186,20 +176,21 @@ def _make(what: str, given: Any, kind: type) -> Any:
 
 def _check(role: str, system: System) -> None:
     """Check the ports of a system for its role."""
-    needed = ROLES[role]
+    needed, may, offered = (
+        {name: _SIZES[name] for name in names.split()} for names in ROLES[role][:3]
+    )
     inputs = _sizes(map(system.get_input_port, range(system.num_input_ports())))
     outputs = _sizes(map(system.get_output_port, range(system.num_output_ports())))
-    found = {name: size for name, size in outputs.items() if name in needed.outputs}
-    known = {**needed.inputs, **needed.may}
-    if needed.inputs.items() <= inputs.items() <= known.items() and (
-        found and found.items() <= needed.outputs.items()
+    found = {name: size for name, size in outputs.items() if name in offered}
+    if needed.items() <= inputs.items() <= (needed | may).items() and (
+        found and found.items() <= offered.items()
     ):
         return
-    wanted = f", if wanted {_listed(needed.may)}" if needed.may else ""
+    wanted = f", if wanted {_listed(may)}" if may else ""
     raise ConfigError(
         f"{role}: {type(system).__name__}: got inputs {_listed(inputs)} and outputs "
-        f"{_listed(outputs)}; expected inputs {_listed(needed.inputs)}{wanted}, and output "
-        f"{_listed(needed.outputs, ' or ')}"
+        f"{_listed(outputs)}; expected inputs {_listed(needed)}{wanted}, and output "
+        f"{_listed(offered, ' or ')}"
     )
 
 

@@ -650,9 +650,6 @@ class StartCheck(LeafSystem):
     | port | direction | size | unit |
     | --- | --- | --- | --- |
     | state | input | 12 | rad, m, rad/s, m/s |
-
-    Args:
-        start: (12,) pose and rates at the start.
     """
 
     def __init__(self, start: Array) -> None:

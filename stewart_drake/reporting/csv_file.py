@@ -22,9 +22,6 @@ def signals_csv(signals: xr.Dataset) -> str:
     """Return a header `time[s],pose_roll[rad],...` and a line per instant; NaN is an empty cell.
 
     A reference of `kind: csv` reads the columns `pose_...` as a motion.
-
-    Args:
-        signals: of a `SimulationResult`, over `time`.
     """
     header, rows = columns_of(signals)
     text = io.StringIO()

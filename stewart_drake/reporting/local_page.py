@@ -15,11 +15,7 @@ _LONGEST: Final = 4096
 
 
 class LocalServer(ThreadingHTTPServer):
-    """Server on a free port of 127.0.0.1.
-
-    Args:
-        handler: of the requests.
-    """
+    """Server on a free port of 127.0.0.1."""
 
     daemon_threads = True
 
@@ -38,12 +34,7 @@ class LocalServer(ThreadingHTTPServer):
 
 
 class LocalHandler(BaseHTTPRequestHandler):
-    """Answers of a page; derive from it and set `token` and `text`.
-
-    Attributes:
-        token: to be known.
-        text: the page.
-    """
+    """Answers of a page; derive from it and set `token` and `text`."""
 
     token: ClassVar[str]
     text: ClassVar[str]

@@ -27,11 +27,7 @@ _PATIENCE: Final = 10.0
 
 
 class Entries:
-    """Texts of a form as measurements; an empty text is a missing one.
-
-    Args:
-        texts: by the measurement's name.
-    """
+    """Texts of a form as measurements; an empty text is a missing one."""
 
     def __init__(self, texts: Mapping[str, str]) -> None:
         self._given = {name: text.strip() for name, text in texts.items() if text.strip()}

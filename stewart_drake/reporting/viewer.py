@@ -127,11 +127,7 @@ class PoseViewer:
         return placement
 
     def run(self, say: Callable[[str], None]) -> None:
-        """Follow the sliders until the stop button or Escape in the browser.
-
-        Args:
-            say: called with a description of each new pose.
-        """
+        """Follow the sliders until the stop button or Escape in the browser."""
         shown = np.full(6, np.nan)
         while self.meshcat.GetButtonClicks(STOP) == 0:
             values = self.values()

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import singledispatch
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -37,7 +36,7 @@ from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig, WaypointsConfig
+from stewart_drake.scenario.reference_config import ReferenceConfig
 from stewart_drake.scenario.reference_files import waypoints
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
@@ -405,29 +404,20 @@ def map_delays(steps: int) -> list[int]:
     return sorted({0, steps // 2, steps, 3 * steps // 2, 2 * steps}) if steps > 1 else [0, 1, 2, 4]
 
 
-@singledispatch
-def _scaled(reference: ReferenceConfig, factor: float) -> ReferenceConfig | None:
-    return None
-
-
-@_scaled.register
-def _(reference: SineConfig, factor: float) -> SineConfig:
-    return replace(reference, amplitude=[factor * a for a in reference.amplitude])
-
-
-@_scaled.register
-def _(reference: WaypointsConfig, factor: float) -> WaypointsConfig:
-    times, poses = waypoints(reference)
-    way = poses[0] + factor * (poses - poses[0])
-    return replace(reference, file=None, times=times.tolist(), poses=way.tolist())
-
-
 def scaled_motion(reference: ReferenceConfig, factor: float) -> ReferenceConfig | None:
     """Return the motion with its amplitude, or its way from the first waypoint, times `factor`.
 
     None if it has no amplitude to scale: a constant pose, or a file of samples.
     """
-    return reference if factor == 1 else _scaled(reference, factor)
+    if factor == 1:
+        return reference
+    if reference.kind == "sine":
+        return replace(reference, amplitude=[factor * a for a in reference.amplitude])
+    if reference.kind == "waypoints":
+        times, poses = waypoints(reference)
+        way = poses[0] + factor * (poses - poses[0])
+        return replace(reference, file=None, times=times.tolist(), poses=way.tolist())
+    return None
 
 
 def delay_map(scenario: Scenario, progress: Progress | None = None) -> tuple[list[Cell], bool]:

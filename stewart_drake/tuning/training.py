@@ -497,12 +497,7 @@ def train_by_regret(
 
 
 class RegretTrainer:
-    """Split, standardisation and loss of both rounds.
-
-    Args:
-        curves: of the conditions.
-        seed: of the split, the first theta and the batches.
-    """
+    """Split, standardisation and loss of both rounds."""
 
     def __init__(self, curves: Curves, seed: int) -> None:
         self._torch, self._curves, self._seed = require_torch(), curves, seed
