@@ -83,9 +83,6 @@ def check_writable(directory: Path | None, *, alone: bool = True) -> None:
     Args:
         directory: or None.
         alone: whether to lock it against other commands until this one ends.
-
-    Raises:
-        ConfigError: not writable, or locked by another command.
     """
     if directory is None:
         return

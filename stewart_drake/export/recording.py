@@ -161,9 +161,6 @@ def record(scenario: Scenario) -> Recorded:
 
     The test replays the controller. The steps of a *multibody* plant are an error that some stable
     loops, such as that of `gravity`, cannot correct.
-
-    Raises:
-        ConfigError: it has a part that the core has not, naming the field; or bad input.
     """
     found: list[Recorded] = []
 

@@ -160,9 +160,6 @@ def identify(
         mechanism: as drawn.
         tolerances: of the drawing, the defaults if None.
         delay: believed one, s; None is that of the first log.
-
-    Raises:
-        ConfigError: one line; a log does not suit the mechanism or is too short.
     """
     if len({log.gravity for log in logs}) > 1:
         raise ConfigError(

@@ -349,9 +349,6 @@ def identify_servos(
         mechanism: with its masses; `effort_limit` is the motors' torque limit.
         rounding: standard deviation of the rounding of a measured angle, rad.
         gravity: m/s^2 along -z.
-
-    Raises:
-        ConfigError: no motion, or no numbers with which the plate stays in its workspace.
     """
     if not np.ptp(log.setpoints, axis=0).max() > 20 * rounding:
         raise ConfigError(f"{log.name}: got setpoints that hardly change; expected a motion")

@@ -65,11 +65,7 @@ def servo_log(
     mechanism: Mechanism,
     table: Table | None = None,
 ) -> ServoLog:
-    """Return a log with its poses; angles of any turn, the arrays of `ServoLog`.
-
-    Raises:
-        ConfigError: the cranks have no pose; with the row of a table, if there is one.
-    """
+    """Return a log with its poses; angles of any turn, the arrays of `ServoLog`."""
     cranks = turned(np.unwrap(cranks, axis=0), mechanism.crank_angles(mechanism.home))
     cranks = np.unwrap(cranks, axis=0)
     poses, pose = np.empty_like(cranks), mechanism.home

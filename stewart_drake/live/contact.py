@@ -260,11 +260,7 @@ class Contact:
 
 
 def address_of(text: str, option: str = "--machine") -> Address:
-    """Return the address of HOST:PORT, which an option names.
-
-    Raises:
-        ConfigError: not of this form, or an unknown host.
-    """
+    """Return the address of HOST:PORT, which an option names."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise ConfigError(f"{option}: got {text!r}; expected HOST:PORT, such as 127.0.0.1:7000")
@@ -284,11 +280,7 @@ def open_endpoint(address: Address, key: bytes | None) -> Endpoint:
 
 
 def call(contact: Contact) -> MachineMessage:
-    """Request a session until the machine offers one and the link is known; return its offer.
-
-    Raises:
-        ConfigError: no answer, or a machine that the controller is not designed for.
-    """
+    """Request a session until the machine offers one and the link is known; return its offer."""
     began, first, where = now(), 0, contact.where
     while True:
         came = contact.ask()
@@ -311,11 +303,7 @@ def call(contact: Contact) -> MachineMessage:
 
 
 def await_free(contact: Contact) -> None:
-    """Wait for a new offer of a machine that no other controller drives.
-
-    Raises:
-        ConfigError: another controller still drives it, or the machine is silent.
-    """
+    """Wait for a new offer of a machine that no other controller drives."""
     contact.forget_waiting()
     began, last, where = now(), contact.last, contact.where
     assert last is not None

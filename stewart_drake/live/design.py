@@ -102,9 +102,6 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
             torque.
         link: measured link.
         machine: message of the machine.
-
-    Raises:
-        ConfigError: round trips longer than that time.
     """
     loss = max(scenario.sensor.loss, link.loss_back)
     sensor = replace(scenario.sensor, delay=0.0, loss=loss, faults=[])

@@ -162,11 +162,7 @@ class Endpoint:
 
 
 def read_key(path: Path | None) -> bytes | None:
-    """Return the key in a file, without line breaks at its end; None without a file.
-
-    Raises:
-        ConfigError: a file that cannot be read, or a key that is too short or too long.
-    """
+    """Return the key in a file, without line breaks at its end; None without a file."""
     if path is None:
         return None
     try:

@@ -60,11 +60,7 @@ FURTHEST: Final = 3600 * SECOND
 
 
 def check_scenario(scenario: Scenario) -> None:
-    """Refuse a scenario that the protocol does not cover.
-
-    Raises:
-        ConfigError: servos given by their bandwidth, or too many samples of encoders.
-    """
+    """Refuse a scenario that the protocol does not cover."""
     if found := differing(scenario, {"actuator.kind": ("torque", "position_servo")}):
         raise ConfigError(found.problem("for a machine", ", which a controller sends"))
     samples = scenario.sensor.samples

@@ -25,11 +25,7 @@ _SAME: Final = 1e-9
 
 
 def motion_period(scenario: Scenario) -> float:
-    """Return the period of a scenario's motion, s.
-
-    Raises:
-        ConfigError: the motion does not repeat, or too fast for the controller.
-    """
+    """Return the period of a scenario's motion, s."""
     reference, dt = scenario.reference, scenario.controller.period
     if reference.kind != "sine":
         raise ConfigError(

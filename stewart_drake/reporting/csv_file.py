@@ -54,11 +54,7 @@ def write_csv(signals: xr.Dataset, path: Path) -> Path:
 
 
 def read_signals(path: Path) -> xr.Dataset:
-    """Return the signals that `simulate` or `compare` saved.
-
-    Raises:
-        ConfigError: no such file, or not a file of signals.
-    """
+    """Return the signals that `simulate` or `compare` saved."""
     if not path.exists():
         raise ConfigError(f"signals: no file {str(path)!r}; expected {_EXPECTED}")
     try:

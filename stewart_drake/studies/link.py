@@ -158,9 +158,6 @@ def study_link(
         scenario: with a network; its `playout` is not used.
         options: see `LinkOptions`.
         progress: called for each finished simulation.
-
-    Raises:
-        ConfigError: the scenario has no network.
     """
     link = scenario.assumed_link
     if link.kind != "network":

@@ -173,11 +173,7 @@ def proposed_pattern(m: Measurements) -> PatternSpec:
 
 
 def best_height(pattern: PatternSpec, m: Measurements) -> float:
-    """Return z in m of the plate's joints at which every rod pushes its crank best.
-
-    Raises:
-        ConfigError: no height is within reach of all legs.
-    """
+    """Return z in m of the plate's joints at which every rod pushes its crank best."""
     legs = pattern_legs(pattern, m.crank, m.rod)
     above = m.shaft_height + m.rod
     found = reachable_heights(legs, np.array([0, 0, 0, 0, 0, above]))
@@ -250,11 +246,7 @@ def check_free(folder: Path) -> None:
 
 
 def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
-    """Write MACHINE and SCENARIO into a folder and check them; a bad machine is not written.
-
-    Raises:
-        ConfigError: one line; a file exists already, or the machine cannot stand or move.
-    """
+    """Write MACHINE and SCENARIO into a folder and check them; a bad machine is not written."""
     check_free(folder)
     with TemporaryDirectory() as place:
         machine, scenario = Path(place) / MACHINE, Path(place) / SCENARIO

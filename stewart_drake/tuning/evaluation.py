@@ -75,9 +75,6 @@ def tuners_of(
 
     A family with faults has the rule and any number of networks, named by their files. Another one
     has one network, called TUNER.
-
-    Raises:
-        ConfigError: no such network, too many, two of one name, or one of another candidate's.
     """
     if not family.has_faults and len(networks) > 1:
         raise ConfigError(f"WEIGHTS: got {len(networks)} without --family; expected one")

@@ -293,9 +293,6 @@ def train(
         hidden: number of hidden neurons.
         max_rows: for training at most.
         evaluations: of the residuals at most.
-
-    Raises:
-        ConfigError: torch is missing, or there are too few rows to train on or to test with.
     """
     rows, rng = labelled_rows(data, kind, density), np.random.default_rng(seed)
     in_train = split_rows(rows, split, rng)
@@ -381,11 +378,7 @@ class FeatureRows(NamedTuple):
 
 
 def curves_of(data: xr.Dataset, features: FeatureName) -> Curves:
-    """Return the cost curves of a data set.
-
-    Raises:
-        ConfigError: its conditions were not run with the 13 ratios, or without these features.
-    """
+    """Return the cost curves of a data set."""
     values = {"densities": "density", "health": "health"}[features]
     ratios = np.log10(data.weights.values[:, 0] / data.weights.values[:, 1])
     whole = not len(ratios) % len(RATIOS)
@@ -432,7 +425,6 @@ def train_by_regret(
         workers, progress: as `run_jobs` takes them.
 
     Raises:
-        ConfigError: torch is missing, a start out of range, or other data.
         As `run_jobs`.
     """
     if start is not None and not RATIOS[0] <= start <= RATIOS[-1]:
