@@ -110,18 +110,14 @@ def check_writable(directory: Path | None, *, alone: bool = True) -> None:
         ) from None
 
 
-def check_file(path: Path, option: str = "--out") -> None:
-    """Make the directory of a file that `--out`, or another option, names."""
+def check_file(path: Path | None, option: str = "--out") -> None:
+    """Make the directory of a file that `--out`, or another option, names, if any."""
+    if path is None:
+        return
     if path.exists() and not path.is_file():
         kind = "a directory" if path.is_dir() else "no regular file"
         raise ConfigError(f"{option}: got {str(path)!r}, {kind}; expected a file")
     check_writable(path.parent, alone=False)
-
-
-def check_log(path: Path | None) -> None:
-    """Make the directory of a file that `--log` names, if any."""
-    if path is not None:
-        check_file(path, "--log")
 
 
 def release() -> None:

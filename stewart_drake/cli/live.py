@@ -21,7 +21,7 @@ from stewart_drake.cli.common import (
     Quiet,
     ScenarioName,
     Settings,
-    check_log,
+    check_file,
 )
 from stewart_drake.cli.options import Given, with_options
 from stewart_drake.files.errors import ConfigError
@@ -108,7 +108,7 @@ def live(
         delivery.discard("signals.nc")
         how: Any = {"armed": options.armed, "viewer": viewer, "max_missing": options.max_missing}
         how["log"] = None if out is None else out / LOG
-        check_log(options.log)
+        check_file(options.log, "--log")
         how["logs"] = session.open_logs(ready, options, delivery.say_wrapped)
         with _Ending() as ending:
             result = session.drive(
@@ -275,7 +275,7 @@ def machine(
 
     options, loaded = given.options(), load_scenario(scenario, controller, settings or ())
     delivery, interrupted = Delivery(None, quiet, as_json), False
-    check_log(options.log)
+    check_file(options.log, "--log")
     with given.named(), open_chosen(loaded, options, delivery.say_wrapped) as (running, address):
         delivery.say_link(loaded)
         before = signal.signal(signal.SIGTERM, interrupt)

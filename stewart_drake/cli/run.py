@@ -19,7 +19,6 @@ from stewart_drake.cli.common import (
     ScenarioName,
     Settings,
     check_file,
-    check_log,
     check_writable,
     open_meshcat,
 )
@@ -72,7 +71,7 @@ def simulate(
             raise ConfigError(f"{option}: got it without --out; expected --out DIR to write into")
     experiment = prepare(load_scenario(scenario, controller, settings or ()))
     delivery = Delivery(out, quiet, as_json)
-    check_log(log)
+    check_file(log, "--log")
     viewer = open_meshcat() if meshcat else None
     delivery.say_link(experiment.scenario)
     margin = controller_margin(experiment)

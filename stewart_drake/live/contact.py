@@ -109,10 +109,8 @@ class Contact:
         identity: identity of the machine that the controller is designed for.
 
     Attributes:
-        link: see `Link`.
         last: newest message of the machine by its sequence, or None.
         offered: nonce of the newest offer; 0 without one.
-        session: see `live.endpoint.Session`.
         heard: own clock when the last message was accepted, ns.
     """
 

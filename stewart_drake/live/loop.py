@@ -28,6 +28,7 @@ from stewart_drake.live.checks import LONGEST_GAP, ReportCheck, stays_within_rea
 from stewart_drake.live.contact import Contact, await_free
 from stewart_drake.live.design import Design
 from stewart_drake.live.endpoint import STALL, now
+from stewart_drake.live.governor import Request, Steering, Way
 from stewart_drake.live.log import LiveRecord
 from stewart_drake.live.protocol import (
     NEVER,
@@ -38,7 +39,6 @@ from stewart_drake.live.protocol import (
     MachineMessage,
     Refusal,
 )
-from stewart_drake.live.steering import Request, Steering, Way
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.peer import Fault
 from stewart_drake.loop.recording import has_measured
@@ -112,7 +112,7 @@ class End(NamedTuple):
 
     @property
     def advice(self) -> str:
-        """What to do next; empty after a run that was not lost."""
+        """Advice after a run that was lost; else empty."""
         return _ADVICE.get(self.status, "")
 
 
@@ -199,7 +199,6 @@ class LiveLoop:
 
     Attributes:
         record: record of the run.
-        timing: see `Timing`.
         memory: memory of the law after the last sample.
         recoveries: number of new references that were planned.
         taken_over: whether the plate was not at the scenario's start.

@@ -108,7 +108,6 @@ class Machine:
     Args:
         experiment: prepared scenario that passes `check_scenario`.
         endpoint: socket.
-        settings: see `Settings`.
         say: prints a line.
         clock: monotonic clock, ns.
         log: gets the true state, the acting torque and the measurement at each sample of a run, by

@@ -15,11 +15,10 @@ from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.live.contact import Contact, address_of, call, open_endpoint
 from stewart_drake.live.design import Design, as_seen, check_controller, design
 from stewart_drake.live.endpoint import Address, Endpoint
-from stewart_drake.live.governor import FASTEST, Governor
+from stewart_drake.live.governor import FASTEST, Governor, Steering, Way
 from stewart_drake.live.loop import CrankLoop, LiveLoop, Viewer
 from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerFlags, MachineFlags
-from stewart_drake.live.steering import Steering, Way
 from stewart_drake.loop.cautions import overconfidence
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.peer import identity_of

@@ -261,7 +261,6 @@ def study_layout(
     Args:
         scenario: its machine, which has a pattern, is the start of the search.
         directory: of the machines; finished searches go below it.
-        options: see `LayoutOptions`.
         progress: as `run_jobs` takes it.
     """
     best, starts, generations = options.best, options.starts, options.generations

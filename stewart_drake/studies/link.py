@@ -156,7 +156,6 @@ def study_link(
 
     Args:
         scenario: with a network; its `playout` is not used.
-        options: see `LinkOptions`.
         progress: called for each finished simulation.
     """
     link = scenario.assumed_link
