@@ -59,7 +59,7 @@ _ESTIMATED = {
 class Experiment(NamedTuple):
     """A scenario with all objects that the loop is built from."""
 
-    scenario: Scenario  # the scenario
+    scenario: Scenario
     mechanism: Mechanism  # machine that the controller assumes
     truth: Mechanism  # machine that is simulated
     reference: Trajectory  # 6 x 1 trajectory of the pose

@@ -132,7 +132,7 @@ class Table:
     """
 
     columns: Sequence[str]  # heads, with units
-    rows: Sequence[Sequence[str]]  # cells; a terminal breaks them at "\\n"
+    rows: Sequence[Sequence[str]]  # cells; a terminal breaks them at "\n"
     caption: str = ""  # a sentence above the table
     # whether a terminal shows it, or the heads on a terminal, None for a column left out
     brief: bool | Sequence[str | None] = False

@@ -106,14 +106,14 @@ class LoopMargins:
 
     steps: int  # mu
     radius: float  # spectral radius of the closed loop
-    S: Peak  # peaks of sensitivity and complementary sensitivity at the motors
-    T: Peak  # peaks of sensitivity and complementary sensitivity at the motors
-    gain_up: float  # factors on the torques of all motors
-    gain_down: float  # factors on the torques of all motors
+    S: Peak  # of sensitivity at the motors
+    T: Peak  # of complementary sensitivity
+    gain_up: float  # factor on the torques of all motors
+    gain_down: float
     # classical margins of one motor at a time; None if the loop is unstable
     motor: MotorMargins | None
-    later: float  # errors of the believed delay, s
-    earlier: float  # errors of the believed delay, s
+    later: float  # error of the believed delay, s
+    earlier: float
 
     @property
     def summary(self) -> dict[str, Any]:

@@ -102,10 +102,10 @@ class System:
     family: str  # `error model`, `minimal chain`, `paper's chain`, `chain under gravity` or `plant`
     steps: int | None  # of delay, or None
     time: float | None  # s along the reference, None for home
-    n: int  # states and inputs
-    m: int  # states and inputs
-    reach: Hautus  # tests of (A, B), and of (A', C')
-    view: Hautus  # tests of (A, B), and of (A', C')
+    n: int  # states
+    m: int  # inputs
+    reach: Hautus  # test of (A, B)
+    view: Hautus  # test of (A', C')
     drake: dict[str, bool]  # Drake's answers to QUESTIONS
     words: tuple[str, ...]  # a sentence for each mode that fails
     note: str  # why Drake disagrees, or empty
