@@ -78,7 +78,6 @@ def main(arguments: list[str] | None = None) -> int:
 
 @functools.cache
 def _command() -> Any:
-    """Return the whole command line as a click command."""
     add_examples(app)
     return typer.main.get_command(app)
 

@@ -83,9 +83,6 @@ def check_writable(directory: Path | None, *, alone: bool = True) -> None:
     Args:
         directory: or None.
         alone: whether to lock it against other commands until this one ends.
-
-    Raises:
-        ConfigError: not writable, or locked by another command.
     """
     if directory is None:
         return
@@ -113,12 +110,10 @@ def check_writable(directory: Path | None, *, alone: bool = True) -> None:
         ) from None
 
 
-def check_file(path: Path, option: str = "--out") -> None:
-    """Make the directory of a file that `--out`, or another option, names.
-
-    Raises:
-        ConfigError: a directory or a device, or not writable.
-    """
+def check_file(path: Path | None, option: str = "--out") -> None:
+    """Make the directory of a file that `--out`, or another option, names, if any."""
+    if path is None:
+        return
     if path.exists() and not path.is_file():
         kind = "a directory" if path.is_dir() else "no regular file"
         raise ConfigError(f"{option}: got {str(path)!r}, {kind}; expected a file")
@@ -126,11 +121,7 @@ def check_file(path: Path, option: str = "--out") -> None:
 
 
 def check_log(path: Path | None) -> None:
-    """Make the directory of a file that `--log` names, if any.
-
-    Raises:
-        ConfigError: see `check_file` and `kind_of_log`.
-    """
+    """Make the directory of a log that `--log` names, if any, and check its suffix."""
     if path is not None:
         from stewart_drake.scenario.run_log import kind_of_log
 
@@ -185,7 +176,6 @@ class Delivery:
             self.say(wrap(line))
 
     def say_link(self, scenario: "Scenario") -> None:
-        """Print the assumed network, if any."""
         from stewart_drake.scenario.link import link_text
 
         if text := link_text(scenario):
@@ -198,7 +188,6 @@ class Delivery:
                 (self.out / name).unlink(missing_ok=True)
 
     def write(self, summary: Mapping[str, Any]) -> None:
-        """Write summary.json."""
         from stewart_drake.files.jsonio import write_json
 
         if self.out is not None:
@@ -224,17 +213,10 @@ class Delivery:
             self.wrote(f"{len(found)} figures" if what == "figures" else what)
 
     def wrote(self, *names: str) -> None:
-        """Add names to the list of written files."""
         self._written += names
 
     def answer(self, found: "AnalysisResult", *files: str, interrupted: bool = False) -> int:
-        """Print an analysis, write summary.json and the page, and return the exit status.
-
-        Args:
-            found: the result.
-            files: names of further files that it wrote.
-            interrupted: whether Ctrl-C ended it.
-        """
+        """Print an analysis, write summary.json and the page, and return the exit status."""
         from stewart_drake.reporting.results import PAGE
 
         self.say(str(found))

@@ -141,9 +141,9 @@ def _new(
 ) -> tuple[int, str]:
     """Write the files; return the exit status and the report as HTML."""
     from stewart_drake.loop.simulation import simulate
-    from stewart_drake.reporting.first_report import first_report
     from stewart_drake.reporting.mechanism import document
     from stewart_drake.reporting.page import Provenance, command_line, html
+    from stewart_drake.reporting.report import first_report
     from stewart_drake.reporting.results import PAGE
     from stewart_drake.scenario.loading import load_scenario
     from stewart_drake.studies import new_machine as study

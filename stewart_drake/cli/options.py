@@ -51,9 +51,6 @@ class Given:
         Args:
             load: loads the scenario with another controller.
             more: values by field, which replace typed ones.
-
-        Raises:
-            ConfigError: a bad value.
         """
         with self.named():
             values = {one.name: self._value(one, load) for one in _offered(self._kind)}
@@ -114,7 +111,6 @@ def _offered(kind: type[Options], recorded: bool = False) -> list[Option]:
 
 
 def _parameter(one: Option) -> inspect.Parameter:
-    """Return the command line's parameter."""
     annotation, default, name = one.annotation, one.default, _dashed(one)
     if one.read:
         annotation, default = list[str] | None, None

@@ -152,8 +152,7 @@ def export(
     """
     from stewart_drake import functions
 
-    if out is not None:
-        check_file(out)
+    check_file(out)
     text = functions.export_csv(signals, out)
     if out is None:
         typer.echo(text, nl=False)

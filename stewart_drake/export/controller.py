@@ -20,12 +20,10 @@ from jinja2 import Environment, StrictUndefined
 from stewart_drake.core.build import FOLDER, compiler
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.workspace import LEAST, home_sign
-from stewart_drake.export.constants import Constants, numbers
-from stewart_drake.export.motion import TOLERANCE, knots
-from stewart_drake.export.recording import Recorded, record
+from stewart_drake.export.recording import TOLERANCE, Recorded, knots, record
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import replacing
-from stewart_drake.law.compiled import Compiled
+from stewart_drake.law.compiled import Compiled, address_of
 from stewart_drake.law.core_law import CompiledLaw
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.law_design import control_law
@@ -36,7 +34,7 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
-from stewart_drake.types import Array
+from stewart_drake.types import Array, ArrayLike
 
 SOURCES: Final = (
     *(
@@ -81,9 +79,6 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         scenario: whose controller it is.
         single: numbers of single precision.
         measured: whether it is compiled and run here, for what its README tells.
-
-    Raises:
-        ConfigError: see `recording.record`.
     """
     recorded, experiment = record(scenario), prepare(scenario)
     compiled, suffix = CompiledLaw(recorded.law), "f" if single else ""
@@ -128,7 +123,6 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
 
 
 def _estimates(scenario: Scenario) -> str:
-    """Return the names of the estimated parameters."""
     names = [name.replace("_", " ") for name in scenario.controller.estimate]
     if scenario.controller.delay_estimator != "none":
         names.append("delay")
@@ -332,3 +326,78 @@ def _made(folder: str, command: Iterable[str], target: str) -> str:
     if done.returncode != 0:
         raise ConfigError(f"export-c: make {target} failed: {done.stdout}{done.stderr}".strip())
     return done.stdout.strip()
+
+
+# ---------------------------------------------------------------- structures as text
+
+
+class Constants:
+    """Initialisers of structures, and definitions of the data that they point to.
+
+    Args:
+        keep: these arrays and C structures.
+        tables: names of the core's tables of functions, by address.
+        suffix: of a number, `f` in single precision.
+
+    Attributes:
+        before: the definitions.
+    """
+
+    def __init__(self, keep: Iterable[Any], tables: dict[int, str], suffix: str) -> None:
+        self._tables, self._suffix = tables, suffix
+        self._arrays, self._structures = {}, {}
+        for kept in keep:
+            if isinstance(kept, np.ndarray):
+                self._arrays[kept.ctypes.data] = kept
+            else:
+                self._structures[address_of(kept)] = kept
+        self.before: list[str] = []
+
+    def struct(self, data: Any, about: str) -> str:
+        """Return the initialiser of a structure."""
+        fields = core().ffi.typeof(data).fields
+        parts = (
+            f".{name} = {self._value(getattr(data, name), field.type, f'{about}_{name}')}"
+            for name, field in fields
+        )
+        return "{" + ", ".join(parts) + "}"
+
+    def _value(self, value: Any, kind: Any, about: str) -> str:
+        if kind.kind == "struct":
+            return self.struct(value, about)
+        if kind.kind == "array":
+            return "{" + ", ".join(self._value(v, kind.item, about) for v in value) + "}"
+        if kind.kind == "pointer":
+            return self._pointed(value, about)
+        return number(value, self._suffix) if kind.cname == "double" else str(int(value))
+
+    def _pointed(self, value: Any, about: str) -> str:
+        """Return the initialiser of a pointer, and define its target."""
+        address = address_of(value)
+        if address == 0:
+            return "0"
+        if address in self._tables:
+            return f"&{self._tables[address]}"
+        if address in self._arrays:
+            values = numbers(self._arrays[address].ravel(), self._suffix)
+            self.before.append(f"static const real {about}[] = {values};")
+            return about
+        pointer = self._structures[address]
+        kind = core().ffi.typeof(pointer).item.cname
+        text = self.struct(pointer[0], about)
+        self.before.append(f"static const {kind} {about} = {text};")
+        return f"&{about}"
+
+
+def numbers(values: ArrayLike, suffix: str) -> str:
+    """Return numbers in braces, or one number alone."""
+    array = np.asarray(values, dtype=np.float64)
+    found = [number(value, suffix) for value in array.ravel().tolist()]
+    return found[0] if array.ndim == 0 else f"{{{', '.join(found)}}}"
+
+
+def number(value: float, suffix: str) -> str:
+    """Return a number, exact."""
+    if not np.isfinite(value):
+        return "NAN" if np.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
+    return f"{value!r}{suffix}"

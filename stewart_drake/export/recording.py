@@ -1,4 +1,4 @@
-"""Laws in Python that remember what they were asked, for a replay in C."""
+"""Laws in Python that remember what they were asked, and motions as knots, for a replay in C."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
@@ -8,68 +8,97 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from pydrake.trajectories import Trajectory
 
-from stewart_drake.export.motion import knots
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.channel import Report
 from stewart_drake.law.core_law import uncovered
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Memory
-from stewart_drake.law.motion import KnownMotion, Motion
+from stewart_drake.law.motion import KnownMotion, Motion, between
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.planner import Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.trajectories import through_states
+from stewart_drake.scenario.trajectories import evaluate, through_states
 from stewart_drake.types import Array
 
 MOST_SAMPLES: Final = 100
 """Of a run that the test replays."""
+TOLERANCE: Final = 1e-7
+"""Tolerance of knots, as a share of the largest value of a coordinate, rate or acceleration."""
+LONGEST: Final = 0.5
+"""Longest time between two knots, s."""
+_HALVES: Final = 16
+"""Largest number of halvings of LONGEST, as at a jump of the motion."""
+_LOOKS: Final = (0.21, 0.5, 0.79)
+"""Shares of the time between two knots at which the polynomial is compared."""
+
+
+def knots(motion: Trajectory, end: float) -> Array:
+    """Return times and motion (n, 19) at knots of a piecewise polynomial of fifth order, for C.
+
+    The polynomial has pose, rates and accelerations of the motion at both knots. Between them it is
+    off by O(h^6) where the motion is smooth; where it is not, or h is too long, knots come closer.
+    """
+    number = max(1, int(np.ceil(end / LONGEST)))
+    coarse = np.linspace(0.0, end, number + 1)
+    rows = [_row(motion, t) for t in coarse]
+    size = np.abs(np.array(rows)[:, 1:]).max(axis=0)
+    size = np.maximum(size, 1e-3 * size.reshape(3, 6).max(axis=1).repeat(6) + 1e-9)
+    found = [rows[0]]
+    for before, after in pairwise(rows):
+        _refine(motion, before, after, size, found, _HALVES)
+    return np.array(found)
+
+
+def _row(motion: Trajectory, time: float) -> Array:
+    return np.append(time, evaluate(motion, time))
+
+
+def _refine(
+    motion: Trajectory, a: Array, b: Array, size: Array, found: list[Array], halves: int
+) -> None:
+    """Append the knots after `a`, up to `b`."""
+    span = b[0] - a[0]
+    off = [
+        np.abs(between(a[1:], b[1:], span, share) - evaluate(motion, a[0] + share * span)) / size
+        for share in _LOOKS
+    ]
+    if np.max(off) > TOLERANCE and halves > 0:
+        middle = _row(motion, a[0] + span / 2)
+        _refine(motion, a, middle, size, found, halves - 1)
+        _refine(motion, middle, b, size, found, halves - 1)
+    else:
+        found.append(b)
 
 
 class Step(NamedTuple):
-    """Input and result of one sample.
+    """Input and result of one sample."""
 
-    Attributes:
-        measurement: (m,), NaN where it is missing.
-        age: of it, periods.
-        preview: (p, 18) rows of the reference that were asked for; none where the law finds the
-            instants itself.
-        answer: (6,) torque as asked for, or (18,) command.
-        status: bits of the causes that were counted.
-        weights: (2,) w_Q and w_R.
-        sent: (6 N,) torques as limited, of this sample and of further ones.
-        report: that came with the measurement: packets, or (r,) of servos.
-    """
-
-    measurement: Array
-    age: int
+    measurement: Array  # (m,), NaN where it is missing
+    age: int  # of it, periods
+    # (p, 18) rows of the reference that were asked for; none where the law finds the instants
+    # itself
     preview: Array
-    answer: Array
-    status: int
-    weights: Array
-    sent: Array
-    report: Report | Array | None
+    answer: Array  # (6,) torque as asked for, or (18,) command
+    status: int  # bits of the causes that were counted
+    weights: Array  # (2,) w_Q and w_R
+    sent: Array  # (6 N,) torques as limited, of this sample and of further ones
+    report: Report | Array | None  # that came with the measurement: packets, or (r,) of servos
 
 
 @dataclass
 class Recorded:
-    """A recorded run.
+    """A recorded run."""
 
-    Attributes:
-        law: the law, without what records it.
-        steps: of it, MOST_SAMPLES at the most.
-        first: (n, 6) torques in flight, or (18,) the command before the first sample.
-        motion: times and reference (k, 19), if the law chooses the instants of the reference.
-        goal: the same of the motion that the law returns to.
-    """
-
-    law: PredictiveLqi | ServoPreview
-    steps: list[Step] = field(default_factory=list)
+    law: PredictiveLqi | ServoPreview  # the law, without what records it
+    steps: list[Step] = field(default_factory=list)  # of it, MOST_SAMPLES at the most
+    # (n, 6) torques in flight, or (18,) the command before the first sample
     first: Array = field(default_factory=lambda: np.empty(0))
+    # times and reference (k, 19), if the law chooses the instants of the reference
     motion: Array | None = None
-    goal: Array | None = None
+    goal: Array | None = None  # the same of the motion that the law returns to
     _along: tuple[Trajectory, Trajectory] | None = None
 
     @property
@@ -116,7 +145,6 @@ class RecordedLqi(PredictiveLqi):
     duration: float = field(kw_only=True)
 
     def initial_memory(self, queue: Array) -> Memory:
-        """Begin anew."""
         self.record.steps.clear()
         self.record.first = queue
         return super().initial_memory(queue)
@@ -129,7 +157,6 @@ class RecordedLqi(PredictiveLqi):
         weights: Array,
         report: Report | None = None,
     ) -> Memory:
-        """Take one sample and remember it."""
         motion = self.record.tabulated(motion, self.duration)
         after = super().step(memory, measurement, motion, weights, report)
         if len(self.record.steps) < MOST_SAMPLES:
@@ -148,7 +175,6 @@ class RecordedServo(ServoPreview):
     record: Recorded = field(kw_only=True)
 
     def initial_memory(self, command: Array) -> ServoMemory:
-        """Begin anew."""
         self.record.steps.clear()
         self.record.first = command
         return super().initial_memory(command)
@@ -156,7 +182,6 @@ class RecordedServo(ServoPreview):
     def step(
         self, memory: ServoMemory, measurement: Measurement, motion: Motion, report: Array
     ) -> ServoMemory:
-        """Take one sample and remember it."""
         after = super().step(memory, measurement, motion, report)
         if len(self.record.steps) < MOST_SAMPLES:
             rows, given = motion(self.preview_times), _given(self, measurement, memory, after)
@@ -179,9 +204,6 @@ def record(scenario: Scenario) -> Recorded:
 
     The test replays the controller. The steps of a *multibody* plant are an error that some stable
     loops, such as that of `gravity`, cannot correct.
-
-    Raises:
-        ConfigError: it has a part that the core has not, naming the field; or bad input.
     """
     found: list[Recorded] = []
 

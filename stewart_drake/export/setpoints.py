@@ -67,33 +67,20 @@ class ServoUnits:
 
 
 def load_units(path: str | Path) -> ServoUnits:
-    """Read a YAML file with the fields of `ServoUnits`.
-
-    Raises:
-        ConfigError: one line.
-    """
+    """Read a YAML file with the fields of `ServoUnits`."""
     return validate(ServoUnits, load_yaml(Path(path)), str(path))
 
 
 @dataclass(frozen=True)
 class Setpoints:
-    """Setpoints, each to be held until the next one.
+    """Setpoints, each to be held until the next one."""
 
-    Attributes:
-        times: (n,) s, at which each is sent.
-        angles: (n, 6) setpoints, rad.
-        cranks: (n, 6) angles of the cranks in the middle of each period, rad.
-        crank_rates: (n, 6) rad/s.
-        torques: (n, 6) that the motion takes there from the servos, N m.
-        blend: length of the soft start, s; 0 without one.
-    """
-
-    times: Array
-    angles: Array
-    cranks: Array
-    crank_rates: Array
-    torques: Array
-    blend: float
+    times: Array  # (n,) s, at which each is sent
+    angles: Array  # (n, 6) setpoints, rad
+    cranks: Array  # (n, 6) angles of the cranks in the middle of each period, rad
+    crank_rates: Array  # (n, 6) rad/s
+    torques: Array  # (n, 6) that the motion takes there from the servos, N m
+    blend: float  # length of the soft start, s; 0 without one
 
     def csv(self, units: ServoUnits | None = None) -> str:
         """Return a header `time[s],setpoint_1[rad],...` and a line per setpoint."""
@@ -108,7 +95,6 @@ class Setpoints:
         return "\n".join([",".join(header), *lines]) + "\n"
 
     def save(self, path: str | Path, units: ServoUnits | None = None) -> None:
-        """Write `csv` to a file."""
         write_whole(Path(path), self.csv(units))
 
 
@@ -242,11 +228,7 @@ def _along(
     plain: bool,
     learned: LearnedSignal | None,
 ) -> Setpoints:
-    """Return the setpoints of the motion, checked at the middle of each period.
-
-    Raises:
-        _BrokenLimit: the first limit that it breaks.
-    """
+    """Return the setpoints of the motion, checked at the middle of each period."""
     mechanism, dynamics = experiment.mechanism, known_dynamics(experiment)
     servo = known_stiffness(experiment.scenario)
     number = max(1, math.ceil(experiment.scenario.duration * rate - 1e-9))

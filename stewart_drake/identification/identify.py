@@ -46,19 +46,12 @@ _COARSE: Final = 0.1  # error of the coarse delay, s
 
 @dataclass(frozen=True)
 class Identification:
-    """Machine identified from logs.
+    """Machine identified from logs."""
 
-    Attributes:
-        logs: of the machine.
-        unknowns: before the logs.
-        solution: the fit.
-        middle: median of the measured poses (6,).
-    """
-
-    logs: Sequence[Log]
-    unknowns: Unknowns
+    logs: Sequence[Log]  # of the machine
+    unknowns: Unknowns  # before the logs
     solution: Solution
-    middle: Array
+    middle: Array  # median of the measured poses (6,)
 
     @property
     def problem(self) -> Problem:
@@ -167,9 +160,6 @@ def identify(
         mechanism: as drawn.
         tolerances: of the drawing, the defaults if None.
         delay: believed one, s; None is that of the first log.
-
-    Raises:
-        ConfigError: one line; a log does not suit the mechanism or is too short.
     """
     if len({log.gravity for log in logs}) > 1:
         raise ConfigError(

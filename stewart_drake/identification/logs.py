@@ -50,28 +50,17 @@ LEAST_ANGLE: Final = 1e-6  # crank angle, rad
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """One log.
+    """One log."""
 
-    Attributes:
-        name: of the file.
-        sent: (m,) increasing times of the torques, s.
-        torques: (m, 6) within the motors' limit, N m; each acts until the next one does.
-        times: (n,) increasing times of the measurements, s.
-        values: (n, 18) crank angles, pose, rates in rad, m and per s; NaN for a missing one.
-        std: (18,) of their errors.
-        gravity: m/s^2 along -z.
-        delay: believed delay in s, or None.
-        before: torques (6,) that act before the first of these does, or None if unknown.
-    """
-
-    name: str
-    sent: Array
-    torques: Array
-    times: Array
-    values: Array
-    std: Array
-    gravity: float
-    delay: float | None = None
+    name: str  # of the file
+    sent: Array  # (m,) increasing times of the torques, s
+    torques: Array  # (m, 6) within the motors' limit, N m; each acts until the next one does
+    times: Array  # (n,) increasing times of the measurements, s
+    values: Array  # (n, 18) crank angles, pose, rates in rad, m and per s; NaN for a missing one
+    std: Array  # (18,) of their errors
+    gravity: float  # m/s^2 along -z
+    delay: float | None = None  # believed delay in s, or None
+    # torques (6,) that act before the first of these does, or None if unknown
     before: Array | None = None
 
     def applied_torque(self, times: Array, delay: float) -> Array:
@@ -110,9 +99,6 @@ def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bo
         mechanism: its motors' limit clips the torques of a CSV log.
         precision: of a CSV log.
         gravity: whether it acted, in a CSV log.
-
-    Raises:
-        ConfigError: one line, with the file, and row and column where there are such.
     """
     if is_run(path):
         log = _of_run(path, mechanism)
@@ -136,7 +122,6 @@ def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bo
 
 
 def _of_run(path: Path, mechanism: Mechanism) -> Log:
-    """Return the log of a run's signals."""
     signals = read_run(path)
     scenario = scenario_of(signals, path)
     try:
@@ -222,7 +207,6 @@ def _measured(measured: Array, scenario: Scenario, samples: Array) -> tuple[Arra
 
 
 def _limited(torques: Array, limit: float | str | None) -> Array:
-    """Return torques (n, 6) within the motors' limit."""
     return torques if limit is None or isinstance(limit, str) else np.clip(torques, -limit, limit)
 
 

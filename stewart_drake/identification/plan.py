@@ -52,22 +52,14 @@ _LEAST_SHARE: Final = 0.05
 
 @dataclass(frozen=True)
 class Plan:
-    """Experiment and the expected accuracy of its identification.
+    """Experiment and the expected accuracy of its identification."""
 
-    Attributes:
-        scenario: with the motion of the file `MOTION`.
-        share: part of the requested amplitude that fits the workspace.
-        times, poses: (n,) s and (n, 6) rad and m, of the motion.
-        unknowns: before the log.
-        covariance: (k, k) of the free ones after the log.
-    """
-
-    scenario: Scenario
-    share: float
-    times: Array
-    poses: Array
-    unknowns: Unknowns
-    covariance: Array
+    scenario: Scenario  # with the motion of the file `MOTION`
+    share: float  # part of the requested amplitude that fits the workspace
+    times: Array  # (n,) s, of the motion
+    poses: Array  # (n, 6) rad and m
+    unknowns: Unknowns  # before the log
+    covariance: Array  # (k, k) of the free ones after the log
 
     @cached_property
     def unseen(self) -> tuple[int, list[str]]:
@@ -139,11 +131,7 @@ def multisine(middle: Array, peak: Array, duration: float) -> tuple[Array, Array
 def fitted_multisine(
     mechanism: Mechanism, middle: Array, peak: Array, duration: float
 ) -> tuple[Array, Array, float]:
-    """Return a multisine that stays well inside the workspace, and its share of `peak`.
-
-    Raises:
-        ConfigError: not even a twentieth of it fits.
-    """
+    """Return a multisine that stays well inside the workspace, and its share of `peak`."""
     least, share = _ROOM * margin(mechanism, middle), 1.0
     while share > _LEAST_SHARE:
         time, poses = multisine(middle, share * peak, duration)
@@ -171,9 +159,6 @@ def plan(
         tolerances: of the machine, the defaults if None.
         amplitude: share of the scenario's motion.
         duration: s.
-
-    Raises:
-        ConfigError: the middle of the scenario's motion leaves no room around it.
     """
     sc, mechanism = experiment.scenario, experiment.mechanism
     instants = np.linspace(0, sc.duration, 200)

@@ -100,19 +100,12 @@ _START_SPEED: Final = 0.05  # rad/s
 
 @dataclass(frozen=True)
 class ServoModel:
-    """Machine with position servos under the setpoints of a log.
+    """Machine with position servos under the setpoints of a log."""
 
-    Attributes:
-        log: setpoints, and the measured crank angles.
-        mechanism: without armature.
-        torque_limit: of each motor, N m, infinite for none.
-        gravity: m/s^2 along -z.
-    """
-
-    log: ServoLog
-    mechanism: Mechanism
-    torque_limit: float
-    gravity: float = DEFAULT_GRAVITY
+    log: ServoLog  # setpoints, and the measured crank angles
+    mechanism: Mechanism  # without armature
+    torque_limit: float  # of each motor, N m, infinite for none
+    gravity: float = DEFAULT_GRAVITY  # m/s^2 along -z
 
     def states(self, theta: Array) -> Array | None:
         """Return states (n, 12) at the times of the log, from rest; None if the plate leaves."""
@@ -165,27 +158,16 @@ def scale_of(theta: Array) -> Array:
 
 @dataclass(frozen=True)
 class ServoIdentification:
-    """Position servos identified from a log.
+    """Position servos identified from a log."""
 
-    Attributes:
-        model: with the log.
-        theta: (8,) values found, of NAMES.
-        residuals: (m, 6) rad.
-        jacobian: (m, 6, k) by the free unknowns.
-        free: (k,) places of those in theta.
-        rounding: standard deviation of the rounding of a measured angle, rad.
-        ball_joints_tried: whether friction of the ball joints was fitted.
-        iterations: evaluations of the fit.
-    """
-
-    model: ServoModel
-    theta: Array
-    residuals: Array
-    jacobian: Array
-    free: NDArray[np.intp]
-    rounding: float
-    ball_joints_tried: bool
-    iterations: int
+    model: ServoModel  # with the log
+    theta: Array  # (8,) values found, of NAMES
+    residuals: Array  # (m, 6) rad
+    jacobian: Array  # (m, 6, k) by the free unknowns
+    free: NDArray[np.intp]  # (k,) places of those in theta
+    rounding: float  # standard deviation of the rounding of a measured angle, rad
+    ball_joints_tried: bool  # whether friction of the ball joints was fitted
+    iterations: int  # evaluations of the fit
 
     @property
     def residual(self) -> float:
@@ -368,9 +350,6 @@ def identify_servos(
         mechanism: with its masses; `effort_limit` is the motors' torque limit.
         rounding: standard deviation of the rounding of a measured angle, rad.
         gravity: m/s^2 along -z.
-
-    Raises:
-        ConfigError: no motion, or no numbers with which the plate stays in its workspace.
     """
     for name, angles in (("setpoints", log.setpoints), ("crank angles", log.cranks)):
         if not np.ptp(angles, axis=0).max() > 20 * rounding:

@@ -24,21 +24,13 @@ _LONGEST_GAP: Final = 0.1  # s
 
 
 class ServoLog(NamedTuple):
-    """Log of position servos: what was sent and what came back, by one clock.
+    """Log of position servos: what was sent and what came back, by one clock."""
 
-    Attributes:
-        name: of the file.
-        times: (n,) increasing, s, at which a setpoint was sent and an angle was received.
-        setpoints: (n, 6) rad, each until the next one.
-        cranks: (n, 6) rad.
-        poses: (n, 6) of the plate, from the cranks; rad and m.
-    """
-
-    name: str
-    times: Array
-    setpoints: Array
-    cranks: Array
-    poses: Array
+    name: str  # of the file
+    times: Array  # (n,) increasing, s, at which a setpoint was sent and an angle was received
+    setpoints: Array  # (n, 6) rad, each until the next one
+    cranks: Array  # (n, 6) rad
+    poses: Array  # (n, 6) of the plate, from the cranks; rad and m
 
 
 def is_servo_log(path: Path) -> bool:
@@ -50,11 +42,6 @@ def is_servo_log(path: Path) -> bool:
 
 
 def read_servo_log(path: Path, mechanism: Mechanism) -> ServoLog:
-    """Read a log.
-
-    Raises:
-        ConfigError: one line, with the file, and row and column where there are such.
-    """
     table = read_table(path, _EXPECTED, _HEADER, _UNITS)
     times = table.stacked(["time"])[:, 0]
     setpoints, cranks = table.stacked(SETPOINTS), table.stacked(CRANKS)
@@ -78,11 +65,7 @@ def servo_log(
     mechanism: Mechanism,
     table: Table | None = None,
 ) -> ServoLog:
-    """Return a log with its poses; angles of any turn, the arrays of `ServoLog`.
-
-    Raises:
-        ConfigError: the cranks have no pose; with the row of a table, if there is one.
-    """
+    """Return a log with its poses; angles of any turn, the arrays of `ServoLog`."""
     cranks = turned(np.unwrap(cranks, axis=0), mechanism.crank_angles(mechanism.home))
     cranks = np.unwrap(cranks, axis=0)
     poses, pose = np.empty_like(cranks), mechanism.home

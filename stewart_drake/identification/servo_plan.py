@@ -47,19 +47,13 @@ _USED: Final = 0.9  # share of the torque limit
 
 @dataclass(frozen=True)
 class ServoPlan:
-    """Setpoints for a log, and the expected accuracy of its identification.
+    """Setpoints for a log, and the expected accuracy of its identification."""
 
-    Attributes:
-        shares: of the three motions, of the size asked for.
-        expected: at the scenario's numbers, for a log of them with rounded angles.
-        peak_torque: N m, with the scenario's numbers.
-        peak_speed: of a crank, rad/s.
-    """
-
-    shares: tuple[float, ...]
+    shares: tuple[float, ...]  # of the three motions, of the size asked for
+    # at the scenario's numbers, for a log of them with rounded angles
     expected: ServoIdentification
-    peak_torque: float
-    peak_speed: float
+    peak_torque: float  # N m, with the scenario's numbers
+    peak_speed: float  # of a crank, rad/s
 
     @property
     def log(self) -> ServoLog:

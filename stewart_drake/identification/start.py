@@ -35,11 +35,7 @@ _LEAST_WINDOWS: Final = 8
 
 
 def measured_poses(log: Log, mechanism: Mechanism) -> Array:
-    """Return the plate's poses (n, 6) at the log's instants, measured or from the crank angles.
-
-    Raises:
-        ConfigError: no pose of this mechanism has such angles, or there are too few whole poses.
-    """
+    """Return the plate's poses (n, 6) at the log's instants, measured or from the crank angles."""
     poses, last = log.values[:, POSE].copy(), mechanism.home
     for row in range(len(poses)):
         angles = log.values[row, ANGLES]

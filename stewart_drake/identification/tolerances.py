@@ -17,27 +17,19 @@ class Tolerances:
 
     None is for bias and Coulomb friction the largest commanded torque, for viscous friction this
     torque at the largest crank speed, for the payload the mass of the plate, anywhere on it.
-
-    Attributes:
-        lengths: of cranks and rods.
-        joints: of each coordinate of a shaft's centre and a plate joint.
-        offsets: of an encoder's zero; without encoders in the log there are none.
-        delay: of the believed delay.
-        bias: of each motor's torque.
-        payload: its mass.
-        position: of each coordinate of the payload in the plate.
-        damping: viscous friction of a crank.
-        coulomb: Coulomb friction of a crank.
     """
 
     lengths: Annotated[_Std, Field(description="m, of cranks and rods")] = 2e-4
     joints: Annotated[_Std, Field(description="m, of each coordinate of shafts and joints")] = 2e-4
+    # of an encoder's zero; without encoders in the log there are none
     offsets: Annotated[_Std, Field(description="rad, of an encoder's zero")] = 2e-3
-    delay: Annotated[_Std, Field(description="s")] = 0.3
+    delay: Annotated[_Std, Field(description="s")] = 0.3  # of the believed delay
     bias: Annotated[_Std | None, Field(description="N m, of each motor")] = None
-    payload: Annotated[_Std | None, Field(description="kg")] = None
+    payload: Annotated[_Std | None, Field(description="kg")] = None  # its mass
     position: Annotated[_Std | None, Field(description="m, of the payload in the plate")] = None
+    # viscous friction of a crank
     damping: Annotated[_Std | None, Field(description="N m s/rad, of a crank")] = None
+    # Coulomb friction of a crank
     coulomb: Annotated[_Std | None, Field(description="N m, of a crank")] = None
 
 

@@ -55,17 +55,11 @@ ONE_SIDED: Final = (DAMPING, COULOMB)  # unknowns that are not negative
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Prior of the unknowns.
+    """Prior of the unknowns."""
 
-    Attributes:
-        mechanism: as drawn.
-        mean: (NUM_UNKNOWNS,) in SI units.
-        std: (NUM_UNKNOWNS,), 0 for known ones.
-    """
-
-    mechanism: Mechanism
-    mean: Array
-    std: Array
+    mechanism: Mechanism  # as drawn
+    mean: Array  # (NUM_UNKNOWNS,) in SI units
+    std: Array  # (NUM_UNKNOWNS,), 0 for known ones
 
     @property
     def free(self) -> NDArray[np.intp]:
@@ -85,7 +79,6 @@ class Unknowns:
         return found
 
     def without_encoders(self) -> "Unknowns":
-        """Return the unknowns without offsets of encoders."""
         std = self.std.copy()
         std[OFFSETS] = 0.0
         return dataclasses.replace(self, std=std)

@@ -55,21 +55,14 @@ class Link:
 
     A request without an answer counts as half a datagram lost there and half an answer lost on the
     way back: the machine keeps no state of requests.
-
-    Attributes:
-        trips: last round trips, s of the machine's clock, without the time for which it held a
-            datagram.
-        sent: number of datagrams whose fate is known.
-        lost: number of them that did not arrive.
-        missed: number of measurements that did not come, by their sequence.
-        came: number of measurements that came.
     """
 
+    # last round trips, s, without the time for which the machine held a datagram
     trips: deque[float] = field(default_factory=lambda: deque(maxlen=_TRIPS))
-    sent: int = 0
-    lost: float = 0
-    missed: float = 0
-    came: int = 0
+    sent: int = 0  # number of datagrams whose fate is known
+    lost: float = 0  # number of them that did not arrive
+    missed: float = 0  # number of measurements that did not come, by their sequence
+    came: int = 0  # number of measurements that came
 
     @property
     def typical(self) -> float:
@@ -116,10 +109,8 @@ class Contact:
         identity: identity of the machine that the controller is designed for.
 
     Attributes:
-        link: see `Link`.
         last: newest message of the machine by its sequence, or None.
         offered: nonce of the newest offer; 0 without one.
-        session: see `live.endpoint.Session`.
         heard: own clock when the last message was accepted, ns.
     """
 
@@ -182,7 +173,6 @@ class Contact:
         return head.sequence
 
     def has_arrived(self, sequence: int) -> bool:
-        """Return whether the machine has acknowledged a datagram."""
         return self._pending.get(sequence, False)
 
     def wait(self, until: int) -> Iterator[MachineMessage]:
@@ -255,11 +245,7 @@ class Contact:
         return max((p - soonest for p in self._phases if p - soonest <= longest), default=0.0)
 
     def _check_identity(self) -> None:
-        """Refuse a machine that the controller is not designed for.
-
-        Raises:
-            ConfigError: the parts that differ, of both sides.
-        """
+        """Refuse a machine that the controller is not designed for."""
         offered = None if self.last is None else self.last.identity
         differs = None if offered is None else offered.differing(self.identity)
         if differs is not None:
@@ -272,11 +258,7 @@ class Contact:
 
 
 def address_of(text: str, option: str = "--machine") -> Address:
-    """Return the address of HOST:PORT, which an option names.
-
-    Raises:
-        ConfigError: not of this form, or an unknown host.
-    """
+    """Return the address of HOST:PORT, which an option names."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise ConfigError(f"{option}: got {text!r}; expected HOST:PORT, such as 127.0.0.1:7000")
@@ -286,11 +268,7 @@ def address_of(text: str, option: str = "--machine") -> Address:
 
 
 def open_endpoint(address: Address, key: bytes | None) -> Endpoint:
-    """Return a socket for a controller of the machine at an address.
-
-    Raises:
-        ConfigError: an address beyond loopback without a key.
-    """
+    """Return a socket for a controller of the machine at an address."""
     if key is None and not is_loopback(address[0]):
         raise ConfigError(
             f"--machine: got {address[0]} without a key; expected a loopback address, or --key FILE"
@@ -300,11 +278,7 @@ def open_endpoint(address: Address, key: bytes | None) -> Endpoint:
 
 
 def call(contact: Contact) -> MachineMessage:
-    """Request a session until the machine offers one and the link is known; return its offer.
-
-    Raises:
-        ConfigError: no answer, or a machine that the controller is not designed for.
-    """
+    """Request a session until the machine offers one and the link is known; return its offer."""
     began, first, where = now(), 0, contact.where
     while True:
         came = contact.ask()
@@ -327,11 +301,7 @@ def call(contact: Contact) -> MachineMessage:
 
 
 def await_free(contact: Contact) -> None:
-    """Wait for a new offer of a machine that no other controller drives.
-
-    Raises:
-        ConfigError: another controller still drives it, or the machine is silent.
-    """
+    """Wait for a new offer of a machine that no other controller drives."""
     contact.forget_waiting()
     began, last, where = now(), contact.last, contact.where
     assert last is not None

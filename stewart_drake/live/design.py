@@ -62,28 +62,16 @@ Learned = Callable[[], LearnedSignal] | None
 
 
 class Design(NamedTuple):
-    """Law and settings of a controller before its start.
+    """Law and settings of a controller before its start."""
 
-    Attributes:
-        experiment: experiment of the scenario over the measured link.
-        law: control law, `PredictiveLqi` or `ServoPreview`.
-        planned: its reference from the scenario's start.
-        queue: torques (L, 6) in flight at the begin.
-        repeats: number of torques that a packet repeats.
-        torque_limit: tighter limit of the scenario and the machine, N m.
-        step: time of a step of the law here, s, and the name of its implementation.
-        rows: number of setpoints of a plan for servos.
-        learned: see `Learned`.
-    """
-
-    experiment: Experiment
-    law: Any
-    planned: Trajectory
-    queue: Array
-    repeats: int
-    torque_limit: float
-    step: tuple[float, str]
-    rows: int = 1
+    experiment: Experiment  # experiment of the scenario over the measured link
+    law: Any  # control law, `PredictiveLqi` or `ServoPreview`
+    planned: Trajectory  # its reference from the scenario's start
+    queue: Array  # torques (L, 6) in flight at the begin
+    repeats: int  # number of torques that a packet repeats
+    torque_limit: float  # tighter limit of the scenario and the machine, N m
+    step: tuple[float, str]  # time of a step of the law here, s, and the name of its implementation
+    rows: int = 1  # number of setpoints of a plan for servos
     learned: Learned = None
 
     @property
@@ -98,11 +86,7 @@ class Design(NamedTuple):
 
 
 def check_controller(scenario: Scenario) -> None:
-    """Refuse a scenario with a tuner, or with servos that need more than a setpoint.
-
-    Raises:
-        ConfigError: such a scenario.
-    """
+    """Refuse a scenario with a tuner, or with servos that need more than a setpoint."""
     accepted = {"tuner.kind": "fixed", "actuator.kind": ("torque", "position_servo")}
     if found := differing(scenario, accepted):
         raise ConfigError(found.problem("for live"))
@@ -121,9 +105,6 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
             torque.
         link: measured link.
         machine: message of the machine.
-
-    Raises:
-        ConfigError: round trips longer than that time.
     """
     loss = max(scenario.sensor.loss, link.loss_back)
     sensor = replace(scenario.sensor, delay=0.0, loss=loss, faults=[])
@@ -198,9 +179,6 @@ def design(scenario: Scenario, machine: MachineMessage, learned: Learned = None)
         scenario: as `as_seen` returns it.
         machine: message of the machine.
         learned: see `Learned`.
-
-    Raises:
-        ConfigError: see `loop.preparation.prepare` and `control_law`.
     """
     experiment = prepare(scenario)
     if scenario.controller.command == "cranks":

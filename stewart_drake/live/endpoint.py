@@ -110,24 +110,17 @@ class Endpoint:
 
     @property
     def address(self) -> Address:
-        """Address of the socket."""
         host, port = self._socket.getsockname()
         return host, port
 
     def fileno(self) -> int:
-        """Return the descriptor, for `select`."""
         return self._socket.fileno()
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
     def send(self, message: Message, to: Address) -> bool:
-        """Send a message; return whether the system took it.
-
-        Raises:
-            ConfigError: an address beyond loopback without a key.
-        """
+        """Send a message; return whether the system took it."""
         self._check_reach(to[0], "machine")
         try:
             self._socket.sendto(encode(message, self._key), to)
@@ -137,7 +130,6 @@ class Endpoint:
         return True
 
     def refuse(self, cause: Refusal, detail: str = "") -> None:
-        """Count a refused datagram."""
         self.refused[cause] += 1
         self.refusal = f"{cause.value}: {detail}" if detail else cause.value
 
@@ -170,11 +162,7 @@ class Endpoint:
 
 
 def read_key(path: Path | None) -> bytes | None:
-    """Return the key in a file, without line breaks at its end; None without a file.
-
-    Raises:
-        ConfigError: a file that cannot be read, or a key that is too short or too long.
-    """
+    """Return the key in a file, without line breaks at its end; None without a file."""
     if path is None:
         return None
     try:
@@ -201,15 +189,10 @@ def is_loopback(host: str) -> bool:
 
 @dataclass
 class Window:
-    """Sequence numbers that have come, of the last WINDOW.
+    """Sequence numbers that have come, of the last WINDOW."""
 
-    Attributes:
-        newest: the newest, 0 for none.
-        seen: bit i is set if `newest` - i has come.
-    """
-
-    newest: int = 0
-    seen: int = 0
+    newest: int = 0  # the newest, 0 for none
+    seen: int = 0  # bit i is set if `newest` - i has come
 
     def take(self, sequence: int) -> Refusal | None:
         """Note a number; return why it is refused, or None."""
@@ -228,21 +211,13 @@ class Window:
 
 @dataclass
 class Session:
-    """One side's view of a session.
+    """One side's view of a session."""
 
-    Attributes:
-        number: random number of the controller.
-        address: address of the other side.
-        nonce: random number of the machine; 0 before its offer.
-        window: sequence numbers that have come.
-        heard: own clock when the last datagram was accepted, ns; 0 for none.
-    """
-
-    number: int
-    address: Address
-    nonce: int = 0
-    window: Window = field(default_factory=Window)
-    heard: int = 0
+    number: int  # random number of the controller
+    address: Address  # address of the other side
+    nonce: int = 0  # random number of the machine; 0 before its offer
+    window: Window = field(default_factory=Window)  # sequence numbers that have come
+    heard: int = 0  # own clock when the last datagram was accepted, ns; 0 for none
     _sent: int = 0
     _echo: int = 0
     _got: int = 0

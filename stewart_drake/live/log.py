@@ -41,9 +41,6 @@ class RowFile:
         path: file, which is replaced; None for a temporary one.
         header: cells of the first line.
         say: prints a line.
-
-    Raises:
-        ConfigError: the file cannot be opened.
     """
 
     def __init__(

@@ -29,6 +29,7 @@ from stewart_drake.live.checks import LONGEST_GAP, ReportCheck, stays_within_rea
 from stewart_drake.live.contact import Contact, await_free
 from stewart_drake.live.design import Design
 from stewart_drake.live.endpoint import STALL, now
+from stewart_drake.live.governor import Request, Steering, Way
 from stewart_drake.live.log import LiveRecord
 from stewart_drake.live.protocol import (
     NEVER,
@@ -39,7 +40,6 @@ from stewart_drake.live.protocol import (
     MachineMessage,
     Refusal,
 )
-from stewart_drake.live.steering import Request, Steering, Way
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.peer import Fault
 from stewart_drake.loop.recording import has_measured
@@ -113,42 +113,26 @@ class End(NamedTuple):
 
     @property
     def advice(self) -> str:
-        """What to do next; empty after a run that was not lost."""
+        """Advice after a run that was lost; else empty."""
         return _ADVICE.get(self.status, "")
 
 
 class Snapshot(NamedTuple):
-    """The loop at a sample.
+    """The loop at a sample."""
 
-    Attributes:
-        time: time since the begin, s.
-        state: estimated state (12,).
-        wanted: reference (18,).
-        torque: torque that acts (6,), N m.
-        error: mean pose error, % of peak to peak.
-        eta: delay from a measurement to its torque as the law assumes it, s.
-        trip: median round trip, s.
-        spread: standard deviation of the round trips, s.
-        lost: share of the datagrams that are lost, there and back.
-        missed: number of missed deadlines.
-        safe: why the safe torque acts, or None.
-        by_hand: whether the target is set by hand.
-        limit: limit that prevents the requested motion, or None.
-    """
-
-    time: float
-    state: Array
-    wanted: Array
-    torque: Array
-    error: float
-    eta: float
-    trip: float
-    spread: float
-    lost: float
-    missed: int
-    safe: str | None
-    by_hand: bool
-    limit: str | None
+    time: float  # time since the begin, s
+    state: Array  # estimated state (12,)
+    wanted: Array  # reference (18,)
+    torque: Array  # torque that acts (6,), N m
+    error: float  # mean pose error, % of peak to peak
+    eta: float  # delay from a measurement to its torque as the law assumes it, s
+    trip: float  # median round trip, s
+    spread: float  # standard deviation of the round trips, s
+    lost: float  # share of the datagrams that are lost, there and back
+    missed: int  # number of missed deadlines
+    safe: str | None  # why the safe torque acts, or None
+    by_hand: bool  # whether the target is set by hand
+    limit: str | None  # limit that prevents the requested motion, or None
 
 
 class Viewer:
@@ -175,22 +159,16 @@ class Viewer:
 
 @dataclass
 class Timing:
-    """Timing of the loop.
+    """Timing of the loop."""
 
-    Attributes:
-        samples: number of steps.
-        late: delay of the last step, s: from the earliest arrival of its measurement until its
-            torques were sent. It includes the jitter of the link and the wait for a lost datagram.
-        resting: the same of the steps that bring the plate to rest, which are not recorded.
-        missed: number of steps whose delay exceeded a period and the usual jitter.
-        overtaken: number of measurements that came after their step.
-    """
-
-    samples: int = 0
+    samples: int = 0  # number of steps
+    # delay of the last step, s: from the earliest arrival of its measurement until its torques were
+    # sent. It includes the jitter of the link and the wait for a lost datagram.
     late: float = math.nan
+    # the same of the steps that bring the plate to rest, which are not recorded
     resting: list[float] = field(default_factory=list)
-    missed: int = 0
-    overtaken: int = 0
+    missed: int = 0  # number of steps whose delay exceeded a period and the usual jitter
+    overtaken: int = 0  # number of measurements that came after their step
 
     def summary(self, recorded: Array) -> dict[str, Any]:
         """Return entries of summary.json, from `late` (n,) of the recorded steps."""
@@ -232,7 +210,6 @@ class LiveLoop:
 
     Attributes:
         record: record of the run.
-        timing: see `Timing`.
         memory: memory of the law after the last sample.
         recoveries: number of new references that were planned.
         taken_over: whether the plate was not at the scenario's start.

@@ -60,11 +60,7 @@ FURTHEST: Final = 3600 * SECOND
 
 
 def check_scenario(scenario: Scenario) -> None:
-    """Refuse a scenario that the protocol does not cover.
-
-    Raises:
-        ConfigError: servos given by their bandwidth, or too many samples of encoders.
-    """
+    """Refuse a scenario that the protocol does not cover."""
     if found := differing(scenario, {"actuator.kind": ("torque", "position_servo")}):
         raise ConfigError(found.problem("for a machine", ", which a controller sends"))
     samples = scenario.sensor.samples
@@ -112,7 +108,6 @@ class Machine:
     Args:
         experiment: prepared scenario that passes `check_scenario`.
         endpoint: socket.
-        settings: see `Settings`.
         say: prints a line.
         clock: monotonic clock, ns.
         log: gets the true state, the acting torque and the measurement at each sample of a run, by
@@ -293,7 +288,6 @@ class Machine:
         )
 
     def _fail(self, reason: Reason, time: int) -> None:
-        """Set the reason why torques do not act."""
         if self.reason.fault:
             self._precede(self.reason, time)
         if time - self._preceded > RECENT:

@@ -19,8 +19,8 @@ import numpy as np
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import jsonable
+from stewart_drake.live.governor import Request
 from stewart_drake.live.loop import End, Snapshot, Viewer
-from stewart_drake.live.steering import Request
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.reporting.local_page import LocalHandler, LocalServer
 from stewart_drake.reporting.page import environment
@@ -55,12 +55,7 @@ class PageRequest(NamedTuple):
 
 
 class PageViewer(Viewer):
-    """The page, in a separate process.
-
-    Args:
-        mechanism: mechanism to draw.
-        title: title of the page.
-    """
+    """The page, in a separate process."""
 
     def __init__(self, mechanism: Mechanism, title: str) -> None:
         context = multiprocessing.get_context("spawn")
@@ -71,11 +66,7 @@ class PageViewer(Viewer):
         self._request, self._stop, self._open, self._ready = Request(), False, True, True
 
     def opened(self) -> str:
-        """Wait for the page; return its address with the token. To be called once.
-
-        Raises:
-            ConfigError: the page's process did not start.
-        """
+        """Wait for the page; return its address with the token. To be called once."""
         with suppress(EOFError):
             if self._connection.poll(_START):
                 return str(self._connection.recv().url)
@@ -103,7 +94,6 @@ class PageViewer(Viewer):
                 self._connection.send(end)
 
     def close(self) -> None:
-        """End the page's process."""
         self._connection.close()
         self._process.join(2.0)
         if self._process.is_alive():
@@ -139,7 +129,6 @@ class Readouts:
         self._text, self._number = "{}", 0
 
     def put(self, values: dict[str, Any]) -> None:
-        """Replace the readouts."""
         with self._changed:
             self._text = json.dumps(jsonable(values), allow_nan=False)
             self._number += 1

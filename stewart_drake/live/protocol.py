@@ -133,78 +133,45 @@ NOTHING: Final = ControllerFlags(0)
 
 @dataclass(frozen=True)
 class Head:
-    """Head of every datagram.
+    """Head of every datagram."""
 
-    Attributes:
-        session: random number of the controller, not 0.
-        nonce: nonce of the machine's offer; 0 in a first request and in its refusal.
-        sequence: number of the sender's datagram in the session, from 1 on.
-        acknowledged: newest sequence received from the other side, 0 for none.
-        time: sender's clock at sending, ns.
-        echo: `time` of the acknowledged datagram.
-        held: time since its arrival, ns.
-    """
-
-    session: int
-    nonce: int
-    sequence: int
-    acknowledged: int
-    time: int
-    echo: int
-    held: int
+    session: int  # random number of the controller, not 0
+    nonce: int  # nonce of the machine's offer; 0 in a first request and in its refusal
+    sequence: int  # number of the sender's datagram in the session, from 1 on
+    acknowledged: int  # newest sequence received from the other side, 0 for none
+    time: int  # sender's clock at sending, ns
+    echo: int  # `time` of the acknowledged datagram
+    held: int  # time since its arrival, ns
 
 
 @dataclass(frozen=True, eq=False)
 class MachineMessage:
-    """A measurement and a report, machine to controller.
-
-    Attributes:
-        head: see `Head`.
-        flags: see `MachineFlags`.
-        sampled: time of the measurement (of its last sample), ns.
-        begin: time at which the run began or will begin, ns, or NEVER.
-        period: sampling period, ns.
-        watchdog: silence after which the safe torque acts, ns.
-        rate: seconds of the machine's clock in a second.
-        torque_limit: limit of each motor at the machine, N m; may be infinite.
-        arrived: whether the datagram `acknowledged` - i has arrived, (64,).
-        acted_from: time at which the first row of `acted` began to act, ns; NEVER without rows.
-        acted: torques (h, 6) that acted, N m; row i acted i periods before the first.
-        cranks: whether the rows of `acted` are setpoints of the cranks, rad.
-        played: number of periods with a torque of a plan.
-        dry: number of periods without one.
-        refused: number of refused datagrams.
-        state: pose and rates (12,) in rad, m, rad/s, m/s, NaN for missing values; or None.
-        codes: encoder codes (N, 6), int32, the oldest first, MISSING for missing ones; or None.
-        bits: bits of a turn of an encoder, 0 without encoders.
-        zeros: crank angles (6,) at code 0, rad; or None.
-        identity: identity of the machine, in the answer to a request; or None.
-        reason: why torques do not act.
-        before: fault that preceded it; its `leg` is 0.
-    """
+    """A measurement and a report, machine to controller."""
 
     head: Head
     flags: MachineFlags
-    sampled: int
-    begin: int
-    period: int
-    watchdog: int
-    rate: float
-    torque_limit: float
-    arrived: NDArray[np.bool_]
-    acted_from: int
-    acted: Array
-    played: int = 0
-    dry: int = 0
-    refused: int = 0
+    sampled: int  # time of the measurement (of its last sample), ns
+    begin: int  # time at which the run began or will begin, ns, or NEVER
+    period: int  # sampling period, ns
+    watchdog: int  # silence after which the safe torque acts, ns
+    rate: float  # seconds of the machine's clock in a second
+    torque_limit: float  # limit of each motor at the machine, N m; may be infinite
+    arrived: NDArray[np.bool_]  # whether the datagram `acknowledged` - i has arrived, (64,)
+    acted_from: int  # time at which the first row of `acted` began to act, ns; NEVER without rows
+    acted: Array  # torques (h, 6) that acted, N m; row i acted i periods before the first
+    played: int = 0  # number of periods with a torque of a plan
+    dry: int = 0  # number of periods without one
+    refused: int = 0  # number of refused datagrams
+    # pose and rates (12,) in rad, m, rad/s, m/s, NaN for missing values; or None
     state: Array | None = None
+    # encoder codes (N, 6), int32, the oldest first, MISSING for missing ones; or None
     codes: NDArray[np.int32] | None = None
-    bits: int = 0
-    zeros: Array | None = None
-    identity: Identity | None = None
-    reason: Reason = NO_FAULT
-    before: Reason = NO_FAULT
-    cranks: bool = False
+    bits: int = 0  # bits of a turn of an encoder, 0 without encoders
+    zeros: Array | None = None  # crank angles (6,) at code 0, rad; or None
+    identity: Identity | None = None  # identity of the machine, in the answer to a request; or None
+    reason: Reason = NO_FAULT  # why torques do not act
+    before: Reason = NO_FAULT  # fault that preceded it; its `leg` is 0
+    cranks: bool = False  # whether the rows of `acted` are setpoints of the cranks, rad
 
     def __eq__(self, other: object) -> bool:
         return _equal(self, other)
@@ -225,27 +192,19 @@ class MachineMessage:
 
 @dataclass(frozen=True, eq=False)
 class ControllerMessage:
-    """Torques for coming periods, controller to machine.
-
-    Attributes:
-        head: see `Head`.
-        flags: see `ControllerFlags`.
-        sampled: time of the sample that the torques were computed for, ns.
-        playout: time at which the first row acts, ns; each row acts for a period.
-        begin: requested begin of the run, ns, or NEVER; every datagram with torques has it.
-        torques: torques (rows, 6), N m; without rows the datagram only shows presence.
-        identity: identity of the machine that the controller is designed for, in a request.
-        cranks: whether the rows of `torques` are setpoints of the cranks, rad.
-    """
+    """Torques for coming periods, controller to machine."""
 
     head: Head
     flags: ControllerFlags = NOTHING
-    sampled: int = 0
-    playout: int = 0
+    sampled: int = 0  # time of the sample that the torques were computed for, ns
+    playout: int = 0  # time at which the first row acts, ns; each row acts for a period
+    # requested begin of the run, ns, or NEVER; every datagram with torques has it
     begin: int = NEVER
+    # torques (rows, 6), N m; without rows the datagram only shows presence
     torques: Array = field(default_factory=lambda: np.empty((0, NUM_TORQUES)))
+    # identity of the machine that the controller is designed for, in a request
     identity: Identity | None = None
-    cranks: bool = False
+    cranks: bool = False  # whether the rows of `torques` are setpoints of the cranks, rad
 
     def __eq__(self, other: object) -> bool:
         return _equal(self, other)

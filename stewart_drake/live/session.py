@@ -21,11 +21,10 @@ from stewart_drake.live.design import (
     read_learned,
 )
 from stewart_drake.live.endpoint import Address, Endpoint
-from stewart_drake.live.governor import FASTEST, PACE, Governor
+from stewart_drake.live.governor import FASTEST, PACE, Governor, Steering, Way
 from stewart_drake.live.loop import CrankLoop, LiveLoop, Viewer
 from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerFlags, MachineFlags
-from stewart_drake.live.steering import Steering, Way
 from stewart_drake.loop.cautions import overconfidence
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.peer import identity_of
@@ -45,19 +44,12 @@ _MOST: Final = 0.5
 
 
 class Ready(NamedTuple):
-    """A machine that was found, and the law for it, before anything moves.
-
-    Attributes:
-        endpoint: socket.
-        contact: contact with the machine.
-        design: law for the scenario over the link that was found.
-        margin: stability margin of the loop with a constant delay eta.
-    """
+    """A machine that was found, and the law for it, before anything moves."""
 
     endpoint: Endpoint
     contact: Contact
-    design: Design
-    margin: ControllerMargin
+    design: Design  # law for the scenario over the link that was found
+    margin: ControllerMargin  # stability margin of the loop with a constant delay eta
 
     @property
     def simulated(self) -> bool:
@@ -213,11 +205,7 @@ def _queue_advice(scenario: Scenario) -> str | None:
 
 
 def check_armed(ready: Ready, armed: bool) -> None:
-    """Refuse a real machine without --arm.
-
-    Raises:
-        ConfigError: a real machine, not armed.
-    """
+    """Refuse a real machine without --arm."""
     if not ready.simulated and not armed:
         ready.endpoint.close()
         raise ConfigError(
@@ -227,11 +215,7 @@ def check_armed(ready: Ready, armed: bool) -> None:
 
 
 def check_jitter(ready: Ready, accepted: bool) -> None:
-    """Refuse a link with more jitter than the loop is stable for, unless that is accepted.
-
-    Raises:
-        ConfigError: too much jitter, not accepted.
-    """
+    """Refuse a link with more jitter than the loop is stable for, unless that is accepted."""
     problem = ready.jitter_problem
     if problem is not None and not accepted:
         ready.endpoint.close()

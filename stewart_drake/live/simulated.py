@@ -74,21 +74,13 @@ def _by_number(times: Array) -> Callable[[int], int | None]:
 
 
 class Plan(NamedTuple):
-    """Torques of a datagram.
+    """Torques of a datagram."""
 
-    Attributes:
-        sequence: sequence of the datagram; 0 for torques in flight at the begin.
-        sampled: time of the sample that they were computed for.
-        sample: number of that sample, from the begin on.
-        playout: time at which the first row acts.
-        torques: torques (n, 6), N m.
-    """
-
-    sequence: int
-    sampled: int
-    sample: int
-    playout: int
-    torques: Array
+    sequence: int  # sequence of the datagram; 0 for torques in flight at the begin
+    sampled: int  # time of the sample that they were computed for
+    sample: int  # number of that sample, from the begin on
+    playout: int  # time at which the first row acts
+    torques: Array  # torques (n, 6), N m
 
 
 class Motors:
@@ -103,9 +95,6 @@ class Motors:
         holds: whether a dry buffer holds the last torque; otherwise it outputs zero.
         delay_of: delay of the torque of sample k on a wire; None for a buffer.
         cranks: whether rows are setpoints of servos, in rad, which are never zero for lack of one.
-
-    Attributes:
-        cranks: see above.
     """
 
     def __init__(

@@ -40,7 +40,7 @@ from stewart_drake.loop.law_design import (
     sizing_of,
     way_onto,
 )
-from stewart_drake.loop.link import buffer_places, measurement_link
+from stewart_drake.loop.link import begun, buffer_places, measurement_link
 from stewart_drake.loop.preparation import Experiment, assemble, network_of, prepare
 from stewart_drake.loop.results import Figures, SimulationResult, accumulated_error, figures
 from stewart_drake.loop.sensor import white_noises
@@ -104,21 +104,13 @@ MakeTuner = Callable[[Experiment, PredictiveLqi], WeightsSource | None]
 
 
 class Instants(NamedTuple):
-    """Instants of a run at which Drake's simulator records and samples.
+    """Instants of a run at which Drake's simulator records and samples."""
 
-    Attributes:
-        nominal: (n,) s, of the record.
-        looks: (n,) s, at which the state is recorded.
-        on_grid: (n,) whether the metric counts each.
-        sampled: (n,) whether the controller samples at each.
-        samples: (k,) s, of the controller's samples.
-    """
-
-    nominal: Array
-    looks: Array
-    on_grid: NDArray[np.bool_]
-    sampled: NDArray[np.bool_]
-    samples: Array
+    nominal: Array  # (n,) s, of the record
+    looks: Array  # (n,) s, at which the state is recorded
+    on_grid: NDArray[np.bool_]  # (n,) whether the metric counts each
+    sampled: NDArray[np.bool_]  # (n,) whether the controller samples at each
+    samples: Array  # (k,) s, of the controller's samples
 
 
 def instants_of(duration: float, period: float) -> Instants:
@@ -149,31 +141,22 @@ def uncovered(scenario: Scenario) -> str | None:
 
 
 class Ending(NamedTuple):
-    """End of a run.
+    """End of a run."""
 
-    Attributes:
-        status: as of `loop.results.RunSummary`.
-        stopped: when and why it did not complete, or None.
-        figures: figures of merit.
-        counts: number of survived problems by name, as in the summary.
-        samples: (k, 18) at the controller's samples [measurement - reference (12); torque that the
-            law asked for (6)], in rad, m, rad/s, m/s and N m.
-        error_so_far: E_ac in % s up to the end, complete or not; NaN where nothing ran.
-        weights: (k, 2) w_Q and w_R at the samples.
-        rows: (k, n) row of the tuner's window for each sample (core/tuner.c); n = 0 without a
-            tuner, and in Drake's loop.
-        loop: `native`, or the other loop and the field that made it necessary; empty if the true
-            machine cannot take the start pose.
-    """
-
-    status: str
-    stopped: Failure | None
+    status: str  # as of `loop.results.RunSummary`
+    stopped: Failure | None  # when and why it did not complete, or None
     figures: Figures
-    counts: dict[str, int]
+    counts: dict[str, int]  # number of survived problems by name, as in the summary
+    # (k, 18) at the controller's samples [measurement - reference (12); torque that the law asked
+    # for (6)], in rad, m, rad/s, m/s and N m
     samples: Array
-    error_so_far: float
-    weights: Array
+    error_so_far: float  # E_ac in % s up to the end, complete or not; NaN where nothing ran
+    weights: Array  # (k, 2) w_Q and w_R at the samples
+    # (k, n) row of the tuner's window for each sample (core/tuner.c); n = 0 without a tuner, and in
+    # Drake's loop
     rows: Array
+    # `native`, or the other loop and the field that made it necessary; empty if the true machine
+    # cannot take the start pose
     loop: str
 
 
@@ -181,38 +164,24 @@ class Ending(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """One run, ready to begin.
-
-    Attributes:
-        experiment: the experiment.
-        law: the control law.
-        planned: motion that it follows.
-        previews: (k, p, 18) rows of that motion at each sample.
-        tuner: tuner of the weights, None for fixed ones.
-        motions: pieces of `planned` and of the reference (`pieces_of`), for a law that reads them
-            at any instant, else empty.
-    """
+    """One run, ready to begin."""
 
     experiment: Experiment
     law: PredictiveLqi | ServoPreview
-    planned: Trajectory
-    previews: Array
-    tuner: WeightsSource | None
+    planned: Trajectory  # motion that it follows
+    previews: Array  # (k, p, 18) rows of that motion at each sample
+    tuner: WeightsSource | None  # tuner of the weights, None for fixed ones
+    # pieces of `planned` and of the reference (`pieces_of`), for a law that reads them at any
+    # instant, else empty
     motions: tuple[tuple[Array, Array], ...] = ()
 
 
 class Preparation:
     """Common part of the runs of all scenarios that differ in `_DRAWN` and the true machine only.
 
-    Args:
-        scenario: one of them.
-
     Attributes:
         when: instants of a run.
         references: (n, 12) pose and rates of the reference at its looks.
-
-    Raises:
-        ConfigError: as `prepare`.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -226,21 +195,13 @@ class Preparation:
         self.references = np.array([evaluate(reference, t)[:NUM_STATE] for t in self.when.looks])
 
     def experiment(self, scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
-        """Return the result of `prepare` for a scenario.
-
-        Raises:
-            ConfigError: the scenario's fields contradict each other.
-        """
+        """Return the result of `prepare` for a scenario."""
         scenario.check()
         true = self._base.truth if truth is None else truth
         return self._base._replace(scenario=scenario, truth=true, network=network_of(scenario))
 
     def prepared(self, experiment: Experiment, tuner: MakeTuner | None = None) -> Prepared:
-        """Compose law, motion and tuner of a run; `tuner` replaces the scenario's.
-
-        Raises:
-            ConfigError: as `law_design.control_law`.
-        """
+        """Compose law, motion and tuner of a run; `tuner` replaces the scenario's."""
         if experiment.scenario.controller.command == "cranks":
             servos, motion, _ = servo_law(experiment)
             return Prepared(experiment, servos, motion, self._preview(motion, servos), None)
@@ -299,11 +260,7 @@ _prepared: dict[tuple[Any, ...], Preparation] = {}
 
 
 def preparation_of(scenario: Scenario) -> Preparation:
-    """Return the preparation of a scenario, made once for all scenarios that share it.
-
-    Raises:
-        ConfigError: as `prepare`.
-    """
+    """Return the preparation of a scenario, made once for all scenarios that share it."""
     key = _key(scenario)
     if key not in _prepared:
         with one_blas_thread:
@@ -342,21 +299,13 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 
 class Course(NamedTuple):
-    """Record of a loop.
+    """Record of a loop."""
 
-    Attributes:
-        states: (n, 12) at the looks up to the end.
-        measured: (k, 12) at the samples, as the controller got them.
-        asked: (k, 6) torques in N m that the law asked for there.
-        sent: (k, 6) the same within the limit.
-        stopped: reason of an early end, or None.
-    """
-
-    states: Array
-    measured: Array
-    asked: Array
-    sent: Array
-    stopped: Failure | None
+    states: Array  # (n, 12) at the looks up to the end
+    measured: Array  # (k, 12) at the samples, as the controller got them
+    asked: Array  # (k, 6) torques in N m that the law asked for there
+    sent: Array  # (k, 6) the same within the limit
+    stopped: Failure | None  # reason of an early end, or None
 
 
 class CompiledController:
@@ -415,7 +364,6 @@ class CompiledController:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of survived problems by cause, after the run."""
         fallbacks = int(self._tuned[2]) if len(self._tuned) else 0
         counts = CoreMemory(self._memory, self._compiled).counts
         return counts.summary() | {"tuner_fallbacks": fallbacks}
@@ -423,9 +371,6 @@ class CompiledController:
 
 class CompiledServo:
     """Law for servos in C, without estimates.
-
-    Args:
-        prepared: a run with such a law.
 
     Attributes:
         weights, rows: as of `CompiledController`, NaN and empty.
@@ -456,7 +401,6 @@ class CompiledServo:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of survived problems by cause, after the run."""
         counts = CoreMemory(self._memory, self._compiled).counts
         survived = counts.plus(*["saturated_steps"] * self._saturated)
         return survived.summary() | {"tuner_fallbacks": 0}
@@ -514,7 +458,6 @@ class PythonController:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of survived problems by cause, so far."""
         fallbacks = 0 if self._tuned is None else self._tuned.fallbacks
         return self._memory.counts.summary() | {"tuner_fallbacks": fallbacks}
 
@@ -543,17 +486,13 @@ def run_loop(
     plant = NativePlant(truth, experiment.start, when.looks, accuracy, LONGEST_STEP)
     noise, c = np.array(sensor.noise_std), core()
     drawn = noise * white_noises(sensor.seed, number) if noise.any() else None
-    of_torques = law if isinstance(law, PredictiveLqi) else None
-    packets = of_torques.channel if of_torques is not None else None
-    packets = packets if isinstance(packets, Packets) else None
-    if isinstance(law, ServoPreview):
-        link, memory, transit = _servo_link(experiment, law, number)
-    else:
-        link, memory, transit = _motor_link(experiment, of_torques, packets, number)
+    channel = law.channel if isinstance(law, PredictiveLqi) else None
+    packets = channel if isinstance(channel, Packets) else None
+    link, memory, transit = _link(experiment, law, number)
     reports = link.history if packets is not None and sc.link.acknowledged else 0
     late = np.zeros(number)
     if sensor.delay or sensor.loss or sc.link.back is not None:
-        late = np.append(measurement_times(sc), np.full(number, np.inf))[:number]
+        late = _padded(measurement_times(sc), number)
     size = NUM_STATE + (1 + NUM_TORQUES) * reports
     back = measurement_link(sc.controller.period, late, size)
     back_memory = back.start()
@@ -610,66 +549,45 @@ def _rows(packets: Packets) -> int:
     return packets.repeats + packets.torques
 
 
-def _motor_link(
-    experiment: Experiment, law: PredictiveLqi | None, packets: Packets | None, number: int
+def _link(
+    experiment: Experiment, law: PredictiveLqi | ServoPreview | None, number: int
 ) -> tuple[Link, Array, Array]:
     """Return the link to the motors, its memory at t = 0, and the transit times (number,) in s.
 
     It is that of `loop.link`: a wire, or a play-out buffer.
     """
-    sc, delay, config = (
-        experiment.scenario,
-        experiment.scenario.true_delay,
-        experiment.scenario.link,
-    )
-    period, queue = sc.controller.period, experiment.torques_in_flight(delay)
-    transit = np.full(number, delay.eta(period))
-    history, rows, holds = 1, 1, True
-    if config.kind == "network":
-        transit = np.append(forward_times(sc, number), np.full(number, np.inf))[:number]
-        history, holds = 1 if law is None else reported(law.kept), config.dry == "hold"
-        rows = 1 if packets is None else _rows(packets)
+    sc, delay = experiment.scenario, experiment.scenario.true_delay
+    period, size = sc.controller.period, NUM_TORQUES
+    if isinstance(law, ServoPreview):
+        _, queue = commands_in_flight(experiment, law, delay)
+        size, limit = NUM_REFERENCE, np.inf
+    else:
+        queue, limit = experiment.torques_in_flight(delay), experiment.torque_limit
+    more: dict[str, Any] = {}
+    if sc.link.kind == "network":
+        transit, rows = _padded(forward_times(sc, number), number), 1
+        more["hold_when_dry"] = sc.link.dry == "hold"
+        if isinstance(law, PredictiveLqi):
+            more["history"] = reported(law.kept)
+            rows = _rows(law.channel) if isinstance(law.channel, Packets) else 1
         kept = buffer_places(delay, rows)
     else:
-        transit = _wire_times(sc, number)
+        drawn = [delay.eta(period)] if sc.delay.constant else torque_delays(sc)
+        transit = np.array(drawn)[np.minimum(np.arange(number), len(drawn) - 1)]
         kept = len(queue) + int(transit.max(initial=0.0) / period) + 2
     link = Link(
-        *(NUM_TORQUES, kept, period),
-        is_wire=config.kind == "wire",
-        hold_when_dry=holds,
-        history=history,
+        *(size, kept, period),
+        is_wire=sc.link.kind == "wire",
         time_tolerance=SIMULTANEOUS * period,
-        limit=experiment.torque_limit,
+        limit=limit,
+        **more,
     )
-    memory, first = link.start(), (delay.periods - len(queue)) * period
-    if len(queue):
-        link.assume(memory, first, queue[0])
-        link.preload(memory, first, queue)
-    return link, memory, transit
+    return link, begun(link, delay, period, queue), transit
 
 
-def _servo_link(
-    experiment: Experiment, law: ServoPreview, number: int
-) -> tuple[Link, Array, Array]:
-    """Return the wire to servos, its memory at t = 0, and the transit times (number,) in s."""
-    sc, delay = experiment.scenario, experiment.scenario.true_delay
-    period, (_, queue) = sc.controller.period, commands_in_flight(experiment, law, delay)
-    transit = _wire_times(sc, number)
-    kept = len(queue) + int(transit.max(initial=0.0) / period) + 2
-    link = Link(NUM_REFERENCE, kept, period, is_wire=True, time_tolerance=SIMULTANEOUS * period)
-    memory, first = link.start(), (delay.periods - len(queue)) * period
-    if len(queue):
-        link.assume(memory, first, queue[0])
-        link.preload(memory, first, queue)
-    return link, memory, transit
-
-
-def _wire_times(sc: Scenario, number: int) -> Array:
-    """Return the transit times (number,) of a wire, s."""
-    if sc.delay.constant:
-        return np.full(number, sc.true_delay.eta(sc.controller.period))
-    drawn = torque_delays(sc)
-    return np.asarray(drawn[np.minimum(np.arange(number), len(drawn) - 1)])
+def _padded(times: Array, number: int) -> Array:
+    """Return the first times (number,); missing ones are infinite."""
+    return np.append(times, np.full(number, np.inf))[:number]
 
 
 def _call_back(plant: NativePlant, loop: Any, controller: Controller) -> Ended:
@@ -751,11 +669,7 @@ def _outside(experiment: Experiment) -> Ending | None:
 
 
 def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
-    """Run a prepared run in C, with law and tuner in C if the core has all their parts.
-
-    Raises:
-        IntegrationError: as `run_loop`.
-    """
+    """Run a prepared run in C, with law and tuner in C if the core has all their parts."""
     law, when, source = prepared.law, preparation.when, prepared.tuner
     wanted = preparation.references[when.sampled]
     field, tuner = core_law.uncovered(law), None if source is None else source.compiled

@@ -192,7 +192,6 @@ class DelayLqiController(SteppedLaw):
             self._put_out(port, len(part(first)), part)
 
     def memory(self, context: Context) -> AnyMemory:
-        """Return the memory in a context of this system."""
         return self.sample(context).memory
 
     def _prepared(self, context: Context) -> Callable[[], AnyMemory]:

@@ -81,37 +81,23 @@ _UNJUDGED: Final = Margins(*[math.nan] * 4)
 
 @dataclass(frozen=True)
 class ControllerMargin:
-    """The loop at its worst along the reference.
+    """The loop at its worst along the reference."""
 
-    Attributes:
-        period: of the controller, s.
-        eta: true total delay, s.
-        radius: largest spectral radius, the factor on an error per period; NaN with a `problem`.
-        time: of that radius, s.
-        margins: the least of each kind; NaN with a `problem`.
-        pole: fastest unstable pole of the open loop, 1/s; 0 without one.
-        pole_time: of that pole, s.
-        estimated: whether an estimator is assumed to have found the unknown parameters.
-        delay_found: whether it is assumed to have found the delay too.
-        tuned: whether a tuner changes the weights.
-        problem: why the loop was not judged, or empty.
-        loops: the judged ones in the order of time, evenly over `span`; none with a `problem`.
-        span: s.
-    """
-
-    period: float
-    eta: float
+    period: float  # of the controller, s
+    eta: float  # true total delay, s
+    # largest spectral radius, the factor on an error per period; NaN with a `problem`
     radius: float = math.nan
-    time: float = math.nan
-    margins: Margins = _UNJUDGED
-    pole: float = 0.0
-    pole_time: float = 0.0
-    estimated: bool = False
-    delay_found: bool = False
-    tuned: bool = False
-    problem: str = ""
+    time: float = math.nan  # of that radius, s
+    margins: Margins = _UNJUDGED  # the least of each kind; NaN with a `problem`
+    pole: float = 0.0  # fastest unstable pole of the open loop, 1/s; 0 without one
+    pole_time: float = 0.0  # of that pole, s
+    estimated: bool = False  # whether an estimator is assumed to have found the unknown parameters
+    delay_found: bool = False  # whether it is assumed to have found the delay too
+    tuned: bool = False  # whether a tuner changes the weights
+    problem: str = ""  # why the loop was not judged, or empty
+    # the judged ones in the order of time, evenly over `span`; none with a `problem`
     loops: tuple[LinearLoop, ...] = field(default=(), repr=False)
-    span: float = 0.0
+    span: float = 0.0  # s
     _growths: dict[float, float] = field(default_factory=dict, repr=False, compare=False)
 
     @property

@@ -1,6 +1,5 @@
 """The closed loop of a scenario as a Drake diagram."""
 
-from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -43,10 +42,7 @@ from stewart_drake.loop.servos import (
 )
 from stewart_drake.loop.tuner import AnnTuner, DensityWindow, LawTuner, weights_source
 from stewart_drake.scenario.config import (
-    PositionServoConfig,
     Scenario,
-    ServoActuatorConfig,
-    TorqueActuatorConfig,
 )
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.link import measurement_times
@@ -139,7 +135,8 @@ def build_closed_loop(
     builder.AddNamedSystem("plant", _plant(experiment, meshcat))
     kind = "magnitude" if network is None else network.density
     builder.AddNamedSystem("density", DensityWindow(sc.controller.period, kind))
-    catch_up = _ACTUATORS[type(experiment.scenario.actuator)](builder, experiment)
+    add = _add_torques if sc.actuator.kind == "torque" else _add_servos
+    catch_up = add(builder, experiment)
     _connect_loop(builder, experiment)
     loop = ClosedLoop()
     builder.BuildInto(loop)
@@ -244,14 +241,6 @@ def _add_servos(builder: DiagramBuilder, experiment: Experiment) -> float:
     if servos.HasInputPort("arrived"):
         _connect(builder, "delay_chain.arrived", "servos.arrived")
     return catch_up
-
-
-_ACTUATORS: Final[Mapping[type, Callable[[DiagramBuilder, Experiment], float]]] = {
-    TorqueActuatorConfig: _add_torques,
-    ServoActuatorConfig: _add_servos,
-    PositionServoConfig: _add_servos,
-}
-"""Functions that add controller, link and motors to a loop, and return its catch-up in s."""
 
 
 def _sensor(experiment: Experiment) -> System:

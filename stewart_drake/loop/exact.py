@@ -36,11 +36,7 @@ CHANGEABLE = (
 
 
 def checked_loads(loads) -> PlantConfig:
-    """Return the checked changes of a plant's parameters.
-
-    Raises:
-        ConfigError: a name out of `CHANGEABLE`, or a value out of its bounds.
-    """
+    """Return the checked changes of a plant's parameters."""
     for name in loads:
         if name not in CHANGEABLE:
             expected = ", ".join(("plate_mass", *CHANGEABLE))
@@ -49,11 +45,7 @@ def checked_loads(loads) -> PlantConfig:
 
 
 def plate_of_mass(mechanism: Mechanism, mass: float) -> Body:
-    """Return the plate with another mass in kg and the same moments of inertia.
-
-    Raises:
-        ConfigError: a mass that is not positive.
-    """
+    """Return the plate with another mass in kg and the same moments of inertia."""
     plate = replace(mechanism.plate, mass=float(mass))
     if (problem := plate.problem("plate")) is not None:
         raise ConfigError(problem)

@@ -36,28 +36,20 @@ REPORTS: Final = 10
 
 
 class SensorKind(NamedTuple):
-    """A kind of sensor.
+    """A kind of sensor."""
 
-    Attributes:
-        system: the sensor, a Drake system with the ports `state` and `measurement`.
-        sensing: part of the law that models the measurement.
-    """
-
+    # the sensor, a Drake system with the ports `state` and `measurement`
     system: Callable[[Any, Experiment], System]
-    sensing: Callable[[Any, Experiment], Sensing]
+    sensing: Callable[[Any, Experiment], Sensing]  # part of the law that models the measurement
 
 
 class LinkKind(NamedTuple):
-    """A kind of link between controller and motors.
+    """A kind of link between controller and motors."""
 
-    Attributes:
-        system: the link, a Drake system with the ports `commanded` and `torque`, for a channel of
-            the law and a number of periods in a report.
-        channel: part of the law that models the link, for the longest wait for a measurement in
-            periods.
-    """
-
+    # the link, a Drake system with the ports `commanded` and `torque`, for a channel of the law and
+    # a number of periods in a report
     system: Callable[[Any, Experiment, Channel, int], System]
+    # part of the law that models the link, for the longest wait for a measurement in periods
     channel: Callable[[Any, Experiment, Timeline, int], Channel]
 
 

@@ -25,11 +25,7 @@ _SAME: Final = 1e-9
 
 
 def motion_period(scenario: Scenario) -> float:
-    """Return the period of a scenario's motion, s.
-
-    Raises:
-        ConfigError: the motion does not repeat, or too fast for the controller.
-    """
+    """Return the period of a scenario's motion, s."""
     reference, dt = scenario.reference, scenario.controller.period
     if reference.kind != "sine":
         raise ConfigError(
@@ -81,7 +77,8 @@ def learned_signal(experiment: Experiment) -> LearnedSignal | None:
     except ConfigError as error:
         raise ConfigError(f"controller.learned: {error}") from None
     for name, value in own.items():
-        same = found[name] == value if value.dtype.kind == "U" else _near(found[name], value)
+        text = value.dtype.kind == "U"
+        same = found[name] == value if text else np.allclose(found[name], value, 0, _SAME)
         if not same:
             exact = "" if np.ndim(value) or value.dtype.kind == "U" else ".9g"
             numbers = (
@@ -107,10 +104,6 @@ _TEXTS: Final = {
     "period": "controller.period, s",
     "delay": "delay, s",
 }
-
-
-def _near(a: Array, b: Array) -> bool:
-    return bool(np.allclose(a, b, rtol=0, atol=_SAME))
 
 
 def _command(scenario: Scenario) -> str:

@@ -27,20 +27,13 @@ class LinkSystem(LeafSystem):
     """A link with its memory as discrete state, which takes a command at each sample."""
 
     def _begin(self, link: Link, period: float, rows: int, delay: Delay, queue: Array) -> None:
-        """Declare input, state and samples; `queue` (L, size) is in flight at t = 0.
-
-        Raises:
-            ValueError: a queue of the wrong shape.
-        """
+        """Declare input, state and samples; `queue` (L, size) is in flight at t = 0."""
         queue, shape = np.asarray(queue, np.float64), (delay.queue_length, link.size)
         if queue.shape != shape:
             raise ValueError(f"queue: got shape {queue.shape}; expected {shape}")
         self._link, self._period = link, period
         self._commanded = self.DeclareVectorInputPort("commanded", rows * link.size)
-        memory, first = link.start(), (delay.periods - len(queue)) * period
-        link.assume(memory, *((first, queue[0]) if len(queue) else (np.nan, np.zeros(link.size))))
-        link.preload(memory, first, queue)
-        self._memory = self.DeclareDiscreteState(memory)
+        self._memory = self.DeclareDiscreteState(begun(link, delay, period, queue))
         update_every(self, period, self._take)
 
     @abstractmethod
@@ -75,6 +68,14 @@ class LinkSystem(LeafSystem):
 
     def _output(self, columns: slice, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._link.acted(self._of(context))[0, columns])
+
+
+def begun(link: Link, delay: Delay, period: float, queue: Array) -> Array:
+    """Return the memory of a link with a queue (L, size) in flight at t = 0, oldest first."""
+    memory, first = link.start(), (delay.periods - len(queue)) * period
+    link.assume(memory, *((first, queue[0]) if len(queue) else (np.nan, np.zeros(link.size))))
+    link.preload(memory, first, queue)
+    return memory
 
 
 class Wire(LinkSystem):

@@ -44,67 +44,50 @@ class."""
 AnyLaw = TypeVar("AnyLaw", PredictiveLqi, ServoPreview)
 
 
+_SIZES: Final[Mapping[str, int]] = {
+    "state": NUM_STATE,
+    "measurement": NUM_STATE,
+    "reference": NUM_REFERENCE,
+    "density": len(TUNER_INPUTS),
+    "weights": len(WEIGHTS),
+    "commanded": NUM_TORQUES,
+    "torque": NUM_TORQUES,
+    "wrench": 6,
+}
+"""Sizes of the ports in all roles."""
+
+
 class Role(NamedTuple):
-    """Place of a system in the loop: its ports with their sizes."""
+    """Place of a system in the loop, with the names of its ports."""
 
-    inputs: Mapping[str, int]
-    """Required inputs."""
-    may: Mapping[str, int]
-    """Optional inputs."""
-    outputs: Mapping[str, int]
-    """Outputs, at least one of them required."""
-    accepted: Accepted = MappingProxyType({})
-    """Accepted values of the scenario's fields."""
+    inputs: str  # required
+    may: str  # optional inputs
+    outputs: str  # at least one of them required
+    accepted: Accepted = MappingProxyType({})  # values of the scenario's fields
 
 
-ROLES: Final[Mapping[str, Role]] = MappingProxyType(
-    {
-        "controller": Role(
-            {"measurement": NUM_STATE},
-            {"reference": NUM_REFERENCE},
-            {"torque": NUM_TORQUES},
-            {"sensor.kind": "state", "tuner.kind": "fixed", "actuator.kind": "torque"},
-        ),
-        "disturbance": Role({}, {}, {"torque": NUM_TORQUES, "wrench": 6}),
-        "sensor": Role(
-            {"state": NUM_STATE}, {}, {"measurement": NUM_STATE}, {"sensor.kind": "state"}
-        ),
-        "link": Role(
-            {"commanded": NUM_TORQUES},
-            {},
-            {"torque": NUM_TORQUES},
-            {"link.kind": "wire", "actuator.kind": "torque"},
-        ),
-        "tuner": Role(
-            {},
-            {
-                "density": len(TUNER_INPUTS),
-                "measurement": NUM_STATE,
-                "reference": NUM_REFERENCE,
-            },
-            {"weights": len(WEIGHTS)},
-        ),
-    }
-)
+ROLES: Final[Mapping[str, Role]] = {
+    "controller": Role(
+        *("measurement", "reference", "torque"),
+        {"sensor.kind": "state", "tuner.kind": "fixed", "actuator.kind": "torque"},
+    ),
+    "disturbance": Role("", "", "torque wrench"),
+    "sensor": Role("state", "", "measurement", {"sensor.kind": "state"}),
+    "link": Role("commanded", "", "torque", {"link.kind": "wire", "actuator.kind": "torque"}),
+    "tuner": Role("", "density measurement reference", "weights"),
+}
 """Places in the loop that a system of the user's own may take."""
 
 _used: "WeakSet[Any]" = WeakSet()
 
 
 class Own(NamedTuple):
-    """Systems, reference and law of the user that replace the scenario's.
+    """Systems, reference and law of the user that replace the scenario's."""
 
-    Attributes:
-        systems: by their ROLES.
-        reference: a 6 x 1 trajectory of the pose with two derivatives.
-        law: changes the scenario's law.
-        instances: systems given as instances, which remain the user's.
-    """
-
-    systems: Mapping[str, System] = MappingProxyType({})
-    reference: Trajectory | None = None
-    law: OwnLaw | None = None
-    instances: tuple[System, ...] = ()
+    systems: Mapping[str, System] = MappingProxyType({})  # by their ROLES
+    reference: Trajectory | None = None  # a 6 x 1 trajectory of the pose with two derivatives
+    law: OwnLaw | None = None  # changes the scenario's law
+    instances: tuple[System, ...] = ()  # systems given as instances, which remain the user's
 
     @property
     def names(self) -> dict[str, str]:
@@ -124,11 +107,7 @@ class Own(NamedTuple):
         )
 
     def claim(self, scenario: Scenario) -> None:
-        """Reserve the systems for one loop of a scenario.
-
-        Raises:
-            ConfigError: one of them was in another loop, or contradicts the scenario.
-        """
+        """Reserve the systems for one loop of a scenario."""
         for role in self.systems:
             if found := differing(scenario, ROLES[role].accepted):
                 raise ConfigError(found.problem(f"with a {role} of your own"))
@@ -141,11 +120,7 @@ class Own(NamedTuple):
             _used.add(system)
 
     def revised(self, law: AnyLaw) -> AnyLaw:
-        """Return the law to use in place of the scenario's.
-
-        Raises:
-            ConfigError: the user's function returned something else.
-        """
+        """Return the law to use in place of the scenario's."""
         if self.law is None:
             return law
         made, kind = self.law(law), type(law)
@@ -166,9 +141,6 @@ def take(given: Mapping[str, Any]) -> Own:
 
     Args:
         given: values by the names of the arguments of `simulate`, None if not given.
-
-    Raises:
-        ConfigError: one line.
     """
     given = {name: thing for name, thing in given.items() if thing is not None}
     systems = {role: _make(role, given[role], System) for role in ROLES if role in given}
@@ -204,20 +176,21 @@ def _make(what: str, given: Any, kind: type) -> Any:
 
 def _check(role: str, system: System) -> None:
     """Check the ports of a system for its role."""
-    needed = ROLES[role]
+    needed, may, offered = (
+        {name: _SIZES[name] for name in names.split()} for names in ROLES[role][:3]
+    )
     inputs = _sizes(map(system.get_input_port, range(system.num_input_ports())))
     outputs = _sizes(map(system.get_output_port, range(system.num_output_ports())))
-    found = {name: size for name, size in outputs.items() if name in needed.outputs}
-    known = {**needed.inputs, **needed.may}
-    if needed.inputs.items() <= inputs.items() <= known.items() and (
-        found and found.items() <= needed.outputs.items()
+    found = {name: size for name, size in outputs.items() if name in offered}
+    if needed.items() <= inputs.items() <= (needed | may).items() and (
+        found and found.items() <= offered.items()
     ):
         return
-    wanted = f", if wanted {_listed(needed.may)}" if needed.may else ""
+    wanted = f", if wanted {_listed(may)}" if may else ""
     raise ConfigError(
         f"{role}: {type(system).__name__}: got inputs {_listed(inputs)} and outputs "
-        f"{_listed(outputs)}; expected inputs {_listed(needed.inputs)}{wanted}, and output "
-        f"{_listed(needed.outputs, ' or ')}"
+        f"{_listed(outputs)}; expected inputs {_listed(needed)}{wanted}, and output "
+        f"{_listed(offered, ' or ')}"
     )
 
 
@@ -239,9 +212,6 @@ def own_motion(reference: Trajectory, duration: float) -> Trajectory:
 
     Returns:
         The trajectory, defined for t >= 0: the preview passes the end.
-
-    Raises:
-        ConfigError: one line.
     """
     name = f"reference: {type(reference).__name__}"
     shape = (reference.rows(), reference.cols())

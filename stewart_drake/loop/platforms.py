@@ -617,11 +617,7 @@ class MultibodyStewart(Diagram):
         self.mechanism, self.tree, self.platform = mechanism, platform.plant, platform
 
     def set_state(self, context: Context, state: Array) -> None:
-        """Put the machine, in its own context, into [pose; rates] (12,), all loops closed.
-
-        Raises:
-            UnreachablePoseError, SingularPoseError: see `loop.platforms.set_pose`.
-        """
+        """Put the machine, in its own context, into [pose; rates] (12,), all loops closed."""
         tree_context = self.GetMutableSubsystemContext(self.tree, context)
         set_pose(self.tree, tree_context, self.mechanism, state[POSE], state[RATES])
 
@@ -654,9 +650,6 @@ class StartCheck(LeafSystem):
     | port | direction | size | unit |
     | --- | --- | --- | --- |
     | state | input | 12 | rad, m, rad/s, m/s |
-
-    Args:
-        start: (12,) pose and rates at the start.
     """
 
     def __init__(self, start: Array) -> None:

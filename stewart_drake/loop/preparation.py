@@ -57,30 +57,18 @@ _ESTIMATED = {
 
 
 class Experiment(NamedTuple):
-    """A scenario with all objects that the loop is built from.
-
-    Attributes:
-        scenario: the scenario.
-        mechanism: machine that the controller assumes.
-        truth: machine that is simulated.
-        reference: 6 x 1 trajectory of the pose.
-        peak_to_peak: (6,) of the reference, rad and m, 0 where it is constant.
-        nominal: dynamics that the controller assumes.
-        start: (12,) state at t = 0.
-        network: network that sets the weights, or None.
-        own: systems, reference and law of the user.
-        calibration: calibrated parameters of the machine, known to the controller, or None.
-    """
+    """A scenario with all objects that the loop is built from."""
 
     scenario: Scenario
-    mechanism: Mechanism
-    truth: Mechanism
-    reference: Trajectory
-    peak_to_peak: Array
-    nominal: StewartDynamics
-    start: Array
-    network: Network | None
-    own: Own = NOTHING
+    mechanism: Mechanism  # machine that the controller assumes
+    truth: Mechanism  # machine that is simulated
+    reference: Trajectory  # 6 x 1 trajectory of the pose
+    peak_to_peak: Array  # (6,) of the reference, rad and m, 0 where it is constant
+    nominal: StewartDynamics  # dynamics that the controller assumes
+    start: Array  # (12,) state at t = 0
+    network: Network | None  # network that sets the weights, or None
+    own: Own = NOTHING  # systems, reference and law of the user
+    # calibrated parameters of the machine, known to the controller, or None
     calibration: Calibration | None = None
 
     def __repr__(self) -> str:
@@ -105,7 +93,6 @@ class Experiment(NamedTuple):
 
     @property
     def tuned(self) -> bool:
-        """Whether a tuner of the scenario sets the weights."""
         return self.scenario.tuner.kind != "fixed"
 
     @property
@@ -232,11 +219,7 @@ def concrete(
 
 
 def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHING) -> Experiment:
-    """Prepare a scenario without the check of its reference.
-
-    Raises:
-        ConfigError: one line.
-    """
+    """Prepare a scenario without the check of its reference."""
     scenario.check()
     network = network_of(scenario)
     drawn = load_mechanism(scenario.mechanism)
@@ -295,11 +278,7 @@ def _estimated(scenario: Scenario) -> tuple[str, ...]:
 
 
 def simulated_machine(scenario: Scenario) -> Mechanism:
-    """Return the machine of the scenario's plant, by default that of the controller.
-
-    Raises:
-        ConfigError: one line.
-    """
+    """Return the machine of the scenario's plant, by default that of the controller."""
     name = scenario.plant.mechanism
     if name is None:
         return load_mechanism(scenario.mechanism)
@@ -310,11 +289,7 @@ def simulated_machine(scenario: Scenario) -> Mechanism:
 
 
 def calibration_of(scenario: Scenario, mechanism: Mechanism) -> Calibration | None:
-    """Return the calibration that the controller uses, checked against its machine.
-
-    Raises:
-        ConfigError: one line.
-    """
+    """Return the calibration that the controller uses, checked against its machine."""
     own, calibration = fingerprint(mechanism), calibration_file(scenario)
     if calibration is None:
         return None
@@ -329,11 +304,7 @@ def calibration_of(scenario: Scenario, mechanism: Mechanism) -> Calibration | No
 
 
 def network_of(scenario: Scenario) -> Network | None:
-    """Return the network of the scenario's tuner, or None for a tuner of another kind.
-
-    Raises:
-        ConfigError: the file is missing or holds no network; one line.
-    """
+    """Return the network of the scenario's tuner, or None for a tuner of another kind."""
     tuner = scenario.tuner
     if tuner.kind != "ann":
         return None

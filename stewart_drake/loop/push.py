@@ -25,9 +25,6 @@ class Push(LeafSystem):
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
     | wrench | output | 6, moment then force, in W at the plate's COM | N m, N | held |
-
-    Args:
-        push: the wrench and its times.
     """
 
     def __init__(self, push: PushConfig) -> None:

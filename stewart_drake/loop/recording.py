@@ -60,7 +60,6 @@ class Table:
         return np.array(np.reshape(self._numbers, (-1, self._width))[:, part], order="C")
 
     def column(self, place: int) -> Array:
-        """Return a column (rows,)."""
         return self.columns(slice(place, place + 1))[:, 0]
 
 

@@ -257,11 +257,7 @@ class SimulationResult:
         return None if self.stopped is None else str(self.stopped)
 
     def save(self, directory: str | Path) -> None:
-        """Write signals.nc and summary.json into a directory, made if missing.
-
-        Raises:
-            OSError: the directory cannot be written to.
-        """
+        """Write signals.nc and summary.json into a directory, made if missing."""
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)
         remove_partials(folder)

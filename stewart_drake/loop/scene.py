@@ -43,12 +43,7 @@ _RING: Final = (1.14, 0.022)
 
 
 class Scene:
-    """The SDFormat model of a mechanism and the ring of its reference.
-
-    Args:
-        mechanism: the machine.
-        meshcat: shows it; the camera is turned to the machine.
-    """
+    """The SDFormat model of a mechanism and the ring of its reference."""
 
     def __init__(self, mechanism: Mechanism, meshcat: Meshcat) -> None:
         self._mechanism, self._meshcat = mechanism, meshcat

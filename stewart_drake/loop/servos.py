@@ -264,11 +264,7 @@ _REPORTED: Final = 10
 
 
 def servo_loop(experiment: Experiment) -> ServoLoop:
-    """Design the loop at each motor for the assumed machine.
-
-    Raises:
-        ConfigError: the sampled loop is unstable at home or along the reference.
-    """
+    """Design the loop at each motor for the assumed machine."""
     sc, nominal = experiment.scenario, experiment.nominal
     actuator = sc.actuator
     assert actuator.kind == "servo"

@@ -1,6 +1,6 @@
 """The tuner of the weights: its features, its policy, and its Drake systems."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final
 
@@ -15,7 +15,6 @@ from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.startup import INSTANTS, TOLERANCE, least_torque, reference_torque
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sampling import Sample, SteppedLaw
-from stewart_drake.scenario.config import AnnTunerConfig, FixedTunerConfig, RuleTunerConfig
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES, RATES, WEIGHTS
 from stewart_drake.scenario.trajectories import evaluate, spread_instants
 from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Kind, Network, density
@@ -121,7 +120,6 @@ class AnnTuner(SteppedLaw):
         self._put_out("weights", len(WEIGHTS), lambda memory: memory[0], now=True)
 
     def fallbacks(self, context: Context) -> int:
-        """Return the number of fallbacks so far."""
         return int(self.sample(context).memory[1])
 
     def _prepared(self, context: Context) -> Callable[[], tuple[Array, int]]:
@@ -168,7 +166,6 @@ class LawTuner(SteppedLaw):
         self._put_out("weights", len(WEIGHTS), lambda memory: source.decide(memory).weights)
 
     def fallbacks(self, context: Context) -> int:
-        """Return the number of fallbacks so far."""
         return int(self.sample(context).memory.fallbacks)
 
     def _prepared(self, context: Context) -> Callable[[], TunerMemory]:
@@ -183,21 +180,16 @@ RULES: Final = {True: Rule(-1.77, 2.35, 0.41), False: Rule(-0.82, 1.37, 0.33)}
 
 
 def weights_source(experiment: Experiment, law: PredictiveLqi) -> WeightsSource | None:
-    """Make features and policy of a scenario's tuner, None for fixed weights.
-
-    Raises:
-        ConfigError: the features need a measured state without delay.
-    """
-    config = experiment.scenario.tuner
-    return TUNERS[type(config)](config, experiment, law)
-
-
-def _fixed(config: FixedTunerConfig, experiment: Experiment, law: PredictiveLqi) -> None:
-    return None
-
-
-def _ann(config: AnnTunerConfig, experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
-    network, c = experiment.network, experiment.scenario.controller
+    """Make features and policy of a scenario's tuner, None for fixed weights."""
+    config, c = experiment.scenario.tuner, experiment.scenario.controller
+    if config.kind == "fixed":
+        return None
+    if config.kind == "rule":
+        given = {name: getattr(config, name) for name in ("ratio", "slope", "knee")}
+        own = {name: value for name, value in given.items() if value is not None}
+        rule = replace(RULES[bool(c.estimate)], **own)
+        return WeightsSource(law.plant, health_of(experiment, law), rule)
+    network = experiment.network
     assert network is not None
     features: DensityFeatures | HealthFeatures = DensityFeatures(network.density)
     if network.features == "health":
@@ -207,27 +199,8 @@ def _ann(config: AnnTunerConfig, experiment: Experiment, law: PredictiveLqi) -> 
     return WeightsSource(law.plant, features, RatioPolicy(network))
 
 
-def _rule(config: RuleTunerConfig, experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
-    usual = RULES[bool(experiment.scenario.controller.estimate)]
-    given = {name: getattr(config, name) for name in ("ratio", "slope", "knee")}
-    own = {name: value for name, value in given.items() if value is not None}
-    return WeightsSource(law.plant, health_of(experiment, law), replace(usual, **own))
-
-
-TUNERS: Final[Mapping[type, Callable[[Any, Experiment, PredictiveLqi], WeightsSource | None]]] = {
-    FixedTunerConfig: _fixed,
-    AnnTunerConfig: _ann,
-    RuleTunerConfig: _rule,
-}
-"""Factories of features and policy, by the kind of tuner."""
-
-
 def health_of(experiment: Experiment, law: PredictiveLqi) -> HealthFeatures:
-    """Return the features `health` of a law.
-
-    Raises:
-        ConfigError: the state is not measured, or late.
-    """
+    """Return the features `health` of a law."""
     sc = experiment.scenario
     sensing = law.sensing
     if not isinstance(sensing, StateSensing) or law.longest_wait:

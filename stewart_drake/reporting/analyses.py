@@ -19,27 +19,16 @@ RENAMED: Final = {"beside": "also"}
 
 
 class Analysis(NamedTuple):
-    """One analysis of a scenario.
+    """One analysis of a scenario."""
 
-    Attributes:
-        help: of the command.
-        examples: of the command, without the program's name.
-        counts: pieces that its progress counts; empty without progress.
-        keeps: pieces that a folder keeps, so that a stopped study can continue.
-        controller: whether the command has `--controller`.
-        exact: whether the default plant is the exact one.
-        alone: whether the command is not one of `analyze`.
-        second: argument of the Python function that may be positional.
-    """
-
-    help: str
-    examples: tuple[str, ...]
-    counts: str = ""
-    keeps: str = ""
-    controller: bool = False
-    exact: bool = False
-    alone: bool = False
-    second: str = ""
+    help: str  # of the command
+    examples: tuple[str, ...]  # of the command, without the program's name
+    counts: str = ""  # pieces that its progress counts; empty without progress
+    keeps: str = ""  # pieces that a folder keeps, so that a stopped study can continue
+    controller: bool = False  # whether the command has `--controller`
+    exact: bool = False  # whether the default plant is the exact one
+    alone: bool = False  # whether the command is not one of `analyze`
+    second: str = ""  # argument of the Python function that may be positional
 
 
 ANALYSES: Final = {

@@ -18,9 +18,6 @@ def signals_csv(signals: xr.Dataset) -> str:
     """Return a header `time[s],pose_roll[rad],...` and a line per instant; NaN is an empty cell.
 
     A reference of `kind: csv` reads the columns `pose_...` as a motion.
-
-    Args:
-        signals: of a `SimulationResult`, over `time`.
     """
     header, rows = columns_of(signals)
     text = io.StringIO()
@@ -48,20 +45,12 @@ def columns_of(signals: xr.Dataset) -> tuple[list[str], Array]:
 
 
 def write_csv(signals: xr.Dataset, path: Path) -> Path:
-    """Write `signals_csv` to a file."""
     write_whole(path, signals_csv(signals))
     return path
 
 
 def read_signals(path: Path) -> xr.Dataset:
-    """Return the signals of a run, which `columns_of` can write.
-
-    Args:
-        path: as `read_log` takes it.
-
-    Raises:
-        ConfigError: no such file, or not of a run.
-    """
+    """Return the signals of a run, which `columns_of` can write; `path` as of `read_log`."""
     try:
         signals = read_log(path)
         for needed in ("time", "pose", "torque_applied"):

@@ -75,7 +75,6 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def capital(text: str) -> str:
-    """Return a text with a capital first letter."""
     return text[:1].upper() + text[1:]
 
 
@@ -128,19 +127,14 @@ class Values:
 class Table:
     """A table of texts; columns of numbers are aligned to the right.
 
-    Attributes:
-        columns: heads, with units.
-        rows: cells; a terminal breaks them at "\\n".
-        caption: a sentence above the table.
-        brief: whether a terminal shows it, or the heads on a terminal, None for a column left out.
-
     Raises:
         ValueError: a row of another length than the head.
     """
 
-    columns: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    caption: str = ""
+    columns: Sequence[str]  # heads, with units
+    rows: Sequence[Sequence[str]]  # cells; a terminal breaks them at "\n"
+    caption: str = ""  # a sentence above the table
+    # whether a terminal shows it, or the heads on a terminal, None for a column left out
     brief: bool | Sequence[str | None] = False
     kind: ClassVar = "table"
 
@@ -200,15 +194,11 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of a page and its caption.
+    """A figure of a page and its caption."""
 
-    Attributes:
-        figure: drawn inside `style.figure_style`, or a function that draws it for a page.
-        caption: the sentence below it.
-    """
-
+    # drawn inside `style.figure_style`, or a function that draws it for a page
     figure: "Figure | Callable[[], Figure]"
-    caption: str
+    caption: str  # the sentence below it
     brief: ClassVar = False
     kind: ClassVar = "picture"
 
@@ -231,13 +221,9 @@ class Listing:
 
 @dataclass(frozen=True)
 class Frame:
-    """An HTML page inside a page, on screen only; its scripts reach nothing outside.
+    """An HTML page inside a page, on screen only; its scripts reach nothing outside."""
 
-    Attributes:
-        source: the page, or a function that makes it when it is written.
-    """
-
-    source: str | Callable[[], str]
+    source: str | Callable[[], str]  # the page, or a function that makes it when it is written
     brief: ClassVar = False
     kind: ClassVar = "frame"
 
@@ -264,26 +250,18 @@ class Section:
         self.blocks = [Paragraph(part) if isinstance(part, str) else part for part in parts]
 
     def all(self, kind: type[_Kind]) -> list[_Kind]:
-        """Return the blocks of a kind."""
         return [block for block in self.blocks if isinstance(block, kind)]
 
 
 @dataclass(frozen=True)
 class Document:
-    """A verdict and sections.
+    """A verdict and sections."""
 
-    Attributes:
-        title: subject.
-        verdict: the conclusion in a sentence or two, or empty.
-        sections: in order; a page lists the headings of more than two.
-        tone: of the verdict.
-        facts: names and values below the verdict of a page, with units.
-    """
-
-    title: str
-    verdict: str
-    sections: list[Section]
-    tone: Tone = "plain"
+    title: str  # subject
+    verdict: str  # the conclusion in a sentence or two, or empty
+    sections: list[Section]  # in order; a page lists the headings of more than two
+    tone: Tone = "plain"  # of the verdict
+    # names and values below the verdict of a page, with units
     facts: Mapping[str, str] = field(default_factory=dict)
 
     def plain(self) -> str:

@@ -52,7 +52,6 @@ def write(study: LearnStudy, folder: Path) -> list[str]:
 
 
 def error_figure(study: LearnStudy) -> Figure:
-    """Draw the error of each repetition."""
     errors = [one.error for one in study.repetitions]
     curve = Curve(np.arange(1, len(errors) + 1), errors, "", line(0))
     return draw([Panel("E of a period  [% s]", [curve], "repetition", yscale="log", height=2.5)])

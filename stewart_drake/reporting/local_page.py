@@ -15,11 +15,7 @@ _LONGEST: Final = 4096
 
 
 class LocalServer(ThreadingHTTPServer):
-    """Server on a free port of 127.0.0.1.
-
-    Args:
-        handler: of the requests.
-    """
+    """Server on a free port of 127.0.0.1."""
 
     daemon_threads = True
 
@@ -29,7 +25,6 @@ class LocalServer(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """Address of the page, with the token."""
         return f"http://127.0.0.1:{self.server_port}/?token={self._token}"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -39,12 +34,7 @@ class LocalServer(ThreadingHTTPServer):
 
 
 class LocalHandler(BaseHTTPRequestHandler):
-    """Answers of a page; derive from it and set `token` and `text`.
-
-    Attributes:
-        token: to be known.
-        text: the page.
-    """
+    """Answers of a page; derive from it and set `token` and `text`."""
 
     token: ClassVar[str]
     text: ClassVar[str]

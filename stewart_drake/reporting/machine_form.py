@@ -27,11 +27,7 @@ _PATIENCE: Final = 10.0
 
 
 class Entries:
-    """Texts of a form as measurements; an empty text is a missing one.
-
-    Args:
-        texts: by the measurement's name.
-    """
+    """Texts of a form as measurements; an empty text is a missing one."""
 
     def __init__(self, texts: Mapping[str, str]) -> None:
         self._given = {name: text.strip() for name, text in texts.items() if text.strip()}
@@ -48,11 +44,7 @@ class Entries:
         return Measurements(**self._given)
 
     def drawn(self) -> str:
-        """Return the drawing as a data URI; masses that are missing do not matter.
-
-        Raises:
-            ConfigError: the lengths are missing, or fit no machine.
-        """
+        """Return the drawing as a data URI; masses that are missing do not matter."""
         masses = dict.fromkeys(("plate_mass", "crank_mass", "rod_mass"), _ANY_MASS)
         lengths = Entries({**self._given, **{name: str(m) for name, m in masses.items()}})
         with TemporaryDirectory() as folder:
@@ -110,7 +102,6 @@ class MachineForm:
 
     @property
     def url(self) -> str:
-        """Address of the form."""
         return self._server.url
 
     def take(self, entries: Entries) -> dict[str, Any]:
@@ -141,7 +132,6 @@ class MachineForm:
         self._fetched.wait(_PATIENCE)
 
     def close(self) -> None:
-        """End the server."""
         self._ready.set()
         self._server.shutdown()
         self._server.server_close()

@@ -74,11 +74,7 @@ def _poles(poles: NDArray[np.complex128]) -> str:
 
 
 def mechanism_figure(mechanism: Mechanism) -> Figure:
-    """Draw two views of a mechanism at its home pose, of the same scale; lengths in mm.
-
-    Raises:
-        UnreachablePoseError: home is out of reach.
-    """
+    """Draw two views of a mechanism at its home pose, of the same scale; lengths in mm."""
     home = assemble(mechanism, mechanism.home)
     joints = mechanism.home[3:] + mechanism.p_PQ @ home.R_WP.T
     points = {"shaft": 1e3 * mechanism.p_WS, "tip": 1e3 * home.p_WT, "joint": 1e3 * joints}
@@ -108,7 +104,6 @@ def mechanism_figure(mechanism: Mechanism) -> Figure:
 
 
 def write_mechanism_figure(mechanism: Mechanism, directory: Path) -> list[Path]:
-    """Write mechanism.png and mechanism.svg."""
     return write_figures({"mechanism": mechanism_figure(mechanism)}, directory)
 
 

@@ -24,17 +24,12 @@ from stewart_drake.reporting.style import figure_style, for_dark_too
 
 @dataclass(frozen=True)
 class Provenance:
-    """Origin of a page.
+    """Origin of a page."""
 
-    Attributes:
-        command: makes the page again.
-        versions: of the package and its dependencies.
-        seconds: computing time, or None.
-    """
-
-    command: str
+    command: str  # makes the page again
+    # of the package and its dependencies
     versions: Mapping[str, str] = field(default_factory=versions)
-    seconds: float | None = None
+    seconds: float | None = None  # computing time, or None
 
 
 def html(document: Document, made: Provenance) -> str:
@@ -43,7 +38,6 @@ def html(document: Document, made: Provenance) -> str:
 
 
 def write_page(document: Document, made: Provenance, path: Path) -> Path:
-    """Write the page to a file."""
     write_whole(path, html(document, made))
     return path
 

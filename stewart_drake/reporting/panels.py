@@ -41,53 +41,39 @@ _CROSS: Final = Line2D([], [], ls="", marker="x", color="#666666", ms=7, mew=2)
 
 @dataclass(frozen=True)
 class Curve:
-    """A line in a panel.
-
-    Attributes:
-        label: for the legend, or empty.
-        steps: whether a value holds until the next x.
-        band: lower and upper end of an interval, and its label.
-        ended: x at which a run ended early, marked by a cross.
-    """
+    """A line in a panel."""
 
     x: ArrayLike
     y: ArrayLike
-    label: str = ""
+    label: str = ""  # for the legend, or empty
     line: Line = RUN
-    steps: bool = False
+    steps: bool = False  # whether a value holds until the next x
+    # lower and upper end of an interval, and its label
     band: tuple[ArrayLike, ArrayLike, str] | None = None
-    ended: float | None = None
+    ended: float | None = None  # x at which a run ended early, marked by a cross
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A pair of axes.
+    """A pair of axes."""
 
-    Attributes:
-        y: name and unit of the vertical axis.
-        x: name and unit of the horizontal axis, shown below the last panel that shares it.
-        limits: levels with a text on each.
-        marks: places on the horizontal axis with a dotted line, and labels for the legend.
-        legend: place of its legend: above the whole figure, above the panel, or inside.
-        height: in inches.
-        wide: whether it fills a whole row, below the others.
-        paint: draws anything else.
-    """
-
-    y: str
+    y: str  # name and unit of the vertical axis
     curves: Sequence[Curve] = ()
+    # name and unit of the horizontal axis, shown below the last panel that shares it
     x: str = "time  [s]"
-    limits: Mapping[float, str] = field(default_factory=dict)
+    limits: Mapping[float, str] = field(default_factory=dict)  # levels with a text on each
+    # places on the horizontal axis with a dotted line, and labels for the legend
     marks: Mapping[float, str] = field(default_factory=dict)
     xscale: Scale = "linear"
     yscale: Scale = "linear"
     xlim: Ends | None = None
     ylim: Ends | None = None
     title: str = ""
+    # place of its legend: above the whole figure, above the panel, or inside
     legend: Literal["figure", "panel", "inside"] = "figure"
-    height: float = 1.8
-    wide: bool = False
-    paint: Callable[[Axes], object] | None = None
+    height: float = 1.8  # in inches
+    wide: bool = False  # whether it fills a whole row, below the others
+    paint: Callable[[Axes], object] | None = None  # draws anything else
 
 
 @figure_style()
@@ -188,7 +174,6 @@ def _fill(ax: Axes, panel: Panel, last: bool, named: bool) -> None:
 
 
 def limit(ax: Axes, level: float, text: str, *, below: bool = False) -> None:
-    """Draw a limit with a text on it."""
     ax.axhline(level, label=None if text else "limit", **LIMIT._asdict())
     ax.annotate(
         text,

@@ -69,9 +69,6 @@ def log_html(path: Path) -> str:
     """Return a log as a page like that of `replay_html`; it needs the scenario of the run.
 
     A row without a pose is left out, and without a reference the pose counts as it.
-
-    Raises:
-        ConfigError: no log of a run, or one without a scenario or poses.
     """
     signals = read_log(path)
     scenario = scenario_of(signals, path)
@@ -126,7 +123,6 @@ def _html(signals: xr.Dataset, mechanism: Mechanism, title: str, outcome: str) -
 
 
 def write_replay(result: SimulationResult, mechanism: Mechanism, path: Path, title: str) -> Path:
-    """Write `replay_html` to a file and return its path."""
     write_whole(path, replay_html(result, mechanism, title))
     return path
 

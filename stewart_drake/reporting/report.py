@@ -1,7 +1,7 @@
-"""The report on a scenario.
+"""The report on a scenario, and the first one on a new machine.
 
-It shows the scenario's own run, the shipped controllers in the manner of the paper's Table II and
-figures 5, 6 and 7, the analyses, and the scenario itself.
+That on a scenario shows its own run, the shipped controllers in the manner of the paper's Table II
+and figures 5, 6 and 7, the analyses, and the scenario itself.
 """
 
 import pickle
@@ -40,6 +40,8 @@ from stewart_drake.reporting.figures import (
     has_packets,
     weights_figure,
 )
+from stewart_drake.reporting.mechanism import document as describe
+from stewart_drake.reporting.mechanism import mechanism_figure
 from stewart_drake.reporting.results import AnalysisResult
 from stewart_drake.reporting.run import comparison_document, run_document
 from stewart_drake.scenario.config import Scenario
@@ -48,6 +50,7 @@ from stewart_drake.scenario.loading import load_compatible, scenario_yaml
 from stewart_drake.studies import compare
 from stewart_drake.studies.compare import LABELS, is_papers, label
 from stewart_drake.studies.jobs import Job, Progress, run_jobs
+from stewart_drake.studies.new_machine import NewMachine
 from stewart_drake.tuner.network import DEFAULT
 
 ANALYSES: Final = ("delay", "hautus", "workspace")
@@ -94,22 +97,16 @@ _PACKETS_BELOW: Final = (
 
 @dataclass(frozen=True)
 class ReportData:
-    """Content of a report.
-
-    Attributes:
-        scenario: as asked for.
-        failure: where the reference leaves the workspace; None with runs.
-        run: of the scenario; None with a `failure`.
-        comparison: runs of the shipped controllers, by name.
-        tuned: runs of the delay-aware controllers with the tuner's weights; none without a network.
-        analyses: results without their studies, by name in the order of ANALYSES.
-    """
+    """Content of a report."""
 
     scenario: Scenario
-    failure: Failure | None
-    run: SimulationResult | None = None
+    failure: Failure | None  # where the reference leaves the workspace; None with runs
+    run: SimulationResult | None = None  # of the scenario; None with a `failure`
+    # runs of the shipped controllers, by name
     comparison: dict[str, SimulationResult] = field(default_factory=dict)
+    # runs of the delay-aware controllers with the tuner's weights; none without a network
     tuned: dict[str, SimulationResult] = field(default_factory=dict)
+    # results without their studies, by name in the order of ANALYSES
     analyses: dict[str, AnalysisResult] = field(default_factory=dict)
 
 
@@ -345,3 +342,26 @@ def mean_error(run: SimulationResult) -> float:
     s, sc = run.summary, run.scenario
     left = sc.duration - (sc.eta if s["delay_floor"] else 0.0)
     return float((s["accumulated_error"] - s["delay_floor"]) / left) if left > 0 else np.nan
+
+
+def first_report(made: NewMachine, result: SimulationResult, findings: Iterable[str]) -> Document:
+    """Return the first report on a new machine: its drawing, its check, and its first run.
+
+    `findings` are sentences about the motors, the loop and its delay.
+    """
+    check, completed = made.check, result.status == "completed"
+    about, ran = describe(check), run_document(result)
+    drawing = Picture(lambda: mechanism_figure(check.mechanism), "The machine at its home pose.")
+    figures = [
+        Picture(figure, f"{name.capitalize()}.") for name, figure in draw_run(result).items()
+    ]
+    motion = "Up and down by a quarter of the travel, once in two seconds."
+    return Document(
+        f"First report on {check.mechanism.name}",
+        " ".join(sentence(text) for text in (check.verdict, *findings)),
+        [
+            Section("The machine", drawing, *_blocks(about)),
+            Section("A first run", Paragraph(motion), *_blocks(ran), *figures),
+        ],
+        "good" if completed else "bad",
+    )

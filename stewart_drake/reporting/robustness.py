@@ -291,7 +291,6 @@ def runs_figure(study: RobustnessStudy) -> Figure:
 
 
 def times_figure(study: RobustnessStudy) -> Figure:
-    """Draw when runs ended early."""
     times = [one.time for one in study.outcomes if one.status != "completed"]
     end = study.experiment.scenario.duration
 

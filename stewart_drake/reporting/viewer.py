@@ -35,17 +35,11 @@ _GHOST: Final = Rgba(0.80, 0.10, 0.10, 0.35)
 
 @dataclass(frozen=True)
 class Placement:
-    """A pose set by the sliders.
+    """A pose set by the sliders."""
 
-    Attributes:
-        pose: (6,) rad and m.
-        reach: reach margins (6,) in m, negative where a leg is short.
-        failure: why the pose is impossible, or None.
-    """
-
-    pose: Array
-    reach: Array
-    failure: Failure | None
+    pose: Array  # (6,) rad and m
+    reach: Array  # reach margins (6,) in m, negative where a leg is short
+    failure: Failure | None  # why the pose is impossible, or None
 
     def __str__(self) -> str:
         short = [
@@ -98,7 +92,6 @@ class PoseViewer:
         self.step(home)
 
     def close(self) -> None:
-        """Free the diagram."""
         dispose(self._diagram)
 
     def values(self) -> Array:
@@ -134,11 +127,7 @@ class PoseViewer:
         return placement
 
     def run(self, say: Callable[[str], None]) -> None:
-        """Follow the sliders until the stop button or Escape in the browser.
-
-        Args:
-            say: called with a description of each new pose.
-        """
+        """Follow the sliders until the stop button or Escape in the browser."""
         shown = np.full(6, np.nan)
         while self.meshcat.GetButtonClicks(STOP) == 0:
             values = self.values()

@@ -34,18 +34,12 @@ class Nearest(NamedTuple):
 
 
 class ClearanceAlong(NamedTuple):
-    """Clearance along a motion, as far as the legs reach.
+    """Clearance along a motion, as far as the legs reach."""
 
-    Attributes:
-        time: (n,) s.
-        links: (n,) m, of the nearest two links; NaN out of reach.
-        base: (n,) m, of the part nearest to the base or its motors; NaN out of reach.
-        nearest: least distance of every pair, the nearest first; empty if no pose is in reach.
-    """
-
-    time: Array
-    links: Array
-    base: Array
+    time: Array  # (n,) s
+    links: Array  # (n,) m, of the nearest two links; NaN out of reach
+    base: Array  # (n,) m, of the part nearest to the base or its motors; NaN out of reach
+    # least distance of every pair, the nearest first; empty if no pose is in reach
     nearest: list[Nearest]
 
     def least(self, fixed: bool) -> Nearest | None:

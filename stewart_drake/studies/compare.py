@@ -92,9 +92,6 @@ def compare(
     Returns:
         Results by controller, in the order of `shown`, then your own. A file is named by its name
         without the suffix.
-
-    Raises:
-        ConfigError: bad input, an unreachable reference.
     """
     settings, chosen = tuple(settings), None
     makers: dict[str, Callable[[], System]] = {}
@@ -156,9 +153,6 @@ def shown(
     the rows in the scenario's `compare`. ADAPTIVE is added then if the others' delay is not the
     true one, or changes, and the scenario supports it; GRAVITY if gravity acts; SERVOS if the
     scenario's motors are servos.
-
-    Raises:
-        ConfigError: bad input.
     """
     settings = tuple(settings)
     if controllers is not None:
@@ -177,11 +171,6 @@ def shown(
 
 
 def _chosen(controllers: Sequence[str | Path]) -> Sequence[str | Path]:
-    """Check the names or files of controllers.
-
-    Raises:
-        ConfigError: none, or an item of another kind.
-    """
     few = isinstance(controllers, str) or len(controllers) == 0
     wrong = [] if few else [one for one in controllers if not isinstance(one, str | Path)]
     if few or wrong:
@@ -240,11 +229,7 @@ def is_papers(scenario: Scenario, *, any_size: bool = False) -> bool:
 
 
 def save_comparison(results: Mapping[str, SimulationResult], directory: str | Path) -> None:
-    """Write NAME.nc of every controller, then summary.json; each file whole or not.
-
-    Raises:
-        OSError: the directory cannot be written to.
-    """
+    """Write NAME.nc of every controller, then summary.json; each file whole or not."""
     folder = Path(directory)
     folder.mkdir(parents=True, exist_ok=True)
     remove_partials(folder)

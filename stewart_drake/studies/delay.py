@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import singledispatch
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -37,7 +36,7 @@ from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig, WaypointsConfig
+from stewart_drake.scenario.reference_config import ReferenceConfig
 from stewart_drake.scenario.reference_files import waypoints
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
@@ -103,25 +102,17 @@ class MotorMargins(NamedTuple):
 
 @dataclass(frozen=True)
 class LoopMargins:
-    """Margins of the loop of one delay.
+    """Margins of the loop of one delay."""
 
-    Attributes:
-        steps: mu.
-        radius: spectral radius of the closed loop.
-        S, T: peaks of sensitivity and complementary sensitivity at the motors.
-        gain_up, gain_down: factors on the torques of all motors.
-        motor: classical margins of one motor at a time; None if the loop is unstable.
-        later, earlier: errors of the believed delay, s.
-    """
-
-    steps: int
-    radius: float
-    S: Peak
-    T: Peak
-    gain_up: float
+    steps: int  # mu
+    radius: float  # spectral radius of the closed loop
+    S: Peak  # of sensitivity at the motors
+    T: Peak  # of complementary sensitivity
+    gain_up: float  # factor on the torques of all motors
     gain_down: float
+    # classical margins of one motor at a time; None if the loop is unstable
     motor: MotorMargins | None
-    later: float
+    later: float  # error of the believed delay, s
     earlier: float
 
     @property
@@ -142,52 +133,33 @@ class LoopMargins:
 
 
 class Cell(NamedTuple):
-    """Simulation with one delay and amplitude.
+    """Simulation with one delay and amplitude."""
 
-    Attributes:
-        steps: whole periods of delay.
-        factor: on the reference's amplitude.
-        status: as of a simulation, or `out_of_reach` if the reference leaves the workspace, or
-            `not_run` after Ctrl-C.
-        error: E_ac in % s, NaN for a run that did not complete.
-        time: s, when it ended early or the reference leaves the workspace; else NaN.
-    """
-
-    steps: int
-    factor: float
+    steps: int  # whole periods of delay
+    factor: float  # on the reference's amplitude
+    # as of a simulation, or `out_of_reach` if the reference leaves the workspace, or `not_run`
+    # after Ctrl-C
     status: str
-    error: float
-    time: float
+    error: float  # E_ac in % s, NaN for a run that did not complete
+    time: float  # s, when it ended early or the reference leaves the workspace; else NaN
 
 
 @dataclass(frozen=True)
 class DelayStudy:
-    """Result of the analysis of the delay.
-
-    Attributes:
-        assessment: of the scenario.
-        controller: the scenario's loop along the reference, as far as that can be followed; None if
-            it cannot be followed at all.
-        eta: total delay, s.
-        poles: along the reference, as far as it can be followed.
-        growths: simulated checks of e^(p eta); none if nothing grows.
-        floors: E_ac in % s of a plate that waits at rest, by whole periods of delay.
-        loops: the closed loop by delay; empty with a reason in `loop_problem`.
-        loop_problem: why the closed loop was not judged, or empty.
-        cells: simulations by delay and amplitude.
-        interrupted: whether Ctrl-C ended the simulations early.
-    """
+    """Result of the analysis of the delay."""
 
     assessment: Assessment
+    # the scenario's loop along the reference, as far as that can be followed; None if it cannot be
+    # followed at all
     controller: ControllerMargin | None
-    eta: float
-    poles: list[PolePoint]
-    growths: list[Growth]
-    floors: dict[int, float]
-    loops: list[LoopMargins]
-    loop_problem: str
-    cells: list[Cell]
-    interrupted: bool
+    eta: float  # total delay, s
+    poles: list[PolePoint]  # along the reference, as far as it can be followed
+    growths: list[Growth]  # simulated checks of e^(p eta); none if nothing grows
+    floors: dict[int, float]  # E_ac in % s of a plate that waits at rest, by whole periods of delay
+    loops: list[LoopMargins]  # the closed loop by delay; empty with a reason in `loop_problem`
+    loop_problem: str  # why the closed loop was not judged, or empty
+    cells: list[Cell]  # simulations by delay and amplitude
+    interrupted: bool  # whether Ctrl-C ended the simulations early
 
     @property
     def verdict(self) -> Verdict | None:
@@ -218,7 +190,6 @@ class DelayStudy:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Content of `summary.json`."""
         verdict = self.verdict
         return {
             "eta": self.eta,
@@ -433,29 +404,20 @@ def map_delays(steps: int) -> list[int]:
     return sorted({0, steps // 2, steps, 3 * steps // 2, 2 * steps}) if steps > 1 else [0, 1, 2, 4]
 
 
-@singledispatch
-def _scaled(reference: ReferenceConfig, factor: float) -> ReferenceConfig | None:
-    return None
-
-
-@_scaled.register
-def _(reference: SineConfig, factor: float) -> SineConfig:
-    return replace(reference, amplitude=[factor * a for a in reference.amplitude])
-
-
-@_scaled.register
-def _(reference: WaypointsConfig, factor: float) -> WaypointsConfig:
-    times, poses = waypoints(reference)
-    way = poses[0] + factor * (poses - poses[0])
-    return replace(reference, file=None, times=times.tolist(), poses=way.tolist())
-
-
 def scaled_motion(reference: ReferenceConfig, factor: float) -> ReferenceConfig | None:
     """Return the motion with its amplitude, or its way from the first waypoint, times `factor`.
 
     None if it has no amplitude to scale: a constant pose, or a file of samples.
     """
-    return reference if factor == 1 else _scaled(reference, factor)
+    if factor == 1:
+        return reference
+    if reference.kind == "sine":
+        return replace(reference, amplitude=[factor * a for a in reference.amplitude])
+    if reference.kind == "waypoints":
+        times, poses = waypoints(reference)
+        way = poses[0] + factor * (poses - poses[0])
+        return replace(reference, file=None, times=times.tolist(), poses=way.tolist())
+    return None
 
 
 def delay_map(scenario: Scenario, progress: Progress | None = None) -> tuple[list[Cell], bool]:

@@ -96,31 +96,19 @@ def _mode_text(mode: Mode, labels: list[Label]) -> str:
 
 @dataclass(frozen=True)
 class System:
-    """One system and its tests.
+    """One system and its tests."""
 
-    Attributes:
-        name: unique.
-        family: `error model`, `minimal chain`, `paper's chain`, `chain under gravity` or `plant`.
-        steps: of delay, or None.
-        time: s along the reference, None for home.
-        n, m: states and inputs.
-        reach, view: tests of (A, B), and of (A', C').
-        drake: Drake's answers to QUESTIONS.
-        words: a sentence for each mode that fails.
-        note: why Drake disagrees, or empty.
-    """
-
-    name: str
-    family: str
-    steps: int | None
-    time: float | None
-    n: int
-    m: int
-    reach: Hautus
-    view: Hautus
-    drake: dict[str, bool]
-    words: tuple[str, ...]
-    note: str
+    name: str  # unique
+    family: str  # `error model`, `minimal chain`, `paper's chain`, `chain under gravity` or `plant`
+    steps: int | None  # of delay, or None
+    time: float | None  # s along the reference, None for home
+    n: int  # states
+    m: int  # inputs
+    reach: Hautus  # test of (A, B)
+    view: Hautus  # test of (A', C')
+    drake: dict[str, bool]  # Drake's answers to QUESTIONS
+    words: tuple[str, ...]  # a sentence for each mode that fails
+    note: str  # why Drake disagrees, or empty
 
     @property
     def answers(self) -> dict[str, bool]:
@@ -162,7 +150,6 @@ class HautusStudy:
     skipped: dict[str, str]
 
     def family(self, name: str) -> list[System]:
-        """Return the systems of one family."""
         return [system for system in self.systems if system.family == name]
 
     @property

@@ -309,12 +309,7 @@ def _end_with(parent: int) -> None:
 
 # joblib's backend for Dask waits for ever if workers die over a call, so futures are used here.
 def _on_dask(scheduler: str, calls: Sequence[_Call]) -> Generator[tuple[str, bytes]]:
-    """Yield the results of calls as they finish; closing the iterator cancels the others.
-
-    Raises:
-        ConfigError: no scheduler at this address; no workers, or workers that cannot be used.
-        ChildProcessError: workers died over one call, or the scheduler went away.
-    """
+    """Yield the results of calls as they finish; closing the iterator cancels the others."""
     try:
         import distributed
     except ImportError:
@@ -360,11 +355,7 @@ def _on_dask(scheduler: str, calls: Sequence[_Call]) -> Generator[tuple[str, byt
 
 
 def _greet(dask: Any, scheduler: str) -> None:
-    """Connect once without a client: one that finds no scheduler leaves an event loop running.
-
-    Raises:
-        OSError, ValueError: no scheduler, or not an address.
-    """
+    """Connect once without a client: one that finds no scheduler leaves an event loop running."""
     options = dask.Security().get_connection_args("client")
 
     async def greet() -> None:

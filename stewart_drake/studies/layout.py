@@ -79,21 +79,13 @@ _STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 @checked(config=_STRICT)
 class Found:
-    """Result of one search, as its file keeps it.
+    """Result of one search, as its file keeps it."""
 
-    Attributes:
-        order, branches: of the arrangement.
-        values: of `layout_space.PARAMETERS`.
-        measures: by name; empty if the motion is out of reach.
-        missed: limits that are not kept, by name, and by which share.
-        evaluations: number of layouts tried.
-    """
-
-    order: list[int]
-    branches: list[int]
-    values: list[float]
-    measures: dict[str, float]
-    missed: dict[str, float]
+    order: list[int]  # of the arrangement
+    branches: list[int]  # of the arrangement
+    values: list[float]  # of `layout_space.PARAMETERS`
+    measures: dict[str, float]  # by name; empty if the motion is out of reach
+    missed: dict[str, float]  # limits that are not kept, by name, and by which share
     evaluations: int
 
 
@@ -107,27 +99,18 @@ class Judged:
 
 
 class Layout(NamedTuple):
-    """Machine with its measures and its run.
+    """Machine with its measures and its run."""
 
-    Attributes:
-        name: of its file, without the suffix; of the scenario's own machine its name.
-        order: (6,): joint of the plate that each leg takes.
-        values: of `layout_space.PARAMETERS`.
-        measures: at all instants that are checked, with the shapes themselves; only the reach if a
-            pose is out of reach.
-        missed: limits that are not kept, by name, and by which share.
-        nearest: the two links at their least distance.
-        outcome: of the scenario with this machine.
-    """
-
-    name: str
+    name: str  # of its file, without the suffix; of the scenario's own machine its name
     mechanism: Mechanism
-    order: tuple[int, ...]
-    values: Array
+    order: tuple[int, ...]  # (6,): joint of the plate that each leg takes
+    values: Array  # of `layout_space.PARAMETERS`
+    # at all instants that are checked, with the shapes themselves; only the reach if a pose is out
+    # of reach
     measures: dict[str, float]
-    missed: dict[str, float]
-    nearest: Nearest | None
-    outcome: Outcome
+    missed: dict[str, float]  # limits that are not kept, by name, and by which share
+    nearest: Nearest | None  # the two links at their least distance
+    outcome: Outcome  # of the scenario with this machine
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -145,19 +128,12 @@ class Layout(NamedTuple):
 
 @dataclass(frozen=True)
 class Problem:
-    """Problem of a search; it is sent to other processes.
+    """Problem of a search; it is sent to other processes."""
 
-    Attributes:
-        scenario: with the motion.
-        space: of layouts.
-        motion: home and the reference at `INSTANTS`.
-        requirements: limits and goal.
-    """
-
-    scenario: Scenario
-    space: Space
-    motion: Motion
-    requirements: Requirements
+    scenario: Scenario  # with the motion
+    space: Space  # of layouts
+    motion: Motion  # home and the reference at `INSTANTS`
+    requirements: Requirements  # limits and goal
 
     def trial(self, values: Sequence[float] | Array, arrangement: Arrangement) -> dict[str, float]:
         """Return the measures of a layout, as far as the limits before them are kept."""
@@ -217,23 +193,15 @@ class Problem:
 
 @dataclass(frozen=True)
 class LayoutStudy:
-    """Result of `layout`.
+    """Result of `layout`."""
 
-    Attributes:
-        problem: of the searches.
-        seed, starts, generations: as asked for.
-        searches: result of each, by its key.
-        before: the scenario's own machine.
-        layouts: the best few, the best first.
-    """
-
-    problem: Problem
+    problem: Problem  # of the searches
     seed: int
     starts: int
     generations: int
-    searches: dict[str, Found]
-    before: Layout
-    layouts: list[Layout]
+    searches: dict[str, Found]  # result of each, by its key
+    before: Layout  # the scenario's own machine
+    layouts: list[Layout]  # the best few, the best first
 
     @property
     def evaluations(self) -> int:
@@ -293,11 +261,7 @@ def study_layout(
     Args:
         scenario: its machine, which has a pattern, is the start of the search.
         directory: of the machines; finished searches go below it.
-        options: see `LayoutOptions`.
         progress: as `run_jobs` takes it.
-
-    Raises:
-        As `run_jobs`, and ConfigError for a scenario or options that do not suit.
     """
     best, starts, generations = options.best, options.starts, options.generations
     seed, folder = options.seed, Path(directory)
@@ -363,11 +327,6 @@ def problem_of(
     vary: Mapping[str, tuple[float, float]],
     keep: Sequence[str],
 ) -> Problem:
-    """Return the problem of a search.
-
-    Raises:
-        ConfigError: one line.
-    """
     for field, value in (
         ("plant.mechanism", scenario.plant.mechanism),
         ("controller.calibration", scenario.controller.calibration),

@@ -41,20 +41,12 @@ from stewart_drake.types import Array
 
 
 class Measure(NamedTuple):
-    """Quantity that a layout is judged by.
+    """Quantity that a layout is judged by."""
 
-    Attributes:
-        more: whether more is better.
-        unit: in files.
-        factor: from `unit` to `shown`.
-        shown: unit for readers.
-        text: meaning.
-    """
-
-    more: bool
-    unit: str
-    factor: float
-    shown: str
+    more: bool  # whether more is better
+    unit: str  # in files
+    factor: float  # from `unit` to `shown`
+    shown: str  # unit for readers
     text: str
 
 
@@ -77,15 +69,10 @@ MEASURES: Final = {
 
 
 class Motion(NamedTuple):
-    """Home and a reference at some instants.
+    """Home and a reference at some instants."""
 
-    Attributes:
-        poses: (n, 6) rad, m; the first is home.
-        wanted: (n - 1, 18) pose, rates and accelerations of the reference.
-    """
-
-    poses: Array
-    wanted: Array
+    poses: Array  # (n, 6) rad, m; the first is home
+    wanted: Array  # (n - 1, 18) pose, rates and accelerations of the reference
 
 
 def motion_of(home: Array, reference: Trajectory, time: Array) -> Motion:
@@ -158,11 +145,7 @@ class Requirements(NamedTuple):
 def requirements(
     goal: str, limits: Mapping[str, float], usual: Mapping[str, float]
 ) -> Requirements:
-    """Return the goal with the given limits, and the usual ones for other measures.
-
-    Raises:
-        ConfigError: an unknown measure, or a limit that is not a number.
-    """
+    """Return the goal with the given limits, and the usual ones for other measures."""
     for option, names in (("goal", [goal]), ("limit", limits)):
         for name in names:
             if name not in MEASURES:
@@ -201,17 +184,11 @@ DIGITS: Final = 4
 
 
 class Arrangement(NamedTuple):
-    """Order and crank solutions of the legs, the same for all three pairs.
+    """Order and crank solutions of the legs, the same for all three pairs."""
 
-    Attributes:
-        order: (6,): leg i takes joint order[i] of the plate.
-        branches: (6,) of -1 or 1.
-        centre_deg: plate offset at which a pair's joints are symmetric about it.
-    """
-
-    order: tuple[int, ...]
-    branches: tuple[int, ...]
-    centre_deg: float
+    order: tuple[int, ...]  # (6,): leg i takes joint order[i] of the plate
+    branches: tuple[int, ...]  # (6,) of -1 or 1
+    centre_deg: float  # plate offset at which a pair's joints are symmetric about it
 
     @property
     def key(self) -> str:
@@ -222,19 +199,13 @@ class Arrangement(NamedTuple):
 
 @dataclass(frozen=True)
 class Space:
-    """Set of the layouts to choose from.
+    """Set of the layouts to choose from."""
 
-    Attributes:
-        spec: of the machine that the search begins from; everything that does not vary stays.
-        bounds: lowest and highest value by parameter.
-        kept: those of `CHOICES` that stay as in `spec`.
-        offset_from_centre: whether the plate's offset is counted from the arrangement's centre.
-    """
-
+    # of the machine that the search begins from; everything that does not vary stays
     spec: MechanismSpec
-    bounds: dict[str, tuple[float, float]]
-    kept: tuple[str, ...]
-    offset_from_centre: bool
+    bounds: dict[str, tuple[float, float]]  # lowest and highest value by parameter
+    kept: tuple[str, ...]  # those of `CHOICES` that stay as in `spec`
+    offset_from_centre: bool  # whether the plate's offset is counted from the arrangement's centre
 
     @property
     def pattern(self) -> PatternSpec:
@@ -310,10 +281,6 @@ def space_around(
         spec: of a machine with a pattern.
         vary: lowest and highest value by parameter; equal ones fix it.
         keep: parameters and choices that stay as they are.
-
-    Raises:
-        ConfigError: a machine without a pattern, names that are unknown or both varied and kept,
-            wrong bounds.
     """
     if spec.pattern is None:
         raise ConfigError(

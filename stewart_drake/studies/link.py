@@ -41,23 +41,14 @@ _SAME: Final = 0.01
 
 
 class Cell(NamedTuple):
-    """Simulations with one bound and loss.
+    """Simulations with one bound and loss."""
 
-    Attributes:
-        bound: s.
-        loss: share of lost packets.
-        late: probability that a packet which is not lost arrives after the bound.
-        missing: probability that no packet brings a torque in time, plans not counted.
-        runs: number of simulations.
-        errors: E_ac in % s of the completed ones.
-    """
-
-    bound: float
-    loss: float
-    late: float
-    missing: float
-    runs: int
-    errors: tuple[float, ...]
+    bound: float  # s
+    loss: float  # share of lost packets
+    late: float  # probability that a packet which is not lost arrives after the bound
+    missing: float  # probability that no packet brings a torque in time, plans not counted
+    runs: int  # number of simulations
+    errors: tuple[float, ...]  # E_ac in % s of the completed ones
 
     @property
     def completed(self) -> float:
@@ -85,25 +76,15 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class LinkStudy:
-    """Result of the study.
+    """Result of the study."""
 
-    Attributes:
-        scenario: with the network.
-        runs: seeds per bound and loss.
-        bounds: over the bound, the shortest first, at the scenario's loss.
-        losses: over the loss, at the best bound, with new seeds.
-        usual: bound of a scenario with `playout: null`, s.
-        left_out: bounds in s that the multibody plant of the scenario cannot have.
-        interrupted: whether Ctrl-C ended it early.
-    """
-
-    scenario: Scenario
-    runs: int
-    bounds: Sequence[Cell]
-    losses: Sequence[Cell]
-    usual: float
-    left_out: tuple[float, ...]
-    interrupted: bool
+    scenario: Scenario  # with the network
+    runs: int  # seeds per bound and loss
+    bounds: Sequence[Cell]  # over the bound, the shortest first, at the scenario's loss
+    losses: Sequence[Cell]  # over the loss, at the best bound, with new seeds
+    usual: float  # bound of a scenario with `playout: null`, s
+    left_out: tuple[float, ...]  # bounds in s that the multibody plant of the scenario cannot have
+    interrupted: bool  # whether Ctrl-C ended it early
 
     @property
     def best(self) -> Cell | None:
@@ -175,11 +156,7 @@ def study_link(
 
     Args:
         scenario: with a network; its `playout` is not used.
-        options: see `LinkOptions`.
         progress: called for each finished simulation.
-
-    Raises:
-        ConfigError: the scenario has no network.
     """
     link = scenario.assumed_link
     if link.kind != "network":

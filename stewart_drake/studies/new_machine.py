@@ -47,25 +47,17 @@ BODIES: Final = ("base", "plate", "crank", "rod")
 
 
 class MechanismCheck(NamedTuple):
-    """Check of a mechanism at rest at its home pose.
+    """Check of a mechanism at rest at its home pose."""
 
-    Attributes:
-        mechanism: that was checked.
-        failure: why the home pose is unusable, or None; then torque, poles and travel are empty.
-        measures: at home.
-        crank_angles: (6,) rad.
-        torque: (6,) N m that hold the plate under gravity.
-        poles: (12,) of the open loop under gravity, 1/s, the fastest growing first.
-        travel: of each coordinate.
-    """
-
-    mechanism: Mechanism
+    mechanism: Mechanism  # that was checked
+    # why the home pose is unusable, or None; then torque, poles and travel are empty
     failure: Failure | None
-    measures: Measures
-    crank_angles: Array
-    torque: Array
+    measures: Measures  # at home
+    crank_angles: Array  # (6,) rad
+    torque: Array  # (6,) N m that hold the plate under gravity
+    # (12,) of the open loop under gravity, 1/s, the fastest growing first
     poles: NDArray[np.complex128]
-    travel: list[Travel]
+    travel: list[Travel]  # of each coordinate
 
     @property
     def verdict(self) -> str:
@@ -181,11 +173,7 @@ def proposed_pattern(m: Measurements) -> PatternSpec:
 
 
 def best_height(pattern: PatternSpec, m: Measurements) -> float:
-    """Return z in m of the plate's joints at which every rod pushes its crank best.
-
-    Raises:
-        ConfigError: no height is within reach of all legs.
-    """
+    """Return z in m of the plate's joints at which every rod pushes its crank best."""
     legs = pattern_legs(pattern, m.crank, m.rod)
     above = m.shaft_height + m.rod
     found = reachable_heights(legs, np.array([0, 0, 0, 0, 0, above]))
@@ -204,7 +192,6 @@ def best_height(pattern: PatternSpec, m: Measurements) -> float:
 
 
 def machine_text(m: Measurements, name: str) -> str:
-    """Return the machine's file."""
     pattern = proposed_pattern(m)
     rows = "\n".join(f"  {field.name}: {getattr(pattern, field.name)}" for field in fields(pattern))
     height = float(f"{best_height(pattern, m):.4g}")
@@ -252,22 +239,14 @@ delay: {{steps: {delay.steps}, fraction: {round(delay.fraction, 9)}}}   # of {m.
 
 
 def check_free(folder: Path) -> None:
-    """Refuse a folder that has one of MACHINE and SCENARIO.
-
-    Raises:
-        ConfigError: it has.
-    """
+    """Refuse a folder that has one of MACHINE and SCENARIO."""
     for file in (MACHINE, SCENARIO):
         if (folder / file).exists():
             raise ConfigError(f"{folder / file}: already exists; expected a folder without it")
 
 
 def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
-    """Write MACHINE and SCENARIO into a folder and check them; a bad machine is not written.
-
-    Raises:
-        ConfigError: one line; a file exists already, or the machine cannot stand or move.
-    """
+    """Write MACHINE and SCENARIO into a folder and check them; a bad machine is not written."""
     check_free(folder)
     with TemporaryDirectory() as place:
         machine, scenario = Path(place) / MACHINE, Path(place) / SCENARIO

@@ -74,34 +74,23 @@ def quantity(name: str, text: str, unit: str) -> float:
 
 
 class Option(NamedTuple):
-    """One option of a study.
+    """One option of a study."""
 
-    Attributes:
-        name: of the field and of the Python argument.
-        annotation: of the Python argument.
-        default: in both; `inspect.Parameter.empty` for none.
-        help: unit and meaning.
-        flag: name on the command line, without dashes; None for an option of Python only.
-        metavar: shown there in place of the value.
-        read: makes the value from the texts of a repeatable option. Its second argument loads the
-            scenario with another controller.
-        recorded: whether the command on a page contains the option.
-        unit: of the value; a text such as `300 mm` is accepted too, see `quantity`.
-    """
-
-    name: str
-    annotation: Any
-    default: Any
-    help: str
+    name: str  # of the field and of the Python argument
+    annotation: Any  # of the Python argument
+    default: Any  # in both; `inspect.Parameter.empty` for none
+    help: str  # unit and meaning
+    # name on the command line, without dashes; None for an option of Python only
     flag: str | None = None
-    metavar: str | None = None
+    metavar: str | None = None  # shown there in place of the value
+    # makes the value from the texts of a repeatable option. Its second argument loads the scenario
+    # with another controller.
     read: "Callable[[list[str], Callable[[str], Scenario]], Any] | None" = None
-    recorded: bool = True
-    unit: str | None = None
+    recorded: bool = True  # whether the command on a page contains the option
+    unit: str | None = None  # of the value; a text such as `300 mm` is accepted too, see `quantity`
 
     @property
     def required(self) -> bool:
-        """Whether a value must be given."""
         return self.default is inspect.Parameter.empty
 
 
@@ -179,9 +168,6 @@ def refuse(options: Mapping[str, object], why: str) -> None:
     Args:
         options: by name.
         why: end of the message, after the value.
-
-    Raises:
-        ConfigError: one line, about the first of them.
     """
     for name, value in options.items():
         if value is not None and value != []:

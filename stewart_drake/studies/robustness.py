@@ -40,22 +40,14 @@ SIGNED: Final = tuple(name for name, one in MACHINE.items() if one.signed)
 
 
 class Influence(NamedTuple):
-    """Correlation of a quantity with the outcome.
+    """Correlation of a quantity with the outcome."""
 
-    Attributes:
-        factor, unit: of the quantity.
-        error: with E_ac among the runs that completed.
-        error_p: its p-value, adjusted by Holm over all quantities.
-        failure: with failing (1 or 0) among all runs.
-        failure_p: its p-value, adjusted.
-    """
-
-    factor: str
-    unit: str
-    error: Correlation
-    error_p: float
-    failure: Correlation
-    failure_p: float
+    factor: str  # of the quantity
+    unit: str  # of the quantity
+    error: Correlation  # with E_ac among the runs that completed
+    error_p: float  # its p-value, adjusted by Holm over all quantities
+    failure: Correlation  # with failing (1 or 0) among all runs
+    failure_p: float  # its p-value, adjusted
 
     @property
     def strength(self) -> float:
@@ -73,25 +65,17 @@ class Influence(NamedTuple):
 
 
 class RobustnessStudy(NamedTuple):
-    """Monte Carlo study; the i-th draw belongs to the i-th outcome.
-
-    Attributes:
-        experiment: of the scenario.
-        ranges, scales, seed: of the draws.
-        limit: E_ac in % s above which a completed run counts as failed, or None.
-        undisturbed: outcome of the scenario itself.
-        draws, outcomes: of the machines.
-        also: by name of another controller, its undisturbed outcome and those on the same draws.
-    """
+    """Monte Carlo study; the i-th draw belongs to the i-th outcome."""
 
     experiment: Experiment
-    ranges: Ranges
-    scales: Scales
-    seed: int
-    limit: float | None
-    undisturbed: Outcome
-    draws: list[Draw]
-    outcomes: list[Outcome]
+    ranges: Ranges  # of the draws
+    scales: Scales  # of the draws
+    seed: int  # of the draws
+    limit: float | None  # E_ac in % s above which a completed run counts as failed, or None
+    undisturbed: Outcome  # outcome of the scenario itself
+    draws: list[Draw]  # of the machines
+    outcomes: list[Outcome]  # of the machines
+    # by name of another controller, its undisturbed outcome and those on the same draws
     also: dict[str, tuple[Outcome, list[Outcome]]] = {}
 
     @property

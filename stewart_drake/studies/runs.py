@@ -33,28 +33,19 @@ _Number = Annotated[float, Field(ge=0), WrapValidator(_or_nan)]
 
 @dataclass(config=_STRICT)
 class Outcome:
-    """End of a run.
+    """End of a run."""
 
-    Attributes:
-        status: as of a simulation; `not_assembled` if drawn parts do not fit together, `refused`
-            if the scenario with the drawn values cannot be prepared.
-        reason: why it failed, or empty.
-        leg: that reached its end, or None.
-        time: s, when it failed, else NaN.
-        error: E_ac in % s, NaN for a run that did not complete.
-        peak_torque: N m, as commanded, NaN without a run.
-        tuner_fallbacks: number of samples at which a tuner ignored its network.
-        loop: what ran it, see `loop.bulk.Ending`; empty without a run.
-    """
-
+    # as of a simulation; `not_assembled` if drawn parts do not fit together, `refused` if the
+    # scenario with the drawn values cannot be prepared
     status: Literal["completed", "left_workspace", "solver_failed", "not_assembled", "refused"]
-    reason: str = ""
-    leg: Annotated[int, Field(ge=1, le=6)] | None = None
-    time: _Number = math.nan
-    error: _Number = math.nan
-    peak_torque: _Number = math.nan
+    reason: str = ""  # why it failed, or empty
+    leg: Annotated[int, Field(ge=1, le=6)] | None = None  # that reached its end, or None
+    time: _Number = math.nan  # s, when it failed, else NaN
+    error: _Number = math.nan  # E_ac in % s, NaN for a run that did not complete
+    peak_torque: _Number = math.nan  # N m, as commanded, NaN without a run
+    # number of samples at which a tuner ignored its network
     tuner_fallbacks: Annotated[int, Field(ge=0)] = 0
-    loop: str = ""
+    loop: str = ""  # what ran it, see `loop.bulk.Ending`; empty without a run
 
 
 @dataclass(config=_STRICT)
@@ -64,7 +55,6 @@ class _File:
 
 
 def outcome_of(ending: Ending) -> Outcome:
-    """Return how a run ended."""
     stopped = ending.stopped
     ended: dict[str, Any] = {}
     if stopped is not None:
@@ -115,9 +105,5 @@ def run_scenarios(
 
 
 def read_outcome(path: Path) -> Outcome:
-    """Read how a run ended.
-
-    Raises:
-        ConfigError: the file is damaged; one line, with the field.
-    """
+    """Read how a run ended."""
     return validate(_File, load_json(path, _MAX_BYTES, _EXPECTED, sealed=True), str(path)).outcome

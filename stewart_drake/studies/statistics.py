@@ -154,43 +154,27 @@ SIGNIFICANT: Final = 0.05
 
 
 class Separation(NamedTuple):
-    """One quantity in the failing runs and in the others.
+    """One quantity in the failing runs and in the others."""
 
-    Attributes:
-        factor: name of the quantity.
-        larger: whether failing runs have the larger values, else the smaller ones.
-        auc: probability that a failing run has the larger value.
-        p: adjusted p-value.
-        bound: begin of the outer third of all runs on that side.
-        failing, others: number of runs in that third.
-    """
-
-    factor: str
-    larger: bool
-    auc: Interval
-    p: float
-    bound: float
-    failing: int
-    others: int
+    factor: str  # name of the quantity
+    larger: bool  # whether failing runs have the larger values, else the smaller ones
+    auc: Interval  # probability that a failing run has the larger value
+    p: float  # adjusted p-value
+    bound: float  # begin of the outer third of all runs on that side
+    failing: int  # number of runs in that third
+    others: int  # number of runs in that third
 
 
 class Pair(NamedTuple):
-    """Two quantities that together separate failing runs better than each alone.
+    """Two quantities that together separate failing runs better than each alone."""
 
-    Attributes:
-        factors: names of the quantities.
-        sides: `large` or `small`, by their medians; of two opposite corners the first.
-        opposite: whether the opposite corner belongs to it.
-        p: adjusted p-value.
-        failing, others: number of runs there.
-    """
-
-    factors: tuple[str, str]
+    factors: tuple[str, str]  # names of the quantities
+    # `large` or `small`, by their medians; of two opposite corners the first
     sides: tuple[str, str]
-    opposite: bool
-    p: float
-    failing: int
-    others: int
+    opposite: bool  # whether the opposite corner belongs to it
+    p: float  # adjusted p-value
+    failing: int  # number of runs there
+    others: int  # number of runs there
 
 
 class Explanation(NamedTuple):

@@ -28,42 +28,38 @@ class Ranges:
 
     Only the torque limit and the noise of the sensor are known to the controller. The unit of each
     number is in `RANGE_UNITS`.
-
-    Attributes:
-        payload: mass at the plate's centre of mass, uniform in +-.
-        torque_bias: rms over the motors, uniform from 0; its direction in the space of the six
-            motors is random.
-        noise: standard deviation of the measured pose (rates: per second), uniform from 0.
-        torque_limit: least and largest limit of the motors, uniform. The limit of the undisturbed
-            run (the scenario's, or that of the mechanism's motors) is never exceeded.
-        damping: friction torque of a crank, uniform from 0.
-        delay: true minus believed delay, uniform in +-; over a wire.
-        delay_steps: the same in whole periods, uniform in +-; adds to `delay`.
-        lengths: error of crank and rod lengths, rms over the twelve, uniform from 0.
-        anchors: error of the coordinates of motor shafts and plate joints, rms over the 36,
-            uniform from 0.
-        coulomb: Coulomb friction of a crank, uniform from 0.
-        payload_position: error of the coordinates of the payload, rms over the three, uniform
-            from 0; without effect on a plate without payload.
-        jitter: standard deviation of the delay from torque to torque, uniform from 0; over a wire.
-        loss: share of the measurements that are lost, uniform from 0; over a network of packets.
     """
 
+    # mass at the plate's centre of mass, uniform in +-
     payload: Annotated[float, _share("+-share of the plate's mass", lt=1)] = 0.1
+    # rms over the motors, uniform from 0; its direction in the space of the six motors is random
     torque_bias: Annotated[float, _share(_TORQUE_SHARE)] = 0.02
+    # standard deviation of the measured pose (rates: per second), uniform from 0
     noise: Annotated[float, _share("share of half the reference's peak to peak")] = 1e-3
+    # least and largest limit of the motors, uniform. The limit of the undisturbed run (the
+    # scenario's, or that of the mechanism's motors) is never exceeded.
     torque_limit: Annotated[
         Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=2, max_length=2)] | None,
         Field(description="[least, most] in peak torques of the undisturbed run"),
     ] = field(default_factory=lambda: [1.0, 3.0])
+    # friction torque of a crank, uniform from 0
     damping: Annotated[float, _share(f"{_TORQUE_SHARE}, at its largest crank speed")] = 0.02
+    # true minus believed delay, uniform in +-; over a wire
     delay: Annotated[float, _share("+-periods of the controller", le=100)] = 0.01
+    # the same in whole periods, uniform in +-; adds to `delay`
     delay_steps: Annotated[int, _share("+-whole periods", le=100)] = 0
+    # error of crank and rod lengths, rms over the twelve, uniform from 0
     lengths: Annotated[float, _share(_CRANK_SHARE, lt=1)] = 2e-4
+    # error of the coordinates of motor shafts and plate joints, rms over the 36, uniform from 0
     anchors: Annotated[float, _share(_CRANK_SHARE, lt=1)] = 2e-4
+    # Coulomb friction of a crank, uniform from 0
     coulomb: Annotated[float, _share(_TORQUE_SHARE)] = 0.0
+    # error of the coordinates of the payload, rms over the three, uniform from 0; without effect on
+    # a plate without payload
     payload_position: Annotated[float, _share(_CRANK_SHARE)] = 0.0
+    # standard deviation of the delay from torque to torque, uniform from 0; over a wire
     jitter: Annotated[float, _share("periods of the controller", le=1)] = 0.0
+    # share of the measurements that are lost, uniform from 0; over a network of packets
     loss: Annotated[float, _share("share of measurements, of packets over a network", lt=0.99)] = (
         0.0
     )
@@ -74,11 +70,7 @@ RANGE_UNITS: Final = units_of(Ranges)
 
 
 def read_ranges(settings: Iterable[str]) -> Ranges:
-    """Return the ranges of `name=value` settings, the value in YAML; others keep their default.
-
-    Raises:
-        ConfigError: in one line.
-    """
+    """Return the ranges of `name=value` settings, the value in YAML; others keep their default."""
     ranges = validate_pairs(Ranges, settings, "--vary", RANGE_UNITS)
     limit = ranges.torque_limit
     if limit is not None and limit[0] > limit[1]:

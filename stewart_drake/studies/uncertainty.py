@@ -38,25 +38,15 @@ changes nothing."""
 
 @dataclass
 class Variant:
-    """Scenario and machine with a draw applied; the controller's belief stays.
+    """Scenario and machine with a draw applied; the controller's belief stays."""
 
-    Attributes:
-        scenario, mechanism: without the draw.
-        fields: of the scenario with the draw.
-        parts: fields of the mechanism that the draw changes.
-    """
-
-    scenario: Scenario
-    mechanism: Mechanism
-    fields: dict[str, Any]
+    scenario: Scenario  # without the draw
+    mechanism: Mechanism  # without the draw
+    fields: dict[str, Any]  # of the scenario with the draw
+    # fields of the mechanism that the draw changes
     parts: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def as_scenario(self) -> Scenario:
-        """Return the scenario with the draw.
-
-        Raises:
-            ConfigError: a drawn value is not accepted by the scenario.
-        """
         return validate(Scenario, self.fields, "drawn")
 
     def machine(self) -> Mechanism:
@@ -69,26 +59,17 @@ class Variant:
 
 
 class Quantity(NamedTuple):
-    """Unknown quantity.
+    """Unknown quantity."""
 
-    Attributes:
-        draw: function of random numbers and the context of its model. It takes the same number of
-            random numbers for any range, so that a narrower range leaves other draws unchanged.
-        apply: changes `fields` or `parts` of a variant.
-        unit: in results; empty for a quantity that is not reported.
-        per_unit: number of units in one of SI.
-        signed: whether the sign matters.
-        sometimes: whether it is absent, 0, in half of the draws.
-        optional: whether it is reported only if it is drawn at all.
-    """
-
+    # function of random numbers and the context of its model. It takes the same number of random
+    # numbers for any range, so that a narrower range leaves other draws unchanged.
     draw: Callable[[Generator, Any], Any]
-    apply: Callable[[Variant, Any], None]
-    unit: str = ""
-    per_unit: float = 1.0
-    signed: bool = False
-    sometimes: bool = False
-    optional: bool = False
+    apply: Callable[[Variant, Any], None]  # changes `fields` or `parts` of a variant
+    unit: str = ""  # in results; empty for a quantity that is not reported
+    per_unit: float = 1.0  # number of units in one of SI
+    signed: bool = False  # whether the sign matters
+    sometimes: bool = False  # whether it is absent, 0, in half of the draws
+    optional: bool = False  # whether it is reported only if it is drawn at all
 
     def in_unit(self, value: Any) -> float:
         """Return the value in its unit: the rms of several numbers, infinite for None."""
@@ -235,27 +216,16 @@ def _add_to_machine(*names: str) -> Callable[[Variant, tuple[float, ...]], None]
 
 
 class Scales(NamedTuple):
-    """Scales of the drawn shares, SI units.
+    """Scales of the drawn shares, SI units."""
 
-    Attributes:
-        plate_mass: kg.
-        motion: (6,) half the reference's peak to peak, rad and m.
-        torque: largest on the reference, N m.
-        speed: largest crank rate on the reference, rad/s.
-        crank: mean length, m.
-        period: of the controller, s.
-        commanded: largest torque that the undisturbed run commands, N m.
-        torque_limit: that of the undisturbed run, N m, infinite for none.
-    """
-
-    plate_mass: float
-    motion: tuple[float, ...]
-    torque: float
-    speed: float
-    crank: float
-    period: float
-    commanded: float
-    torque_limit: float = math.inf
+    plate_mass: float  # kg
+    motion: tuple[float, ...]  # (6,) half the reference's peak to peak, rad and m
+    torque: float  # largest on the reference, N m
+    speed: float  # largest crank rate on the reference, rad/s
+    crank: float  # mean length, m
+    period: float  # of the controller, s
+    commanded: float  # largest torque that the undisturbed run commands, N m
+    torque_limit: float = math.inf  # that of the undisturbed run, N m, infinite for none
 
 
 class About(NamedTuple):

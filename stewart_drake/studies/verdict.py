@@ -17,22 +17,14 @@ from stewart_drake.types import Array
 
 
 class Assessment(NamedTuple):
-    """Assessment of a scenario that need not be possible.
-
-    Attributes:
-        experiment: of the scenario.
-        failure: when and why the reference leaves the workspace, or None.
-        home_failure: why the home pose is outside the workspace, or None.
-        motion: (6,) usual size of the pose, rad and m: half the reference's peak to peak.
-        torque: usual size of a torque, N m: the largest that following the reference takes. If it
-            cannot be followed, that of a median instant, because torques may grow without bound on
-            the way out.
-    """
+    """Assessment of a scenario that need not be possible."""
 
     experiment: Experiment
-    failure: Failure | None
-    home_failure: Failure | None
-    motion: Array
+    failure: Failure | None  # when and why the reference leaves the workspace, or None
+    home_failure: Failure | None  # why the home pose is outside the workspace, or None
+    motion: Array  # (6,) usual size of the pose, rad and m: half the reference's peak to peak
+    # usual size of a torque, N m: the largest that following the reference takes. If it cannot be
+    # followed, that of a median instant, because torques may grow without bound on the way out.
     torque: float
 
     @property
@@ -90,17 +82,11 @@ NO: Final = 1e3
 
 @dataclass(frozen=True)
 class Verdict:
-    """Growth of an error of the prediction over the delay, under any controller.
+    """Growth of an error of the prediction over the delay, under any controller."""
 
-    Attributes:
-        eta: true total delay, s.
-        pole: fastest unstable pole of the open loop along the reference, 1/s; 0 without one.
-        time: of that pole, s.
-    """
-
-    eta: float
-    pole: float
-    time: float
+    eta: float  # true total delay, s
+    pole: float  # fastest unstable pole of the open loop along the reference, 1/s; 0 without one
+    time: float  # of that pole, s
 
     @property
     def amplification(self) -> float:

@@ -86,29 +86,17 @@ def size_motors(dynamics: StewartDynamics, reference: Trajectory, time: Array) -
 
 @dataclass(frozen=True)
 class WorkspaceStudy:
-    """Result of `analyze workspace`.
+    """Result of `analyze workspace`."""
 
-    Attributes:
-        experiment: of the scenario, reachable or not.
-        home: why the home pose is unusable, or None.
-        exit: when and why the reference first leaves the workspace, or None.
-        margins: along the reference.
-        factor: largest amplitude factor that fits.
-        travel: per coordinate from home; empty with a bad home pose.
-        sections: through home; empty with a bad home pose.
-        sizing: of the motors, or None if the reference leaves the workspace.
-        clearance: whether links touch, along the reference and around home.
-    """
-
-    experiment: Experiment
-    home: Failure | None
-    exit: Failure | None
-    margins: Margins
-    factor: Factor
-    travel: list[Travel]
-    sections: list[Section]
-    sizing: Sizing | None
-    clearance: ClearanceStudy
+    experiment: Experiment  # of the scenario, reachable or not
+    home: Failure | None  # why the home pose is unusable, or None
+    exit: Failure | None  # when and why the reference first leaves the workspace, or None
+    margins: Margins  # along the reference
+    factor: Factor  # largest amplitude factor that fits
+    travel: list[Travel]  # per coordinate from home; empty with a bad home pose
+    sections: list[Section]  # through home; empty with a bad home pose
+    sizing: Sizing | None  # of the motors, or None if the reference leaves the workspace
+    clearance: ClearanceStudy  # whether links touch, along the reference and around home
 
     @property
     def torque_limit(self) -> float | None:
@@ -191,11 +179,7 @@ class WorkspaceStudy:
 
 
 def study_workspace(scenario: Scenario) -> WorkspaceStudy:
-    """Judge a scenario's reference; one that leaves the workspace is analysed, not refused.
-
-    Raises:
-        ConfigError: the scenario itself is wrong.
-    """
+    """Judge a scenario's reference; one that leaves the workspace is analysed, not refused."""
     experiment = assemble(scenario)
     mechanism, reference = experiment.mechanism, experiment.reference
     time = check_instants(scenario.duration)

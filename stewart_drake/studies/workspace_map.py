@@ -47,29 +47,18 @@ _FACTOR_TOLERANCE: Final = 1e-6
 
 
 class Measures(NamedTuple):
-    """Measures of one pose; NaN from `transmission` on for a pose outside the workspace.
+    """Measures of one pose; NaN from `transmission` on for a pose outside the workspace."""
 
-    Attributes:
-        reach: (6,) reach margin of each leg, m, negative out of reach.
-        sines: (6,) of the cranks' angles off dead centre, negative out of reach.
-        parallel: det W, positive at home, 0 at a parallel singularity.
-        margin: positive inside the workspace, see `dynamics.workspace.margin`.
-        transmission: (6,) |r . tangent|: share of a crank's push along its rod.
-        held: least singular value of W: how firmly the rods hold the plate in their weakest
-            direction.
-        condition: largest over least singular value of A; 1 for a machine that is alike in all
-            directions.
-        play: m per rad, 1 / least singular value of A: how far crank errors of norm 1 move the
-            plate.
-    """
-
-    reach: Array
-    sines: Array
-    parallel: float
-    margin: float
-    transmission: Array
+    reach: Array  # (6,) reach margin of each leg, m, negative out of reach
+    sines: Array  # (6,) of the cranks' angles off dead centre, negative out of reach
+    parallel: float  # det W, positive at home, 0 at a parallel singularity
+    margin: float  # positive inside the workspace, see `dynamics.workspace.margin`
+    transmission: Array  # (6,) |r . tangent|: share of a crank's push along its rod.
+    # least singular value of W: how firmly the rods hold the plate in their weakest direction
     held: float
+    # largest over least singular value of A; 1 for a machine that is alike in all directions
     condition: float
+    # m per rad, 1 / least singular value of A: how far crank errors of norm 1 move the plate
     play: float
 
 

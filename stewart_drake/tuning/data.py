@@ -160,11 +160,7 @@ def _file(runs: list[tuple[Ending, Array]], duration: float) -> bytes:
 
 
 def read_condition(path: Path, runs: int = 1, samples: int = SAMPLES) -> dict[str, NDArray[Any]]:
-    """Read the file of a condition with a number of runs.
-
-    Raises:
-        ConfigError: the file is damaged; one line.
-    """
+    """Read the file of a condition with a number of runs."""
     shapes: dict[str, tuple[str, tuple[int, ...]]] = {
         "samples": ("f", (runs, samples, len(TUNER_INPUTS))),
         "used": ("f", (runs, samples, len(WEIGHTS))),
@@ -196,9 +192,6 @@ def make_data(
 
     Returns:
         The data set, as `load_data` reads it.
-
-    Raises:
-        As `run_jobs`.
     """
     directory, gains = Path(directory), tuple(family.gains.values())
     drawn = "" if family.name == "paper" else f", seed {family.seed}"
@@ -270,11 +263,7 @@ def assemble(
 
 
 def load_data(path: str | Path) -> xr.Dataset:
-    """Read dataset.nc, or the one in a folder.
-
-    Raises:
-        ConfigError: there is none, or it is not a data set of this kind.
-    """
+    """Read dataset.nc, or the one in a folder."""
     path = Path(path)
     if (path / "curves").is_dir() and not (path / "dataset.nc").exists():
         raise ConfigError(
@@ -297,7 +286,6 @@ def load_data(path: str | Path) -> xr.Dataset:
 
 
 def hash_of(*arrays: Any) -> str:
-    """Return the SHA-256 of the values of arrays."""
     digest = hashlib.sha256()
     for array in arrays:
         values = np.ascontiguousarray(array, dtype="<f8")

@@ -50,27 +50,18 @@ Runs = dict[str, NDArray[Any]]
 
 
 class Evaluation(NamedTuple):
-    """Results of all candidates under all conditions.
+    """Results of all candidates under all conditions."""
 
-    Attributes:
-        family: with its conditions.
-        names: of the candidates: the fixed gains, then the tuners.
-        cost: (c, n) J in % s.
-        error: (c, n) E_ac in % s, NaN for a run that did not complete.
-        ratios: by tuner, log10(w_Q / w_R) at the samples of each condition.
-        summary: content of `summary.json`.
-    """
-
-    family: Family
-    names: tuple[str, ...]
-    cost: Array
-    error: Array
+    family: Family  # with its conditions
+    names: tuple[str, ...]  # of the candidates: the fixed gains, then the tuners
+    cost: Array  # (c, n) J in % s
+    error: Array  # (c, n) E_ac in % s, NaN for a run that did not complete
+    # by tuner, log10(w_Q / w_R) at the samples of each condition
     ratios: dict[str, list[list[float]]]
-    summary: dict[str, Any]
+    summary: dict[str, Any]  # content of `summary.json`
 
     @property
     def tuners(self) -> tuple[str, ...]:
-        """Names of the tuners."""
         return self.names[len(self.family.gains) :]
 
 
@@ -84,9 +75,6 @@ def tuners_of(
 
     A family with faults has the rule and any number of networks, named by their files. Another one
     has one network, called TUNER.
-
-    Raises:
-        ConfigError: no such network, too many, two of one name, or one of another candidate's.
     """
     if not family.has_faults and len(networks) > 1:
         raise ConfigError(f"WEIGHTS: got {len(networks)} without --family; expected one")
@@ -125,9 +113,6 @@ def evaluate(
         directory: of the runs, in fixed/, rule/ and NAME-HASH/, so that a second network needs its
             own runs only.
         workers, scheduler, progress: as `run_jobs` takes them.
-
-    Raises:
-        As `run_jobs` and `load_network`, and ConfigError for fewer than two conditions.
     """
     cells, gains = family.conditions, tuple(family.gains.values())
     if len(cells) < 2:

@@ -87,26 +87,16 @@ class Condition(NamedTuple):
 
 @dataclass(frozen=True)
 class Family:
-    """Conditions, and the fixed gains that each is run with.
+    """Conditions, and the fixed gains that each is run with."""
 
-    Attributes:
-        name: `paper`, `disturbed`, or one of FAMILIES.
-        base: scenario that the conditions vary.
-        conditions: by the name of their files.
-        gains: w_Q and w_R by name.
-        seed: of the draws.
-        draws: one per condition; empty for the paper's grid.
-        samples: number of samples that are kept of each run.
-        settings: of the scenario `paper` that make the base, for a family with faults.
-    """
-
-    name: str
-    base: Scenario
-    conditions: dict[str, Condition]
-    gains: dict[str, tuple[float, float]]
-    seed: int = 0
-    draws: list[Draw] = field(default_factory=list)
-    samples: int = SAMPLES
+    name: str  # `paper`, `disturbed`, or one of FAMILIES
+    base: Scenario  # scenario that the conditions vary
+    conditions: dict[str, Condition]  # by the name of their files
+    gains: dict[str, tuple[float, float]]  # w_Q and w_R by name
+    seed: int = 0  # of the draws
+    draws: list[Draw] = field(default_factory=list)  # one per condition; empty for the paper's grid
+    samples: int = SAMPLES  # number of samples that are kept of each run
+    # of the scenario `paper` that make the base, for a family with faults
     settings: tuple[str, ...] = ()
 
     @property
@@ -116,7 +106,6 @@ class Family:
 
 
 def with_gain(scenario: Scenario, w_Q: float, w_R: float) -> Scenario:
-    """Return the scenario with these fixed weights."""
     return replace(scenario, controller=replace(scenario.controller, w_Q=w_Q, w_R=w_R))
 
 
@@ -124,20 +113,13 @@ def with_gain(scenario: Scenario, w_Q: float, w_R: float) -> Scenario:
 
 
 class Faults(NamedTuple):
-    """Settings of a family with faults, and sizes of these.
+    """Settings of a family with faults, and sizes of these."""
 
-    Attributes:
-        settings: of the scenario `paper`.
-        offset, jitter: least and largest, s.
-        about: description for a reader.
-        network: shipped network that was trained for it.
-    """
-
-    settings: tuple[str, ...]
-    offset: tuple[float, float]
-    jitter: tuple[float, float]
-    about: str
-    network: str
+    settings: tuple[str, ...]  # of the scenario `paper`
+    offset: tuple[float, float]  # least and largest, s
+    jitter: tuple[float, float]  # least and largest, s
+    about: str  # description for a reader
+    network: str  # shipped network that was trained for it
 
 
 _ON_REFERENCE: Final = ("plant.kind=exact", "start=on_reference", "queue=reference")
@@ -165,11 +147,7 @@ class About(NamedTuple):
 
 
 def sine_of(scenario: Scenario) -> SineConfig:
-    """Return the scenario's reference, which has a frequency and an amplitude.
-
-    Raises:
-        ConfigError: it is not a sine.
-    """
+    """Return the scenario's reference, which has a frequency and an amplitude."""
     if scenario.reference.kind != "sine":
         raise ConfigError(
             f"reference.kind: got {scenario.reference.kind!r}; expected 'sine', whose frequency "

@@ -34,11 +34,7 @@ class FamilyOptions(JobOptions):
         controller: str | Path | None,
         settings: Iterable[str],
     ) -> "Family":
-        """Return the conditions, on the exact plant unless a setting says otherwise.
-
-        Raises:
-            ConfigError: options that do not go together, or as the families.
-        """
+        """Return the conditions, on the exact plant unless a setting says otherwise."""
         from stewart_drake.scenario.loading import load_scenario
         from stewart_drake.tuning.families import disturbed_family, faulty_family, paper_grid
 
@@ -106,11 +102,7 @@ class TrainingOptions(Options):
     workers: int | None = option(None, "Number of processes; all cores by default.", "N")
 
     def check(self) -> None:
-        """Refuse options of the other loss.
-
-        Raises:
-            ConfigError: there is one.
-        """
+        """Refuse options of the other loss."""
         of_labels = {"labels": self.labels, "split": self.split, "density": self.density}
         of_regret = {"start": self.start, "workers": self.workers}
         if self.regret:

@@ -85,31 +85,22 @@ DECAY: Final = 1e-4
 
 @dataclass(frozen=True)
 class Training:
-    """A trained network and how it was trained.
+    """A trained network and how it was trained."""
 
-    Attributes:
-        network: with its card.
-        curve: one row per step. Labels: root mean square errors of training and test rows. Regret:
-            round, step, regret of the training and of the held-out rows.
-        targets: (N, 2) labels of the test rows, as the output layer gives them; empty for regret.
-        outputs: (N, 2) of the network there.
-    """
-
-    network: Network
+    network: Network  # with its card
+    # one row per step. Labels: root mean square errors of training and test rows. Regret: round,
+    # step, regret of the training and of the held-out rows.
     curve: Array
+    # (N, 2) labels of the test rows, as the output layer gives them; empty for regret
     targets: Array
-    outputs: Array
+    outputs: Array  # (N, 2) of the network there
 
 
 # ---------------------------------------------------------------- the network
 
 
 def require_torch() -> Any:
-    """Return the module torch, with one thread.
-
-    Raises:
-        ConfigError: it is not installed.
-    """
+    """Return the module torch, with one thread."""
     try:
         import torch
     except ImportError:
@@ -147,9 +138,6 @@ class TorchModel:
     """f and its Jacobian over rows of inputs, by torch in double precision.
 
     `outputs` is f (N, 2) of theta and inputs u (N, n), `jacobian` df/dtheta (N, 2, len(theta)).
-
-    Raises:
-        ConfigError: torch is not installed.
     """
 
     def __init__(self, inputs: int, hidden: int) -> None:
@@ -305,9 +293,6 @@ def train(
         hidden: number of hidden neurons.
         max_rows: for training at most.
         evaluations: of the residuals at most.
-
-    Raises:
-        ConfigError: torch is missing, or there are too few rows to train on or to test with.
     """
     rows, rng = labelled_rows(data, kind, density), np.random.default_rng(seed)
     in_train = split_rows(rows, split, rng)
@@ -363,14 +348,10 @@ def train(
 
 
 class Curves(NamedTuple):
-    """Cost curves of conditions, and the features of their runs.
+    """Cost curves of conditions, and the features of their runs."""
 
-    Attributes:
-        J: (n, m) in % s, of m = 13 fixed ratios, or of 1 roll-out.
-        features: (n, m, k, 18) after each of k samples, NaN if they are not known.
-    """
-
-    J: Array
+    J: Array  # (n, m) in % s, of m = 13 fixed ratios, or of 1 roll-out
+    # (n, m, k, 18) after each of k samples, NaN if they are not known
     features: NDArray[np.float32]
 
     @property
@@ -397,11 +378,7 @@ class FeatureRows(NamedTuple):
 
 
 def curves_of(data: xr.Dataset, features: FeatureName) -> Curves:
-    """Return the cost curves of a data set.
-
-    Raises:
-        ConfigError: its conditions were not run with the 13 ratios, or without these features.
-    """
+    """Return the cost curves of a data set."""
     values = {"densities": "density", "health": "health"}[features]
     ratios = np.log10(data.weights.values[:, 0] / data.weights.values[:, 1])
     whole = not len(ratios) % len(RATIOS)
@@ -448,7 +425,6 @@ def train_by_regret(
         workers, progress: as `run_jobs` takes them.
 
     Raises:
-        ConfigError: torch is missing, a start out of range, or other data.
         As `run_jobs`.
     """
     if start is not None and not RATIOS[0] <= start <= RATIOS[-1]:
@@ -466,7 +442,6 @@ def train_by_regret(
         samples = data.sizes["sample"]
 
         def own_runs(network: Network, chosen: Indices, number: int) -> Curves:
-            """Run some of the conditions with a network."""
             key = _key(network)
             found = run_jobs(
                 {
@@ -514,12 +489,7 @@ def train_by_regret(
 
 
 class RegretTrainer:
-    """Split, standardisation and loss of both rounds.
-
-    Args:
-        curves: of the conditions.
-        seed: of the split, the first theta and the batches.
-    """
+    """Split, standardisation and loss of both rounds."""
 
     def __init__(self, curves: Curves, seed: int) -> None:
         self._torch, self._curves, self._seed = require_torch(), curves, seed
