@@ -14,7 +14,7 @@ from stewart_drake.law.core_law import CompiledLaw, CoreLqi, serving, uncovered
 from stewart_drake.law.delay_model import delayed_model
 from stewart_drake.law.error_model import linear_model
 from stewart_drake.law.measurement import Measurement
-from stewart_drake.law.motion import Preview
+from stewart_drake.law.motion import KnownMotion, Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError, lqr, lqr_by_doubling, reduced_gain
 from stewart_drake.loop.law_design import compose_law, control_law
@@ -209,6 +209,7 @@ class Pair:
         self.scenario = load_scenario(name, settings=("plant.kind=exact", *settings))
         experiment = prepare(self.scenario)
         self.law, self.planned, _ = control_law(experiment)
+        self.goal = experiment.reference
         self.native = CoreLqi(self.law)
         queue = experiment.torques_in_flight(self.law.timeline.delay)
         self.one: Any = self.law.initial_memory(queue)
@@ -231,7 +232,10 @@ class Pair:
         reference = np.array([evaluate(self.planned, max(0.0, k * period + t)) for t in times])
         reference = reference if lose is None else lose(k, reference)
         weights = np.full(2, np.nan) if lose is not None and k in (6, 20) else self.weights
-        given = Measurement.of(y, age * period), Preview(times, reference), weights
+        motion: Any = Preview(times, reference)
+        if law.moves:
+            motion = KnownMotion(self.planned, self.goal, k * period)
+        given = Measurement.of(y, age * period), motion, weights
         self.one = law.step(self.one, *given)
         self.other = self.native.step(self.other, *given)
         gap = float(np.abs(self.one.torque - self.other.torque).max())
@@ -299,7 +303,7 @@ def lost_in_a_row(first, number):
 def test_after_a_gap_the_way_back_is_that_of_python(case, first, number):
     """Torques, counts and memory are the same, from rest."""
     name, settings, _ = CASES[case]
-    pair, gaps, peak = Pair(name, settings), [], 0.0
+    pair, gaps, peak = Pair(name, (*settings, "controller.replan=0")), [], 0.0
     for k in range(32):
         gaps.append(pair.step(k, np.zeros(12), None, lost_in_a_row(first, number)))
         one, other = pair.one, pair.other
@@ -334,7 +338,7 @@ def test_a_reference_that_is_missing_is_continued_as_in_python(case, start):
 
 
 def test_what_was_sent_in_its_place_is_in_flight():
-    pair = Pair("paper", ())
+    pair = Pair("paper", ("controller.replan=0",))
     for k in range(3):
         pair.step(k, np.zeros(12), None)
     torque, c = np.arange(6.0), core()

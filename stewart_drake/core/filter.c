@@ -286,6 +286,7 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
         return;
     }
     a.prior = &before;
+    stewart_copy(size, now.mean, second); /* with the noise, which a start leaves */
     if (values && *now.outliers > 0
         && stewart_filter_start(filter, now.outlier, theta, now.mean, second, scratch)
         && attempt(&a, scratch))
