@@ -62,19 +62,211 @@ from stewart_drake.scenario.reference_config import WaypointsConfig as Waypoints
 from stewart_drake.scenario.run_log import read_log as read_log
 from stewart_drake import law as law
 from stewart_drake import systems as systems
-__version__: str
-__all__ = ['ActuatorConfig', 'AddStewartPlatform', 'AnalysisResult', 'ClosedLoop', 'ComparisonResult', 'ConfigError', 'ControllerConfig', 'CsvConfig', 'DelayConfig', 'DesignedLaw', 'EncoderSensorConfig', 'ExactPlant', 'ForwardKinematicsError', 'HoldConfig', 'LinkConfig', 'Mechanism', 'NetworkConfig', 'PlantConfig', 'PositionServoConfig', 'ReachyMoveConfig', 'ReferenceConfig', 'Scenario', 'SensorConfig', 'ServoActuatorConfig', 'SimulationResult', 'SineConfig', 'StateSensorConfig', 'StewartDynamics', 'StewartPlatform', 'TorqueActuatorConfig', 'TunerConfig', 'UnreachablePoseError', 'WaypointsConfig', 'WireConfig', '__version__', 'analyze_delay', 'analyze_hautus', 'analyze_link', 'analyze_robustness', 'analyze_workspace', 'build_closed_loop', 'check_model', 'compare', 'design_law', 'evaluate_tuner', 'export_c', 'export_csv', 'identify', 'law', 'layout', 'learn', 'linear_models', 'load_mechanism', 'load_scenario', 'make_tuner_data', 'model_sdf', 'new', 'plan_identification', 'read_log', 'replay_log', 'report', 'run_live', 'run_machine', 'set_accuracy', 'setpoints', 'shipped', 'simulate', 'systems', 'train_tuner', 'view_model']
 
-def evaluate_tuner(directory: str | pathlib.Path, networks: collections.abc.Sequence[str | pathlib.Path] = (), scenario: str | pathlib.Path = 'paper', controller: str | pathlib.Path | None = None, settings: collections.abc.Iterable[str] = (), *, progress: collections.abc.Callable[[int, int], None] | None = None, command: str = '', family: typing.Literal['T', 'N2'] | None = None, seed: int = 0, scenarios: int = 40, workers: int | None = None, scheduler: str | None = None) -> stewart_drake.reporting.results.AnalysisResult: ...
-def make_tuner_data(directory: str | pathlib.Path, scenario: str | pathlib.Path = 'paper', controller: str | pathlib.Path | None = None, settings: collections.abc.Iterable[str] = (), *, progress: collections.abc.Callable[[int, int], None] | None = None, family: typing.Literal['T', 'N2'] | None = None, seed: int = 0, disturbed: int | None = None, draws: int | None = None, workers: int | None = None, scheduler: str | None = None) -> stewart_drake.reporting.results.AnalysisResult: ...
-def new(directory: str | pathlib.Path, name: str, *, base_radius: float, shaft_distance: float, plate_radius: float, joint_distance: float, crank: float, rod: float, plate_mass: float, crank_mass: float, rod_mass: float, shaft_height: float = 0.0, upright: float = 90.0, cranks: typing.Literal['apart', 'together'] = 'apart', torque_limit: float | None = None, delay: float = 0.1, gravity: bool = True) -> stewart_drake.studies.new_machine.NewMachine: ...
-def run_live(scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, machine: str, *, duration: float | None = None, armed: bool = False, key: pathlib.Path | None = None, max_missing: float | None = None, accept_jitter: bool = False, log: pathlib.Path | None = None, learn: int = 0, learned: pathlib.Path | None = None, mirror: str | None = None) -> stewart_drake.reporting.results.SimulationResult: ...
-def run_machine(scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, *, rate: float = 1.0, watchdog: float = 1.0, safe: typing.Literal['zero', 'hold'] = 'zero', restart: typing.Literal['rest', 'motion'] = 'rest', port: int = 47000, host: str = '127.0.0.1', key: pathlib.Path | None = None, duration: float = 0.0, log: pathlib.Path | None = None, reachy: str | None = None, ahead: float = 0.0) -> dict[str, typing.Any]: ...
-def train_tuner(data: str | pathlib.Path, out: str | pathlib.Path, *, progress: collections.abc.Callable[[int, int], None] | None = None, regret: bool = False, start: float | None = None, labels: typing.Literal['as_run', 'best_in_cell', 'best_in_cell_torque'] | None = None, split: typing.Literal['sample', 'run', 'cell'] | None = None, density: typing.Literal['magnitude', 'signed'] | None = None, seed: int = 0, workers: int | None = None) -> stewart_drake.reporting.results.AnalysisResult: ...
-def analyze_delay(scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, simulations: bool = True) -> stewart_drake.reporting.results.AnalysisResult: ...
-def analyze_hautus(scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path) -> stewart_drake.reporting.results.AnalysisResult: ...
-def analyze_link(scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, runs: int = 5) -> stewart_drake.reporting.results.AnalysisResult: ...
-def analyze_robustness(scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, runs: int = 200, *, ranges: stewart_drake.studies.study_options.Ranges | None = None, seed: int = 0, limit: float | None = None, also: collections.abc.Mapping[str, stewart_drake.scenario.config.Scenario] | None = None, workers: int | None = None, scheduler: str | None = None, directory: str | pathlib.Path | None = None) -> stewart_drake.reporting.results.AnalysisResult: ...
-def analyze_workspace(scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path) -> stewart_drake.reporting.results.AnalysisResult: ...
-def layout(scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, directory: str | pathlib.Path | None = None, *, goal: str = 'condition', limits: collections.abc.Mapping[str, float] | None = None, vary: collections.abc.Mapping[str, tuple[float, float]] | None = None, keep: collections.abc.Sequence[str] = (), best: int = 3, starts: int = 1, generations: int = 100, seed: int = 0, workers: int | None = None, scheduler: str | None = None) -> stewart_drake.reporting.results.AnalysisResult: ...
-def learn(scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, repetitions: int = 6) -> stewart_drake.reporting.results.AnalysisResult: ...
+__version__: str
+__all__ = [
+    "ActuatorConfig",
+    "AddStewartPlatform",
+    "AnalysisResult",
+    "ClosedLoop",
+    "ComparisonResult",
+    "ConfigError",
+    "ControllerConfig",
+    "CsvConfig",
+    "DelayConfig",
+    "DesignedLaw",
+    "EncoderSensorConfig",
+    "ExactPlant",
+    "ForwardKinematicsError",
+    "HoldConfig",
+    "LinkConfig",
+    "Mechanism",
+    "NetworkConfig",
+    "PlantConfig",
+    "PositionServoConfig",
+    "ReachyMoveConfig",
+    "ReferenceConfig",
+    "Scenario",
+    "SensorConfig",
+    "ServoActuatorConfig",
+    "SimulationResult",
+    "SineConfig",
+    "StateSensorConfig",
+    "StewartDynamics",
+    "StewartPlatform",
+    "TorqueActuatorConfig",
+    "TunerConfig",
+    "UnreachablePoseError",
+    "WaypointsConfig",
+    "WireConfig",
+    "__version__",
+    "analyze_delay",
+    "analyze_hautus",
+    "analyze_link",
+    "analyze_robustness",
+    "analyze_workspace",
+    "build_closed_loop",
+    "check_model",
+    "compare",
+    "design_law",
+    "evaluate_tuner",
+    "export_c",
+    "export_csv",
+    "identify",
+    "law",
+    "layout",
+    "learn",
+    "linear_models",
+    "load_mechanism",
+    "load_scenario",
+    "make_tuner_data",
+    "model_sdf",
+    "new",
+    "plan_identification",
+    "read_log",
+    "replay_log",
+    "report",
+    "run_live",
+    "run_machine",
+    "set_accuracy",
+    "setpoints",
+    "shipped",
+    "simulate",
+    "systems",
+    "train_tuner",
+    "view_model",
+]
+
+def evaluate_tuner(
+    directory: str | pathlib.Path,
+    networks: collections.abc.Sequence[str | pathlib.Path] = (),
+    scenario: str | pathlib.Path = "paper",
+    controller: str | pathlib.Path | None = None,
+    settings: collections.abc.Iterable[str] = (),
+    *,
+    progress: collections.abc.Callable[[int, int], None] | None = None,
+    command: str = "",
+    family: typing.Literal["T", "N2"] | None = None,
+    seed: int = 0,
+    scenarios: int = 40,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def make_tuner_data(
+    directory: str | pathlib.Path,
+    scenario: str | pathlib.Path = "paper",
+    controller: str | pathlib.Path | None = None,
+    settings: collections.abc.Iterable[str] = (),
+    *,
+    progress: collections.abc.Callable[[int, int], None] | None = None,
+    family: typing.Literal["T", "N2"] | None = None,
+    seed: int = 0,
+    disturbed: int | None = None,
+    draws: int | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def new(
+    directory: str | pathlib.Path,
+    name: str,
+    *,
+    base_radius: float,
+    shaft_distance: float,
+    plate_radius: float,
+    joint_distance: float,
+    crank: float,
+    rod: float,
+    plate_mass: float,
+    crank_mass: float,
+    rod_mass: float,
+    shaft_height: float = 0.0,
+    upright: float = 90.0,
+    cranks: typing.Literal["apart", "together"] = "apart",
+    torque_limit: float | None = None,
+    delay: float = 0.1,
+    gravity: bool = True,
+) -> stewart_drake.studies.new_machine.NewMachine: ...
+def run_live(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+    machine: str,
+    *,
+    duration: float | None = None,
+    armed: bool = False,
+    key: pathlib.Path | None = None,
+    max_missing: float | None = None,
+    accept_jitter: bool = False,
+    log: pathlib.Path | None = None,
+    learn: int = 0,
+    learned: pathlib.Path | None = None,
+    mirror: str | None = None,
+) -> stewart_drake.reporting.results.SimulationResult: ...
+def run_machine(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+    *,
+    rate: float = 1.0,
+    watchdog: float = 1.0,
+    safe: typing.Literal["zero", "hold"] = "zero",
+    restart: typing.Literal["rest", "motion"] = "rest",
+    port: int = 47000,
+    host: str = "127.0.0.1",
+    key: pathlib.Path | None = None,
+    duration: float = 0.0,
+    log: pathlib.Path | None = None,
+    reachy: str | None = None,
+    ahead: float = 0.0,
+) -> dict[str, typing.Any]: ...
+def train_tuner(
+    data: str | pathlib.Path,
+    out: str | pathlib.Path,
+    *,
+    progress: collections.abc.Callable[[int, int], None] | None = None,
+    regret: bool = False,
+    start: float | None = None,
+    labels: typing.Literal["as_run", "best_in_cell", "best_in_cell_torque"] | None = None,
+    split: typing.Literal["sample", "run", "cell"] | None = None,
+    density: typing.Literal["magnitude", "signed"] | None = None,
+    seed: int = 0,
+    workers: int | None = None,
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def analyze_delay(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, simulations: bool = True
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def analyze_hautus(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def analyze_link(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, runs: int = 5
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def analyze_robustness(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+    runs: int = 200,
+    *,
+    ranges: stewart_drake.studies.study_options.Ranges | None = None,
+    seed: int = 0,
+    limit: float | None = None,
+    also: collections.abc.Mapping[str, stewart_drake.scenario.config.Scenario] | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    directory: str | pathlib.Path | None = None,
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def analyze_workspace(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def layout(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+    directory: str | pathlib.Path | None = None,
+    *,
+    goal: str = "condition",
+    limits: collections.abc.Mapping[str, float] | None = None,
+    vary: collections.abc.Mapping[str, tuple[float, float]] | None = None,
+    keep: collections.abc.Sequence[str] = (),
+    best: int = 3,
+    starts: int = 1,
+    generations: int = 100,
+    seed: int = 0,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> stewart_drake.reporting.results.AnalysisResult: ...
+def learn(
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, repetitions: int = 6
+) -> stewart_drake.reporting.results.AnalysisResult: ...

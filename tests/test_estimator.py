@@ -387,7 +387,7 @@ def test_bounds_are_kept_by_the_nearest_mean_there_is(seed, width):
 # Outliers.
 
 
-@pytest.mark.parametrize("size", [1e-2, 0.3, 1.0, 10.0, 1e3, 1e6, 1e100, 1e300])
+@pytest.mark.parametrize("size", [0.3, 1.0, 10.0, 1e3, 1e6, 1e100, 1e300])
 def test_an_outlier_is_passed_over(size):
     result = run(inside(np.random.default_rng(4)), 4)
     before, (torques, durations) = result.estimates[-2], result.inputs[-1]
@@ -403,6 +403,23 @@ def test_an_outlier_is_passed_over(size):
         again = advance(after, acted(torques, durations), y)
         assert again.outliers == 0
         assert squared(again.parameters - result.truth, again.covariance[12:, 12:]) < 40
+
+
+def test_a_small_outlier_that_other_parameters_explain_is_forgotten():
+    """It is believed until the next measurement, or passed over; then the parameters are right."""
+    result = run(inside(np.random.default_rng(4)), 4)
+    before, (torques, durations) = result.estimates[-2], result.inputs[-1]
+    believed = []
+    for channel in range(12):
+        y = result.measurements[-1].copy()
+        y[channel] += 0.01
+        after = advance(before, acted(torques, durations), y)
+        believed.append(after.outliers == 0)
+        y = PLANT.predict(result.states[-1], torques, durations, SUBSTEPS, result.truth)[-1]
+        again = advance(after, acted(torques, durations), y)
+        assert again.outliers == 0
+        assert squared(again.parameters - result.truth, again.covariance[12:, 12:]) < 40
+    assert any(believed) and not all(believed)
 
 
 def test_after_patience_the_measurement_is_believed():

@@ -7,6 +7,7 @@
 #define SURE ((real)2.5)
 #define WIDER 6
 #define LATEST 1000 /* largest t */
+#define UNTIMELY 4  /* t of torques that are off by twice the assumed standard deviation */
 
 void stewart_noise_start(stewart_noise *noise)
 {
@@ -53,7 +54,9 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
     noise->wander = scored(noise->wander, of_wander, noise->known_wander);
     const real sure = noise->wander - SURE / REAL(sqrt)(noise->known_wander);
     noise->used *= REAL(sqrt)(keep);
-    if (WIDER * sure > noise->used) /* not for NaN */
+    if (sure > 0 || noise->timing > UNTIMELY) /* not for NaN */
+        noise->asked += (real)m;
+    if (WIDER * sure > noise->used)
         noise->used = WIDER * sure;
 }
 

@@ -21,12 +21,13 @@
 
 #include "machine.h"
 
-enum { STEWART_NOISE = 5 }; /* numbers of these */
+enum { STEWART_NOISE = 6 }; /* numbers of these */
 
 typedef struct {
     real timing, wander;              /* t, w */
     real known_timing, known_wander;  /* J of both */
     real used;                        /* factor of W in use */
+    real asked;                       /* number of values at which w exceeded SURE deviations, or t UNTIMELY */
 } stewart_noise;
 
 void stewart_noise_start(stewart_noise *noise);

@@ -13,6 +13,8 @@ from stewart_drake.types import Array
 THETA = slice(NUM_STATE, None)
 TOLERATED: Final = 1.1
 """Factor on the ratio up to which an estimator counts as consistent."""
+CHANGING: Final = 0.05
+"""Share of the measurements at which parameters change by chance."""
 CHANCE: Final = 3.0
 """Standard deviations of the ratio that chance explains."""
 
@@ -60,10 +62,12 @@ class Innovations(NamedTuple):
     Attributes:
         squares: sum of nu' S^-1 nu over the measurements that were used.
         values: number of values in them.
+        changes: number of values at which the parameters had to change, see core/noise.h.
     """
 
     squares: float = 0.0
     values: float = 0.0
+    changes: float = 0.0
 
     @property
     def ratio(self) -> float:
@@ -75,11 +79,14 @@ class Innovations(NamedTuple):
         """Result of the test, None with too few measurements.
 
         The ratio is below 1 / TOLERATED (`cautious`) or above TOLERATED (`overconfident`) by more
-        than chance explains: its standard deviation is sqrt(2 / values).
+        than chance explains: its standard deviation is sqrt(2 / values). Parameters that were
+        assumed to be constant and had to change are `overconfident` too.
         """
         chance = CHANCE * math.sqrt(2 / self.values) if self.values else math.inf
         if not chance < 1:
             return None
+        if self.changes > CHANGING * self.values:
+            return "overconfident"
         if self.ratio > TOLERATED * (1 + chance):
             return "overconfident"
         return "cautious" if self.ratio < (1 - chance) / TOLERATED else "consistent"

@@ -367,7 +367,7 @@ def belief_of(
     measured = memory[last : last + m]
     if observer.settings is not None:
         mean, root, rest = np.split(memory[:last], [n, n + n * n])
-        L, (left_out, *innovations) = root.reshape(n, n), rest[m + 2 : m + 5]
+        L, (left_out, *innovations) = root.reshape(n, n), rest[[m + 2, m + 3, m + 4, -1]]
         timing = law.observer.uncertainty(law, c.at(memory), c.ffi.NULL)
         belief = Belief(
             Estimate(mean, L @ L.T), timeline, measured, faults, timing=timing, memory=memory

@@ -105,9 +105,10 @@ def overconfidence(summary: RunSummary) -> list[str]:
         return []
     factor = math.sqrt(consistency["nis_ratio"])
     return [
-        f"the estimator is overconfident: its prediction errors are {factor:.2g} times as large as "
-        "it states. The machine does what the model cannot explain, as friction, a payload off the "
-        "centre, a push or a wrong delay do: estimate that, or raise controller.model_error"
+        "the estimator is overconfident: the machine does what its model cannot explain, as friction, "
+        "a payload off the centre, a push or a wrong delay do. Its prediction errors are "
+        f"{factor:.2g} times as large as it states, after it has widened its uncertainty: estimate "
+        "the cause, or raise controller.model_error"
     ]
 
 
