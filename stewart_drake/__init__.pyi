@@ -1,11 +1,14 @@
 # Written by .ci/public_names.py.
 import collections.abc
 import pathlib
+import typing
+
 import stewart_drake.reporting.results
 import stewart_drake.scenario.config
 import stewart_drake.studies.new_machine
 import stewart_drake.studies.study_options
-import typing
+from stewart_drake import law as law
+from stewart_drake import systems as systems
 from stewart_drake.dynamics.stewart import StewartDynamics as StewartDynamics
 from stewart_drake.files.errors import ConfigError as ConfigError
 from stewart_drake.files.resources import shipped as shipped
@@ -60,8 +63,6 @@ from stewart_drake.scenario.reference_config import ReferenceConfig as Reference
 from stewart_drake.scenario.reference_config import SineConfig as SineConfig
 from stewart_drake.scenario.reference_config import WaypointsConfig as WaypointsConfig
 from stewart_drake.scenario.run_log import read_log as read_log
-from stewart_drake import law as law
-from stewart_drake import systems as systems
 
 __version__: str
 __all__ = [

@@ -405,11 +405,11 @@ def test_an_outlier_is_passed_over(size):
         assert squared(again.parameters - result.truth, again.covariance[12:, 12:]) < 40
 
 
-def test_a_small_outlier_that_other_parameters_explain_is_forgotten():
-    """It is believed until the next measurement, or passed over; then the parameters are right."""
+def test_a_small_outlier_that_other_parameters_explain_moves_them_little():
+    """It is believed, or passed over; after the next measurement they are off by 10 % of the usual."""
     result = run(inside(np.random.default_rng(4)), 4)
     before, (torques, durations) = result.estimates[-2], result.inputs[-1]
-    believed = []
+    believed, usual = [], SETTINGS.parameters.usual_std
     for channel in range(12):
         y = result.measurements[-1].copy()
         y[channel] += 0.01
@@ -418,7 +418,7 @@ def test_a_small_outlier_that_other_parameters_explain_is_forgotten():
         y = PLANT.predict(result.states[-1], torques, durations, SUBSTEPS, result.truth)[-1]
         again = advance(after, acted(torques, durations), y)
         assert again.outliers == 0
-        assert squared(again.parameters - result.truth, again.covariance[12:, 12:]) < 40
+        assert np.all(np.abs(again.parameters - result.truth) < 0.1 * usual)
     assert any(believed) and not all(believed)
 
 

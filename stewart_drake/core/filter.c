@@ -8,8 +8,9 @@
 #define LEARNT ((real)0.3) /* the same, for parameters that are good enough over a few periods */
 #define UNTIMELY 70 /* factor on the first variance of the timing, for a torque far too early or late */
 #define CHANGED ((real)1e-3) /* shares of `usual_std` by which parameters may have changed: the least, */
-#define MOST_CHANGED ((real)0.1)  /* the largest, */
-#define MOST_AGREEING ((real)0.3) /* and where the outlier before agrees with this one */
+#define MOST_CHANGED ((real)0.01) /* the largest, */
+#define MOST_AGREEING ((real)0.3) /* and where the outlier before agrees with this one, or the prior is wrong: */
+#define YOUNG 3         /* measurements after which the prior has been tried */
 
 int stewart_posterior_size(int n, int m)
 {
@@ -292,8 +293,9 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
         && attempt(&a, scratch))
         outliers += *now.outliers;
     a.prior = &now;
+    const real most = outliers > 1 || *now.values <= YOUNG * (real)m ? MOST_AGREEING : MOST_CHANGED;
     if (values && !filter->legs
-        && explain(&a, &now, &before, (outliers > 1 ? MOST_AGREEING : MOST_CHANGED) * (real)1.1, scratch)) {
+        && explain(&a, &now, &before, most * (real)1.1, scratch)) {
         accept(n, m, &after, &now);
         return;
     }

@@ -105,8 +105,8 @@ def overconfidence(summary: RunSummary) -> list[str]:
         return []
     factor = math.sqrt(consistency["nis_ratio"])
     return [
-        "the estimator is overconfident: the machine does what its model cannot explain, as friction, "
-        "a payload off the centre, a push or a wrong delay do. Its prediction errors are "
+        "the estimator is overconfident: the machine does what its model cannot explain, as "
+        "friction, a payload off the centre, a push or a wrong delay do. Its prediction errors are "
         f"{factor:.2g} times as large as it states, after it has widened its uncertainty: estimate "
         "the cause, or raise controller.model_error"
     ]
