@@ -12,6 +12,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import yaml_text
 from stewart_drake.law.filter_settings import CHANCE, EXACT, usual_parameters
 from stewart_drake.law.observers import CoreObserver
+from stewart_drake.law.startup import reference_torque
 from stewart_drake.loop.law_design import GENTLE, compose_law
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.geometry import Body, fingerprint
@@ -212,7 +213,10 @@ def test_without_a_file_the_law_is_as_machine_and_motion_say():
     law = compose_law(found)
     prior, torque = observer(law).settings.parameters, law.plant.coarse_torque_limit / GENTLE
     assert not prior.prior.any()
-    expected = [0.3 * torque] * 6 + [PAPER.plate.mass / 4, 0.1 * torque]
+    usual = [0.3 * torque] * 6 + [PAPER.plate.mass / 4, 0.1 * torque]
+    assert prior.usual_std == pytest.approx(usual, rel=1e-12)
+    motion = reference_torque(found.nominal, found.reference, found.scenario.duration)
+    expected = [0.05 * motion] * 6 + [PAPER.plate.mass / 10, 0.05 * motion]
     assert prior.std == pytest.approx(expected, rel=1e-12)
 
 

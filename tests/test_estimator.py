@@ -406,7 +406,7 @@ def test_an_outlier_is_passed_over(size):
 
 
 def test_a_small_outlier_that_other_parameters_explain_moves_them_little():
-    """It is believed, or passed over; after the next measurement they are off by 10 % of the usual."""
+    """After the next measurement they are off by less than 10 % of the usual deviation."""
     result = run(inside(np.random.default_rng(4)), 4)
     before, (torques, durations) = result.estimates[-2], result.inputs[-1]
     believed, usual = [], SETTINGS.parameters.usual_std
