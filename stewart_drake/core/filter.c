@@ -7,6 +7,7 @@
 #define KNOWN ((real)0.01) /* a constant is known when its deviation is this share of the usual one */
 #define LEARNT ((real)0.3) /* the same, for parameters that are good enough over a few periods */
 #define UNTIMELY 70 /* factor on the first variance of the timing, for a torque far too early or late */
+#define ONCE ((real)0.05) /* factor of the timing, at least, after such a torque, halved */
 #define CHANGED ((real)1e-3) /* shares of `usual_std` by which parameters may have changed: the least, */
 #define MOST_CHANGED ((real)0.01) /* the largest, */
 #define MOST_AGREEING ((real)0.3) /* and where the outlier before agrees with this one, or the prior is wrong: */
@@ -238,7 +239,6 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
     stewart_copy(size, now->mean, before->mean);
     if (filter->learns_timing && before->noise->timing < UNTIMELY) {
         before->noise->timing = UNTIMELY;
-        before->noise->known_timing = 0;
         if (attempt(a, scratch))
             late = a->likelihood;
     }
@@ -252,8 +252,9 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
     if (isfinite(late) && !(found && a->likelihood >= late)) {
         stewart_copy(size, now->mean, before->mean);
         before->noise->timing = UNTIMELY;
-        before->noise->known_timing = 0;
         found = attempt(a, scratch);
+        *a->after->noise = *now->noise; /* one torque, not yet all of them */
+        a->after->noise->timing = 2 * (now->noise->timing > ONCE ? now->noise->timing : ONCE);
     }
     a->prior = now;
     return found;

@@ -5,7 +5,8 @@
 
 #define ONE_TORQUE ((real)0.5) /* its information about t = 1: 1 / (2 t^2) */
 #define SURE ((real)2.5)
-#define WIDER 6
+#define WIDER 12
+#define ODD 3       /* largest share of a value in w, so that no few ones decide */
 #define LATEST 1000 /* largest t */
 #define UNTIMELY 4  /* t of torques that are off by twice the assumed standard deviation */
 
@@ -42,9 +43,9 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
         }
         const real found = S - (noise->used - noise->wander) * W; /* S at w instead of the one in use */
         S = found > S / 10 ? found : S / 10;
-        const real off = (innovations[i] * innovations[i] / S - 1) / (2 * S);
-        of_timing += K * off;
-        of_wander += W * off;
+        const real off = innovations[i] * innovations[i] / S - 1;
+        of_timing += K * off / (2 * S);
+        of_wander += W * (off < ODD ? off : ODD) / (2 * S);
         noise->known_timing += K * K / (2 * S * S);
         noise->known_wander += W * W / (2 * S * S);
     }

@@ -5,7 +5,7 @@ sensor and by what is to be estimated:
 
 | settings | delay | sensor of the state | encoders |
 | --- | --- | --- | --- |
-| None | None | the measurement as it comes (`timing`: and timing_observer.c) | forward kinematics |
+| None | None | the measurement as it comes | forward kinematics and differences |
 | given | None | filter of filter.h; with `gaps` one over gaps | encoder_filter.c |
 | given | given | delay.h and delay_search.c | the same, of the last sample of a period |
 """
@@ -120,13 +120,11 @@ class CoreObserver:
         settings: of the filter; None: only the state is estimated.
         delay: prior of an unknown delay; None: the delay is known.
         gaps: whether the filter corrects the estimate before a gap between measurements.
-        timing: where only the state is estimated, assumptions for learning the timing of torques.
     """
 
     settings: FilterSettings | None = None
     delay: DelaySettings | None = None
     gaps: bool = False
-    timing: FilterSettings | None = None
 
     def kept(self, period: float) -> int:
         """Return the number of torques to keep in flight beyond the assumed delay."""
@@ -215,7 +213,6 @@ _KALMAN: Final = ("sensing", "instant", "kalman")
 _SOURCES: Final[dict[str, tuple[str, ...]]] = {
     "state": ("observers", "sensing"),
     "differences": ("observers", "sensing", "encoders", "kinematics.c", "differences_observer.c"),
-    "timing": ("observers", "sensing", "noise", "timing_observer.c"),
     "filter": ("observers", "filter_observers", "filter", "filter_attempt.h", "noise", *_KALMAN),
     "delay": ("delay_observer", "delay", "delay_search.c", "arrivals", *_KALMAN),
 }
@@ -246,8 +243,6 @@ def part_of(observer: CoreObserver, sensing: Sensing, plant: NominalPlant, perio
     elif settings is not None:
         kind = "encoder" if within else "gap" if observer.gaps else "filter"
         estimation = filter_settings_of(settings, sensing.size)
-    elif observer.timing is not None and not (own or within):
-        kind, estimation = "timing", timing_settings_of(observer.timing)
     return Part(f"stewart_{kind}_observer", sensor, own, estimation, _SOURCES[kind])
 
 
@@ -301,17 +296,6 @@ def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
     for name, array in arrays.items():
         setattr(it.filter, name, c.at(array))
     return Compiled(it, (prior, arrays))
-
-
-def timing_settings_of(settings: FilterSettings) -> Compiled:
-    """Return the `stewart_timing_settings`."""
-    it = core().ffi.new("stewart_timing_settings *")
-    it.model_std, it.timing_std, it.keep = (
-        settings.model_std.tolist(),
-        settings.timing_std,
-        settings.keep,
-    )
-    return Compiled(it, ())
 
 
 def _delay_settings_of(
@@ -377,10 +361,7 @@ def belief_of(
     theta, std = np.empty(p), np.empty(p)
     law.observer.parameters(law, *map(c.at, (memory, theta, std)))
     belief = Belief.nothing(timeline, m, theta).at(memory[:NUM_STATE])
-    timing = 0.0
-    if law.observer.uncertainty:
-        timing = law.observer.uncertainty(law, c.at(memory), c.ffi.NULL)
-    return replace(belief, measured=measured, faults=faults, timing=timing, memory=memory)
+    return replace(belief, measured=measured, faults=faults, memory=memory)
 
 
 def _delay_belief(law: Any, memory: Array, timeline: Timeline, faults: tuple[str, ...]) -> Belief:

@@ -199,10 +199,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         learns=of_state,
     )
     gaps = sc.sensor.kind == "state" and sc.sensor.loss > 0
-    observer = CoreObserver(settings, gaps=gaps) if c.estimate else CoreObserver()
-    tolerated = tolerated_timing(experiment)
-    if not c.estimate and settings.learns_timing and math.isfinite(tolerated):
-        observer = CoreObserver(timing=settings)
+    observer = CoreObserver(settings if c.estimate else None, gaps=gaps)
     quiet = c.open_loop_start and sc.start == "rest"
     waits = longest_wait(sc)
     channel = link.channel(sc.link, experiment, timeline, waits)
@@ -220,7 +217,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         longest_wait=waits,
         kept=waits + (REPORTS if isinstance(channel, Packets) else 0),
         silence=_until_seen(timeline.delay, waits) if quiet else 0,
-        tolerated_timing=tolerated,
+        tolerated_timing=tolerated_timing(experiment),
     )
     if c.delay_estimator != "none":
         prior = timeline.eta, c.delay_std, c.delay_max
@@ -347,11 +344,14 @@ def replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> Pre
 
     The catch-up goes out before anything is known of the machine. When payload and bias are known,
     and the prediction so is certain, the law plans again. Where nothing is estimated, or the delay
-    is, where torques come in packets or measurements late, the law stays as it is.
+    is, where torques come in packets or measurements late, or a quadratic program plans, the law
+    stays as it is.
     """
     asked = experiment.scenario.controller.replan
-    plain = isinstance(law.channel, Wire) and isinstance(law.predictor, NonlinearPredictor)
-    if not (length and law.estimates and plain) or law.longest_wait or asked == 0:
+    plain = type(law) is PredictiveLqi and isinstance(law.predictor, NonlinearPredictor)
+    if not (length and law.estimates and plain and isinstance(law.channel, Wire)):
+        return law
+    if law.longest_wait or asked == 0:
         return law
     return replace(law, planner=Replan(asked or length, experiment.scale))
 
@@ -360,10 +360,11 @@ def tolerated_timing(experiment: Experiment) -> float:
     """Return the standard deviation of single torques' timing that the loop tolerates, s.
 
     A share of the time constant of the loop, 1 / bandwidth of theory.md, section 13. Infinite for
-    weights that are given or set by a tuner, and for laws without nonlinear prediction.
+    weights that are given or set by a tuner, and for laws that do not estimate parameters: without
+    them a bias would be taken for torques that act early or late.
     """
     sc, c = experiment.scenario, experiment.scenario.controller
-    if c.w_R is not None or sc.tuner.kind != "fixed" or c.prediction != "nonlinear":
+    if c.w_R is not None or sc.tuner.kind != "fixed" or not c.estimate:
         return math.inf
     times = spread_instants(sc.duration, _POSES)
     fastest = np.array([evaluate(experiment.reference, t)[ACCELERATIONS] for t in times])
