@@ -164,7 +164,7 @@ CASES = {
     "less than a period": ("paper", ("delay.steps=0", "delay.fraction=0.5"), None),
     "without estimator": ("motion_base", ("controller.estimate=[]",), None),
     "wrench": ("gravity", (*DIRTY, "controller.estimate=[payload,wrench]"), spoiled),
-    "saturation": ("paper", (*DIRTY, "actuator.torque_limit=0.03"), None),
+    "saturation": ("paper", (*DIRTY, "actuator.torque_limit=0.03", "controller.replan=0"), None),
     "bad measurements": ("gravity", DIRTY, spoiled),
     "bad measurements without estimator": (
         *("gravity", (NOISE, "controller.estimate=[]"), spoiled),

@@ -168,7 +168,7 @@ def test_many_drawn_machines_end_as_in_drake(part):
 
 
 def test_states_torques_and_measurements_are_drakes():
-    one = LOOPS["late"]
+    one = LOOPS["dirty"]
     preparation = preparation_of(one)
     prepared = preparation.prepared(preparation.experiment(one))
     wanted = preparation.references[preparation.when.sampled]
@@ -324,7 +324,7 @@ def test_a_motion_that_cannot_be_is_refused_each_time():
 
 # A reference that is missing.
 
-START = {"rest": (), "reference": FOLLOWS}
+START = {"rest": ("controller.replan=0",), "reference": FOLLOWS}
 
 
 def error_without(start, missing):

@@ -373,7 +373,7 @@ REFUSED = {
         *("controller.prior={wrench: [1, 1]}", "controller.prior={wrench_walk: [1, 1]}"),
     ],
     "controller.delay_estimator=none": [
-        *("controller.replan=0.3", "controller.delay_std=0.1", "controller.delay_max=2.0"),
+        *("controller.delay_std=0.1", "controller.delay_max=2.0"),
     ],
     "tuner.kind=rule": ["controller.w_Q=2.0", "controller.w_R=2.0"],
     "controller.limits=ignore": ["controller.horizon=10"],
@@ -434,7 +434,7 @@ def test_a_comparison_refuses_what_no_row_uses(tmp_path):
     late = ("controller.delay_steps=7", "controller.replan=0.3")
     assert shown("paper", late)["adaptive_lqi"].controller.replan == 0.3
     for settings in (
-        late[1:],
+        ("controller.delay_std=0.1", "controller.delay_estimator=none"),
         ("controller.estimate=[]", "controller.prior={payload: 0.1}"),
     ):
         with pytest.raises(ConfigError, match=r"^settings: controller"):

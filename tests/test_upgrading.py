@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.config import ControllerConfig, Scenario
 from stewart_drake.scenario.loading import load_scenario, scenario_to_dict
 from stewart_drake.scenario.renames import CONTROLLER, with_new_names
 
@@ -44,11 +44,15 @@ def old(tmp_path):
 
 
 def test_a_scenario_of_0_1_is_todays_with_all_that_is_new_at_its_default(old):
-    rounded = "reference: {amplitude: [0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08]}"
+    rounded = (
+        "reference: {amplitude: [0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08]}\n"
+        "controller: {w_R: 1.0}"
+    )
     assert old(ALL_FIELDS) == old(rounded)
     # But for the motion's digits that is the default.
     assert old(ALL_FIELDS).reference.amplitude == pytest.approx(Scenario().reference.amplitude)
-    assert dataclasses.replace(old(ALL_FIELDS), reference=Scenario().reference) == Scenario()
+    today = dataclasses.replace(Scenario(), controller=ControllerConfig(w_R=1.0))
+    assert dataclasses.replace(old(ALL_FIELDS), reference=Scenario().reference) == today
 
 
 def test_a_fraction_below_1e_9_is_none():
