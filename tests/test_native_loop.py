@@ -168,7 +168,7 @@ def test_many_drawn_machines_end_as_in_drake(part):
 
 
 def test_states_torques_and_measurements_are_drakes():
-    one = LOOPS["dirty"]
+    one = LOOPS["gravity"]
     preparation = preparation_of(one)
     prepared = preparation.prepared(preparation.experiment(one))
     wanted = preparation.references[preparation.when.sampled]

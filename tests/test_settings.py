@@ -434,7 +434,7 @@ def test_a_comparison_refuses_what_no_row_uses(tmp_path):
     late = ("controller.delay_steps=7", "controller.replan=0.3")
     assert shown("paper", late)["adaptive_lqi"].controller.replan == 0.3
     for settings in (
-        ("controller.delay_std=0.1", "controller.delay_estimator=none"),
+        ("controller.horizon=10",),
         ("controller.estimate=[]", "controller.prior={payload: 0.1}"),
     ):
         with pytest.raises(ConfigError, match=r"^settings: controller"):
