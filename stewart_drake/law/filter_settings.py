@@ -178,7 +178,7 @@ TIMING_ERROR = 0.01
 """Standard deviation of the delay, as a share of a period. With an exact delay the filter would
 attribute the effect of a late torque, large in a catch-up, to payload and bias."""
 FIRST_TIMING_ERROR = 0.006
-"""The same on an exact plant where innovations correct it."""
+"""The same where innovations correct it."""
 NOISE_MEMORY = 5.0
 """Time over which innovations correct the noise, s."""
 
@@ -305,7 +305,7 @@ def filter_settings(
             model_std *= INTEGRATION_ERROR / MODEL_ERROR
     else:
         model_std = acceleration_noise(model_error, motion_scale, period)
-    usual_timing = period * (FIRST_TIMING_ERROR if learns and white else TIMING_ERROR)
+    usual_timing = period * (FIRST_TIMING_ERROR if learns else TIMING_ERROR)
     return FilterSettings(
         parameters,
         model_std,

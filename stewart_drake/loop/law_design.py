@@ -189,14 +189,14 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     torque_scale = max(least, peak_torque)
     plate, asked = experiment.mechanism.plate.mass, experiment.planned_limit
     parameters = estimated_parameters(experiment, torque_scale, max(STILL * least, peak_torque))
-    of_state = isinstance(sc.sensor, StateSensorConfig)
+    exact = sc.plant.kind == "exact" and isinstance(sc.sensor, StateSensorConfig)
     settings = filter_settings(
         *(motion, plate, torque_scale, asked, c.period, parameters),
         model_error=c.model_error,
         timing_std=c.timing_std,
-        white=sc.plant.kind == "exact" and of_state,
+        white=exact,
         noisy=isinstance(sc.sensor, StateSensorConfig) and all(sc.sensor.noise_std),
-        learns=of_state,
+        learns=exact,
     )
     gaps = sc.sensor.kind == "state" and sc.sensor.loss > 0
     observer = CoreObserver(settings if c.estimate else None, gaps=gaps)
