@@ -129,7 +129,7 @@ def test_features_are_root_mean_squares_over_their_samples():
 
 def test_what_is_lost_is_finite_and_bounded():
     """Also of a run that is being lost, where signals grow without limit."""
-    one = scenario("delay.fraction=0.3", "controller.delay_steps=8", *FOLLOWS)
+    one = scenario("delay.fraction=0.5", "controller.delay_steps=8", *FOLLOWS)
     ending, found = watched_run(one, watching(*weights_of(1.0)), SAMPLES)
     values = found[np.isfinite(found).all(axis=1)]
     assert ending.stopped is not None

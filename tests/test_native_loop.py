@@ -373,8 +373,9 @@ def test_a_preview_that_is_missing_is_continued_from_the_last(number):
 
 def error_of_a_later_start(samples_late):
     """Return E_ac of `paper` from rest, held there for some samples before the first torque."""
-    preparation = preparation_of(scenario("paper"))
-    prepared = preparation.prepared(preparation.experiment(scenario("paper")))
+    one = scenario("paper", *START["rest"])
+    preparation = preparation_of(one)
+    prepared = preparation.prepared(preparation.experiment(one))
     experiment, law, late = prepared.experiment, prepared.law, 0.1 * samples_late
     planned, _ = plan_catch_up(
         *(experiment.nominal, experiment.reference, experiment.start),

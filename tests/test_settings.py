@@ -29,7 +29,7 @@ DOCS = Path(__file__).parents[1] / "docs" / "reference" / "scenario.md"
 SIX = [0.01, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 SCENARIOS = {
-    "paper": ("paper", None, ("duration=0.45", "delay.steps=2")),
+    "paper": ("paper", None, ("duration=0.65", "delay.steps=2", "plant.payload_mass=0.2")),
     "paper's plant": ("table2", "delay_lqi", ("overlay=paper_plant", "duration=0.9")),
     "gravity, hold": (
         "gravity",
@@ -171,7 +171,7 @@ OTHER = {
     "controller.catch_up": 0.7,
     "controller.delay_std": 0.1,
     "controller.delay_max": 2.5,
-    "controller.replan": 0.3,
+    "controller.replan": 1.0,
     "controller.model_error": 0.05,
     "controller.timing_std": 0.02,
     "controller.horizon": 10,

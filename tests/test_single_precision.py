@@ -147,7 +147,7 @@ def observed(controller, settings, monkeypatch):
     ],
 )
 def test_the_delay_is_found_to_microseconds_of_that_in_double(settings, single, monkeypatch):
-    """At every sample, through the search, a jump, and drift."""
+    """At every sample, through the search, a jump, and drift; 0.3 % of its deviation if larger."""
     calls = observed("adaptive_lqi", ("plant.kind=exact", *settings), monkeypatch)
     law, memory = None, None
     for observer, before, measurement, in_flight, sensing, plant, after in calls:
@@ -155,7 +155,8 @@ def test_the_delay_is_found_to_microseconds_of_that_in_double(settings, single, 
             law = single.law(observer, sensing, plant, before.timeline)
         memory = single.observe(law, memory, measurement, in_flight)
         found = single.ffi.from_buffer("stewart_delay_memory *", memory[12:])  # after the state
-        assert found.eta == pytest.approx(after.timeline.arrival, abs=3e-6)
+        bound = max(3e-6, 3e-3 * after.delay_std) if after.settled else 3e-6
+        assert found.eta == pytest.approx(after.timeline.arrival, abs=bound)
         assert found.settled == after.settled
         assert found.std == pytest.approx(after.delay_std, rel=1e-2)
     assert after.settled

@@ -94,9 +94,15 @@ def test_a_machine_and_a_motion_of_one_s_own(do):
         "--set controller.w_R=1000"
     )
     assert "completed" in told[slow]
-    usual = slow.split()[:-2]
-    assert main([*usual, "--out", "out/usual", "--quiet"]) == 0
-    assert summary("usual")["status"] == "left_workspace"
+    given = slow.split()
+    for name, words in {
+        "slow": given,
+        "usual": given[:-2],
+        "fast": [*given[:-1], "controller.w_R=1"],
+    }.items():
+        assert main([*words, "--out", f"out/{name}", "--quiet"]) == 0
+    assert summary("slow")["accumulated_error"] < summary("usual")["accumulated_error"] / 40
+    assert summary("usual")["warnings"] and summary("fast")["status"] == "left_workspace"
     sample = next(text for language, _, text in FENCE.findall(TEXT) if language == "text")
     real = told["simulate waves.yaml --out out/waves --csv --replay"]
     assert real.startswith(sample), "the output that the text shows"

@@ -15,6 +15,8 @@
 /* Longest piece between two states that are taken from the dynamics, and shortest one, s. */
 #define PIECE ((real)0.025)
 #define SHORTEST ((real)1e-6)
+/* Share of a piece by which rounding may move an instant: one at a joint belongs to the later piece. */
+#define ROUNDING ((real)1e-5)
 /* Share of the motion by which a prediction is off, when the delay was just found and else. */
 #define SURPRISE ((real)0.02)
 #define OFF ((real)0.08)
@@ -48,9 +50,10 @@ int stewart_along(int number, const real *pieces, real time, real *row)
 {
     for (int k = 0; k < number; k++, pieces += STEWART_PIECE) {
         const real begin = pieces[0], end = pieces[1], *first = pieces + 2, *last = first + ROW;
-        if (!(time < end))
+        const real slack = ROUNDING * (end - begin);
+        if (!(time < end - slack))
             continue;
-        if (time >= begin) {
+        if (time >= begin - slack) {
             stewart_between(first, last, end - begin, (time - begin) / (end - begin), row);
             return 1;
         }

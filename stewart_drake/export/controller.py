@@ -118,7 +118,12 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     readme = _README.from_string(texts.pop("README.md"))
     files |= {name: _filled(text, values) for name, text in texts.items()}
     values["SIZES"] = _sizes(files) if measured else _UNMEASURED
-    kinds = {"servos": kind == "servos", "tuned": tuner is not None, "over_udp": over_udp}
+    kinds = {
+        "servos": kind == "servos",
+        "tuned": tuner is not None,
+        "over_udp": over_udp,
+        "moves": recorded.moves,
+    }
     return files | {"README.md": readme.render(values | kinds)}
 
 
@@ -132,7 +137,7 @@ def _estimates(scenario: Scenario) -> str:
 def _is_example(recorded: Recorded, tuner: Compiled | None) -> bool:
     """Return whether the examples over UDP drive this law."""
     law = recorded.law
-    if not isinstance(law, PredictiveLqi) or tuner is not None or recorded.moves:
+    if not isinstance(law, PredictiveLqi) or tuner is not None or law.finds_delay:
         return False
     return law.sensing.size == NUM_STATE and law.channel.torques == 1
 
@@ -273,7 +278,7 @@ def _surroundings(experiment: Experiment, recorded: Recorded, suffix: str) -> di
         ),
         "KNOTS": str(len(rows)),
         "MOTION": _table(rows),
-        "GOAL": "" if recorded.goal is None else _goal(recorded.goal),
+        "GOAL": _goal(recorded.goal),
         "MOTION_TOLERANCE": f"{TOLERANCE:g}",
     }
 
@@ -282,7 +287,9 @@ def _table(rows: Array) -> str:
     return ",\n    ".join(numbers(row, "") for row in rows)
 
 
-def _goal(rows: Array) -> str:
+def _goal(rows: Array | None) -> str:
+    if rows is None:
+        return "void stewart_goal(double t, real *reference) { stewart_reference(t, reference); }\n"
     number = len(rows)
     return (
         f"\nstatic const double goal[{number}][1 + STEWART_REFERENCE] = {{\n"

@@ -146,7 +146,7 @@ class RecordedLqi(PredictiveLqi):
 
     def initial_memory(self, queue: Array) -> Memory:
         self.record.steps.clear()
-        self.record.first = queue
+        self.record.first, self.record.law = queue, PredictiveLqi(**self.parts)
         return super().initial_memory(queue)
 
     def step(

@@ -179,13 +179,15 @@ def identify(
         longest = max(pairs, key=lambda pair: len(pair[0].times))
         coarse = start.coarse_delay(*longest, mechanism, believed, tolerances.delay)
         # Long trajectories lead nowhere after a loss of the plate; and the coarse delay may err.
-        starts = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5)]
-    tried = list[_Begun]()
-    for first_delay, share in starts:
-        tried.append(_begin(first_delay, share, pairs, unknowns))
-        if tried[-1].chi2 <= WRONG:
+        starts = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5), (coarse, 0.2)]
+    begun = [_begin(*starts[0], pairs, unknowns)]
+    found = _grown(begun[0])
+    for first in starts[1:]:
+        if found.chi2 <= WRONG:
             break
-    found = _grown(min(tried, key=lambda one: one.chi2))
+        begun.append(_begin(*first, pairs, unknowns))
+        if begun[-1].chi2 == min(one.chi2 for one in begun):
+            found = _grown(begun[-1])
     while (halved := finer(found.problem, found.fit.guess)) is not None:
         found = found.refitted(halved)
     return Identification(logs, unknowns, found, middle)

@@ -28,11 +28,11 @@ from stewart_drake.law.core_law import CompiledLaw, CoreMemory
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
+from stewart_drake.law.planner import Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.law_design import (
-    REPLAN,
     compose_law,
     first_queue,
     followed_motion,
@@ -189,7 +189,7 @@ class Preparation:
         self._sizing = sizing_of(self._base)
         self._ways: dict[bytes, CatchUp | None] = {}
         self._previews: dict[int, tuple[Trajectory, Array]] = {}
-        self._motions: dict[int, tuple[Trajectory, tuple[Array, Array]]] = {}
+        self._motions: dict[tuple[int, float], tuple[Trajectory, tuple[Array, Array]]] = {}
         self.when: Instants = instants_of(scenario.duration, scenario.controller.period)
         reference = self._base.reference
         self.references = np.array([evaluate(reference, t)[:NUM_STATE] for t in self.when.looks])
@@ -217,7 +217,8 @@ class Preparation:
         source = (tuner or weights_source)(experiment, law)
         previews = self._preview(motion, law)
         followed = followed_motion(law, motion, experiment.reference) or ()
-        motions = tuple(self._pieces(one, followed) for one in followed)
+        longest = law.planner.duration if isinstance(law.planner, Replan) else 0.0
+        motions = tuple(self._pieces(one, followed, longest) for one in followed)
         return Prepared(experiment, law, motion, previews, source, motions)
 
     def _preview(self, motion: Trajectory, law: PredictiveLqi | ServoPreview) -> Array:
@@ -228,13 +229,17 @@ class Preparation:
             self._previews[id(motion)] = motion, np.array(rows)
         return self._previews[id(motion)][1]
 
-    def _pieces(self, motion: Trajectory, followed: tuple[Trajectory, ...]) -> tuple[Array, Array]:
-        if id(motion) not in self._motions:
+    def _pieces(
+        self, motion: Trajectory, followed: tuple[Trajectory, ...], longest: float
+    ) -> tuple[Array, Array]:
+        """Return `pieces_of` a motion, as far as plans of `longest` s at the most look."""
+        key = id(motion), longest
+        if key not in self._motions:
             sc, c = self._base.scenario, self._base.scenario.controller
             delay = (c.delay_max or 0.0) + believed_delay(sc).eta(c.period)
-            until = sc.duration + 2 * (delay + (c.replan or REPLAN) + 20 * c.period)
-            self._motions[id(motion)] = motion, pieces_of(motion, followed, until)
-        return self._motions[id(motion)][1]
+            until = sc.duration + 2 * (delay + longest + 20 * c.period)
+            self._motions[key] = motion, pieces_of(motion, followed, until)
+        return self._motions[key][1]
 
 
 def pieces_of(

@@ -348,7 +348,7 @@ def replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> Pre
     stays as it is.
     """
     asked = experiment.scenario.controller.replan
-    plain = type(law) is PredictiveLqi and isinstance(law.predictor, NonlinearPredictor)
+    plain = not isinstance(law, LimitedLqi) and isinstance(law.predictor, NonlinearPredictor)
     if not (length and law.estimates and plain and isinstance(law.channel, Wire)):
         return law
     if law.longest_wait or asked == 0:
@@ -407,7 +407,7 @@ def first_queue(experiment: Experiment, law: PredictiveLqi) -> Array:
 def followed_motion(
     law: PredictiveLqi, planned: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, Trajectory] | None:
-    """Return the motions that a law with a delay estimator reads at any instant, or None."""
+    """Return the motions that a law reads at instants of its own, or None."""
     return (planned, reference) if law.moves else None
 
 

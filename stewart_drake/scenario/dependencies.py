@@ -14,6 +14,7 @@ Accepted = Mapping[str, Any]
 """Accepted value by field, dotted as in files; a tuple holds several; a list has one as an item."""
 
 _DELAYS: Final = ("constant", "drifting")
+_CONSTANTS: Final = ("torque_bias", "payload", "damping", "coulomb", "wrench", "offsets")
 REQUIRES: Final[tuple[tuple[str, Any, Accepted], ...]] = (
     ("controller.delay_steps", None, {"controller.delay_fraction": None}),
     ("controller.prediction", "linear", {"controller.delay_estimator": "none"}),
@@ -92,15 +93,20 @@ value of the first field."""
 
 
 class Needs(NamedTuple):
-    """Row of `NEEDS`: without an accepted value of `other` the `fields` have no effect."""
+    """Row of `NEEDS`: without an accepted value of `other` the `fields` have no effect.
+
+    Except where a delay is estimated, for a row with `known_delay`.
+    """
 
     fields: tuple[str, ...]
     other: str
     accepted: Any
+    known_delay: bool = False
 
 
-def _needs(names: str, other: str, accepted: Any) -> Needs:
-    return Needs(tuple(f"controller.{name}" for name in names.split()), other, accepted)
+def _needs(names: str, other: str, accepted: Any, known_delay: bool = False) -> Needs:
+    fields = tuple(f"controller.{name}" for name in names.split())
+    return Needs(fields, other, accepted, known_delay)
 
 
 NEEDS: Final = (
@@ -114,7 +120,7 @@ NEEDS: Final = (
     _needs(
         "prior.rates model_error timing_std",
         "controller.estimate",
-        ("torque_bias", "payload", "damping", "coulomb", "wrench", "offsets"),
+        _CONSTANTS,
     ),
     _needs("prior.rates", "sensor.kind", "encoders"),
     _needs("timing_std", "controller.command", "torque"),
@@ -130,6 +136,9 @@ NEEDS: Final = (
         "torque",
     ),
     _needs("catch_up open_loop_start", "start", "rest"),
+    _needs("replan", "start", "rest", known_delay=True),
+    _needs("replan", "link.kind", "wire", known_delay=True),
+    _needs("replan", "controller.estimate", _CONSTANTS, known_delay=True),
 )
 """Fields that have an effect only with certain values of another field."""
 
@@ -187,6 +196,8 @@ def idle_fields(scenario: Any) -> list[Idle]:
     found = []
     for row in NEEDS:
         if not (unmet := differing(scenario, {row.other: row.accepted})):
+            continue
+        if row.known_delay and not differing(scenario, {"controller.delay_estimator": _DELAYS}):
             continue
         for field in row.fields:
             if (place := _place(scenario, field)) is None:
