@@ -445,8 +445,8 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
     return 1;
 }
 
-/* Compute `after`, one period after a hypothesis whose root is L (n, n) instead of its own. The variance
-   of the timing is at least `least` (s^2); y may be NULL. Returns 0 if y does not fit. */
+/* Compute `after`, one period after a hypothesis, with L (n, n) in place of its root. The variance of the
+   timing is at least `least` (s^2); y may be NULL. Returns 0 if y does not fit. */
 static int attempt(Model *a, const stewart_guess *guess, const real *L, const real *y, real least,
                    stewart_guess *after, stewart_scratch scratch)
 {

@@ -11,8 +11,8 @@
 
        g = 1/2 sum_i d_i (nu_i^2 - S_ii) / S_ii^2,   I = 1/2 sum_i d_i^2 / S_ii^2,   d_i = K_ii or W_ii,
 
-   and Fisher scoring is t <- t + g / J, with J the sum of the information, of which the share `keep` is
-   kept in each period. In the slope of w, nu_i^2 / S_ii - 1 is at most ODD, so that a few values do not
+   and Fisher scoring is t <- t + g / J, with J the sum of the information; each period keeps the share
+   `keep` of J. In the slope of w, nu_i^2 / S_ii - 1 is at most ODD, so that a few values do not
    decide.
 
    Torques begin with t = 1, and with the information of one torque. Parameters begin as constants,

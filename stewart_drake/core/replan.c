@@ -48,8 +48,8 @@ static void look(const stewart_law *law, const real *memory, const stewart_sampl
     }
 }
 
-/* Plan: pieces of the predicted motion, through `states`, then those back onto the goal. Returns 0 if
-   there is no plan. */
+/* Plan: pieces of the predicted motion, through `states`, then those back onto the goal. Returns 0
+   without a plan. */
 static int plan(const stewart_law *law, const stewart_outlook *outlook, const stewart_sample *sample,
                 const real *states, real *memory, stewart_scratch scratch)
 {
