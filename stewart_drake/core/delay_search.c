@@ -25,7 +25,7 @@
 #define PATIENCE 3   /* outliers in a row after which the filter restarts */
 #define GRID ((real)0.5) /* periods between the delays of the grid after a jump */
 #define BEST 2       /* filters that are started from the grid */
-#define HOPELESS 100 /* squared distance, plus ten times the least, above which no second one is started */
+#define HOPELESS 100 /* largest squared distance of a second one, besides ten times the least */
 #define SETTLED 5    /* log of the odds at which one of two takes over */
 #define AT_ONCE 2    /* largest number of cells with which there is time to plan at the same sample */
 #define CAUTION 10   /* factor on the weight of torques during the search */

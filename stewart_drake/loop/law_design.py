@@ -147,7 +147,7 @@ class Sizing(NamedTuple):
 
 
 def sizing_of(experiment: Experiment) -> Sizing:
-    """Return the sizing of a law; it depends on mechanism, reference, period and believed delay."""
+    """Return the sizing of a law, for the scenario's duration, period and believed delay."""
     sc, nominal, reference = experiment.scenario, experiment.nominal, experiment.reference
     period, steps = sc.controller.period, believed_delay(sc).steps
     substeps = choose_substeps(nominal, reference, period, steps, sc.duration)
