@@ -72,6 +72,9 @@ PLANT = (
     "coulomb_friction",
     "coulomb_speed",
     "payload_position",
+    "ball_joint_damping",
+    "ball_joint_friction",
+    "ball_joint_friction_speed",
 )
 """Fields of the plant that a draw changes, in the order of the unknowns."""
 KNOWLEDGE = ("the identified machine", "the truth", "the drawing and the identified delay")

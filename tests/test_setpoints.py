@@ -102,7 +102,7 @@ def test_a_broken_limit_is_refused_with_time_and_motor(settings, message):
     assert "\n" not in str(said.value)
 
 
-@pytest.mark.parametrize("rate", [0, -50, 1e6, float("nan")])
+@pytest.mark.parametrize("rate", [0, -50, 0.1, 1e6, float("nan")])
 def test_a_rate_out_of_range_is_refused(rate):
     with pytest.raises(ConfigError, match="rate: got"):
         sd.setpoints("reachy_mini", rate)

@@ -40,20 +40,20 @@ def _shipped(kind: "Kind") -> Callable[[str], list[str]]:
 
 
 def complete_setting(incomplete: str) -> list[str]:
-    """Complete `--set`: fields, and the values of a field that has few."""
+    """Return completions of `--set`: field names, and the values of fields with few values."""
     from stewart_drake.scenario.loading import setting_choices
 
     return [text for text in setting_choices() if text.startswith(incomplete)]
 
 
-def _name(metavar: str, kind: "Kind") -> Any:
+def _shipped_argument(metavar: str, kind: "Kind") -> Any:
     return typer.Argument(
         metavar=metavar, help="Shipped name or file.", autocompletion=_shipped(kind)
     )
 
 
-ScenarioName = Annotated[str, _name("SCENARIO", "scenario")]
-MechanismName = Annotated[str, _name("MECHANISM", "mechanism")]
+ScenarioName = Annotated[str, _shipped_argument("SCENARIO", "scenario")]
+MechanismName = Annotated[str, _shipped_argument("MECHANISM", "mechanism")]
 Settings = Annotated[
     list[str] | None,
     typer.Option(
@@ -78,10 +78,12 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON,
 
 
 def check_writable(directory: Path | None, *, alone: bool = True) -> None:
-    """Make the directory of `--out`, if any; see also `release`.
+    """Make the directory of `--out`, and check that files can be written there.
+
+    `release` unlocks it, and removes it if it was made here and stayed empty.
 
     Args:
-        directory: or None.
+        directory: of the output; nothing is done for None.
         alone: whether to lock it against other commands until this one ends.
     """
     if directory is None:
@@ -111,7 +113,7 @@ def check_writable(directory: Path | None, *, alone: bool = True) -> None:
 
 
 def check_file(path: Path | None, option: str = "--out") -> None:
-    """Make the directory of a file that `--out`, or another option, names, if any."""
+    """Check that a file can be written, and make its directory; `option` names it in errors."""
     if path is None:
         return
     if path.exists() and not path.is_file():
@@ -121,7 +123,7 @@ def check_file(path: Path | None, option: str = "--out") -> None:
 
 
 def check_log(path: Path | None) -> None:
-    """Make the directory of a log that `--log` names, if any, and check its suffix."""
+    """Check that the log of `--log` can be written and has a known suffix."""
     if path is not None:
         from stewart_drake.scenario.run_log import kind_of_log
 
@@ -182,7 +184,7 @@ class Delivery:
             self.say_wrapped(f"link: {text}")
 
     def discard(self, *names: str) -> None:
-        """Delete files of an earlier run, and its summary."""
+        """Delete the summary and these files of an earlier run."""
         if self.out is not None:
             for name in ("summary.json", *names):
                 (self.out / name).unlink(missing_ok=True)
@@ -195,9 +197,10 @@ class Delivery:
             self.wrote("summary.json")
 
     def draw(self, what: str, draw: Callable[[Path], Any]) -> None:
-        """Write figures or a page after the results; an error in drawing is only a warning.
+        """Write figures or a page after the results.
 
-        A file that cannot be written, as on a full disk, is an error as everywhere.
+        An error in drawing is only a warning, since the results are written already. An OSError,
+        as on a full disk, is raised.
         """
         if self.out is None:
             return

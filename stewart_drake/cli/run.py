@@ -106,7 +106,7 @@ def simulate(
 
             write_csv(result.signals, out / CSV)
         result.save(out)
-        delivery.wrote("summary.json", "signals.nc", *[".csv"] * csv)
+        delivery.wrote("summary.json", "signals.nc", *[CSV] * csv)
     delivery.draw("figures", draw)
     if replay or meshcat:
         delivery.draw(REPLAY, film)

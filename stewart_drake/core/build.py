@@ -21,7 +21,7 @@ FOLDER = Path(__file__).resolve().parent
 ROOT = FOLDER.parents[1]
 LIBRARY = FOLDER / "_dynamics.so"
 DECLARED = "_dynamics.cffi"
-"""Python module beside the library: its declarations as cffi loads them without a parser."""
+"""Python module next to the library: its declarations, as cffi loads them without a parser."""
 EQUATIONS = FOLDER / "equations.h"
 MODELS = ROOT / "models"
 GENERATORS = ("equations", "derivatives", "generate")

@@ -4,11 +4,10 @@
 
        eta_{k+1} = eta_k + dt eta_dot_k + noise,   eta_dot_{k+1} = eta_dot_k + noise,
 
-   and what acts between two samples follows from it (arrivals.h). A torque that arrives tau later
-   moves the plate by minus its kick, so dx/deta is minus the sum of the kicks; here it is a central
-   difference of the whole prediction over DIFFERENCE, which also has what happens after the kick.
-   With a torque change at a sample itself it is the mean of both sides. An arrival at a within the
-   period moves by a eta_dot with the rate: to first order dx/deta_dot = dt/2 dx/deta.
+   and the torques that act between two samples follow from it (arrivals.h). dx/deta is a central
+   difference of the whole prediction, over DIFFERENCE. If a torque changes at a sample, it is the mean of
+   the derivatives of both sides. The rate delays an arrival at the time a within the period by
+   a eta_dot. With dt/2 for a, dx/deta_dot = dt/2 dx/deta.
 
    The likelihood of a measurement, -1/2 (nu' S^-1 nu + ln |S|) with innovation nu and covariance S,
    is kept: the delay is found by comparing filters (delay_search.c). */
@@ -19,17 +18,17 @@
 #define MOST STEWART_MAX_SCHEDULE
 
 #define ITERATIONS 6 /* at the most, while the delay is hardly known */
-#define FEW 4        /* once it is known */
-#define TRIED 15     /* values of the delay that are tried before the iterations of a vague one */
+#define FEW 4        /* the same once it is known */
+#define TRIED 15     /* values of the delay to start the iterations from, while it is hardly known */
 #define DIFFERENCE ((real)1e-3) /* s */
 #define KNOWN ((real)0.01) /* a constant is known at this share of its usual standard deviation */
 #define HEARD 10           /* measurements after which a misfit may be a jump of parameters */
-#define MEMORY 5           /* s over which the timing of single torques is judged */
-#define UNTIMELY ((real)0.05) /* periods by which a torque may come early or late at the most */
-#define JERKED ((real)0.02)   /* periods by which the delay may have changed where it did */
-#define EDGE ((real)0.1)      /* periods about one from which torques may come into it */
+#define MEMORY 5           /* s over which the timing of single torques is estimated */
+#define UNTIMELY ((real)0.05) /* periods, largest standard deviation of the timing */
+#define JERKED ((real)0.02)   /* periods, standard deviation of a small step of the delay */
+#define EDGE ((real)0.1)      /* periods before and after one from which a torque may move into it */
 #define BEFORE ((real)1 / 120) /* see stewart_period_late */
-#define ASIDE ((real)0.01) /* share of a kick's variance in every other direction */
+#define ASIDE ((real)0.01) /* share of a kick's variances that is added without correlation */
 #define LARGEST_RATE ((real)0.5) /* s/s */
 #define UNLIKELY ((real)-1e6) /* log-likelihood of a measurement that cannot be explained */
 #define SQRT_HALF ((real)0.70710678118654752)
@@ -79,33 +78,33 @@ typedef struct {
     int number;
     real *torques, *durations;
     real states[X * MOST]; /* after each of them */
-} Way;
+} Path;
 
-static Way take_way(const stewart_period *t, stewart_scratch *scratch)
+static Path take_path(const stewart_period *t, stewart_scratch *scratch)
 {
     const int most = t->flights + 3;
-    Way way = {.torques = stewart_take(scratch, U * most)};
-    way.durations = stewart_take(scratch, most);
-    return way;
+    Path path = {.torques = stewart_take(scratch, U * most)};
+    path.durations = stewart_take(scratch, most);
+    return path;
 }
 
-/* Schedule between two instants. Returns 0 for too many torques. */
-static int act(const stewart_period *t, const real *xi, real begin, real end, Way *way)
+/* Compute the schedule between two instants. Returns 0 for too many torques. */
+static int schedule_between(const stewart_period *t, const real *xi, real begin, real end, Path *path)
 {
     const stewart_arrivals view = arriving(t, xi);
-    way->number = stewart_torque_schedule(&view, t->flights, t->in_flight, begin, end, t->newest,
-                                          way->torques, way->durations);
-    return way->number <= MOST;
+    path->number = stewart_torque_schedule(&view, t->flights, t->in_flight, begin, end, t->newest,
+                                           path->torques, path->durations);
+    return path->number <= MOST;
 }
 
-/* States along a period from xi, and its end. Returns 0 if there are none. */
-static int predict(const stewart_period *t, const real *xi, Way *way, real *state)
+/* Compute the path of a period from xi, and the state at its end. Returns 0 for too many torques. */
+static int predict(const stewart_period *t, const real *xi, Path *path, real *state)
 {
-    if (!act(t, xi, 0, t->delay->period, way))
+    if (!schedule_between(t, xi, 0, t->delay->period, path))
         return 0;
-    const stewart_schedule schedule = {way->number, way->torques, way->durations, 0};
-    stewart_predict(t->delay->machine, xi + X, &schedule, xi, way->states);
-    stewart_copy(X, way->states + X * (way->number - 1), state);
+    const stewart_schedule schedule = {path->number, path->torques, path->durations, 0};
+    stewart_predict(t->delay->machine, xi + X, &schedule, xi, path->states);
+    stewart_copy(X, path->states + X * (path->number - 1), state);
     return 1;
 }
 
@@ -128,22 +127,23 @@ int stewart_delay_advance_scratch(int p, int m, int flights)
 int stewart_period_end(const stewart_period *t, const real *xi, real *state,
                        stewart_scratch scratch)
 {
-    Way way = take_way(t, &scratch);
-    return predict(t, xi, &way, state);
+    Path path = take_path(t, &scratch);
+    return predict(t, xi, &path, state);
 }
 
-/* H (12, n) along the way of a period from xi. */
-static int linearize_along(const stewart_period *t, const real *xi, const Way *way, int fourth_order, real *H,
-                           stewart_scratch scratch)
+/* Compute H (12, n) along the path of a period from xi. */
+static int linearize_along(const stewart_period *t, const real *xi, const Path *path,
+                           int fourth_order, real *H, stewart_scratch scratch)
 {
     const int n = size_of(t->delay), known = n - 2;
-    const stewart_schedule schedule = {way->number, way->torques, way->durations, 0};
+    const stewart_schedule schedule = {path->number, path->torques, path->durations, 0};
     real *all = stewart_take(&scratch, MOST * X * known), *moved = stewart_take(&scratch, n);
     real later[X], sooner[X];
-    if (!stewart_transitions(t->delay->machine, xi, &schedule, fourth_order, way->states, all, scratch))
+    if (!stewart_transitions(t->delay->machine, xi, &schedule, fourth_order, path->states, all,
+                             scratch))
         return 0;
     for (int i = 0; i < X; i++) {
-        stewart_copy(known, all + X * known * (way->number - 1) + known * i, H + n * i);
+        stewart_copy(known, all + X * known * (path->number - 1) + known * i, H + n * i);
         H[n * i + n - 2] = H[n * i + n - 1] = 0;
     }
     if (!(xi[n - 2] < STEWART_NEVER))
@@ -162,11 +162,11 @@ static int linearize_along(const stewart_period *t, const real *xi, const Way *w
     return 1;
 }
 
-int stewart_period_at(const stewart_period *t, const real *xi, int fourth_order, real *state, real *H,
-                      stewart_scratch scratch)
+int stewart_period_at(const stewart_period *t, const real *xi, int fourth_order, real *state,
+                      real *H, stewart_scratch scratch)
 {
-    Way way = take_way(t, &scratch);
-    return predict(t, xi, &way, state) && linearize_along(t, xi, &way, fourth_order, H, scratch);
+    Path path = take_path(t, &scratch);
+    return predict(t, xi, &path, state) && linearize_along(t, xi, &path, fourth_order, H, scratch);
 }
 
 /* Probability that a normal error of this standard deviation lies between two bounds. */
@@ -176,43 +176,43 @@ static real between(real low, real high, real std)
     return (real)0.5 * (REAL(erfc)(low * part) - REAL(erfc)(high * part));
 }
 
-/* A change of torque at c that comes a second earlier leaves B dT in the rates at the end and moves
-   the pose by that for the rest of the period. It does so in this period if c + j is within it, j its
-   error: next to a sample with the probability Phi.
+/* A change of torque dT leaves B dT in the rates at the period's end, per second that it comes early, and
+   moves the pose by that for the rest of the period. A change at c with the error j does so in this
+   period if c + j lies within it; the variance is that of j times the probability of this.
 
-   Torques in flight at t = 0 began at unknown instants, phi dt off the samples. Mean torques of changes
-   dT per period leave the rates off by B dT dt phi (1 - phi) / 2 at the samples. For phi uniform in
-   [0, 1] the mean square is BEFORE (B dT dt)^2. */
+   The torques that were in flight at t = 0 changed at unknown instants, phi dt after the samples. Mean
+   torques of the periods, with a change dT per period, leave the rates off by B dT dt phi (1 - phi) / 2
+   at the samples. For phi uniform in [0, 1] the mean square is BEFORE (B dT dt)^2. */
 int stewart_period_late(const stewart_period *t, const real *xi, const real *state, real std,
                         real *K, int *others, stewart_scratch scratch)
 {
     const real dt = t->delay->period;
     const stewart_arrivals view = arriving(t, xi);
     real before[6], after[6], at = -EDGE * dt;
-    Way way = take_way(t, &scratch);
+    Path path = take_path(t, &scratch);
     const real first = ((real)(t->newest + 1 - view.num_own) * dt + view.eta) * (1 + view.rate);
     stewart_belief belief;
     stewart_believe(t->delay->machine, xi + X, &belief);
     *others = 0;
-    if (!act(t, xi, at, dt - at, &way))
+    if (!schedule_between(t, xi, at, dt - at, &path))
         return -1;
-    stewart_accelerate(&belief, state, way.torques, before);
-    for (int k = 0; k + 1 < way.number; k++, K += X) {
+    stewart_accelerate(&belief, state, path.torques, before);
+    for (int k = 0; k + 1 < path.number; k++, K += X) {
         real left, share = REAL(sqrt)(BEFORE) * dt;
-        at += way.durations[k];
+        at += path.durations[k];
         left = dt - at < 0 ? 0 : dt - at < dt ? dt - at : dt;
         if (view.num_own > 0 && at >= first - STEWART_INSTANT)
             share = std * REAL(sqrt)(REAL(fmax)(between(-at, dt - at, std), 0));
         else
             ++*others;
-        stewart_accelerate(&belief, state, way.torques + U * (k + 1), after);
+        stewart_accelerate(&belief, state, path.torques + U * (k + 1), after);
         for (int i = 0; i < 6; i++) {
             K[6 + i] = share * (after[i] - before[i]);
             K[i] = left * K[6 + i];
             before[i] = after[i];
         }
     }
-    return way.number - 1;
+    return path.number - 1;
 }
 
 /* ---- a measurement at its end ----------------------------------------------------------------- */
@@ -222,28 +222,29 @@ typedef struct {
     stewart_instant instant;
     const stewart_period *period;
     const real *mean;    /* (n) prior */
-    Way way;             /* the last one */
-    int m, n, fourth_order, rows, others;
+    Path path;           /* of the last prediction */
+    int m, n, fourth_order;
+    int rows, others;    /* of K: number of all rows, and of those before the controller's own */
     real *first;         /* state and H about the prior, for all attempts */
-    real K[X * MOST];    /* see stewart_period_late */
+    real K[X * MOST];    /* (rows, 12), see stewart_period_late */
     real drift[X];       /* standard deviations of the model's other errors */
-    real *seen;          /* (m, rows) J K' where the noise is taken */
+    real *seen;          /* (m, rows) J K', effect of K on the measurement */
     real *white, *nu;    /* (m, n) C^-1 J H, and (m) C^-1 nu, nu the innovation about the prior */
 } Model;
 
 static int predict_model(void *about, const real *xi, real *state)
 {
     Model *a = about;
-    return predict(a->period, xi, &a->way, state);
+    return predict(a->period, xi, &a->path, state);
 }
 
 static int linearize_model(void *about, const real *xi, real *H, stewart_scratch scratch)
 {
     Model *a = about;
-    return linearize_along(a->period, xi, &a->way, a->fourth_order, H, scratch);
+    return linearize_along(a->period, xi, &a->path, a->fourth_order, H, scratch);
 }
 
-static int rows(void *about, const real *xi, real *e, real *H, stewart_scratch scratch)
+static int whitened_rows(void *about, const real *xi, real *e, real *H, stewart_scratch scratch)
 {
     Model *a = about;
     stewart_instant_rows(&a->instant, xi, e, H, scratch);
@@ -262,7 +263,8 @@ static real timing_of(const stewart_delay *d, const stewart_guess *guess)
     return guess->timing > least ? guess->timing : least;
 }
 
-/* Noise of the model, and of torques early or late by a variance `used`, where it is linearised. */
+/* Compute the noise of the model and of the torques' timing, of variance `used`, about xi and the state
+   at the period's end. */
 static int set_noise(Model *a, const real *xi, real used, stewart_scratch scratch)
 {
     const stewart_delay *d = a->period->delay;
@@ -279,10 +281,9 @@ static int set_noise(Model *a, const real *xi, real used, stewart_scratch scratc
     return 1;
 }
 
-/* xi <- the prior with that eta of TRIED ones that the measurement fits best.
-
-   By nu' S^-1 nu, S of all but the delay: the linearised effect of a torque that has not arrived yet
-   is none, and iterations from there would never find one that has. */
+/* xi <- the prior with the eta, out of TRIED values, that has the least nu' S^-1 nu, with S the covariance
+   without the delay's. A torque that has not arrived yet has no linearised effect, so iterations from
+   there would never find that it has arrived. */
 static int best_of_many(Model *a, const stewart_guess *guess, const real *L, real std, real *xi,
                         stewart_scratch scratch)
 {
@@ -299,7 +300,7 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
             for (int k = j; k < known; k++)
                 A[X * j + i] += a->instant.H[n * i + k] * L[n * k + j];
         }
-    /* Seen from where the period begins. */
+    /* With dh/dx at the beginning of the period. */
     if (!stewart_innovation_root(d->sensing, a->mean, known, A, d->model_std, a->instant.C, scratch))
         return 0;
     stewart_copy(n, a->mean, trial);
@@ -322,9 +323,9 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
     return 1;
 }
 
-/* Update a hypothesis' estimate of the timing of single torques, and its outliers.
+/* Update a hypothesis' estimate of the variance s of single torques' timing.
 
-   With S = S_0 + s M, s the variance, the log-likelihood has the slope and the information
+   With S = S_0 + s M the log-likelihood has the slope and the information
 
        dL/ds = 1/2 (nu' S^-1 M S^-1 nu - tr S^-1 M),   I = 1/2 tr S^-1 M S^-1 M,
 
@@ -333,8 +334,8 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
    the mean over those; with a weight of 1 / s^4 the first punctual torques would dominate for ever.
 
    Whitened by C, S is 1 + W W' with W = C^-1 H L, and s M is B B' with B = C^-1 J K' of the own rows
-   of K. With T = B' S^-1 B the traces are those of T and of T T. Returns 0 where S is not positive
-   definite, 2 for a torque further off than any is, else 1. */
+   of K. With T = B' S^-1 B the traces are those of T and of T T. Returns 0 if S is not positive
+   definite, 2 if this measurement alone gives more than twice the largest variance, else 1. */
 static int judge_timing(Model *a, const real *L, real used, stewart_guess *after,
                         stewart_scratch scratch)
 {
@@ -372,12 +373,12 @@ static int judge_timing(Model *a, const real *L, real used, stewart_guess *after
         }
     if (!(square > 0)) /* no torque has changed */
         return 1;
-    const real told = used * (1 + (pull - trace) / square); /* of `square` torques */
+    const real alone = used * (1 + (pull - trace) / square); /* of this measurement */
     const real kept = after->torques < MEMORY / dt ? after->torques : MEMORY / dt;
-    const real timing = (kept * after->timing + square * told) / (kept + square);
+    const real timing = (kept * after->timing + square * alone) / (kept + square);
     after->timing = timing < 0 ? 0 : timing < most ? timing : most;
     after->torques = kept + square;
-    return 1 + (told > 2 * most);
+    return 1 + (alone > 2 * most);
 }
 
 /* Whether the effect of a single torque can be separated from that of the delay. */
@@ -392,13 +393,14 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
 {
     const stewart_delay *d = a->period->delay;
     const int n = a->n, m = a->m, p = d->machine->estimated;
-    const int free_eta = stewart_norm(n, L + n * (n - 2)) > 0, free_rate = stewart_norm(n, L + n * (n - 1)) > 0;
+    const int free_eta = stewart_norm(n, L + n * (n - 2)) > 0;
+    const int free_rate = stewart_norm(n, L + n * (n - 1)) > 0;
     real *lower = stewart_take(&scratch, n), *upper = stewart_take(&scratch, n);
     real *C = a->instant.C, distance, spread;
     if (std > d->period / 10) {
         if (!best_of_many(a, guess, L, std, xi, scratch)
-            || !predict(a->period, xi, &a->way, a->instant.state)
-            || !linearize_along(a->period, xi, &a->way, a->fourth_order, a->instant.H, scratch)
+            || !predict(a->period, xi, &a->path, a->instant.state)
+            || !linearize_along(a->period, xi, &a->path, a->fourth_order, a->instant.H, scratch)
             || !set_noise(a, xi, used, scratch))
             return 0;
     }
@@ -421,8 +423,8 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
         upper[n - 1] = LARGEST_RATE;
     }
     const stewart_kalman filter = {
-        n, m, std > d->period / 100 ? ITERATIONS : FEW, a->mean, L, lower, upper, a, rows,
-                                   stewart_instant_settle, NULL, NULL};
+        n, m, std > d->period / 100 ? ITERATIONS : FEW, a->mean, L, lower, upper, a,
+        whitened_rows, stewart_instant_settle, NULL, NULL};
     if (!stewart_kalman_update(&filter, xi, root, &distance, &spread, scratch))
         return 0;
     if (!(distance <= d->gate)) /* or NaN */
@@ -443,8 +445,8 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
     return 1;
 }
 
-/* `after` (but its root, which is L's) a period after a hypothesis with the root L (n, n), with a
-   variance of the timing of at least `least` (s^2); y may be NULL. 0 where it does not fit. */
+/* Compute `after`, one period after a hypothesis, with L (n, n) in place of its root. The variance of the
+   timing is at least `least` (s^2); y may be NULL. Returns 0 if y does not fit. */
 static int attempt(Model *a, const stewart_guess *guess, const real *L, const real *y, real least,
                    stewart_guess *after, stewart_scratch scratch)
 {
@@ -469,7 +471,9 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
             return 0;
         L = posterior;
     }
-    real less_sure = 0; /* the mean delay is not known better than the timing of these torques */
+    /* The mean delay cannot be known better than the timing of the torques that it is the mean of: a
+       larger variance of the timing adds to that of eta. */
+    real less_sure = 0;
     if (after->heard > 0)
         less_sure = (timing_of(d, after) - timing) / after->heard;
     if (!(less_sure > 0))
@@ -512,8 +516,7 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
     return stewart_all_finite(n + n * (n + 1) / 2, after->numbers);
 }
 
-/* Let the delay itself have changed by a standard deviation: a variance added to that of eta, in the
-   last two rows of the root. */
+/* L <- root of the covariance with std^2 added to the variance of eta. Only its last two rows change. */
 static void jerk(int n, real std, real *L)
 {
     real *eta = L + n * (n - 2) + n - 2, *rate = L + n * (n - 1) + n - 2;
@@ -525,9 +528,9 @@ static void jerk(int n, real std, real *L)
     rate[1] = REAL(hypot)(rate[1], along * std / *eta);
 }
 
-/* `after` with a measurement that a jump of parameters explains; the delay may have jumped instead,
-   which further misfits will show. Returns 0, with L as before, where none does. */
-static int pushed(Model *a, const stewart_guess *guess, real *L, const real *y, stewart_guess *after,
+/* Compute `after` with a measurement that a jump of parameters explains. The delay may have jumped
+   instead, which further misfits will show. Returns 0 if none does; L is restored. */
+static int jumped(Model *a, const stewart_guess *guess, real *L, const real *y, stewart_guess *after,
                   stewart_scratch scratch)
 {
     const stewart_delay *d = a->period->delay;
@@ -554,7 +557,7 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
     const int n = size_of(d), p = n - X - 2, m = d->sensing->size;
     Model a = {.period = t, .mean = guess->numbers, .m = m, .n = n};
     real *L = stewart_take(&scratch, n * n);
-    a.way = take_way(t, &scratch);
+    a.path = take_path(t, &scratch);
     a.first = stewart_take(&scratch, X + X * n);
     a.seen = stewart_take(&scratch, m * MOST);
     a.white = stewart_take(&scratch, m * n);
@@ -570,8 +573,9 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
         if (!(d->walk_std[i] > 0)
             && !(stewart_norm(n, L + n * (X + i)) <= KNOWN * d->usual_std[i])) /* or NaN */
             a.fourth_order = 1;
-    const int goes = stewart_period_at(t, guess->numbers, a.fourth_order, a.first, a.first + X, scratch);
-    if (y && goes) {
+    const int exists =
+        stewart_period_at(t, guess->numbers, a.fourth_order, a.first, a.first + X, scratch);
+    if (y && exists) {
         if (attempt(&a, guess, L, y, 0, after, scratch))
             return;
         if (is_precise(d, guess, n, stewart_guess_std(guess, n))) {
@@ -584,10 +588,10 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
             stewart_guess_root(guess, n, L);
         }
         if (d->jump_std && guess->heard >= HEARD && guess->outliers == 0
-            && pushed(&a, guess, L, y, after, scratch))
+            && jumped(&a, guess, L, y, after, scratch))
             return;
     }
-    if (!goes || !attempt(&a, guess, L, NULL, 0, after, scratch)) /* the hypothesis has failed */
+    if (!exists || !attempt(&a, guess, L, NULL, 0, after, scratch)) /* the hypothesis has failed */
         stewart_copy(stewart_guess_size(p), (const real *)guess, (real *)after);
     if (y) {
         after->fits = 0;

@@ -29,7 +29,8 @@ typedef struct {
     real believed, delay_std;        /* s, mean and standard deviation of the delay's prior */
     real longest;                    /* s */
     real timing_std;                 /* s, least standard deviation of the timing of torques */
-    real walk, rate_std, rate_walk;  /* s per root s; s/s, 0 for a delay without a rate; s/s per root s */
+    real walk;                       /* s per root s, change of the delay */
+    real rate_std, rate_walk;        /* s/s, and s/s per root s; 0 for a delay without a rate */
     int quiet;                       /* whether nothing is fed back before the delay is found */
 } stewart_delay;
 
@@ -38,10 +39,10 @@ typedef struct {
     real low, high;      /* s, between which eta is */
     real log_likelihood; /* of the last measurement */
     real fits;           /* whether the last measurement was not an outlier */
-    real outliers;       /* in a row, also those that another timing of a torque explains */
+    real outliers;       /* consecutive ones, also those that a torque's timing or a jump explains */
     real timing;         /* s^2, variance of the timing of single torques */
     real torques;        /* number of torques in that estimate */
-    real heard;          /* number of measurements after an own torque */
+    real heard;          /* number of measurements since an own torque has arrived */
     real weight;         /* log of the odds */
     real squares;        /* sum of nu' S^-1 nu of the measurements that were used */
     real values;         /* number of values in them */
@@ -60,29 +61,30 @@ real stewart_guess_std(const stewart_guess *guess, int n);
 /* One period as a function of xi. */
 typedef struct {
     const stewart_delay *delay;
-    stewart_arrivals view; /* from its beginning; eta and rate do not count */
+    stewart_arrivals view; /* at its beginning; eta and rate are replaced by those of xi */
     int flights, newest;   /* see stewart_torque_schedule */
     const real *in_flight; /* (flights, 6) */
 } stewart_period;
 
 int stewart_period_scratch(int p, int flights); /* of each of these */
 
-/* State at the end. Returns 0 if it does not exist. */
+/* Compute the state at the end. Returns 0 for too many torques. */
 int stewart_period_end(const stewart_period *period, const real *xi, real *state,
                        stewart_scratch scratch);
 
-/* State at the end, and H (12, n) = d[state]/d[xi]; `fourth_order`: see stewart_transitions. Returns 0
-   where they do not exist. */
-int stewart_period_at(const stewart_period *period, const real *xi, int fourth_order, real *state, real *H,
-                      stewart_scratch scratch);
+/* Compute the state at the end, and H (12, n) = d[state]/d[xi]; `fourth_order`: see stewart_transitions.
+   Returns 0 where they do not exist. */
+int stewart_period_at(const stewart_period *period, const real *xi, int fourth_order, real *state,
+                      real *H, stewart_scratch scratch);
 
-/* Rows K (k, 12): changes of the state at the end if single torques are early or late by one standard
-   deviation, first the `others` before the controller's own, then the own ones, `std` in s. K'K is the
-   covariance. Returns k, at most STEWART_MAX_SCHEDULE, or -1. */
+/* Compute rows K (k, 12): changes of the state at the end if a single torque is early or late by one
+   standard deviation. The first `others` rows are of torques before the controller's own. The rest are of
+   own torques, with the standard deviation `std` in s. K'K is the covariance. Returns k, at most
+   STEWART_MAX_SCHEDULE, or -1 for too many torques. */
 int stewart_period_late(const stewart_period *period, const real *xi, const real *state, real std,
                         real *K, int *others, stewart_scratch scratch);
 
-/* The hypothesis a period later, with a measurement y (m) at its end, or NULL. */
+/* Advance a hypothesis by a period, and correct it by a measurement y (m) at its end, if not NULL. */
 void stewart_delay_advance(const stewart_period *period, const stewart_guess *guess, const real *y,
                            stewart_guess *after, stewart_scratch scratch);
 
@@ -104,9 +106,9 @@ typedef struct {
     real caution;                /* factor on the weight of torques */
     real settled;                /* whether the delay is known */
     real mean, std;              /* s, of the delay; NaN before the first measurement */
-    real numbers[];              /* what acts without own torques (flights - 1 or 1, 6), the last two
-                                    measurements (2, m), then hypotheses; the first is that nothing
-                                    has arrived, or the only one */
+    real numbers[];              /* torques that act until an own one arrives (flights - 1 or 1, 6), the
+                                    last two measurements (2, m), then hypotheses: first the master,
+                                    or the only one */
 } stewart_delay_memory;
 
 /* Numbers of the memory for p parameters, m values and a number of torques in flight at a sample. */
@@ -120,8 +122,8 @@ stewart_guess *stewart_delay_guess(int p, int m, int flights, stewart_delay_memo
 
 void stewart_delay_start(const stewart_delay *delay, int flights, stewart_delay_memory *memory);
 
-/* One period, then a measurement y (m) at its end, or NULL. `in_flight` (flights, 6) are the torques
-   before this sample's; `near` (12) is where the plate is thought to be. */
+/* Advance by a period, and correct by a measurement y (m) at its end, if not NULL. `in_flight` (flights,
+   6) are the torques sent before this sample; `near` (12) is the expected state. */
 void stewart_delay_observe(const stewart_delay *delay, int flights, const real *in_flight,
                            const real *y, const real *near, stewart_delay_memory *memory,
                            stewart_scratch scratch);

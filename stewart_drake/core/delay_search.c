@@ -1,18 +1,18 @@
 /* State, parameters and an unknown delay: a Gaussian sum over its arrival, see delay.h.
 
-   Until the first of the controller's torques arrives, it is only known that it has not. A
-   *master* filter assumes just this. At t_k a *cell* is taken from it, as it was at t_{k-1}, for an
-   arrival in between: eta uniform in (t_{k-1}, t_k]. With Phi the distribution of the prior,
+   The *master* filter assumes that no torque of the controller has arrived. At t_k a *cell* is copied
+   from it, as it was at t_{k-1}, for a first arrival in between: eta uniform in (t_{k-1}, t_k]. With Phi
+   the distribution of the prior,
 
        p = [Phi(t_k) - Phi(t_{k-1})] / [1 - Phi(t_{k-1})]
 
    of the master's weight goes to the cell, 1 - p stays. Each measurement multiplies all weights by its
-   likelihood. When one cell, and what lies within NEAR of it, has all but e^-LEAD of the weight and
-   knows the delay to NEAR, it is the delay: the search is over, and one filter goes on.
+   likelihood. The search ends with a cell as the only filter when its delay is known to NEAR, and every
+   hypothesis farther than NEAR from it has less than e^-LEAD of its weight.
 
-   Two outliers in a row may be a jump of the delay. Then state and parameters are known, and what was
-   measured last is compared with what every delay of a grid would have done; filters are begun at the
-   best few, and one that fits alone takes over. */
+   Two outliers in a row may be a jump of the delay. State and parameters are known by then, so the last
+   measurements are compared with the prediction for every delay of a grid. Filters start from the best
+   few; the best of them takes over if no other explains the measurements about as well. */
 
 #include "delay.h"
 #include "short.h"
@@ -20,17 +20,17 @@
 #define LEAD 7       /* log of the odds that ends the search */
 #define FORGOTTEN 14 /* log of the odds that drops a cell */
 #define NEAR ((real)0.2) /* periods; nearer delays are one hypothesis */
-#define LEAST_SHARE ((real)1e-4) /* of the master's weight, for a cell and for the master */
+#define LEAST_SHARE ((real)1e-4) /* least part of the master's weight for a new cell, and for the master */
 #define SUSPICIOUS 2 /* outliers in a row that start the search for a jump */
 #define PATIENCE 3   /* outliers in a row after which the filter restarts */
 #define GRID ((real)0.5) /* periods between the delays of the grid after a jump */
 #define BEST 2       /* filters that are started from the grid */
-#define HOPELESS 100 /* squared distance above which no filter is started */
-#define SETTLED 5    /* log of the odds at which one of them takes over */
-#define AT_ONCE 2    /* cells with which a plan fits in the same sample */
+#define HOPELESS 100 /* largest squared distance of a second one, besides ten times the least */
+#define SETTLED 5    /* log of the odds at which one of two takes over */
+#define AT_ONCE 2    /* largest number of cells with which there is time to plan at the same sample */
 #define CAUTION 10   /* factor on the weight of torques during the search */
-#define LOOSENED ((real)0.05) /* deviations of the prior, allowed change of parameters */
-#define LOOSENED_BY_JUMP ((real)0.01)
+#define LOOSENED ((real)0.05) /* standard deviation added to parameters at a restart, share of the prior's */
+#define LOOSENED_BY_JUMP ((real)0.01) /* the same at a jump of the delay */
 #define TORQUES 1 /* prior weight of `first_timing`, in torques. Without it the first late torques
                      would be outliers, and the next ones would change payload and bias. */
 #define SQRT_HALF ((real)0.70710678118654752)
@@ -129,7 +129,7 @@ static void rest_of_prior(const stewart_delay *d, real t, real *mean, real *std)
 
 /* ---- the search ------------------------------------------------------------------------------- */
 
-/* The cell of an arrival within period k becomes the next one. */
+/* Add the cell of an arrival within period k. */
 static void spawn(Search *s, int k, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
@@ -155,7 +155,7 @@ static void spawn(Search *s, int k, stewart_scratch scratch)
     stewart_guess_keep_root(n, L, cell);
 }
 
-/* State (12) from one measurement alone, and the lower triangular root (12, 12) of its covariance. */
+/* Compute the state (12) from one measurement, and the lower triangular root (12, 12) of its covariance. */
 static int start_of(const stewart_sensing *sensing, const real *y, const real *near, real *state,
                     real *root, stewart_scratch scratch)
 {
@@ -169,7 +169,7 @@ static int start_of(const stewart_sensing *sensing, const real *y, const real *n
     return 1;
 }
 
-/* From one measurement alone: nothing has arrived, or something in any period so far. */
+/* Begin from one measurement, with the master and a cell for every period so far. */
 static void begin(Search *s, const real *y, const real *near, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
@@ -200,7 +200,7 @@ static void begin(Search *s, const real *y, const real *near, stewart_scratch sc
             spawn(s, k, scratch);
 }
 
-/* One period and a measurement, or NULL, for the hypothesis at a place. */
+/* Advance the hypothesis at a place by one period and a measurement, or NULL. */
 static void update(Search *s, int place, const real *y, stewart_scratch scratch)
 {
     stewart_guess *guess = guess_at(s, place);
@@ -212,7 +212,7 @@ static void update(Search *s, int place, const real *y, stewart_scratch scratch)
     copy_guess(s->n, after, guess);
 }
 
-/* One more measurement, or NULL, for master and cells, and perhaps the end of the search. */
+/* Advance master and cells by a measurement, or NULL; drop unlikely cells; end the search if it is over. */
 static void search(Search *s, const real *y, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
@@ -265,8 +265,8 @@ static void search(Search *s, const real *y, stewart_scratch scratch)
 
 /* ---- jumps and new starts --------------------------------------------------------------------- */
 
-/* `guess` from a state (12) with the root of its covariance (12, 12) and another eta of variance
-   std^2, its parameters as they are known, to `loosened` deviations of the prior. */
+/* Begin `guess` from a state (12) with the root of its covariance (12, 12), and an eta of variance std^2.
+   Parameters are those of `from`, with `loosened` standard deviations of the prior added. */
 static void begin_at(const Search *s, const stewart_guess *from, real eta, real std, real loosened,
                      const real *state, const real *root, stewart_guess *guess,
                      stewart_scratch scratch)
@@ -343,21 +343,21 @@ static int compare(const Search *s, const stewart_period *t, const stewart_guess
     return 1;
 }
 
-/* The place of the lowest local minimum but one that was chosen before (-1 for none), or -1. */
-static int valley(int number, const real *cost, int but)
+/* Return the place of the lowest local minimum, other than `chosen` (-1 for none), or -1. */
+static int valley(int number, const real *cost, int chosen)
 {
     int best = -1;
     for (int i = 0; i < number; i++) {
         const int falls = i == 0 || cost[i] <= cost[i - 1];
         const int rises = i == number - 1 || cost[i] <= cost[i + 1];
-        if (i != but && falls && rises && isfinite(cost[i]) && (best < 0 || cost[i] < cost[best]))
+        if (i != chosen && falls && rises && isfinite(cost[i]) && (best < 0 || cost[i] < cost[best]))
             best = i;
     }
     return best;
 }
 
-/* Put a hypothesis of another delay that explains the last of three measurements, the last two of the
-   memory and y, in the place of the only one. Returns 0 where there is none. */
+/* Replace the only hypothesis by one of another delay that explains the last three measurements: two in
+   the memory, and y. Returns 0 if there is none. */
 static int jump(Search *s, const real *y, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
@@ -421,7 +421,7 @@ static int jump(Search *s, const real *y, stewart_scratch scratch)
     return 1;
 }
 
-/* From the last measurement, after outliers that nothing explains. */
+/* Restart from the last measurement, after outliers that nothing explains. */
 static void restart(Search *s, const real *y, const real *near, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
@@ -520,7 +520,7 @@ void stewart_delay_observe(const stewart_delay *d, int flights, const real *in_f
     Search s = {.delay = d, .n = n, .m = m, .flights = flights, .memory = memory};
     s.before = memory->numbers;
     s.past = memory->numbers + U * others;
-    if (first) /* all in flight is others'; without a queue the torque of the last period goes on */
+    if (first) /* no own torque in flight yet; without a queue the torque of the last period goes on */
         stewart_copy(U * others, in_flight + U * (flights - others), s.before);
     memory->sent = first ? 0 : memory->sent < (real)flights ? memory->sent + 1 : (real)flights;
     memory->found = memory->fresh;
@@ -542,7 +542,7 @@ void stewart_delay_observe(const stewart_delay *d, int flights, const real *in_f
     stewart_copy(m, s.past + m, s.past);
     for (int i = 0; i < m; i++)
         s.past[m + i] = y ? y[i] : (real)NAN;
-    if (!first) { /* a period on */
+    if (!first) { /* move on by a period; the last torque stays */
         for (int i = 0; i < U * (others - 1); i++)
             s.before[i] = s.before[i + U];
     }

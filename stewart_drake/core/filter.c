@@ -3,15 +3,16 @@
 #include "filter_attempt.h"
 #include "short.h"
 
-#define ITERATIONS 4 /* at the most; one does once the parameters are roughly known */
+#define ITERATIONS 4       /* at the most; one is enough when the parameters are roughly known */
 #define KNOWN ((real)0.01) /* a constant is known when its deviation is this share of the usual one */
-#define LEARNT ((real)0.3) /* the same, for parameters that are good enough over a few periods */
-#define UNTIMELY 70 /* factor on the first variance of the timing, for a torque far too early or late */
-#define ONCE ((real)0.05) /* factor of the timing, at least, after such a torque, halved */
-#define CHANGED ((real)1e-3) /* shares of `usual_std` by which parameters may have changed: the least, */
-#define MOST_CHANGED ((real)0.01) /* the largest, */
-#define MOST_AGREEING ((real)0.3) /* and where the outlier before agrees with this one, or the prior is wrong: */
-#define YOUNG 3         /* measurements after which the prior has been tried */
+#define LEARNT ((real)0.3) /* the same, for a prediction over a few periods */
+#define UNTIMELY 70        /* factor t of the timing (noise.h) for a torque far too early or late */
+#define ONCE ((real)0.05)  /* after such a torque t is doubled, from this value at least */
+/* Shares of `usual_std` by which parameters may have changed. */
+#define CHANGED ((real)1e-3)      /* the least */
+#define MOST_CHANGED ((real)0.01) /* the largest for a single outlier */
+#define MOST_AGREEING ((real)0.3) /* the largest if the last outlier agrees, or the prior is untested */
+#define YOUNG 3                   /* measurements that test the prior */
 
 int stewart_posterior_size(int n, int m)
 {
@@ -82,7 +83,7 @@ static int predict(void *about, const real *xi, real *end)
     return 1;
 }
 
-/* H along the states of `predict`: those of the end are the last, where the instant has them. */
+/* H along the states of `predict`. `last` is not written: it is the end of H already. */
 static int linearize(void *about, const real *xi, real *last, stewart_scratch scratch)
 {
     Sample *s = about;
@@ -105,8 +106,8 @@ static void learn(const Sample *s, const real *innovations, const real *variance
             K[(X + 1) * i] = 1;
     }
     stewart_whiten(m, X, s->instant.C, K);
-    stewart_noise_learn(m, innovations, variances, K, f->learns_timing ? a->kicks : nothing, a->n - X, a->last,
-                        f->wander_std, f->keep, a->after->noise);
+    stewart_noise_learn(m, innovations, variances, K, f->learns_timing ? a->kicks : nothing, a->n - X,
+                        a->last, f->wander_std, f->keep, a->after->noise);
 }
 
 static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
@@ -114,7 +115,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     const stewart_filter *f = a->filter;
     const stewart_posterior *prior = a->prior;
     const int n = a->n, m = f->sensing->size, pieces = a->period->schedule.number;
-    /* Corrections of parameters that are known already are too small to need F to fourth order. */
+    /* Corrections of known parameters are too small to need F to fourth order. */
     Sample s = {.attempt = a, .fourth_order = !is_known(f, prior->root, KNOWN)};
     real *xi = a->after->mean, distance = 0, spread;
     real *innovations = stewart_take(&scratch, m), *variances = stewart_take(&scratch, m);
@@ -172,7 +173,7 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
         known[i] -= theta[offsets + i % LEGS];
     if (!sensing->start(sensing, known, near, state, root, scratch))
         return 0;
-    if (offsets >= 0) { /* to first order dq = J^-1 (dy - do): as uncertain as the offsets make it */
+    if (offsets >= 0) { /* the pose is also off by dq = -J^-1 do, with do the error of the offsets */
         stewart_copy(LEGS * p, filter->prior_root + p * offsets, back);
         if (!filter->legs->moved(filter, state, back, scratch))
             return 0;
@@ -192,8 +193,8 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
     return 1;
 }
 
-/* Compute `after` of a jump in the parameters, from `now` with widened variances in `before`. A single
-   leg that does not fit is rather a fault than a large jump. Returns 0 where none explains the values. */
+/* Compute `after` of a jump of parameters, from `now` with widened variances in `before`. Returns 0 if
+   no jump explains the values. A single leg that does not fit is taken for a fault, not a large jump. */
 static int jump(stewart_attempt *a, const stewart_posterior *now, const stewart_posterior *before,
                 stewart_scratch scratch)
 {
@@ -225,9 +226,9 @@ static void accept(int n, int m, const stewart_posterior *found, stewart_posteri
     *now->noise = *found->noise;
 }
 
-/* Compute `after` of an outlier that the model explains after all: by a torque far too early or late, or
-   by parameters that changed, from `now` with more noise or widened variances in `before`. Of a change,
-   the least share that explains it counts. Returns 0 where none does. */
+/* Compute `after` of an outlier that the model explains after all, from `now` with more noise or widened
+   variances in `before`: a torque came far too early or late, or parameters changed by the least share
+   that explains it. Returns 0 if neither does. */
 static int explain(stewart_attempt *a, const stewart_posterior *now, const stewart_posterior *before,
                    real most, stewart_scratch scratch)
 {
@@ -253,7 +254,7 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
         stewart_copy(size, now->mean, before->mean);
         before->noise->timing = UNTIMELY;
         found = attempt(a, scratch);
-        *a->after->noise = *now->noise; /* one torque, not yet all of them */
+        *a->after->noise = *now->noise; /* one late torque does not make all of them late */
         a->after->noise->timing = 2 * (now->noise->timing > ONCE ? now->noise->timing : ONCE);
     }
     a->prior = now;
@@ -288,7 +289,7 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
         return;
     }
     a.prior = &before;
-    stewart_copy(size, now.mean, second); /* with the noise, which a start leaves */
+    stewart_copy(size, now.mean, second); /* a start keeps squares, values and noise */
     if (values && *now.outliers > 0
         && stewart_filter_start(filter, now.outlier, theta, now.mean, second, scratch)
         && attempt(&a, scratch))
@@ -301,12 +302,12 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
         return;
     }
     a.values = NULL;
-    const int alone = attempt(&a, scratch);
-    if (values && (!alone || outliers >= STEWART_PATIENCE)
-        && stewart_filter_start(filter, values, theta, alone ? after.mean : now.mean, estimate,
+    const int predicted = attempt(&a, scratch);
+    if (values && (!predicted || outliers >= STEWART_PATIENCE)
+        && stewart_filter_start(filter, values, theta, predicted ? after.mean : now.mean, estimate,
                                 scratch))
         return;
-    if (alone)
+    if (predicted)
         accept(n, m, &after, &now);
     *now.unseen = unseen;
     if (values) {

@@ -131,12 +131,9 @@ const stewart_observer stewart_filter_observer = {
 
 /* ---- over gaps -----------------------------------------------------------------------------------
 
-   An observer that corrects the estimate before a gap. Its memory has that estimate too, and the torques
-   since.
-
    A filter without measurements linearises along a guessed path: while the parameters are uncertain, its
-   covariance is then wrong. So the estimate of the last measurement is kept, and the next measurement
-   corrects it, over all n periods at once:
+   covariance is then wrong. This observer keeps the estimate of the last measurement, the anchor, and the
+   torques since. The next measurement corrects the anchor over all n periods at once:
 
        y_k = h(f(x_{k-n}, T_{k-n} ... T_{k-1}, theta)) + noise,
 
@@ -145,13 +142,13 @@ const stewart_observer stewart_filter_observer = {
 
        q_p^2 n + q_v^2 dt^2 (0^2 + 1^2 + ... + (n - 1)^2)   and   q_v^2 n.
 
-   A parameter that walks is held over the gap, and widens by n steps at its end. */
+   A parameter that walks is constant over the gap; its variance grows by n steps at the end. */
 
 #define LONGEST_GAP 10 /* periods; after more the filter continues from its prediction */
 
 enum { GAP_TORQUES = 2 * (LONGEST_GAP + 1) };
 
-/* The anchor, then torques and durations, how many, and of how many periods. */
+/* After that of the filter: the anchor, torques, durations, the number of both, and of periods. */
 static int gap_memory(const stewart_law *law)
 {
     return stewart_filtered_memory(law) + estimate_numbers(law) + (U + 1) * GAP_TORQUES + 2;

@@ -1,12 +1,12 @@
-/* Observers with a filter, of a plate with a known delay. Their memory is an estimate, the last
-   measurement, and the number of periods for which the code of each leg has been constant. */
+/* Observers with a filter, for a known delay. Their memory is an estimate, the last measurement, and the
+   number of periods for which the code of each leg has been constant. */
 
 #pragma once
 
 #include "filter.h"
 #include "observers.h"
 
-#define STEWART_LEG_GATE 30 /* squared residual of a leg, per variance, from which it is left out */
+#define STEWART_LEG_GATE 30 /* largest squared residual of a leg, over its variance, that is used */
 
 /* Settings at `law->estimation`. In `filter`, leave machine, sensing and legs unset: the observer fills
    them in from the law. */
@@ -15,11 +15,9 @@ typedef struct {
     const real *prior; /* (p) initial estimate of the parameters */
 } stewart_filter_settings;
 
-/* Extended Kalman filter of the measured state; the same, re-linearised over a gap in the measurements;
-   and of encoders. */
-extern const stewart_observer stewart_filter_observer;
-extern const stewart_observer stewart_gap_observer;
-extern const stewart_observer stewart_encoder_observer;
+extern const stewart_observer stewart_filter_observer;  /* of the measured state */
+extern const stewart_observer stewart_gap_observer;     /* the same, re-linearised over gaps */
+extern const stewart_observer stewart_encoder_observer; /* of encoders */
 
 extern const stewart_legs stewart_encoder_legs; /* filter step with encoders, see filter_attempt.h */
 

@@ -10,12 +10,12 @@
 /* Prior N(mean, L L') of xi (n), and the model of a measurement.
 
    `rows` computes the residuals e (m) at xi and H (m, n), the derivative of the prediction, both
-   whitened: with R = C C' they are C^-1 e and C^-1 H. Returns m, at most `most`, or -1 if there is no
-   prediction from xi. Values that are left out have no row.
+   whitened: with R = C C' they are C^-1 e and C^-1 H. Returns m, at most `most`, or -1 if xi has no
+   prediction. Values that are left out have no row.
 
    `settle` moves from `xi` to `better`, the result of an iteration, and linearises there unless the
    correction is small. Returns 1 for a small correction, which ends the iterations, 0 for another one,
-   or -1 if there is no prediction from there. */
+   or -1 if `better` has no prediction. */
 typedef struct {
     int n, most, iterations;
     const real *mean, *root;   /* (n), L (n, n) */
@@ -27,9 +27,9 @@ typedef struct {
 } stewart_kalman;
 
 /* Compute the mean xi (n), from a first guess in its place, and the root (n, n) of its covariance, which
-   must not be that of the prior. `distance` is nu' S^-1 nu of the last innovation nu = e + H (xi - mean), S = H P H' + R,
-   and `spread` is ln |S| - ln |R|. Returns 0 if the model has no prediction, or for NaN in a bounded
-   mean; the caller checks all other numbers.
+   must not be that of the prior. `distance` is nu' S^-1 nu of the last innovation
+   nu = e + H (xi - mean), with S = H P H' + R, and `spread` is ln |S| - ln |R|. Returns 0 if there is no
+   prediction, or for NaN in a bounded mean; the caller checks all other numbers.
 
    Scratch: `stewart_kalman_scratch` numbers, and what the model takes. */
 int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, real *distance,
@@ -50,7 +50,8 @@ void stewart_root_of_prediction(int n, const real *H, const real *std, const rea
 void stewart_widen_root(int n, const real *jump, real *L, stewart_scratch scratch);
 
 /* P (n, n) <- L, lower triangular with L L' = P, which is symmetric and may be singular: a component
-   that those before it determine has a column of zeros. Returns 0 for a negative variance beyond rounding, or NaN. */
+   that those before it determine has a column of zeros. Returns 0 for NaN, or a variance below 0 by more
+   than rounding. */
 int stewart_root(int n, real *P);
 
 /* The mean within bounds that is nearest to `mean` in the metric of the covariance L L'. Returns 0 for

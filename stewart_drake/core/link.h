@@ -75,5 +75,5 @@ void stewart_link_change(const stewart_link *link, double *memory, double time);
 /* Drop the waiting commands. Until another is taken, hold the last command (`holds`) or put out zero. */
 void stewart_link_reset(const stewart_link *link, double *memory, double time, int holds);
 
-/* The acting command (size). */
+/* Return the acting command (size). */
 const double *stewart_link_current(const double *memory);

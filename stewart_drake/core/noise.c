@@ -3,10 +3,10 @@
 #include "noise.h"
 #include "short.h"
 
-#define ONE_TORQUE ((real)0.5) /* its information about t = 1: 1 / (2 t^2) */
+#define ONE_TORQUE ((real)0.5) /* information of one torque at t = 1: 1 / (2 t^2) */
 #define SURE ((real)2.5)
 #define WIDER 12
-#define ODD 3       /* largest share of a value in w, so that no few ones decide */
+#define ODD 3       /* largest nu^2 / S - 1 of a value in the slope of w */
 #define LATEST 1000 /* largest t */
 #define UNTIMELY 4  /* t of torques that are off by twice the assumed standard deviation */
 
@@ -15,7 +15,7 @@ void stewart_noise_start(stewart_noise *noise)
     *noise = (stewart_noise){.timing = 1};
 }
 
-/* Fisher scoring of one factor; NaN leaves 0. */
+/* Fisher scoring of one factor; 0 for NaN. */
 static real scored(real factor, real slope, real information)
 {
     const real found = information > 0 ? factor + slope / information : 0;
@@ -26,7 +26,7 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
                          const real *timing, int p, const real *G, const real *wander, real keep,
                          stewart_noise *noise)
 {
-    real of_timing = 0, of_wander = 0;
+    real timing_slope = 0, wander_slope = 0;
     noise->known_timing *= keep;
     noise->known_wander *= keep;
     for (int i = 0; i < m; i++) {
@@ -41,31 +41,31 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
             change *= wander[k];
             W += change * change;
         }
-        const real found = S - (noise->used - noise->wander) * W; /* S at w instead of the one in use */
-        S = found > S / 10 ? found : S / 10;
+        const real S_at_w = S - (noise->used - noise->wander) * W; /* not at the factor in use */
+        S = S_at_w > S / 10 ? S_at_w : S / 10;
         const real off = innovations[i] * innovations[i] / S - 1;
-        of_timing += K * off / (2 * S);
-        of_wander += W * (off < ODD ? off : ODD) / (2 * S);
+        timing_slope += K * off / (2 * S);
+        wander_slope += W * (off < ODD ? off : ODD) / (2 * S);
         noise->known_timing += K * K / (2 * S * S);
         noise->known_wander += W * W / (2 * S * S);
     }
     const real t = noise->timing > 1 ? noise->timing : 1;
-    const real found = scored(noise->timing, of_timing, noise->known_timing + ONE_TORQUE / (t * t));
+    const real found = scored(noise->timing, timing_slope, noise->known_timing + ONE_TORQUE / (t * t));
     noise->timing = found < LATEST ? found : LATEST;
-    noise->wander = scored(noise->wander, of_wander, noise->known_wander);
-    const real sure = noise->wander - SURE / REAL(sqrt)(noise->known_wander);
+    noise->wander = scored(noise->wander, wander_slope, noise->known_wander);
+    const real excess = noise->wander - SURE / REAL(sqrt)(noise->known_wander);
     noise->used *= REAL(sqrt)(keep);
-    if (sure > 0 || noise->timing > UNTIMELY) /* not for NaN */
+    if (excess > 0 || noise->timing > UNTIMELY) /* not for NaN */
         noise->asked += (real)m;
-    if (WIDER * sure > noise->used)
-        noise->used = WIDER * sure;
+    if (WIDER * excess > noise->used)
+        noise->used = WIDER * excess;
 }
 
-void stewart_kicks(const stewart_machine *machine, const stewart_schedule *schedule, const real *following,
-                   const real *state, const real *theta, real *squares)
+void stewart_kicks(const stewart_machine *machine, const stewart_schedule *schedule,
+                   const real *following, const real *state, const real *theta, real *squares)
 {
     stewart_belief belief;
-    real before[6], after[6], left = 0;
+    real before[6], after[6], left = 0; /* s from a change of torque to the end */
     stewart_believe(machine, theta, &belief);
     stewart_fill(X, 0, squares);
     for (int k = 0; k < schedule->number; k++)

@@ -63,8 +63,8 @@ typedef struct {
     int quiet;               /* whether nothing is fed back yet */
 } stewart_course_input;
 
-/* Fills in a course of which `number` and `times` are set, from the rows `given` at its times and the
-   course of the last sample. After a gap in the reference the way back leads onto it. Up to the instant
+/* Fill in a course, with `number` and `times` set, from the rows `given` at its times and the course of
+   the last sample. After a gap in the reference the way back leads onto it. Up to the instant
    at which the next torque acts, the course is that of the last sample; at the first preview ever, and
    as long as nothing is fed back, it is the predicted motion. Scratch: 2 * 18 numbers for each row, and
    12 for each torque of `until` and one. */

@@ -5,11 +5,12 @@
 
 #define PIECE STEWART_PIECE
 
-/* Memory: samples since the plan was made or the start, number of pieces, samples since the start, pieces.
-   Times of pieces are from the sample of the plan. */
+/* Memory: samples since the last plan, or without one since the start; number of pieces; samples since
+   the start; the pieces. Times of pieces are from the sample of the plan. */
 #define HEAD 3
-#define EARLY ((real)0.5) /* share of the assumed delay, before which no torque arrives */
-#define LATEST ((real)1e6) /* samples that are counted */
+#define EARLY ((real)0.5)  /* no torque arrives before this share of the assumed delay */
+#define LATEST ((real)1e6) /* largest count of samples since the start */
+
 static int most_pieces(const stewart_law *law)
 {
     const stewart_replan *replan = law->planning;
@@ -21,7 +22,8 @@ static int replan_memory(const stewart_law *law) { return HEAD + PIECE * most_pi
 static int replan_scratch(const stewart_law *law)
 {
     const stewart_replan *replan = law->planning;
-    const int p = law->machine.estimated, judged = (X + p) * (X + p) + stewart_sure_scratch(p, replan->until);
+    const int p = law->machine.estimated;
+    const int judged = (X + p) * (X + p) + stewart_sure_scratch(p, replan->until);
     const int planned = PIECE * most_pieces(law) + stewart_plan_scratch(law->period, replan->periods);
     return X * (replan->until + 1) + (judged > planned ? judged : planned);
 }
@@ -31,7 +33,7 @@ static void replan_start(const stewart_law *law, real *memory)
     stewart_fill(replan_memory(law), 0, memory);
 }
 
-/* The path, and beyond its end the reference; without a path what the caller follows. */
+/* Rows of the pieces, and of the goal beyond their end; without pieces, of the caller's reference. */
 static void look(const stewart_law *law, const real *memory, const stewart_sample *sample, int number,
                  const real *times, real *rows)
 {
@@ -46,7 +48,8 @@ static void look(const stewart_law *law, const real *memory, const stewart_sampl
     }
 }
 
-/* A new path: the predicted motion, through `states`, then a plan back. Returns 0 where there is none. */
+/* Plan: pieces of the predicted motion, through `states`, then those back onto the goal. Returns 0
+   without a plan. */
 static int plan(const stewart_law *law, const stewart_outlook *outlook, const stewart_sample *sample,
                 const real *states, real *memory, stewart_scratch scratch)
 {
@@ -74,8 +77,9 @@ int stewart_sure_scratch(int estimated, int torques)
     return X * n * torques + n + stewart_transitions_scratch(estimated);
 }
 
-int stewart_is_sure(const stewart_machine *machine, const stewart_schedule *schedule, const real *states,
-                    const real *theta, const real *L, const real *size, real sure, stewart_scratch scratch)
+int stewart_is_sure(const stewart_machine *machine, const stewart_schedule *schedule,
+                    const real *states, const real *theta, const real *L, const real *size, real sure,
+                    stewart_scratch scratch)
 {
     const int p = machine->estimated, n = X + p, last = schedule->number - 1;
     real *H = stewart_take(&scratch, X * n * schedule->number), *xi = stewart_take(&scratch, n);
@@ -88,10 +92,10 @@ int stewart_is_sure(const stewart_machine *machine, const stewart_schedule *sche
     for (int i = 0; i < 6; i++) {
         real variance = 0;
         for (int j = 0; j < n; j++) {
-            real off = 0;
+            real part = 0; /* (H L)_ij */
             for (int k = 0; k < n; k++)
-                off += H[X * n * last + n * i + k] * L[n * k + j];
-            variance += off * off;
+                part += H[X * n * last + n * i + k] * L[n * k + j];
+            variance += part * part;
         }
         if (!(REAL(sqrt)(variance) <= sure * size[i])) /* or NaN */
             return 0;
@@ -106,17 +110,19 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     real *states = stewart_take(&scratch, X * (outlook->until.number + 1)), wanted[ROW];
     memory[0] += 1;
     memory[2] = memory[2] < LATEST ? memory[2] + 1 : LATEST;
-    /* While the delay is looked for, only what was there before the first torque can have acted counts. */
+    /* While the delay is unknown, plan only before the first torque can have acted. */
     const int early = memory[2] * law->period <= EARLY * outlook->eta;
     if (!sample->goal || !(outlook->settled || early) || !stewart_all_finite(X, outlook->state))
         return 0;
     stewart_copy(X, outlook->state, states);
     stewart_predict(&law->machine, outlook->theta, &outlook->until, states, states + X);
     look(law, memory, sample, 1, &outlook->eta, wanted);
-    /* A delay that is known counts as found when the first torque has acted for a period. */
+    /* A known delay counts as found from the sample at which the first torque has acted for a period
+       until the next plan. */
     const real acted = outlook->eta / law->period + 2;
     const int first = !law->observer->outlook && memory[2] >= acted && memory[2] - memory[0] < acted;
-    if (!stewart_is_off(replan->size, states + X * outlook->until.number, wanted, outlook->found || first))
+    if (!stewart_is_off(replan->size, states + X * outlook->until.number, wanted,
+                        outlook->found || first))
         return 0;
     if (law->observer->uncertainty) {
         const int n = X + law->machine.estimated;

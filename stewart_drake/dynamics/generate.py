@@ -1,8 +1,8 @@
 """`python -m stewart_drake.dynamics.generate` writes core/equations.h and models/*.sdf.
 
-The expressions are those of `dynamics.equations`, for any machine: its geometry
-(`mechanism.geometry.geometry_of`) is an argument. A function of one leg is a loop of six, which a
-compiler can do for several legs at a time. core/dynamics.c calls these functions.
+The expressions are those of `dynamics.equations`. They hold for any machine: its geometry
+(`mechanism.geometry.geometry_of`) is an argument. An expression of one leg becomes a loop over six,
+which a compiler can vectorise. core/dynamics.c calls these functions.
 """
 
 from collections.abc import Sequence
@@ -49,22 +49,25 @@ _FORMS: Final = _UNARY | _BINARY
 
 
 class Input(NamedTuple):
-    """Argument: its name in C, its symbols, and whether there is one per leg, `name[n][6]`."""
+    """Argument of a function in C."""
 
     name: str
     symbols: ca.SX
-    own: bool = False
+    own: bool = False  # whether each leg has its own, `name[n][6]`
 
 
 class Output(NamedTuple):
-    """Result; in a function with arguments per leg it is one per leg, `name[n][6]`."""
+    """Result. In a function with an `own` argument each leg has one, `name[n][6]`."""
 
     name: str
     value: ca.SX
 
 
 def c_function(name: str, inputs: Sequence[Input], outputs: Sequence[Output]) -> str:
-    """Return the text of a static C function, by columns; common terms of the legs come first."""
+    """Return a static C function; matrices are stored by columns.
+
+    Terms that all legs share are computed before the loop over the legs.
+    """
     values = [ca.densify(output.value) for output in outputs]
     function = ca.Function(name, [i.symbols for i in inputs], values, {"cse": True})
     looped = any(i.own for i in inputs)
@@ -86,7 +89,8 @@ def _statements(
     """Return the statements before the loop over the legs, and those inside."""
     before: list[str] = []
     inside: list[str] = []
-    held: dict[int, tuple[str, bool]] = {}  # content of each place of CasADi's work vector
+    # By place in CasADi's work vector: the C expression it holds, and whether each leg has its own.
+    held: dict[int, tuple[str, bool]] = {}
     for k in range(function.n_instructions()):
         operation = function.instruction_id(k)
         to, of = function.instruction_output(k), function.instruction_input(k)
@@ -152,7 +156,7 @@ def _numbers() -> tuple[Input, Input]:
 
 
 def _lower(sums: Sums) -> ca.SX:
-    """Return each number once (28,)."""
+    """Return the sums without the upper triangles of M_ww and M_vv (28,)."""
     M_ww, M_wv, M_vv, *rest = sums
     triangles = [
         ca.vertcat(*(M[i, j] for i in range(3) for j in range(i + 1))) for M in (M_ww, M_vv)
@@ -161,6 +165,7 @@ def _lower(sums: Sums) -> ca.SX:
 
 
 def _sums(numbers: ca.SX) -> Sums:
+    """Return the sums whose `_lower` is `numbers`."""
     M_ww, M_wv, M_vv, h_w, h_v, energy = ca.vertsplit(numbers, [0, 6, 15, 21, 24, 27, 28])
     whole = []
     for triangle in (M_ww, M_vv):

@@ -1,7 +1,7 @@
-"""The controller of a scenario as a folder of C, with a test that replays a run of it.
+"""Export of a scenario's controller as a folder of C, with a test that replays a run of it.
 
-The sources are those of core/ that the law uses. Written here are the configuration, and the inputs
-and outputs of the law in Python for the test.
+The sources are copies of those in core/ that the law uses. The configuration is generated, and so
+are the recorded inputs and outputs of the law in Python, for the test.
 """
 
 import os
@@ -57,7 +57,7 @@ EXAMPLES: Final = (
     *("stewart_example.c", "stewart_example.h", "stewart_machine.c", "stewart_udp.c", *MACHINE),
     *("stewart_board.c", "stewart_board.h"),
 )
-"""Examples over UDP: for a measured state, a known delay, and one torque at a sample."""
+"""Sources of the examples over UDP, see `_is_example`."""
 TEMPLATES: Final = Path(__file__).with_name("templates")
 TOLERANCES: Final = {"double": 1e-9, "float": 1e-3}
 """Tolerance of the replay, as a share of the peak."""
@@ -77,8 +77,8 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
 
     Args:
         scenario: whose controller it is.
-        single: numbers of single precision.
-        measured: whether it is compiled and run here, for what its README tells.
+        single: whether numbers have single precision.
+        measured: whether to compile and run it here, for the sizes in its README.
     """
     recorded, experiment = record(scenario), prepare(scenario)
     compiled, suffix = CompiledLaw(recorded.law), "f" if single else ""
@@ -106,7 +106,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     kind = "torques" if isinstance(law, PredictiveLqi) else "servos"
     names = {path.name for path in TEMPLATES.iterdir() if not path.name.startswith("replay_")}
     if over_udp or recorded.moves:
-        values |= _surroundings(experiment, recorded, suffix)
+        values |= _example_data(experiment, recorded, suffix)
     else:
         names -= {"stewart_motion.c", "stewart_motion.h"}
     if over_udp:
@@ -135,7 +135,10 @@ def _estimates(scenario: Scenario) -> str:
 
 
 def _is_example(recorded: Recorded, tuner: Compiled | None) -> bool:
-    """Return whether the examples over UDP drive this law."""
+    """Return whether the examples over UDP support this law.
+
+    They have a measured state, a known delay, fixed weights, and one torque per sample.
+    """
     law = recorded.law
     if not isinstance(law, PredictiveLqi) or tuner is not None or law.finds_delay:
         return False
@@ -143,7 +146,7 @@ def _is_example(recorded: Recorded, tuner: Compiled | None) -> bool:
 
 
 def _sources(compiled: CompiledLaw, tuner: Compiled | None) -> list[str]:
-    """Return the files of core/ that a law is made of."""
+    """Return the files of core/ that a law and its tuner need."""
     found: dict[str, None] = {}
     for name in (*SOURCES, *compiled.sources, *([] if tuner is None else ["tuner"])):
         found |= dict.fromkeys([name] if "." in name else [f"{name}.h", f"{name}.c"])
@@ -160,7 +163,7 @@ def objects(files: Mapping[str, str]) -> list[str]:
 def _configuration(
     recorded: Recorded, compiled: CompiledLaw, tuner: Compiled | None, suffix: str
 ) -> dict[str, str]:
-    """Return the constants of a law in C, and the sizes that it needs."""
+    """Return the constants of a law in C, and the sizes of its memory."""
     written = Constants(compiled.keep, compiled.tables, suffix)
     torques, c = isinstance(recorded.law, PredictiveLqi), core()
     text = written.struct(compiled.data[0], "stewart_law")
@@ -205,7 +208,7 @@ def _configuration(
 def _replay(
     recorded: Recorded, experiment: Experiment, tuner: Compiled | None, suffix: str
 ) -> dict[str, str]:
-    """Return what the test of an export replays."""
+    """Return the recorded steps that the test replays."""
     steps, period = recorded.steps, recorded.law.timeline.period
 
     def rows(arrays: Iterable[Array]) -> str:
@@ -237,7 +240,7 @@ def _replay(
 
 
 def _reports(reports: list[Any], suffix: str) -> str:
-    """Return the reports of a run, and the function that gives each of them."""
+    """Return the reports of a run in C, and the function that returns the k-th one."""
     head = "static const stewart_report *report_of(int k)"
     if not any(reports):
         return f"{head}\n{{\n    (void)k;\n    return NULL;\n}}\n"
@@ -256,8 +259,8 @@ def _reports(reports: list[Any], suffix: str) -> str:
     return "\n".join([*lines, "{\n    return reports[k].age < 0 ? NULL : &reports[k];\n}\n"])
 
 
-def _surroundings(experiment: Experiment, recorded: Recorded, suffix: str) -> dict[str, str]:
-    """Return the data of the scenario for the examples."""
+def _example_data(experiment: Experiment, recorded: Recorded, suffix: str) -> dict[str, str]:
+    """Return the data of the scenario that the examples need."""
     scenario, c = experiment.scenario, experiment.scenario.controller
     rows = recorded.motion
     if rows is None:
@@ -301,9 +304,9 @@ def _goal(rows: Array | None) -> str:
 def write(files: Mapping[str, str], folder: Path) -> list[Path]:
     """Write all files to an existing folder or, on an error, none."""
     paths = [folder / name for name in files]
-    with ExitStack() as all_of_them:
+    with ExitStack() as replacements:
         for path, text in zip(paths, files.values(), strict=True):
-            all_of_them.enter_context(replacing(path)).write_text(text, "utf-8")
+            replacements.enter_context(replacing(path)).write_text(text, "utf-8")
     return paths
 
 
@@ -313,22 +316,22 @@ def _filled(text: str, values: Mapping[str, str]) -> str:
 
 
 def _sizes(files: Mapping[str, str]) -> str:
-    """Return the output of `make test` and `make size`, or how to get it."""
+    """Return the output of `make size` and `make test`, or without a compiler how to get it."""
     command = compiler()
     if command is None or shutil.which("make") is None:
         return _UNMEASURED
     with tempfile.TemporaryDirectory() as folder:
         for name, text in files.items():
             Path(folder, name).write_text(text, "utf-8")
-        said = [_made(folder, command, target) for target in ("size", "test")]
-    return "```text\n" + "\n".join(said) + "\n```\n"
+        outputs = [_make(folder, command, target) for target in ("size", "test")]
+    return "```text\n" + "\n".join(outputs) + "\n```\n"
 
 
-def _made(folder: str, command: Iterable[str], target: str) -> str:
-    surroundings: dict[str, Any] = os.environ | {"LC_ALL": "C"}
+def _make(folder: str, command: Iterable[str], target: str) -> str:
+    environment: dict[str, Any] = os.environ | {"LC_ALL": "C"}
     arguments = ["make", "-s", target, f"CC={' '.join(command)}"]
     done = subprocess.run(
-        arguments, cwd=folder, env=surroundings, capture_output=True, text=True, check=False
+        arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False
     )
     if done.returncode != 0:
         raise ConfigError(f"export-c: make {target} failed: {done.stdout}{done.stderr}".strip())
@@ -339,15 +342,15 @@ def _made(folder: str, command: Iterable[str], target: str) -> str:
 
 
 class Constants:
-    """Initialisers of structures, and definitions of the data that they point to.
+    """Initialisers of C structures, and definitions of the data that they point to.
 
     Args:
-        keep: these arrays and C structures.
+        keep: arrays and C structures that a pointer may refer to.
         tables: names of the core's tables of functions, by address.
         suffix: of a number, `f` in single precision.
 
     Attributes:
-        before: the definitions.
+        before: definitions that must precede the initialisers.
     """
 
     def __init__(self, keep: Iterable[Any], tables: dict[int, str], suffix: str) -> None:
@@ -397,14 +400,14 @@ class Constants:
 
 
 def numbers(values: ArrayLike, suffix: str) -> str:
-    """Return numbers in braces, or one number alone."""
+    """Return an array as an initialiser in braces, a scalar as a number."""
     array = np.asarray(values, dtype=np.float64)
     found = [number(value, suffix) for value in array.ravel().tolist()]
     return found[0] if array.ndim == 0 else f"{{{', '.join(found)}}}"
 
 
 def number(value: float, suffix: str) -> str:
-    """Return a number, exact."""
+    """Return a number in C, exact in double precision."""
     if not np.isfinite(value):
         return "NAN" if np.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
     return f"{value!r}{suffix}"

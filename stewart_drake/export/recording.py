@@ -1,4 +1,4 @@
-"""Laws in Python that remember what they were asked, and motions as knots, for a replay in C."""
+"""Recording of a law's inputs and results, and of motions as knots, for a replay in C."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
@@ -24,27 +24,29 @@ from stewart_drake.scenario.trajectories import evaluate, through_states
 from stewart_drake.types import Array
 
 MOST_SAMPLES: Final = 100
-"""Of a run that the test replays."""
+"""Largest number of samples that the test replays."""
 TOLERANCE: Final = 1e-7
 """Tolerance of knots, as a share of the largest value of a coordinate, rate or acceleration."""
 LONGEST: Final = 0.5
 """Longest time between two knots, s."""
 _HALVES: Final = 16
-"""Largest number of halvings of LONGEST, as at a jump of the motion."""
-_LOOKS: Final = (0.21, 0.5, 0.79)
-"""Shares of the time between two knots at which the polynomial is compared."""
+"""Largest number of halvings of LONGEST, reached at a jump of the motion."""
+_COMPARED: Final = (0.21, 0.5, 0.79)
+"""Shares of the time between two knots at which polynomial and motion are compared."""
 
 
 def knots(motion: Trajectory, end: float) -> Array:
-    """Return times and motion (n, 19) at knots of a piecewise polynomial of fifth order, for C.
+    """Return times and motion (n, 19) at the knots of a piecewise quintic polynomial, for C.
 
-    The polynomial has pose, rates and accelerations of the motion at both knots. Between them it is
-    off by O(h^6) where the motion is smooth; where it is not, or h is too long, knots come closer.
+    Each piece has pose, rates and accelerations of the motion at both ends. Between knots h apart
+    its error is O(h^6) where the motion is smooth. Knots are added until the error is within
+    TOLERANCE.
     """
     number = max(1, int(np.ceil(end / LONGEST)))
     coarse = np.linspace(0.0, end, number + 1)
     rows = [_row(motion, t) for t in coarse]
     size = np.abs(np.array(rows)[:, 1:]).max(axis=0)
+    # A coordinate that hardly moves counts as 1e-3 of the largest in pose, rates or accelerations.
     size = np.maximum(size, 1e-3 * size.reshape(3, 6).max(axis=1).repeat(6) + 1e-9)
     found = [rows[0]]
     for before, after in pairwise(rows):
@@ -63,7 +65,7 @@ def _refine(
     span = b[0] - a[0]
     off = [
         np.abs(between(a[1:], b[1:], span, share) - evaluate(motion, a[0] + share * span)) / size
-        for share in _LOOKS
+        for share in _COMPARED
     ]
     if np.max(off) > TOLERANCE and halves > 0:
         middle = _row(motion, a[0] + span / 2)
@@ -77,38 +79,35 @@ class Step(NamedTuple):
     """Input and result of one sample."""
 
     measurement: Array  # (m,), NaN where it is missing
-    age: int  # of it, periods
-    # (p, 18) rows of the reference that were asked for; none where the law finds the instants
-    # itself
-    preview: Array
-    answer: Array  # (6,) torque as asked for, or (18,) command
+    age: int  # of the measurement, periods
+    preview: Array  # (p, 18) rows of the reference; none if the law chooses their instants
+    answer: Array  # (6,) torque before the limit, or (18,) command
     status: int  # bits of the causes that were counted
     weights: Array  # (2,) w_Q and w_R
-    sent: Array  # (6 N,) torques as limited, of this sample and of further ones
-    report: Report | Array | None  # that came with the measurement: packets, or (r,) of servos
+    sent: Array  # (6 N,) torques within the limit, of this sample and of later ones
+    report: Report | Array | None  # with the measurement: on packets, or (r,) of servos
 
 
 @dataclass
 class Recorded:
     """A recorded run."""
 
-    law: PredictiveLqi | ServoPreview  # the law, without what records it
-    steps: list[Step] = field(default_factory=list)  # of it, MOST_SAMPLES at the most
-    # (n, 6) torques in flight, or (18,) the command before the first sample
+    law: PredictiveLqi | ServoPreview  # the law itself, not the one that records
+    steps: list[Step] = field(default_factory=list)  # at most MOST_SAMPLES
+    # (n, 6) torques in flight at t = 0, or (18,) the command before the first sample
     first: Array = field(default_factory=lambda: np.empty(0))
-    # times and reference (k, 19), if the law chooses the instants of the reference
-    motion: Array | None = None
-    goal: Array | None = None  # the same of the motion that the law returns to
+    motion: Array | None = None  # (k, 19) its knots, if the law chooses the instants to read
+    goal: Array | None = None  # (k, 19) knots of the reference that a plan returns to
     _along: tuple[Trajectory, Trajectory] | None = None
 
     @property
     def moves(self) -> bool:
-        """Whether the law asks for the reference at instants that it finds itself."""
+        """Whether the law chooses the instants at which it reads the reference."""
         law = self.law
         return isinstance(law, PredictiveLqi) and law.moves
 
     def tabulated(self, motion: Motion, duration: float) -> Motion:
-        """Return the motion as its knots have it, which is what C follows."""
+        """Return the motion interpolated between its knots, as C follows it."""
         if not (self.moves and isinstance(motion, KnownMotion)):
             return motion
         if self._along is None:
@@ -121,7 +120,7 @@ class Recorded:
 
     @property
     def _furthest(self) -> float:
-        """Instant from a sample on, s, beyond which no law asks for the reference."""
+        """Longest time ahead of a sample at which the law reads the reference, s."""
         law, period = self.law, self.law.timeline.period
         assert isinstance(law, PredictiveLqi)
         most = law.timeline.queue_length
@@ -139,7 +138,7 @@ def _trajectory(rows: Array, then: Trajectory) -> Trajectory:
 
 @dataclass(frozen=True)
 class RecordedLqi(PredictiveLqi):
-    """A law that remembers what it was asked since its memory was begun."""
+    """A law that records its steps since its memory was last initialised."""
 
     record: Recorded = field(kw_only=True)
     duration: float = field(kw_only=True)
@@ -170,7 +169,7 @@ class RecordedLqi(PredictiveLqi):
 
 @dataclass(frozen=True)
 class RecordedServo(ServoPreview):
-    """A law for servos that remembers what it was asked since its memory was begun."""
+    """A law for servos that records its steps since its memory was last initialised."""
 
     record: Recorded = field(kw_only=True)
 
@@ -192,7 +191,7 @@ class RecordedServo(ServoPreview):
 
 
 def _given(law: Any, measurement: Measurement, before: Any, after: Any) -> tuple[Array, int, int]:
-    """Return values, age in periods, and the causes that were counted, as bits."""
+    """Return the measured values, their age in periods, and bits of the counted causes."""
     new = np.subtract(after.counts, before.counts)
     bits = int((new > 0) @ 2 ** np.arange(len(new)))
     age = round(measurement.age / law.timeline.period)
@@ -200,10 +199,10 @@ def _given(law: Any, measurement: Measurement, before: Any, after: Any) -> tuple
 
 
 def record(scenario: Scenario) -> Recorded:
-    """Return the law of a scenario with what it did in a run on the exact plant.
+    """Return the law of a scenario with its steps in a run on the exact plant.
 
-    The test replays the controller. The steps of a *multibody* plant are an error that some stable
-    loops, such as that of `gravity`, cannot correct.
+    The plant is exact since only the controller is tested. The integration error of a *multibody*
+    plant is one that some stable loops, such as that of `gravity`, cannot correct.
     """
     found: list[Recorded] = []
 

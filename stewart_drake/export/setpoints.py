@@ -130,8 +130,12 @@ def make_setpoints(
         ConfigError: bad input, or a motion beyond reach, or beyond the range, speed or torque of a
             motor; with its time and motor.
     """
-    if not (0 < rate <= _LARGEST_RATE):
-        raise ConfigError(f"rate: got {rate:g} Hz; expected above 0 and at most {_LARGEST_RATE:g}")
+    least = 2 / scenario.duration
+    if not (least <= rate <= _LARGEST_RATE):
+        raise ConfigError(
+            f"rate: got {rate:g} Hz; expected {least:g}, two setpoints in duration, to "
+            f"{_LARGEST_RATE:g}"
+        )
     if not plain and scenario.actuator.kind != "position_servo":
         raise ConfigError(
             f"actuator.kind: got {scenario.actuator.kind!r}; expected 'position_servo', whose "
@@ -231,7 +235,7 @@ def _along(
     """Return the setpoints of the motion, checked at the middle of each period."""
     mechanism, dynamics = experiment.mechanism, known_dynamics(experiment)
     servo = known_stiffness(experiment.scenario)
-    number = max(1, math.ceil(experiment.scenario.duration * rate - 1e-9))
+    number = math.ceil(experiment.scenario.duration * rate - 1e-9)
     times, (cranks, rates, torques) = np.arange(number) / rate, np.empty((3, number, NUM_TORQUES))
     for k, t in enumerate(times):
         middle = t + 0.5 / rate

@@ -45,7 +45,8 @@ def replacing(path: Path) -> Iterator[Path]:
     stays and the temporary one is removed. A replaced file keeps its permissions.
 
     Raises:
-        OSError: `path` cannot be written or replaced, e.g. because it is a folder; it is named.
+        OSError: `path` cannot be written or replaced, e.g. because it is a folder. The error names
+            `path`, not the temporary file.
     """
     partial = path.with_name(f".{path.name[:_NAME]}.{secrets.token_hex(8)}.part")
     try:
@@ -58,7 +59,7 @@ def replacing(path: Path) -> Iterator[Path]:
         os.replace(partial, path)
     except BaseException as error:
         partial.unlink(missing_ok=True)
-        # A failing write, such as on a full disk, names no file, others name the temporary one.
+        # An error of `write`, as on a full disk, names no file; others name the temporary one.
         if isinstance(error, OSError) and error.errno and error.filename in (None, str(partial)):
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
@@ -71,6 +72,6 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove the temporary files of writers that were killed, in a folder without other writers."""
+    """Remove the temporary files of killed writers; no other process may write in the folder."""
     for partial in folder.glob(".*.????????????????.part"):
         partial.unlink(missing_ok=True)

@@ -53,7 +53,7 @@ class Estimate:
 
 
 class Innovations(NamedTuple):
-    """What the measurements say about the stated uncertainty.
+    """Consistency of the stated uncertainty with the measurements.
 
     An innovation nu is a measurement minus its prediction, S its stated covariance. If both state
     and covariance are right, nu' S^-1 nu of n values has the mean n: the normalised innovation

@@ -52,7 +52,7 @@ class ClearSpace:
     def along(cls, mechanism: Mechanism, poses: Array) -> "ClearSpace":
         """Return the distances to keep for a reference with these poses (n, 6).
 
-        RESERVE is kept, or a share of what the reference has where that is less. Pairs that touch
+        The distance is RESERVE, or a share of the reference's own if that is less. Pairs that touch
         somewhere on the reference, by their capsules, are not guarded. Where the reference itself
         is out of reach, the legs keep RESERVE.
         """

@@ -42,12 +42,12 @@ class ParameterSet:
         std: (n,) of the prior.
         lower, upper: (n,) physical bounds.
         correlation: (n, n) of the prior; None: uncorrelated.
-        usual: (n,) std without a calibration, the scale of a well-known parameter; None: std.
+        usual: (n,) standard deviation without a calibration; None: std.
         walk: (n,) standard deviation of the change per root second; None: constants.
         jump: (n,) standard deviation of a sudden change; None: constants.
 
     Raises:
-        ValueError: naming the parameter; a shape that does not fit.
+        ValueError: wrong shapes; a prior beyond its bounds or without a standard deviation above 0.
     """
 
     names: tuple[str, ...]
@@ -93,13 +93,13 @@ class ParameterSet:
             ValueError: a mean is further beyond a bound; names the parameter.
         """
         prior, std, correlation = self.prior.copy(), self.std.copy(), np.eye(len(self.names))
-        own = [i for i, name in enumerate(self.names) if name in known.names]
-        there = [known.names.index(self.names[i]) for i in own]
-        P = known.covariance[np.ix_(there, there)]
-        of_known = np.sqrt(np.diag(P))
-        std[own] = np.maximum(of_known, EXACT * self.usual_std[own])
+        own = [i for i, name in enumerate(self.names) if name in known.names]  # places here
+        theirs = [known.names.index(self.names[i]) for i in own]  # places in the calibration
+        P = known.covariance[np.ix_(theirs, theirs)]
+        known_std = np.sqrt(np.diag(P))
+        std[own] = np.maximum(known_std, EXACT * self.usual_std[own])
         low, high = self.lower[own], self.upper[own]
-        mean, chance = known.mean[there], CHANCE * of_known
+        mean, chance = known.mean[theirs], CHANCE * known_std
         within = (low - chance <= mean) & (mean <= high + chance)
         prior[own] = np.where(within, np.clip(mean, low, high), mean)
         correlation[np.ix_(own, own)] = P / np.outer(std[own], std[own])
@@ -116,13 +116,13 @@ class ParameterSet:
         return replace(self, std=self._with(self.std, std), correlation=correlation)
 
     def changing(self, walk: Mapping[str, float], jump: Mapping[str, float]) -> "ParameterSet":
-        """Return the prior with other changes by name, per root second and sudden ones.
+        """Return the prior with other changes by name, `walk` per root second and `jump` at once.
 
-        At the start such a parameter is off by a sudden change, or else by what it changes in a
-        second.
+        The prior standard deviation of such a parameter is that of its sudden change, else that of
+        its change in a second.
         """
-        still = np.zeros(len(self.names))
-        walks, jumps = (still if own is None else own for own in (self.walk, self.jump))
+        constant = np.zeros(len(self.names))
+        walks, jumps = (constant if own is None else own for own in (self.walk, self.jump))
         found = replace(self, walk=self._with(walks, walk), jump=self._with(jumps, jump))
         return found.trusting({**walk, **jump})
 
@@ -137,15 +137,15 @@ class FilterSettings:
 
     Attributes:
         parameters: estimated together with the state.
-        model_std: (12,) error of one step of the model; without it the filter would explain
-            integration errors by parameters where a sensor has no noise.
+        model_std: (12,) error of one step of the model. Without it the filter would attribute
+            integration errors to parameters where a sensor has no noise.
         timing_std: s, of the instant of a torque.
         walk_std: (p,) change of a parameter in a period; None: constants.
         jump_std: (p,) sudden change of a parameter; None: constants.
         learns_timing: whether innovations correct `timing_std`.
-        wander: assumed change of a parameter in a period as a share of its usual standard
-            deviation, where innovations show that parameters change; 0: they do not.
-        keep: share of what innovations say about the noise that is kept in a period.
+        wander: assumed change of a parameter in a period, as a share of its usual standard
+            deviation, if innovations show that parameters change (core/noise.h); 0: constants.
+        keep: forgetting factor of the noise estimate, per period.
     """
 
     parameters: ParameterSet
@@ -163,24 +163,24 @@ EXACT = 1e-6
 MOUNTING = float(np.deg2rad(0.1))
 """Standard deviation of the mounting angle of an encoder, rad."""
 JUMP_SHARE = 0.4
-"""Standard deviation of a sudden wrench, as a share of what the motion takes."""
+"""Standard deviation of a sudden wrench, as a share of the motion's."""
 WALK_SHARE = 0.001
-"""The same of its change in a second."""
+"""Standard deviation of a wrench's change in a second, as the same share."""
 CHANCE = 3.0
-"""Standard deviations by which an estimate may be beyond a bound."""
+"""Largest distance of a calibrated mean beyond a bound, in standard deviations."""
 MODEL_ERROR = 2e-4
-"""Error of the model in a USUAL_PERIOD as a share of the motion: that of an engine with 1 ms."""
+"""Error of the model in a USUAL_PERIOD, as a share of the motion, for an engine's steps of 1 ms."""
 INTEGRATION_ERROR = 1e-5
-"""The same of an exact plant: that of the filter's own integration."""
+"""The same for an exact plant: error of the filter's own integration."""
 USUAL_PERIOD = 0.1
-"""Period of these errors, s."""
+"""Period for which these errors are given, s."""
 TIMING_ERROR = 0.01
-"""Standard deviation of the delay, as a share of a period. With an exact delay the filter would
+"""Standard deviation of a torque's instant, as a share of a period. Without it the filter would
 attribute the effect of a late torque, large in a catch-up, to payload and bias."""
 FIRST_TIMING_ERROR = 0.006
-"""The same where innovations correct it."""
+"""Initial value of the same where innovations correct it."""
 NOISE_MEMORY = 5.0
-"""Time over which innovations correct the noise, s."""
+"""Time constant of forgetting in the noise estimate, s."""
 
 
 def usual_parameters(
@@ -194,14 +194,14 @@ def usual_parameters(
     """Return default priors, from the drawing and the reference motion only.
 
     The payload is up to ten plates, within two radii of the plate's joints. Friction and bias scale
-    with the torques, a wrench with what a motor does for the motion; in a second it may change by
-    as much. Encoders are mounted to a tenth of a degree.
+    with the torques. A wrench scales with `wrench`: its prior is its change in a second, WALK_SHARE
+    of that, and a sudden change is JUMP_SHARE of it. Encoders are mounted to a tenth of a degree.
 
     Args:
         plate_mass, torque_scale, torque_limit: as of `filter_settings`.
         radius: of the plate's joints, m, for the position of the payload.
-        wrench: scale of a wrench on the plate, moment in N m and force in N.
         free: names of PLANT_PARAMETERS and OFFSETS, those of the plant first.
+        wrench: scale of a wrench on the plate, moment in N m and force in N.
     """
     prior, std, lower, upper, walk, jump = (np.zeros(NUM_PLANT_PARAMETERS) for _ in range(6))
     bias_bound = 100 * torque_scale if torque_limit is None else torque_limit
@@ -222,10 +222,10 @@ def usual_parameters(
     lower[WRENCH], upper[WRENCH] = -np.inf, np.inf
     std[WRENCH] = walk[WRENCH] = WALK_SHARE * np.repeat(wrench, 3)
     jump[WRENCH] = JUMP_SHARE * np.repeat(wrench, 3)
-    of_sensor = (0.0, MOUNTING, -np.pi, np.pi, 0.0, 0.0)
+    of_offset = (0.0, MOUNTING, -np.pi, np.pi, 0.0, 0.0)
     columns = [
         np.append(column, len(OFFSETS) * [value])
-        for column, value in zip((prior, std, lower, upper, walk, jump), of_sensor, strict=True)
+        for column, value in zip((prior, std, lower, upper, walk, jump), of_offset, strict=True)
     ]
     names, units = (*PLANT_PARAMETERS, *OFFSETS), (*PLANT_PARAMETER_UNITS, *("rad",) * len(OFFSETS))
     chosen = [names.index(name) for name in free]
@@ -244,7 +244,7 @@ def acceleration_noise(share: float, motion_scale: Array, period: float) -> Arra
     """Return the model's error (12,) over a period, for white noise in the accelerations.
 
     With the intensity sigma = share * motion_scale, rates are off by sigma sqrt(dt) and poses by
-    sigma sqrt(dt^3 / 3), as an integrated random walk is. One number so serves all periods.
+    sigma sqrt(dt^3 / 3), as an integrated random walk is. One number therefore serves all periods.
 
     Args:
         share: of the motion, per s^1.5.
@@ -290,11 +290,12 @@ def filter_settings(
         parameters: to estimate; `usual_parameters` if None.
         model_error: share of the motion per s^1.5, see `acceleration_noise`; None:
             `usual_model_error`.
-        timing_std: s, of the instant of a torque; None: TIMING_ERROR of the period, or learnt.
+        timing_std: s, of the instant of a torque; None:
+            TIMING_ERROR of the period, or FIRST_TIMING_ERROR with `learns`.
         white: whether the errors of model and sensor are white. Those of an engine's steps and of
-            rounded angles are not: they add up, and the default is then that of a USUAL_PERIOD.
-        noisy: whether a white sensor has noise. The error of an exact model is then
-            INTEGRATION_ERROR; without noise the filter would follow each digit of it.
+            rounded angles add up instead: their default is that of a USUAL_PERIOD at any period.
+        noisy: whether a white sensor has noise. The model's error is then INTEGRATION_ERROR. The
+            filter of a sensor without noise would otherwise follow each digit of that error.
         learns: whether innovations correct the noise, see core/noise.h.
     """
     if parameters is None:

@@ -2,8 +2,9 @@
 
 (A, B) is controllable if and only if [lambda I - A, B] has full row rank for every eigenvalue
 lambda of A; stabilisable, if for every one on or outside the stability boundary. The smallest
-singular value measures the distance from failure. Powers of A (the controllability matrix) do not:
-they lose all digits beyond a few states. By transposition (A, C) is observable, detectable.
+singular value measures the distance from failure. The controllability matrix does not: the powers
+of A in it lose all digits beyond a few states. (A, C) is observable or detectable if (A', C') is
+controllable or stabilisable.
 
 A left null vector w of the pencil, w' A = lambda w', w' B = 0, is a combination of states that the
 input does not change. Its transposed counterpart is a motion that no output shows.
@@ -23,9 +24,9 @@ BOUNDARY: Final = 1e-6
 """Distance from the stability boundary, relative to the spectral radius (1 in discrete time), up to
 which a mode counts as not decaying."""
 CLUSTER: Final = 1e-3
-"""Eigenvalues as close as this share of the spectral radius are one mode, see `cluster`."""
+"""Distance over the spectral radius, up to which eigenvalues are one mode; see `cluster`."""
 _SAME: Final = 1e-7
-"""The same for eigenvalues that fail, which are known better."""
+"""The same for eigenvalues at which the pencil fails: the failure locates them more exactly."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +34,9 @@ class Mode:
     """One eigenvalue and its test.
 
     Attributes:
-        eigenvalue: where the pencil fails, else the mean of its cluster; of a conjugate pair that
-            with imaginary part > 0.
-        multiplicity: eigenvalues in its cluster (conjugates not counted).
+        eigenvalue: point at which the pencil fails, else the mean of the cluster. A conjugate pair
+            is represented by the one with imaginary part > 0.
+        multiplicity: number of eigenvalues in the cluster (conjugates not counted).
         decays: whether it is inside the stability boundary.
         margin: smallest singular value of the pencil over ||[A, B]||.
         directions: (n, d) orthonormal, spanning what the input does not reach or the output does
@@ -55,7 +56,7 @@ class Hautus:
 
     Attributes:
         modes: every distinct eigenvalue, least margin first.
-        tolerance: below which a margin is a failure.
+        tolerance: margin below which a mode fails.
     """
 
     modes: tuple[Mode, ...]
@@ -97,7 +98,7 @@ def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool, tolerance: float = TOL
         A: (n, n).
         B: (n, m).
         discrete: whether x_{k+1} = A x_k + B u_k, instead of the differential equation.
-        tolerance: relative, below which a margin is a failure.
+        tolerance: margin, relative to ||[A, B]||, below which a mode fails.
 
     Raises:
         ValueError: wrong shapes or entries that are not finite.
@@ -118,14 +119,14 @@ def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool, tolerance: float = TOL
         if abs(center.imag) < CLUSTER * radius:
             center = complex(center.real)
         if center.imag < 0:
-            continue  # as its conjugate
-        # Other points than eigenvalues never fail, so that more points do no harm.
+            continue  # its conjugate represents both
+        # The pencil has full rank except at eigenvalues, so an additional point cannot fail.
         points = np.unique(np.append(members, center))
         margins = pbh_margins(A, B, points) / size
         failing = margins < tolerance
         if not failing.any():
             found = [(center, float(margins.min()))]
-        elif failing[points == center].any():  # as of a defective eigenvalue
+        elif failing[points == center].any():  # a defective eigenvalue, see `cluster`
             found = [(center, float(margins[points == center][0]))]
         else:
             groups = cluster(points[failing], _SAME * radius)

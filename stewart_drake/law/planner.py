@@ -1,9 +1,9 @@
-"""Planning of the way back onto the reference, in flight.
+"""Planning, during the motion, of a way back onto the reference.
 
-Where the prediction is far off the reference, as where the delay has just been found or has
-changed, feedback of a large error through a long delay gives a poor way back. The torques in flight
-cannot be changed. From the instant on at which the next one acts, `law.catch_up` plans a motion
-that held torques follow without error. The law then follows the predicted motion, the plan, and the
+The prediction can be far off the reference, for example when the delay has just been found or has
+changed. Feedback of such an error through a long delay responds badly. The torques in flight cannot
+be changed, so `law.catch_up` plans a motion from the instant at which the next one acts. Held
+torques follow it without error. The law then follows the predicted motion, the plan, and the
 reference: no error is left to feed back, and the integral begins anew.
 """
 
@@ -24,7 +24,7 @@ from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array
 
 EARLY = 0.5
-"""Share of an assumed delay before which no torque arrives."""
+"""No torque arrives before this share of the assumed delay."""
 
 
 class FollowedMotion(NamedTuple):
@@ -32,8 +32,8 @@ class FollowedMotion(NamedTuple):
 
     Attributes:
         motion: as a function of the time from now.
-        path: (n, 38) pieces that were planned in flight, see core/planning.h, or None.
-        replanned: whether they were planned at this sample.
+        path: (n, 38) pieces of the last plan, see core/planning.h, or None.
+        replanned: whether it was made at this sample.
     """
 
     motion: Motion
@@ -56,9 +56,9 @@ class Planner(Protocol):
 
         Args:
             path: pieces (n, 38) planned before, or None.
-            belief: now.
-            in_flight: (n, 6) torques, before this sample's.
-            motion: that is asked for.
+            belief: estimate at this sample.
+            in_flight: (n, 6) torques sent before this sample.
+            motion: the requested motion.
             plant: model of the plant.
         """
         ...
@@ -66,7 +66,7 @@ class Planner(Protocol):
 
 @dataclass(frozen=True)
 class NoPlanner:
-    """Follows the motion that is asked for."""
+    """Follows the requested motion."""
 
     def follow(
         self,
@@ -108,7 +108,7 @@ class Replan:
         followed = motion if path is None else replace(motion, pieces=path)
         before = FollowedMotion(followed, path, False)
         timeline, c = belief.timeline, core()
-        # While the delay is looked for, only what was there before a torque can have acted counts.
+        # While the delay is unknown, plan only before a torque can have acted.
         early = motion.now + timeline.period <= EARLY * timeline.eta
         if not (belief.has_state and (belief.settled or early)):
             return before
@@ -116,12 +116,13 @@ class Replan:
         states = np.vstack([belief.state, plant.predict(belief.state, schedule, belief.parameters)])
         wanted = followed(np.array([timeline.eta]))[0, :NUM_STATE].copy()
         size = np.array(self.size, np.float64)
-        # A delay that is known counts as found when the first torque has acted for a period.
+        # A known delay counts as found from the sample at which the first torque has acted for a
+        # period until the next plan.
         acted = timeline.eta + timeline.period - 1e-9
         planned = 0.0 if path is None else path[0, 0]
         first = math.isnan(belief.delay_mean) and motion.now >= acted > planned
-        where = c.at(size), c.at(states[-1]), c.at(wanted)
-        if not c.lib.stewart_is_off(*where, belief.found or first):
+        arrays = c.at(size), c.at(states[-1]), c.at(wanted)
+        if not c.lib.stewart_is_off(*arrays, belief.found or first):
             return before
         if belief.estimate.uncertain and not self._is_sure(belief, schedule, states, plant):
             return before
@@ -129,7 +130,7 @@ class Replan:
         begin, periods = motion.now + timeline.eta, periods_of(self.duration, timeline.period)
         plan = model.plan(motion.reference, states[-1], begin, timeline.period, periods)
         if plan is None:
-            return before  # there is none from here; the next sample may find one
+            return before  # no plan exists from here; it may at the next sample
         pieces = np.vstack([model.way(schedule, states, motion.now), plan.pieces])
         return FollowedMotion(replace(motion, pieces=pieces), pieces, True)
 
@@ -142,6 +143,6 @@ class Replan:
         L = U * np.sqrt(np.maximum(w, 0.0))
         arrays = [numbers(a) for a in (*schedule, states, belief.parameters, L, self.size)]
         torques, durations, *rest = map(c.at, arrays)
-        what = c.ffi.new("stewart_schedule *", [number, torques, durations, 0])
+        until_next = c.ffi.new("stewart_schedule *", [number, torques, durations, 0])
         scratch = c.scratch(c.lib.stewart_sure_scratch(len(belief.parameters), number))
-        return bool(c.lib.stewart_is_sure(machine.it, what, *rest, self.sure, scratch))
+        return bool(c.lib.stewart_is_sure(machine.it, until_next, *rest, self.sure, scratch))

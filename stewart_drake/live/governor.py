@@ -17,7 +17,7 @@ The governor moves g towards the target by the largest share k in [0, 1] for whi
 under g + k (target - g) keeps to the limits (scalar reference governor; Garone, Di Cairano,
 Kolmanovsky, "Reference and command governors for systems with constraints", Automatica 75, 2017).
 k = 0 is the future that was checked before, so that a solution always exists: the plate stays
-within the limits and can come to rest at g at any time.
+within the limits and can stop at g at any time.
 
 A step takes torque in proportion to w^2. At each period w is therefore the fastest pace whose whole
 future keeps to the torque limit. A slower w than before makes a moving plate stop later, possibly
@@ -141,7 +141,7 @@ class GovernorState(NamedTuple):
     """State of a governor at the beginning of a period."""
 
     state: Array  # pose, rates and accelerations (18,) of the reference, rad, m and per s, s^2
-    applied: Array  # applied target g (6,), at which the reference comes to rest
+    applied: Array  # applied target g (6,), at which the reference ends at rest
     limit: str | None = None  # limit that keeps g from the target, in words, or None
     turn: int = 0  # coordinate that moves alone next if all together cannot
     pace: float = PACE  # pole w, 1/s

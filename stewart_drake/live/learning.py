@@ -1,9 +1,9 @@
 """Learning from repetitions of a motion of a machine, in real time.
 
-*Torques.* All repetitions are one run: the motion for some periods, then a way back to the start by
-the governor, where the plate rests. The torques that the model lacks in the last period correct
-those of the next repetition, as in `studies.learn`. They are computed on the way back, some at each
-sample.
+*Torques.* All repetitions are one run. In each the plate follows the motion for some periods, then
+the governor brings it back to the start, where it rests. The torques that the model lacks in the
+last period correct those of the next repetition, as in `studies.learn`. They are computed on the
+way back, some at each sample.
 
 *Setpoints.* Each repetition is another session: a soft start, the motion, and rest. The angles
 that the cranks lack in the last periods correct the setpoints of the next one.
@@ -48,28 +48,28 @@ from stewart_drake.studies.learn import (
 from stewart_drake.types import Array
 
 _SETTLING: Final = 9.0
-"""Time before what is learned from, s: the longest way onto the motion, and a second."""
+"""Time before the periods that are learned from, s: the longest way onto the motion, and 1 s."""
 _DELAYS: Final = 5.0
-"""The same for torques, in delays after that way."""
+"""Additional time for torques, in delays."""
 _LEARNED_FROM: Final = 4.0
-"""Least time that setpoints are learned from, s; whole periods."""
+"""Least time that setpoints are learned from, s; it is rounded up to whole periods."""
 _WAIT: Final = 10.0
 """Longest wait for a way onto the motion, s."""
 _PACE: Final = 2.0
-"""Pole of the governor over the motion's frequency: the way back takes little more torque."""
+"""Pole of the governor over the motion's angular frequency, for a way back with little torque."""
 _SOFT: Final = 2.0
 """Time in which one learned torque replaces another, s."""
 _INSTANTS: Final = 200
-"""Instants of a period at which its rates are looked at."""
+"""Instants of a period at which its slowest one is sought."""
 _EACH: Final = 4
-"""Lacking torques that are computed at a sample; one takes some 0.7 ms."""
+"""Number of lacking torques that are computed at a sample; one takes about 0.7 ms."""
 
 
 class Repetition(NamedTuple):
     """One repetition in real time.
 
     Attributes:
-        error: rms of the angles that the cranks lacked in the last periods, rad.
+        error: rms error of the crank angles in the last periods, rad.
         result: the run.
     """
 
@@ -86,8 +86,7 @@ def learn_live(
 ) -> SimulationResult:
     """Repeat a motion on a machine, learn from each repetition, and write what was learned.
 
-    Learning ends early after two repetitions without a smaller error, or where one does not
-    complete.
+    Learning ends early after two repetitions without a smaller error, or if one does not complete.
 
     Args:
         scenario: law and motion.
@@ -152,10 +151,10 @@ def _learn_torques(
 
 
 class TorqueLessons(Viewer):
-    """Asks for the repetitions of a motion, and learns torques from each.
+    """Requests the repetitions of a motion, and learns torques from each.
 
-    It is the viewer of a run, and a log of it. Called, it returns what the loop adds: the torque of
-    the last repetition at first, then softly that of the present one.
+    It is the viewer of a run, and a log of it. A call returns the torque that the loop adds. It is
+    blended from that of the last repetition into that of the present one.
 
     Args:
         experiment: of the scenario.
@@ -164,7 +163,7 @@ class TorqueLessons(Viewer):
 
     Attributes:
         experiment: of the scenario.
-        tried: torques of the repetitions so far; zero in the first one.
+        tried: added torques of the repetitions so far; those of the first one are zero.
         errors: E of the last period of each complete repetition, % s.
         done: whether learning has ended.
         pace: pole of the governor, 1/s.
@@ -200,12 +199,11 @@ class TorqueLessons(Viewer):
         return int(np.argmin(self.errors))
 
     def __call__(self) -> LearnedSignal:
-        """Return the torque that is added."""
         before, present = self._before.coefficients, self.tried[-1].coefficients
         return LearnedSignal(self._period, before + self._share * (present - before))
 
     def request(self) -> Request:
-        """Ask for the motion, or for a target that goes back to the start."""
+        """Request the motion, or a target on the way back to the start."""
         return Request(target=self._target) if self._returns else Request()
 
     def finished(self) -> bool:
@@ -213,7 +211,7 @@ class TorqueLessons(Viewer):
         return self.done
 
     def write(self, time: float, values: Mapping[str, Array]) -> None:
-        """Keep the samples of the last period of the motion."""
+        """Keep the samples of the motion's last period."""
         if not self._returns or time <= self._until + self._dt / 2:
             self._rows.append((time, values))
         else:
@@ -223,7 +221,7 @@ class TorqueLessons(Viewer):
         """Do nothing."""
 
     def show(self, snapshot: Snapshot) -> None:
-        """Go from the motion to the start, and from the start to the next repetition."""
+        """Change from the motion to the way back, and from there to the next repetition."""
         t = snapshot.time
         if self.done:
             return
@@ -248,12 +246,12 @@ class TorqueLessons(Viewer):
             self._begin(t)
 
     def _end_of_motion(self, t: float) -> float:
-        """Return when a motion ends that begins at t s: where it is slowest, for a gentle stop."""
+        """Return the end, in s, of a motion from t s on: where it is slowest, for a gentle stop."""
         least = t + self._span
         return least + (self._slowest - least) % self._period
 
     def _judge(self) -> None:
-        """Take the error of the repetition, and end after the last one."""
+        """Compute the error of the repetition; end after the last one."""
         times = np.array([time for time, _ in self._rows])
         errors = np.array([row["pose"] - row["reference"] for _, row in self._rows])
         self.errors.append(accumulated_error(times, errors, self.experiment.scale))
@@ -285,8 +283,8 @@ class TorqueLessons(Viewer):
         return bool(there and np.all(np.abs(wanted[RATES]) <= REST_RATE * self._size))
 
     def _begin(self, t: float) -> None:
-        """Begin the next repetition, with what the last one has shown."""
-        least = 2 * (1 + 2 * self._harmonics)
+        """Begin the next repetition, with torques fitted to those that the last one lacked."""
+        least = 2 * (1 + 2 * self._harmonics)  # twice the number of coefficients
         if len(self._found) < least:
             self._end(f"{len(self._found)} measurements of a period; expected at least {least}")
             return
@@ -321,7 +319,8 @@ def _learn_setpoints(
     assert servo.kind == "position_servo"
     lag = (servo.velocity_gain + servo.crank_damping) / servo.stiffness
     last = period * math.ceil(_LEARNED_FROM / period)
-    duration, least = dt * math.ceil((_SETTLING + last) / dt + 1), 2 * (1 + 2 * number)
+    duration = dt * math.ceil((_SETTLING + last) / dt + 1)
+    least = 2 * (1 + 2 * number)  # twice the number of coefficients
     address, key = address_of(machine), read_key(options.key)
     how = options.model_dump(include={"armed", "accept_jitter", "max_missing"})
     done, steps, own = list[Repetition](), Anderson(), prepare(scenario)

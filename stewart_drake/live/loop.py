@@ -322,7 +322,7 @@ class LiveLoop:
 
         Args:
             duration: recorded time, s.
-            ending: whether to come to rest before that.
+            ending: returns whether to end before that.
         """
         end, k = End("completed", None), 0
         try:

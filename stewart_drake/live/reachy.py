@@ -1,8 +1,8 @@
 """The machine's end in front of Reachy Mini's daemon: plans over UDP, setpoints to the robot.
 
 The daemon's WebSocket sends the positions of the joints, without time stamps, and takes setpoints
-that act at once. This process, beside the daemon, stamps positions on arrival, keeps plans until
-their time, and sends one setpoint per period. `live` drives it as any other machine.
+that act at once. This process stamps positions on arrival, keeps plans until their time, and
+sends one setpoint per period. `live` drives it as any other machine.
 """
 
 import asyncio
@@ -78,7 +78,7 @@ class Positions(NamedTuple):
 
 
 class Daemon:
-    """Connection to the daemon, in a thread of its own. It connects anew whenever it is lost.
+    """Connection to the daemon, in a separate thread. It reconnects whenever it is lost.
 
     Args:
         address: of the daemon.
@@ -95,7 +95,7 @@ class Daemon:
         self._url = f"ws://{self._where}/ws/sdk"
         self.positions: deque[Positions] = deque(maxlen=_KEPT)
         self.simulated, self.lines, self.problem = False, deque[str](), ""
-        self._told = self._odd = self._closed = False
+        self._reported_loss = self._reported_message = self._closed = False
         self._motors_on, self._setpoint = True, ""
         self._loop, self._wake = asyncio.new_event_loop(), asyncio.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -139,7 +139,7 @@ class Daemon:
                 async with connect(
                     self._url, max_size=_LONGEST, open_timeout=2.0, close_timeout=0.2, proxy=None
                 ) as socket:
-                    self._setpoint, self._odd = "", False
+                    self._setpoint, self._reported_message = "", False
                     writer = asyncio.create_task(self._write(socket))
                     try:
                         await self._read(socket)
@@ -154,8 +154,8 @@ class Daemon:
     def _lose(self, problem: str) -> None:
         self.problem = problem
         self.positions.clear()
-        if not self._told:
-            self._told = True
+        if not self._reported_loss:
+            self._reported_loss = True
             self.lines.append(f"daemon at {self._where}: {problem}; the head is held, trying again")
 
     async def _write(self, socket: Any) -> None:
@@ -190,16 +190,16 @@ class Daemon:
             if joints.shape != (JOINTS,) or not np.all(np.abs(joints) < 2 * math.pi):
                 raise ValueError
         except (ValueError, KeyError, TypeError, RecursionError):
-            if not self._odd:
-                self._odd = True
+            if not self._reported_message:
+                self._reported_message = True
                 self.lines.append(
                     f"daemon at {self._where}: sent {brief(data)}; expected a message such as "
                     f"joint_positions with {JOINTS} angles in rad; ignored"
                 )
             return False
         self.positions.append(Positions(now(), joints))
-        if self._told:
-            self._told = False
+        if self._reported_loss:
+            self._reported_loss = False
             self.lines.append(f"daemon at {self._where}: positions come again")
         return True
 

@@ -72,10 +72,10 @@ from stewart_drake.tuner.source import Decision, WeightsSource
 from stewart_drake.types import Array
 
 SHARE: Final = 0.1
-"""Tolerance of an integration step over the scenario's accuracy. Steps of order 8 are long: one
-digit more costs a sixth."""
+"""Tolerance of an integration step over the scenario's accuracy. With steps of order 8, one more
+digit costs a sixth more time."""
 LONGEST_STEP: Final = np.inf
-"""s; the state is recorded every 20 ms for steps of any length."""
+"""Longest integration step, s. The state is recorded every 20 ms for steps of any length."""
 COVERED: Final[Accepted] = {
     "plant.kind": "exact",
     "actuator.kind": ("torque", "position_servo"),
@@ -90,14 +90,14 @@ _DRAWN: Final = (
     ("actuator", "torque_limit"),
     *(("controller", name) for name in ("w_Q", "w_R", "delay_steps", "delay_fraction")),
 )
-"""Fields of a scenario without effect on a `Preparation`; the believed delay counts instead."""
+"""Fields of a scenario without effect on a `Preparation`, apart from the believed delay."""
 _PREPARATIONS: Final = 16
-"""Number of preparations that a process keeps."""
+"""Largest number of preparations that a process keeps."""
 _NODES: Final = 5e-3
-"""s between the nodes of a motion. Quintics between them have errors of 1e-10 in accelerations for
-a 1 Hz sine."""
+"""Time between the nodes of a motion, s. For a 1 Hz sine, quintics between them have errors of
+1e-10 in accelerations."""
 _BEFORE: Final = 1e-12
-"""s before a node, where the values on its left side are taken."""
+"""Time before a node at which its values on the left are taken, s."""
 
 MakeTuner = Callable[[Experiment, PredictiveLqi], WeightsSource | None]
 """Returns the tuner of an experiment with a law, or None for fixed weights."""
@@ -106,8 +106,8 @@ MakeTuner = Callable[[Experiment, PredictiveLqi], WeightsSource | None]
 class Instants(NamedTuple):
     """Instants of a run at which Drake's simulator records and samples."""
 
-    nominal: Array  # (n,) s, of the record
-    looks: Array  # (n,) s, at which the state is recorded
+    nominal: Array  # (n,) s, times in the record
+    looks: Array  # (n,) s, times at which the state is recorded
     on_grid: NDArray[np.bool_]  # (n,) whether the metric counts each
     sampled: NDArray[np.bool_]  # (n,) whether the controller samples at each
     samples: Array  # (k,) s, of the controller's samples
@@ -150,7 +150,7 @@ class Ending(NamedTuple):
     # (k, 18) at the controller's samples [measurement - reference (12); torque that the law asked
     # for (6)], in rad, m, rad/s, m/s and N m
     samples: Array
-    error_so_far: float  # E_ac in % s up to the end, complete or not; NaN where nothing ran
+    error_so_far: float  # E_ac in % s up to the end, complete or not; NaN for a run without samples
     weights: Array  # (k, 2) w_Q and w_R at the samples
     # (k, n) row of the tuner's window for each sample (core/tuner.c); n = 0 without a tuner, and in
     # Drake's loop
@@ -168,20 +168,19 @@ class Prepared(NamedTuple):
 
     experiment: Experiment
     law: PredictiveLqi | ServoPreview
-    planned: Trajectory  # motion that it follows
+    planned: Trajectory  # motion that the law follows
     previews: Array  # (k, p, 18) rows of that motion at each sample
     tuner: WeightsSource | None  # tuner of the weights, None for fixed ones
-    # pieces of `planned` and of the reference (`pieces_of`), for a law that reads them at any
-    # instant, else empty
+    # `pieces_of` the planned motion and of the reference, if the law reads them at any instant
     motions: tuple[tuple[Array, Array], ...] = ()
 
 
 class Preparation:
-    """Common part of the runs of all scenarios that differ in `_DRAWN` and the true machine only.
+    """Common part of the runs of scenarios that differ in `_DRAWN` and the true machine only.
 
     Attributes:
         when: instants of a run.
-        references: (n, 12) pose and rates of the reference at its looks.
+        references: (n, 12) pose and rates of the reference at `when.looks`.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -223,16 +222,17 @@ class Preparation:
 
     def _preview(self, motion: Trajectory, law: PredictiveLqi | ServoPreview) -> Array:
         """Return the rows (k, p, 18) of `loop.controller.Reference` at all samples."""
-        if id(motion) not in self._previews:  # kept with its motion, which keeps the id
+        # The motion is kept too, so that no other one gets its id.
+        if id(motion) not in self._previews:
             times = np.maximum(0.0, self.when.samples[:, None] + law.preview_times)
-            rows = [[evaluate(motion, t) for t in ahead] for ahead in times]
+            rows = [[evaluate(motion, t) for t in preview] for preview in times]
             self._previews[id(motion)] = motion, np.array(rows)
         return self._previews[id(motion)][1]
 
     def _pieces(
         self, motion: Trajectory, followed: tuple[Trajectory, ...], longest: float
     ) -> tuple[Array, Array]:
-        """Return `pieces_of` a motion, as far as plans of `longest` s at the most look."""
+        """Return `pieces_of` a motion, as far as laws with plans of at most `longest` s read it."""
         key = id(motion), longest
         if key not in self._motions:
             sc, c = self._base.scenario, self._base.scenario.controller
@@ -292,7 +292,7 @@ def _key(scenario: Scenario) -> tuple[Any, ...]:
 
 
 def _stamp(path: Path) -> tuple[int, int]:
-    """Return time and size of a file, which change with its content."""
+    """Return time and size of a file, to notice a change of its content."""
     try:
         found = path.stat()
     except OSError as error:
@@ -304,7 +304,7 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 
 class Course(NamedTuple):
-    """Record of a loop."""
+    """Record of a run of the loop."""
 
     states: Array  # (n, 12) at the looks up to the end
     measured: Array  # (k, 12) at the samples, as the controller got them
@@ -369,7 +369,7 @@ class CompiledController:
 
     @property
     def counts(self) -> dict[str, int]:
-        fallbacks = int(self._tuned[2]) if len(self._tuned) else 0
+        fallbacks = int(self._tuned[2]) if len(self._tuned) else 0  # after two weights
         counts = CoreMemory(self._memory, self._compiled).counts
         return counts.summary() | {"tuner_fallbacks": fallbacks}
 
@@ -423,7 +423,7 @@ Controller = Callable[[int, Measurement, Report | None], tuple[Array, Array]]
 
 
 class PythonController:
-    """Law and tuner with a part in Python, a `Controller`.
+    """`Controller` whose law or tuner has a part in Python.
 
     Attributes:
         weights: (2,) of each sample.
@@ -479,11 +479,11 @@ def run_loop(
         experiment: with a scenario that is not `uncovered`.
         when: `instants_of` its duration and period.
         controller: the controller.
-        law: its law, for packets and reports; without it single torques are sent.
+        law: law of the controller, for packets and reports; if None, single torques are sent.
 
     Raises:
         IntegrationError: no step is short enough for the accuracy.
-        As the controller.
+        Exception: the exception of a controller in Python.
     """
     sc, sensor, number = experiment.scenario, experiment.scenario.sensor, len(when.samples)
     assert sensor.kind == "state"
@@ -559,7 +559,7 @@ def _link(
 ) -> tuple[Link, Array, Array]:
     """Return the link to the motors, its memory at t = 0, and the transit times (number,) in s.
 
-    It is that of `loop.link`: a wire, or a play-out buffer.
+    The link is a wire or a play-out buffer, as in `loop.link`.
     """
     sc, delay = experiment.scenario, experiment.scenario.true_delay
     period, size = sc.controller.period, NUM_TORQUES
@@ -607,14 +607,14 @@ def _call_back(plant: NativePlant, loop: Any, controller: Controller) -> Ended:
         try:
             age = sample.age * loop.period
             measured = Measurement.of(numbers(sample.measurement, NUM_STATE), age)
-            told, report = sample.report, None
-            if told != ffi.NULL:
-                acted = numbers(told.acted, told.periods, NUM_TORQUES).copy()
-                report = Report(numbers(told.arrived, told.packets) > 0, acted, told.age)
+            data, report = sample.report, None
+            if data != ffi.NULL:
+                acted = numbers(data.acted, data.periods, NUM_TORQUES).copy()
+                report = Report(numbers(data.arrived, data.packets) > 0, acted, data.age)
             asked, sent = controller(number, measured, report)
             numbers(torque, NUM_TORQUES)[:] = asked
             numbers(command, loop.rows, NUM_TORQUES)[:] = sent
-        except BaseException as error:  # which cannot pass through C
+        except BaseException as error:  # it cannot pass through C
             raised.append(error)
             return 1
         return 0
@@ -635,8 +635,8 @@ def run_in_bulk(
     """Run a scenario, without a stability verdict.
 
     Args:
-        scenario: what to run.
-        truth: the machine to simulate, that of the scenario's plant if None.
+        scenario: to run.
+        truth: the machine to simulate; that of the scenario's plant if None.
         tuner: replaces the scenario's tuner; not for Drake's loop.
 
     Raises:
@@ -648,12 +648,12 @@ def run_in_bulk(
     if only_drake is not None:
         if tuner is not None:
             raise ValueError(f"tuner: got one for Drake's loop ({only_drake}); expected None")
-        outside = _outside(assemble(scenario, truth))
-        return outside or _in_drake(scenario, truth, only_drake)
+        refused = _refused_start(assemble(scenario, truth))
+        return refused or _in_drake(scenario, truth, only_drake)
     preparation = preparation_of(scenario)
     experiment = preparation.experiment(scenario, truth)
     try:
-        return _outside(experiment) or run_prepared(
+        return _refused_start(experiment) or run_prepared(
             preparation, preparation.prepared(experiment, tuner)
         )
     except IntegrationError:
@@ -662,15 +662,15 @@ def run_in_bulk(
         return _in_drake(scenario, truth, "plant.accuracy")
 
 
-def _outside(experiment: Experiment) -> Ending | None:
+def _refused_start(experiment: Experiment) -> Ending | None:
     """Return the end of a run whose true machine cannot take the start pose, else None."""
     failure = diagnose(experiment.truth, 0.0, experiment.start[POSE])
     if failure is None:
         return None
     counts = Counts().summary() | {"tuner_fallbacks": 0}
-    nothing = Figures(*[np.nan] * len(Figures._fields))
+    unknown = Figures(*[np.nan] * len(Figures._fields))
     samples, weights, rows = (np.empty((0, n)) for n in (len(TUNER_INPUTS), len(WEIGHTS), 0))
-    return Ending("left_workspace", failure, nothing, counts, samples, np.nan, weights, rows, "")
+    return Ending("left_workspace", failure, unknown, counts, samples, np.nan, weights, rows, "")
 
 
 def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
@@ -715,8 +715,8 @@ def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
 
 
 def _in_drake(scenario: Scenario, truth: Mechanism | None, field: str) -> Ending:
-    whole = dataclasses.replace(scenario, log_period=None)  # a log with all samples
-    result = simulate(whole, true_mechanism=truth, judge_stability=False)
+    logged = dataclasses.replace(scenario, log_period=None)  # a log with all samples
+    result = simulate(logged, true_mechanism=truth, judge_stability=False)
     if result.status == "interrupted":
         raise KeyboardInterrupt
     return ending_of(result, f"drake, {field}")
@@ -750,7 +750,7 @@ def samples_of(result: SimulationResult) -> Array:
     signals, sc = result.signals, result.scenario
     if not signals.sizes["time"]:
         return np.empty((0, len(TUNER_INPUTS)))
-    # The log has the signals from an instant on, hence T_k at k dt.
+    # A logged value holds from its time on, so that at k dt is T_k.
     number = int(float(signals.time.values[-1]) / sc.controller.period + 1e-9) + 1
     at = sc.controller.period * np.arange(number)
     kept = signals.sel(time=at, method="nearest")

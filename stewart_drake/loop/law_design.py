@@ -1,4 +1,4 @@
-"""The control law of a scenario, composed of parts, and for a diagram of the user."""
+"""Composition of a control law from parts, for a scenario or for a user's diagram."""
 
 import dataclasses
 import math
@@ -83,19 +83,19 @@ from stewart_drake.types import Array, ArrayLike
 REPLAN = 0.4
 """Duration of a plan back onto the reference with a delay estimator, s."""
 TOLERATED = 0.004
-"""Standard deviation of torques' timing, as a share of the loop's time constant, up to which the
-weight of the torques stays: 1 ms for the motion of `paper`."""
+"""Largest standard deviation of the torques' timing at which their weight is not raised, as a share
+of the loop's time constant: 1 ms for the motion of `paper`."""
 BIAS_SHARE = 0.05
 """Prior standard deviation of torque bias and of damping at 1 rad/s, as a share of the torque that
 the motion takes."""
 PAYLOAD_SHARE = 0.1
-"""The same of the payload, as a share of the plate."""
+"""Prior standard deviation of the payload, as a share of the plate's mass."""
 GENTLE = 3.0
-"""Largest torque predicted with the default substeps, over that of the reference."""
+"""Largest torque for which the default substeps suffice, over the torque scale of the law."""
 _MOST = 0.999
-"""Share of the measurements that arrive within the wait."""
+"""Share of the measurements that arrive within the longest delay of `longest_wait`."""
 _POSES = 500
-"""Poses of a reference that are looked at for distances to keep."""
+"""Instants of a reference at which clearances and accelerations are evaluated."""
 _PATIENCE = 10
 """Further periods of waiting for a measurement before the model replaces it."""
 
@@ -109,9 +109,9 @@ def cost_of(experiment: Experiment, peak_torque: float) -> Cost:
 def pd_gain(experiment: Experiment) -> PdGain:
     """Return the gains of a scenario with `controller.kind: pd`.
 
-    Null gains follow equation (pd) of `law.pd`. The uncompensated delay is the true one less the
-    assumed one, and half a period for the hold. The pole is that of the plate held still at the
-    reference's first pose. One given gain sets the other for critical damping, kd^2 = 4 kp.
+    Gains that are not given follow equation (pd) of `law.pd`. The uncompensated delay is the true
+    one less the assumed one, plus half a period for the hold. The pole is that of the plate held at
+    the start pose. One given gain sets the other for critical damping, kd^2 = 4 kp.
     """
     sc = experiment.scenario
     c = sc.controller
@@ -147,7 +147,7 @@ class Sizing(NamedTuple):
 
 
 def sizing_of(experiment: Experiment) -> Sizing:
-    """Size a law by mechanism, reference, duration, period and the believed delay."""
+    """Return the sizing of a law, for the scenario's duration, period and believed delay."""
     sc, nominal, reference = experiment.scenario, experiment.nominal, experiment.reference
     period, steps = sc.controller.period, believed_delay(sc).steps
     substeps = choose_substeps(nominal, reference, period, steps, sc.duration)
@@ -185,10 +185,11 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     c, motion = sc.controller, experiment.motion_scale
     sensor, link = SENSORS[type(sc.sensor)], LINKS[type(sc.link)]
     timeline = Timeline(c.period, believed_delay(sc))
-    substeps, peak_torque, least = sizing or sizing_of(experiment)
-    torque_scale = max(least, peak_torque)
+    substeps, peak_torque, machine_scale = sizing or sizing_of(experiment)
+    torque_scale = max(machine_scale, peak_torque)
     plate, asked = experiment.mechanism.plate.mass, experiment.planned_limit
-    parameters = estimated_parameters(experiment, torque_scale, max(STILL * least, peak_torque))
+    motion_torque = max(STILL * machine_scale, peak_torque)
+    parameters = estimated_parameters(experiment, torque_scale, motion_torque)
     exact = sc.plant.kind == "exact" and isinstance(sc.sensor, StateSensorConfig)
     settings = filter_settings(
         *(motion, plate, torque_scale, asked, c.period, parameters),
@@ -236,7 +237,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
 
 
 def clear_space(experiment: Experiment) -> ClearSpace:
-    """Return the distances that plans keep, by machine and reference, to the last horizon's end."""
+    """Return the distances that plans keep, from the reference up to the last horizon's end."""
     sc = experiment.scenario
     period = sc.controller.period
     ahead = believed_delay(sc).eta(period) + sc.controller.horizon * period
@@ -254,8 +255,8 @@ def estimated_parameters(
     Args:
         experiment: of the scenario.
         torque_scale: of machine and motion, N m.
-        motion_torque: largest torque that the motion takes, N m; it sets the scale of a wrench,
-            with its force at the tip of the shortest crank.
+        motion_torque: largest torque that the motion takes, N m. It sets the scale of a wrench: the
+            moment, and the force at the tip of the shortest crank.
 
     Raises:
         ConfigError: the calibration is beyond the bounds of such a machine.
@@ -294,7 +295,7 @@ def estimated_parameters(
 
 
 def _of_wrench(moment_and_force: Sequence[float] | None) -> dict[str, float]:
-    """Return two numbers, of moment and force, by the names of a wrench; none for None."""
+    """Return the scale of each component of a wrench, by name; nothing for None."""
     if moment_and_force is None:
         return {}
     return dict(zip(WRENCHES, np.repeat(moment_and_force, 3).tolist(), strict=True))
@@ -304,7 +305,7 @@ def _until_seen(delay: Delay, waits: int) -> int:
     """Return the samples until the first torque of the law has acted for a whole hold.
 
     Until then only the torque bias moves the plate. Estimates of payload and friction are noise,
-    and feedback through them would act for eta.
+    and feedback that rests on them would act for the whole delay.
     """
     late = max(waits - _PATIENCE, 0)
     return math.ceil(delay.periods + 1 - 1e-9) + late
@@ -342,34 +343,35 @@ def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, floa
 def replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> PredictiveLqi:
     """Return the law for a start from rest with a catch-up of `length` s, 0 for none.
 
-    The catch-up goes out before anything is known of the machine. When payload and bias are known,
-    and the prediction so is certain, the law plans again. Where nothing is estimated, or the delay
-    is, where torques come in packets or measurements late, or a quadratic program plans, the law
-    stays as it is.
+    The catch-up is computed before payload and bias are known. Once they are, and the prediction is
+    certain enough, the law plans again. The law is returned unchanged without a catch-up or
+    estimated parameters, with a delay estimator or a linear prediction, over packets, with late
+    measurements, with a quadratic program, or with `replan: 0`.
     """
-    asked = experiment.scenario.controller.replan
+    replan = experiment.scenario.controller.replan
     plain = not isinstance(law, LimitedLqi) and isinstance(law.predictor, NonlinearPredictor)
     if not (length and law.estimates and plain and isinstance(law.channel, Wire)):
         return law
-    if law.longest_wait or asked == 0:
+    if law.longest_wait or replan == 0:
         return law
-    return replace(law, planner=Replan(asked or length, experiment.scale))
+    return replace(law, planner=Replan(replan or length, experiment.scale))
 
 
 def tolerated_timing(experiment: Experiment) -> float:
     """Return the standard deviation of single torques' timing that the loop tolerates, s.
 
-    A share of the time constant of the loop, 1 / bandwidth of theory.md, section 13. Infinite for
-    weights that are given or set by a tuner, and for laws that do not estimate parameters: without
-    them a bias would be taken for torques that act early or late.
+    It is a share of the time constant of the loop, 1 / bandwidth of theory.md, section 13. It is
+    infinite for weights that are given or set by a tuner. So it is for laws that do not estimate
+    parameters, since they would take a bias for torques that act early or late.
     """
     sc, c = experiment.scenario, experiment.scenario.controller
     if c.w_R is not None or sc.tuner.kind != "fixed" or not c.estimate:
         return math.inf
     times = spread_instants(sc.duration, _POSES)
-    fastest = np.array([evaluate(experiment.reference, t)[ACCELERATIONS] for t in times])
-    moves = np.where(experiment.peak_to_peak > 0, experiment.peak_to_peak / 2, np.inf)
-    bandwidth = math.sqrt(float((np.abs(fastest).max(axis=0) / moves).max() / TOLERANCE))
+    accelerations = np.array([evaluate(experiment.reference, t)[ACCELERATIONS] for t in times])
+    amplitudes = np.where(experiment.peak_to_peak > 0, experiment.peak_to_peak / 2, np.inf)
+    largest = np.abs(accelerations).max(axis=0)
+    bandwidth = math.sqrt(float((largest / amplitudes).max() / TOLERANCE))
     return TOLERATED / bandwidth if bandwidth else math.inf
 
 
@@ -398,7 +400,7 @@ def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
 def first_queue(experiment: Experiment, law: PredictiveLqi) -> Array:
     """Return the torques in flight at t = 0 that a law assumes.
 
-    A law that estimates the delay has one for each period up to the longest delay.
+    For a law that estimates the delay there is one for each period up to the longest delay.
     """
     delay = Delay(law.queue_length) if law.finds_delay else law.timeline.delay
     return experiment.torques_in_flight(delay)
@@ -407,7 +409,7 @@ def first_queue(experiment: Experiment, law: PredictiveLqi) -> Array:
 def followed_motion(
     law: PredictiveLqi, planned: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, Trajectory] | None:
-    """Return the motions that a law reads at instants of its own, or None."""
+    """Return the motions (planned, reference) if the law reads them at any instant, else None."""
     return (planned, reference) if law.moves else None
 
 
@@ -420,9 +422,9 @@ class DesignedLaw:
     """Result of `design_law`; it can be added to several diagrams.
 
     Attributes:
-        law: the control law as a pure function, memory in, memory out.
+        law: the control law, a pure function from one memory to the next.
         reference: trajectory (6, 1).
-        planned: trajectory that it follows: the reference, or a way onto it and the reference.
+        planned: trajectory that the law follows: the reference, or first a way onto it.
         queue: (L, 6) assumed torques in flight at t = 0 in N m, oldest first.
         weights: (2,) w_Q and w_R.
     """

@@ -528,7 +528,7 @@ def AddStewartPlatform(
         )
     if any(config.push.wrench):
         raise ConfigError(
-            f"plant.push.wrench: got {config.push.wrench} for a platform in a diagram of its own; "
+            f"plant.push.wrench: got {config.push.wrench} for a platform in your own diagram; "
             "expected zeros, and a source for the platform's input wrench"
         )
     if config.kind == "exact":

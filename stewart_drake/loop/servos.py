@@ -180,7 +180,7 @@ class PositionServos(LeafSystem):
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
-    | command | input | 18, of which angles are used | rad | piecewise constant |
+    | command | input | 18 (only angles are used) | rad | piecewise constant |
     | state | input | 12 | rad, m, rad/s, m/s | continuous |
     | torque | output | 6 | N m | continuous, direct feedthrough |
     | report | output | of `law.servos.ReportLayout` | N m | to be read at samples |
@@ -211,19 +211,19 @@ class PositionServos(LeafSystem):
         # Integrals at the ends of the reported parts, the oldest first.
         self._ends = self.DeclareAbstractState(Value(np.full((parts, NUM_TORQUES + 1), np.nan)))
         inputs = {self.input_port_ticket(p.get_index()) for p in (self._command, self._state)}
-        self._acting = self.DeclareCacheEntry(
+        self._torques_entry = self.DeclareCacheEntry(
             "torques",
             ValueProducer(allocate=lambda: Value(np.empty((2, 6))), calc=weak(self._torques)),
             inputs,
         )
-        self.DeclareVectorOutputPort(
-            "torque", NUM_TORQUES, weak(self._torque), {self._acting.ticket()}
-        )
-        kept = {self.abstract_state_ticket(self._ends), self.xc_ticket(), self._acting.ticket()}
-        self.DeclareVectorOutputPort("report", reports.size, weak(self._report), kept)
+        torques = self._torques_entry.ticket()
+        self.DeclareVectorOutputPort("torque", NUM_TORQUES, weak(self._torque), {torques})
+        read = {self.abstract_state_ticket(self._ends), self.xc_ticket(), torques}
+        self.DeclareVectorOutputPort("report", reports.size, weak(self._report), read)
         update_every(self, self._part, self._keep, servo_time)
 
     def _torques(self, context: Context, result: AbstractValue) -> None:
+        """Compute the torques (2, 6): as asked, and within the limit."""
         command = np.array(self._command.Eval(context))
         if not np.all(np.isfinite(command)):
             command = self._first
@@ -231,13 +231,13 @@ class PositionServos(LeafSystem):
         result.set_value(self._servo.torques(self._geometry, command[POSE], state))
 
     def _torque(self, context: Context, output: BasicVector) -> None:
-        acting: Any = self._acting.Eval(context)
-        output.SetFromVector(acting[1])
+        pair: Any = self._torques_entry.Eval(context)
+        output.SetFromVector(pair[1])
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        acting: Any = self._acting.Eval(context)
-        cut = np.abs(acting[0] - acting[1]).sum()
-        derivatives.SetFromVector(np.append(acting[1], cut))
+        pair: Any = self._torques_entry.Eval(context)
+        asked, limited = pair
+        derivatives.SetFromVector(np.append(limited, np.abs(asked - limited).sum()))
 
     def _impulses(self, context: Context) -> Array:
         """Return the integrals at the ends of all reported parts and now (n + 1, 7)."""
@@ -250,8 +250,8 @@ class PositionServos(LeafSystem):
 
     def _report(self, context: Context, output: BasicVector) -> None:
         parts = np.diff(self._impulses(context), axis=0) / self._part
-        acting: Any = self._acting.Eval(context)
-        output.SetFromVector(self.reports.of_means(parts[:, :-1], parts[:, -1] > 0, acting[0]))
+        pair: Any = self._torques_entry.Eval(context)
+        output.SetFromVector(self.reports.of_means(parts[:, :-1], parts[:, -1] > 0, pair[0]))
 
 
 _PART: Final = 0.005

@@ -21,13 +21,13 @@ TorqueMap = Literal["virtual_work", "printed"]
 
 @dataclass(frozen=True)
 class Assembly:
-    """Link frames of the six legs and of the plate in W; arrays with a leading axis of six."""
+    """Link frames of the six legs and of the plate in W."""
 
-    crank_angles: Array
-    R_WC: Array
-    p_WT: Array
-    R_WD: Array
-    R_WP: Array
+    crank_angles: Array  # (6,) rad
+    R_WC: Array  # (6, 3, 3)
+    p_WT: Array  # (6, 3) crank tips, m
+    R_WD: Array  # (6, 3, 3)
+    R_WP: Array  # (3, 3)
 
 
 def assemble(mechanism: Mechanism, pose: Array) -> Assembly:
@@ -68,37 +68,40 @@ def joint_state(mechanism: Mechanism, pose: Array, rates: Array) -> JointState:
     """
     home, now = assemble(mechanism, mechanism.home), assemble(mechanism, pose)
     axes = mechanism.R_WS[:, :, 2]
-    # The cross-piece turns about the motor axis n with the crank and by theta_1 against it; its
-    # axis y then carries the rod, at the angle atan2(x.n, x.(n x y)) about y.
+    # theta_1 turns the cross-piece of the universal joint relative to the crank, about the motor
+    # axis n. theta_2 turns the rod about the cross-piece's axis y. Both are zero at home;
+    # `y_of_crank` is the y of the home pose, carried by the crank.
     y_of_crank = (now.R_WC @ home.R_WC.swapaxes(1, 2) @ home.R_WD[:, :, 1, None])[..., 0]
     y = now.R_WD[:, :, 1]
-    first = np.arctan2(_dot(np.cross(y_of_crank, y), axes), _dot(y_of_crank, y))
-    second = _elevation(now.R_WD, axes) - _elevation(home.R_WD, axes)
-    turn = (now.crank_angles - home.crank_angles + np.pi) % (2 * np.pi) - np.pi
+    theta_1 = np.arctan2(_dot(np.cross(y_of_crank, y), axes), _dot(y_of_crank, y))
+    theta_2 = _elevation(now.R_WD, axes) - _elevation(home.R_WD, axes)
+    crank = (now.crank_angles - home.crank_angles + np.pi) % (2 * np.pi) - np.pi
 
-    # Rates: alpha_dot from the rod's length; the rod's angular velocity without spin r x d / l,
-    # plus the spin that leaves no component along n x (n x r).
+    # Rates. The rod's length l is constant, so its axis r gives r . (v_Q - v_T) = 0, and from this
+    # alpha_dot. Without spin the rod's angular velocity is r x (v_Q - v_T) / l. The rod turns about
+    # n and y only: its spin about r cancels the component along n x y, that is n x (n x r).
     legs = leg_geometry(mechanism, pose)
     w_WP = angle_rate_map(pose[ANGLES]) @ rates[ANGLES]
     v_WQ = rates[POSITION] + np.cross(w_WP, legs.p_PQ_W)
     along = _dot(legs.rod, v_WQ)
-    # At rest a dead centre is a pose like any other; moving, it takes levers that are not zero.
+    # `levers` refuses a dead centre. A plate at rest has alpha_dot = 0 even there.
     alpha_dot = along / levers(mechanism, legs) if along.any() else along
     v_WT = (mechanism.crank_lengths * alpha_dot)[:, None] * legs.tangent
     swing = np.cross(legs.rod, v_WQ - v_WT) / mechanism.rod_lengths[:, None]
     swing_n, rod_n = _dot(swing, axes), _dot(legs.rod, axes)
     w_WD = swing + (swing_n * rod_n / (1 - rod_n**2))[:, None] * legs.rod
-    first_rate = _dot(w_WD, axes) - alpha_dot
-    second_rate = _dot(w_WD, now.R_WD[:, :, 1])
+    theta_1_rate = _dot(w_WD, axes) - alpha_dot
+    theta_2_rate = _dot(w_WD, now.R_WD[:, :, 1])
     return JointState(
-        crank=turn,
-        universal=np.column_stack([first, second]),
+        crank=crank,
+        universal=np.column_stack([theta_1, theta_2]),
         crank_rate=alpha_dot,
-        universal_rate=np.column_stack([first_rate, second_rate]),
+        universal_rate=np.column_stack([theta_1_rate, theta_2_rate]),
     )
 
 
 def _elevation(R_WD: Array, axes: Array) -> Array:
+    """Return the angle (6,) of the rod x about y, from the direction n x y towards n."""
     x, y = R_WD[:, :, 0], R_WD[:, :, 1]
     return np.asarray(np.arctan2(_dot(x, axes), _dot(x, np.cross(axes, y))), dtype=np.float64)
 
@@ -114,12 +117,14 @@ def torque_map(mechanism: Mechanism, pose: Array, form: TorqueMap = "virtual_wor
 
         [M; F] = tau_1 [F_1 ... F_6]',   tau_1 = [p_PQ_W x e_rod; e_rod]  column by column,
 
-    and (15)-(16) relate F_i to the motor torque, F = tau_2 T. A massless leg does no net work:
-    T alpha_dot = F v_Q.e_rod = F u alpha_dot e_rod.tangent, so tau_2 = 1 / (u e_rod.tangent). The
-    paper prints e_rod.e_N / u instead; with e_N the crank's tangent that is kept as `printed`.
+    and (15)-(16) relate F_i to the motor torque, F = tau_2 T. A massless leg of crank length u does
+    no net work: T alpha_dot = F v_Q.e_rod = F u alpha_dot e_rod.tangent, so tau_2 =
+    1 / (u e_rod.tangent). The paper prints e_rod.e_N / u instead, which `printed` keeps, with e_N
+    the crank's tangent.
 
-    `virtual_work` also returns what pose coordinates need: d2(angles)/dt2 = E^-1 (R I R')^-1 M at
-    rest. `printed` takes (17)-(18) at their word: d2(angles)/dt2 = I^-1 M.
+    `virtual_work` has the accelerations of the pose coordinates at rest: d2(angles)/dt2 =
+    E^-1 (R I R')^-1 M, with E the map from rates of the angles to angular velocity. `printed` has
+    (17)-(18) as they stand: d2(angles)/dt2 = I^-1 M.
 
     Raises:
         UnreachablePoseError: the pose (6,) is out of reach.

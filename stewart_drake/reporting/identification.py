@@ -40,6 +40,7 @@ _OF_KIND: Final = {
     "pose": list(COORDINATE_NAMES),
     "rates": [f"d{name}/dt" for name in COORDINATE_NAMES],
 }
+"""Names of the measured values, by kind of measurement."""
 
 
 def document(found: Identification) -> Document:
@@ -101,8 +102,8 @@ def _shared(of: Identification | Plan, **more: Any) -> dict[str, Any]:
 
 
 def _pair(values: tuple[float, float], unit: str) -> str:
-    middle, worst = (number(1e3 * value, 2) for value in values)
-    return f"{middle} {unit}, at worst {worst} {unit}"
+    median, worst = (number(1e3 * value, 2) for value in values)
+    return f"{median} {unit}, at worst {worst} {unit}"
 
 
 def file_names(logs: Sequence[Log]) -> list[str]:
@@ -172,10 +173,10 @@ def residuals_of(found: Identification, log: int) -> tuple[Array, Array]:
     for i, segment in enumerate(found.problem.segments):
         if segment.log is not found.logs[log]:
             continue
-        here = found.fit.residuals.measured[: len(segment.rows), i]
-        there = np.isfinite(segment.log.values[segment.rows])
+        fitted = found.fit.residuals.measured[: len(segment.rows), i]
+        measured = np.isfinite(segment.log.values[segment.rows])
         times.append(segment.log.times[segment.rows])
-        rows.append(np.where(there, here, np.nan))
+        rows.append(np.where(measured, fitted, np.nan))
     if not times:
         return np.empty(0), np.empty((0, 18))
     return np.concatenate(times), np.concatenate(rows)

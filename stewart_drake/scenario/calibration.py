@@ -74,7 +74,7 @@ class Calibration:
                 raise ConfigError(
                     f"covariance: got a variance of {variance:g} for {name}; expected 0 or more"
                 )
-        # In units of the standard deviations; an exactly known parameter has no correlation.
+        # Check the correlations. Exactly known parameters are not scaled: their rows must be zero.
         std = np.sqrt(np.where(variances > 0, variances, 1.0))
         scaled = P / np.outer(std, std)
         skew = np.abs(scaled - scaled.T)

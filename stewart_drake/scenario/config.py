@@ -286,8 +286,8 @@ class ControllerConfig:
             number, else 0.3 s.
         command: sent to the motors: a `torque` each, or for servos `cranks`: crank angles and
             rates of the reference for the time of arrival, and the torque of `feedforward`. With
-            `cranks` there is no feedback but the result of `estimate`, and only period, delay,
-            feedforward, estimate and catch_up have an effect.
+            `cranks` only `estimate` feeds back, and only period, delay, feedforward, estimate and
+            catch_up have an effect.
         delay_estimator: `none`; or the delay is estimated, starting with the assumed one, as
             `constant`, or as `drifting` at a rate that is estimated too.
         delay_std: prior standard deviation of the delay, s.

@@ -48,7 +48,7 @@ _LOCK: Final = ".lock"
 _MAX_MANIFEST: Final = 10_000_000
 _KEY: Final = re.compile(r"[A-Za-z0-9_+-][A-Za-z0-9_.+-]{0,199}")
 _WATCH: Final = 0.5
-"""Time between two checks of a worker for the process that started it, s."""
+"""Time between two checks by a worker that the process that started it is alive, s."""
 _CONNECT_TIMEOUT: Final = 10.0
 """Longest wait for the scheduler, and for its first worker, s."""
 _RESUME: Final = "finished jobs are kept and the same command continues from there"
@@ -209,8 +209,9 @@ class _Unreadable(NamedTuple):
     reason: str
 
 
-# cloudpickle sends a class of a script or notebook by its contents. One that derives from a class
-# of pydrake cannot be made again from them; if an executor reads it, that ends the worker.
+# cloudpickle sends a class of a script or notebook by value. A class that derives from one of
+# pydrake cannot be rebuilt from that. The attempt would end the worker if the executor made it, so
+# `_call_packed` makes it.
 def _pack(call: _Call) -> bytes | str:
     """Return a call as bytes, or the reason why it cannot be sent."""
     try:
@@ -221,7 +222,7 @@ def _pack(call: _Call) -> bytes | str:
 
 
 def _call_packed(number: int, packed: bytes | str) -> tuple[str, bytes] | _Unreadable:
-    """Call in a worker the result of `_pack`."""
+    """Unpack and run a call in a worker."""
     if isinstance(packed, str):
         return _Unreadable(number, packed)
     try:
@@ -249,7 +250,7 @@ def _on_this_machine(workers: int | None, calls: Sequence[_Call]) -> Generator[t
     backend = joblib.parallel_config(
         backend="loky", inner_max_num_threads=1, initializer=_end_with, initargs=(os.getpid(),)
     )
-    # On leaving early joblib warns that not all results were fetched: that is meant.
+    # joblib warns of results that are not fetched, as after Ctrl-C or an exception.
     with backend, warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=UserWarning, module="joblib")
         parallel = joblib.Parallel(n_jobs=number, batch_size=1, return_as="generator_unordered")
@@ -277,8 +278,9 @@ def _signals_blocked() -> Iterator[None]:
     """Start processes that Ctrl-C does not reach, and resource trackers that print nothing.
 
     A process inherits the signal mask of the thread that starts it, and a thread likewise; Ctrl-C
-    would break the imports of a worker in the middle. The tracker comes first, because some Pythons
-    unblock the signal when they start it. It clears what a killed worker leaves, with warnings.
+    would break the imports of a worker in the middle. The tracker is started before the signal is
+    blocked, because some Pythons unblock it there. The tracker removes the resources that a killed
+    worker leaves; its warnings about them are turned off.
     """
     before = os.environ.get("PYTHONWARNINGS")
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [before, "ignore:resource_tracker"]))
@@ -307,7 +309,7 @@ def _end_with(parent: int) -> None:
 # ---------------------------------------------------------------- a Dask cluster
 
 
-# joblib's backend for Dask waits for ever if workers die over a call, so futures are used here.
+# joblib's backend for Dask waits for ever if workers die during a call, so futures are used here.
 def _on_dask(scheduler: str, calls: Sequence[_Call]) -> Generator[tuple[str, bytes]]:
     """Yield the results of calls as they finish; closing the iterator cancels the others."""
     try:
@@ -355,7 +357,7 @@ def _on_dask(scheduler: str, calls: Sequence[_Call]) -> Generator[tuple[str, byt
 
 
 def _greet(dask: Any, scheduler: str) -> None:
-    """Connect once without a client: one that finds no scheduler leaves an event loop running."""
+    """Connect once without a client: a client without a scheduler leaves an event loop running."""
     options = dask.Security().get_connection_args("client")
 
     async def greet() -> None:
