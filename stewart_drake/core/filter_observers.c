@@ -169,7 +169,7 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
     real *anchor = memory + stewart_filtered_memory(law), *since = anchor + size;
     real *durations = since + U * GAP_TORQUES, *pieces = durations + GAP_TORQUES, *periods = pieces + 1;
     real *known = stewart_take(&scratch, size), *last = stewart_take(&scratch, m);
-    real longer[X], walk[STEWART_MAX_ESTIMATED];
+    real longer[X], walk[STEWART_MAX_ESTIMATED], wander[STEWART_MAX_ESTIMATED];
     const stewart_sensing sensing = stewart_sensing_of(law);
     stewart_filter filter = filter_of(law, &sensing);
     stewart_copy(size, memory, known);
@@ -204,10 +204,14 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
         longer[i] = REAL(sqrt)(passed * pose * pose + drifts * rate * rate);
         longer[6 + i] = REAL(sqrt)(passed * rate * rate);
     }
-    for (int i = 0; i < estimated(law); i++)
+    for (int i = 0; i < estimated(law); i++) {
         walk[i] = REAL(sqrt)(passed) * filter.walk_std[i];
+        wander[i] = REAL(sqrt)(passed) * filter.wander_std[i];
+    }
     filter.model_std = longer;
     filter.walk_std = walk;
+    filter.wander_std = wander;
+    filter.keep = REAL(pow)(filter.keep, passed);
     stewart_filter_advance(&filter, &period, values, &history, anchor, scratch);
     if (*stewart_posterior_at(anchor, n, m).outliers > 0)
         return status;

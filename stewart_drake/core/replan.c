@@ -6,10 +6,12 @@
 #define PIECE STEWART_PIECE
 
 /* Memory: samples since the last plan, or without one since the start; number of pieces; samples since
-   the start; the pieces. Times of pieces are from the sample of the plan. */
-#define HEAD 3
+   the start; whether a plan was made after a torque had acted; the pieces. Times of pieces are from the
+   sample of the plan. */
+#define HEAD 4
 #define EARLY ((real)0.5)  /* no torque arrives before this share of the assumed delay */
 #define LATEST ((real)1e6) /* largest count of samples since the start */
+#define ROUNDING ((real)1e-3) /* samples; an instant that is nearer to a sample is there */
 
 static int most_pieces(const stewart_law *law)
 {
@@ -31,6 +33,12 @@ static int replan_scratch(const stewart_law *law)
 static void replan_start(const stewart_law *law, real *memory)
 {
     stewart_fill(replan_memory(law), 0, memory);
+}
+
+/* Whether the first torque has acted for a period. */
+static int has_acted(const stewart_law *law, const stewart_outlook *outlook, const real *memory)
+{
+    return memory[2] >= outlook->eta / law->period + 2 - ROUNDING;
 }
 
 /* Rows of the pieces, and of the goal beyond their end; without pieces, of the caller's reference. */
@@ -67,6 +75,7 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
         return 0;
     memory[0] = 0;
     memory[1] = (real)(number + further);
+    memory[3] = has_acted(law, outlook, memory);
     stewart_copy(PIECE * (number + further), pieces, memory + HEAD);
     return 1;
 }
@@ -111,7 +120,7 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     memory[0] += 1;
     memory[2] = memory[2] < LATEST ? memory[2] + 1 : LATEST;
     /* While the delay is unknown, plan only before the first torque can have acted. */
-    const int early = memory[2] * law->period <= EARLY * outlook->eta;
+    const int early = (memory[2] - ROUNDING) * law->period <= EARLY * outlook->eta;
     if (!sample->goal || !(outlook->settled || early) || !stewart_all_finite(X, outlook->state))
         return 0;
     stewart_copy(X, outlook->state, states);
@@ -119,8 +128,7 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     look(law, memory, sample, 1, &outlook->eta, wanted);
     /* A known delay counts as found from the sample at which the first torque has acted for a period
        until the next plan. */
-    const real acted = outlook->eta / law->period + 2;
-    const int first = !law->observer->outlook && memory[2] >= acted && memory[2] - memory[0] < acted;
+    const int first = !law->observer->outlook && has_acted(law, outlook, memory) && !memory[3];
     if (!stewart_is_off(replan->size, states + X * outlook->until.number, wanted,
                         outlook->found || first))
         return 0;

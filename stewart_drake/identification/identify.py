@@ -42,6 +42,7 @@ WRONG: Final = 1.5  # chi^2 per value above which a fit is wrong and its interva
 USUAL_DELAY: Final = 0.1  # believed delay without any other information, s
 _FEW: Final = 15  # iterations over the segments that are fitted first
 _COARSE: Final = 0.1  # error of the coarse delay, s
+_SHORT: Final = 0.2  # share of a segment's length that is tried last
 
 
 @dataclass(frozen=True)
@@ -179,15 +180,17 @@ def identify(
         longest = max(pairs, key=lambda pair: len(pair[0].times))
         coarse = start.coarse_delay(*longest, mechanism, believed, tolerances.delay)
         # Long trajectories lead nowhere after a loss of the plate; and the coarse delay may err.
-        starts = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5), (coarse, 0.2)]
-    begun = [_begin(*starts[0], pairs, unknowns)]
-    found = _grown(begun[0])
-    for first in starts[1:]:
-        if found.chi2 <= WRONG:
+        starts = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5), (coarse, _SHORT)]
+    tried = list[_Begun]()
+    for first_delay, share in starts:
+        begun = _begin(unknowns.at_delay(first_delay), share, pairs, unknowns)
+        if share == _SHORT:  # a wrong drawing explains short segments, too
+            begun = _begin(begun.guess.values, 1.0, pairs, unknowns)
+        tried.append(begun)
+        if begun.chi2 <= WRONG and (found := _grown(begun)).chi2 <= WRONG:
             break
-        begun.append(_begin(*first, pairs, unknowns))
-        if begun[-1].chi2 == min(one.chi2 for one in begun):
-            found = _grown(begun[-1])
+    else:
+        found = _grown(min(tried, key=lambda one: one.chi2))
     while (halved := finer(found.problem, found.fit.guess)) is not None:
         found = found.refitted(halved)
     return Identification(logs, unknowns, found, middle)
@@ -199,10 +202,8 @@ class _Begun(NamedTuple):
     guess: Guess  # values found, and the measured first states of all segments
 
 
-def _begin(delay: float, share: float, pairs: Sequence[start.Pair], unknowns: Unknowns) -> _Begun:
-    """Fit the nearest segments, from a delay in s, with a share of the usual length."""
-    values = unknowns.mean.copy()
-    values[DELAY] = delay
+def _begin(values: Array, share: float, pairs: Sequence[start.Pair], unknowns: Unknowns) -> _Begun:
+    """Fit the nearest segments, from values of the unknowns, with a share of the usual length."""
     late = _COARSE if unknowns.std[DELAY] > 0 else 0.0
     whole, first = start.problem_of(pairs, unknowns, values, late, share=share)
     problem, guess = followed(whole, first)

@@ -78,6 +78,12 @@ class Unknowns:
         found[np.ix_(self.free, self.free)] = covariance
         return found
 
+    def at_delay(self, delay: float) -> Array:
+        """Return the means (NUM_UNKNOWNS,) with a delay in s."""
+        values = self.mean.copy()
+        values[DELAY] = delay
+        return values
+
     def without_encoders(self) -> "Unknowns":
         std = self.std.copy()
         std[OFFSETS] = 0.0

@@ -27,6 +27,10 @@ EARLY = 0.5
 """No torque arrives before this share of the assumed delay."""
 
 
+ROUNDING = 1e-3
+"""Periods; an instant that is nearer to a sample is there."""
+
+
 class FollowedMotion(NamedTuple):
     """Motion to follow.
 
@@ -109,7 +113,7 @@ class Replan:
         before = FollowedMotion(followed, path, False)
         timeline, c = belief.timeline, core()
         # While the delay is unknown, plan only before a torque can have acted.
-        early = motion.now + timeline.period <= EARLY * timeline.eta
+        early = motion.now + (1 - ROUNDING) * timeline.period <= EARLY * timeline.eta
         if not (belief.has_state and (belief.settled or early)):
             return before
         schedule = timeline.until_next(timeline.queue(in_flight))
@@ -118,7 +122,7 @@ class Replan:
         size = np.array(self.size, np.float64)
         # A known delay counts as found from the sample at which the first torque has acted for a
         # period until the next plan.
-        acted = timeline.eta + timeline.period - 1e-9
+        acted = timeline.eta + (1 - ROUNDING) * timeline.period
         planned = 0.0 if path is None else path[0, 0]
         first = math.isnan(belief.delay_mean) and motion.now >= acted > planned
         arrays = c.at(size), c.at(states[-1]), c.at(wanted)
