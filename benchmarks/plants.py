@@ -198,7 +198,7 @@ def measure(motion: Motion) -> dict[str, Curve]:
 
 
 def claims(curves: Sequence[dict[str, Curve]]) -> list[list[str]]:
-    """Return the rows that docs/figures.md quotes."""
+    """Return the ratios of each plant, as rows."""
     rows = []
     for motion, families in zip(motions(), curves, strict=True):
         exact, sap = families["exact, runge_kutta5"], families["SAP"]

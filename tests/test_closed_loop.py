@@ -70,7 +70,7 @@ def test_torques_arrive_after_the_delay_and_not_before(plant):
     ],
 )
 def test_the_tuner_does_not_save_the_faithful_controllers(controller, start, seconds):
-    """docs/figures.md says so of the paper's figures, which were reached with a tuner."""
+    """The paper's figures were reached with a tuner."""
     result = run(*start, "tuner.kind=ann", "duration=2.0", controller=controller)
     assert result.status == "left_workspace" and result.stopped is not None
     assert result.stopped.time == pytest.approx(seconds, abs=0.0051)

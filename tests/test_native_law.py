@@ -165,6 +165,10 @@ CASES = {
     "without estimator": ("motion_base", ("controller.estimate=[]",), None),
     "wrench": ("gravity", (*DIRTY, "controller.estimate=[payload,wrench]"), spoiled),
     "saturation": ("paper", (*DIRTY, "actuator.torque_limit=0.03", "controller.replan=0"), None),
+    "planned again": (
+        *("paper", (NOISE, "plant.payload_mass=0.4", "controller.period=0.05", "delay.steps=12")),
+        None,
+    ),
     "bad measurements": ("gravity", DIRTY, spoiled),
     "bad measurements without estimator": (
         *("gravity", (NOISE, "controller.estimate=[]"), spoiled),
@@ -264,6 +268,7 @@ def test_step_by_step_the_torques_are_those_of_python(case):
             bound = relative * np.abs(a[np.isfinite(a)]).max(initial=0.0) + absolute
             assert np.nanmax(np.abs(a - b), initial=0.0) <= bound, k
     assert max(gaps) <= 1e-9 * peak
+    assert case != "planned again" or pair.one.path is not None
     for count in HAPPENED.get(case, ()):
         assert getattr(pair.one.counts, count) > 0
 

@@ -84,7 +84,7 @@ REPLAN = 0.4
 """Duration of a plan back onto the reference with a delay estimator, s."""
 TOLERATED = 0.004
 """Largest standard deviation of the torques' timing at which their weight is not raised, as a share
-of the loop's time constant: 1 ms for the motion of `paper`."""
+of the loop's time constant: 0.7 ms for the motion of `paper`."""
 BIAS_SHARE = 0.05
 """Prior standard deviation of torque bias and of damping at 1 rad/s, as a share of the torque that
 the motion takes."""
