@@ -273,7 +273,10 @@ static void predict(const stewart_law *law, const stewart_outlook *outlook, cons
     stewart_copy(6, integral, a->integral);
     for (int i = 0; i < 6; i++)
         before[i] = outlook->state[i] - followed[i];
-    stewart_predict(&law->machine, outlook->theta, schedule, states, states + X);
+    if (law->fraction == 0 && outlook->predicted && !isnan(outlook->predicted[0]))
+        stewart_copy(X * (schedule->number + 1), outlook->predicted, states);
+    else
+        stewart_predict(&law->machine, outlook->theta, schedule, states, states + X);
     for (int k = 0; k < outlook->samples; k++) {
         const real *wanted = followed + ROW * (k + 1), *end = states + X * each * (k + 1);
         const int waits = stewart_at_limit(&law->machine, each, schedule->torques + U * each * k);
@@ -363,6 +366,9 @@ static int respond(const stewart_law *law, real *memory, const stewart_outlook *
     return 0;
 }
 
+/* Whether a planner predicts across a known delay, as feedback does. */
+static int is_known(const stewart_law *law) { return law->planner && !law->observer->outlook; }
+
 int stewart_step_scratch(const stewart_law *law)
 {
     const stewart_channel *channel = law->channel;
@@ -379,10 +385,12 @@ int stewart_step_scratch(const stewart_law *law)
     if (planned > channelled)
         channelled = planned;
     const int holding = 3 * rows + law->rows + (used > channelled ? used : channelled);
+    const int predicted = is_known(law) ? X * (queue + 1) : 0;
     const int observing = law->observer->scratch(law);
     /* An estimated delay has its own instants and torques, of the preview and of the last period. */
     const int outlook = law->observer->outlook ? (U + 2) * law->rows + 2 * (U + 1) * 8 : telling;
-    return law->measured + outlook + behind + (holding > observing ? holding : observing);
+    return law->measured + outlook + behind + predicted +
+           (holding > observing ? holding : observing);
 }
 
 int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
@@ -398,6 +406,11 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
     if (law->channel)
         law->channel->update(law, sent, sample->report, in_flight, scratch);
     estimate(law, memory, sample, &outlook, &scratch);
+    outlook.predicted = NULL;
+    if (is_known(law)) {
+        outlook.predicted = stewart_take(&scratch, X * (outlook.until.number + 1));
+        outlook.predicted[0] = (real)NAN;
+    }
     if (law->planner &&
         law->planner->follow(law, memory + l->planner.at, &outlook, sample, scratch)) {
         stewart_fill(6, 0, memory + l->error.at); /* there is none left to feed back */

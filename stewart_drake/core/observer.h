@@ -38,6 +38,7 @@ typedef struct {
     const real *times;      /* (samples) s from now */
     int pending;            /* 1 if the newest torque still acts then */
     int limited;            /* whether a torque since the last sample was at the limit */
+    real *predicted; /* (until.number + 1, 12) states that a planner fills in, NULL without; first NaN */
 } stewart_outlook;
 
 /* A kind of observer. Its memory, a part of the law's, begins with the state (12), which may be set. */

@@ -75,7 +75,7 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
         return 0;
     memory[0] = 0;
     memory[1] = (real)(number + further);
-    memory[3] = has_acted(law, outlook, memory);
+    memory[3] = (real)has_acted(law, outlook, memory);
     stewart_copy(PIECE * (number + further), pieces, memory + HEAD);
     return 1;
 }
@@ -116,7 +116,9 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
                          const stewart_sample *sample, stewart_scratch scratch)
 {
     const stewart_replan *replan = law->planning;
-    real *states = stewart_take(&scratch, X * (outlook->until.number + 1)), wanted[ROW];
+    real wanted[ROW], *states = outlook->predicted;
+    if (!states)
+        states = stewart_take(&scratch, X * (outlook->until.number + 1));
     memory[0] += 1;
     memory[2] = memory[2] < LATEST ? memory[2] + 1 : LATEST;
     /* While the delay is unknown, plan only before the first torque can have acted. */
@@ -128,7 +130,7 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     look(law, memory, sample, 1, &outlook->eta, wanted);
     /* A known delay counts as found from the sample at which the first torque has acted for a period
        until the next plan. */
-    const int first = !law->observer->outlook && has_acted(law, outlook, memory) && !memory[3];
+    const int first = !law->observer->outlook && has_acted(law, outlook, memory) && !(memory[3] > 0);
     if (!stewart_is_off(replan->size, states + X * outlook->until.number, wanted,
                         outlook->found || first))
         return 0;

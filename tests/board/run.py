@@ -73,13 +73,14 @@ class Row:
 
 
 OUTLIERS: Final = "sensor.faults=[{kind: spike, size: 0.02, share: 0.3, from: 3.0, to: 10.0}]"
+FOLLOWS: Final = ("start=on_reference", "queue=reference")  # so that no plan is made in flight
 WITHOUT: Final = ("controller.estimate=[]",)
 ENCODERS: Final = ("sensor.kind=encoders",)
 DELAY: Final = ("controller.delay_estimator=constant", "controller.delay_steps=6")
 NETWORK: Final = ("link.kind=network", "link.loss=0.1")
 ROWS: Final = (
     Row("ideal", M7, median=2.1, workspace=67248),
-    Row("ideal, outliers in measurements", M7, (OUTLIERS,), most=5),
+    Row("ideal, outliers in measurements", M7, (*FOLLOWS, OUTLIERS), most=5),
     Row("ideal, without estimator", M7, WITHOUT),
     Row("ideal, without estimator", M4, WITHOUT, median=1.8),
     Row("ideal", M4, median=4),
