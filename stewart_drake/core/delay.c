@@ -424,7 +424,7 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
     }
     const stewart_kalman filter = {
         n, m, std > d->period / 100 ? ITERATIONS : FEW, a->mean, L, lower, upper, a,
-        whitened_rows, stewart_instant_settle, NULL, NULL};
+        whitened_rows, stewart_instant_settle, 0, NULL, NULL};
     if (!stewart_kalman_update(&filter, xi, root, &distance, &spread, scratch))
         return 0;
     if (!(distance <= d->gate)) /* or NaN */

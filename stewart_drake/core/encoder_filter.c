@@ -235,7 +235,7 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
     stewart_read(s.encoders, a->values, s.shown, history->last, history->still, &s.reading, scratch);
     const stewart_kalman update = {a->n,     LEGS * s.encoders->nodes, ITERATIONS, a->prior->mean,
                                    a->prior->root, f->lower, f->upper, &s, rows_of_legs, settle_legs,
-                                   NULL, NULL};
+                                   0, NULL, NULL};
     if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &spread, scratch))
         return 0;
     *a->after->squares += distance;

@@ -13,6 +13,7 @@
 #define MOST_CHANGED ((real)0.01) /* the largest for a single outlier */
 #define MOST_AGREEING ((real)0.3) /* the largest if the last outlier agrees, or the prior is untested */
 #define YOUNG 3                   /* measurements that test the prior */
+#define HOPELESS 100              /* gates beyond which no iteration explains a measurement */
 
 int stewart_posterior_size(int n, int m)
 {
@@ -92,6 +93,33 @@ static int linearize(void *about, const real *xi, real *last, stewart_scratch sc
                                s->fourth_order, s->states, s->H, scratch);
 }
 
+/* Predict and linearise from the prior's mean. Attempts at the same period often begin with the same. */
+static int begin(Sample *s, const real *xi, real *end, stewart_scratch scratch)
+{
+    const int n = s->attempt->n, pieces = s->attempt->period->schedule.number;
+    real *kept = s->attempt->kept, *mean = kept + 1, *last = mean + n, *states = last + X;
+    real *H = states + X * pieces;
+    int same = kept[0] == (real)s->fourth_order;
+    for (int i = 0; i < n && same; i++)
+        same = mean[i] == xi[i];
+    if (same) {
+        stewart_copy(X, last, end);
+        stewart_copy(X * pieces, states, s->states);
+        stewart_copy(X * n * pieces, H, s->H);
+        return 1;
+    }
+    if (!predict(s, xi, end) || !linearize(s, xi, s->instant.H, scratch))
+        return 0;
+    kept[0] = (real)s->fourth_order;
+    stewart_copy(n, xi, mean);
+    stewart_copy(X, end, last);
+    stewart_copy(X * pieces, s->states, states);
+    stewart_copy(X * n * pieces, s->H, H);
+    return 1;
+}
+
+static int kept_numbers(int n, int pieces) { return 1 + n + X + X * (n + 1) * pieces; }
+
 /* Learn the noise in `after` from whitened innovations (m) with their variances. */
 static void learn(const Sample *s, const real *innovations, const real *variances)
 {
@@ -117,7 +145,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     const int n = a->n, m = f->sensing->size, pieces = a->period->schedule.number;
     /* Corrections of known parameters are too small to need F to fourth order. */
     Sample s = {.attempt = a, .fourth_order = !is_known(f, prior->root, KNOWN)};
-    real *xi = a->after->mean, distance = 0, spread;
+    real *xi = a->after->mean, spread;
     real *innovations = stewart_take(&scratch, m), *variances = stewart_take(&scratch, m);
     s.instant = (stewart_instant){f->sensing, a->values, n,  a->end,  NULL,
                                   NULL,       NULL,      &s, predict, linearize};
@@ -126,7 +154,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     s.states = stewart_take(&scratch, X * pieces);
     s.H = stewart_take(&scratch, X * n * pieces);
     a->last = s.instant.H = s.H + X * n * (pieces - 1);
-    if (!predict(&s, xi, a->end) || !linearize(&s, xi, s.instant.H, scratch))
+    if (!begin(&s, xi, a->end, scratch))
         return 0;
     stewart_attempt_predicted(a);
     if (!a->values)
@@ -134,14 +162,15 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     if (!stewart_innovation_root(f->sensing, a->end, 0, NULL, a->drift, s.instant.C, scratch))
         return 0;
     const stewart_kalman update = {n, m, ITERATIONS, prior->mean, prior->root, f->lower, f->upper, &s,
-                                   stewart_instant_rows, stewart_instant_settle, innovations, variances};
-    if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &spread, scratch))
+                                   stewart_instant_rows, stewart_instant_settle, a->hopeless,
+                                   innovations, variances};
+    if (!stewart_kalman_update(&update, xi, a->after->root, &a->distance, &spread, scratch))
         return 0;
-    if (!(distance <= f->gate)) /* or NaN */
+    if (!(a->distance <= f->gate)) /* or NaN */
         return 0;
-    *a->after->squares += distance;
+    *a->after->squares += a->distance;
     *a->after->values += (real)m;
-    a->likelihood = -(distance + spread) / 2;
+    a->likelihood = -(a->distance + spread) / 2;
     for (int i = 0; i < m; i++)
         a->likelihood -= REAL(log)(s.instant.C[(m + 1) * i]);
     learn(&s, innovations, variances);
@@ -226,6 +255,18 @@ static void accept(int n, int m, const stewart_posterior *found, stewart_posteri
     *now->noise = *found->noise;
 }
 
+/* Compute `after` from `now` with a share of `usual_std` added, in `before`. */
+static int attempt_changed(stewart_attempt *a, const stewart_posterior *now,
+                           const stewart_posterior *before, real share, stewart_scratch scratch)
+{
+    real std[STEWART_MAX_ESTIMATED];
+    for (int i = 0; i < a->n - X; i++)
+        std[i] = share * a->filter->usual_std[i];
+    stewart_copy(stewart_posterior_size(a->n, a->filter->sensing->size), now->mean, before->mean);
+    stewart_widen_root(a->n, std, before->root, scratch);
+    return attempt(a, scratch);
+}
+
 /* Compute `after` of an outlier that the model explains after all, from `now` with more noise or widened
    variances in `before`: a torque came far too early or late, or parameters changed by the least share
    that explains it. Returns 0 if neither does. */
@@ -233,23 +274,21 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
                    real most, stewart_scratch scratch)
 {
     const stewart_filter *filter = a->filter;
-    const int p = a->n - X, size = stewart_posterior_size(a->n, filter->sensing->size);
-    real std[STEWART_MAX_ESTIMATED], late = -(real)INFINITY;
+    const int size = stewart_posterior_size(a->n, filter->sensing->size);
+    real late = -(real)INFINITY;
     int found = 0;
     a->prior = before;
+    a->hopeless = HOPELESS * filter->gate;
     stewart_copy(size, now->mean, before->mean);
     if (filter->learns_timing && before->noise->timing < UNTIMELY) {
         before->noise->timing = UNTIMELY;
         if (attempt(a, scratch))
             late = a->likelihood;
     }
-    for (real share = CHANGED; !found && share <= most; share *= REAL(sqrt)(10)) {
-        for (int i = 0; i < p; i++)
-            std[i] = share * filter->usual_std[i];
-        stewart_copy(size, now->mean, before->mean);
-        stewart_widen_root(a->n, std, before->root, scratch);
-        found = attempt(a, scratch);
-    }
+    /* The largest share has the least distance: if that one is hopeless, all are. */
+    if (attempt_changed(a, now, before, most, scratch) || a->distance <= a->hopeless)
+        for (real share = CHANGED; !found && share <= most; share *= REAL(sqrt)(10))
+            found = attempt_changed(a, now, before, share, scratch);
     if (isfinite(late) && !(found && a->likelihood >= late)) {
         stewart_copy(size, now->mean, before->mean);
         before->noise->timing = UNTIMELY;
@@ -258,6 +297,7 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
         a->after->noise->timing = 2 * (now->noise->timing > ONCE ? now->noise->timing : ONCE);
     }
     a->prior = now;
+    a->hopeless = 0;
     return found;
 }
 
@@ -274,6 +314,8 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
     real outliers = 1;
     stewart_attempt a = {.filter = filter, .n = n, .period = period, .prior = &now,
                          .values = values, .history = history, .after = &after};
+    a.kept = stewart_take(&scratch, kept_numbers(n, period->schedule.number));
+    a.kept[0] = (real)NAN;
     int fits = values && attempt(&a, scratch);
     if (values && filter->jump_std && (!fits || a.gated)) {
         if (jump(&a, &now, &before, scratch)) {
@@ -324,5 +366,5 @@ int stewart_filter_scratch(const stewart_filter *filter, int torques)
     const int step = legs ? legs->scratch(filter, torques) : sample;
     const int within = step + stewart_transitions_scratch(p) + 2 * n * n + (X + 2) * n;
     const int start = X * X + m + LEGS * (6 + p) + (legs ? legs->start_scratch(filter) : 0);
-    return 2 * stewart_posterior_size(n, m) + (within > start ? within : start);
+    return 2 * stewart_posterior_size(n, m) + kept_numbers(n, torques) + (within > start ? within : start);
 }

@@ -15,8 +15,12 @@ typedef struct {
     real end[STEWART_STATES];   /* state at the end of the period */
     real drift[STEWART_STATES]; /* standard deviation of the model's error there */
     real kicks[STEWART_STATES]; /* variance of `end` by the torques' timing, at t = 1 (noise.h) */
+    real distance;              /* of the last innovation, as of `stewart_kalman` */
     real likelihood;            /* log of the density of the values, without a constant */
     const real *last;           /* (12, n) d[end]/d[xi] */
+    real *kept; /* of the last prediction from a prior: 1 if F was of fourth order, 0 if not, NaN for none;
+                   the prior's mean, the state at the end, states, H (see filter.c) */
+    real hopeless;              /* as of `stewart_kalman` */
     int left_out;               /* why values were left out, bits as of a `fault` */
     int gated;                  /* number of legs with a value that does not fit */
 } stewart_attempt;

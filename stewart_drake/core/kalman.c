@@ -287,6 +287,8 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
         for (int i = 0; i < n; i++)
             *spread += 2 * REAL(log)(REAL(fabs)(R[(N + 1) * i]));
         *distance = R[N * n + n] * R[N * n + n];
+        if (round == 0 && filter->hopeless > 0 && !(*distance <= filter->hopeless)) /* or NaN */
+            return 0;
         for (int i = 0; i < n; i++) { /* root R = L, row by row */
             const real *l = filter->root + n * i;
             real *x = root + n * i;

@@ -23,13 +23,14 @@ typedef struct {
     void *model;
     int (*rows)(void *model, const real *xi, real *e, real *H, stewart_scratch scratch);
     int (*settle)(void *model, const real *xi, const real *better, stewart_scratch scratch);
+    real hopeless; /* distance of the first iteration above which the update is given up; 0: none is */
     real *innovations, *variances; /* (most) results, or NULL: nu and the diagonal of S, whitened by C */
 } stewart_kalman;
 
 /* Compute the mean xi (n), from a first guess in its place, and the root (n, n) of its covariance, which
    must not be that of the prior. `distance` is nu' S^-1 nu of the last innovation
    nu = e + H (xi - mean), with S = H P H' + R, and `spread` is ln |S| - ln |R|. Returns 0 if there is no
-   prediction, or for NaN in a bounded mean; the caller checks all other numbers.
+   prediction, for NaN in a bounded mean, or if it is given up; the caller checks all other numbers.
 
    Scratch: `stewart_kalman_scratch` numbers, and what the model takes. */
 int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, real *distance,

@@ -96,7 +96,7 @@ struct stewart_law {
     real fraction;     /* of a period, that the assumed delay is beyond `steps` */
     int steps;         /* of the assumed delay, whole periods */
     int kept;          /* torques that are remembered beyond the delay's */
-    int longest_wait;  /* for a late measurement, periods */
+    int longest_wait;  /* periods: the greatest age of a measurement */
     int silence;       /* samples at the start at which nothing is fed back */
     real tolerated_timing; /* s, deviation of single torques from which on their weight grows; 0: it is given */
     int measured;      /* numbers of a measurement */

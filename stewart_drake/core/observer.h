@@ -8,7 +8,7 @@
 /* Problems of a step that the law compensates; counts[i] of the memory is of bit i. */
 enum stewart_status {
     STEWART_RICCATI_FAILURE = 1,      /* no new gain: the last one was used */
-    STEWART_UNREACHABLE = 2,          /* no model where the torque will act: feedforward alone */
+    STEWART_UNREACHABLE = 2,          /* the predicted pose is out of the workspace: feedforward alone */
     STEWART_NONFINITE_TORQUE = 4,     /* not a number: the last torque was used */
     STEWART_MEASUREMENT_MISSING = 8,  /* replaced, at least in part, by the model's prediction */
     STEWART_MEASUREMENT_FROZEN = 16,

@@ -98,6 +98,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "REAL": "float" if single else "double",
         "ESTIMATES": _estimates(scenario),
         "SILENCE": str(getattr(law, "silence", 0)),
+        "WAIT": str(getattr(law, "longest_wait", 0)),
         "TESTS": "stewart_test protocol_test" if over_udp else "stewart_test",
         "TEST_OBJECTS": "stewart_motion.o" if recorded.moves else "",
     }
