@@ -367,7 +367,7 @@ static int respond(const stewart_law *law, real *memory, const stewart_outlook *
 }
 
 /* Whether a planner predicts across a known delay, as feedback does. */
-static int is_known(const stewart_law *law) { return law->planner && !law->observer->outlook; }
+static int shares_prediction(const stewart_law *law) { return law->planner && !law->observer->outlook; }
 
 int stewart_step_scratch(const stewart_law *law)
 {
@@ -385,7 +385,7 @@ int stewart_step_scratch(const stewart_law *law)
     if (planned > channelled)
         channelled = planned;
     const int holding = 3 * rows + law->rows + (used > channelled ? used : channelled);
-    const int predicted = is_known(law) ? X * (queue + 1) : 0;
+    const int predicted = shares_prediction(law) ? X * (queue + 1) : 0;
     const int observing = law->observer->scratch(law);
     /* An estimated delay has its own instants and torques, of the preview and of the last period. */
     const int outlook = law->observer->outlook ? (U + 2) * law->rows + 2 * (U + 1) * 8 : telling;
@@ -407,7 +407,7 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
         law->channel->update(law, sent, sample->report, in_flight, scratch);
     estimate(law, memory, sample, &outlook, &scratch);
     outlook.predicted = NULL;
-    if (is_known(law)) {
+    if (shares_prediction(law)) {
         outlook.predicted = stewart_take(&scratch, X * (outlook.until.number + 1));
         outlook.predicted[0] = (real)NAN;
     }

@@ -117,11 +117,7 @@ NEEDS: Final = (
         _needs(f"prior.{name}", "controller.estimate", name)
         for name in ("torque_bias", "payload", "damping")
     ),
-    _needs(
-        "prior.rates model_error timing_std",
-        "controller.estimate",
-        _CONSTANTS,
-    ),
+    _needs("prior.rates model_error timing_std", "controller.estimate", _CONSTANTS),
     _needs("prior.rates", "sensor.kind", "encoders"),
     _needs("timing_std", "controller.command", "torque"),
     _needs("prior.offsets", "controller.estimate", "offsets"),

@@ -11,20 +11,6 @@ static const real sent[STEPS][@TORQUES@ * STEWART_MOTORS] = {
 @REPORTS@
 #if @MOVES@ /* the law chooses the instants of the reference */
 #include "stewart_motion.h"
-
-static void look(void *about, int number, const real *times, real *rows)
-{
-    for (int i = 0; i < number; i++)
-        stewart_reference(fmax(0, *(const double *)about + (double)times[i]),
-                          rows + STEWART_REFERENCE * i);
-}
-
-static void look_back(void *about, int number, const real *times, real *rows)
-{
-    for (int i = 0; i < number; i++)
-        stewart_goal(fmax(0, *(const double *)about + (double)times[i]),
-                     rows + STEWART_REFERENCE * i);
-}
 #else
 static real preview[STEPS][STEWART_PREVIEW * STEWART_REFERENCE] = {
     @PREVIEW_ROWS@};
@@ -53,8 +39,8 @@ static int answer(int k, real *torque)
     sample.weights[1] = weights[k][1];
 #if @MOVES@
     double now = k * (double)stewart_configuration.period;
-    sample.reference = look;
-    sample.goal = look_back;
+    sample.reference = stewart_look_ahead;
+    sample.goal = stewart_look_back;
     sample.about = &now;
 #else
     sample.reference = stewart_given_rows;

@@ -176,21 +176,6 @@ static void correct(controller *c, unsigned k)
                   c->last.history, acted[0]);
 }
 
-/* Rows of the motion at instants from a sample on. */
-static void look_ahead(void *about, int number, const real *times, real *rows)
-{
-    const double now = *(const double *)about;
-    for (int i = 0; i < number; i++)
-        stewart_reference(fmax(0, now + (double)times[i]), rows + i * STEWART_REFERENCE);
-}
-
-static void look_back(void *about, int number, const real *times, real *rows)
-{
-    const double now = *(const double *)about;
-    for (int i = 0; i < number; i++)
-        stewart_goal(fmax(0, now + (double)times[i]), rows + i * STEWART_REFERENCE);
-}
-
 /* The law at sample k, its torque within the machine's limit. */
 static void compute(controller *c, real *memory, unsigned k, const real *measurement, int age,
                     real *torque)
@@ -198,7 +183,8 @@ static void compute(controller *c, real *memory, unsigned k, const real *measure
     const stewart_law *law = &stewart_configuration;
     double now = k * (double)law->period;
     real limit = (real)fmin(c->last.torque_limit, (double)law->machine.torque_limit);
-    stewart_sample sample = {.measurement = measurement, .age = age, .reference = look_ahead, .goal = look_back};
+    stewart_sample sample = {.measurement = measurement, .age = age, .reference = stewart_look_ahead};
+    sample.goal = stewart_look_back;
     sample.about = &now;
     sample.weights[0] = stewart_weights[0];
     sample.weights[1] = stewart_weights[1];
