@@ -21,8 +21,8 @@ import stewart_drake as sd
 from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.law.core_law import Serving
 from stewart_drake.law.cost import QuadraticCost
-from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import InverseDynamicsFeedforward
+from stewart_drake.law.nominal import DesignModel
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictors import NonlinearPredictor
 from stewart_drake.loop import controller

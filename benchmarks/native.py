@@ -14,12 +14,11 @@ from pydrake.math import DiscreteAlgebraicRiccatiEquation
 import stewart_drake as sd
 from stewart_drake.export.recording import record
 from stewart_drake.law.core_law import CoreLqi
-from stewart_drake.law.delay_model import delayed_model
-from stewart_drake.law.error_model import linear_model
-from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.delay_model import delayed_model, linear_model
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import lqr, lqr_by_doubling, reduced_gain
+from stewart_drake.law.sensing import Measurement
 
 MECHANISM = sd.load_mechanism("paper")
 

@@ -14,8 +14,13 @@ from pydrake.math import DiscreteAlgebraicRiccatiEquation
 from scipy.linalg import solve_discrete_are
 
 import stewart_drake as sd
-from stewart_drake.law.delay_model import ChainModel, DelayedModel, chain, delayed_model
-from stewart_drake.law.error_model import double_integrators
+from stewart_drake.law.delay_model import (
+    ChainModel,
+    DelayedModel,
+    chain,
+    delayed_model,
+    double_integrators,
+)
 from stewart_drake.law.riccati import augmented_gain, full_gain, reduced_gain
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.types import Array

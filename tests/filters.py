@@ -9,11 +9,18 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import Estimate
 from stewart_drake.law.compiled import machine_of, numbers
-from stewart_drake.law.encoder_sensing import EncoderSensing, encoders_of
 from stewart_drake.law.filter_settings import FilterSettings
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import filter_settings_of
-from stewart_drake.law.sensing import FAULTS, Sensing, StateSensing, described, state_sensor
+from stewart_drake.law.sensing import (
+    FAULTS,
+    EncoderSensing,
+    Sensing,
+    StateSensing,
+    described,
+    encoders_of,
+    state_sensor,
+)
 from stewart_drake.types import Array
 
 

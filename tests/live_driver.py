@@ -8,8 +8,8 @@ import numpy as np
 
 from stewart_drake.law.channel import Packets, Report
 from stewart_drake.law.core_law import serving
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import KnownMotion
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.live.endpoint import Address, Endpoint, Session, now
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.protocol import (

@@ -7,25 +7,24 @@ import numpy as np
 import pytest
 
 from stewart_drake.law import cost as cost_module
-from stewart_drake.law.delay_model import delayed_model
-from stewart_drake.law.design_models import MultibodyModel
-from stewart_drake.law.error_model import (
+from stewart_drake.law.delay_model import (
+    delayed_model,
     double_integrators,
     linear_model,
 )
-from stewart_drake.law.holds import (
+from stewart_drake.law.feedforward import (
     GAUSS_NODES,
     held_torques,
     means_and_changes,
     rates_at_samples,
     state_within_hold,
 )
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts, Memory
 from stewart_drake.law.motion import Preview
-from stewart_drake.law.nominal import TorqueLimit
+from stewart_drake.law.nominal import MultibodyModel, TorqueLimit
 from stewart_drake.law.predictors import LinearPredictor, NonlinearPredictor
 from stewart_drake.law.riccati import RiccatiError, full_gain
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.startup import weight_scales
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.preparation import assemble, prepare

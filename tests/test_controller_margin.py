@@ -12,8 +12,8 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.resources import resolve
 from stewart_drake.law.delay_model import sample, sample_in_steps
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.stability import fastest_pole
 from stewart_drake.loop.cautions import cautions_after, cautions_before, coarse_step
 from stewart_drake.loop.controller_margin import (

@@ -11,8 +11,7 @@ import xarray as xr
 from stewart_drake.cli import main
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.delay_model import delayed_model
-from stewart_drake.law.error_model import linear_model
+from stewart_drake.law.delay_model import delayed_model, linear_model
 from stewart_drake.law.riccati import reduced_gain
 from stewart_drake.loop.bulk import run_in_bulk, samples_of
 from stewart_drake.loop.simulation import simulate

@@ -16,10 +16,9 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.compiled import machine_of
 from stewart_drake.law.filter_settings import filter_settings
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver, DelaySettings, part_of
-from stewart_drake.law.sensing import StateSensing, state_sensor
+from stewart_drake.law.sensing import Measurement, StateSensing, state_sensor
 from stewart_drake.law.timeline import Arrivals, Timeline
 from stewart_drake.loop.controller_margin import controller_margin
 from stewart_drake.loop.preparation import prepare

@@ -10,11 +10,13 @@ from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.delay_model import chain, delayed_model, sample
-from stewart_drake.law.error_model import (
+from stewart_drake.law.delay_model import (
     ContinuousModel,
+    chain,
+    delayed_model,
     double_integrators,
     linear_model,
+    sample,
     with_integral,
 )
 from stewart_drake.mechanism.assembly import torque_map

@@ -34,8 +34,7 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.files import resources
 from stewart_drake.files.yamlio import load_yaml
-from stewart_drake.law.delay_model import chain, delayed_model
-from stewart_drake.law.error_model import double_integrators, linear_model
+from stewart_drake.law.delay_model import chain, delayed_model, double_integrators, linear_model
 from stewart_drake.law.riccati import reduced_gain
 from stewart_drake.loop.controller import DelayLqiController
 from stewart_drake.loop.diagram import ClosedLoop

@@ -10,11 +10,10 @@ from scipy.optimize import least_squares
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import Estimate
-from stewart_drake.law.encoder_sensing import EncoderSensing, encoders_of, node_shares
 from stewart_drake.law.filter_settings import filter_settings, usual_parameters
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver
+from stewart_drake.law.sensing import EncoderSensing, Measurement, encoders_of, node_shares
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.scenario.calibration import OFFSETS

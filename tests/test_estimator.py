@@ -14,10 +14,9 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.compiled import machine_of
 from stewart_drake.law.filter_settings import FilterSettings, ParameterSet
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver
-from stewart_drake.law.sensing import StateSensing
+from stewart_drake.law.sensing import Measurement, StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import PARAMETER_UNITS, PARAMETERS, PAYLOAD

@@ -9,10 +9,9 @@ import stewart_drake as sd
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import THETA
 from stewart_drake.law.filter_settings import filter_settings
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver
-from stewart_drake.law.sensing import StateSensing
+from stewart_drake.law.sensing import Measurement, StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.delay import Delay

@@ -7,8 +7,13 @@ from hypothesis import strategies as st
 from pydrake.systems.primitives import IsControllable, LinearSystem
 from scipy.linalg import block_diag, expm
 
-from stewart_drake.law.delay_model import chain, delayed_model, sample
-from stewart_drake.law.error_model import double_integrators, with_integral
+from stewart_drake.law.delay_model import (
+    chain,
+    delayed_model,
+    double_integrators,
+    sample,
+    with_integral,
+)
 from stewart_drake.law.hautus import TOLERANCE, cluster, hautus, scaled
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.studies.hautus import describe, state_labels

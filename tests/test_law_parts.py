@@ -8,18 +8,23 @@ import pytest
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import Belief
-from stewart_drake.law.design_models import MultibodyModel, PaperModel
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
     InverseDynamicsFeedforward,
     NoFeedforward,
+    held_torques,
+    means_and_changes,
 )
-from stewart_drake.law.holds import held_torques, means_and_changes
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
-from stewart_drake.law.nominal import FINE_SUBSTEP_FACTOR, NominalPlant, TorqueLimit
+from stewart_drake.law.nominal import (
+    FINE_SUBSTEP_FACTOR,
+    MultibodyModel,
+    NominalPlant,
+    PaperModel,
+    TorqueLimit,
+)
 from stewart_drake.law.observers import CoreObserver
-from stewart_drake.law.sensing import FirstState, StateSensing
+from stewart_drake.law.sensing import FirstState, Measurement, StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.delay import Delay

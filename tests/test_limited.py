@@ -12,8 +12,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.catch_up import LEAST_ERROR_SHARE
 from stewart_drake.law.clear_space import ClearSpace
 from stewart_drake.law.core_law import serving
-from stewart_drake.law.feedforward import InverseDynamicsFeedforward
-from stewart_drake.law.holds import GAUSS_NODES, mean_torques
+from stewart_drake.law.feedforward import GAUSS_NODES, InverseDynamicsFeedforward, mean_torques
 from stewart_drake.law.horizon import HoldModel, HorizonCost, condense, riccati
 from stewart_drake.law.horizon_qp import NEAR, QpError, problem_of, solve_by_daqp
 from stewart_drake.law.limited import LimitedLqi

@@ -8,9 +8,10 @@ import pytest
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 
 import stewart_drake as sd
-from stewart_drake.law.delay_model import chain, delayed_model
-from stewart_drake.law.error_model import (
+from stewart_drake.law.delay_model import (
     ContinuousModel,
+    chain,
+    delayed_model,
     double_integrators,
     linear_model,
 )

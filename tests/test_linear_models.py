@@ -6,7 +6,7 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.error_model import ContinuousModel
+from stewart_drake.law.delay_model import ContinuousModel
 from stewart_drake.law.stability import LinearLoop, loop_gain, sensitivity, spectral_radius
 from stewart_drake.loop.controller_margin import controller_margin, loop_at, state_spaces
 from stewart_drake.loop.preparation import prepare

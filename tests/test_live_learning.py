@@ -10,7 +10,7 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.law.core_law import serving
 from stewart_drake.law.learned import LearnedSignal
-from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servos import rise
 from stewart_drake.live import design as designing
 from stewart_drake.live import learning

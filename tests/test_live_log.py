@@ -15,8 +15,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import KnownMotion
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.live.log import LiveRecord, RowFile
 from stewart_drake.live.machine import Machine
 from stewart_drake.live.session import drive, prepare_session

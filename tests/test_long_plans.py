@@ -7,7 +7,7 @@ import pytest
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.catch_up import Model, plan_catch_up
-from stewart_drake.law.holds import mean_torques
+from stewart_drake.law.feedforward import mean_torques
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.startup import BLOCK, choose_substeps
 from stewart_drake.loop.preparation import prepare

@@ -11,12 +11,11 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law import core_law
 from stewart_drake.law.core_law import CompiledLaw, CoreLqi, serving, uncovered
-from stewart_drake.law.delay_model import delayed_model
-from stewart_drake.law.error_model import linear_model
-from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.delay_model import delayed_model, linear_model
 from stewart_drake.law.motion import KnownMotion, Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError, lqr, lqr_by_doubling, reduced_gain
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.law_design import compose_law, control_law
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.loading import load_scenario

@@ -8,9 +8,8 @@ import pytest
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.core_law import uncovered
-from stewart_drake.law.delay_model import chain, delayed_model
-from stewart_drake.law.error_model import linear_model
-from stewart_drake.law.pd import pd_gains
+from stewart_drake.law.cost import pd_gains
+from stewart_drake.law.delay_model import chain, delayed_model, linear_model
 from stewart_drake.law.stability import closed_loop, fastest_pole, spectral_radius
 from stewart_drake.loop.law_design import compose_law, pd_gain
 from stewart_drake.loop.preparation import prepare

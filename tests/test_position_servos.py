@@ -11,8 +11,8 @@ from scipy.optimize import minimize_scalar
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.core_law import CoreServo, uncovered
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.bulk import ending_of, run_in_bulk
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import commands_in_flight, compose_servo_law, servo_law

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from stewart_drake.law.delay_model import DelayedModel, delayed_model
-from stewart_drake.law.error_model import double_integrators
+from stewart_drake.law.delay_model import DelayedModel, delayed_model, double_integrators
 from stewart_drake.law.riccati import augmented_gain
 from stewart_drake.loop.results import accumulated_error
 from stewart_drake.mechanism.assembly import torque_map

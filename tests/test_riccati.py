@@ -8,8 +8,13 @@ from numpy.typing import NDArray
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law import riccati
-from stewart_drake.law.delay_model import DelayedModel, chain, delayed_model
-from stewart_drake.law.error_model import double_integrators, linear_model
+from stewart_drake.law.delay_model import (
+    DelayedModel,
+    chain,
+    delayed_model,
+    double_integrators,
+    linear_model,
+)
 from stewart_drake.law.riccati import RiccatiError, augmented_gain, full_gain, lqr, reduced_gain
 from stewart_drake.law.stability import is_stable
 from stewart_drake.mechanism.assembly import torque_map

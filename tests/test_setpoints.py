@@ -7,8 +7,8 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.export.setpoints import ServoUnits, load_units, softened
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import compose_servo_law
 from stewart_drake.scenario.signals import POSE, RATES

@@ -16,9 +16,9 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.core_law import serving
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.controller import DelayLqiController, Reference
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.exact import ExactPlant

@@ -11,12 +11,12 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.channel import Report
 from stewart_drake.law.core_law import uncovered
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import KnownMotion, Motion, between
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.planner import Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario

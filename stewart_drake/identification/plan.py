@@ -29,7 +29,7 @@ from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
 from stewart_drake.identification.start import segment_length, segments_of
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import DELAY, NAMES, UNITS, Unknowns, unknowns_of
-from stewart_drake.law.holds import mean_torques
+from stewart_drake.law.feedforward import mean_torques
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario

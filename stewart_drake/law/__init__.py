@@ -2,18 +2,21 @@
 
 from stewart_drake.law.channel import Channel, Packets, Wire
 from stewart_drake.law.cost import QuadraticCost
-from stewart_drake.law.design_models import DesignModel, MultibodyModel, PaperModel
-from stewart_drake.law.encoder_sensing import EncoderSensing
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
     Feedforward,
     InverseDynamicsFeedforward,
     NoFeedforward,
 )
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import KnownMotion
-from stewart_drake.law.nominal import NominalPlant, TorqueLimit
+from stewart_drake.law.nominal import (
+    DesignModel,
+    MultibodyModel,
+    NominalPlant,
+    PaperModel,
+    TorqueLimit,
+)
 from stewart_drake.law.observers import CoreObserver, DelaySettings, Observer
 from stewart_drake.law.planner import NoPlanner, Planner, Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
@@ -23,7 +26,7 @@ from stewart_drake.law.predictors import (
     NonlinearPredictor,
     Predictor,
 )
-from stewart_drake.law.sensing import Sensing, StateSensing
+from stewart_drake.law.sensing import EncoderSensing, Measurement, Sensing, StateSensing
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.law.timeline import Arrivals, Timeline
 

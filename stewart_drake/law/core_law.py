@@ -19,22 +19,19 @@ from stewart_drake.law.catch_up import periods_of
 from stewart_drake.law.channel import Packets, Report, Sent, Wire, report_of, structures
 from stewart_drake.law.compiled import Compiled, address_of, machine_of, resists
 from stewart_drake.law.cost import QuadraticCost
-from stewart_drake.law.design_models import MultibodyModel
-from stewart_drake.law.encoder_sensing import EncoderSensing
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
     InverseDynamicsFeedforward,
     NoFeedforward,
 )
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts, Memory
 from stewart_drake.law.motion import KnownMotion, Motion
-from stewart_drake.law.nominal import NominalPlant, TorqueLimit
+from stewart_drake.law.nominal import MultibodyModel, NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver, belief_of, part_of
 from stewart_drake.law.planner import NoPlanner, Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.predictors import ArrivalPredictor, NonlinearPredictor
-from stewart_drake.law.sensing import StateSensing
+from stewart_drake.law.sensing import EncoderSensing, Measurement, StateSensing
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.signals import (
@@ -418,3 +415,33 @@ def serving(law: PredictiveLqi | ServoPreview) -> Serving:
     if field is not None:
         return Serving(law, f"python ({field})")
     return Serving(CoreLqi(law) if isinstance(law, PredictiveLqi) else CoreServo(law), "native")
+
+
+@dataclass(frozen=True)
+class OuterLqi(PredictiveLqi):
+    """`PredictiveLqi` around the free law of the same parts."""
+
+    @cached_property
+    def free(self) -> PredictiveLqi:
+        """The law without what this one adds."""
+        return PredictiveLqi(**self.parts)
+
+    @cached_property
+    def _served(self) -> Any:
+        return serving(self.free).law
+
+
+@dataclass(frozen=True)
+class OuterMemory:
+    """Memory of an `OuterLqi`; other names are those of the free law's memory.
+
+    Attributes:
+        free: memory of the free law.
+    """
+
+    free: Any
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name == "free":
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return getattr(self.free, name)

@@ -1,15 +1,16 @@
 """Cost that the gain minimises, and the gain."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
-from stewart_drake.law.delay_model import DelayedModel, delayed_model
-from stewart_drake.law.error_model import ContinuousModel
+from stewart_drake.law.delay_model import ContinuousModel, DelayedModel, delayed_model
 from stewart_drake.law.riccati import prediction_matrix, reduced_gain
 from stewart_drake.law.timeline import Timeline
+from stewart_drake.scenario.signals import NUM_COORDINATES, RATES
 from stewart_drake.types import Array
 
 
@@ -110,3 +111,82 @@ class QuadraticCost:
             RiccatiError: no gain was found.
         """
         return reduced_gain(model, *self.matrices(weights))
+
+
+def pd_gains(delay: float, pole: float = 0.0) -> tuple[float, float]:
+    """Return kp in 1/s^2 and kd in 1/s of equation (pd).
+
+    Args:
+        delay: h, uncompensated, s; above 0.
+        pole: p, 1/s.
+    """
+    turns = pole * delay
+    sh = -2 + math.sqrt(2 + turns**2)
+    excess, factor = sh**2 - turns**2, math.exp(sh)
+    damping = -(2 * sh + excess) * factor
+    return (-excess * factor - damping * sh) / delay**2, damping / delay
+
+
+@dataclass(frozen=True)
+class PdGain:
+    """Spring and damper on the error of the pose, in place of the LQI gain.
+
+    With B the accelerations per torque, T = T_ff - B^-1 (kp e + kd e') makes every coordinate a
+    loop of its own:
+
+        e'' = p^2 e - kp e(t - h) - kd e'(t - h),
+
+    with h the uncompensated delay, and p the pole with which gravity lets the plate fall; p = 0
+    without gravity. The characteristic function times exp(s h) is
+
+        f(s) = (s^2 - p^2) exp(s h) + kp + kd s.
+
+    f = f' = f'' = 0 is a triple real pole s. From f'' = 0, (s h)^2 + 4 s h + 2 - (p h)^2 = 0, so
+
+        s h = -2 + sqrt(2 + (p h)^2),
+        kd = -(2 s + h (s^2 - p^2)) exp(s h),     kp = -(s^2 - p^2) exp(s h) - kd s.       (pd)
+
+    The pole is stable where p h < sqrt(2), the limit of every controller of this form. Without
+    gravity, kp h^2 = 0.079 and kd h = 0.461.
+
+    Attributes:
+        kp: 1/s^2.
+        kd: 1/s.
+        period: of the controller, s.
+    """
+
+    kp: float
+    kd: float
+    period: float
+
+    integrates = False  # not annotated: no field
+
+    def regulated(self, integral: Array) -> Array:
+        """Return no part of the integral (6,)."""
+        return np.empty(0)
+
+    def sampled(self, model: ContinuousModel, timeline: Timeline) -> DelayedModel:
+        """Return `law.delay_model.delayed_model` without an integral."""
+        steps, fraction = timeline.steps, timeline.fraction
+        return delayed_model(model, timeline.period, steps, fraction, integral=False)
+
+    def gain(self, model: DelayedModel, weights: Array) -> Array:
+        """Return B^-1 [kp, kd] (6, 12), with zeros for a torque that is still to act.
+
+        B is the change of the rates by a torque held for a period, divided by the period.
+
+        Args:
+            model: of `sampled`.
+            weights: (2,) without effect.
+
+        Raises:
+            numpy.linalg.LinAlgError: B is singular.
+        """
+        B = (model.B_old + model.B_new)[RATES] / self.period
+        one = np.eye(NUM_COORDINATES)
+        K = np.linalg.solve(B, np.hstack([self.kp * one, self.kd * one]))
+        if model.fraction > 0:
+            K = np.hstack([K, np.zeros_like(one)])
+        if not np.all(np.isfinite(K)):
+            raise np.linalg.LinAlgError("B: is singular")
+        return K

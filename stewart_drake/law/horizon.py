@@ -16,7 +16,7 @@ import numpy as np
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.compiled import Once, machine_of
-from stewart_drake.law.holds import GAUSS_NODES
+from stewart_drake.law.feedforward import GAUSS_NODES
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.scenario.signals import (
     BIAS,

@@ -18,11 +18,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from stewart_drake.law.channel import Report
-from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.core_law import OuterLqi, OuterMemory
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import Motion
-from stewart_drake.law.outer import OuterLqi, OuterMemory
 from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
 from stewart_drake.types import Array
 

@@ -20,7 +20,7 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.workspace import margins
 from stewart_drake.law.clear_space import ClearSpace
-from stewart_drake.law.holds import (
+from stewart_drake.law.feedforward import (
     GAUSS_NODES,
     mean_torques,
     means_and_changes,

@@ -27,16 +27,15 @@ import numpy as np
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.channel import Report, Sent
 from stewart_drake.law.clear_space import RESERVE, ClearSpace
-from stewart_drake.law.core_law import AnyMemory, CoreMemory
+from stewart_drake.law.core_law import AnyMemory, CoreMemory, OuterLqi, OuterMemory
 from stewart_drake.law.cost import QuadraticCost
-from stewart_drake.law.holds import GAUSS_NODES
+from stewart_drake.law.feedforward import GAUSS_NODES
 from stewart_drake.law.horizon import NODES, HoldModel, HorizonCost, Plan, condense, riccati
 from stewart_drake.law.horizon_qp import QpError, Solver, problem_of, solve_by_daqp
-from stewart_drake.law.limited_memory import LimitedMemory
-from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import Motion, Preview
-from stewart_drake.law.outer import OuterLqi
 from stewart_drake.law.riccati import lqr_by_doubling
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import reach_margins
@@ -72,6 +71,43 @@ class QpLimits:
     space: ClearSpace
     solver: Solver = solve_by_daqp
     budget: float = math.inf
+
+
+@dataclass(frozen=True)
+class LimitedMemory(OuterMemory):
+    """Memory of `law.limited.LimitedLqi`; other names are those of the free law's memory.
+
+    Attributes:
+        free: memory of the law without limits, with the torques that were sent.
+        plan: last plan, where the limits did bind at the last sample, else None.
+        limited_steps, qp_failures, qp_late: as of `law.memory.Counts`.
+    """
+
+    plan: Plan | None = None
+    limited_steps: int = 0
+    qp_failures: int = 0
+    qp_late: int = 0
+
+    @property
+    def counts(self) -> Counts:
+        """Numbers of survived problems, by cause."""
+        counts: Counts = self.free.counts
+        return counts._replace(
+            limited_steps=self.limited_steps, qp_failures=self.qp_failures, qp_late=self.qp_late
+        )
+
+    def following(self, free: Any) -> "LimitedMemory":
+        """Return the memory after a sample in which the free law's torque was sent."""
+        return replace(self, free=free, plan=None)
+
+    def limited(self, free: Any, plan: Plan | None, cause: str | None) -> "LimitedMemory":
+        """Return the memory after a sample with a plan, or without one for a cause."""
+        after = replace(self, free=free, plan=plan, limited_steps=self.limited_steps + 1)
+        return after if cause is None else replace(after, **{cause: getattr(self, cause) + 1})
+
+    def without_error(self) -> "LimitedMemory":
+        """Return the memory with error and integral reset."""
+        return replace(self, free=self.free.without_error())
 
 
 class _Ahead(NamedTuple):

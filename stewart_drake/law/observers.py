@@ -21,12 +21,18 @@ from scipy.special import chdtri
 from stewart_drake.core.library import core
 from stewart_drake.law.belief import Belief, Estimate, Innovations
 from stewart_drake.law.compiled import Compiled, Once, machine_of, numbers
-from stewart_drake.law.encoder_sensing import EncoderSensing, encoders_of
 from stewart_drake.law.filter_settings import FilterSettings
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.nominal import NominalPlant
-from stewart_drake.law.sensing import Sensing, StateSensing, described, state_sensor
+from stewart_drake.law.sensing import (
+    EncoderSensing,
+    Measurement,
+    Sensing,
+    StateSensing,
+    described,
+    encoders_of,
+    state_sensor,
+)
 from stewart_drake.law.timeline import Arrivals, Timeline
 from stewart_drake.scenario.calibration import OFFSETS
 from stewart_drake.scenario.delay import Delay

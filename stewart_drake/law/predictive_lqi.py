@@ -6,7 +6,7 @@ torque begins to act, and (42) is applied there:
     T_k = T_ff - K [e; z; ...],   e = predicted pose and rate error, z = predicted integral,
 
 with K from `law.riccati.reduced_gain` and T_ff the feedforward of the hold interval
-[t + eta, t + eta + dt), see `law.holds`. Linear prediction multiplies [e_k; z_k; queue] by
+[t + eta, t + eta + dt), see `law.feedforward`. Linear prediction multiplies [e_k; z_k; queue] by
 `prediction_matrix`, which is the paper's K_aug e_dis; nonlinear prediction integrates the exact
 dynamics through the queue. Torques enter the linear parts as deviations from their feedforward.
 """
@@ -22,16 +22,14 @@ import numpy as np
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.channel import Channel, Report, Wire
 from stewart_drake.law.cost import Cost
-from stewart_drake.law.design_models import DesignModel
 from stewart_drake.law.feedforward import Feedforward
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts, Memory
 from stewart_drake.law.motion import Course, Motion
-from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.nominal import DesignModel, NominalPlant
 from stewart_drake.law.observers import CoreObserver, Observer, estimates_parameters
 from stewart_drake.law.planner import NoPlanner, Planner
 from stewart_drake.law.predictors import PredictedState, Predictor
-from stewart_drake.law.sensing import Sensing
+from stewart_drake.law.sensing import Measurement, Sensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE, NUM_TORQUES, POSE, RATES

@@ -6,8 +6,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from stewart_drake.law.belief import Belief
-from stewart_drake.law.delay_model import DelayedModel
-from stewart_drake.law.error_model import ContinuousModel, linear_model
+from stewart_drake.law.delay_model import ContinuousModel, DelayedModel, linear_model
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.riccati import prediction_matrix
 from stewart_drake.law.timeline import Timeline

@@ -22,12 +22,11 @@ import numpy as np
 
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.feedforward import Feedforward, InverseDynamicsFeedforward
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import Motion
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import Observer
-from stewart_drake.law.sensing import Sensing
+from stewart_drake.law.sensing import Measurement, Sensing
 from stewart_drake.law.servos import Reported, ReportLayout, Stiffness
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import UnreachablePoseError

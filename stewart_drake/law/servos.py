@@ -37,7 +37,6 @@ from numpy.typing import NDArray
 
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.holds import cubic
 from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.scenario.signals import (
     MODEL_TORQUE,
@@ -219,6 +218,15 @@ class Segment(NamedTuple):
         start, stop = self.at(begin, coast), np.array(command)
         stop[POSE] = turned(command[POSE], start[POSE])
         return Segment(begin, end, start, stop)
+
+
+def cubic(start: Array, end: Array, h: float, s: float) -> tuple[Array, Array]:
+    """Return angles and rates (6,) at the share s of h s, by the cubic between two states (12,)."""
+    rise, v_0, v_1 = (end[POSE] - start[POSE]) / h, start[RATES], end[RATES]
+    a, b = v_0 - rise, v_1 - rise
+    left = 1 - s
+    pose = left * start[POSE] + s * end[POSE] + h * s * left * (left * a - s * b)
+    return pose, rise + left * (1 - 3 * s) * a + s * (3 * s - 2) * b
 
 
 def rise(share: Array | float) -> Array:

@@ -28,8 +28,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from stewart_drake.law.delay_model import DelayedModel, delayed_model
-from stewart_drake.law.error_model import ContinuousModel
+from stewart_drake.law.delay_model import ContinuousModel, DelayedModel, delayed_model
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.types import Array, Complex
 

@@ -12,7 +12,7 @@ import numpy as np
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.holds import mean_torques
+from stewart_drake.law.feedforward import mean_torques
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (

@@ -20,10 +20,10 @@ from stewart_drake.law.channel import Packets
 from stewart_drake.law.core_law import serving
 from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.limited import LimitedLqi
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.live.contact import Link
 from stewart_drake.live.protocol import (

@@ -17,7 +17,7 @@ import numpy as np
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.core_law import AnyMemory
-from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.controller import held_by
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.recording import Record, Table

@@ -22,7 +22,7 @@ from stewart_drake.law.belief import Belief
 from stewart_drake.law.channel import Report
 from stewart_drake.law.core_law import AnyMemory, serving
 from stewart_drake.law.learned import LearnedMemory
-from stewart_drake.law.measurement import Measurement
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servos import rise
 from stewart_drake.law.timeline import Timeline, TorqueSchedule
 from stewart_drake.live.checks import LONGEST_GAP, ReportCheck, stays_within_reach
@@ -671,7 +671,7 @@ class LiveLoop:
     def _held_state(self, t: float, torque: Array, belief: Belief) -> Array:
         """Return the state (12,) that the reference asks for at the end of the next torque's hold.
 
-        Held torques meet the poses there. The rates differ by equation (rates) of `law.holds`.
+        Held torques meet the poses there. Rates differ by equation (rates) of `law.feedforward`.
         """
         law, way, timeline = self._design.law, self._steering.way, belief.timeline
         end = t + timeline.eta + self._period

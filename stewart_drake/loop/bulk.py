@@ -25,11 +25,11 @@ from stewart_drake.law import core_law
 from stewart_drake.law.catch_up import CatchUp
 from stewart_drake.law.channel import Packets, Report
 from stewart_drake.law.core_law import CompiledLaw, CoreMemory
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
 from stewart_drake.law.planner import Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.law_design import (

@@ -11,10 +11,10 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.channel import Packets, Report
 from stewart_drake.law.core_law import AnyMemory, serving
-from stewart_drake.law.measurement import Measurement
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
 from stewart_drake.loop.sampling import Sample, SteppedLaw, declare_constant, weak
 from stewart_drake.scenario.signals import (

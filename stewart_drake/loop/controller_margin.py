@@ -36,11 +36,10 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.cost import law_gain
-from stewart_drake.law.delay_model import chain
-from stewart_drake.law.encoder_sensing import EncoderSensing
-from stewart_drake.law.error_model import ContinuousModel, linear_model
+from stewart_drake.law.delay_model import ContinuousModel, chain, linear_model
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError
+from stewart_drake.law.sensing import EncoderSensing
 from stewart_drake.law.stability import (
     LinearLoop,
     Margins,

@@ -13,8 +13,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import System
 
 from stewart_drake.law.channel import Channel, Packets, Wire
-from stewart_drake.law.encoder_sensing import EncoderSensing
-from stewart_drake.law.sensing import Sensing, StateSensing
+from stewart_drake.law.sensing import EncoderSensing, Sensing, StateSensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.exact import ExactPlant

@@ -17,8 +17,7 @@ from stewart_drake.files.yamlio import validate
 from stewart_drake.law.catch_up import CatchUp
 from stewart_drake.law.channel import Packets, Wire
 from stewart_drake.law.clear_space import ClearSpace
-from stewart_drake.law.cost import Cost, QuadraticCost
-from stewart_drake.law.design_models import MultibodyModel, PaperModel
+from stewart_drake.law.cost import Cost, PdGain, QuadraticCost, pd_gains
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
     Feedforward,
@@ -33,9 +32,8 @@ from stewart_drake.law.filter_settings import (
 from stewart_drake.law.learned import with_learned
 from stewart_drake.law.least_error import LeastError
 from stewart_drake.law.limited import LimitedLqi, QpLimits
-from stewart_drake.law.nominal import NominalPlant, TorqueLimit
+from stewart_drake.law.nominal import MultibodyModel, NominalPlant, PaperModel, TorqueLimit
 from stewart_drake.law.observers import CoreObserver, DelaySettings
-from stewart_drake.law.pd import PdGain, pd_gains
 from stewart_drake.law.planner import NoPlanner, Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.predictors import (
@@ -109,7 +107,7 @@ def cost_of(experiment: Experiment, peak_torque: float) -> Cost:
 def pd_gain(experiment: Experiment) -> PdGain:
     """Return the gains of a scenario with `controller.kind: pd`.
 
-    Gains that are not given follow equation (pd) of `law.pd`. The uncompensated delay is the true
+    Gains that are not given follow equation (pd) of `law.cost`. The uncompensated delay is the true
     one less the assumed one, plus half a period for the hold. The pole is that of the plate held at
     the start pose. One given gain sets the other for critical damping, kd^2 = 4 kp.
     """

@@ -256,7 +256,7 @@ class ControllerConfig:
         kind: of the feedback, `lqi` (optimal for w_Q and w_R, linearised again at each sample) or
             `pd` (constant kp and kd on the errors of pose and rates, times the plate's inertia;
             without integral).
-        kp: of `pd`, 1/s^2; null is by kd, or by the uncompensated delay and gravity: `law.pd`.
+        kp: of `pd`, 1/s^2; null is by kd, or by the uncompensated delay and gravity: `law.cost`.
         kd: of `pd`, 1/s; null is by kp, for critical damping, or as that.
         period: between two torques, s.
         integral: whether the error is also integrated.

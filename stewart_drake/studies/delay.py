@@ -11,8 +11,7 @@ from threadpoolctl import threadpool_limits
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.law.cost import law_gain
-from stewart_drake.law.delay_model import DelayedModel
-from stewart_drake.law.error_model import double_integrators, linear_model
+from stewart_drake.law.delay_model import DelayedModel, double_integrators, linear_model
 from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.law.stability import (
     LinearLoop,

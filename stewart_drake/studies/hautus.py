@@ -22,9 +22,10 @@ from threadpoolctl import threadpool_limits
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, Failure, diagnose, measures_at
-from stewart_drake.law.delay_model import chain, delayed_model
-from stewart_drake.law.error_model import (
+from stewart_drake.law.delay_model import (
     ContinuousModel,
+    chain,
+    delayed_model,
     double_integrators,
     linear_model,
     with_integral,
