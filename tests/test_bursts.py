@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stewart_drake.core.library import core
-from stewart_drake.law.channel import Packets, structure
+from stewart_drake.law.channel import Packets, packets_of
 from stewart_drake.scenario.link_config import PacketsConfig
 from stewart_drake.scenario.packets import (
     BurstChain,
@@ -72,7 +72,7 @@ def test_the_first_packets_are_lost_as_often_as_later_ones():
 
 def chances(channel, arrived, since, last):
     """(last, n + 1) probabilities of the sources of the last torques, see core/packets.h."""
-    c, packets, known = core(), structure(channel), len(arrived)
+    c, packets, known = core(), packets_of(channel).it, len(arrived)
     flags, rows = arrived.astype(np.float64), np.empty((last, known + 1))
     for d in range(last):
         n = c.lib.stewart_packet_chances(

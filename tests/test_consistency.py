@@ -186,7 +186,7 @@ def test_the_default_goes_with_the_plant_and_the_sensor():
     for other in ("plant.kind=multibody", "sensor.kind=encoders"):
         found = settings_of("controller.period=0.01", "delay.steps=80", other)
         assert np.allclose(found.model_std, long.model_std)
-    direct = filter_settings(SCALE, 4.0, 0.02, None, 0.01)
+    direct = filter_settings(SCALE, 0.01, usual_parameters(4.0, 0.02, None))
     assert np.allclose(direct.model_std, 2e-4 * np.tile(SCALE, 2))
 
 

@@ -15,7 +15,7 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.compiled import machine_of
-from stewart_drake.law.filter_settings import filter_settings
+from stewart_drake.law.filter_settings import filter_settings, usual_parameters
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver, DelaySettings, part_of
 from stewart_drake.law.sensing import Measurement, StateSensing, state_sensor
@@ -33,7 +33,7 @@ DT = 0.1
 AMPLITUDES = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
 DYNAMICS = StewartDynamics(PAPER, gravity=False)
 PLANT = NominalPlant(DYNAMICS, 2, 1.0, TorqueLimit())
-SETTINGS = filter_settings(AMPLITUDES, 4.0, 0.06, None, DT)
+SETTINGS = filter_settings(AMPLITUDES, DT, usual_parameters(4.0, 0.06, None))
 NOISE = 1e-4 * np.tile(AMPLITUDES, 2)
 SENSING = StateSensing(NOISE, AMPLITUDES)
 DELAY = DelaySettings.of("constant", 0.45, 0.3, 1.5, quiet=False)

@@ -8,7 +8,7 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import THETA
-from stewart_drake.law.filter_settings import filter_settings
+from stewart_drake.law.filter_settings import filter_settings, usual_parameters
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.sensing import Measurement, StateSensing
@@ -23,7 +23,9 @@ DYNAMICS = StewartDynamics(PAPER, gravity=False)
 PLANT = NominalPlant(DYNAMICS, 20, 1.0, TorqueLimit())
 # The model is right and no torque is early or late: what is allowed for that is next to nothing.
 SETTINGS = replace(
-    filter_settings(AMPLITUDES, 4.0, 0.02, None, DT), model_std=np.full(12, 1e-7), timing_std=1e-6
+    filter_settings(AMPLITUDES, DT, usual_parameters(4.0, 0.02, None)),
+    model_std=np.full(12, 1e-7),
+    timing_std=1e-6,
 )
 LONGEST = 10  # gap in periods, as in core/filter_observers.c
 NOISE = 1e-3 * np.tile(AMPLITUDES, 2)

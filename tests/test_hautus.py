@@ -14,9 +14,9 @@ from stewart_drake.law.delay_model import (
     sample,
     with_integral,
 )
-from stewart_drake.law.hautus import TOLERANCE, cluster, hautus, scaled
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.studies.hautus import describe, state_labels
+from stewart_drake.studies.pbh import TOLERANCE, cluster, hautus, scaled
 from tests.mechanisms import PAPER
 
 PAPER_MODEL = double_integrators(torque_map(PAPER, PAPER.home))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.catch_up import Model, plan_catch_up
+from stewart_drake.law.catch_up import CatchUp, Model
 from stewart_drake.law.feedforward import mean_torques
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.startup import BLOCK, choose_substeps
@@ -40,7 +40,7 @@ def test_a_plan_of_many_periods_is_followed_period_by_period(period, duration):
     )
     plant, reference, begin = experiment.nominal, experiment.reference, 0.8
     start = np.concatenate([experiment.mechanism.home, np.zeros(6)])
-    planned, span = plan_catch_up(plant, reference, start, begin, period, duration, None)
+    planned, span = CatchUp(plant, reference, start, begin, period).plan(duration, None)
     assert duration <= span < duration + period * (1 + 1e-9)
     n = round(span / period)
     assert n * period == pytest.approx(span)
@@ -62,7 +62,7 @@ def test_the_shortest_plan_within_a_limit_is_found_in_a_few_steps(monkeypatch):
     )
     start = np.concatenate([experiment.mechanism.home, np.zeros(6)])
     spans = [
-        plan_catch_up(experiment.nominal, experiment.reference, start, 0.8, dt, None, limit)[1]
+        CatchUp(experiment.nominal, experiment.reference, start, 0.8, dt).plan(None, limit)[1]
         for dt in (period, 0.02)
     ]
     assert spans[0] == pytest.approx(spans[1], abs=0.021)

@@ -11,7 +11,7 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.dynamics.open_loop import IntegrationError
-from stewart_drake.law.catch_up import plan_catch_up
+from stewart_drake.law.catch_up import CatchUp
 from stewart_drake.loop import bulk
 from stewart_drake.loop.bulk import (
     PythonController,
@@ -377,10 +377,10 @@ def error_of_a_later_start(samples_late):
     preparation = preparation_of(one)
     prepared = preparation.prepared(preparation.experiment(one))
     experiment, law, late = prepared.experiment, prepared.law, 0.1 * samples_late
-    planned, _ = plan_catch_up(
+    planned, _ = CatchUp(
         *(experiment.nominal, experiment.reference, experiment.start),
-        *(law.timeline.eta + late, law.timeline.period, None, None),
-    )
+        *(law.timeline.eta + late, law.timeline.period),
+    ).plan(None, None)
     times = np.maximum(0.0, preparation.when.samples[:, None] + law.preview_times)
     previews = np.array([[evaluate(planned, t) for t in ahead] for ahead in times])
     previews[:samples_late] = np.concatenate([experiment.start[:6], np.zeros(12)])

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -33,36 +34,6 @@ PIECE = 0.025
 """s; largest distance of the instants at which a planned motion is checked."""
 
 
-def plan_catch_up(
-    dynamics: StewartDynamics,
-    reference: Trajectory,
-    start: Array,
-    t_start: float,
-    period: float,
-    duration: float | None,
-    torque_limit: float | None,
-) -> tuple[Trajectory, float]:
-    """Plan the motion, then the reference; return it with the duration of the plan in s.
-
-    Where no plan of up to LONGEST_CATCH_UP is possible, because the plate leaves its workspace
-    before the first torque acts, that is the reference alone, and 0 s.
-
-    Args:
-        dynamics: the nominal plant.
-        reference: the motion to reach.
-        start: (12,) state at `t_start`, the first instant at which a torque can act.
-        t_start: s.
-        period: of the controller, s.
-        duration: s, rounded up to whole periods, two at least; None for the shortest that keeps
-            HEADROOM to the torque limit, or for DEFAULT_CATCH_UP or more without a limit.
-        torque_limit: N m, or None.
-
-    Raises:
-        ConfigError: with the given duration the plate would leave its workspace.
-    """
-    return CatchUp(dynamics, reference, start, t_start, period).plan(duration, torque_limit)
-
-
 class Plan(NamedTuple):
     """A plan as of core/planning.h.
 
@@ -76,10 +47,14 @@ class Plan(NamedTuple):
 
 
 class CatchUp:
-    """Plans from one state, for any torque limit; each is made once.
+    """Motions from one state onto the reference, for any torque limit; each is planned once.
 
     Args:
-        dynamics, reference, start, t_start, period: as of `plan_catch_up`.
+        dynamics: the nominal plant.
+        reference: the motion to reach.
+        start: (12,) state at `t_start`, the first instant at which a torque can act.
+        t_start: s.
+        period: of the controller, s.
         least: makes the plans of least error under a torque limit, or None for the shortest ones.
     """
 
@@ -92,42 +67,53 @@ class CatchUp:
         period: float,
         least: Callable[[], LeastError] | None = None,
     ) -> None:
-        self._least, self._improved = least, dict[tuple[int, float], tuple[Trajectory, float]]()
-        self._model, self._reference, self._period = Model(dynamics), reference, period
+        self._least, self._reference, self._period = least, reference, period
         self._start, self._t_start = start, t_start
-        self._plans: dict[int, Plan | None] = {}
-        self._motions: dict[int, Trajectory] = {}
+        given = reference, start, t_start, period
+        self._planned = cache(partial(Model(dynamics).plan, *given))
+        self._motion, self._improved = cache(self._follow), cache(self._improve)
 
     def plan(self, duration: float | None, torque_limit: float | None) -> tuple[Trajectory, float]:
-        """Return `plan_catch_up`; an equal plan is the same trajectory."""
+        """Plan the motion, then the reference; return it with the duration of the plan in s.
+
+        Equal plans are the same trajectory. Where no plan of up to LONGEST_CATCH_UP is possible,
+        because the plate leaves its workspace before the first torque acts, that is the reference
+        alone, and 0 s.
+
+        Args:
+            duration: s, rounded up to whole periods, two at least; None for the shortest that keeps
+                HEADROOM to the torque limit, or for DEFAULT_CATCH_UP or more without a limit.
+            torque_limit: N m, or None.
+
+        Raises:
+            ConfigError: with the given duration the plate would leave its workspace.
+        """
         periods = shortest(self._possible, self._period, duration, torque_limit)
         if periods is None:
             return self._reference, 0.0
         plan = self._motion(periods), periods * self._period
         if self._least is None or torque_limit is None or duration is not None:
             return plan
-        key = periods, torque_limit
-        if key not in self._improved:
-            given = plan[0], self._reference, self._start, self._t_start, self._period, periods
-            pieces = self._least().pieces(*given, LEAST_ERROR_SHARE * torque_limit)
-            if pieces is not None:
-                plan = self._through(pieces), float(pieces[-1, 1]) - self._t_start
-            self._improved[key] = plan
-        return self._improved[key]
+        return self._improved(periods, torque_limit) or plan
 
     def _possible(self, periods: int, limit: float) -> bool:
-        if periods not in self._plans:
-            given = self._reference, self._start, self._t_start, self._period, periods
-            self._plans[periods] = self._model.plan(*given)
-        found = self._plans[periods]
+        found = self._planned(periods)
         return found is not None and found.peak <= limit
 
-    def _motion(self, periods: int) -> Trajectory:
-        if periods not in self._motions:
-            found = self._plans[periods]
-            assert found is not None
-            self._motions[periods] = self._through(found.pieces)
-        return self._motions[periods]
+    def _follow(self, periods: int) -> Trajectory:
+        found = self._planned(periods)
+        assert found is not None
+        return self._through(found.pieces)
+
+    def _improve(self, periods: int, torque_limit: float) -> tuple[Trajectory, float] | None:
+        """Return the plan of least error in place of the shortest one, or None without one."""
+        assert self._least is not None
+        begin = self._reference, self._start, self._t_start, self._period, periods
+        limit = LEAST_ERROR_SHARE * torque_limit
+        pieces = self._least().pieces(self._motion(periods), *begin, limit)
+        if pieces is None:
+            return None
+        return self._through(pieces), float(pieces[-1, 1]) - self._t_start
 
     def _through(self, pieces: Array) -> Trajectory:
         """Return the motion along pieces (n, 38), then the reference."""
@@ -146,7 +132,7 @@ def shortest(
     Args:
         possible: whether a plan of n periods keeps to a limit in N m.
         period: s.
-        duration, torque_limit: as of `plan_catch_up`.
+        duration, torque_limit: as of `CatchUp.plan`.
 
     Raises:
         ConfigError: no plan has the given duration.

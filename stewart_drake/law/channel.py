@@ -8,13 +8,13 @@ Their average would be worse, since the buffer never plays it.
 
 import sys
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.core.library import core
+from stewart_drake.law.compiled import Compiled, Once, numbers
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.packets import NO_LOSSES, BurstChain
 from stewart_drake.scenario.signals import NUM_TORQUES
@@ -136,7 +136,7 @@ class Packets:
             )
 
     def start(self) -> Sent:
-        c, channel = core(), structure(self)
+        c, channel = core(), packets_of(self).it
         memory = np.empty(c.lib.stewart_packets_memory(channel))
         c.lib.stewart_packets_start(channel, c.at(memory))
         return Sent(memory, len(self.in_time))
@@ -144,51 +144,36 @@ class Packets:
     def in_flight(
         self, sent: Sent, in_flight: Array, timeline: Timeline, report: Report | None
     ) -> tuple[Sent, Array]:
-        c, channel = core(), structure(self)
+        c, channel, told = core(), packets_of(self).it, report_of(report)
         memory, flying = sent.memory.copy(), in_flight.copy()
-        told = None if report is None else report_of(report)
-        data = c.ffi.NULL if told is None else told.data
         c.lib.stewart_packets_update(
-            *(channel, c.at(memory), data, timeline.steps, len(flying), c.at(flying)),
+            *(channel, c.at(memory), told.it, timeline.steps, len(flying), c.at(flying)),
             c.scratch(c.lib.stewart_packets_scratch(channel)),
         )
         return Sent(memory, sent.rows), flying
 
     def send(self, sent: Sent, plan: Array, in_flight: Array) -> Sent:
-        c, memory = core(), sent.memory.copy()
-        given = np.array(plan, np.float64), np.array(in_flight, np.float64)
-        c.lib.stewart_packets_send(
-            structure(self), c.at(memory), c.at(given[0]), len(in_flight), c.at(given[1])
-        )
+        c, memory, rows, before = core(), sent.memory.copy(), numbers(plan), numbers(in_flight)
+        given = c.at(memory), c.at(rows), len(before), c.at(before)
+        c.lib.stewart_packets_send(packets_of(self).it, *given)
         return Sent(memory, sent.rows)
 
 
-class ReportData(NamedTuple):
-    """A `stewart_report *` with the arrays that it points to."""
-
-    data: Any
-    arrived: Array
-    acted: Array
-
-
-def report_of(report: Report) -> ReportData:
-    """Return a report for the core."""
+def report_of(report: Report | None) -> Compiled:
+    """Return the `stewart_report *`, NULL for None."""
     c = core()
-    arrived, acted = report.arrived.astype(np.float64), np.array(report.acted, np.float64)
+    if report is None:
+        return Compiled(c.ffi.NULL)
+    arrived, acted = numbers(report.arrived), numbers(report.acted)
     values = len(arrived), c.at(arrived), len(acted), c.at(acted), report.age
-    return ReportData(c.ffi.new("stewart_report *", values), arrived, acted)
+    return Compiled(c.ffi.new("stewart_report *", values), (arrived, acted))
 
 
-def structure(channel: Packets) -> Any:
+@Once
+def packets_of(channel: Packets) -> Compiled:
     """Return the `stewart_packets` of core/packets.h."""
-    return structures(channel)[0]
-
-
-@lru_cache(maxsize=64)
-def structures(channel: Packets) -> tuple[Any, ...]:
-    """Return the `stewart_packets` with the arrays that it points to."""
     c, kept = core(), len(channel.arrived_by)
-    shares = np.array(channel.in_time), np.array(channel.arrived_by)
+    shares = numbers(channel.in_time), numbers(channel.arrived_by)
     values = {
         "torques": channel.torques,
         "repeats": channel.repeats,
@@ -200,4 +185,4 @@ def structures(channel: Packets) -> tuple[Any, ...]:
         "in_time": c.at(shares[0]),
         "arrived_by": c.at(shares[1]),
     }
-    return c.ffi.new("stewart_packets *", values), *shares
+    return Compiled(c.ffi.new("stewart_packets *", values), shares)

@@ -16,7 +16,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.catch_up import periods_of
-from stewart_drake.law.channel import Packets, Report, Sent, Wire, report_of, structures
+from stewart_drake.law.channel import Packets, Report, Sent, Wire, packets_of, report_of
 from stewart_drake.law.compiled import Compiled, address_of, machine_of, resists
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.feedforward import (
@@ -156,9 +156,10 @@ class CompiledLaw:
             d.rows = 1 + observer.max_schedule_length(d.period) + 6
         if isinstance(law.channel, Packets):
             d.channel = c.ffi.addressof(c.lib, "stewart_network")
-            d.packets, *arrays = structures(law.channel)
+            packets = packets_of(law.channel)
+            d.packets = packets.it
             self.tables[address_of(d.channel)] = "stewart_network"
-            self.keep += [d.packets, *arrays]
+            self.keep += packets.pointed()
             self.sources += ("network.c", "packets.c")
         if isinstance(law.planner, Replan):
             self._plans(law.planner)
@@ -176,7 +177,7 @@ class CompiledLaw:
         self.keep.append(plan)
         self.sources += ("replan", "planning")
 
-    @property
+    @cached_property
     def scratch(self) -> int:
         """Numbers of scratch memory that a step takes at the most."""
         lib = core().lib
@@ -280,7 +281,6 @@ class CoreLqi:
 
     def __init__(self, law: PredictiveLqi) -> None:
         self._law, self._compiled = law, CompiledLaw(law)
-        self._scratch = self._compiled.scratch
 
     def initial_memory(self, queue: Array) -> CoreMemory:
         """Return the memory before the first sample; the queue (L, 6) is that of the delay."""
@@ -303,13 +303,17 @@ class CoreLqi:
         values, weights = measurement.known(law.sensing.size), _row_major(weights)
         if weights.shape != (len(WEIGHTS),):
             raise ValueError(f"weights: got shape {weights.shape}; expected {(len(WEIGHTS),)}")
-        told = None if report is None else report_of(report)
+        told = report_of(report)
         sample = c.ffi.new("stewart_sample *")
         sample.measurement, sample.age = c.at(values), _age(law, measurement)
         asked = self._asked(sample, motion)
-        sample.report = c.ffi.NULL if told is None else told.data
+        sample.report = told.it
         sample.weights = weights.tolist()
-        data, scratch, torque = memory.data.copy(), np.empty(self._scratch), np.empty(NUM_TORQUES)
+        data, scratch, torque = (
+            memory.data.copy(),
+            np.empty(self._compiled.scratch),
+            np.empty(NUM_TORQUES),
+        )
         c.lib.stewart_step(self._compiled.data, c.at(data), c.at(scratch), sample, c.at(torque))
         asked.raise_errors()
         return CoreMemory(data, self._compiled)
@@ -339,7 +343,6 @@ class CoreServo:
 
     def __init__(self, law: ServoPreview) -> None:
         self._law, self._compiled = law, CompiledLaw(law)
-        self._scratch = self._compiled.scratch
 
     def initial_memory(self, command: Array) -> CoreMemory:
         """Return the memory before the first sample, with the command (18,) that was sent last."""
@@ -355,7 +358,7 @@ class CoreServo:
         sample, report = c.ffi.new("stewart_sample *"), _row_major(report)
         sample.measurement, sample.age = c.at(values), _age(law, measurement)
         sample.reference, sample.about = c.lib.stewart_given_rows, c.at(rows)
-        data, scratch = memory.data.copy(), np.empty(self._scratch)
+        data, scratch = memory.data.copy(), np.empty(self._compiled.scratch)
         command, servo = np.empty(NUM_REFERENCE), self._compiled.data
         given = c.at(data), c.at(scratch), sample, c.at(report), c.at(command)
         c.lib.stewart_servo_step(servo, *given)

@@ -198,7 +198,9 @@ def usual_parameters(
     of that, and a sudden change is JUMP_SHARE of it. Encoders are mounted to a tenth of a degree.
 
     Args:
-        plate_mass, torque_scale, torque_limit: as of `filter_settings`.
+        plate_mass: kg.
+        torque_scale: of the motion, N m.
+        torque_limit: of the motors in N m, or None.
         radius: of the plate's joints, m, for the position of the payload.
         free: names of PLANT_PARAMETERS and OFFSETS, those of the plant first.
         wrench: scale of a wrench on the plate, moment in N m and force in N.
@@ -268,11 +270,8 @@ def usual_model_error(motion_scale: Array, period: float) -> Array:
 
 def filter_settings(
     motion_scale: Array,
-    plate_mass: float,
-    torque_scale: float,
-    torque_limit: float | None,
     period: float,
-    parameters: ParameterSet | None = None,
+    parameters: ParameterSet,
     model_error: float | None = None,
     timing_std: float | None = None,
     white: bool = False,
@@ -283,11 +282,8 @@ def filter_settings(
 
     Args:
         motion_scale: (6,) range of each coordinate, rad and m; the same per s for the rates.
-        plate_mass: kg.
-        torque_scale: of the motion, N m.
-        torque_limit: of the motors in N m, or None.
         period: between two torques, s.
-        parameters: to estimate; `usual_parameters` if None.
+        parameters: to estimate.
         model_error: share of the motion per s^1.5, see `acceleration_noise`; None:
             `usual_model_error`.
         timing_std: s, of the instant of a torque; None:
@@ -298,8 +294,6 @@ def filter_settings(
             filter of a sensor without noise would otherwise follow each digit of that error.
         learns: whether innovations correct the noise, see core/noise.h.
     """
-    if parameters is None:
-        parameters = usual_parameters(plate_mass, torque_scale, torque_limit)
     if model_error is None:
         model_std = usual_model_error(motion_scale, period if white else USUAL_PERIOD)
         if white and noisy:

@@ -34,6 +34,7 @@ from stewart_drake.law.horizon import NODES, HoldModel, HorizonCost, Plan, conde
 from stewart_drake.law.horizon_qp import QpError, Solver, problem_of, solve_by_daqp
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import Motion, Preview
+from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.riccati import lqr_by_doubling
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.timeline import Timeline
@@ -130,6 +131,94 @@ class _Ahead(NamedTuple):
         return _shrunk(self.rows, self.share, mechanism)[:, :NUM_STATE]
 
 
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Search for a plan within the limits, from one state.
+
+    Attributes:
+        plant: model of the plant.
+        limits: to keep.
+        holds: motion of the plant over single holds.
+        start: (12,) state at the beginning of the plan.
+        reference: plan that replaces another one after the edge of the workspace.
+    """
+
+    plant: NominalPlant
+    limits: QpLimits
+    holds: HoldModel
+    start: Array
+    reference: Plan
+
+    def continued(self, last: Plan) -> Plan:
+        """Return the motion of the plant along the last plan, a hold later."""
+        later = last.later(self.reference.states[-1], self.reference.torques[-1])
+        return self._along(later, 0) or later
+
+    def within(self, plan: Plan, cost: HorizonCost, until: float) -> Plan:
+        """Return the plan after LINEARISATIONS quadratic programs, fewer if time is short.
+
+        Raises:
+            QpError: the first one has no solution.
+            ArithmeticError: the model or its Riccati equation does not exist.
+        """
+        limits, motors = self.limits, self.plant.motors
+        for number in range(LINEARISATIONS):
+            left = until - time.perf_counter()
+            if left <= 0:
+                if number > 0:
+                    break
+                raise QpError("QP: no time is left", late=True)
+            try:
+                model = self.holds.linearised(plan.states, plan.torques)
+                policy = riccati(model, cost, plan.states, plan.torques)
+                m = condense(model, policy, self.start - plan.states[0])
+                poses = plan.states[1:, POSE]
+                problem = problem_of(m, poses, plan.torques, motors.limit, limits.space)
+                v = limits.solver(problem, left)[problem.slacks :]
+            except (ArithmeticError, np.linalg.LinAlgError):
+                if number > 0:
+                    break
+                raise
+            change = Plan(m.states + m.state_map @ v, m.torques + m.torque_map @ v, policy.K)
+            plan = self._towards(plan, change)
+        return plan
+
+    def _towards(self, plan: Plan, change: Plan) -> Plan:
+        """Return the motion of the plant for the largest step that stays within the first half."""
+        for share in _STEPS:
+            least = 0 if share == _STEPS[-1] else self.limits.horizon // 2
+            wanted = Plan(
+                plan.states + share * change.states,
+                plan.torques + share * change.torques,
+                change.gains,
+            )
+            moved = self._along(wanted, least)
+            if moved is not None:
+                return moved
+        raise QpError("QP: no step keeps the plate in its workspace")
+
+    def _along(self, plan: Plan, least: int) -> Plan | None:
+        """Return the motion of the plant along a plan; the reference replaces it after an edge.
+
+        None if one of the first `least` holds leads to the edge of the workspace.
+        """
+        states, torques = plan.states.copy(), plan.torques.copy()
+        states[0], mechanism = self.start, self.plant.mechanism
+        for j, (torque, K) in enumerate(zip(plan.torques, plan.gains, strict=True)):
+            torques[j] = self.plant.motors.saturate(torque - K @ (states[j] - plan.states[j]))
+            states[j + 1] = self.holds.after(states[j], torques[j])
+        edge = _EDGE * RESERVE * mechanism.crank_lengths.min()
+        beyond = ~(reach_margins(mechanism, states[1:, POSE]).min(axis=1) > edge)
+        if beyond[:least].any():
+            return None
+        if beyond.any():
+            first = int(np.argmax(beyond))
+            states[first + 1 :] = self.reference.states[first + 1 :]
+            torques[first + 1 :] = self.reference.torques[first + 1 :]
+        finite = np.isfinite(states).all() and np.isfinite(torques).all()
+        return Plan(states, torques, plan.gains) if finite else None
+
+
 @dataclass(frozen=True)
 class LimitedLqi(OuterLqi):
     """`PredictiveLqi` whose torques come from a quadratic program where a limit binds.
@@ -182,29 +271,25 @@ class LimitedLqi(OuterLqi):
         if self._meets_limits(after, ahead, start, holds):
             return memory.following(after)
         until = begun + self.limits.budget
-        caution = belief.caution * max(1.0, belief.timing / self.tolerated_timing) ** 2
-        weighted = weights * [1.0, caution]
-        reference = self._reference_plan(ahead)
-        last = self._continued(memory.plan, reference, start, holds)
-        plan, cause = last, None
+        search = _Search(self.plant, self.limits, holds, start, self._reference_plan(ahead))
+        plan = last = None if memory.plan is None else search.continued(memory.plan)
+        cause = None
         try:
-            cost = self._cost(after, ahead, holds, weighted)
+            cost = self._cost(after, ahead, holds, self.cautious(weights, belief))
             try:
-                plan = self._plan_within(last or reference, reference, start, holds, cost, until)
+                plan = search.within(last or search.reference, cost, until)
             except (ArithmeticError, np.linalg.LinAlgError):
                 if last is None:
                     raise
-                plan = self._plan_within(reference, reference, start, holds, cost, until)
+                plan = search.within(search.reference, cost, until)
         except (ArithmeticError, np.linalg.LinAlgError) as error:  # the last plan goes on
             cause = "qp_late" if isinstance(error, QpError) and error.late else "qp_failures"
-        torques = after.plan if plan is None else self._sent(plan.torques, after.plan)
+        torques = after.plan
+        if plan is not None:  # which may be shorter than a packet
+            torques = np.vstack([plan.torques[: len(torques)], torques[len(plan.torques) :]])
         return memory.limited(_sending(after, torques, before.integral), plan, cause)
 
-    def _sent(self, torques: Array, free: Array) -> Array:
-        """Return the torques of a plan (N, 6) for the rows of a packet, then those of `free`."""
-        return np.vstack([torques[: len(free)], free[len(torques) :]])
-
-    def _ahead(self, further: Array, belief: Belief) -> "_Ahead":
+    def _ahead(self, further: Array, belief: Belief) -> _Ahead:
         n, space, dynamics = self.limits.horizon, self.limits.space, self.plant.dynamics
         rows, nodes = further[: n + 1], further[n + 1 :]
         share = space.shrunk(further[:, POSE])
@@ -212,7 +297,7 @@ class LimitedLqi(OuterLqi):
         held = self.feedforward.held(within, dynamics, belief.parameters)
         return _Ahead(rows, nodes, share, held.torques)
 
-    def _meets_limits(self, after: Any, ahead: "_Ahead", start: Array, holds: HoldModel) -> bool:
+    def _meets_limits(self, after: Any, ahead: _Ahead, start: Array, holds: HoldModel) -> bool:
         """Return whether the plan of the free law meets the limits: gain and feedforward go on.
 
         The integral goes on by the trapezoid rule.
@@ -237,13 +322,7 @@ class LimitedLqi(OuterLqi):
         space, poses = self.limits.space, np.array(states)[:, POSE]
         return bool(np.all(space.room(poses) >= -_INTO_RESERVE * space.least))
 
-    def _cost(
-        self,
-        after: Any,
-        ahead: "_Ahead",
-        holds: HoldModel,
-        weights: Array,
-    ) -> HorizonCost:
+    def _cost(self, after: Any, ahead: _Ahead, holds: HoldModel, weights: Array) -> HorizonCost:
         """Return the cost of a plan, with TERMINAL times the Riccati solution at its end.
 
         The integral is constant in a plan; its share of the law's torque joins the feedforward.
@@ -263,97 +342,11 @@ class LimitedLqi(OuterLqi):
         end = ahead.rows[-1, :NUM_STATE]
         return HorizonCost(nodes, end, torques, errors[POSE], R, TERMINAL * P)
 
-    def _reference_plan(self, ahead: "_Ahead") -> Plan:
+    def _reference_plan(self, ahead: _Ahead) -> Plan:
         """Return the shrunk reference, with its torques within the limit."""
         torques = self.plant.motors.saturate(ahead.torques)
         gains = np.zeros((len(torques), 6, NUM_STATE))
         return Plan(ahead.states(self.plant.mechanism), torques, gains)
-
-    def _continued(
-        self, last: Plan | None, reference: Plan, start: Array, holds: HoldModel
-    ) -> Plan | None:
-        """Return the motion of the plant along the last plan a hold later, or None without one."""
-        if last is None:
-            return None
-        later = last.later(reference.states[-1], reference.torques[-1])
-        moved = self._along(later, start, holds, reference, 0)
-        return later if moved is None else moved
-
-    def _plan_within(
-        self,
-        plan: Plan,
-        reference: Plan,
-        start: Array,
-        holds: HoldModel,
-        cost: HorizonCost,
-        until: float,
-    ) -> Plan:
-        """Return the plan after LINEARISATIONS quadratic programs, fewer if time is short.
-
-        Raises:
-            QpError: the first one has no solution.
-            ArithmeticError: the model or its Riccati equation does not exist.
-        """
-        limits, motors = self.limits, self.plant.motors
-        for number in range(LINEARISATIONS):
-            left = until - time.perf_counter()
-            if left <= 0:
-                if number > 0:
-                    break
-                raise QpError("QP: no time is left", late=True)
-            try:
-                model = holds.linearised(plan.states, plan.torques)
-                policy = riccati(model, cost, plan.states, plan.torques)
-                m = condense(model, policy, start - plan.states[0])
-                poses = plan.states[1:, POSE]
-                problem = problem_of(m, poses, plan.torques, motors.limit, limits.space)
-                v = limits.solver(problem, left)[problem.slacks :]
-            except (ArithmeticError, np.linalg.LinAlgError):
-                if number > 0:
-                    break
-                raise
-            change = Plan(m.states + m.state_map @ v, m.torques + m.torque_map @ v, policy.K)
-            plan = self._towards(plan, change, start, holds, reference)
-        return plan
-
-    def _towards(
-        self, plan: Plan, change: Plan, start: Array, holds: HoldModel, reference: Plan
-    ) -> Plan:
-        """Return the motion of the plant for the largest step that stays within the first half."""
-        for share in _STEPS:
-            least = 0 if share == _STEPS[-1] else self.limits.horizon // 2
-            wanted = Plan(
-                plan.states + share * change.states,
-                plan.torques + share * change.torques,
-                change.gains,
-            )
-            moved = self._along(wanted, start, holds, reference, least)
-            if moved is not None:
-                return moved
-        raise QpError("QP: no step keeps the plate in its workspace")
-
-    def _along(
-        self, plan: Plan, start: Array, holds: HoldModel, reference: Plan, least: int
-    ) -> Plan | None:
-        """Return the motion of the plant along a plan; the reference replaces it after an edge.
-
-        None if one of the first `least` holds leads to the edge of the workspace.
-        """
-        states, torques = plan.states.copy(), plan.torques.copy()
-        states[0], mechanism = start, self.plant.mechanism
-        for j, (torque, K) in enumerate(zip(plan.torques, plan.gains, strict=True)):
-            torques[j] = self.plant.motors.saturate(torque - K @ (states[j] - plan.states[j]))
-            states[j + 1] = holds.after(states[j], torques[j])
-        edge = _EDGE * RESERVE * mechanism.crank_lengths.min()
-        beyond = ~(reach_margins(mechanism, states[1:, POSE]).min(axis=1) > edge)
-        if beyond[:least].any():
-            return None
-        if beyond.any():
-            first = int(np.argmax(beyond))
-            states[first + 1 :] = reference.states[first + 1 :]
-            torques[first + 1 :] = reference.torques[first + 1 :]
-        finite = np.isfinite(states).all() and np.isfinite(torques).all()
-        return Plan(states, torques, plan.gains) if finite else None
 
 
 def _shrunk(rows: Array, share: float, mechanism: Mechanism) -> Array:

@@ -279,6 +279,20 @@ def _gate(size: int) -> float:
     return float(chdtri(size, OUTLIER))
 
 
+def _assumed(settings: FilterSettings) -> dict[str, Array]:
+    """Return what all filters assume of parameters: prior and changes."""
+    known, p = settings.parameters, len(settings.parameters.names)
+    walk = np.zeros(p) if settings.walk_std is None else settings.walk_std
+    arrays = {
+        "prior_root": numbers(np.linalg.cholesky(known.covariance), p, p),
+        "usual_std": numbers(known.usual_std, p),
+        "walk_std": numbers(walk, p),
+    }
+    if settings.jump_std is not None:
+        arrays["jump_std"] = numbers(settings.jump_std, p)
+    return arrays
+
+
 @Once
 def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
     """Return the `stewart_filter_settings` of a filter for `size` measured values."""
@@ -286,10 +300,8 @@ def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
     free = np.full(NUM_STATE, np.inf)
     it, prior = c.ffi.new("stewart_filter_settings *"), numbers(known.prior)
     arrays = {
+        **_assumed(settings),
         "model_std": numbers(settings.model_std, NUM_STATE),
-        "prior_root": numbers(np.linalg.cholesky(known.covariance), p, p),
-        "usual_std": numbers(known.usual_std, p),
-        "walk_std": numbers(np.zeros(p) if settings.walk_std is None else settings.walk_std, p),
         "wander_std": numbers(settings.wander * known.usual_std, p),
         "lower": numbers([*-free, *known.lower], NUM_STATE + p),
         "upper": numbers([*free, *known.upper], NUM_STATE + p),
@@ -297,8 +309,6 @@ def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
     it.prior, it.filter.gate, it.filter.timing_std = c.at(prior), _gate(size), settings.timing_std
     it.filter.learns_timing, it.filter.keep = settings.learns_timing, settings.keep
     it.filter.offsets = known.names.index(OFFSETS[0]) if OFFSETS[0] in known.names else -1
-    if settings.jump_std is not None:
-        arrays["jump_std"] = numbers(settings.jump_std, p)
     for name, array in arrays.items():
         setattr(it.filter, name, c.at(array))
     return Compiled(it, (prior, arrays))
@@ -308,19 +318,13 @@ def _delay_settings_of(
     observer: CoreObserver, settings: FilterSettings, size: int, period: float
 ) -> Compiled:
     """Return the `stewart_delay_settings` for `size` values of one instant."""
-    c, prior, delay = core(), settings.parameters, observer.delay
-    p = len(prior.names)
+    c, delay = core(), observer.delay
     assert delay is not None
     it = c.ffi.new("stewart_delay_settings *")
     it.values, it.most = size, observer.max_schedule_length(period)
-    arrays = {
-        "prior_root": numbers(np.linalg.cholesky(prior.covariance)),
-        **{name: numbers(getattr(prior, name)) for name in ("prior", "std", "usual_std")},
-        **{name: numbers(getattr(prior, name)) for name in ("lower", "upper")},
-        "walk_std": numbers(np.zeros(p) if settings.walk_std is None else settings.walk_std, p),
-    }
-    if settings.jump_std is not None:
-        arrays["jump_std"] = numbers(settings.jump_std, p)
+    arrays = _assumed(settings)
+    for name in ("prior", "std", "lower", "upper"):
+        arrays[name] = numbers(getattr(settings.parameters, name))
     for name, array in arrays.items():
         setattr(it.delay, name, c.at(array))
     it.delay.period, it.delay.gate, it.delay.believed = period, _gate(size), delay.mean

@@ -370,8 +370,7 @@ class PredictiveLqi:
             model = self.model.at(ahead.state, torque, belief.parameters, self.plant)
             error = error - self.feedforward.offset(changes, model.B[RATES], belief.timeline)
             delayed = self.cost.sampled(model, belief.timeline)
-            caution = belief.caution * max(1.0, belief.timing / self.tolerated_timing) ** 2
-            K = self.cost.gain(delayed, weights * [1.0, caution])
+            K = self.cost.gain(delayed, self.cautious(weights, belief))
             return error, self.predictor.gain(K, delayed), None
         except UnreachablePoseError:  # nothing to regulate: the feedforward acts alone
             return error, self._no_gain(belief.timeline), "unreachable"
@@ -379,6 +378,11 @@ class PredictiveLqi:
             none = self._no_gain(belief.timeline)
             last = memory.gain if memory.gain.shape == none.shape else none  # of another delay
             return error, last, "riccati_failures"
+
+    def cautious(self, weights: Array, belief: Belief) -> Array:
+        """Return w_Q and w_R (2,), with w_R raised for an uncertain delay."""
+        caution = belief.caution * max(1.0, belief.timing / self.tolerated_timing) ** 2
+        return np.asarray(weights * [1.0, caution])
 
     def _no_gain(self, timeline: Timeline) -> Array:
         """Return NaN in the shape of a gain: on error, integral and pending torques."""

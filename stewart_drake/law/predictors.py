@@ -6,11 +6,11 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from stewart_drake.law.belief import Belief
-from stewart_drake.law.delay_model import ContinuousModel, DelayedModel, linear_model
+from stewart_drake.law.delay_model import ContinuousModel, DelayedModel
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.riccati import prediction_matrix
-from stewart_drake.law.timeline import Timeline
-from stewart_drake.scenario.signals import POSE, RATES
+from stewart_drake.law.timeline import Timeline, TorqueSchedule
+from stewart_drake.scenario.signals import POSE
 from stewart_drake.types import Array
 
 
@@ -51,18 +51,8 @@ class Predictor(Protocol):
         """Return the gain (6, n) on [error; integral; pending torques] for a `reduced_gain` K."""
         ...
 
-    def model(
-        self,
-        design: ContinuousModel,
-        state: Array,
-        torque: Array,
-        parameters: Array,
-        plant: NominalPlant,
-    ) -> ContinuousModel:
-        """Return the linearisation of the prediction about a state (12,) under a torque (6,).
-
-        `design` is the model of the gain there.
-        """
+    def model(self, design: ContinuousModel, exact: ContinuousModel) -> ContinuousModel:
+        """Return the linearised prediction, given those of the gain and of the exact equations."""
         ...
 
 
@@ -85,14 +75,7 @@ class LinearPredictor:
         """Return K_aug, K times the prediction by the model of the gain."""
         return K @ prediction_matrix(model)
 
-    def model(
-        self,
-        design: ContinuousModel,
-        state: Array,
-        torque: Array,
-        parameters: Array,
-        plant: NominalPlant,
-    ) -> ContinuousModel:
+    def model(self, design: ContinuousModel, exact: ContinuousModel) -> ContinuousModel:
         return design
 
 
@@ -118,23 +101,16 @@ class NonlinearPredictor:
             return PredictedState(x, x - wanted[0], integral)
         schedule, each = timeline.schedule(queue), timeline.per_period
         ends = plant.predict(x, schedule, belief.parameters)[each - 1 :: each]
-        durations = np.full(timeline.steps, timeline.period)
-        torques = schedule.torques.reshape(timeline.steps, -1)
-        return _compared(np.vstack([x, ends]), wanted, durations, torques, integral, plant)
+        periods = TorqueSchedule(
+            schedule.torques.reshape(timeline.steps, -1), np.full(timeline.steps, timeline.period)
+        )
+        return _compared(np.vstack([x, ends]), wanted, periods, integral, plant)
 
     def gain(self, K: Array, model: DelayedModel) -> Array:
         return K
 
-    def model(
-        self,
-        design: ContinuousModel,
-        state: Array,
-        torque: Array,
-        parameters: Array,
-        plant: NominalPlant,
-    ) -> ContinuousModel:
-        derivatives = plant.dynamics.derivatives(state[POSE], state[RATES], torque, parameters)
-        return linear_model(derivatives.A, derivatives.B)
+    def model(self, design: ContinuousModel, exact: ContinuousModel) -> ContinuousModel:
+        return exact
 
 
 @dataclass(frozen=True)
@@ -150,19 +126,14 @@ class ArrivalPredictor(NonlinearPredictor):
         """Predict; the integral continues from one change of torque to the next."""
         schedule = belief.timeline.until_next(queue)
         states = np.vstack([belief.state, plant.predict(belief.state, schedule, belief.parameters)])
-        return _compared(states, wanted, schedule.durations, schedule.torques, integral, plant)
+        return _compared(states, wanted, schedule, integral, plant)
 
 
 def _compared(
-    states: Array,
-    wanted: Array,
-    durations: Array,
-    torques: Array,
-    integral: Array,
-    plant: NominalPlant,
+    states: Array, wanted: Array, schedule: TorqueSchedule, integral: Array, plant: NominalPlant
 ) -> PredictedState:
     """Return the last of states (1 + n, 12), with the integral over n intervals with torques."""
     errors = states - wanted
-    added = durations[:, None] / 2 * (errors[:-1, POSE] + errors[1:, POSE])
-    free = np.array([not plant.motors.reached(torque) for torque in torques], bool)
+    added = schedule.durations[:, None] / 2 * (errors[:-1, POSE] + errors[1:, POSE])
+    free = np.array([not plant.motors.reached(torque) for torque in schedule.torques], bool)
     return PredictedState(states[-1], errors[-1], integral + added[free].sum(axis=0))

@@ -4,13 +4,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 
 from stewart_drake.core.library import core
 from stewart_drake.law.delay_model import DelayedModel, chain
-from stewart_drake.law.hautus import distinct, pbh_margins
 from stewart_drake.law.stability import is_stable
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Complex
 
 Solver = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 """Function with the arguments and results of `lqr`."""
@@ -197,3 +197,26 @@ def is_stabilizable(A: Array, B: Array) -> bool:
     unstable = distinct(eigenvalues[np.abs(eigenvalues) >= 1 - 1e-6], 1e-5)
     scale = np.linalg.norm(A) + np.linalg.norm(B)
     return bool(np.all(pbh_margins(A, B, unstable) > 1e-13 * scale * len(A)))
+
+
+def pbh_margins(A: Array, B: Array, eigenvalues: Complex) -> Array:
+    """Return the smallest singular value of [lambda I - A, B] for each eigenvalue (k,)."""
+    if eigenvalues.size == 0:
+        return np.empty(0)
+    real = np.all(np.abs(eigenvalues.imag) <= 1e-12 * np.abs(eigenvalues))
+    # Real arithmetic takes half the time.
+    at = eigenvalues.real if real else eigenvalues
+    return np.linalg.svd(pencils(A, B, at), compute_uv=False)[:, -1]
+
+
+def distinct(values: Complex, resolution: float) -> Complex:
+    """Return one value of each group that agrees to `resolution`."""
+    grid = np.round(values / resolution)
+    _, first = np.unique(grid, return_index=True)
+    return values[first]
+
+
+def pencils(A: Array, B: Array, points: NDArray[np.inexact]) -> NDArray[np.inexact]:
+    """Return [lambda I - A, B] (k, n, n + m) for points lambda (k,)."""
+    shifted = points[:, None, None] * np.eye(len(A)) - A
+    return np.concatenate([shifted, np.broadcast_to(B, (len(points), *B.shape))], axis=2)

@@ -119,6 +119,12 @@ class Sensing(Protocol):
         ...
 
 
+def _fault(sensor: Any, *given: Any) -> str | None:
+    """Return the first fault that a `stewart_sensing` finds, or None."""
+    found = sensor.fault(core().ffi.addressof(sensor), *given)
+    return next((name for i, name in enumerate(FAULTS) if found >> i & 1), None)
+
+
 @dataclass(frozen=True)
 class StateSensing:
     """Measurement of pose and rates: h(x) = x.
@@ -149,9 +155,7 @@ class StateSensing:
         """Return the fault; one missing value makes the whole measurement missing."""
         c, values, before = core(), measurement.known(self.size), numbers(last, self.size)
         given = c.at(geometry(mechanism)), period, c.at(values), c.at(before)
-        sensor = c.lib.stewart_state_sensing(state_sensor(self).it)
-        found = sensor.fault(c.ffi.addressof(sensor), *given)
-        return next((name for i, name in enumerate(FAULTS) if found >> i & 1), None)
+        return _fault(c.lib.stewart_state_sensing(state_sensor(self).it), *given)
 
     def start(self, measurement: Measurement, near: Array | None = None) -> FirstState:
         """Return the measurement, with the variance of its noise."""
@@ -301,10 +305,8 @@ class EncoderSensing:
     ) -> str | None:
         """Return the fault: a measurement is of use as long as one leg is."""
         values, c = measurement.known(self.size), core()
-        sensor = c.lib.stewart_encoder_sensing(encoders_of(self).it)
-        nothing = c.ffi.NULL, 0.0, c.at(values), c.ffi.NULL
-        found = sensor.fault(c.ffi.addressof(sensor), *nothing)
-        return next((name for i, name in enumerate(FAULTS) if found >> i & 1), None)
+        given = c.ffi.NULL, 0.0, c.at(values), c.ffi.NULL
+        return _fault(c.lib.stewart_encoder_sensing(encoders_of(self).it), *given)
 
     def start(self, measurement: Measurement, near: Array | None = None) -> FirstState | None:
         """Return the pose by forward kinematics, with the expected rates."""

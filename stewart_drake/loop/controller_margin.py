@@ -37,6 +37,7 @@ from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.cost import law_gain
 from stewart_drake.law.delay_model import ContinuousModel, chain, linear_model
+from stewart_drake.law.nominal import MultibodyModel
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.law.sensing import EncoderSensing
@@ -266,7 +267,7 @@ def _gain(experiment: Experiment, truth: StewartDynamics, law: PredictiveLqi, ti
     current = truth.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
     forward = law.feedforward.at(x, plant.dynamics, theta)
     design = law.model.about(x, forward, theta, plant)
-    predictor = law.predictor.model(design, x, current, theta, plant)
+    predictor = law.predictor.model(design, MultibodyModel().about(x, current, theta, plant))
     weights = np.array(c.weights)
     return law_gain(law.cost, design, predictor, timeline, weights)
 

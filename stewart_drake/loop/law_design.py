@@ -185,12 +185,13 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     timeline = Timeline(c.period, believed_delay(sc))
     substeps, peak_torque, machine_scale = sizing or sizing_of(experiment)
     torque_scale = max(machine_scale, peak_torque)
-    plate, asked = experiment.mechanism.plate.mass, experiment.planned_limit
     motion_torque = max(STILL * machine_scale, peak_torque)
     parameters = estimated_parameters(experiment, torque_scale, motion_torque)
     exact = sc.plant.kind == "exact" and isinstance(sc.sensor, StateSensorConfig)
     settings = filter_settings(
-        *(motion, plate, torque_scale, asked, c.period, parameters),
+        motion,
+        c.period,
+        parameters,
         model_error=c.model_error,
         timing_std=c.timing_std,
         white=exact,

@@ -30,10 +30,10 @@ from stewart_drake.law.delay_model import (
     linear_model,
     with_integral,
 )
-from stewart_drake.law.hautus import TOLERANCE, Hautus, Mode, hautus, scaled
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import COORDINATE_NAMES, NUM_TORQUES
+from stewart_drake.studies.pbh import TOLERANCE, Hautus, Mode, hautus, scaled
 from stewart_drake.studies.verdict import Assessment, assess
 from stewart_drake.types import Array
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stewart_drake.law.riccati import pbh_margins, pencils
 from stewart_drake.types import Array, ArrayLike, Complex
 
 TOLERANCE: Final = 1e-10
@@ -172,29 +172,7 @@ def cluster(values: Complex, distance: float) -> list[Complex]:
     return groups
 
 
-def pbh_margins(A: Array, B: Array, eigenvalues: Complex) -> Array:
-    """Return the smallest singular value of [lambda I - A, B] for each eigenvalue (k,)."""
-    if eigenvalues.size == 0:
-        return np.empty(0)
-    real = np.all(np.abs(eigenvalues.imag) <= 1e-12 * np.abs(eigenvalues))
-    # Real arithmetic takes half the time.
-    pencils = _pencils(A, B, eigenvalues.real if real else eigenvalues)
-    return np.linalg.svd(pencils, compute_uv=False)[:, -1]
-
-
-def distinct(values: Complex, resolution: float) -> Complex:
-    """Return one value of each group that agrees to `resolution`."""
-    grid = np.round(values / resolution)
-    _, first = np.unique(grid, return_index=True)
-    return values[first]
-
-
-def _pencils(A: Array, B: Array, points: NDArray[np.inexact]) -> NDArray[np.inexact]:
-    shifted = points[:, None, None] * np.eye(len(A)) - A
-    return np.concatenate([shifted, np.broadcast_to(B, (len(points), *B.shape))], axis=2)
-
-
 def _null_space(A: Array, B: Array, point: complex, threshold: float) -> Complex:
     """Return orthonormal w (n, d) with w' [point I - A, B] = 0, without conjugation."""
-    left, values, _ = np.linalg.svd(_pencils(A, B, np.array([point]))[0], full_matrices=False)
+    left, values, _ = np.linalg.svd(pencils(A, B, np.array([point]))[0], full_matrices=False)
     return left[:, values < threshold].conj()
