@@ -58,7 +58,7 @@ def uncovered(law: PredictiveLqi | ServoPreview) -> str | None:
     """
     covered = {
         "controller.limits": not hasattr(law, "limits"),
-        "controller.learned": not hasattr(law, "learned"),
+        "controller.learned": getattr(law, "learned", None) is None,
         "law": type(law) in (PredictiveLqi, ServoPreview) and type(law.plant) is NominalPlant,
         "plant.kind": type(law.plant.dynamics) is StewartDynamics,
         "sensor.kind": type(law.sensing) in (StateSensing, EncoderSensing),

@@ -131,8 +131,8 @@ def pd_gains(delay: float, pole: float = 0.0) -> tuple[float, float]:
 class PdGain:
     """Spring and damper on the error of the pose, in place of the LQI gain.
 
-    With B the accelerations per torque, T = T_ff - B^-1 (kp e + kd e') makes every coordinate a
-    loop of its own:
+    With B the accelerations per torque, T = T_ff - B^-1 (kp e + kd e') gives every
+    coordinate a separate loop:
 
         e'' = p^2 e - kp e(t - h) - kd e'(t - h),
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -205,40 +206,37 @@ def usual_parameters(
         free: names of PLANT_PARAMETERS and OFFSETS, those of the plant first.
         wrench: scale of a wrench on the plate, moment in N m and force in N.
     """
-    prior, std, lower, upper, walk, jump = (np.zeros(NUM_PLANT_PARAMETERS) for _ in range(6))
-    bias_bound = 100 * torque_scale if torque_limit is None else torque_limit
-    std[BIAS], lower[BIAS], upper[BIAS] = 0.3 * torque_scale, -bias_bound, bias_bound
-    std[PAYLOAD], upper[PAYLOAD] = 0.25 * plate_mass, 10 * plate_mass
-    lower[PAYLOAD] = -0.5 * plate_mass  # the plate may be lighter than assumed
-    for friction in (DAMPING, COULOMB, BALL_JOINTS.start, BALL_JOINTS.start + 1):
-        std[friction], upper[friction] = 0.1 * torque_scale, 100 * torque_scale
-    speeds = {
-        COULOMB_SPEED: DEFAULT_COULOMB_SPEED,
-        BALL_JOINT_FRICTION_SPEED: DEFAULT_BALL_JOINT_SPEED,
-    }
-    for at, speed in speeds.items():
-        prior[at] = std[at] = speed
-        lower[at], upper[at] = 1e-3, 10.0
-    std[PAYLOAD_POSITION] = radius / 2
-    lower[PAYLOAD_POSITION], upper[PAYLOAD_POSITION] = -2 * radius, 2 * radius
-    lower[WRENCH], upper[WRENCH] = -np.inf, np.inf
-    std[WRENCH] = walk[WRENCH] = WALK_SHARE * np.repeat(wrench, 3)
-    jump[WRENCH] = JUMP_SHARE * np.repeat(wrench, 3)
-    of_offset = (0.0, MOUNTING, -np.pi, np.pi, 0.0, 0.0)
-    columns = [
-        np.append(column, len(OFFSETS) * [value])
-        for column, value in zip((prior, std, lower, upper, walk, jump), of_offset, strict=True)
-    ]
     names, units = (*PLANT_PARAMETERS, *OFFSETS), (*PLANT_PARAMETER_UNITS, *("rad",) * len(OFFSETS))
+    bias = 100 * torque_scale if torque_limit is None else torque_limit
+    scale = np.repeat(wrench, 3)
+    friction = 0.0, 0.1 * torque_scale, 0.0, 100 * torque_scale
+    speed, joint_speed = DEFAULT_COULOMB_SPEED, DEFAULT_BALL_JOINT_SPEED
+    table: list[tuple[int | slice, tuple[Any, ...]]] = [  # prior, std, lower, upper
+        (BIAS, (0.0, 0.3 * torque_scale, -bias, bias)),
+        # The plate may be lighter than assumed.
+        (PAYLOAD, (0.0, 0.25 * plate_mass, -0.5 * plate_mass, 10 * plate_mass)),
+        (PAYLOAD_POSITION, (0.0, radius / 2, -2 * radius, 2 * radius)),
+        (DAMPING, friction),
+        (COULOMB, friction),
+        (slice(BALL_JOINTS.start, BALL_JOINTS.start + 2), friction),
+        (COULOMB_SPEED, (speed, speed, 1e-3, 10.0)),
+        (BALL_JOINT_FRICTION_SPEED, (joint_speed, joint_speed, 1e-3, 10.0)),
+        (WRENCH, (0.0, WALK_SHARE * scale, -np.inf, np.inf)),
+        (slice(NUM_PLANT_PARAMETERS, None), (0.0, MOUNTING, -np.pi, np.pi)),
+    ]
+    columns, changes = np.zeros((4, len(names))), np.zeros((2, len(names)))
+    for place, values in table:
+        for column, value in zip(columns, values, strict=True):
+            column[place] = value
+    changes[0, WRENCH], changes[1, WRENCH] = WALK_SHARE * scale, JUMP_SHARE * scale
     chosen = [names.index(name) for name in free]
-    changes = dict(zip(("walk", "jump"), (column[chosen] for column in columns[4:]), strict=True))
-    if not walk[WRENCH].any() or not any(name in WRENCHES for name in free):
-        changes = {}
+    changing = scale.any() and any(name in WRENCHES for name in free)
     return ParameterSet(
         tuple(free),
         tuple(units[i] for i in chosen),
-        *(column[chosen] for column in columns[:4]),
-        **changes,
+        *columns[:, chosen],
+        walk=changes[0, chosen] if changing else None,
+        jump=changes[1, chosen] if changing else None,
     )
 
 

@@ -23,7 +23,7 @@ from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import Motion
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
+from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.types import Array
 
 Law = TypeVar("Law", PredictiveLqi, ServoPreview)
@@ -127,47 +127,10 @@ class LearnedLqi(OuterLqi):
         )
 
 
-@dataclass(frozen=True)
-class LearnedServoMemory(ServoMemory):
-    """Memory of `LearnedPreview`.
-
-    Attributes:
-        samples: number of samples so far.
-    """
-
-    samples: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class LearnedPreview(ServoPreview):
-    """`ServoPreview` with learned setpoints.
-
-    Attributes:
-        learned: by the time of the motion, which begins with the first sample.
-    """
-
-    learned: LearnedSignal = field(kw_only=True)
-
-    def initial_memory(self, command: Array) -> ServoMemory:
-        """Return the memory before the first sample; see `ServoPreview.initial_memory`."""
-        return LearnedServoMemory(**vars(super().initial_memory(command)))
-
-    def correction(self, memory: Any) -> Array:
-        """Return the learned angles (6,) of the next command, rad."""
-        return self.learned(self.timeline.period * memory.samples + self.preview_times)[0]
-
-    def step(
-        self, memory: Any, measurement: Measurement, motion: Motion, report: Array
-    ) -> ServoMemory:
-        """Compute the command of one sample; see `ServoPreview.step`."""
-        stepped: Any = super().step(memory, measurement, motion, report)
-        return replace(stepped, samples=memory.samples + 1)
-
-
 def with_learned(law: Law, learned: LearnedSignal | None) -> Law:
     """Return the law with a learned torque, or with learned setpoints; as it is for None."""
     if learned is None:
         return law
     if isinstance(law, ServoPreview):
-        return LearnedPreview(**vars(law), learned=learned)
+        return replace(law, learned=learned)
     return LearnedLqi(**law.parts, learned=learned)

@@ -113,11 +113,6 @@ class DelaySettings:
         return cls(mean, std, longest, *drift, quiet)
 
 
-def estimates_parameters(observer: Observer) -> bool:
-    """Return whether an observer estimates parameters; of a user's own this is assumed."""
-    return not (isinstance(observer, CoreObserver) and observer.settings is None)
-
-
 @dataclass(frozen=True)
 class CoreObserver:
     """Observer of the core.

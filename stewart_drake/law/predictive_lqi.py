@@ -26,7 +26,7 @@ from stewart_drake.law.feedforward import Feedforward
 from stewart_drake.law.memory import Counts, Memory
 from stewart_drake.law.motion import Course, Motion
 from stewart_drake.law.nominal import DesignModel, NominalPlant
-from stewart_drake.law.observers import CoreObserver, Observer, estimates_parameters
+from stewart_drake.law.observers import CoreObserver, Observer
 from stewart_drake.law.planner import NoPlanner, Planner
 from stewart_drake.law.predictors import PredictedState, Predictor
 from stewart_drake.law.sensing import Measurement, Sensing
@@ -105,8 +105,8 @@ class PredictiveLqi:
 
     @property
     def estimates(self) -> bool:
-        """Whether the observer estimates parameters."""
-        return estimates_parameters(self.observer)
+        """Whether the observer estimates parameters; of a user's own this is assumed."""
+        return not (isinstance(self.observer, CoreObserver) and self.observer.settings is None)
 
     @property
     def finds_delay(self) -> bool:

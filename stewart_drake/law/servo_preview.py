@@ -15,6 +15,7 @@ Servos given by their stiffness hold a setpoint for a period instead of moving t
 compensated for torque and velocity gain, without it they are the angles of the reference.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -54,6 +55,7 @@ class ServoMemory:
         in_flight: (1, 6) the same within the limit.
         counts: see `law.memory.Counts`.
         integral, weights: NaN.
+        samples: number of samples so far.
     """
 
     command: Array
@@ -65,6 +67,7 @@ class ServoMemory:
     lag: int
     integral: Array
     weights: Array
+    samples: int = 0
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,8 @@ class ServoPreview:
         feedforward: the torque T_ff of a command.
         reports: layout of the machine's reports.
         servo: servos given by their stiffness, None for others.
+        learned: correction (n, 6) of the angles at instants (n,) of the motion, which begins with
+            the first sample, in rad and s; None: none.
     """
 
     timeline: Timeline
@@ -88,6 +93,7 @@ class ServoPreview:
     feedforward: Feedforward
     reports: ReportLayout
     servo: Stiffness | None = None
+    learned: Callable[[Array], Array] | None = None
 
     @cached_property
     def preview_times(self) -> Array:
@@ -158,6 +164,7 @@ class ServoPreview:
             torque=torque,
             in_flight=self.plant.motors.saturate(torque)[None],
             counts=memory.counts.plus(*belief.faults, cause, *["saturated_steps"] * saturated),
+            samples=memory.samples + 1,
         )
 
     def _observe(
@@ -175,10 +182,6 @@ class ServoPreview:
             belief = replace(fresh.assuming(belief.parameters), measured=belief.measured)
         return self.observer.observe(belief, measurement, torques, self.sensing, self.plant)
 
-    def correction(self, memory: ServoMemory) -> Array:
-        """Return what is added to the angles (6,) of the next command, rad."""
-        return np.zeros(NUM_TORQUES)
-
     def _next(self, memory: ServoMemory, wanted: Array, belief: Belief) -> tuple[Array, str | None]:
         """Return the next command (18,); where there is none, the cranks stop, with the cause."""
         last = memory.command
@@ -189,7 +192,9 @@ class ServoPreview:
             return stay, "unreachable"
         if not np.all(np.isfinite(command)):
             return stay, "nonfinite_torque"
-        command[POSE] += self.correction(memory)
+        if self.learned is not None:
+            time = self.timeline.period * memory.samples
+            command[POSE] += self.learned(time + self.preview_times)[0]
         if self.servo is not None:
             command[POSE] = self.servo.limited(command[POSE], last[POSE])
         return command, None

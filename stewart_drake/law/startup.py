@@ -29,17 +29,17 @@ from stewart_drake.scenario.trajectories import evaluate, spread_instants
 from stewart_drake.types import Array
 
 PREDICTION_BUDGET = 2e-5
-"""rad, and shares of the reach, by which integrating over the delay may move the predicted pose."""
+"""Largest integration error of the predicted pose over the delay, rad and shares of the reach."""
 MOST_SUBSTEPS = 64
 """Per torque."""
 ASTRAY = 0.3
-"""rad, and crank lengths, from the reference on which a prediction is of no use."""
+"""Distance from the reference from which a prediction is of no use, rad and crank lengths."""
 STILL = 0.1
-"""rad, and crank lengths, by which a coordinate that is only held is thought to move."""
+"""Assumed motion of a coordinate that is only held, rad and crank lengths."""
 BLOCK = 64
-"""Holds that are predicted at a time; over a long delay the comparison may end with the first."""
+"""Holds per prediction; over a long delay the comparison may end with the first ones."""
 INSTANTS = 200
-"""At which the torques along a reference are looked at."""
+"""Number of instants at which torques along a reference are evaluated."""
 TOLERANCE = 0.03
 """Pose error that is tolerable, as a share of half the reference's peak to peak.
 
@@ -54,7 +54,10 @@ def initial_queue(
     period: float,
     delay: Delay,
 ) -> Array:
-    """Torques (L, 6) in flight at t = 0, oldest first: nothing, what holds still, what follows."""
+    """Return the torques (L, 6) in flight at t = 0, oldest first, N m.
+
+    They are zero, or those that hold the start pose, or those that follow the reference.
+    """
     length = delay.queue_length
     if kind == "zero" or length == 0:
         return np.zeros((length, NUM_TORQUES))
@@ -65,16 +68,16 @@ def initial_queue(
 
 
 def sizes(mechanism: Mechanism) -> Array:
-    """(6,) 1 rad, and the longest a leg reaches, crank and rod in line, in m."""
+    """Return 1 rad and the longest reach of a leg, crank and rod in line, in m, as (6,)."""
     return np.repeat([1.0, (mechanism.crank_lengths + mechanism.rod_lengths).max()], 3)
 
 
 def machine_torque(dynamics: StewartDynamics) -> float:
-    """Motor torque in N m that the machine's own inertia takes when it moves briskly.
+    """Return the motor torque of a brisk motion without gravity, N m.
 
-    At constant acceleration a plate goes from rest s = a T^2 / 2 in the time T. This is the torque
+    At constant acceleration a plate goes from rest s = a T^2 / 2 in the time T. The torque is that
     for one rad or one crank length from home in 1 s, about or along the axis that takes most:
-    max |B^-1 M 2 s|, without gravity.
+    max |B^-1 M 2 s|.
     """
     mechanism = dynamics.mechanism
     s = np.diag(np.repeat([1.0, mechanism.crank_lengths.min()], 3))
@@ -84,7 +87,7 @@ def machine_torque(dynamics: StewartDynamics) -> float:
 
 
 def least_torque(dynamics: StewartDynamics) -> float:
-    """N m; the torque that goes with STILL, for a reference that takes none."""
+    """Return the torque that corresponds to STILL, for a reference that takes none, N m."""
     return STILL * machine_torque(dynamics)
 
 
@@ -94,7 +97,7 @@ def weight_scales(
     peak_to_peak: Array,
     peak_torque: float,
 ) -> tuple[Array, Array, Array]:
-    """Weights (6,) of the pose error, its integral and the torques in the cost, before w_Q, w_R.
+    """Return weights (6,) of pose error, integral and torques in the cost, before w_Q and w_R.
 
     Bryson's rule, one over the square of the tolerable value: of the error TOLERANCE times half the
     reference's peak to peak (`sizes` where that is 0), that for 1 s of the integral, and the torque
@@ -109,21 +112,21 @@ def weight_scales(
 
 
 def reference_torques(dynamics: StewartDynamics, reference: Trajectory, duration: float) -> Array:
-    """Largest of the six motor torques (INSTANTS,) in N m along the reference."""
+    """Return the largest of the six motor torques (INSTANTS,) along the reference, N m."""
     states = (evaluate(reference, t) for t in spread_instants(duration, INSTANTS))
     torques = [dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS]) for x in states]
     return np.abs(torques).max(axis=1)
 
 
 def reference_torque(dynamics: StewartDynamics, reference: Trajectory, duration: float) -> float:
-    """Largest motor torque in N m that following the reference takes."""
+    """Return the largest motor torque that the reference takes, N m."""
     return float(reference_torques(dynamics, reference, duration).max())
 
 
 def choose_substeps(
     dynamics: StewartDynamics, reference: Trajectory, period: float, steps: int, duration: float
 ) -> int:
-    """Least number of Runge-Kutta steps per period that keeps the prediction within its budget.
+    """Return the fewest Runge-Kutta steps per period that keep the prediction within its budget.
 
     Along the reference, the pose predicted over the delay with n steps per period is compared with
     that of 2 n steps; their difference is 15/16 of the error with n. Torques held for long periods
