@@ -230,11 +230,15 @@ def usual_parameters(
             column[place] = value
     changes[0, WRENCH], changes[1, WRENCH] = WALK_SHARE * scale, JUMP_SHARE * scale
     chosen = [names.index(name) for name in free]
+    prior, std, lower, upper = columns[:, chosen]
     changing = scale.any() and any(name in WRENCHES for name in free)
     return ParameterSet(
         tuple(free),
         tuple(units[i] for i in chosen),
-        *columns[:, chosen],
+        prior,
+        std,
+        lower,
+        upper,
         walk=changes[0, chosen] if changing else None,
         jump=changes[1, chosen] if changing else None,
     )
