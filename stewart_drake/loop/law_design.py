@@ -79,7 +79,9 @@ from stewart_drake.scenario.trajectories import evaluate, motion_range, spread_i
 from stewart_drake.types import Array, ArrayLike
 
 REPLAN = 0.4
-"""Duration of a plan back onto the reference with a delay estimator, s."""
+"""Longest plan back onto the reference with a delay estimator, s."""
+REPLAN_SHARE = 0.75
+"""The same as a share of the assumed delay: an error that grew fast is taken back fast."""
 TOLERATED = 0.004
 """Largest standard deviation of the torques' timing at which their weight is not raised, as a share
 of the loop's time constant: 0.7 ms for the motion of `paper`."""
@@ -221,12 +223,13 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     )
     if c.delay_estimator != "none":
         prior = timeline.eta, c.delay_std, c.delay_max
+        back = min(REPLAN, REPLAN_SHARE * timeline.eta)
         delay = DelaySettings.of(c.delay_estimator, *prior, quiet)
         law = replace(
             law,
             observer=CoreObserver(settings, delay),
             predictor=ArrivalPredictor(),
-            planner=NoPlanner() if c.replan == 0 else Replan(c.replan or REPLAN, experiment.scale),
+            planner=NoPlanner() if c.replan == 0 else Replan(c.replan or back, experiment.scale),
             silence=0,  # until the delay is found
         )
     if c.limits == "qp":

@@ -295,8 +295,9 @@ class ControllerConfig:
         open_loop_start: whether a start from rest has no feedback before the first own torque can
             have acted.
         replan: duration of a plan back onto the reference, s; 0 for none; null is that of the
-            catch-up, and with a delay estimator 0.4 s. It is made where the prediction is certain
-            and off the reference: after a start from rest, or a jump of an estimated delay.
+            catch-up, and with a delay estimator 0.75 times the assumed delay, 0.4 s at most. It is
+            made where the prediction is certain and off the reference: after a start from rest, or
+            a jump of an estimated delay.
         model_error: of the estimator's model: white noise of the accelerations, as a share of the
             motion's range per s^1.5; null is 2e-4 of it in each period, and less in
             a short one on an exact plant.
