@@ -324,7 +324,8 @@ def test_a_motion_that_cannot_be_is_refused_each_time():
 
 # A reference that is missing.
 
-START = {"rest": ("controller.replan=0",), "reference": FOLLOWS}
+# A law that plans reads the motion as a function, in which nothing is missing.
+START = {"rest": ("controller.replan=0",), "reference": (*FOLLOWS, "controller.replan=0")}
 
 
 def error_without(start, missing):

@@ -208,11 +208,11 @@ class Preparation:
         queue = experiment.torques_in_flight(law.timeline.delay).tobytes()
         if queue not in self._ways:
             self._ways[queue] = way_onto(experiment, law)
-        way, motion = self._ways[queue], experiment.reference
+        way, motion, length = self._ways[queue], experiment.reference, 0.0
         if way is not None:
             catch_up = experiment.scenario.controller.catch_up
             motion, length = way.plan(catch_up, experiment.planned_limit)
-            law = replanning(law, experiment, length)
+        law = replanning(law, experiment, length)
         source = (tuner or weights_source)(experiment, law)
         previews = self._preview(motion, law)
         followed = followed_motion(law, motion, experiment.reference) or ()

@@ -78,10 +78,13 @@ from stewart_drake.scenario.signals import (
 from stewart_drake.scenario.trajectories import evaluate, motion_range, spread_instants
 from stewart_drake.types import Array, ArrayLike
 
-REPLAN = 0.4
-"""Longest plan back onto the reference with a delay estimator, s."""
-REPLAN_SHARE = 0.75
-"""The same as a share of the assumed delay: an error that grew fast is taken back fast."""
+LONGEST_REPLAN = 0.4
+"""Longest plan back onto the reference where `controller.replan` is null, s."""
+FOUND_SHARE = 0.75
+"""The same as a share of the assumed delay, with a delay estimator: an error that grew over a short
+delay is taken back as fast."""
+KNOWN_SHARE = 0.2
+"""The same with a known delay, after a start on the reference: the error is still small."""
 TOLERATED = 0.004
 """Largest standard deviation of the torques' timing at which their weight is not raised, as a share
 of the loop's time constant: 0.7 ms for the motion of `paper`."""
@@ -223,7 +226,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     )
     if c.delay_estimator != "none":
         prior = timeline.eta, c.delay_std, c.delay_max
-        back = min(REPLAN, REPLAN_SHARE * timeline.eta)
+        back = min(LONGEST_REPLAN, FOUND_SHARE * timeline.eta)
         delay = DelaySettings.of(c.delay_estimator, *prior, quiet)
         law = replace(
             law,
@@ -337,26 +340,29 @@ def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, floa
     sc, law = experiment.scenario, compose_law(experiment)
     way = way_onto(experiment, law)
     if way is None:
-        return law, experiment.reference, 0.0
+        return replanning(law, experiment, 0.0), experiment.reference, 0.0
     motion, length = way.plan(sc.controller.catch_up, experiment.planned_limit)
     return replanning(law, experiment, length), motion, length
 
 
 def replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> PredictiveLqi:
-    """Return the law for a start from rest with a catch-up of `length` s, 0 for none.
+    """Return the law that plans a way back onto the reference, or `law` where it does not.
 
-    The catch-up is computed before payload and bias are known. Once they are, and the prediction is
-    certain enough, the law plans again. The law is returned unchanged without a catch-up or
-    estimated parameters, with a delay estimator or a linear prediction, over packets, with late
-    measurements, with a quadratic program, or with `replan: 0`.
+    After a start from rest with a catch-up of `length` s it plans again for as long: payload and
+    bias were unknown before. After a start on the reference it takes back what they moved the plate
+    by before they were known. It does not plan without estimated parameters, after a start from
+    rest without a catch-up (0 s), with a delay estimator or a linear prediction, over packets, with
+    late measurements, with a quadratic program, or with `replan: 0`.
     """
-    replan = experiment.scenario.controller.replan
+    sc = experiment.scenario
+    replan, period = sc.controller.replan, sc.controller.period
     plain = not isinstance(law, LimitedLqi) and isinstance(law.predictor, NonlinearPredictor)
-    if not (length and law.estimates and plain and isinstance(law.channel, Wire)):
+    if not (law.estimates and plain and isinstance(law.channel, Wire)):
         return law
-    if law.longest_wait or replan == 0:
+    if law.longest_wait or replan == 0 or (sc.start == "rest" and not length):
         return law
-    return replace(law, planner=Replan(replan or length, experiment.scale))
+    short = max(2 * period, min(LONGEST_REPLAN, KNOWN_SHARE * law.timeline.eta))
+    return replace(law, planner=Replan(replan or length or short, experiment.scale))
 
 
 def tolerated_timing(experiment: Experiment) -> float:

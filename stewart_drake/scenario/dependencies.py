@@ -132,7 +132,6 @@ NEEDS: Final = (
         "torque",
     ),
     _needs("catch_up open_loop_start", "start", "rest"),
-    _needs("replan", "start", "rest", known_delay=True),
     _needs("replan", "link.kind", "wire", known_delay=True),
     _needs("replan", "controller.estimate", _CONSTANTS, known_delay=True),
 )
