@@ -27,9 +27,10 @@ from stewart_drake.live.contact import address_of
 from stewart_drake.live.design import always
 from stewart_drake.live.endpoint import read_key
 from stewart_drake.live.governor import PACE, Request
-from stewart_drake.live.loop import REST_RATE, START_ERROR, End, Snapshot, Viewer
+from stewart_drake.live.loop import REST_RATE, START_ERROR
 from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.session import drive, plans, prepare_session
+from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.loop.learned import HARMONICS, harmonics_below, motion_period, save_learned
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import SimulationResult, accumulated_error

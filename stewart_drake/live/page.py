@@ -20,7 +20,7 @@ import numpy as np
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import jsonable
 from stewart_drake.live.governor import Request
-from stewart_drake.live.loop import End, Snapshot, Viewer
+from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.reporting.local_page import LocalHandler, LocalServer
 from stewart_drake.reporting.page import environment
