@@ -191,7 +191,7 @@ class Exchange:
 
 
 class Watch:
-    """Reports what becomes of the machine.
+    """Reports changes of the machine's state, and ends a run without it.
 
     Args:
         exchange: datagrams of the run.
@@ -247,7 +247,7 @@ class Watch:
         stalled = lag > STALL / SECOND
         if stalled and not self._stalled:
             went_on = "the machine went on by its buffer"
-            self._report(k, f"this process stood still for {lag:.1f} s; {went_on}")
+            self._report(k, f"this process did not run for {lag:.1f} s; {went_on}")
         self._stalled = stalled
 
     def _report(self, k: int, text: str) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law.channel import Report
-from stewart_drake.law.core_law import AnyMemory, serving
+from stewart_drake.law.core_law import serving
 from stewart_drake.law.measurement import Measurement
 from stewart_drake.live.checks import LONGEST_GAP, ReportCheck, stays_within_reach
 from stewart_drake.live.contact import Contact
@@ -82,7 +82,7 @@ class LiveLoop:
     """
 
     _compared = slice(0, NUM_STATE)
-    """Part of the state that tells whether the plate is at the start."""
+    """Part of the state that is compared with the scenario's start."""
 
     def __init__(
         self,
@@ -256,17 +256,14 @@ class LiveLoop:
 
     # -------------------------------------------------------------- torques
 
-    def _stepped(self, t: float, measurement: Measurement, report: Report | None) -> AnyMemory:
+    def _stepped(self, t: float, measurement: Measurement, report: Report | None) -> Any:
         """Return the memory after the law's step at t in s."""
         way, weights = self._steering.way, self._design.experiment.scenario.controller.weights
 
         def ahead(times: Array) -> Array:
             return np.array([way.at(t + one) for one in times])
 
-        stepped: AnyMemory = self._law.step(
-            self.memory, measurement, ahead, np.array(weights), report
-        )
-        return stepped
+        return self._law.step(self.memory, measurement, ahead, np.array(weights), report)
 
     def _packet(self, k: int) -> tuple[Array, int]:
         """Return the rows (n, 6) to send, and the sample that the first one is of."""
@@ -282,10 +279,9 @@ class LiveLoop:
         self.exchange.send(k, packet, first, eta, self._design.cranks)
         self._check.sent(first + round((eta - timeline.fraction * P) / P), packet)
 
-    def _as_sent(self, k: int) -> AnyMemory:
+    def _as_sent(self, k: int) -> Any:
         """Return the memory for the record, with the torque as it was sent."""
-        memory: AnyMemory = self.memory
-        return memory if self._learned is None else self._learned.as_sent(k, memory)
+        return self.memory if self._learned is None else self._learned.as_sent(k, self.memory)
 
     def _acted(self, message: MachineMessage) -> dict[int, Array]:
         """Return the torques (6,) that have acted by the number of the period that they began."""
@@ -403,11 +399,10 @@ class CrankLoop(LiveLoop):
     def _heard(self, k: int, acted: dict[int, Array]) -> None:
         self.record.latest = self.memory.command[MODEL_TORQUE]  # the servos' own is not known
 
-    def _stepped(self, t: float, measurement: Measurement, report: Report | None) -> AnyMemory:
+    def _stepped(self, t: float, measurement: Measurement, report: Report | None) -> Any:
         wanted = self._steering.way.at(t + self._horizon)[None]
         nothing = np.full(self._design.law.reports.size, np.nan)
-        stepped: AnyMemory = self._law.step(self.memory, measurement, lambda _: wanted, nothing)
-        return stepped
+        return self._law.step(self.memory, measurement, lambda _: wanted, nothing)
 
     def _packet(self, k: int) -> tuple[Array, int]:
         law, command, t = self._design.law, self.memory.command, k * self._period + self._horizon
@@ -427,9 +422,8 @@ class CrankLoop(LiveLoop):
             rows.append(law.servo.limited(further + learned[i], rows[-1]))
         return np.array(rows), k
 
-    def _as_sent(self, k: int) -> AnyMemory:
-        memory: AnyMemory = self.memory
-        return memory
+    def _as_sent(self, k: int) -> Any:
+        return self.memory
 
     def _lead(self, t: float, state: Array, message: MachineMessage | None) -> str | None:
         begins, motion, pose = t + self._horizon, self._steering.motion, state[POSE]

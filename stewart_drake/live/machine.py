@@ -117,8 +117,8 @@ class Machine:
         endpoint: socket.
         say: prints a line.
         clock: monotonic clock, ns.
-        log: gets the true state, the acting torque and the measurement at each sample of a run, by
-            the machine's clock; or None.
+        log: log of true state, acting torque and measurement at each sample of a run, by the
+            machine's clock; or None.
         body: makes plant and sensor, and their name; those of the scenario by default.
 
     Attributes:

@@ -50,7 +50,7 @@ SOFT_START: Final = 1.0
 _REJOIN: Final = 0.2
 """The same after a gap of at most this length, s."""
 _DECAY: Final = 0.08
-"""Time constant in which a crank comes to rest where plans end, s."""
+"""Time constant with which a crank stops where plans end, s."""
 _STILL: Final = 1e-4
 """Rate below which a crank is at rest, rad/s."""
 STALE: Final = 0.5
