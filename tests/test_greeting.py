@@ -18,7 +18,6 @@ from stewart_drake.live import contact as contacts
 from stewart_drake.live.checks import ReportCheck
 from stewart_drake.live.contact import Contact, await_free, call, open_endpoint
 from stewart_drake.live.endpoint import ANSWERS, ANSWERS_AT_ONCE
-from stewart_drake.live.loop import End, Viewer
 from stewart_drake.live.machine import Machine
 from stewart_drake.live.page import PageViewer
 from stewart_drake.live.protocol import (
@@ -32,6 +31,7 @@ from stewart_drake.live.protocol import (
     encode,
 )
 from stewart_drake.live.session import drive, prepare_session
+from stewart_drake.live.viewer import End, Viewer
 from stewart_drake.loop.peer import FAULTS, Fault, Part, Reason, identity_of, in_words
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.loading import load_scenario

@@ -33,11 +33,12 @@ from stewart_drake.live.contact import Contact, Link, address_of, await_free, ca
 from stewart_drake.live.design import as_seen, check_controller, design
 from stewart_drake.live.endpoint import Endpoint
 from stewart_drake.live.governor import Governor, Request, Steering, Way
-from stewart_drake.live.loop import End, LiveLoop, Snapshot, Viewer
+from stewart_drake.live.loop import LiveLoop
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.page import PageRequest, PageViewer, Readouts, read_request, serve
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerMessage, MachineFlags
 from stewart_drake.live.session import _queue_advice, check_armed, drive, plans, prepare_session
+from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.preparation import prepare

@@ -15,9 +15,11 @@ from stewart_drake.law.servos import rise
 from stewart_drake.live import design as designing
 from stewart_drake.live import learning
 from stewart_drake.live.endpoint import Endpoint
+from stewart_drake.live.exchange import Exchange
+from stewart_drake.live.learned import LearnedSetpoints, LearnedTorques
 from stewart_drake.live.learning import learn_live
 from stewart_drake.live.log import LiveRecord
-from stewart_drake.live.loop import CrankLoop, LiveLoop
+from stewart_drake.live.loop import LiveLoop
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.protocol import ControllerMessage, MachineFlags
@@ -42,27 +44,22 @@ def some_signal(size=0.05, period=PERIOD):
     return LearnedSignal(period, coefficients)
 
 
-def loop_of(learned, by_hand=lambda: False):
-    """Return a loop that has only what plans are made of."""
+def plan_of(learned, by_hand=lambda: False):
+    """Return the learned part of a plan as a function of its time."""
     scenario = sd.load_scenario("reachy_mini", settings=(STEPS,))
     made = designing.design(scenario, Message(), designing.always(learned))
 
-    class Alone(CrankLoop):
-        _by_hand = property(lambda self: by_hand())
-
-        def __init__(self):
-            self._design, self._period, self._share = made, 0.02, 0.0
-
-    return Alone()
+    part = LearnedSetpoints(made.learned, 0.02)
+    return lambda t: part.plan(t, made.rows, by_hand())
 
 
 def test_what_was_learned_begins_and_ends_softly_and_is_by_the_time_of_the_motion():
     signal, on_hand = some_signal(), [False]
-    loop = loop_of(signal, lambda: on_hand[0])
+    plan = plan_of(signal, lambda: on_hand[0])
     plans = []
     for k in range(120):
         on_hand[0] = k >= 80
-        plans.append(loop._learned(0.02 * k))
+        plans.append(plan(0.02 * k))
     first = np.array([plan[0] for plan in plans])
     times = 0.02 * np.arange(120)
     up, down = rise(times[:80]), rise(1 - (times[80:] - times[80]))
@@ -113,12 +110,11 @@ def test_a_packet_has_the_sum_and_the_law_the_rest(limit):
 
     class Alone(LiveLoop):
         _by_hand = property(lambda self: on_hand[0])
-        _sends = True
 
         def __init__(self):
-            self._design, self._period, self._share = made, 0.1, 0.0
-            self._added, self._saturated, self._sequences = {}, 0, {}
-            self.record, self._contact = LiveRecord(made.experiment, limit, None, print), None
+            self._design, self._period, self._learned = made, 0.1, LearnedTorques(made)
+            self.exchange = Exchange(None, 0.1, 12)
+            self.record = LiveRecord(made.experiment, limit, None, print)
             self.memory = law.initial_memory(made.queue)
 
     loop, before, mean, acted, net = Alone(), None, signal.coefficients[0], {}, []
@@ -156,8 +152,8 @@ def test_a_packet_has_the_sum_and_the_law_the_rest(limit):
         sent_at = 29 - i - timeline.steps
         np.testing.assert_allclose(torque, net[sent_at], atol=1e-12)
     loop.record.finish()
-    assert loop._as_sent(39).counts.saturated_steps == loop._saturated
-    assert (loop._saturated > 0) == (limit < 1)
+    assert loop._as_sent(39).counts.saturated_steps == loop._learned.saturated
+    assert (loop._learned.saturated > 0) == (limit < 1)
     np.testing.assert_allclose(loop._as_sent(39).torque, asked + learned, atol=1e-12)
 
 

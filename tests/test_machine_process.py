@@ -309,11 +309,13 @@ def test_either_side_of_a_network_may_stand_still_for_a_second(side):
         suspended.popen.send_signal(signal.SIGSTOP)
         time.sleep(1.0)
         suspended.popen.send_signal(signal.SIGCONT)
-        suspended.until(r"stood still for (0\.[5-9]|[12]\.)")
+        suspended.until(r"(stood still|did not run) for (0\.[5-9]|[12]\.)")
         survived = driving.end() == 0
         assert running.end(signal.SIGINT) == 130
     # A busy computer may suspend it for some tenths of a second more.
-    stops = [float(s) for s in re.findall(r"stood still for ([\d.]+) s", suspended.said)]
+    stops = [
+        float(s) for s in re.findall(r"(?:stood still|did not run) for ([\d.]+) s", suspended.said)
+    ]
     assert sum(stop > 0.5 for stop in stops) == 1 and max(stops) < 3.0
     assert (
         "nothing was heard from the controller for 0.7 s: the safe torque (zero) acts"

@@ -174,7 +174,7 @@ void stewart_plan_times(real begin, real period, int periods, real times[3])
 }
 
 /* State (12) at which held torques take the reference over: with a change s of the torque over the
-   hold, rates are off by -dt/24 B s at its beginning (law/holds.py). */
+   hold, rates are off by -dt/24 B s at its beginning (law/feedforward.py). */
 static int target(const stewart_belief *belief, real period, const real *rows, real *state,
                   stewart_scratch scratch)
 {

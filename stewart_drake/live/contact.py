@@ -131,6 +131,12 @@ class Contact:
         return {cause.value: n for cause, n in self.endpoint.refused.items()}
 
     @property
+    def machine(self) -> MachineMessage:
+        """Newest message of a machine that has answered."""
+        assert self.last is not None
+        return self.last
+
+    @property
     def where(self) -> str:
         """Name of the machine in messages."""
         host, port = self.session.address
@@ -303,17 +309,16 @@ def call(contact: Contact) -> MachineMessage:
 def await_free(contact: Contact) -> None:
     """Wait for a new offer of a machine that no other controller drives."""
     contact.forget_waiting()
-    began, last, where = now(), contact.last, contact.where
-    assert last is not None
-    patience = max(_PATIENCE * SECOND, 2 * last.watchdog)
+    began, where = now(), contact.where
+    patience = max(_PATIENCE * SECOND, 2 * contact.machine.watchdog)
     while now() - began <= patience:
-        if contact.ask() and MachineFlags.BUSY not in (contact.last or last).flags:
+        if contact.ask() and MachineFlags.BUSY not in contact.machine.flags:
             return
     silent = (now() - contact.heard) / SECOND
     if silent < patience / SECOND:
         raise ConfigError(
-            f"{where} is in use by another controller (retry {last.watchdog / SECOND:g} s after it "
-            "stops)"
+            f"{where} is in use by another controller (retry "
+            f"{contact.machine.watchdog / SECOND:g} s after it stops)"
         )
     if contact.endpoint.refusal:
         raise ConfigError(

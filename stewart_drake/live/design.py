@@ -22,7 +22,6 @@ from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.limited import LimitedLqi
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.nominal import TorqueLimit
-from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.live.contact import Link
@@ -191,7 +190,8 @@ def design(scenario: Scenario, machine: MachineMessage, learned: Learned = None)
     repeats = scenario.controller.packet_repeats if scenario.link.kind == "network" else 0
     queue = first_queue(experiment, law)
     assert law.kept < MOST_HISTORY
-    step = _step_time(law, planned, queue)
+    took, backend = _step_times(replace(law, silence=0), planned, queue, _TRIED, np.ones(2))
+    step = min(took), backend
     return Design(experiment, law, planned, queue, repeats, limit, step, learned=learned)
 
 
@@ -205,25 +205,30 @@ def _of_cranks(experiment: Experiment, machine: MachineMessage, learned: Learned
     law, planned, _ = servo_law(experiment)
     limit = min(experiment.torque_limit, machine.torque_limit)
     first, _ = commands_in_flight(experiment, law, experiment.scenario.true_delay)
-    served, backend = serving(law)
-    motion, report = KnownMotion(planned, planned, 0.0), np.full(law.reports.size, np.nan)
-    measured = Measurement.of(law.sensing.seen(evaluate(planned, 0.0)[:NUM_STATE]))
     rows = 1 if MachineFlags.WIRE in machine.flags else _PLAN
-    memory, started = served.initial_memory(first), clock.thread_time()
-    for _ in range(rows):
-        memory = served.step(memory, measured, motion, report)
-    step = clock.thread_time() - started, backend
+    took, backend = _step_times(law, planned, first, rows, np.full(law.reports.size, np.nan))
+    step = sum(took), backend
     return Design(experiment, law, planned, first, 0, limit, step, rows, learned)
 
 
-def _step_time(law: PredictiveLqi, motion: Trajectory, queue: Array) -> tuple[float, str]:
-    """Return the shortest time of some steps, s of this thread, and their implementation."""
+def _step_times(
+    law: Any, motion: Trajectory, first: Array, number: int, given: Array
+) -> tuple[list[float], str]:
+    """Return the times of steps, s of this thread, and the name of their implementation.
+
+    Args:
+        law: control law.
+        motion: its reference.
+        first: queue or command before the first sample.
+        number: of steps.
+        given: weights or report of each step.
+    """
     served: Any
-    served, backend = serving(replace(law, silence=0))
-    memory, weights, took = served.initial_memory(queue), np.ones(2), list[float]()
+    served, backend = serving(law)
+    memory, took = served.initial_memory(first), list[float]()
     measured = Measurement.of(law.sensing.seen(evaluate(motion, 0.0)[:NUM_STATE]))
-    for _ in range(_TRIED):
+    for _ in range(number):
         started = clock.thread_time()
-        memory = served.step(memory, measured, KnownMotion(motion, motion, 0.0), weights)
+        memory = served.step(memory, measured, KnownMotion(motion, motion, 0.0), given)
         took.append(clock.thread_time() - started)
-    return min(took), backend
+    return took, backend

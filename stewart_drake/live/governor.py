@@ -147,13 +147,6 @@ class GovernorState(NamedTuple):
     pace: float = PACE  # pole w, 1/s
 
 
-class Blend(NamedTuple):
-    """A blend onto a motion."""
-
-    way: Trajectory  # trajectory of the blend, then the motion
-    end: float  # time at which the motion is reached, s
-
-
 @dataclass(frozen=True)
 class Governor:
     """Keeps a reference set by hand within the workspace and the torque limits."""
@@ -288,10 +281,10 @@ class Governor:
                 return slowest._replace(applied=applied, limit=limit)
         return limit
 
-    def onto(self, state: Array, time: float, motion: Trajectory) -> Blend | str:
+    def onto(self, state: Array, time: float, motion: Trajectory) -> Trajectory | str:
         """Return the shortest blend from a state (18,) at `time` s onto a motion within the limits.
 
-        Without any it returns the limit that the longest one exceeds.
+        It goes on as the motion. Without any the limit that the longest one exceeds is returned.
         """
         states, least = np.empty((0, NUM_REFERENCE)), min(4 / self.slowest, _BLENDS[-1])
         for duration in (one for one in _BLENDS if one >= least):
@@ -299,8 +292,7 @@ class Governor:
             shares = np.arange(0.0, 1.0, _BLEND_STEP / duration)
             states = np.array([between(state, goal, duration, share) for share in shares])
             if self._within(states):
-                end = time + duration
-                return Blend(through_states([(time, state, end, goal)], motion), end)
+                return through_states([(time, state, time + duration, goal)], motion)
         return self.problem(states) or ""
 
 
@@ -376,10 +368,10 @@ class Steering:
             if governed is None:
                 return replace(self, until=time, limit=None)
             blend = self.governor.onto(self.way.at(time), time, self.motion)
-            if isinstance(blend, Blend):
-                way = self.way.then(time, _along(blend.way))
-                return replace(self, way=way, governed=None, until=time, limit=None)
-            return replace(self._by_hand(governed, time), limit=blend)
+            if isinstance(blend, str):
+                return replace(self._by_hand(governed, time), limit=blend)
+            way = self.way.then(time, _along(blend))
+            return replace(self, way=way, governed=None, until=time, limit=None)
         if governed is None:
             begun = self.governor.begin(self.way.at(time))
             if isinstance(begun, str):
@@ -410,7 +402,7 @@ class Steering:
             blend = self.governor.onto(last, end, self.motion)
             if isinstance(blend, str):
                 return blend
-            return replace(self, way=way.then(end, _along(blend.way)), until=end, limit=None)
+            return replace(self, way=way.then(end, _along(blend)), until=end, limit=None)
         begun = self.governor.begin(last)
         if isinstance(begun, str):
             return begun

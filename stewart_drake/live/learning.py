@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -24,12 +24,13 @@ from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.servos import rise
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.live.contact import address_of
-from stewart_drake.live.design import always
+from stewart_drake.live.design import Learned, always
 from stewart_drake.live.endpoint import read_key
 from stewart_drake.live.governor import PACE, Request
-from stewart_drake.live.loop import REST_RATE, START_ERROR, End, Snapshot, Viewer
+from stewart_drake.live.loop import REST_RATE, START_ERROR
 from stewart_drake.live.options import LiveOptions
-from stewart_drake.live.session import drive, plans, prepare_session
+from stewart_drake.live.session import Ready, drive, plans, prepare_session
+from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.loop.learned import HARMONICS, harmonics_below, motion_period, save_learned
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import SimulationResult, accumulated_error
@@ -65,16 +66,40 @@ _EACH: Final = 4
 """Number of lacking torques that are computed at a sample; one takes about 0.7 ms."""
 
 
-class Repetition(NamedTuple):
-    """One repetition in real time.
+class _Asked(NamedTuple):
+    """A request to learn a scenario's motion on a machine."""
 
-    Attributes:
-        error: rms error of the crank angles in the last periods, rad.
-        result: the run.
-    """
+    scenario: Scenario
+    machine: str  # HOST:PORT
+    options: LiveOptions
+    say: Callable[[str], None]
+    ending: Callable[[], bool]
 
-    error: float
-    result: SimulationResult
+    @property
+    def file(self) -> Path:
+        """File for what is learned."""
+        return self.options.learned or Path("learned.npz")
+
+    def call(self, learned: Learned, duration: float = math.inf, plan: bool = True) -> Ready:
+        """Find the machine; print the plan of a run of `duration` s."""
+        address, key = address_of(self.machine), read_key(self.options.key)
+        ready = prepare_session(self.scenario, address, key, learned)
+        for line in plans(ready, duration, self.scenario.mechanism) if plan else ():
+            self.say(line)
+        return ready
+
+    def drive(self, ready: Ready, duration: float = math.inf, **how: Any) -> SimulationResult:
+        """Drive the machine."""
+        how |= self.options.model_dump(include={"armed", "accept_jitter", "max_missing"})
+        return drive(ready, duration, ending=self.ending, say=self.say, **how)
+
+    def end(self, best: int) -> None:
+        """Print the number of the best repetition, from 0."""
+        self.say(
+            f"repetition {1 + best} is the best; {self.file} is for controller.learned"
+            if best
+            else "nothing was learned: no repetition was better than the first one"
+        )
 
 
 def learn_live(
@@ -103,50 +128,27 @@ def learn_live(
         ConfigError: see `studies.learn.check_learning` and `live.session`.
     """
     check_learning(scenario)
-    file = options.learned or Path("learned.npz")
-    if not file.parent.is_dir():
-        raise ConfigError(f"--learned: got {file}; expected a file in a folder that is there")
-    learn = _learn_setpoints if scenario.controller.command == "cranks" else _learn_torques
-    return learn(scenario, machine, options, file, say, ending)
-
-
-def _said(best: int, file: Path) -> str:
-    if best == 0:
-        return "nothing was learned: no repetition was better than the first one"
-    return f"repetition {1 + best} is the best; {file} is for controller.learned"
+    asked = _Asked(scenario, machine, options, say, ending)
+    if not asked.file.parent.is_dir():
+        raise ConfigError(f"--learned: got {asked.file}; expected a file in a folder that is there")
+    cranks = scenario.controller.command == "cranks"
+    return _learn_setpoints(asked) if cranks else _learn_torques(asked)
 
 
 # ---------------------------------------------------------------- torques
 
 
-def _learn_torques(
-    scenario: Scenario,
-    machine: str,
-    options: LiveOptions,
-    file: Path,
-    say: Callable[[str], None],
-    ending: Callable[[], bool],
-) -> SimulationResult:
-    lessons = TorqueLessons(prepare(scenario), options.learn, say)
-    ready = prepare_session(scenario, address_of(machine), read_key(options.key), lessons)
-    for line in plans(ready, math.inf, scenario.mechanism):
-        say(line)
-    result = drive(
-        ready,
-        viewer=lessons,
-        ending=ending,
-        say=say,
-        logs=[lessons],
-        pace=lessons.pace,
-        **options.model_dump(include={"armed", "accept_jitter", "max_missing"}),
-    )
+def _learn_torques(asked: _Asked) -> SimulationResult:
+    lessons = TorqueLessons(prepare(asked.scenario), asked.options.learn, asked.say)
+    ready = asked.call(lessons)
+    result = asked.drive(ready, viewer=lessons, logs=[lessons], pace=lessons.pace)
     if result.status != "completed":
-        say(f"{End(result.status, result.stopped).words}; learning ends")
+        asked.say(f"{End(result.status, result.stopped).words}; learning ends")
     if lessons.errors:
         best = lessons.best
         if best:
-            save_learned(file, lessons.tried[best], lessons.experiment)
-        say(_said(best, file))
+            save_learned(asked.file, lessons.tried[best], lessons.experiment)
+        asked.end(best)
     return result
 
 
@@ -305,15 +307,9 @@ class TorqueLessons(Viewer):
 # ---------------------------------------------------------------- setpoints
 
 
-def _learn_setpoints(
-    scenario: Scenario,
-    machine: str,
-    options: LiveOptions,
-    file: Path,
-    say: Callable[[str], None],
-    ending: Callable[[], bool],
-) -> SimulationResult:
-    learned, best = None, 0
+def _learn_setpoints(asked: _Asked) -> SimulationResult:
+    scenario, say = asked.scenario, asked.say
+    learned: LearnedSignal | None = None
     period, dt = motion_period(scenario), scenario.controller.period
     number, servo = harmonics_below(period, dt), scenario.actuator
     assert servo.kind == "position_servo"
@@ -321,36 +317,32 @@ def _learn_setpoints(
     last = period * math.ceil(_LEARNED_FROM / period)
     duration = dt * math.ceil((_SETTLING + last) / dt + 1)
     least = 2 * (1 + 2 * number)  # twice the number of coefficients
-    address, key = address_of(machine), read_key(options.key)
-    how = options.model_dump(include={"armed", "accept_jitter", "max_missing"})
-    done, steps, own = list[Repetition](), Anderson(), prepare(scenario)
-    for k in range(1, options.learn + 1):
-        ready = prepare_session(scenario, address, key, always(learned))
-        if k == 1:
-            for line in plans(ready, duration, scenario.mechanism):
-                say(line)
-        experiment = ready.design.experiment
-        result = drive(ready, duration, ending=ending, say=say, **how)
+    errors, runs = list[float](), list[SimulationResult]()
+    steps, own = Anderson(), prepare(scenario)
+    for k in range(1, asked.options.learn + 1):
+        ready = asked.call(always(learned), duration, plan=k == 1)
+        result = asked.drive(ready, duration)
         if result.status != "completed":
             say(f"repetition {k}: {End(result.status, result.stopped).words}; learning ends")
             break
-        times, missed = lacking_angles(experiment, result, last)
+        times, missed = lacking_angles(ready.design.experiment, result, last)
         if len(times) < least:
             say(
                 f"repetition {k}: {len(times)} measurements in the last {last:.3g} s; expected at "
                 f"least {least}; learning ends"
             )
             break
-        done.append(Repetition(float(np.sqrt(np.mean(missed**2))), result))
-        say(f"repetition {k}: the cranks lack {np.degrees(done[-1].error):.3f} degrees rms")
-        best = int(np.argmin([one.error for one in done]))
+        errors.append(float(np.sqrt(np.mean(missed**2))))  # rad
+        runs.append(result)
+        say(f"repetition {k}: the cranks lack {np.degrees(errors[-1]):.3f} degrees rms")
+        best = int(np.argmin(errors))
         if best == k - 1 and learned is not None:  # at once, so that Ctrl-C loses nothing
-            save_learned(file, learned, own)
+            save_learned(asked.file, learned, own)
         if k - 1 - best >= PATIENCE:
             break
         fitted = corrected_setpoints(steps.used, fit(times, missed, period, number), period, lag)
         learned = LearnedSignal(period, steps.after(fitted))
-    if not done:
+    if not runs:
         return result
-    say(_said(best, file))
-    return done[best].result
+    asked.end(best)
+    return runs[best]

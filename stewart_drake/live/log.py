@@ -175,14 +175,10 @@ class LiveRecord(Record):
         """Set the scenario that was run."""
         self._scenario = scenario
 
-    def flush(self) -> None:
-        """Write the rows that wait for a report."""
-        while self._rows:
-            self._write(min(self._rows))
-
     def finish(self) -> Array:
         """Close the file and read it for `summarize` and `dataset`; return its `late` (n,), s."""
-        self.flush()
+        while self._rows:
+            self._write(min(self._rows))
         rows = self._file.close()
         logged, (seconds, late) = rows[:, :-2], rows[:, -2:].T
         at, columns = 1, {}

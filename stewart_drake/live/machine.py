@@ -11,7 +11,7 @@ import math
 import select
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final
@@ -33,6 +33,7 @@ from stewart_drake.live.protocol import (
     MachineFlags,
     MachineMessage,
     Refusal,
+    bits_of,
 )
 from stewart_drake.live.simulated import (
     Body,
@@ -72,6 +73,21 @@ def check_scenario(scenario: Scenario) -> None:
 
 
 @contextmanager
+def socket_and_log(
+    scenario: Scenario, options: MachineOptions, say: Callable[[str], None]
+) -> Iterator[tuple[Endpoint, RunLog | None]]:
+    """Yield the socket of a machine, and the log that its options ask for."""
+    with ExitStack() as opened:
+        endpoint = Endpoint(ControllerMessage, options.host, options.port, read_key(options.key))
+        opened.callback(endpoint.close)
+        log = None
+        if options.log is not None:
+            log = Background(open_log(options.log, scenario), str(options.log), say)
+            opened.callback(log.close)
+        yield endpoint, log
+
+
+@contextmanager
 def open_machine(
     scenario: Scenario, options: MachineOptions, say: Callable[[str], None] = print
 ) -> "Iterator[tuple[Machine, Address]]":
@@ -81,17 +97,8 @@ def open_machine(
         ConfigError: a scenario that the protocol does not cover, or an address in use.
     """
     check_scenario(scenario)
-    experiment = prepare(scenario)
-    endpoint = Endpoint(ControllerMessage, options.host, options.port, read_key(options.key))
-    log = None
-    try:
-        if options.log is not None:
-            log = Background(open_log(options.log, scenario), str(options.log), say)
-        yield Machine(experiment, endpoint, options, say, log=log), endpoint.address
-    finally:
-        endpoint.close()
-        if log is not None:
-            log.close()
+    with socket_and_log(scenario, options, say) as (endpoint, log):
+        yield Machine(prepare(scenario), endpoint, options, say, log=log), endpoint.address
 
 
 def reason_of(failure: Failure) -> Reason:
@@ -110,8 +117,8 @@ class Machine:
         endpoint: socket.
         say: prints a line.
         clock: monotonic clock, ns.
-        log: gets the true state, the acting torque and the measurement at each sample of a run, by
-            the machine's clock; or None.
+        log: log of true state, acting torque and measurement at each sample of a run, by the
+            machine's clock; or None.
         body: makes plant and sensor, and their name; those of the scenario by default.
 
     Attributes:
@@ -170,6 +177,9 @@ class Machine:
 
     def _new_motors(self) -> Motors:
         return Motors.of(self._experiment)
+
+    def _report(self, time: int, text: str) -> None:
+        self._say(f"{time / SECOND:.3f} s: {text}")
 
     # -------------------------------------------------------------- time
 
@@ -263,7 +273,7 @@ class Machine:
         if when > self._stalled_until:
             self.counts["stood still"] += 1
             self._precede(Reason(Fault.STOOD, lasted=lag), when)
-            self._say(f"{when / SECOND:.3f} s: {self.before}; the plate went on by its buffer")
+            self._report(when, f"{self.before}; the plate went on by its buffer")
         self._stalled_until = when + lag
 
     # -------------------------------------------------------------- the plate
@@ -282,9 +292,8 @@ class Machine:
         left = self._origin + round(failure.time * SECOND)
         self._fail(reason_of(failure), left)
         why = in_words(self.reason, self.before)
-        self._say(
-            f"{left / SECOND:.3f} s: the plate left its workspace: {why}; stopped, a new session "
-            "begins at rest"
+        self._report(
+            left, f"the plate left its workspace: {why}; stopped, a new session begins at rest"
         )
 
     def _fail(self, reason: Reason, time: int) -> None:
@@ -310,7 +319,7 @@ class Machine:
         self._running, self._origin, self._safe = True, time, False
         self._motors.begin(Plan(0, time, 0, playout, self._first_rows()))
         self.counts["runs"] += 1
-        self._say(f"{time / SECOND:.3f} s: the run began")
+        self._report(time, "the run began")
 
     def _first_rows(self) -> Array:
         return self._queue
@@ -321,7 +330,7 @@ class Machine:
         if self._safe and self._motors.fed:
             self._precede(self.reason, time)
             self._safe, self.reason = False, Reason()
-            self._say(f"{time / SECOND:.3f} s: torques act again")
+            self._report(time, "torques act again")
 
     def _take_sample(self, time: int) -> None:
         self._follow(time)
@@ -361,7 +370,7 @@ class Machine:
         safe = f"the safe torque ({self._settings.safe}) acts"
         if self._motors.cranks:
             safe = "the cranks are held"
-        self._say(f"{time / SECOND:.3f} s: {self.reason}: {safe}")
+        self._report(time, f"{self.reason}: {safe}")
 
     def _go_safe(self, time: int) -> None:
         self._follow(time)
@@ -431,9 +440,7 @@ class Machine:
             self._go_safe(time)
             self.reason = self.before = Reason()
         self.begin = NEVER
-        self._say(
-            f"{time / SECOND:.3f} s: session {self.counts['sessions']}, of {host}:{port}, {where}"
-        )
+        self._report(time, f"session {self.counts['sessions']}, of {host}:{port}, {where}")
 
     def _obey(self, message: ControllerMessage, time: int) -> None:
         if ControllerFlags.STOP in message.flags:
@@ -442,7 +449,7 @@ class Machine:
                 self._go_safe(time)
             if self.failure is None:
                 self._fail(Reason(Fault.STOP), time)
-            self._say(f"{time / SECOND:.3f} s: {FAULTS[Fault.STOP]}")
+            self._report(time, FAULTS[Fault.STOP])
             return
         if max(message.begin % NEVER, message.playout) > time + FURTHEST:
             self._refuse(Refusal.MALFORMED)
@@ -515,7 +522,7 @@ class Machine:
             watchdog=self.watchdog,
             rate=self._settings.rate,
             torque_limit=self._experiment.torque_limit,
-            arrived=np.array([bool(seen >> i & 1) for i in range(64)]),
+            arrived=bits_of(seen),
             acted_from=acted[0][0] if acted else NEVER,
             acted=np.array(rows).reshape(-1, NUM_TORQUES),
             played=self._motors.played,

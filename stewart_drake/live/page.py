@@ -13,20 +13,21 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
+from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import jsonable
 from stewart_drake.live.governor import Request
-from stewart_drake.live.loop import End, Snapshot, Viewer
+from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.reporting.local_page import LocalHandler, LocalServer
 from stewart_drake.reporting.page import environment
 from stewart_drake.reporting.style import FACTORS
 from stewart_drake.reporting.viewer import slider_range
-from stewart_drake.scenario.signals import COORDINATE_NAMES, NUM_COORDINATES, POSE, RATES
+from stewart_drake.scenario.signals import COORDINATE_NAMES, POSE, RATES
 from stewart_drake.types import Array
 
 _FRAME: Final = 1 / 30
@@ -39,12 +40,6 @@ _START: Final = 60.0
 """Longest wait for the page, s."""
 _AHEAD: Final = 0.2
 """Longest extrapolation of the pose between two samples, s."""
-
-
-class Opened(NamedTuple):
-    """The address of the page, once its process serves it."""
-
-    url: str
 
 
 class PageRequest(NamedTuple):
@@ -69,7 +64,7 @@ class PageViewer(Viewer):
         """Wait for the page; return its address with the token. To be called once."""
         with suppress(EOFError):
             if self._connection.poll(_START):
-                return str(self._connection.recv().url)
+                return str(self._connection.recv())
         raise ConfigError("the browser page did not start; run with --no-browser")
 
     def show(self, snapshot: Snapshot) -> None:
@@ -173,7 +168,7 @@ def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
     threading.Thread(target=server.serve_forever, daemon=True).start()
     with suppress(EOFError, OSError):  # the loop is gone
         with lock:
-            connection.send(Opened(server.url))
+            connection.send(server.url)
         _draw(connection, lock, scene, readouts)
     time.sleep(_LAST)  # for browsers to receive the end
     server.shutdown()
@@ -219,9 +214,7 @@ def _values(seen: Snapshot) -> dict[str, Any]:
         "pose": np.round(FACTORS * seen.state[POSE], 2).tolist(),
         "torque": np.round(seen.torque, 4).tolist(),
         "error": round(seen.error, 3),
-        "eta": round(1e3 * seen.eta, 1),
-        "trip": round(1e3 * seen.trip, 1),
-        "spread": round(1e3 * seen.spread, 1),
+        **{name: round(1e3 * getattr(seen, name), 1) for name in ("eta", "trip", "spread")},
         "lost": round(100 * seen.lost, 1),
         "missed": seen.missed,
         "safe": seen.safe,
@@ -259,25 +252,18 @@ def _handler(page: str, secret: str, readouts: Readouts, ask: Any) -> type[Local
     return Handler
 
 
-def read_request(data: bytes) -> PageRequest | None:
-    """Return a browser's request, or None for anything else.
+class _Asked(BaseModel):
+    """Request of a browser: `target`, six numbers in degrees and mm or null, and `stop`."""
 
-    It is JSON with `target`, six numbers in degrees and mm or null, and `stop`.
-    """
+    target: Annotated[list[FiniteFloat], Field(min_length=6, max_length=6)] | None = None
+    stop: bool = False
+
+
+def read_request(data: bytes) -> PageRequest | None:
+    """Return a browser's request, `_Asked` as JSON, or None for anything else."""
     try:
-        found = json.loads(data)
-    except (ValueError, RecursionError):  # thousands of brackets
+        asked = _Asked.model_validate_json(data, strict=True)
+    except ValidationError:
         return None
-    if not isinstance(found, dict) or not isinstance(found.get("stop", False), bool):
-        return None
-    target = found.get("target")
-    if target is None:
-        return PageRequest(None, found.get("stop", False))
-    numbers = isinstance(target, list) and len(target) == NUM_COORDINATES
-    if not numbers or not all(type(x) in (int, float) for x in target):
-        return None
-    try:
-        pose = np.array(target, dtype=np.float64) / FACTORS
-    except OverflowError:  # an integer of hundreds of digits
-        return None
-    return PageRequest(pose, found.get("stop", False)) if np.all(np.isfinite(pose)) else None
+    target = None if asked.target is None else np.array(asked.target) / FACTORS
+    return PageRequest(target, asked.stop)

@@ -52,12 +52,21 @@ SECOND: Final = 10**9
 # magic, version, bytes of the tag, bytes in all, session, nonce, sequence, acknowledged, time,
 # echo, held, flags
 _HEAD: Final = struct.Struct("<4sBBHQQIIQQQI")
-# kind, samples, bits, history; sampled, begin, period, watchdog, rate, torque_limit, arrived,
-# acted_from; played, dry, refused; reason, leg, before, content; their durations
 _MACHINE: Final = struct.Struct("<BBBBQQQQddQQIIIBBBBQQ")
+_MACHINE_NUMBERS: Final = (
+    *("kind", "samples", "bits", "history", "sampled", "begin", "period", "watchdog", "rate"),
+    *("torque_limit", "arrived", "acted_from", "played", "dry", "refused"),
+    *("fault", "leg", "before", "content", "lasted", "before_lasted"),
+)
+_OWN: Final = (
+    *("bits", "sampled", "begin", "period", "watchdog", "rate", "torque_limit"),
+    *("acted_from", "played", "dry", "refused"),
+)
+"""Those of them that are attributes of `MachineMessage`."""
 # rows, content, reserved (2); sampled, playout, begin
 _CONTROLLER: Final = struct.Struct("<BB2xQQQ")
 _PART: Final = struct.Struct(f"<{DIGEST}s{NAME}s")
+_IDENTITY: Final = _PART.size * len(Identity._fields)
 _PADDING: Final = bytes(_MACHINE.size - _CONTROLLER.size)
 """Padding that makes a request as long as its answer."""
 _REQUEST: Final = 1
@@ -174,7 +183,7 @@ class MachineMessage:
     cranks: bool = False  # whether the rows of `acted` are setpoints of the cranks, rad
 
     def __eq__(self, other: object) -> bool:
-        return _equal(self, other)
+        return isinstance(other, MachineMessage) and encode(self) == encode(other)
 
     @property
     def why(self) -> str:
@@ -207,24 +216,10 @@ class ControllerMessage:
     cranks: bool = False  # whether the rows of `torques` are setpoints of the cranks, rad
 
     def __eq__(self, other: object) -> bool:
-        return _equal(self, other)
+        return isinstance(other, ControllerMessage) and encode(self) == encode(other)
 
 
 Message = MachineMessage | ControllerMessage
-
-
-def _equal(one: Any, other: object) -> bool:
-    if type(one) is not type(other):
-        return False
-    for name, a in vars(one).items():
-        b = getattr(other, name)
-        if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
-            same = np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
-        else:
-            same = a == b
-        if not same:
-            return False
-    return True
 
 
 # ---------------------------------------------------------------- writing
@@ -268,13 +263,11 @@ def _machine_body(m: MachineMessage) -> bytes:
     elif m.identity is not None:
         kind, measured = _OFFERS, _identity_bytes(m.identity)
     arrived = sum(1 << i for i, there in enumerate(m.arrived[:64]) if there)
-    times = (m.sampled, m.begin, m.period, m.watchdog)
-    packed = _MACHINE.pack(
-        *(kind, samples, m.bits, len(m.acted), *times, m.rate, m.torque_limit),
-        *(arrived, m.acted_from, m.played, m.dry, m.refused),
-        *(m.reason.fault, m.reason.leg, m.before.fault, _CRANKS * m.cranks),
-        *(m.reason.lasted, m.before.lasted),
-    )
+    numbers = vars(m) | {"kind": kind, "samples": samples, "history": len(m.acted)}
+    numbers |= {"arrived": arrived, "content": _CRANKS * m.cranks}
+    numbers |= {"fault": m.reason.fault, "leg": m.reason.leg, "lasted": m.reason.lasted}
+    numbers |= {"before": m.before.fault, "before_lasted": m.before.lasted}
+    packed = _MACHINE.pack(*(numbers[name] for name in _MACHINE_NUMBERS))
     return packed + measured + np.asarray(m.acted, "<f8").tobytes()
 
 
@@ -343,9 +336,8 @@ def _authenticate(data: bytes, tag: int, key: bytes | None) -> None:
 def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
     if len(body) < _MACHINE.size:
         raise RefusedError(Refusal.MALFORMED, "a short body")
-    kind, samples, bits, history, *rest = _MACHINE.unpack_from(body)
-    sampled, begin, period, watchdog, rate, limit, arrived, acted_from, *counts = rest
-    played, dry, refused, fault, leg, before, content, lasted, before_lasted = counts
+    n = dict(zip(_MACHINE_NUMBERS, _MACHINE.unpack_from(body), strict=True))
+    kind, samples, bits, history = (n[name] for name in _MACHINE_NUMBERS[:4])
     fits = {
         0: samples == 0 and bits == 0,
         1: samples == 1 and bits == 0,
@@ -353,11 +345,11 @@ def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
         _OFFERS: samples == 0 and bits == 0 and history == 0,
     }
     encoders = 8 * NUM_LEGS + 4 * NUM_LEGS * samples
-    sizes = {0: 0, 1: 8 * NUM_STATE, 2: encoders, _OFFERS: _PART.size * len(Identity._fields)}
-    plausible = rate > 0 and math.isfinite(rate) and limit > 0 and period > 0
-    plausible = plausible and content in (0, _CRANKS)
-    plausible = plausible and max(fault, before) < len(Fault) and leg <= NUM_LEGS
-    if not (fits.get(kind) and history <= MOST_HISTORY and plausible and flags < 1024):
+    sizes = {0: 0, 1: 8 * NUM_STATE, 2: encoders, _OFFERS: _IDENTITY}
+    plausible = 0 < n["rate"] < math.inf and n["torque_limit"] > 0 and n["period"] > 0
+    plausible = plausible and n["content"] in (0, _CRANKS) and n["leg"] <= NUM_LEGS
+    plausible = plausible and max(n["fault"], n["before"]) < len(Fault) and flags < 1024
+    if not (fits.get(kind) and history <= MOST_HISTORY and plausible):
         raise RefusedError(Refusal.MALFORMED, "a number outside its range")
     if len(body) != _MACHINE.size + sizes[kind] + 8 * NUM_TORQUES * history:
         raise RefusedError(Refusal.MALFORMED, "a body of another length")
@@ -373,36 +365,30 @@ def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
     identity = _identity(measured) if kind == _OFFERS else None
     if not np.all(np.isfinite(acted)) or (zeros is not None and not np.all(np.isfinite(zeros))):
         raise RefusedError(Refusal.MALFORMED, "a torque or an angle that is not finite")
-    there = np.array([bool(arrived >> i & 1) for i in range(64)])
     return MachineMessage(
         head=head,
         flags=MachineFlags(flags),
-        sampled=sampled,
-        begin=begin,
-        period=period,
-        watchdog=watchdog,
-        rate=rate,
-        torque_limit=limit,
-        arrived=there,
-        acted_from=acted_from,
+        arrived=bits_of(n["arrived"]),
         acted=acted,
-        played=played,
-        dry=dry,
-        refused=refused,
         state=state,
         codes=codes,
-        bits=bits,
         zeros=zeros,
         identity=identity,
-        reason=Reason(Fault(fault), leg, lasted),
-        before=Reason(Fault(before), 0, before_lasted),
-        cranks=content == _CRANKS,
+        reason=Reason(Fault(n["fault"]), n["leg"], n["lasted"]),
+        before=Reason(Fault(n["before"]), 0, n["before_lasted"]),
+        cranks=n["content"] == _CRANKS,
+        **{name: n[name] for name in _OWN},
     )
+
+
+def bits_of(number: int) -> NDArray[np.bool_]:
+    """Return the bits (64,) of a number, the lowest first."""
+    return np.array([bool(number >> i & 1) for i in range(64)])
 
 
 def _identity(data: bytes) -> Identity:
     parts = []
-    for digest, padded in _PART.iter_unpack(data[: _PART.size * len(Identity._fields)]):
+    for digest, padded in _PART.iter_unpack(data[:_IDENTITY]):
         name = padded.rstrip(b"\0")
         if any(not 0x20 <= letter <= 0x7E for letter in name):
             raise RefusedError(Refusal.MALFORMED, "a name that cannot be printed")
@@ -414,27 +400,23 @@ def _controller(head: Head, flags: int, body: bytes) -> ControllerMessage:
     if len(body) < _CONTROLLER.size:
         raise RefusedError(Refusal.MALFORMED, "a short body")
     rows, content, sampled, playout, begin = _CONTROLLER.unpack_from(body)
-    asks = content == _REQUEST
+    asks, told = content == _REQUEST, body[_CONTROLLER.size :]
     if rows > MOST_ROWS or content > _CRANKS or (asks and rows) or flags > 3 or any(body[2:4]):
         raise RefusedError(Refusal.MALFORMED, "a number outside its range")
     if asks:
-        size = _PART.size * len(Identity._fields)
-        said, padding = body[_CONTROLLER.size :][:size], body[_CONTROLLER.size + size :]
-        if padding != _PADDING or len(said) != size:
+        if told[_IDENTITY:] != _PADDING:
             raise RefusedError(Refusal.MALFORMED, "a request of another length")
-        no_torques = np.empty((0, NUM_TORQUES))
-        numbers = (sampled, playout, begin, no_torques)
-        return ControllerMessage(head, ControllerFlags(flags), *numbers, _identity(said))
-    if len(body) != _CONTROLLER.size + 8 * NUM_TORQUES * rows:
+        torques, identity = _rows(b""), _identity(told)
+    elif len(told) != 8 * NUM_TORQUES * rows:
         raise RefusedError(Refusal.MALFORMED, "a body of another length")
-    torques = _rows(body[_CONTROLLER.size :])
+    else:
+        torques, identity = _rows(told), None
     if not np.all(np.isfinite(torques)):
         raise RefusedError(Refusal.MALFORMED, "a torque that is not finite")
     if rows and begin == NEVER:
         raise RefusedError(Refusal.MALFORMED, "torques for no run")
-    numbers = (sampled, playout, begin, torques)
-    cranks = content == _CRANKS
-    return ControllerMessage(head, ControllerFlags(flags), *numbers, cranks=cranks)
+    times, cranks = (sampled, playout, begin), content == _CRANKS
+    return ControllerMessage(head, ControllerFlags(flags), *times, torques, identity, cranks)
 
 
 def _rows(data: bytes) -> Array:

@@ -11,7 +11,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
@@ -22,8 +22,8 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import brief
 from stewart_drake.law.servos import Stiffness, rise
 from stewart_drake.live.contact import address_of
-from stewart_drake.live.endpoint import Address, Endpoint, now, read_key
-from stewart_drake.live.machine import Machine, check_scenario, open_machine
+from stewart_drake.live.endpoint import Address, Endpoint, now
+from stewart_drake.live.machine import Machine, check_scenario, open_machine, socket_and_log
 from stewart_drake.live.options import MachineOptions
 from stewart_drake.live.protocol import (
     NEVER,
@@ -40,7 +40,6 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import ForwardKinematicsError
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing
-from stewart_drake.scenario.run_log import Background, open_log
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE, POSE
 from stewart_drake.types import Array
 
@@ -51,7 +50,7 @@ SOFT_START: Final = 1.0
 _REJOIN: Final = 0.2
 """The same after a gap of at most this length, s."""
 _DECAY: Final = 0.08
-"""Time constant in which a crank comes to rest where plans end, s."""
+"""Time constant with which a crank stops where plans end, s."""
 _STILL: Final = 1e-4
 """Rate below which a crank is at rest, rad/s."""
 STALE: Final = 0.5
@@ -343,7 +342,7 @@ class RobotMachine(Machine):
         """Send the setpoint of a period."""
         self._at(time + self.period, 4, self._drive)
         while self._daemon.lines:
-            self._say(f"{time / SECOND:.3f} s: {self._daemon.lines.popleft()}")
+            self._report(time, self._daemon.lines.popleft())
         if not self._daemon.ready:
             self._soft = None
             if self._running and self.reason.fault != Fault.DRIVE:
@@ -403,18 +402,12 @@ def open_robot(
         ) from None
     assert options.reachy is not None
     address, experiment = address_of(options.reachy, "--reachy"), prepare(scenario)
-    endpoint = Endpoint(ControllerMessage, options.host, options.port, read_key(options.key))
-    log, daemon = None, Daemon(address)
-    try:
+    with (
+        socket_and_log(scenario, options, say) as (endpoint, log),
+        closing(Daemon(address)) as daemon,
+    ):
         _await_positions(daemon, options.reachy)
-        if options.log is not None:
-            log = Background(open_log(options.log, scenario), str(options.log), say)
         yield RobotMachine(experiment, endpoint, options, daemon, say, log=log), endpoint.address
-    finally:
-        daemon.close()
-        endpoint.close()
-        if log is not None:
-            log.close()
 
 
 def _await_positions(daemon: Daemon, where: str) -> None:

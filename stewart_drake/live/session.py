@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import numpy as np
+
 from stewart_drake.dynamics.native_functions import one_blas_thread
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.contact import Contact, address_of, call, open_endpoint
@@ -22,9 +24,10 @@ from stewart_drake.live.design import (
 )
 from stewart_drake.live.endpoint import Address, Endpoint
 from stewart_drake.live.governor import FASTEST, PACE, Governor, Steering, Way
-from stewart_drake.live.loop import CrankLoop, LiveLoop, Viewer
+from stewart_drake.live.loop import CrankLoop, LiveLoop
 from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.protocol import NOTHING, SECOND, ControllerFlags, MachineFlags
+from stewart_drake.live.viewer import Viewer
 from stewart_drake.loop.cautions import overconfidence
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.peer import identity_of
@@ -54,8 +57,7 @@ class Ready(NamedTuple):
     @property
     def simulated(self) -> bool:
         """Whether the machine reports that it is a simulation."""
-        last = self.contact.last
-        return last is not None and MachineFlags.SIMULATION in last.flags
+        return MachineFlags.SIMULATION in self.contact.machine.flags
 
     @property
     def jitter_problem(self) -> str | None:
@@ -120,8 +122,7 @@ def _in_time(experiment: Experiment) -> Experiment:
 def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
     """Return lines about the machine, the link and the law, for before the begin."""
     contact, made = ready.contact, ready.design
-    machine, link, sc = contact.last, contact.link, made.experiment.scenario
-    assert machine is not None
+    machine, link, sc = contact.machine, contact.link, made.experiment.scenario
     host, port = contact.session.address
     kind = "a simulation" if ready.simulated else "A REAL MACHINE: it will move"
     eta = made.law.timeline.eta
@@ -341,10 +342,22 @@ def drive(
     )
 
 
-def _live_summary(loop: LiveLoop, contact: Contact, late: Array) -> dict[str, Any]:
-    """Return `live` of summary.json."""
-    link, last = contact.link, contact.last
-    return loop.timing.summary(late) | {
+def _live_summary(loop: LiveLoop, contact: Contact, recorded: Array) -> dict[str, Any]:
+    """Return `live` of summary.json, from the delays (n,) of the recorded steps, s."""
+    link, last = contact.link, contact.machine
+    late = np.append(recorded, loop.resting)
+    late = late if len(late) else np.array([math.nan])
+    p99 = float(np.quantile(late, 0.99))
+    return {
+        "samples": loop.exchange.sent,
+        "deadlines_missed": loop.missed,
+        "measurements_overtaken": loop.exchange.overtaken,
+        "sent_after_due_ms": {
+            "median": 1e3 * float(np.median(late)),
+            "p99": 1e3 * p99,
+            "worst": 1e3 * float(late.max()),
+        },
+        "jitter_std_ms": 1e3 * float(np.std(np.clip(late, None, p99))),
         "taken_over": loop.taken_over,
         "recoveries": loop.recoveries,
         "round_trip_ms": {
@@ -354,9 +367,9 @@ def _live_summary(loop: LiveLoop, contact: Contact, late: Array) -> dict[str, An
         },
         "lost_there": link.loss_there,
         "lost_back": link.loss_back,
-        "periods_played": 0 if last is None else last.played,
-        "periods_dry": 0 if last is None else last.dry,
+        "periods_played": last.played,
+        "periods_dry": last.dry,
         "refused": contact.refused,
-        "refused_by_machine": 0 if last is None else last.refused,
+        "refused_by_machine": last.refused,
         "unsent": contact.endpoint.unsent,
     }

@@ -84,28 +84,32 @@ static void digest_end(sha256 *s, uint8_t *out)
         out[i] = (uint8_t)(s->h[i / 4] >> (24 - 8 * (i % 4)));
 }
 
+/* Begin with a block of a key, each of its bytes changed by `pad`. */
+static void digest_key(sha256 *s, const uint8_t *block, uint8_t pad)
+{
+    digest_begin(s);
+    for (int i = 0; i < 64; i++) {
+        uint8_t byte = block[i] ^ pad;
+        digest_add(s, &byte, 1);
+    }
+}
+
 /* HMAC-SHA256 (RFC 2104), 32 bytes. */
 static void hmac(stewart_key key, const uint8_t *data, size_t size, uint8_t *outer)
 {
-    uint8_t pad[64] = {0}, inner[32];
+    uint8_t block[64] = {0}, inner[32];
     sha256 s;
     if (key.size > 64) {
         digest_begin(&s);
         digest_add(&s, key.bytes, key.size);
-        digest_end(&s, pad);
+        digest_end(&s, block);
     } else {
-        memcpy(pad, key.bytes, key.size);
+        memcpy(block, key.bytes, key.size);
     }
-    for (int i = 0; i < 64; i++)
-        pad[i] ^= 0x36;
-    digest_begin(&s);
-    digest_add(&s, pad, 64);
+    digest_key(&s, block, 0x36);
     digest_add(&s, data, size);
     digest_end(&s, inner);
-    for (int i = 0; i < 64; i++)
-        pad[i] ^= 0x36 ^ 0x5c;
-    digest_begin(&s);
-    digest_add(&s, pad, 64);
+    digest_key(&s, block, 0x5c);
     digest_add(&s, inner, 32);
     digest_end(&s, outer);
 }
@@ -120,53 +124,86 @@ static void tag_of(stewart_key key, const uint8_t *data, size_t size, uint8_t *t
 
 /* ---------------------------------------------------------------- numbers */
 
-static void put(uint8_t **at, uint64_t value, int bytes)
+static void put(uint8_t **at, uint64_t value, size_t bytes)
 {
-    for (int i = 0; i < bytes; i++)
+    for (size_t i = 0; i < bytes; i++)
         *(*at)++ = (uint8_t)(value >> 8 * i);
 }
 
-static void put_double(uint8_t **at, double value)
-{
-    uint64_t bits;
-    memcpy(&bits, &value, sizeof bits);
-    put(at, bits, 8);
-}
-
-static void put_doubles(uint8_t **at, const double *values, int number)
-{
-    for (int i = 0; i < number; i++)
-        put_double(at, values[i]);
-}
-
-static uint64_t get(const uint8_t **at, int bytes)
+static uint64_t get(const uint8_t **at, size_t bytes)
 {
     uint64_t value = 0;
-    for (int i = 0; i < bytes; i++)
+    for (size_t i = 0; i < bytes; i++)
         value |= (uint64_t)*(*at)++ << 8 * i;
     return value;
 }
 
-static double get_double(const uint8_t **at)
+/* A number of 1, 4 or 8 bytes as an unsigned one; a double by its bits. */
+typedef union {
+    uint8_t one;
+    uint32_t four;
+    uint64_t eight;
+} number;
+
+static void put_numbers(uint8_t **at, const void *from, size_t size, size_t count)
 {
-    uint64_t bits = get(at, 8);
-    double value;
-    memcpy(&value, &bits, sizeof value);
-    return value;
+    for (size_t i = 0; i < count; i++) {
+        number n = {0};
+        memcpy(&n, (const uint8_t *)from + size * i, size);
+        put(at, size == 1 ? n.one : size == 4 ? n.four : n.eight, size);
+    }
 }
 
-/* Whether all of them are finite. */
-static int get_doubles(const uint8_t **at, double *values, int number)
+static void get_numbers(const uint8_t **at, void *to, size_t size, size_t count)
 {
-    int finite = 1;
-    for (int i = 0; i < number; i++) {
-        values[i] = get_double(at);
-        finite &= isfinite(values[i]) != 0;
+    for (size_t i = 0; i < count; i++) {
+        number n;
+        uint64_t value = get(at, size);
+        if (size == 1)
+            n.one = (uint8_t)value;
+        else if (size == 4)
+            n.four = (uint32_t)value;
+        else
+            n.eight = value;
+        memcpy((uint8_t *)to + size * i, &n, size);
     }
-    return finite;
+}
+
+static int all_finite(const double *values, int count)
+{
+    for (int i = 0; i < count; i++)
+        if (!isfinite(values[i]))
+            return 0;
+    return 1;
+}
+
+/* A number of a structure. Tables of them have the order of docs/protocol.md. */
+typedef struct {
+    size_t place, size;
+} field;
+
+#define FIELD(type, member) {offsetof(type, member), sizeof(((type *)NULL)->member)}
+#define PUT(at, structure, fields) put_fields(at, structure, fields, sizeof fields / sizeof *fields)
+#define GET(at, structure, fields) get_fields(at, structure, fields, sizeof fields / sizeof *fields)
+
+static void put_fields(uint8_t **at, const void *structure, const field *fields, size_t count)
+{
+    for (size_t i = 0; i < count; i++)
+        put_numbers(at, (const uint8_t *)structure + fields[i].place, fields[i].size, 1);
+}
+
+static void get_fields(const uint8_t **at, void *structure, const field *fields, size_t count)
+{
+    for (size_t i = 0; i < count; i++)
+        get_numbers(at, (uint8_t *)structure + fields[i].place, fields[i].size, 1);
 }
 
 /* ---------------------------------------------------------------- head and tag */
+
+#define OF(member) FIELD(stewart_head, member)
+static const field HEAD[] = {OF(session), OF(nonce), OF(sequence), OF(acknowledged),
+                             OF(time),    OF(echo),  OF(held),     OF(flags)};
+#undef OF
 
 static void put_head(uint8_t **at, const char *magic, const stewart_head *h, stewart_key key)
 {
@@ -175,14 +212,7 @@ static void put_head(uint8_t **at, const char *magic, const stewart_head *h, ste
     put(at, STEWART_PROTOCOL, 1);
     put(at, key.size ? STEWART_TAG : 0, 1);
     put(at, 0, 2); /* the length, once it is known */
-    put(at, h->session, 8);
-    put(at, h->nonce, 8);
-    put(at, h->sequence, 4);
-    put(at, h->acknowledged, 4);
-    put(at, h->time, 8);
-    put(at, h->echo, 8);
-    put(at, h->held, 8);
-    put(at, h->flags, 4);
+    PUT(at, h, HEAD);
 }
 
 static size_t finish(uint8_t *data, uint8_t *end, stewart_key key)
@@ -200,9 +230,10 @@ static int same_kind(const uint8_t *data, const char *magic)
     return memcmp(data, magic, 4) == 0;
 }
 
-/* What head and tag say; `at` is left at the body, of `body` bytes. */
-static int get_head(const uint8_t *data, size_t size, stewart_key key, stewart_head *h,
-                    const uint8_t **at, size_t *body)
+/* What head and tag of a datagram of a kind say; `at` is left at the body, of `body` bytes, at least
+   `least`. */
+static int get_head(const char *magic, size_t least, const uint8_t *data, size_t size, stewart_key key,
+                    stewart_head *h, const uint8_t **at, size_t *body)
 {
     if (size < STEWART_HEAD || size > STEWART_LONGEST ||
         !(same_kind(data, "STWM") || same_kind(data, "STWC")))
@@ -223,26 +254,10 @@ static int get_head(const uint8_t *data, size_t size, stewart_key key, stewart_h
         if (differs)
             return STEWART_KEY;
     }
-    h->session = get(at, 8);
-    h->nonce = get(at, 8);
-    h->sequence = (uint32_t)get(at, 4);
-    h->acknowledged = (uint32_t)get(at, 4);
-    h->time = get(at, 8);
-    h->echo = get(at, 8);
-    h->held = get(at, 8);
-    h->flags = (uint32_t)get(at, 4);
+    GET(at, h, HEAD);
     *body = size - STEWART_HEAD - tag;
-    return h->session == 0 || h->sequence == 0 ? STEWART_MALFORMED : STEWART_TAKEN;
-}
-
-/* Read the head of a datagram of a kind with a body of at least `least` bytes. */
-static int get_head_of(const char *magic, size_t least, const uint8_t *data, size_t size,
-                       stewart_key key, stewart_head *h, const uint8_t **at, size_t *body)
-{
-    int refused = get_head(data, size, key, h, at, body);
-    if (refused)
-        return refused;
-    return same_kind(data, magic) && *body >= least ? STEWART_TAKEN : STEWART_MALFORMED;
+    return h->session && h->sequence && same_kind(data, magic) && *body >= least ? STEWART_TAKEN
+                                                                                 : STEWART_MALFORMED;
 }
 
 size_t stewart_write_version(const uint8_t *data, uint8_t *answer)
@@ -305,49 +320,35 @@ unsigned stewart_differing(const stewart_identity *one, const stewart_identity *
 
 #define MACHINE_BODY 100
 
-/* Contents of a datagram; 0: torques. */
-enum { REQUEST = 1, CRANKS = 2 };
+#define OF(member) FIELD(stewart_measured, member)
+static const field MACHINE[] = {
+    OF(kind),          OF(samples),      OF(bits),         OF(history),
+    OF(sampled),       OF(begin),        OF(period),       OF(watchdog),
+    OF(rate),          OF(torque_limit), OF(arrived),      OF(acted_from),
+    OF(played),        OF(dry),          OF(refused),      OF(reason.fault),
+    OF(reason.leg),    OF(before.fault), OF(content),      OF(reason.lasted),
+    OF(before.lasted),
+};
+#undef OF
 
 size_t stewart_write_measured(const stewart_measured *m, stewart_key key, uint8_t *data)
 {
     uint8_t *at = data;
     put_head(&at, "STWM", &m->head, key);
-    put(&at, m->kind, 1);
-    put(&at, m->samples, 1);
-    put(&at, m->bits, 1);
-    put(&at, m->history, 1);
-    put(&at, m->sampled, 8);
-    put(&at, m->begin, 8);
-    put(&at, m->period, 8);
-    put(&at, m->watchdog, 8);
-    put_double(&at, m->rate);
-    put_double(&at, m->torque_limit);
-    put(&at, m->arrived, 8);
-    put(&at, m->acted_from, 8);
-    put(&at, m->played, 4);
-    put(&at, m->dry, 4);
-    put(&at, m->refused, 4);
-    put(&at, m->reason.fault, 1);
-    put(&at, m->reason.leg, 1);
-    put(&at, m->before.fault, 1);
-    put(&at, m->cranks ? CRANKS : 0, 1);
-    put(&at, m->reason.lasted, 8);
-    put(&at, m->before.lasted, 8);
+    PUT(&at, m, MACHINE);
     if (m->kind == STEWART_OFFER)
         put_identity(&at, &m->identity);
     if (m->kind == STEWART_STATE)
-        put_doubles(&at, m->state, 12);
+        put_numbers(&at, m->state, 8, 12);
     if (m->kind == STEWART_ENCODERS) {
-        put_doubles(&at, m->zeros, 6);
-        for (int i = 0; i < m->samples; i++)
-            for (int leg = 0; leg < 6; leg++)
-                put(&at, (uint32_t)m->codes[i][leg], 4);
+        put_numbers(&at, m->zeros, 8, 6);
+        put_numbers(&at, m->codes, 4, 6u * m->samples);
     }
-    put_doubles(&at, &m->acted[0][0], 6 * m->history);
+    put_numbers(&at, m->acted, 8, 6u * m->history);
     return finish(data, at, key);
 }
 
-static int plausible(const stewart_measured *m, uint64_t content)
+static int plausible(const stewart_measured *m)
 {
     int fits = (m->kind == STEWART_NOTHING && m->samples == 0 && m->bits == 0) ||
                (m->kind == STEWART_OFFER && m->samples == 0 && m->bits == 0 && m->history == 0) ||
@@ -355,8 +356,8 @@ static int plausible(const stewart_measured *m, uint64_t content)
                (m->kind == STEWART_ENCODERS && m->samples >= 1 && m->samples <= STEWART_SAMPLES &&
                 m->bits >= 1 && m->bits <= STEWART_BITS);
     return fits && m->history <= STEWART_HISTORY && m->rate > 0 && isfinite(m->rate) &&
-           m->torque_limit > 0 && m->period > 0 && (content == 0 || content == CRANKS) &&
-           m->head.flags < 1024 &&
+           m->torque_limit > 0 && m->period > 0 && m->content != STEWART_REQUEST &&
+           m->content <= STEWART_CRANKS && m->head.flags < 1024 &&
            m->reason.fault < STEWART_FAULTS && m->reason.leg <= 6 && m->before.fault < STEWART_FAULTS;
 }
 
@@ -365,32 +366,11 @@ int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key, ste
     const uint8_t *at;
     size_t body;
     memset(m, 0, sizeof *m);
-    int refused = get_head_of("STWM", MACHINE_BODY, data, size, key, &m->head, &at, &body);
+    int refused = get_head("STWM", MACHINE_BODY, data, size, key, &m->head, &at, &body);
     if (refused)
         return refused;
-    m->kind = (uint8_t)get(&at, 1);
-    m->samples = (uint8_t)get(&at, 1);
-    m->bits = (uint8_t)get(&at, 1);
-    m->history = (uint8_t)get(&at, 1);
-    m->sampled = get(&at, 8);
-    m->begin = get(&at, 8);
-    m->period = get(&at, 8);
-    m->watchdog = get(&at, 8);
-    m->rate = get_double(&at);
-    m->torque_limit = get_double(&at);
-    m->arrived = get(&at, 8);
-    m->acted_from = get(&at, 8);
-    m->played = (uint32_t)get(&at, 4);
-    m->dry = (uint32_t)get(&at, 4);
-    m->refused = (uint32_t)get(&at, 4);
-    m->reason.fault = (uint8_t)get(&at, 1);
-    m->reason.leg = (uint8_t)get(&at, 1);
-    m->before.fault = (uint8_t)get(&at, 1);
-    uint64_t content = get(&at, 1);
-    m->cranks = content == CRANKS;
-    m->reason.lasted = get(&at, 8);
-    m->before.lasted = get(&at, 8);
-    if (!plausible(m, content))
+    GET(&at, m, MACHINE);
+    if (!plausible(m))
         return STEWART_MALFORMED;
     size_t measured = m->kind == STEWART_STATE      ? 96u
                       : m->kind == STEWART_OFFER    ? IDENTITY
@@ -398,21 +378,17 @@ int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key, ste
                                                     : 0u;
     if (body != MACHINE_BODY + measured + 48u * m->history)
         return STEWART_MALFORMED;
-    int finite = 1;
     if (m->kind == STEWART_OFFER)
         return get_identity(&at, &m->identity) ? STEWART_TAKEN : STEWART_MALFORMED;
     if (m->kind == STEWART_STATE)
-        get_doubles(&at, m->state, 12); /* NaN is what was lost */
+        get_numbers(&at, m->state, 8, 12); /* NaN is what was lost */
     if (m->kind == STEWART_ENCODERS) {
-        finite = get_doubles(&at, m->zeros, 6);
-        for (int i = 0; i < m->samples; i++)
-            for (int leg = 0; leg < 6; leg++) {
-                uint32_t code = (uint32_t)get(&at, 4);
-                memcpy(&m->codes[i][leg], &code, sizeof code);
-            }
+        get_numbers(&at, m->zeros, 8, 6);
+        get_numbers(&at, m->codes, 4, 6u * m->samples);
     }
-    finite &= get_doubles(&at, &m->acted[0][0], 6 * m->history);
-    return finite ? STEWART_TAKEN : STEWART_MALFORMED;
+    get_numbers(&at, m->acted, 8, 6u * m->history);
+    return all_finite(m->zeros, 6) && all_finite(m->acted[0], 6 * m->history) ? STEWART_TAKEN
+                                                                              : STEWART_MALFORMED;
 }
 
 /* ---------------------------------------------------------------- controller to machine */
@@ -420,22 +396,24 @@ int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key, ste
 #define CONTROLLER_BODY 28
 #define PADDING (MACHINE_BODY - CONTROLLER_BODY) /* a request is as long as its answer */
 
+static const field PLAN[] = {FIELD(stewart_plan, sampled), FIELD(stewart_plan, playout),
+                             FIELD(stewart_plan, begin)};
+
 size_t stewart_write_plan(const stewart_plan *m, stewart_key key, uint8_t *data)
 {
+    const int asks = m->content == STEWART_REQUEST;
     uint8_t *at = data;
     put_head(&at, "STWC", &m->head, key);
-    put(&at, m->asks ? 0 : m->rows, 1);
-    put(&at, m->asks ? REQUEST : m->cranks ? CRANKS : 0, 1);
+    put(&at, asks ? 0 : m->rows, 1);
+    put(&at, m->content, 1);
     put(&at, 0, 2);
-    put(&at, m->sampled, 8);
-    put(&at, m->playout, 8);
-    put(&at, m->begin, 8);
-    if (m->asks) {
+    PUT(&at, m, PLAN);
+    if (asks) {
         put_identity(&at, &m->identity);
         memset(at, 0, PADDING);
         at += PADDING;
     } else {
-        put_doubles(&at, &m->torques[0][0], 6 * m->rows);
+        put_numbers(&at, m->torques, 8, 6u * m->rows);
     }
     return finish(data, at, key);
 }
@@ -445,27 +423,27 @@ int stewart_read_plan(const uint8_t *data, size_t size, stewart_key key, stewart
     const uint8_t *at;
     size_t body;
     memset(m, 0, sizeof *m);
-    int refused = get_head_of("STWC", CONTROLLER_BODY, data, size, key, &m->head, &at, &body);
+    int refused = get_head("STWC", CONTROLLER_BODY, data, size, key, &m->head, &at, &body);
     if (refused)
         return refused;
     m->rows = (uint8_t)get(&at, 1);
-    uint64_t content = get(&at, 1), zero = get(&at, 2);
-    m->asks = content == REQUEST;
-    m->cranks = content == CRANKS;
-    m->sampled = get(&at, 8);
-    m->playout = get(&at, 8);
-    m->begin = get(&at, 8);
-    if (m->rows > STEWART_ROWS || content > CRANKS || (m->asks && m->rows) || zero || m->head.flags > 3 ||
-        body != CONTROLLER_BODY + (m->asks ? IDENTITY + PADDING : 48u * m->rows))
+    m->content = (uint8_t)get(&at, 1);
+    const int asks = m->content == STEWART_REQUEST;
+    const uint64_t zero = get(&at, 2);
+    GET(&at, m, PLAN);
+    if (m->rows > STEWART_ROWS || m->content > STEWART_CRANKS || (asks && m->rows) || zero ||
+        m->head.flags > 3 || body != CONTROLLER_BODY + (asks ? IDENTITY + PADDING : 48u * m->rows))
         return STEWART_MALFORMED;
-    if (m->asks) {
+    if (asks) {
         int good = get_identity(&at, &m->identity);
         for (int i = 0; i < PADDING; i++)
             good &= *at++ == 0;
         return good ? STEWART_TAKEN : STEWART_MALFORMED;
     }
-    int finite = get_doubles(&at, &m->torques[0][0], 6 * m->rows);
-    return finite && !(m->rows && m->begin == STEWART_NEVER) ? STEWART_TAKEN : STEWART_MALFORMED;
+    get_numbers(&at, m->torques, 8, 6u * m->rows);
+    return all_finite(m->torques[0], 6 * m->rows) && !(m->rows && m->begin == STEWART_NEVER)
+               ? STEWART_TAKEN
+               : STEWART_MALFORMED;
 }
 
 /* ---------------------------------------------------------------- sessions */

@@ -55,6 +55,9 @@ enum { STEWART_STOP = 1, STEWART_ARMED = 2 };
 /* Kinds of measurement; an offer has the machine's identity in its place. */
 enum { STEWART_NOTHING, STEWART_STATE, STEWART_ENCODERS, STEWART_OFFER };
 
+/* Contents of a datagram's rows; a request has the controller's identity and no rows. */
+enum { STEWART_TORQUES, STEWART_REQUEST, STEWART_CRANKS /* setpoints, rad */ };
+
 /* What kept a machine from going on. */
 enum {
     STEWART_NO_FAULT,
@@ -105,14 +108,13 @@ typedef struct {
     stewart_identity identity;     /* of an offer */
     double state[12], zeros[6]; /* the one or the other, by kind */
     int32_t codes[STEWART_SAMPLES][6];
-    uint8_t cranks; /* rows of `acted` are setpoints of the cranks, rad; 0: torques */
+    uint8_t content; /* of `acted` */
     double acted[STEWART_HISTORY][6];
 } stewart_measured;
 
 typedef struct {
     stewart_head head;
-    uint8_t rows, asks; /* asks: a request, with an identity and no rows */
-    uint8_t cranks;     /* rows are setpoints of the cranks, rad; 0: torques */
+    uint8_t rows, content;
     uint64_t sampled, playout, begin;
     stewart_identity identity;
     double torques[STEWART_ROWS][6];

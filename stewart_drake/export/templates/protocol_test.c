@@ -124,10 +124,12 @@ static void test_plan(void)
     data[4] = 1;
     check(stewart_read_plan(data, size, key, &read) == STEWART_VERSION, "another version");
     plan.head.flags = 0;
-    plan.rows = plan.cranks = 1;
+    plan.rows = 1;
+    plan.content = STEWART_CRANKS;
     check(same(data, stewart_write_plan(&plan, none, data), crank_bytes), "crank angles");
     size = from_hex(crank_bytes, data);
-    check(stewart_read_plan(data, size, none, &read) == STEWART_TAKEN && read.cranks, "reading them");
+    check(stewart_read_plan(data, size, none, &read) == STEWART_TAKEN && read.content == STEWART_CRANKS,
+          "reading them");
     damage(plan_bytes, none);
     damage(keyed_bytes, key);
     damage(crank_bytes, none);
@@ -167,7 +169,9 @@ static const stewart_identity paper = {{
 static void test_greeting(void)
 {
     uint8_t data[STEWART_LONGEST + 1];
-    stewart_plan request = {.head = head, .asks = 1, .begin = STEWART_NEVER, .identity = paper}, asked;
+    stewart_plan request = {.head = head, .content = STEWART_REQUEST, .begin = STEWART_NEVER,
+                            .identity = paper};
+    stewart_plan asked;
     stewart_measured offer = {.head = head, .kind = STEWART_OFFER, .sampled = 2400000000u,
                               .begin = STEWART_NEVER, .period = 100000000u, .watchdog = 1000000000u,
                               .rate = 1, .torque_limit = 0.5, .arrived = 11,
@@ -181,7 +185,9 @@ static void test_greeting(void)
               strcmp(read.identity.parts[0].name, "paper") == 0,
           "reading the offer");
     size = from_hex(request_bytes, data);
-    check(stewart_read_plan(data, size, none, &asked) == STEWART_TAKEN && asked.asks, "the request");
+    check(stewart_read_plan(data, size, none, &asked) == STEWART_TAKEN &&
+              asked.content == STEWART_REQUEST,
+          "the request");
     check(stewart_differing(&asked.identity, &read.identity) == 0, "the same identity");
     asked.identity.parts[2].digest[7] ^= 1;
     check(stewart_differing(&asked.identity, &read.identity) == 4, "another sensor");

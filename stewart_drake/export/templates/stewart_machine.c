@@ -62,12 +62,11 @@ static void precede(machine *m, stewart_reason reason, uint64_t time)
 /* Set the reason why torques do not act. */
 static void fail(machine *m, uint8_t fault, uint8_t leg, uint64_t lasted, uint64_t time)
 {
-    stewart_reason reason = {fault, leg, lasted}, none = {0, 0, 0};
     if (m->reason.fault)
         precede(m, m->reason, time);
     if (time - m->preceded > RECENT)
-        m->before = none;
-    m->reason = reason;
+        m->before = (stewart_reason){0, 0, 0};
+    m->reason = (stewart_reason){fault, leg, lasted};
 }
 
 /* Return the reason in words. */
@@ -107,9 +106,8 @@ static void change(machine *m, uint64_t time)
     stewart_link_change(&m->buffer, m->link, (double)time);
     board_drive(time, stewart_link_current(m->link));
     if (m->safe && m->link[STEWART_LINK_FED] > 0) {
-        stewart_reason none = {0, 0, 0};
         precede(m, m->reason, time);
-        m->reason = none;
+        m->reason = (stewart_reason){0, 0, 0};
         m->safe = 0;
     }
 }
@@ -131,8 +129,7 @@ static void put_back(machine *m)
     m->begin = STEWART_NEVER;
     m->running = m->safe = m->left = 0;
     m->preceded = 0;
-    memset(&m->reason, 0, sizeof m->reason);
-    memset(&m->before, 0, sizeof m->before);
+    m->reason = m->before = (stewart_reason){0, 0, 0};
 }
 
 static int alive(const machine *m, uint64_t time)
@@ -245,7 +242,7 @@ static int greet(machine *m, const stewart_plan *request, const struct sockaddr_
 /* Take a plan; return the cause of its refusal, or STEWART_TAKEN. */
 static int plan_ahead(machine *m, const stewart_plan *plan, uint64_t now)
 {
-    if (plan->cranks || plan->playout > now + FURTHEST ||
+    if (plan->content == STEWART_CRANKS || plan->playout > now + FURTHEST ||
         (plan->begin != STEWART_NEVER && plan->begin > now + FURTHEST))
         return STEWART_MALFORMED;
     if (plan->begin != STEWART_NEVER && m->begin == STEWART_NEVER && !m->running) {
@@ -278,7 +275,7 @@ static int arrive(machine *m, const stewart_plan *plan, const struct sockaddr_in
 {
     const stewart_head *h = &plan->head;
     int cause;
-    if (plan->asks)
+    if (plan->content == STEWART_REQUEST)
         return greet(m, plan, from, now);
     if (m->driven && h->session == m->session.number && h->nonce == m->session.nonce) {
         cause = udp_same(from, &m->driver) ? stewart_note(&m->session, h, now) : STEWART_FOREIGN;

@@ -120,7 +120,7 @@ static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playou
     plan.sampled = sampled;
     plan.playout = playout;
     plan.begin = c->begin;
-    plan.asks = c->session.nonce == 0;
+    plan.content = c->session.nonce ? STEWART_TORQUES : STEWART_REQUEST;
     plan.identity = stewart_own_identity;
     plan.rows = (uint8_t)rows;
     for (unsigned row = 0; row < rows; row++)
