@@ -6,6 +6,7 @@
 #include "law.h"
 
 extern const stewart_observer stewart_state_observer;       /* of the measured state */
+extern const stewart_observer stewart_timing_observer;      /* that also learns when torques come */
 extern const stewart_observer stewart_differences_observer; /* of encoders */
 
 /* Predict the state (12) a period later with the known parameters; and scratch memory for it. */

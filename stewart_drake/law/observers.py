@@ -121,11 +121,13 @@ class CoreObserver:
         settings: of the filter; None: only the state is estimated.
         delay: prior of an unknown delay; None: the delay is known.
         gaps: whether the filter corrects the estimate before a gap between measurements.
+        timing: whether the standard deviation of the torques' instants is learnt without a filter.
     """
 
     settings: FilterSettings | None = None
     delay: DelaySettings | None = None
     gaps: bool = False
+    timing: bool = False
 
     def kept(self, period: float) -> int:
         """Return the number of torques to keep in flight beyond the assumed delay."""
@@ -213,6 +215,7 @@ class Part(NamedTuple):
 _KALMAN: Final = ("sensing", "instant", "kalman")
 _SOURCES: Final[dict[str, tuple[str, ...]]] = {
     "state": ("observers", "sensing"),
+    "timing": ("observers", "sensing", "timing_observer.c"),
     "differences": ("observers", "sensing", "encoders", "kinematics.c", "differences_observer.c"),
     "filter": ("observers", "filter_observers", "filter", "filter_attempt.h", "noise", *_KALMAN),
     "delay": ("delay_observer", "delay", "delay_search.c", "arrivals", *_KALMAN),
@@ -233,7 +236,8 @@ def part_of(observer: CoreObserver, sensing: Sensing, plant: NominalPlant, perio
         sensor, own = encoders_of(sensing), False
     else:
         sensor = described(sensing, plant.mechanism) if own else state_sensor(sensing)
-    kind, estimation, settings = "differences" if within else "state", None, observer.settings
+    estimation, settings = None, observer.settings
+    kind = "differences" if within else "timing" if observer.timing else "state"
     if settings is not None and settings.parameters.names != tuple(plant.dynamics.free):
         free = ", ".join(plant.dynamics.free)
         raise ValueError(f"settings.parameters: got other names than those of the plant: {free}")
@@ -366,7 +370,9 @@ def belief_of(
     theta, std = np.empty(p), np.empty(p)
     law.observer.parameters(law, *map(c.at, (memory, theta, std)))
     belief = Belief.nothing(timeline, m, theta).at(memory[:NUM_STATE])
-    return replace(belief, measured=measured, faults=faults, memory=memory)
+    learns = law.observer.uncertainty != c.ffi.NULL
+    timing = law.observer.uncertainty(law, c.at(memory), c.ffi.NULL) if learns else 0.0
+    return replace(belief, measured=measured, faults=faults, timing=timing, memory=memory)
 
 
 def _delay_belief(law: Any, memory: Array, timeline: Timeline, faults: tuple[str, ...]) -> Belief:

@@ -204,7 +204,8 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         learns=exact,
     )
     gaps = sc.sensor.kind == "state" and sc.sensor.loss > 0
-    observer = CoreObserver(settings if c.estimate else None, gaps=gaps)
+    clean = exact and not any(sc.sensor.noise_std)
+    observer = CoreObserver(settings if c.estimate else None, gaps=gaps, timing=clean)
     quiet = c.open_loop_start and sc.start == "rest"
     waits = longest_wait(sc)
     channel = link.channel(sc.link, experiment, timeline, waits)
@@ -369,11 +370,10 @@ def tolerated_timing(experiment: Experiment) -> float:
     """Return the standard deviation of single torques' timing that the loop tolerates, s.
 
     It is a share of the time constant of the loop, 1 / bandwidth of theory.md, section 13. It is
-    infinite for weights that are given or set by a tuner. So it is for laws that do not estimate
-    parameters, since they would take a bias for torques that act early or late.
+    infinite for weights that are given or set by a tuner.
     """
     sc, c = experiment.scenario, experiment.scenario.controller
-    if c.w_R is not None or sc.tuner.kind != "fixed" or not c.estimate:
+    if c.w_R is not None or sc.tuner.kind != "fixed":
         return math.inf
     times = spread_instants(sc.duration, _POSES)
     accelerations = np.array([evaluate(experiment.reference, t)[ACCELERATIONS] for t in times])

@@ -1,0 +1,122 @@
+/* See observers.h.
+
+   A torque that comes delta late moves the rates at the next sample by -M^-1 B D delta, D the change of
+   torque. As an impulse of the torques, u = dt (T(x, r / dt) - T(x, 0)) with the prediction's error r of
+   the rates, that is u = -D delta. Unknown bias, payload and friction change u slowly, so that its second
+   difference w = u_k - 2 u_{k-1} + u_{k-2} counts, of variance 6 |D|^2 sigma^2 along D. What w has across
+   D, per direction, is no delay's:
+
+       sigma^2 = sum((D.w)^2 - |D|^2 |w_across|^2 / 5) / sum(6 |D|^4). */
+
+#include "observers.h"
+#include "short.h"
+
+#define KEEP ((real)0.85) /* share of the sums that is left after a period */
+
+typedef struct {
+    real impulses[2 * U], change[U]; /* u at the last two samples and D at the last; NaN without */
+    real excess, weight;             /* the sums */
+} Timing;
+
+enum { TIMING_NUMBERS = sizeof(Timing) / sizeof(real) };
+
+static int timing_memory(const stewart_law *law) { return stewart_plain_memory(law) + TIMING_NUMBERS; }
+
+static Timing *timing_of(const stewart_law *law, real *memory)
+{
+    return (Timing *)(memory + stewart_plain_memory(law));
+}
+
+static void timing_start(const stewart_law *law, real *memory)
+{
+    stewart_plain_start(law, memory);
+    stewart_fill(TIMING_NUMBERS, (real)NAN, memory + stewart_plain_memory(law));
+    timing_of(law, memory)->excess = timing_of(law, memory)->weight = 0;
+}
+
+static void timing_restart(const stewart_law *law, real *memory)
+{
+    stewart_plain_restart(law, memory);
+    stewart_fill(3 * U, (real)NAN, memory + stewart_plain_memory(law));
+}
+
+/* u (6) of a predicted state and the one found. */
+static void impulse_between(const stewart_law *law, const real *predicted, const real *found, real *u)
+{
+    stewart_belief belief;
+    real row[ROW], still[U];
+    stewart_believe(&law->machine, NULL, &belief);
+    stewart_copy(X, found, row);
+    stewart_fill(6, 0, row + X);
+    stewart_required_torque(&belief, row, still);
+    for (int i = 0; i < 6; i++)
+        row[X + i] = (found[6 + i] - predicted[6 + i]) / law->period;
+    stewart_required_torque(&belief, row, u);
+    for (int i = 0; i < U; i++)
+        u[i] = law->period * (u[i] - still[i]);
+}
+
+static void learn(Timing *timing, const real *u, const real *D)
+{
+    real along = 0, square = 0, all = 0;
+    for (int i = 0; i < U; i++) {
+        const real w = u[i] - 2 * timing->impulses[i] + timing->impulses[U + i];
+        along += D[i] * w;
+        square += D[i] * D[i];
+        all += w * w;
+    }
+    if (!(square > 0) || !isfinite(along)) /* or NaN */
+        return;
+    const real across = (all - along * along / square) / (U - 1);
+    timing->excess = KEEP * timing->excess + along * along - square * across;
+    timing->weight = KEEP * timing->weight + 6 * square * square;
+}
+
+static int timing_observe(const stewart_law *law, real *memory, int number, const real *torques,
+                          const real *values, stewart_scratch scratch)
+{
+    Timing *timing = timing_of(law, memory);
+    real predicted[X], u[U], D[U];
+    stewart_copy(X, memory, predicted);
+    const int status = stewart_state_observer.observe(law, memory, number, torques, values, scratch);
+    if (status || !stewart_all_finite(X, predicted) || !stewart_all_finite(X, memory)) {
+        stewart_fill(3 * U, (real)NAN, timing->impulses);
+        return status;
+    }
+    stewart_schedule schedule;
+    const real *following, *first, *last;
+    stewart_last_periods(law, number, torques, 1, &schedule, &following, &scratch);
+    first = schedule.torques;
+    last = schedule.torques + U * (schedule.number - 1);
+    stewart_move_on(law, number, torques, predicted, scratch);
+    impulse_between(law, predicted, memory, u);
+    for (int i = 0; i < U; i++) {
+        const real next = schedule.number > 1 ? last[i] - first[i] : following[i] - last[i];
+        D[i] = schedule.number > 1 ? next : (next + timing->change[i]) / 2;
+        timing->change[i] = next;
+    }
+    learn(timing, u, D);
+    stewart_copy(U, timing->impulses, timing->impulses + U);
+    stewart_copy(U, u, timing->impulses);
+    return status;
+}
+
+static int timing_scratch(const stewart_law *law)
+{
+    return stewart_state_observer.scratch(law) + stewart_moving_scratch(law);
+}
+
+static real timing_uncertainty(const stewart_law *law, const real *memory, real *L)
+{
+    const Timing *timing = (const Timing *)(memory + stewart_plain_memory(law));
+    const int n = X + law->machine.estimated;
+    if (L)
+        stewart_fill(n * n, 0, L);
+    return timing->excess > 0 ? REAL(sqrt)(timing->excess / timing->weight) : 0;
+}
+
+const stewart_observer stewart_timing_observer = {
+    timing_memory,  timing_scratch,           timing_start,          timing_observe,
+    timing_restart, stewart_plain_parameters, stewart_state_sensing, NULL, NULL,
+    timing_uncertainty,
+};
