@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import Simulator
 
 import stewart_drake as sd
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -199,3 +200,37 @@ def test_a_learnt_timing_keeps_the_plate_across_a_delay_with_gravity(seed):
     kept = run_in_bulk(load_scenario("gravity", "predictor_lqi", (exact, *noisy)))
     assert lost.status == "left_workspace"
     assert kept.status == "completed" and kept.error_so_far < 0.3
+
+
+# The timing of torques without an estimator.
+
+
+def timing_of(*settings):
+    """Return the standard deviation of the torques' instants that is known at each sample, s."""
+    known = *ON, "controller.estimate=[]", "duration=8"
+    found, loop = (
+        [],
+        sd.build_closed_loop(load_scenario("paper", "predictor_lqi", (*known, *settings))),
+    )
+    simulator = Simulator(loop, loop.CreateDefaultContext())
+    controller = loop.GetSubsystemByName("controller")
+    for k in range(1, 80):
+        simulator.AdvanceTo(0.1 * k + 0.05)
+        context = controller.GetMyContextFromRoot(simulator.get_context())
+        found.append(controller.memory(context).belief.timing)
+    return np.array(found)
+
+
+def test_a_jitter_is_learnt_without_an_estimator():
+    """Root mean square over the second half of runs with six seeds."""
+    late = [timing_of("delay.jitter_std=0.003", f"delay.seed={seed}")[40:] for seed in range(6)]
+    assert np.sqrt(np.mean(np.square(late))) == pytest.approx(0.003, rel=0.3)
+
+
+@pytest.mark.parametrize("cause", [(), (f"plant.torque_bias={[3e-4, -3e-4] * 3}",)])
+def test_what_is_constant_is_no_jitter(cause):
+    assert timing_of(*cause).max() < 2e-4
+
+
+def test_noise_is_no_jitter():
+    assert not timing_of(NOISY[-1]).any()
