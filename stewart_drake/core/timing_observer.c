@@ -3,19 +3,29 @@
    A torque that comes delta late moves the rates at the next sample by -M^-1 B D delta, D the change of
    torque. As an impulse of the torques, u = dt (T(x, r / dt) - T(x, 0)) with the prediction's error r of
    the rates, that is u = -D delta. Unknown bias, payload and friction change u slowly, so that its second
-   difference w = u_k - 2 u_{k-1} + u_{k-2} counts, of variance 6 |D|^2 sigma^2 along D. What w has across
+   difference w = u_k - 2 u_{k-1} + u_{k-2} counts, of variance c |D|^2 sigma^2 along D. What w has across
    D, per direction, is no delay's:
 
-       sigma^2 = sum((D.w)^2 - |D|^2 |w_across|^2 / 5) / sum(6 |D|^4). */
+       sigma^2 = sum((D.w)^2 - |D|^2 |w_across|^2 / 5) / sum(c |D|^4).
+
+   c = 1 + 4 + 1 for torques that change within a period. Where they change at the samples, a late one moves
+   the rates of the sample after it and an early one those of the sample before. Either is half a normal
+   deviate, of mean +-sigma / sqrt(2 pi) and variance sigma^2 (1/2 - 1/(2 pi)), so that u has the variance
+   1 - 1/pi and the covariance 1/(2 pi) with the one before: c = 6 (1 - 1/pi) - 8 / (2 pi). */
 
 #include "observers.h"
 #include "short.h"
 
-#define KEEP ((real)0.85) /* share of the sums that is left after a period */
+#define WITHIN ((real)6) /* c */
+#define AT_SAMPLES ((real)2.8169011381620934)
+#define FADE ((real)0.98)
+#define LEAST ((real)1) /* of the second sum, in largest terms: a motion that turns around tells little */
+#define KEEP ((real)0.9) /* share of the sums that is left after a period */
 
 typedef struct {
     real impulses[2 * U], change[U]; /* u at the last two samples and D at the last; NaN without */
     real excess, weight;             /* the sums */
+    real largest;                    /* term of the second one, which fades slowly */
 } Timing;
 
 enum { TIMING_NUMBERS = sizeof(Timing) / sizeof(real) };
@@ -31,7 +41,8 @@ static void timing_start(const stewart_law *law, real *memory)
 {
     stewart_plain_start(law, memory);
     stewart_fill(TIMING_NUMBERS, (real)NAN, memory + stewart_plain_memory(law));
-    timing_of(law, memory)->excess = timing_of(law, memory)->weight = 0;
+    Timing *timing = timing_of(law, memory);
+    timing->excess = timing->weight = timing->largest = 0;
 }
 
 static void timing_restart(const stewart_law *law, real *memory)
@@ -56,7 +67,7 @@ static void impulse_between(const stewart_law *law, const real *predicted, const
         u[i] = law->period * (u[i] - still[i]);
 }
 
-static void learn(Timing *timing, const real *u, const real *D)
+static void learn(Timing *timing, const real *u, const real *D, real c)
 {
     real along = 0, square = 0, all = 0;
     for (int i = 0; i < U; i++) {
@@ -69,7 +80,8 @@ static void learn(Timing *timing, const real *u, const real *D)
         return;
     const real across = (all - along * along / square) / (U - 1);
     timing->excess = KEEP * timing->excess + along * along - square * across;
-    timing->weight = KEEP * timing->weight + 6 * square * square;
+    timing->weight = KEEP * timing->weight + c * square * square;
+    timing->largest = REAL(fmax)(FADE * timing->largest, c * square * square);
 }
 
 static int timing_observe(const stewart_law *law, real *memory, int number, const real *torques,
@@ -95,7 +107,7 @@ static int timing_observe(const stewart_law *law, real *memory, int number, cons
         D[i] = schedule.number > 1 ? next : (next + timing->change[i]) / 2;
         timing->change[i] = next;
     }
-    learn(timing, u, D);
+    learn(timing, u, D, schedule.number > 1 ? WITHIN : AT_SAMPLES);
     stewart_copy(U, timing->impulses, timing->impulses + U);
     stewart_copy(U, u, timing->impulses);
     return status;
@@ -112,7 +124,8 @@ static real timing_uncertainty(const stewart_law *law, const real *memory, real 
     const int n = X + law->machine.estimated;
     if (L)
         stewart_fill(n * n, 0, L);
-    return timing->excess > 0 ? REAL(sqrt)(timing->excess / timing->weight) : 0;
+    const real weight = REAL(fmax)(timing->weight, LEAST * timing->largest);
+    return timing->excess > 0 ? REAL(sqrt)(timing->excess / weight) : 0;
 }
 
 const stewart_observer stewart_timing_observer = {
