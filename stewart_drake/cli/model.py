@@ -2,6 +2,7 @@
 
 import re
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -123,9 +124,12 @@ def new(
     delivery = Delivery(folder, quiet, as_json)
     study.check_free(folder)
     if form:
-        from stewart_drake.reporting.machine_form import machine_form
+        from stewart_drake.reporting.machine_form import MachineForm
 
-        with stopping("nothing was written"), machine_form(given.given, "new machine") as page:
+        with (
+            stopping("nothing was written"),
+            closing(MachineForm(given.given, "new machine")) as page,
+        ):
             # The address is printed also with --quiet.
             echo(f"fill in the form at {page.url}, Ctrl-C ends it", error=as_json)
             measurements = page.wait()

@@ -183,18 +183,9 @@ def map_figure(study: DelayStudy) -> Figure:
         ax.spines[:].set_visible(False)
         ax.tick_params(length=0)
 
-    return draw(
-        [
-            Panel(
-                "amplitude",
-                x="delay",
-                xlim=(-0.5, len(steps) - 0.5),
-                ylim=(-0.5, len(factors) - 0.5),
-                height=0.8 * len(factors),
-                paint=paint,
-            )
-        ]
-    )
+    xlim, ylim = (-0.5, len(steps) - 0.5), (-0.5, len(factors) - 0.5)
+    height = 0.8 * len(factors)
+    return draw([Panel("amplitude", x="delay", xlim=xlim, ylim=ylim, height=height, paint=paint)])
 
 
 def _draw_cell(ax: Axes, cell: Cell, x: int, y: int, floor: float) -> None:

@@ -13,8 +13,8 @@ after rendering is left out. Numbers get three significant digits.
     text                     is a paragraph of a page
     > text                   is a paragraph of a page and of a terminal
     = name :: value          is a value with its name
-    @name caption            is the context's entry of this name: blocks, or a function that draws
-                             a figure; a paragraph if it is True
+    @name caption            is the context's entry of this name: blocks, texts of warnings, or a
+                             function that draws a figure; a paragraph if it is True
       | head :: cell         below it is a column of a table of all `it` in the named items
       | head :: brief :: cell    with the head on a terminal; the head - leaves the column out
       | @other               has the columns of another table
@@ -28,7 +28,7 @@ A terminal shows a table or a paragraph of `@>name`. A line is not broken at ~, 
 import math
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from io import StringIO
@@ -72,6 +72,11 @@ def number(value: float, digits: int = 3) -> str:
         return f"{value:.0e}"
     decimals = digits - 1 - math.floor(math.log10(abs(value))) if value else 0
     return f"{value:.{max(0, decimals)}f}"
+
+
+def listed(items: Iterable[object], form: str = "%s", between: str = ", ") -> str:
+    """Return items in one text, each in a form such as `%s: %g`."""
+    return between.join(form % one for one in items)
 
 
 def capital(text: str) -> str:
@@ -335,6 +340,8 @@ def _blocks(part: _Part, context: Mapping[str, Any]) -> Iterator[Block]:
                 yield Paragraph(text, part.mark == "@>")
             elif callable(one):
                 yield Picture(one, text)
+            elif isinstance(one, str):
+                yield Caution(one)
             else:
                 yield replace(one, caption=text) if text and isinstance(one, Table) else one
 
@@ -386,5 +393,5 @@ def _environment() -> "Environment":
     found = Environment(
         loader=PackageLoader("stewart_drake.reporting"), undefined=StrictUndefined, finalize=shown
     )
-    found.filters |= {"number": number, "capital": capital}
+    found.filters |= {"number": number, "capital": capital, "listed": listed}
     return found

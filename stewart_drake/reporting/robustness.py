@@ -79,6 +79,7 @@ def document(study: RobustnessStudy) -> Document:
         title=title,
         percent=_percent,
         ended=_failed,
+        rank=_rank,
         third=_third,
         where=_where,
         spans=_spans(study),
@@ -119,6 +120,14 @@ def _percent(share: Interval) -> str:
 
 def _failed(error: float) -> str:
     return "failed" if error == math.inf else number(error)
+
+
+def _rank(one: Correlation, p: float) -> tuple[str, str, str]:
+    """Return a rank correlation, marked if significant, its interval, and its p-value."""
+    if math.isnan(one.rho):
+        return "-", "-", "-"
+    mark = "* " if p < SIGNIFICANT else ""
+    return f"{mark}{one.rho:+.2f}", f"{one.low:+.2f} to {one.high:+.2f}", f"{p:.2g}"
 
 
 def _reason(study: RobustnessStudy, reason: str, runs: int) -> dict[str, Any]:
@@ -198,19 +207,9 @@ def distribution_figure(study: RobustnessStudy) -> Figure:
 
     band = (low, high, "95 % interval")
     curve = Curve(errors, 100 * counts / total, "all runs", steps=True, band=band)
-    return draw(
-        [
-            Panel(
-                "share of all runs  [%]",
-                [curve],
-                "accumulated error E_ac  [% s]",
-                xscale="log",
-                ylim=(0, 103),
-                height=2.7,
-                paint=paint,
-            )
-        ]
-    )
+    name, over = "share of all runs  [%]", "accumulated error E_ac  [% s]"
+    how: Any = {"xscale": "log", "ylim": (0, 103), "height": 2.7}
+    return draw([Panel(name, [curve], over, paint=paint, **how)])
 
 
 def influence_figure(influences: Sequence[Influence]) -> Figure:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as checked
 from scipy.optimize import Bounds, differential_evolution
 
@@ -24,9 +23,9 @@ from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
-from stewart_drake.files.jsonio import load_json, sealed_json
+from stewart_drake.files.jsonio import sealed_json
 from stewart_drake.files.resources import resolve
-from stewart_drake.files.yamlio import validate, yaml_text
+from stewart_drake.files.yamlio import yaml_text
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.clearance import ClearanceScene
 from stewart_drake.loop.preparation import Experiment, assemble, check_instants
@@ -58,7 +57,7 @@ from stewart_drake.studies.layout_space import (
     singular,
     space_around,
 )
-from stewart_drake.studies.runs import Outcome, outcome_of
+from stewart_drake.studies.runs import STRICT, Outcome, outcome_of, read_kept
 from stewart_drake.studies.study_options import LayoutOptions
 from stewart_drake.types import Array
 
@@ -73,11 +72,9 @@ _SAME: Final = 0.02
 _REACH, _APART = 0.05, 0.05
 """Usual limits of reach and clearance, in cranks of the machine the search begins from."""
 _USUAL: Final = {"transmission": 0.3, "plate_joint_deg": 45.0, "crank_joint_deg": 45.0}
-_MAX_BYTES: Final = 1_000_000
-_STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
-@checked(config=_STRICT)
+@checked(config=STRICT)
 class Found:
     """Result of one search, as its file keeps it."""
 
@@ -89,7 +86,7 @@ class Found:
     evaluations: int
 
 
-@checked(config=_STRICT)
+@checked(config=STRICT)
 class Judged:
     """Measures and run of a machine, as their file keeps them."""
 
@@ -278,7 +275,7 @@ def study_layout(
         search,
         folder / "searches",
         settings=problem.summary | {"seed": seed, "generations": generations},
-        read=partial(_read, Found, "the file of a search"),
+        read=partial(read_kept, Found, "the file of a search"),
         progress=part_of(progress, 0, len(jobs) + best + 1),
         **options.jobs,
     )
@@ -301,7 +298,7 @@ def study_layout(
         judge,
         folder / "judged",
         settings=problem.summary | {"machines": texts},
-        read=partial(_read, Judged, "the file of a judgement"),
+        read=partial(read_kept, Judged, "the file of a judgement"),
         workers=options.workers,
         progress=part_of(progress, len(jobs), len(jobs) + len(places)),
     )
@@ -442,7 +439,3 @@ def _plain(spec: MechanismSpec) -> dict[str, Any]:
 def _finite(measures: Mapping[str, float]) -> dict[str, float]:
     """Return finite measures; a motion through a singularity has an infinite condition number."""
     return {name: float(value) for name, value in measures.items() if math.isfinite(value)}
-
-
-def _read(kind: type[Any], expected: str, path: Path) -> Any:
-    return validate(kind, load_json(path, _MAX_BYTES, expected, sealed=True), str(path))

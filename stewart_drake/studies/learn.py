@@ -250,15 +250,10 @@ def corrected_setpoints(used: Array, missed: Fit, period: float, lag: float) -> 
 def lacking_angles(
     experiment: Experiment, result: SimulationResult, period: float
 ) -> tuple[Array, Array]:
-    """Return the crank angles that the last period of a motion lacks, rad.
-
-    Args:
-        experiment: of the scenario.
-        result: a run of it.
-        period: of the motion, s.
+    """Return the angles that the cranks lack in the last period of a run.
 
     Returns:
-        Samples (n,), s, and angles of the motion less those of the state there (n, 6).
+        Samples (n,), s, and crank angles of the motion less those of the state there (n, 6), rad.
     """
     dt, angles = experiment.scenario.controller.period, experiment.mechanism.crank_angles
     first, _, states = _last_samples(experiment, result, period)
@@ -271,21 +266,15 @@ def lacking_angles(
     return np.array(times), np.reshape(found, (-1, 6))
 
 
-class _Last(NamedTuple):
-    """Samples of the last period of a run.
+def _last_samples(
+    experiment: Experiment, result: SimulationResult, period: float
+) -> tuple[int, NDArray[np.intp], Array]:
+    """Return the samples of the last period of a run.
 
-    Attributes:
-        first: number of the first one.
-        rows: (first + n,) of all samples up to the last one, in the signals.
-        states: (n, 12) of these, measured or else estimated.
+    Returns:
+        Number of the first one; rows (first + n,) in the signals of all samples up to the last;
+        states (n, 12) of the period, measured or else estimated.
     """
-
-    first: int
-    rows: NDArray[np.intp]
-    states: Array
-
-
-def _last_samples(experiment: Experiment, result: SimulationResult, period: float) -> _Last:
     sc, signals = experiment.scenario, result.signals
     dt, time = sc.controller.period, signals.time.values
     wanted = dt * np.arange(math.floor(time[-1] / dt + 1e-9) + 1)
@@ -293,18 +282,13 @@ def _last_samples(experiment: Experiment, result: SimulationResult, period: floa
     first = max(0, len(rows) - 1 - round(period / dt))
     measured = sc.sensor.measures_state and sc.sensor.delay == 0
     states = (signals.measurement if measured else signals.state_estimate).values
-    return _Last(first, rows, states[rows[first:]])
+    return first, rows, states[rows[first:]]
 
 
 def lacking_torques(
     experiment: Experiment, result: SimulationResult, period: float
 ) -> tuple[Array, Array]:
-    """Return the torques that the model lacks in the last period of a motion.
-
-    Args:
-        experiment: of the scenario.
-        result: a run of it.
-        period: of the motion, s.
+    """Return the torques that the model lacks in the last period of a run.
 
     Returns:
         Middles (n,) of the controller's periods, s, and torques (n, 6), N m.

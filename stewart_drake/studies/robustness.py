@@ -19,7 +19,7 @@ from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.jobs import Progress, run_jobs
-from stewart_drake.studies.runs import Outcome, loops_of, read_outcome
+from stewart_drake.studies.runs import Outcome, read_outcome
 from stewart_drake.studies.statistics import (
     Correlation,
     Explanation,
@@ -122,8 +122,8 @@ class RobustnessStudy(NamedTuple):
 
     @property
     def loops(self) -> dict[str, int]:
-        """Number of runs by what ran them, see `loop.bulk.Ending`."""
-        return loops_of(self.outcomes)
+        """Number of runs by what ran them, the most frequent first, see `loop.bulk.Ending`."""
+        return dict(Counter(one.loop for one in self.outcomes if one.loop).most_common())
 
     def quantile(self, probability: float) -> Interval:
         """Return a quantile of E_ac over all runs, % s; an incomplete run counts as infinite."""
