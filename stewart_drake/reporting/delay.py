@@ -52,7 +52,6 @@ def document(study: DelayStudy) -> Document:
         growth_figure=study.poles and partial(growth_figure, study),
         floor=study.floors[steps],
         margins=loop if loop is not None and loop.radius < 1 else None,
-        loops=study.loops,
         loop_figure=any(one.radius < 1 for one in study.loops) and partial(loop_figure, study),
         cells=study.cells and _map_table(study),
         failed=any(cell.status != "completed" for cell in study.cells),

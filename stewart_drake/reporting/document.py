@@ -13,8 +13,8 @@ after rendering is left out. Numbers get three significant digits.
     text                     is a paragraph of a page
     > text                   is a paragraph of a page and of a terminal
     = name :: value          is a value with its name
-    @name caption            is the context's entry of this name: blocks, texts of warnings, or a
-                             function that draws a figure; a paragraph if it is True
+    @name caption            is what has this name, such as `study.loops`: blocks, texts of
+                             warnings, or a function that draws a figure; a paragraph if it is True
       | head :: cell         below it is a column of a table of all `it` in the named items
       | head :: brief :: cell    with the head on a terminal; the head - leaves the column out
       | @other               has the columns of another table
@@ -300,9 +300,10 @@ def sections(name: str, /, **context: Any) -> list[Section]:
     """Return the sections of a template that have a named block, or need none."""
     found = []
     for heading, folded, parts in _template(name):
-        named = [bool(context[part.name]) for part in parts if part.name]
-        if any(named) or not named:
-            blocks = [block for part in parts for block in _blocks(part, context)]
+        values = [part.entry and part.entry(context) for part in parts]
+        if any(values) or not any(part.entry for part in parts):
+            pairs = zip(parts, values, strict=True)
+            blocks = [block for part, value in pairs for block in _blocks(part, value, context)]
             found.append(Section(heading.render(context), *blocks, folded=folded))
     return found
 
@@ -311,15 +312,14 @@ class _Part(NamedTuple):
     """A part of a template; `rows` are the pieces of its lines that begin with `kind`."""
 
     mark: str
-    name: str
+    entry: "Callable[[Mapping[str, Any]], Any] | None"  # returns what is named
     text: "Template"
     kind: str
     rows: "list[list[Template]]"
 
 
-def _blocks(part: _Part, context: Mapping[str, Any]) -> Iterator[Block]:
-    value: Any = context[part.name] if part.name else None
-    if part.name and not value:
+def _blocks(part: _Part, value: Any, context: Mapping[str, Any]) -> Iterator[Block]:
+    if part.entry and not value:
         return
     text = " ".join(part.text.render(context).split())
     if part.kind == "|":
@@ -331,7 +331,7 @@ def _blocks(part: _Part, context: Mapping[str, Any]) -> Iterator[Block]:
     elif part.kind == "+":
         head, *rows = [[one.render(context).strip() for one in row] for row in part.rows]
         yield Table(head, rows, text)
-    elif not part.name:
+    elif part.entry is None:
         if text:
             yield Paragraph(text, part.mark == ">")
     else:
@@ -366,8 +366,9 @@ def _template(name: str) -> "list[tuple[Template, bool, list[_Part]]]":
     columns: dict[str, list[list[Template]]] = {}
     source, *_ = environment.loader.get_source(environment, f"{name}.md.j2")
     for part in re.split(r"\n\s*\n", source.strip()):
-        opening, *lines = re.split(r"\n *(?=[|=+] )", f"\n{part}")
-        ((mark, named, text),) = re.findall(r"^(#-?|[!>]|@>?|)(\w*)(.*)", " ".join(opening.split()))
+        first, *lines = re.split(r"\n *(?=[|=+] )", f"\n{part}")
+        opening = " ".join(first.split())
+        ((mark, named, text),) = re.findall(r"^(#-?|[!>]|@>?|)([\w.]*)(.*)", opening)
         if "@" not in mark:
             named, text = "", named + text
         template = environment.from_string(text.strip())
@@ -379,7 +380,8 @@ def _template(name: str) -> "list[tuple[Template, bool, list[_Part]]]":
         if rows and rows[0][0].startswith("@"):
             pieces = columns[rows[0][0]]
         columns[f"@{named}"] = pieces
-        found[-1][2].append(_Part(mark, named, template, lines[0][0] if lines else "", pieces))
+        entry = environment.compile_expression(named, undefined_to_none=False) if named else None
+        found[-1][2].append(_Part(mark, entry, template, lines[0][0] if lines else "", pieces))
     return found
 
 

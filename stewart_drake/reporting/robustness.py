@@ -63,7 +63,6 @@ _SUCCESS, _ABOVE, _FAILED = "#2F86C6", "#E69F00", "#C4502A"
 def document(study: RobustnessStudy) -> Document:
     """Return success rate, quantiles, influences, failures, and the worst runs."""
     influences, found, low = study.influences(), study.explanation, study.success.low
-    failed = bool(study.failed.any())
     early = any(one.status != "completed" for one in study.outcomes)
     errors = [one for one in influences if one.error_p < SIGNIFICANT]
     errors.sort(key=lambda one: -abs(one.error.rho))
@@ -93,11 +92,8 @@ def document(study: RobustnessStudy) -> Document:
         influences=influences,
         influence_figure=partial(influence_figure, influences),
         runs_figure=partial(runs_figure, study),
-        reasons=failed and [_reason(study, *one) for one in study.reasons.items()],
-        compared=failed and found.failing and found.others,
-        singles=failed and found.singles,
-        pairs=failed and found.pairs,
-        times_figure=failed and early and partial(times_figure, study),
+        reasons=[_reason(study, *one) for one in study.reasons.items()],
+        times_figure=early and partial(times_figure, study),
         ranges=list(factors(study.draws)),
         vary=", ".join(
             f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}"
