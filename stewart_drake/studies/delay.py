@@ -16,6 +16,7 @@ from stewart_drake.law.error_model import double_integrators, linear_model
 from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.law.stability import (
     LinearLoop,
+    Margins,
     Peak,
     amplification,
     fastest_pole,
@@ -108,12 +109,9 @@ class LoopMargins:
     radius: float  # spectral radius of the closed loop
     S: Peak  # of sensitivity at the motors
     T: Peak  # of complementary sensitivity
-    gain_up: float  # factor on the torques of all motors
-    gain_down: float
+    margins: Margins  # errors of the delay, and of all motors alike
     # classical margins of one motor at a time; None if the loop is unstable
     motor: MotorMargins | None
-    later: float  # error of the believed delay, s
-    earlier: float
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -124,11 +122,11 @@ class LoopMargins:
             "sensitivity_frequency": self.S.frequency,
             "complementary_peak": self.T.value,
             "complementary_frequency": self.T.frequency,
-            "gain_margin": [self.gain_down, self.gain_up],
+            "gain_margin": [self.margins.gain_down, self.margins.gain_up],
             "motor_gain_margin": self.motor and [self.motor.gain_down, self.motor.gain_up],
             "motor_phase_margin_deg": self.motor and self.motor.phase,
-            "delay_margin_later": self.later,
-            "delay_margin_earlier": self.earlier,
+            "delay_margin_later": self.margins.longer,
+            "delay_margin_earlier": self.margins.shorter,
         }
 
 
@@ -359,20 +357,11 @@ def loop_margins(found: Assessment, delays: Iterable[int] = DELAYS) -> list[Loop
 def _margins_of(loop: LinearLoop) -> LoopMargins:
     radius, true = spectral_radius(loop.matrix()), loop.sampled()
     S = T = Peak(math.nan, math.nan)
+    motor = None
     if radius < 1:
         S, T = peaks(true, loop.K, loop.period)
-    margins = worst_margins([loop])
-    return LoopMargins(
-        steps=loop.delay.steps,
-        radius=radius,
-        S=S,
-        T=T,
-        gain_up=margins.gain_up,
-        gain_down=margins.gain_down,
-        motor=_motor_margins(true, loop.K, loop.period) if radius < 1 else None,
-        later=margins.longer,
-        earlier=margins.shorter,
-    )
+        motor = _motor_margins(true, loop.K, loop.period)
+    return LoopMargins(loop.delay.steps, radius, S, T, worst_margins([loop]), motor)
 
 
 def _motor_margins(plant: DelayedModel, K: Array, period: float) -> MotorMargins:

@@ -1,8 +1,6 @@
 """Monte Carlo study of a scenario: many runs, each with one drawn machine."""
 
-import csv
 import dataclasses
-import io
 import math
 import re
 from collections import Counter
@@ -277,15 +275,18 @@ def factor_values(draws: list[Draw]) -> dict[str, Array]:
 
 def table(study: RobustnessStudy) -> str:
     """Return all runs as CSV, a row each; a missing number is empty."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    units, values = factors(study.draws), factor_values(study.draws)
-    head = [f"{name} [{unit}]" for name, unit in units.items()]
-    writer.writerow(
-        ["run", "status", "reason", "leg", "time [s]", "E_ac [% s]", "peak_torque [N m]", *head]
-    )
-    for i, one in enumerate(study.outcomes):
-        numbers = [one.time, one.error, one.peak_torque, *(values[name][i] for name in units)]
-        cells = [repr(float(v)) if math.isfinite(v) else "" for v in numbers]
-        writer.writerow([i, one.status, study.reason_of(one), one.leg or "", *cells])
-    return text.getvalue()
+    import pandas
+
+    outcomes, values = study.outcomes, factor_values(study.draws)
+    columns: dict[str, Any] = {
+        "run": range(len(outcomes)),
+        "status": [one.status for one in outcomes],
+        "reason": [study.reason_of(one) for one in outcomes],
+        "leg": [one.leg or "" for one in outcomes],
+        "time [s]": [one.time for one in outcomes],
+        "E_ac [% s]": study.errors,
+        "peak_torque [N m]": [one.peak_torque for one in outcomes],
+    }
+    columns |= {f"{name} [{unit}]": values[name] for name, unit in factors(study.draws).items()}
+    frame = pandas.DataFrame(columns).replace([np.inf, -np.inf], np.nan)
+    return str(frame.to_csv(index=False, lineterminator="\n"))
