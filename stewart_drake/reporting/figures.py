@@ -233,11 +233,7 @@ def _delay(run: SimulationResult) -> Figure:
 
 
 def weights_figure(runs: Mapping[str, SimulationResult]) -> Figure:
-    """Draw w_Q, w_R and their ratio, which determines the gain.
-
-    Args:
-        runs: at least one, by the title of its column.
-    """
+    """Draw w_Q, w_R and their ratio, which determines the gain, of runs by title."""
     above, below = list[Panel](), list[Panel]()
     for title, run in runs.items():
         weights, c, end = run.signals.weights.values, run.scenario.controller, shown_until(run)

@@ -188,13 +188,7 @@ def _analyse(name: str, scenario: Scenario) -> AnalysisResult:
 
 
 def document(found: ReportData, name: str, replay: str = "") -> Document:
-    """Return the report.
-
-    Args:
-        found: its content.
-        name: of the scenario.
-        replay: page of the replay, to be shown inside, or empty.
-    """
+    """Return the report on a scenario of this name, with the page of its replay, if any, inside."""
     text, tone = verdict(found)
     compared = draw_comparison(found.comparison)
     if found.tuned:

@@ -267,11 +267,7 @@ def analysis_result(
 ) -> AnalysisResult:
     """Do a study and describe its result.
 
-    Args:
-        study: returns the numbers, with a `summary` of plain data.
-        document: describes them.
-        command: repeats the study, as typed.
-        write: see `AnalysisResult`.
+    `study` returns the numbers, with a `summary` of plain data. `command` repeats it, as typed.
     """
     from stewart_drake.reporting.page import Provenance
 

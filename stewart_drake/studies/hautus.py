@@ -7,6 +7,7 @@ torques it takes, have size 1, see `assess`.
 """
 
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -68,17 +69,16 @@ def describe(directions: NDArray[np.complex128], labels: list[Label]) -> str:
     """Return directions (n, d) in words: their number, and the states that they consist of."""
     d = directions.shape[1]
     share = (np.abs(directions) ** 2).sum(axis=1) / d
-    groups: dict[str, list[str]] = {}
-    for label, part in zip(labels, share, strict=True):
-        if part >= _SHOWN / NUM_TORQUES:
-            groups.setdefault(label.group, []).append(label.name)
-    sizes = {g: sum(label.group == g for label in labels) for g in groups}
-    named = [
-        group if len(names) == sizes[group] else f"{group} ({', '.join(names)})"
-        for group, names in groups.items()
-        if not group.startswith(_TORQUE)
-    ]
-    torques = [group.removeprefix(_TORQUE) for group in groups if group.startswith(_TORQUE)]
+    named, torques = list[str](), list[str]()
+    pairs = zip(labels, share, strict=True)
+    for group, states in groupby(pairs, key=lambda pair: pair[0].group):
+        shown = [(label.name, part >= _SHOWN / NUM_TORQUES) for label, part in states]
+        names = [name for name, large in shown if large]
+        if names and group.startswith(_TORQUE):
+            torques.append(group.removeprefix(_TORQUE))
+        elif names:
+            part_of_it = "" if len(names) == len(shown) else f" ({', '.join(names)})"
+            named.append(group + part_of_it)
     if len(torques) == 1:
         named.append(_TORQUE + torques[0])
     elif torques:

@@ -193,9 +193,7 @@ class LayoutStudy:
     """Result of `layout`."""
 
     problem: Problem  # of the searches
-    seed: int
-    starts: int
-    generations: int
+    options: LayoutOptions
     searches: dict[str, Found]  # result of each, by its key
     before: Layout  # the scenario's own machine
     layouts: list[Layout]  # the best few, the best first
@@ -234,9 +232,7 @@ class LayoutStudy:
         return {
             "verdict": self.verdict,
             **self.problem.summary,
-            "seed": self.seed,
-            "starts": self.starts,
-            "generations": self.generations,
+            **{name: getattr(self.options, name) for name in ("seed", "starts", "generations")},
             "evaluations": self.evaluations,
             "searches": {
                 key: {"measures": one.measures, "missed": one.missed}
@@ -255,20 +251,15 @@ def study_layout(
 ) -> LayoutStudy:
     """Search machines for a scenario's motion, or continue a search; write the best.
 
-    Args:
-        scenario: its machine, which has a pattern, is the start of the search.
-        directory: of the machines; finished searches go below it.
-        progress: as `run_jobs` takes it.
+    The search begins at the scenario's machine, which has a pattern. Machines go into the
+    directory, finished searches below it.
     """
-    best, starts, generations = options.best, options.starts, options.generations
-    seed, folder = options.seed, Path(directory)
-    problem = problem_of(
-        scenario, options.goal, options.limits or {}, options.vary or {}, options.keep
-    )
+    folder, problem = Path(directory), problem_of(scenario, options)
+    seed, generations = options.seed, options.generations
     jobs = {
         f"{arrangement.key}_{start}": (problem, arrangement, seed, start, generations)
         for arrangement in problem.space.arrangements()
-        for start in range(starts)
+        for start in range(options.starts)
     }
     searches = run_jobs(
         jobs,
@@ -276,23 +267,22 @@ def study_layout(
         folder / "searches",
         settings=problem.summary | {"seed": seed, "generations": generations},
         read=partial(read_kept, Found, "the file of a search"),
-        progress=part_of(progress, 0, len(jobs) + best + 1),
+        progress=part_of(progress, 0, len(jobs) + options.best + 1),
         **options.jobs,
     )
-    chosen = _best_of(problem, list(searches.values()), best)
+    chosen = _best_of(problem, list(searches.values()), options.best)
     texts = {}
     for k, one in enumerate(chosen, 1):
         arrangement = Arrangement(tuple(one.order), tuple(one.branches), 0.0)
         machine = problem.space.machine(one.values, arrangement, f"layout_{k}")
         texts[machine.name] = yaml_text(_plain(machine))
-    for name, text in texts.items():
-        write_whole(folder / f"{name}.yaml", text)
+        write_whole(folder / f"{machine.name}.yaml", texts[machine.name])
     number = len(texts) + 1
     while (old := folder / f"layout_{number}.yaml").exists():  # of an earlier start
         old.unlink()
         number += 1
-    own = scenario.mechanism
-    places = {"before": own} | {name: str((folder / f"{name}.yaml").resolve()) for name in texts}
+    places = {name: str((folder / f"{name}.yaml").resolve()) for name in texts}
+    places = {"before": scenario.mechanism} | places
     judged = run_jobs(
         {key: (problem, place) for key, place in places.items()},
         judge,
@@ -306,24 +296,16 @@ def study_layout(
     def layout(key: str, order: Sequence[int], values: Sequence[float] | Array) -> Layout:
         one, mechanism = judged[key], load_mechanism(places[key])
         name, missed = key if key in texts else mechanism.name, problem.missed(one.measures)
-        order, values = tuple(order), np.array(values)
-        return Layout(
-            name, mechanism, order, values, one.measures, missed, one.nearest, one.outcome
-        )
+        own = name, mechanism, tuple(order), np.array(values)
+        return Layout(*own, one.measures, missed, one.nearest, one.outcome)
 
     space = problem.space
     before = layout("before", space.pattern.plate_order, own_values(space.spec))
     layouts = [layout(key, one.order, one.values) for key, one in zip(texts, chosen, strict=True)]
-    return LayoutStudy(problem, seed, starts, generations, searches, before, layouts)
+    return LayoutStudy(problem, options, searches, before, layouts)
 
 
-def problem_of(
-    scenario: Scenario,
-    goal: str,
-    limits: Mapping[str, float],
-    vary: Mapping[str, tuple[float, float]],
-    keep: Sequence[str],
-) -> Problem:
+def problem_of(scenario: Scenario, options: LayoutOptions) -> Problem:
     for field, value in (
         ("plant.mechanism", scenario.plant.mechanism),
         ("controller.calibration", scenario.controller.calibration),
@@ -333,13 +315,14 @@ def problem_of(
                 f"{field}: got {value}; expected null, as the machine is searched for"
             )
     experiment, spec = assemble(scenario), mechanism_spec(resolve("mechanism", scenario.mechanism))
-    space = space_around(spec, vary, keep)
+    space = space_around(spec, options.vary or {}, options.keep)
     crank = float(own_values(spec)[PARAMETERS.index("crank")])
     usual = {"reach": _REACH * crank, "clearance": _APART * crank, **_USUAL}
     if math.isfinite(experiment.torque_limit):
         usual["torque"] = experiment.torque_limit
     motion = motion_of(experiment.mechanism.home, experiment.reference, _instants(experiment))
-    return Problem(scenario, space, motion, requirements(goal, limits, usual))
+    wanted = requirements(options.goal, options.limits or {}, usual)
+    return Problem(scenario, space, motion, wanted)
 
 
 def _instants(experiment: Experiment) -> Array:

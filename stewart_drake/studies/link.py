@@ -108,7 +108,7 @@ class LinkStudy:
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore", RuntimeWarning)  # of errors that hardly differ
                 paired = cell.completed == best.completed == 1
-                test = stats.ttest_rel if paired else stats.ttest_ind
+                test: Any = stats.ttest_rel if paired else stats.ttest_ind
                 p = test(*errors, alternative="greater").pvalue
             if worse < _SAME or not p < 1 - CONFIDENCE:
                 found.append(cell.bound)
@@ -149,11 +149,9 @@ class LinkStudy:
 def study_link(
     scenario: Scenario, options: LinkOptions, progress: Progress | None = None
 ) -> LinkStudy:
-    """Simulate a scenario on the exact plant over bounds, then over losses.
+    """Simulate a scenario with a network on the exact plant over bounds, then over losses.
 
-    Args:
-        scenario: with a network; its `playout` is not used.
-        progress: called for each finished simulation.
+    The scenario's own `playout` is not used.
     """
     link = scenario.assumed_link
     if link.kind != "network":

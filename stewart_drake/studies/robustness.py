@@ -191,11 +191,8 @@ def study_robustness(
 ) -> RobustnessStudy:
     """Run a scenario undisturbed and then with drawn machines, or continue an earlier study.
 
-    Args:
-        scenario: to run; draws add to its own disturbances.
-        directory: of runs.csv; the runs are kept in runs/. A later call may ask for more runs.
-        options: see `RobustnessOptions`. Names in `also` become names of folders.
-        progress: as `run_jobs` takes it.
+    Draws add to the scenario's own disturbances. The directory gets runs.csv and the folder runs/;
+    a later call may ask for more runs. Names in `also` become names of folders.
 
     Raises:
         As `run_jobs`, and ConfigError for a scenario that does not suit, and for an undisturbed run
