@@ -63,9 +63,10 @@ def check(
     from stewart_drake.reporting.mechanism import document
 
     def draw(folder: Path) -> None:
-        from stewart_drake.reporting.mechanism import write_mechanism_figure
+        from stewart_drake.reporting.mechanism import mechanism_figure
+        from stewart_drake.reporting.style import write_figures
 
-        write_mechanism_figure(found.mechanism, folder)
+        write_figures({"mechanism": mechanism_figure(found.mechanism)}, folder)
 
     delivery = Delivery(out, quiet, as_json)
     found = check_model(mechanism)

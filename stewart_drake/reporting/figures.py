@@ -5,7 +5,6 @@ Angles are shown in degrees, positions in mm. A run that ended early ends with a
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +14,7 @@ from matplotlib.figure import Figure
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.reporting import style
 from stewart_drake.reporting.panels import Curve, Panel, draw
-from stewart_drake.reporting.style import FACTORS, UNITS, Line, write_figures
+from stewart_drake.reporting.style import FACTORS, UNITS, Line
 from stewart_drake.scenario.signals import (
     ANGLES,
     COORDINATES,
@@ -52,13 +51,6 @@ _FIXED: Final = Line("#888888", ":", 1.2)
 _Runs = Mapping[str, tuple[SimulationResult, Line]]
 
 
-def comparison_figures(
-    results: Mapping[str, SimulationResult], directory: str | Path
-) -> list[Path]:
-    """Write the figures of `draw_comparison` as PNG and SVG."""
-    return write_figures(draw_comparison(results), directory)
-
-
 def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure]:
     """Return states, errors, and torques of each delay-aware controller, by name.
 
@@ -81,11 +73,6 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
     if tuned:
         figures["weights"] = weights_figure(tuned)
     return figures
-
-
-def run_figures(result: SimulationResult, directory: str | Path) -> list[Path]:
-    """Write the figures of `draw_run` as PNG and SVG."""
-    return write_figures(draw_run(result), directory)
 
 
 def draw_run(result: SimulationResult) -> dict[str, Figure]:

@@ -2,7 +2,6 @@
 
 import itertools
 from functools import partial
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -16,7 +15,7 @@ from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.reporting.document import Document, from_template, number
 from stewart_drake.reporting.panels import Panel, draw
-from stewart_drake.reporting.style import Line, write_figures
+from stewart_drake.reporting.style import Line
 from stewart_drake.reporting.workspace import travel_text
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.studies.new_machine import MechanismCheck
@@ -89,10 +88,6 @@ def mechanism_figure(mechanism: Mechanism) -> Figure:
         upwards = f"{'xyz'[axes[1]]}  [mm]"
         panels.append(Panel(upwards, x="x  [mm]", title=name, height=4.05, paint=paint))
     return draw(panels, 2)
-
-
-def write_mechanism_figure(mechanism: Mechanism, directory: Path) -> list[Path]:
-    return write_figures({"mechanism": mechanism_figure(mechanism)}, directory)
 
 
 def _view(
