@@ -36,7 +36,7 @@ EVERY: Final = 10.0
 def echo(text: str, *, error: bool = False) -> None:
     """Print a text, with verdicts coloured on a terminal unless NO_COLOR is set."""
     for color, words in _COLORS.items():
-        text = re.sub(words, lambda found, color=color: typer.style(found[0], fg=color), text)
+        text = re.sub(words, typer.style(r"\g<0>", fg=color), text)
     try:
         typer.echo(text, err=error, color=False if os.environ.get("NO_COLOR") else None)
     except BrokenPipeError:  # the reader has left; the files are still to be written
