@@ -419,24 +419,20 @@ def delay_map(scenario: Scenario, progress: Progress | None = None) -> tuple[lis
     """
     cells: dict[str, Cell] = {}
     variants: dict[str, Scenario] = {}
+    exact = replace(scenario, plant=scenario.plant.without_engine)
     for steps in map_delays(scenario.delay.steps):
         for factor in FACTORS:
             motion = scaled_motion(scenario.reference, factor)
             if motion is None:
                 continue
-            variant = replace(
-                scenario,
-                reference=motion,
-                plant=scenario.plant.without_engine,
-                delay=replace(scenario.delay, steps=steps),
-            )
+            delay = replace(scenario.delay, steps=steps)
+            variant = replace(exact, reference=motion, delay=delay)
             key = f"mu{steps}-x{factor}"
-            failure = assemble(variant).reference_failure()
-            if failure is None:
-                variants[key] = variant
-                cells[key] = Cell(steps, factor, "not_run", math.nan, math.nan)
+            cells[key] = Cell(steps, factor, "not_run", math.nan, math.nan)
+            if failure := assemble(variant).reference_failure():
+                cells[key] = cells[key]._replace(status="out_of_reach", time=float(failure.time))
             else:
-                cells[key] = Cell(steps, factor, "out_of_reach", math.nan, float(failure.time))
+                variants[key] = variant
     found, interrupted = run_scenarios(variants, progress)
     for key, one in found.items():
         cells[key] = cells[key]._replace(status=one.status, error=one.error, time=one.time)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -204,7 +203,7 @@ def _bounds(section: Section) -> dict[str, Any]:
     """Return the extent of a section and its best condition number."""
     inside = np.isfinite(section.condition)
 
-    def ends(values: Array, used: NDArray[np.bool_]) -> list[float]:
+    def ends(values: Array, used: Any) -> list[float]:
         return [float(values[used][k]) if used.any() else np.nan for k in (0, -1)]
 
     return {
