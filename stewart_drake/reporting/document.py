@@ -94,7 +94,6 @@ class Paragraph:
 
     text: str
     brief: bool = False
-    kind: ClassVar = "paragraph"
 
     def plain(self) -> str:
         return wrap(self.text)
@@ -106,11 +105,6 @@ class Caution:
 
     text: str
     brief: ClassVar = True
-    kind: ClassVar = "caution"
-
-    @property
-    def sentence(self) -> str:
-        return f"Warning: {sentence(self.text)}"
 
     def plain(self) -> str:
         return wrap(f"warning: {self.text}")
@@ -122,7 +116,6 @@ class Values:
 
     entries: Mapping[str, str]
     brief: bool = True
-    kind: ClassVar = "values"
 
     def plain(self) -> str:
         return rows(self.entries)
@@ -141,7 +134,6 @@ class Table:
     caption: str = ""  # a sentence above the table
     # whether a terminal shows it, or the heads on a terminal, None for a column left out
     brief: bool | Sequence[str | None] = False
-    kind: ClassVar = "table"
 
     def __post_init__(self) -> None:
         for count, row in enumerate(self.rows, start=1):
@@ -205,7 +197,6 @@ class Picture:
     figure: "Figure | Callable[[], Figure]"
     caption: str  # the sentence below it
     brief: ClassVar = False
-    kind: ClassVar = "picture"
 
     @cached_property
     def drawn(self) -> "Figure":
@@ -221,7 +212,6 @@ class Listing:
 
     text: str
     brief: ClassVar = False
-    kind: ClassVar = "listing"
 
 
 @dataclass(frozen=True)
@@ -230,7 +220,6 @@ class Frame:
 
     source: str | Callable[[], str]  # the page, or a function that makes it when it is written
     brief: ClassVar = False
-    kind: ClassVar = "frame"
 
     @property
     def html(self) -> str:
