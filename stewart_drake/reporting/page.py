@@ -88,10 +88,6 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters |= {
-        "kind": lambda block: type(block).__name__,
-        "sentence": sentence,
-        "source": source,
-        "size": size,
-    }
+    found.filters |= {"source": source, "size": size}
+    found.filters |= {"sentence": sentence, "kind": lambda block: type(block).__name__}
     return found
