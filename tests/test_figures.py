@@ -12,9 +12,13 @@ from matplotlib.image import imread
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.reporting import figures
-from stewart_drake.reporting.figures import comparison_figures, run_figures
-from stewart_drake.reporting.style import controller_lines, figure_style, plain_log_ticks
+from stewart_drake.reporting.figures import draw_comparison, draw_run
+from stewart_drake.reporting.style import (
+    controller_lines,
+    figure_style,
+    plain_log_ticks,
+    write_figures,
+)
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 
@@ -40,14 +44,6 @@ def comparison(run):
     return {name: failed if name == "lqr" else run for name in CONTROLLERS}
 
 
-@pytest.fixture
-def drawn(monkeypatch):
-    """Return the figures by name, instead of their files."""
-    kept = {}
-    monkeypatch.setattr(figures, "write_figures", lambda made, _: kept.update(made) or [])
-    return kept
-
-
 def limits(ax):
     return np.array(ax.get_ylim())
 
@@ -57,7 +53,7 @@ def written(run, tmp_path_factory):
     """Return the folder of one run's figures."""
     before = dict(plt.rcParams)
     folder = tmp_path_factory.mktemp("figures")
-    paths = run_figures(run, folder)
+    paths = write_figures(draw_run(run), folder)
     assert dict(plt.rcParams) == before, "the user's settings were changed"
     assert not plt.get_fignums(), "a window could open"
     return folder, paths
@@ -77,20 +73,21 @@ def test_files_of_a_run(written):
             assert ElementTree.parse(path).getroot().tag.endswith("svg")
 
 
-def test_figures_of_a_comparison(comparison, drawn):
-    comparison_figures(comparison, "unused")
+def test_figures_of_a_comparison(comparison):
+    drawn = draw_comparison(comparison)
     torques = ["torques_delay_lqr", "torques_delay_lqi", "torques_predictor_lqi"]
     assert list(drawn) == ["states", "errors", *torques]
 
 
-def test_a_controller_without_estimator_has_no_parameters_to_show(drawn):
+def test_a_controller_without_estimator_has_no_parameters_to_show():
     settings = ("plant.kind=exact", "duration=0.1")
-    run_figures(simulate(load_scenario("paper", "lqr", settings), judge_stability=False), "unused")
+    scenario = load_scenario("paper", "lqr", settings)
+    drawn = draw_run(simulate(scenario, judge_stability=False))
     assert list(drawn) == ["states", "errors", "torques"]
 
 
-def test_axes_name_their_units(run, drawn):
-    run_figures(run, "unused")
+def test_axes_name_their_units(run):
+    drawn = draw_run(run)
     for name, units in {
         "states": ["deg"] * 3 + ["mm"] * 3,
         "errors": ["deg"] * 3 + ["mm"] * 3,
@@ -103,8 +100,8 @@ def test_axes_name_their_units(run, drawn):
         assert {ax.get_xlim() for ax in drawn[name].axes} == {(0.0, 1.0)}
 
 
-def test_a_diverging_run_does_not_squash_the_others_and_ends_with_a_cross(comparison, drawn):
-    comparison_figures(comparison, "unused")
+def test_a_diverging_run_does_not_squash_the_others_and_ends_with_a_cross(comparison):
+    drawn = draw_comparison(comparison)
     run = comparison["lqi"].signals
     shown = drawn["states"].axes[0]
     motion = np.rad2deg(np.ptp(run.reference.values[:, 0]))
@@ -116,26 +113,26 @@ def test_a_diverging_run_does_not_squash_the_others_and_ends_with_a_cross(compar
     assert legend == ["reference", *(LABELS[name] for name in CONTROLLERS), "run ended"]
 
 
-def test_a_run_stopped_before_its_first_sample_can_be_drawn(run, drawn):
+def test_a_run_stopped_before_its_first_sample_can_be_drawn(run):
     nothing = dataclasses.replace(
         run,
         status="interrupted",
         stopped=Failure(0.0, None, np.nan, "interrupted"),
         signals=run.signals.isel(time=slice(0, 0)),
     )
-    run_figures(nothing, "unused")
+    drawn = draw_run(nothing)
     drawn["states"].draw_without_rendering()
     assert list(drawn) == ["states", "errors", "torques"]
-    assert comparison_figures({}, "unused") == []
+    assert draw_comparison({}) == {}
 
 
 @pytest.mark.parametrize("number", [3, 7, 12])
-def test_any_number_of_controllers_has_distinct_lines_named_on_the_figure(run, drawn, number):
+def test_any_number_of_controllers_has_distinct_lines_named_on_the_figure(run, number):
     names = [*CONTROLLERS, *(f"a controller of my own {k}" for k in range(7))][:number]
     lines = controller_lines(names)
     grey = {(line.linestyle, line.marker) for line in lines.values()}
     assert len(grey) == len(set(lines.values())) == number
-    comparison_figures(dict.fromkeys(names, run), "unused")
+    drawn = draw_comparison(dict.fromkeys(names, run))
     box = drawn["states"].legends[0].get_window_extent()
     assert 0 <= box.x0 < box.x1 <= drawn["states"].bbox.x1
 

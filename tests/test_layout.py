@@ -37,6 +37,7 @@ from stewart_drake.studies.layout_space import (
     space_around,
 )
 from stewart_drake.studies.runs import Outcome
+from stewart_drake.studies.study_options import LayoutOptions
 from stewart_drake.studies.workspace import size_motors
 from stewart_drake.studies.workspace_map import margins_along
 from tests.mechanisms import PAPER
@@ -50,8 +51,7 @@ QUICK = ("plant.kind=exact", "duration=1.5")
 
 
 def problem(**options):
-    chosen = {"goal": "condition", "limits": {}, "vary": {}, "keep": ()} | options
-    return problem_of(load_scenario("paper", None, QUICK), **chosen)
+    return problem_of(load_scenario("paper", None, QUICK), LayoutOptions(**options))
 
 
 # ------------------------------------------------------------------ measures
@@ -219,7 +219,7 @@ def test_a_judgement_is_of_all_instants_and_a_run():
 
 def test_a_motion_out_of_reach_is_judged_without_a_run():
     far = load_scenario("paper", None, (*QUICK, "reference.offset=[0, 0, 0, 0, 0, 0.9]"))
-    found = json.loads(judge(problem_of(far, "condition", {}, {}, ()), "paper"))
+    found = json.loads(judge(problem_of(far, LayoutOptions()), "paper"))
     assert found["outcome"]["status"] == "refused" and found["measures"]["reach"] < 0
     assert list(found["measures"]) == ["reach"]
 
@@ -229,7 +229,7 @@ def test_a_layout_that_loses_its_goal_between_the_instants_looked_at_is_reported
     lost = Layout("layout_1", PAPER, OWN.order, own, {"reach": -0.01}, {"reach": 1.02}, None,
                   Outcome("refused", "out of reach", time=0.0))  # fmt: skip
     found = Found(list(OWN.order), list(OWN.branches), own.tolist(), {"condition": 3.0}, {}, 7)
-    study = LayoutStudy(problem(), 0, 1, 1, {"a": found}, lost, [lost])
+    study = LayoutStudy(problem(), LayoutOptions(), {"a": found}, lost, [lost])
     assert study.verdict == (
         "partly: of 7 layouts in 1 searches the best has no condition at every instant; "
         "0 of 1 complete the scenario"
@@ -238,9 +238,8 @@ def test_a_layout_that_loses_its_goal_between_the_instants_looked_at_is_reported
 
 def test_errata_another_layout_is_conditioned_better():
     """Published lengths and separations, and the search of docs/errata.md."""
-    asked = problem_of(
-        load_scenario("paper"), "condition", {"reach": 0.005, "clearance": -1.0}, {}, ()
-    )
+    limits = {"reach": 0.005, "clearance": -1.0}
+    asked = problem_of(load_scenario("paper"), LayoutOptions(limits=limits))
     other = own_values(SPEC)
     for name, value in (
         ("rotation_deg", 9.7451),

@@ -217,15 +217,15 @@ def margins(*settings, steps=8):
 def test_margins_of_the_papers_loop():
     """Those of docs/theory.md, section 13: 1.6 and 1.9 ms, and with tolerance 1 38 and 40 ms."""
     tight, loose = margins(), margins("controller.w_R=1111.1111")
-    assert 1e3 * tight.later == pytest.approx(1.6, abs=0.05)
-    assert 1e3 * tight.earlier == pytest.approx(1.9, abs=0.05)
-    assert 1e3 * loose.later == pytest.approx(38, abs=0.5)
-    assert 1e3 * loose.earlier == pytest.approx(40, abs=0.5)
+    assert 1e3 * tight.margins.longer == pytest.approx(1.6, abs=0.05)
+    assert 1e3 * tight.margins.shorter == pytest.approx(1.9, abs=0.05)
+    assert 1e3 * loose.margins.longer == pytest.approx(38, abs=0.5)
+    assert 1e3 * loose.margins.shorter == pytest.approx(40, abs=0.5)
     for m in (tight, loose):
-        least = min(m.gain_up - 1, 1 - m.gain_down)
+        least = min(m.margins.gain_up - 1, 1 - m.margins.gain_down)
         assert 1 / m.T.value <= least * 1.001  # the small-gain bound
         assert m.motor is not None
-        assert m.motor.gain_up >= m.gain_up  # six wrong motors are worse than one
+        assert m.motor.gain_up >= m.margins.gain_up  # six wrong motors are worse than one
         # |S| bounds both classical margins of each motor from below.
         assert m.motor.gain_up >= m.S.value / (m.S.value - 1) * 0.999
         assert np.deg2rad(m.motor.phase) >= 2 * np.arcsin(0.5 / m.S.value) * 0.999
@@ -236,7 +236,7 @@ def test_the_faithful_controller_is_unstable_on_the_true_plant():
     scenario = sd.load_scenario("paper", "delay_lqi", ("plant.kind=exact",))
     (m,) = loop_margins(assess(scenario), ())
     assert m.radius > 1.3
-    assert m.later == m.earlier == 0
+    assert m.margins.longer == m.margins.shorter == 0
     assert m.motor is None
     assert math.isnan(m.S.value)
 

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from http.client import HTTPConnection
 from urllib.parse import parse_qs, urlsplit
 from urllib.request import urlopen
@@ -16,7 +17,7 @@ import yaml
 import stewart_drake as sd
 from stewart_drake.cli import main, model
 from stewart_drake.mechanism.kinematics import leg_geometry
-from stewart_drake.reporting.machine_form import machine_form
+from stewart_drake.reporting.machine_form import MachineForm
 from tests.browser import needs_chromium
 from tests.screen import too_long
 
@@ -196,7 +197,7 @@ def asked(url, path, data, token=None):
 
 @pytest.fixture
 def form():
-    with machine_form({"rod": "0.26"}, "new machine") as served:
+    with closing(MachineForm({"rod": "0.26"}, "new machine")) as served:
         yield served
 
 

@@ -16,6 +16,8 @@ from stewart_drake.files.fileio import remove_partials
 from stewart_drake.reporting.terminal import echo
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from stewart_drake.files.resources import Kind
     from stewart_drake.reporting.results import AnalysisResult
     from stewart_drake.scenario.config import Scenario
@@ -214,6 +216,16 @@ class Delivery:
             echo(text, error=True)
         else:
             self.wrote(f"{len(found)} figures" if what == "figures" else what)
+
+    def figures(self, draw: "Callable[[], Mapping[str, Figure]]") -> None:
+        """Write figures by name after the results, as `draw` does."""
+
+        def write(folder: Path) -> list[Path]:
+            from stewart_drake.reporting.style import write_figures
+
+            return write_figures(draw(), folder)
+
+        self.draw("figures", write)
 
     def wrote(self, *names: str) -> None:
         self._written += names

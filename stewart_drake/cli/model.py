@@ -2,6 +2,7 @@
 
 import re
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -62,9 +63,10 @@ def check(
     from stewart_drake.reporting.mechanism import document
 
     def draw(folder: Path) -> None:
-        from stewart_drake.reporting.mechanism import write_mechanism_figure
+        from stewart_drake.reporting.mechanism import mechanism_figure
+        from stewart_drake.reporting.style import write_figures
 
-        write_mechanism_figure(found.mechanism, folder)
+        write_figures({"mechanism": mechanism_figure(found.mechanism)}, folder)
 
     delivery = Delivery(out, quiet, as_json)
     found = check_model(mechanism)
@@ -123,9 +125,12 @@ def new(
     delivery = Delivery(folder, quiet, as_json)
     study.check_free(folder)
     if form:
-        from stewart_drake.reporting.machine_form import machine_form
+        from stewart_drake.reporting.machine_form import MachineForm
 
-        with stopping("nothing was written"), machine_form(given.given, "new machine") as page:
+        with (
+            stopping("nothing was written"),
+            closing(MachineForm(given.given, "new machine")) as page,
+        ):
             # The address is printed also with --quiet.
             echo(f"fill in the form at {page.url}, Ctrl-C ends it", error=as_json)
             measurements = page.wait()

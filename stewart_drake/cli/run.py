@@ -27,16 +27,17 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.reporting.terminal import count_bar, echo, progress_bars
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from pydrake.geometry import Meshcat
 
 
 CSV: Final = "signals.csv"
 REPLAY: Final = "replay.html"
 RUN_FIGURES: Final = ("states", "errors", "torques", "parameters", "delay", "weights")
-"""All that `run_figures` may write; those of an earlier run are deleted."""
+"""All that `draw_run` may return; those of an earlier run are deleted."""
 COMPARED_FIGURES: Final = ("states", "errors", "weights")
 OF_CONTROLLERS: Final = ("torques", "delay")
-"""All that `comparison_figures` may write, of all controllers and of each."""
+"""All that `draw_comparison` may return, of all controllers and of each."""
 
 
 def simulate(
@@ -88,10 +89,10 @@ def simulate(
         result = run(experiment, progress=shown, meshcat=viewer, judge_stability=margin, log=log)
     delivery.say(run_document(result).plain())
 
-    def draw(folder: Path) -> list[Path]:
-        from stewart_drake.reporting.figures import run_figures
+    def draw() -> "dict[str, Figure]":
+        from stewart_drake.reporting.figures import draw_run
 
-        return run_figures(result, folder)
+        return draw_run(result)
 
     def film(folder: Path) -> None:
         from stewart_drake.reporting.replay import write_replay
@@ -107,7 +108,7 @@ def simulate(
             write_csv(result.signals, out / CSV)
         result.save(out)
         delivery.wrote("summary.json", "signals.nc", *[CSV] * csv)
-    delivery.draw("figures", draw)
+    delivery.figures(draw)
     if replay or meshcat:
         delivery.draw(REPLAY, film)
     if log is not None:
@@ -275,10 +276,10 @@ def compare(
     from stewart_drake.studies import compare as study
     from stewart_drake.studies.verdict import delay_verdict
 
-    def draw(folder: Path) -> list[Path]:
-        from stewart_drake.reporting.figures import comparison_figures
+    def draw() -> "dict[str, Figure]":
+        from stewart_drake.reporting.figures import draw_comparison
 
-        return comparison_figures(results, folder)
+        return draw_comparison(results)
 
     chosen = None if controllers is None else [one.strip() for one in controllers.split(",")]
     names = tuple(study.shown(scenario, settings or (), chosen))
@@ -300,7 +301,7 @@ def compare(
     if out is not None:
         study.save_comparison(results, out)
         delivery.wrote("summary.json", f"{len(results)} signal files")
-    delivery.draw("figures", draw)
+    delivery.figures(draw)
     ended = [result.status for result in results.values()]
     interrupted = "interrupted" in ended or len(ended) < len(names)
     return delivery.end(study.comparison_summary(results), interrupted)

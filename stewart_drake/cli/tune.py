@@ -1,7 +1,7 @@
 """Commands of the tuner: tune dataset, tune train, tune evaluate."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,6 +19,9 @@ from stewart_drake.cli.options import Given, with_options
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.reporting.terminal import count_bar
 from stewart_drake.tuning.options import DataOptions, EvaluationOptions, TrainingOptions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 app = typer.Typer(
     rich_markup_mode=None, help="Make data for the neural tuner, train it, evaluate it."
@@ -77,10 +80,10 @@ def train(
     """
     from stewart_drake.functions import train_tuner
 
-    def draw(folder: Path) -> list[Path]:
+    def draw() -> "dict[str, Figure]":
         from stewart_drake.reporting.tuner import training_figures
 
-        return training_figures(found.study, folder)
+        return training_figures(found.study)
 
     if out.suffix != ".json":
         raise ConfigError(f"--out: got {str(out)!r}; expected a file ending in .json")
@@ -97,7 +100,7 @@ def train(
     delivery.write(found.summary)
     delivery.say(found.table())
     if not options.regret:
-        delivery.draw("figures", draw)
+        delivery.figures(draw)
     return delivery.end(found.summary)
 
 

@@ -121,13 +121,8 @@ def analyze(
 ) -> "AnalysisResult":
     """Study a scenario and describe the result.
 
-    Args:
-        name: of the analysis.
-        scenario: to study.
-        options: of the study; its defaults if None.
-        command: repeats the analysis; shown on the page.
-        directory: folder of a study's runs.
-        progress: called with the number of finished runs and of all.
+    The page shows `command`, which repeats the analysis. A study keeps its runs in `directory`, and
+    calls `progress` with the number of finished runs and of all.
     """
     from dataclasses import replace
 

@@ -10,7 +10,6 @@ from typing import Any, ParamSpec, TypeVar
 
 from stewart_drake.loop import simulation
 from stewart_drake.loop.preparation import simulated_machine
-from stewart_drake.loop.results import SimulationResult as LoopResult
 from stewart_drake.reporting.analyses import ANALYSES, RENAMED, analyze, options_of, words_of
 from stewart_drake.reporting.results import AnalysisResult, ComparisonResult, SimulationResult
 from stewart_drake.scenario.config import Scenario
@@ -33,11 +32,7 @@ def _with(shown: Callable[[S], R], function: Callable[P, S]) -> Callable[P, R]:
     return call
 
 
-def _shown(result: LoopResult) -> SimulationResult:
-    return SimulationResult.of(result)
-
-
-simulate = _with(_shown, simulation.simulate)
+simulate = _with(SimulationResult.of, simulation.simulate)
 compare = _with(ComparisonResult, comparison.compare)
 
 

@@ -1,7 +1,5 @@
 """Signals of a run as CSV, for spreadsheets: one column per component, with its unit."""
 
-import csv
-import io
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +17,11 @@ def signals_csv(signals: xr.Dataset) -> str:
 
     A reference of `kind: csv` reads the columns `pose_...` as a motion.
     """
+    import pandas
+
     header, rows = columns_of(signals)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    for row in rows:
-        writer.writerow(f"{value:.12g}" if np.isfinite(value) else "" for value in row)
-    return text.getvalue()
+    frame = pandas.DataFrame(np.where(np.isfinite(rows), rows, np.nan), columns=header)
+    return str(frame.to_csv(index=False, float_format="%.12g", lineterminator="\n"))
 
 
 def columns_of(signals: xr.Dataset) -> tuple[list[str], Array]:

@@ -10,11 +10,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from stewart_drake.law.servos import mean_inertia
+from stewart_drake.law.stability import Margins
 from stewart_drake.reporting.document import Document, Table, Tone, from_template, number
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import DATA_INK, DATA_PAPER, line
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.studies.delay import Cell, DelayStudy
+from stewart_drake.studies.delay import Cell, DelayStudy, MotorMargins
 from stewart_drake.studies.verdict import HARDLY, NO, loop_verdict, milliseconds
 
 _TONES: Final[dict[str, Tone]] = {"yes": "good", "hardly": "fair", "no": "bad"}
@@ -52,7 +53,6 @@ def document(study: DelayStudy) -> Document:
         growth_figure=study.poles and partial(growth_figure, study),
         floor=study.floors[steps],
         margins=loop if loop is not None and loop.radius < 1 else None,
-        loops=study.loops,
         loop_figure=any(one.radius < 1 for one in study.loops) and partial(loop_figure, study),
         cells=study.cells and _map_table(study),
         failed=any(cell.status != "completed" for cell in study.cells),
@@ -91,10 +91,15 @@ def _cell_word(cell: Cell) -> str:
     return word if math.isnan(cell.time) else f"{word} {cell.time:.2f}"
 
 
-def _gains(loop: Any) -> str:
-    """Return the range of gains of a loop, or of one of its motors."""
-    up = f"{loop.gain_up:.3f}" if math.isfinite(loop.gain_up) else "∞"
-    return f"{loop.gain_down:.3f} to {up}"
+def _gains(margins: Margins | MotorMargins) -> str:
+    """Return the range of gains of all motors, or of one."""
+    up = f"{margins.gain_up:.3f}" if math.isfinite(margins.gain_up) else "∞"
+    return f"{margins.gain_down:.3f} to {up}"
+
+
+def _least(margins: Margins | MotorMargins) -> float:
+    """Return the smallest tolerable error of the gain, as a share."""
+    return min(margins.gain_up - 1, 1 - margins.gain_down)
 
 
 def growth_figure(study: DelayStudy) -> Figure:
@@ -134,9 +139,7 @@ def growth_figure(study: DelayStudy) -> Figure:
 def loop_figure(study: DelayStudy) -> Figure:
     """Draw peaks of S and T, and tolerable errors of gain and delay, over the delay."""
     loops = [loop for loop in study.loops if loop.radius < 1]
-    single = [
-        100 * min(m.motor.gain_up - 1, 1 - m.motor.gain_down) if m.motor else np.nan for m in loops
-    ]
+    single = [100 * _least(m.motor) if m.motor else np.nan for m in loops]
     curves = {
         "peak over all frequencies": {
             "S": [m.S.value for m in loops],
@@ -144,11 +147,11 @@ def loop_figure(study: DelayStudy) -> Figure:
         },
         "tolerable error of the gain  [%]": {
             "one motor": single,
-            "all motors": [100 * min(m.gain_up - 1, 1 - m.gain_down) for m in loops],
+            "all motors": [100 * _least(m.margins) for m in loops],
         },
         "tolerable error of the delay  [ms]": {
-            "longer": [1e3 * m.later for m in loops],
-            "shorter": [1e3 * m.earlier for m in loops],
+            "longer": [1e3 * m.margins.longer for m in loops],
+            "shorter": [1e3 * m.margins.shorter for m in loops],
         },
     }
     steps = [loop.steps for loop in loops]
@@ -183,18 +186,9 @@ def map_figure(study: DelayStudy) -> Figure:
         ax.spines[:].set_visible(False)
         ax.tick_params(length=0)
 
-    return draw(
-        [
-            Panel(
-                "amplitude",
-                x="delay",
-                xlim=(-0.5, len(steps) - 0.5),
-                ylim=(-0.5, len(factors) - 0.5),
-                height=0.8 * len(factors),
-                paint=paint,
-            )
-        ]
-    )
+    xlim, ylim = (-0.5, len(steps) - 0.5), (-0.5, len(factors) - 0.5)
+    height = 0.8 * len(factors)
+    return draw([Panel("amplitude", x="delay", xlim=xlim, ylim=ylim, height=height, paint=paint)])
 
 
 def _draw_cell(ax: Axes, cell: Cell, x: int, y: int, floor: float) -> None:

@@ -13,8 +13,8 @@ after rendering is left out. Numbers get three significant digits.
     text                     is a paragraph of a page
     > text                   is a paragraph of a page and of a terminal
     = name :: value          is a value with its name
-    @name caption            is the context's entry of this name: blocks, or a function that draws
-                             a figure; a paragraph if it is True
+    @name caption            is what has this name, such as `study.loops`: blocks, texts of
+                             warnings, or a function that draws a figure; a paragraph if it is True
       | head :: cell         below it is a column of a table of all `it` in the named items
       | head :: brief :: cell    with the head on a terminal; the head - leaves the column out
       | @other               has the columns of another table
@@ -28,7 +28,7 @@ A terminal shows a table or a paragraph of `@>name`. A line is not broken at ~, 
 import math
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from io import StringIO
@@ -74,6 +74,11 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.{max(0, decimals)}f}"
 
 
+def listed(items: Iterable[object], form: str = "%s", between: str = ", ") -> str:
+    """Return items in one text, each in a form such as `%s: %g`."""
+    return between.join(form % one for one in items)
+
+
 def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
@@ -89,7 +94,6 @@ class Paragraph:
 
     text: str
     brief: bool = False
-    kind: ClassVar = "paragraph"
 
     def plain(self) -> str:
         return wrap(self.text)
@@ -101,11 +105,6 @@ class Caution:
 
     text: str
     brief: ClassVar = True
-    kind: ClassVar = "caution"
-
-    @property
-    def sentence(self) -> str:
-        return f"Warning: {sentence(self.text)}"
 
     def plain(self) -> str:
         return wrap(f"warning: {self.text}")
@@ -117,7 +116,6 @@ class Values:
 
     entries: Mapping[str, str]
     brief: bool = True
-    kind: ClassVar = "values"
 
     def plain(self) -> str:
         return rows(self.entries)
@@ -136,7 +134,6 @@ class Table:
     caption: str = ""  # a sentence above the table
     # whether a terminal shows it, or the heads on a terminal, None for a column left out
     brief: bool | Sequence[str | None] = False
-    kind: ClassVar = "table"
 
     def __post_init__(self) -> None:
         for count, row in enumerate(self.rows, start=1):
@@ -200,7 +197,6 @@ class Picture:
     figure: "Figure | Callable[[], Figure]"
     caption: str  # the sentence below it
     brief: ClassVar = False
-    kind: ClassVar = "picture"
 
     @cached_property
     def drawn(self) -> "Figure":
@@ -216,7 +212,6 @@ class Listing:
 
     text: str
     brief: ClassVar = False
-    kind: ClassVar = "listing"
 
 
 @dataclass(frozen=True)
@@ -225,7 +220,6 @@ class Frame:
 
     source: str | Callable[[], str]  # the page, or a function that makes it when it is written
     brief: ClassVar = False
-    kind: ClassVar = "frame"
 
     @property
     def html(self) -> str:
@@ -295,9 +289,10 @@ def sections(name: str, /, **context: Any) -> list[Section]:
     """Return the sections of a template that have a named block, or need none."""
     found = []
     for heading, folded, parts in _template(name):
-        named = [bool(context[part.name]) for part in parts if part.name]
-        if any(named) or not named:
-            blocks = [block for part in parts for block in _blocks(part, context)]
+        values = [part.entry and part.entry(context) for part in parts]
+        if any(values) or not any(part.entry for part in parts):
+            pairs = zip(parts, values, strict=True)
+            blocks = [block for part, value in pairs for block in _blocks(part, value, context)]
             found.append(Section(heading.render(context), *blocks, folded=folded))
     return found
 
@@ -306,15 +301,14 @@ class _Part(NamedTuple):
     """A part of a template; `rows` are the pieces of its lines that begin with `kind`."""
 
     mark: str
-    name: str
+    entry: "Callable[[Mapping[str, Any]], Any] | None"  # returns what is named
     text: "Template"
     kind: str
     rows: "list[list[Template]]"
 
 
-def _blocks(part: _Part, context: Mapping[str, Any]) -> Iterator[Block]:
-    value: Any = context[part.name] if part.name else None
-    if part.name and not value:
+def _blocks(part: _Part, value: Any, context: Mapping[str, Any]) -> Iterator[Block]:
+    if part.entry and not value:
         return
     text = " ".join(part.text.render(context).split())
     if part.kind == "|":
@@ -326,7 +320,7 @@ def _blocks(part: _Part, context: Mapping[str, Any]) -> Iterator[Block]:
     elif part.kind == "+":
         head, *rows = [[one.render(context).strip() for one in row] for row in part.rows]
         yield Table(head, rows, text)
-    elif not part.name:
+    elif part.entry is None:
         if text:
             yield Paragraph(text, part.mark == ">")
     else:
@@ -335,6 +329,8 @@ def _blocks(part: _Part, context: Mapping[str, Any]) -> Iterator[Block]:
                 yield Paragraph(text, part.mark == "@>")
             elif callable(one):
                 yield Picture(one, text)
+            elif isinstance(one, str):
+                yield Caution(one)
             else:
                 yield replace(one, caption=text) if text and isinstance(one, Table) else one
 
@@ -359,8 +355,9 @@ def _template(name: str) -> "list[tuple[Template, bool, list[_Part]]]":
     columns: dict[str, list[list[Template]]] = {}
     source, *_ = environment.loader.get_source(environment, f"{name}.md.j2")
     for part in re.split(r"\n\s*\n", source.strip()):
-        opening, *lines = re.split(r"\n *(?=[|=+] )", f"\n{part}")
-        ((mark, named, text),) = re.findall(r"^(#-?|[!>]|@>?|)(\w*)(.*)", " ".join(opening.split()))
+        first, *lines = re.split(r"\n *(?=[|=+] )", f"\n{part}")
+        opening = " ".join(first.split())
+        ((mark, named, text),) = re.findall(r"^(#-?|[!>]|@>?|)([\w.]*)(.*)", opening)
         if "@" not in mark:
             named, text = "", named + text
         template = environment.from_string(text.strip())
@@ -372,7 +369,8 @@ def _template(name: str) -> "list[tuple[Template, bool, list[_Part]]]":
         if rows and rows[0][0].startswith("@"):
             pieces = columns[rows[0][0]]
         columns[f"@{named}"] = pieces
-        found[-1][2].append(_Part(mark, named, template, lines[0][0] if lines else "", pieces))
+        entry = environment.compile_expression(named, undefined_to_none=False) if named else None
+        found[-1][2].append(_Part(mark, entry, template, lines[0][0] if lines else "", pieces))
     return found
 
 
@@ -386,5 +384,5 @@ def _environment() -> "Environment":
     found = Environment(
         loader=PackageLoader("stewart_drake.reporting"), undefined=StrictUndefined, finalize=shown
     )
-    found.filters |= {"number": number, "capital": capital}
+    found.filters |= {"number": number, "capital": capital, "listed": listed}
     return found

@@ -3,9 +3,8 @@
 Angles are shown in degrees, positions in mm. A run that ended early ends with a cross at that time.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +14,7 @@ from matplotlib.figure import Figure
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.reporting import style
 from stewart_drake.reporting.panels import Curve, Panel, draw
-from stewart_drake.reporting.style import FACTORS, UNITS, Line, write_figures
+from stewart_drake.reporting.style import FACTORS, UNITS, Line
 from stewart_drake.scenario.signals import (
     ANGLES,
     COORDINATES,
@@ -52,13 +51,6 @@ _FIXED: Final = Line("#888888", ":", 1.2)
 _Runs = Mapping[str, tuple[SimulationResult, Line]]
 
 
-def comparison_figures(
-    results: Mapping[str, SimulationResult], directory: str | Path
-) -> list[Path]:
-    """Write the figures of `draw_comparison` as PNG and SVG."""
-    return write_figures(draw_comparison(results), directory)
-
-
 def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure]:
     """Return states, errors, and torques of each delay-aware controller, by name.
 
@@ -81,11 +73,6 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
     if tuned:
         figures["weights"] = weights_figure(tuned)
     return figures
-
-
-def run_figures(result: SimulationResult, directory: str | Path) -> list[Path]:
-    """Write the figures of `draw_run` as PNG and SVG."""
-    return write_figures(draw_run(result), directory)
 
 
 def draw_run(result: SimulationResult) -> dict[str, Figure]:
@@ -123,50 +110,47 @@ def _states(runs: _Runs) -> Figure:
     reference = FACTORS * wanted.reference.values
     spans = _spans(reference)
     least = _LEAST_SPAN * np.repeat([spans[ANGLES].max(), spans[POSITION].max()], 3)
-    panels = []
-    for k, unit in enumerate(UNITS):
-        poses = [FACTORS[k] * run.signals.pose.values[:, k] for run, _ in runs.values()]
-        core = [reference[:, k], *_trusted(runs, poses)]
-        curve = Curve(wanted.time.values, reference[:, k], "reference", style.REFERENCE)
-        panels.append(
-            Panel(
-                f"{_SYMBOLS[COORDINATES[k]]}  [{unit}]",
-                [curve, *_curves(runs, poses)],
-                xlim=_times(runs),
-                ylim=_limits(core, poses, _STATE_REACH * spans[k], least[k]),
-            )
-        )
-    return draw(panels, 2, down=True)
+    time = wanted.time.values
+    curves = [Curve(time, column, "reference", style.REFERENCE) for column in reference.T]
+    return _coordinates(runs, "pose", _STATE_REACH * spans, least, curves)
 
 
 def _errors(runs: _Runs) -> Figure:
     spans = np.max([_spans(FACTORS * run.signals.reference.values) for run, _ in runs.values()], 0)
-    panels = []
+    return _coordinates(runs, "error", _ERROR_REACH * spans, np.zeros(6))
+
+
+def _coordinates(
+    runs: _Runs, signal: str, reach: Array, least: Array, wanted: Sequence[Curve] = ()
+) -> Figure:
+    """Draw the six coordinates of a signal, over the wanted ones; `reach`, `least`: `_limits`."""
+    panels, word = [], "" if signal == "pose" else f" {signal}"
     for k, unit in enumerate(UNITS):
-        errors = [FACTORS[k] * run.signals.error.values[:, k] for run, _ in runs.values()]
+        data = [FACTORS[k] * run.signals[signal].values[:, k] for run, _ in runs.values()]
+        behind = wanted[k : k + 1]
+        core = [*(np.asarray(curve.y) for curve in behind), *_trusted(runs, data)]
         panels.append(
             Panel(
-                f"{_SYMBOLS[COORDINATES[k]]} error  [{unit}]",
-                _curves(runs, errors),
+                f"{_SYMBOLS[COORDINATES[k]]}{word}  [{unit}]",
+                [*behind, *_curves(runs, data)],
                 xlim=_times(runs),
-                ylim=_limits(_trusted(runs, errors), errors, _ERROR_REACH * spans[k]),
+                ylim=_limits(core, data, reach[k], least[k]),
             )
         )
     return draw(panels, 2, down=True)
 
 
 def _torques(run: SimulationResult, label: str, line: Line, commanded: bool = False) -> Figure:
-    runs, signals = {label: (run, line)}, run.signals
-    panels = []
+    signals, panels, xlim = run.signals, [], (0.0, shown_until(run))
     for k, leg in enumerate(LEGS):
         asked = signals.torque_commanded.values[:, k]
         curves = [Curve(signals.time.values, asked, "commanded", style.COMMANDED, steps=True)]
-        applied = _curves(runs, [signals.torque_applied.values[:, k]], steps=True)
+        applied = _curve(run, signals.torque_applied.values[:, k], label, line, steps=True)
         name = f"motor {leg}{'' if commanded else ' applied'}  [N m]"
-        panels.append(Panel(name, curves * commanded + applied, xlim=_times(runs)))
+        panels.append(Panel(name, [*curves * commanded, applied], xlim=xlim))
     if has_packets(run):
         strip = partial(_packet_strip, run=run)
-        panels.append(Panel("", xlim=_times(runs), height=1.15, wide=True, paint=strip))
+        panels.append(Panel("", xlim=xlim, height=1.15, wide=True, paint=strip))
     return draw(panels, 2, down=True, sharey=True)
 
 
@@ -188,7 +172,7 @@ def _packet_strip(ax: Axes, run: SimulationResult) -> None:
 
 
 def _parameters(run: SimulationResult) -> Figure:
-    runs, time = {"estimate": (run, style.RUN)}, run.signals.time.values
+    time, xlim = run.signals.time.values, (0.0, shown_until(run))
     true, values, widths = (
         _PARAMETER_FACTORS * data
         for data in (
@@ -208,7 +192,7 @@ def _parameters(run: SimulationResult) -> Figure:
                     Curve(time, np.full(len(time), true[k]), "true value", style.TRUTH),
                     Curve(time, value, "estimate", band=(value - width, value + width, "± 2 σ")),
                 ],
-                xlim=_times(runs),
+                xlim=xlim,
                 ylim=_limits([value, true[k] + np.array([-least, least])], [], 0.0),
             )
         )
@@ -236,22 +220,13 @@ def _delay(run: SimulationResult) -> Figure:
 
 
 def weights_figure(runs: Mapping[str, SimulationResult]) -> Figure:
-    """Draw w_Q, w_R and their ratio, which determines the gain.
-
-    Args:
-        runs: at least one, by the title of its column.
-    """
+    """Draw w_Q, w_R and their ratio, which determines the gain, of runs by title."""
     above, below = list[Panel](), list[Panel]()
     for title, run in runs.items():
         weights, c, end = run.signals.weights.values, run.scenario.controller, shown_until(run)
         ratio, fixed = weights[:, 0] / weights[:, 1], c.weights[0] / c.weights[1]
-        first, other = (
-            _curves({name: (run, look)}, [data], True)[0]
-            for name, look, data in (
-                (WEIGHTS[0], style.RUN, weights[:, 0]),
-                ("", Line("#000000", "-", 1.3), ratio),
-            )
-        )
+        first = _curve(run, weights[:, 0], WEIGHTS[0], style.RUN, steps=True)
+        other = _curve(run, ratio, "", Line("#000000", "-", 1.3), steps=True)
         second = Curve(first.x, weights[:, 1], WEIGHTS[1], style.COMMANDED, steps=True)
         constant = Curve((0, end), (fixed, fixed), "fixed weights", _FIXED)
         how: dict[str, Any] = {"xlim": (0, end), "yscale": "log" if len(weights) else "linear"}
@@ -270,13 +245,17 @@ def _times(runs: _Runs) -> tuple[float, float]:
     return 0.0, max(shown_until(run) for run, _ in runs.values())
 
 
-def _curves(runs: _Runs, data: Iterable[Array], steps: bool = False) -> list[Curve]:
-    curves = []
-    for (label, (run, line)), values in zip(runs.items(), data, strict=True):
-        early = run.stopped is not None and run.status != "interrupted"
-        ended = run.stopped.time if run.stopped is not None and early else None
-        curves.append(Curve(run.signals.time.values, values, label, line, steps, ended=ended))
-    return curves
+def _curve(
+    run: SimulationResult, values: Array, label: str, line: Line, steps: bool = False
+) -> Curve:
+    stopped = None if run.status == "interrupted" else run.stopped
+    ended = None if stopped is None else stopped.time
+    return Curve(run.signals.time.values, values, label, line, steps, ended=ended)
+
+
+def _curves(runs: _Runs, data: Iterable[Array]) -> list[Curve]:
+    pairs = zip(runs.items(), data, strict=True)
+    return [_curve(run, values, label, line) for (label, (run, line)), values in pairs]
 
 
 def _trusted(runs: _Runs, data: list[Array]) -> list[Array]:

@@ -13,14 +13,7 @@ from stewart_drake.identification.logs import KINDS, Log
 from stewart_drake.identification.plan import MOTION, Plan
 from stewart_drake.identification.unknowns import DELAY, GEOMETRY, NAMES
 from stewart_drake.identification.unknowns import UNITS as SI_UNITS
-from stewart_drake.reporting.document import (
-    Caution,
-    Document,
-    Picture,
-    Table,
-    from_template,
-    number,
-)
+from stewart_drake.reporting.document import Document, Picture, Table, from_template, number
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import FACTORS, LEG_LINES, UNITS
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS
@@ -48,7 +41,7 @@ def document(found: Identification) -> Document:
     interval = number(1e3 * found.std[DELAY], 2)
     digits = len(interval.partition(".")[2])
     exact = f"{1e3 * found.values[DELAY]:.6g}"
-    cautions, names = [Caution(one) for one in _cautions(found)], file_names(found.logs)
+    cautions, names = _cautions(found), file_names(found.logs)
     right = found.right
     return from_template(
         "identification",
@@ -158,10 +151,8 @@ def residual_figure(found: Identification, log: int) -> Figure:
         if found.logs[log].measures(part):
             values = residuals[:, part]
             looks = (line._replace(linewidth=0.9) for line in LEG_LINES)
-            curves = [
-                Curve(times, values[:, k], label, look)
-                for k, (label, look) in enumerate(zip(_OF_KIND[kind], looks, strict=True))
-            ]
+            named = zip(values.T, _OF_KIND[kind], looks, strict=True)
+            curves = [Curve(times, column, label, look) for column, label, look in named]
             limits = {sign * 2.0: f"{sign * 2} standard deviations" for sign in (1, -1)}
             panels.append(Panel(f"{kind}  [std]", curves, limits=limits, legend="panel"))
     return draw(panels)

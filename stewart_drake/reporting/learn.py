@@ -30,7 +30,6 @@ def document(study: LearnStudy) -> Document:
         first=first,
         best=best,
         learned=best is not first,
-        repetitions=study.repetitions,
         number=lambda one: numbers[id(one)],
         films=[
             Frame(partial(replay_html, one.result, machine, f"repetition {numbers[id(one)]}"))

@@ -36,8 +36,6 @@ def document(study: LinkStudy) -> Document:
         assured=_ASSURED,
         wanted=math.ceil(math.log(1 - CONFIDENCE) / math.log(_ASSURED)),
         left_out=" and ".join(f"{bound:g} s" for bound in study.left_out),
-        bounds=study.bounds,
-        losses=study.losses,
         figure=partial(bound_figure, study),
     )
 

@@ -4,8 +4,7 @@ import json
 import re
 import secrets
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final, Literal, get_args, get_origin
@@ -26,46 +25,45 @@ _PATIENCE: Final = 10.0
 """Longest wait for a browser that fetches the report, s."""
 
 
-class Entries:
-    """Texts of a form as measurements; an empty text is a missing one."""
+Entries = dict[str, str]
+"""Texts of a form by the name of the measurement, without those that are missing."""
 
-    def __init__(self, texts: Mapping[str, str]) -> None:
-        self._given = {name: text.strip() for name, text in texts.items() if text.strip()}
 
-    def measurements(self) -> Measurements:
-        """Return the measurements.
+def measurements_of(entries: Entries) -> Measurements:
+    """Return the measurements.
 
-        Raises:
-            ConfigError: the first problem; it begins with the measurement's name.
-        """
-        for one in Measurements.described():
-            if one.required and one.name not in self._given:
-                raise ConfigError(f"{one.name}: is missing")
-        return Measurements(**self._given)
+    Raises:
+        ConfigError: the first problem; it begins with the measurement's name.
+    """
+    for one in Measurements.described():
+        if one.required and one.name not in entries:
+            raise ConfigError(f"{one.name}: is missing")
+    return Measurements(**entries)
 
-    def drawn(self) -> str:
-        """Return the drawing as a data URI; masses that are missing do not matter."""
-        masses = dict.fromkeys(("plate_mass", "crank_mass", "rod_mass"), _ANY_MASS)
-        lengths = Entries({**self._given, **{name: str(m) for name, m in masses.items()}})
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "machine.yaml"
-            path.write_text(machine_text(lengths.measurements(), "machine"))
-            try:
-                return source(mechanism_figure(load_mechanism(path)))
-            except UnreachablePoseError as error:
-                raise ConfigError(f"rod: {error}") from None
 
-    def answer(self) -> dict[str, Any]:
-        """Return what the page shows: `drawing` or null, `field` and `problem` or null."""
-        found: dict[str, Any] = {"drawing": None, "field": None, "problem": None}
+def drawing(entries: Entries) -> str:
+    """Return the drawing as a data URI; masses that are missing do not matter."""
+    masses = dict.fromkeys(("plate_mass", "crank_mass", "rod_mass"), str(_ANY_MASS))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "machine.yaml"
+        path.write_text(machine_text(measurements_of(entries | masses), "machine"))
         try:
-            found["drawing"] = self.drawn()
-            self.measurements()
-        except ConfigError as error:
-            name, _, words = str(error).partition(": ")
-            known = name in Measurements.model_fields
-            found["field"], found["problem"] = (name, words) if known else (None, str(error))
-        return found
+            return source(mechanism_figure(load_mechanism(path)))
+        except UnreachablePoseError as error:
+            raise ConfigError(f"rod: {error}") from None
+
+
+def answer(entries: Entries) -> dict[str, Any]:
+    """Return what the page shows: `drawing` or null, `field` and `problem` or null."""
+    found: dict[str, Any] = {"drawing": None, "field": None, "problem": None}
+    try:
+        found["drawing"] = drawing(entries)
+        measurements_of(entries)
+    except ConfigError as error:
+        name, _, words = str(error).partition(": ")
+        known = name in Measurements.model_fields
+        found["field"], found["problem"] = (name, words) if known else (None, str(error))
+    return found
 
 
 def read_entries(data: bytes) -> Entries | None:
@@ -77,11 +75,11 @@ def read_entries(data: bytes) -> Entries | None:
     known = isinstance(found, dict) and found.keys() <= Measurements.model_fields.keys()
     if not known or not all(isinstance(text, str) for text in found.values()):
         return None
-    return Entries(found)
+    return {name: text.strip() for name, text in found.items() if text.strip()}
 
 
 class MachineForm:
-    """The form, served until it is closed.
+    """The form, served until it is closed, as by `contextlib.closing`.
 
     Args:
         given: measurements that the form begins with, by name.
@@ -89,7 +87,7 @@ class MachineForm:
     """
 
     def __init__(self, given: Mapping[str, Any], title: str) -> None:
-        self._entries: Entries | None = None
+        self._entries: Entries = {}
         self._asked, self._ready, self._fetched = (threading.Event() for _ in range(3))
         self._report = ""
         fields = [_field(one, given.get(one.name)) for one in Measurements.described()]
@@ -105,8 +103,8 @@ class MachineForm:
         return self._server.url
 
     def take(self, entries: Entries) -> dict[str, Any]:
-        """Take complete entries; return `Entries.answer`."""
-        found = entries.answer()
+        """Take complete entries; return `answer`."""
+        found = answer(entries)
         if found["problem"] is None:
             self._entries = entries
             self._asked.set()
@@ -116,8 +114,7 @@ class MachineForm:
         """Wait for complete measurements."""
         while not self._asked.wait(0.2):  # short, so that Ctrl-C ends it
             pass
-        assert self._entries is not None
-        return self._entries.measurements()
+        return measurements_of(self._entries)
 
     def report(self) -> str:
         """Wait for the page that follows the form."""
@@ -137,16 +134,6 @@ class MachineForm:
         self._server.server_close()
 
 
-@contextmanager
-def machine_form(given: Mapping[str, Any], title: str) -> Iterator[MachineForm]:
-    """Serve a form; close it at the end."""
-    form = MachineForm(given, title)
-    try:
-        yield form
-    finally:
-        form.close()
-
-
 def _handler(form: MachineForm, page: str, secret: str) -> type[LocalHandler]:
     class Handler(LocalHandler):
         token, text = secret, page
@@ -160,7 +147,7 @@ def _handler(form: MachineForm, page: str, secret: str) -> type[LocalHandler]:
             entries = read_entries(data)
             if entries is None or path not in ("/check", "/write"):
                 return None
-            found = entries.answer() if path == "/check" else form.take(entries)
+            found = answer(entries) if path == "/check" else form.take(entries)
             return json.dumps(found).encode()
 
     return Handler

@@ -2,7 +2,6 @@
 
 import itertools
 from functools import partial
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -16,7 +15,7 @@ from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.reporting.document import Document, from_template, number
 from stewart_drake.reporting.panels import Panel, draw
-from stewart_drake.reporting.style import Line, write_figures
+from stewart_drake.reporting.style import Line
 from stewart_drake.reporting.workspace import travel_text
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.studies.new_machine import MechanismCheck
@@ -82,29 +81,13 @@ def mechanism_figure(mechanism: Mechanism) -> Figure:
     low, high = everything.min(axis=0), everything.max(axis=0)
     half = 0.62 * max((high - low)[:2].max(), high[2] - low[2], abs(high[2]), abs(low[2]))
     middle, centre = (low + high) / 2, 1e3 * mechanism.home[3:]
-    return draw(
-        [
-            Panel(
-                f"{'xyz'[axes[1]]}  [mm]",
-                x="x  [mm]",
-                title=name,
-                height=4.05,
-                paint=partial(
-                    _view,
-                    points=points,
-                    axes=axes,
-                    centre=centre,
-                    corners=middle + [[-half], [half]],
-                ),
-            )
-            for name, axes in _VIEWS.items()
-        ],
-        2,
-    )
-
-
-def write_mechanism_figure(mechanism: Mechanism, directory: Path) -> list[Path]:
-    return write_figures({"mechanism": mechanism_figure(mechanism)}, directory)
+    view = partial(_view, points=points, centre=centre, corners=middle + [[-half], [half]])
+    panels = []
+    for name, axes in _VIEWS.items():
+        paint = partial(view, axes=axes)
+        upwards = f"{'xyz'[axes[1]]}  [mm]"
+        panels.append(Panel(upwards, x="x  [mm]", title=name, height=4.05, paint=paint))
+    return draw(panels, 2)
 
 
 def _view(
@@ -123,19 +106,13 @@ def _view(
     ax.plot(*np.vstack([base, base[:1]]).T, label="shaft centres", zorder=1, **BASE._asdict())
     for rank, i in enumerate(np.argsort(depth)):
         order = 3 + rank / 10
-        first = {"crank": "crank", "rod": "rod"} if rank == 0 else {}
-        ax.plot(
-            *zip(tip[i], joint[i], strict=True),
-            label=first.get("rod"),
-            zorder=order,
-            **ROD._asdict(),
-        )
-        ax.plot(
-            *zip(shaft[i], tip[i], strict=True),
-            label=first.get("crank"),
-            zorder=order + 0.05,
-            **CRANK._asdict(),
-        )
+        for name, look, begin, end, above in (
+            ("rod", ROD, tip, joint, 0.0),
+            ("crank", CRANK, shaft, tip, 0.05),
+        ):
+            label = None if rank else name
+            link = zip(begin[i], end[i], strict=True)
+            ax.plot(*link, label=label, zorder=order + above, **look._asdict())
         ax.plot(*joint[i], "o", color=PLATE.color, ms=4, zorder=order + 0.06)
         ax.plot(*shaft[i], "o", color="#1B1F24", ms=5, zorder=order + 0.06)
     ax.update_datalim(corners[:, axes])

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.versions import versions
-from stewart_drake.reporting.document import Document
+from stewart_drake.reporting.document import Document, sentence
 from stewart_drake.reporting.style import figure_style, for_dark_too
 
 
@@ -89,4 +89,5 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     found.filters |= {"source": source, "size": size}
+    found.filters |= {"sentence": sentence, "kind": lambda block: type(block).__name__}
     return found

@@ -15,6 +15,7 @@ from matplotlib.ticker import ScalarFormatter
 
 from stewart_drake.reporting.style import (
     BAND_ALPHA,
+    LEG_LINES,
     LIMIT,
     MARK,
     RUN,
@@ -24,7 +25,8 @@ from stewart_drake.reporting.style import (
     plain_log_ticks,
     powers_of_ten,
 )
-from stewart_drake.types import ArrayLike
+from stewart_drake.scenario.signals import LEGS
+from stewart_drake.types import Array, ArrayLike
 
 Scale = Literal["linear", "log", "powers"]
 """Scale of an axis: `log` has ticks such as 20 and 50, `powers` such as 10⁻³."""
@@ -74,6 +76,12 @@ class Panel:
     height: float = 1.8  # in inches
     wide: bool = False  # whether it fills a whole row, below the others
     paint: Callable[[Axes], object] | None = None  # draws anything else
+
+
+def leg_curves(x: ArrayLike, values: Array, name: str = "leg") -> list[Curve]:
+    """Return the curves of six columns (n, 6), a leg each."""
+    legs = zip(LEGS, LEG_LINES, values.T, strict=True)
+    return [Curve(x, column, f"{name} {leg}", look) for leg, look, column in legs]
 
 
 @figure_style()

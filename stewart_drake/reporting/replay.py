@@ -30,14 +30,9 @@ _MAX_FRAMES: Final = 1500
 
 
 def replay(signals: xr.Dataset, mechanism: Mechanism, meshcat: Meshcat | None = None) -> Meshcat:
-    """Put the animation of a run into Meshcat and return it.
+    """Put the animation of a run into Meshcat, by default a new one on a free local port.
 
-    `StaticHtml()` of the Meshcat plays without a server.
-
-    Args:
-        signals: of a `SimulationResult`; poses and references over time.
-        mechanism: the machine.
-        meshcat: target; a new one on a free local port if None.
+    `StaticHtml()` of the returned Meshcat plays without a server.
     """
     meshcat = meshcat or _quiet_meshcat()
     scene, shown = Scene(mechanism, meshcat), _thinned(signals)

@@ -188,13 +188,7 @@ def _analyse(name: str, scenario: Scenario) -> AnalysisResult:
 
 
 def document(found: ReportData, name: str, replay: str = "") -> Document:
-    """Return the report.
-
-    Args:
-        found: its content.
-        name: of the scenario.
-        replay: page of the replay, to be shown inside, or empty.
-    """
+    """Return the report on a scenario of this name, with the page of its replay, if any, inside."""
     text, tone = verdict(found)
     compared = draw_comparison(found.comparison)
     if found.tuned:
@@ -350,7 +344,6 @@ def first_report(made: NewMachine, result: SimulationResult, findings: Iterable[
     `findings` are sentences about the motors, the loop and its delay.
     """
     check, completed = made.check, result.status == "completed"
-    about, ran = describe(check), run_document(result)
     drawing = Picture(lambda: mechanism_figure(check.mechanism), "The machine at its home pose.")
     figures = [
         Picture(figure, f"{name.capitalize()}.") for name, figure in draw_run(result).items()
@@ -360,8 +353,8 @@ def first_report(made: NewMachine, result: SimulationResult, findings: Iterable[
         f"First report on {check.mechanism.name}",
         " ".join(sentence(text) for text in (check.verdict, *findings)),
         [
-            Section("The machine", drawing, *_blocks(about)),
-            Section("A first run", Paragraph(motion), *_blocks(ran), *figures),
+            Section("The machine", drawing, *_blocks(describe(check))),
+            Section("A first run", Paragraph(motion), *_blocks(run_document(result)), *figures),
         ],
         "good" if completed else "bad",
     )

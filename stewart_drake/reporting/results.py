@@ -123,20 +123,11 @@ class SimulationResult(loop_results.SimulationResult):
         return write_replay(self, machine, Path(path), title)
 
 
-class ComparisonResult(Mapping[str, SimulationResult]):
+class ComparisonResult(dict[str, SimulationResult]):
     """Runs of a scenario under several controllers, by controller."""
 
     def __init__(self, runs: Mapping[str, loop_results.SimulationResult]) -> None:
-        self._runs = {name: SimulationResult.of(run) for name, run in runs.items()}
-
-    def __getitem__(self, name: str) -> SimulationResult:
-        return self._runs[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._runs)
-
-    def __len__(self) -> int:
-        return len(self._runs)
+        super().__init__((name, SimulationResult.of(run)) for name, run in runs.items())
 
     def __repr__(self) -> str:
         return f"ComparisonResult({', '.join(f'{k}: {run.status}' for k, run in self.items())})"
@@ -276,11 +267,7 @@ def analysis_result(
 ) -> AnalysisResult:
     """Do a study and describe its result.
 
-    Args:
-        study: returns the numbers, with a `summary` of plain data.
-        document: describes them.
-        command: repeats the study, as typed.
-        write: see `AnalysisResult`.
+    `study` returns the numbers, with a `summary` of plain data. `command` repeats it, as typed.
     """
     from stewart_drake.reporting.page import Provenance
 

@@ -63,7 +63,6 @@ _SUCCESS, _ABOVE, _FAILED = "#2F86C6", "#E69F00", "#C4502A"
 def document(study: RobustnessStudy) -> Document:
     """Return success rate, quantiles, influences, failures, and the worst runs."""
     influences, found, low = study.influences(), study.explanation, study.success.low
-    failed = bool(study.failed.any())
     early = any(one.status != "completed" for one in study.outcomes)
     errors = [one for one in influences if one.error_p < SIGNIFICANT]
     errors.sort(key=lambda one: -abs(one.error.rho))
@@ -79,6 +78,7 @@ def document(study: RobustnessStudy) -> Document:
         title=title,
         percent=_percent,
         ended=_failed,
+        rank=_rank,
         third=_third,
         where=_where,
         spans=_spans(study),
@@ -92,11 +92,8 @@ def document(study: RobustnessStudy) -> Document:
         influences=influences,
         influence_figure=partial(influence_figure, influences),
         runs_figure=partial(runs_figure, study),
-        reasons=failed and [_reason(study, *one) for one in study.reasons.items()],
-        compared=failed and found.failing and found.others,
-        singles=failed and found.singles,
-        pairs=failed and found.pairs,
-        times_figure=failed and early and partial(times_figure, study),
+        reasons=[_reason(study, *one) for one in study.reasons.items()],
+        times_figure=early and partial(times_figure, study),
         ranges=list(factors(study.draws)),
         vary=", ".join(
             f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}"
@@ -119,6 +116,14 @@ def _percent(share: Interval) -> str:
 
 def _failed(error: float) -> str:
     return "failed" if error == math.inf else number(error)
+
+
+def _rank(one: Correlation, p: float) -> tuple[str, str, str]:
+    """Return a rank correlation, marked if significant, its interval, and its p-value."""
+    if math.isnan(one.rho):
+        return "-", "-", "-"
+    mark = "* " if p < SIGNIFICANT else ""
+    return f"{mark}{one.rho:+.2f}", f"{one.low:+.2f} to {one.high:+.2f}", f"{p:.2g}"
 
 
 def _reason(study: RobustnessStudy, reason: str, runs: int) -> dict[str, Any]:
@@ -198,19 +203,9 @@ def distribution_figure(study: RobustnessStudy) -> Figure:
 
     band = (low, high, "95 % interval")
     curve = Curve(errors, 100 * counts / total, "all runs", steps=True, band=band)
-    return draw(
-        [
-            Panel(
-                "share of all runs  [%]",
-                [curve],
-                "accumulated error E_ac  [% s]",
-                xscale="log",
-                ylim=(0, 103),
-                height=2.7,
-                paint=paint,
-            )
-        ]
-    )
+    name, over = "share of all runs  [%]", "accumulated error E_ac  [% s]"
+    how: Any = {"xscale": "log", "ylim": (0, 103), "height": 2.7}
+    return draw([Panel(name, [curve], over, paint=paint, **how)])
 
 
 def influence_figure(influences: Sequence[Influence]) -> Figure:

@@ -7,8 +7,8 @@ from typing import Any
 
 from stewart_drake.loop.preparation import assemble, check_instants
 from stewart_drake.loop.results import SimulationResult
-from stewart_drake.reporting.document import Caution, Document, from_template, number
-from stewart_drake.scenario.config import ControllerConfig, Scenario
+from stewart_drake.reporting.document import Document, from_template, number
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.studies.compare import PAPER_ERRORS, is_papers, label
 from stewart_drake.studies.verdict import loop_word
@@ -26,8 +26,8 @@ def run_document(result: SimulationResult) -> Document:
         s=s,
         inf=math.inf,
         names=COORDINATE_NAMES,
-        events=[(name, n) for name, n in s["counts"].items() if n],
-        cautions=[Caution(text) for text in s["warnings"]],
+        events=[(n, name) for name, n in s["counts"].items() if n],
+        cautions=s["warnings"],
     )
 
 
@@ -66,7 +66,7 @@ def comparison_document(results: _Runs, tuned: _Runs | None = None) -> Document:
         and any(is_papers(run.scenario, any_size=True) for run in results.values()),
         runs=[_row(title, name, run) for title, name, run in runs],
         loops=[f"{name} ({label(name)}): {text}" for name, text in loops.items()],
-        cautions=[Caution(text) for text in _shared_warnings(results)],
+        cautions=_shared_warnings(results),
         **context,
     )
 
@@ -113,13 +113,11 @@ def _two_row(name: str, run: SimulationResult, results: _Runs) -> dict[str, Any]
         below = 100 * (1 - run.accumulated_error / lqr.accumulated_error)
     title, before = label(name), printed and printed.scenario.controller
     if name != base:
-        values = {
-            one.name: getattr(run.scenario.controller, one.name) for one in fields(ControllerConfig)
-        }
+        own = run.scenario.controller
         changes = [
-            f"{key} {value:g}" if isinstance(value, float) else f"{key} {value}"
-            for key, value in values.items()
-            if value != getattr(before, key, None)
+            f"{one.name} {value:g}" if isinstance(value, float) else f"{one.name} {value}"
+            for one in fields(own)
+            if (value := getattr(own, one.name)) != getattr(before, one.name, None)
         ]
         title = f"{name}: {', '.join(changes)}"
     return {

@@ -15,10 +15,8 @@ from stewart_drake.identification.servo_fit import (
     ServoIdentification,
 )
 from stewart_drake.identification.servo_plan import SETPOINTS_FILE, ServoPlan
-from stewart_drake.reporting.document import Caution, Document, Table, Tone, from_template, number
-from stewart_drake.reporting.panels import Curve, Panel, draw
-from stewart_drake.reporting.style import LEG_LINES
-from stewart_drake.scenario.signals import LEGS
+from stewart_drake.reporting.document import Document, Table, Tone, from_template, number
+from stewart_drake.reporting.panels import Panel, draw, leg_curves
 from stewart_drake.types import Array
 
 _UNITS: Final = {"s": ("ms", 1e3), "rad": ("mrad", 1e3), "kg m^2": ("g m^2", 1e3)}
@@ -27,16 +25,16 @@ _UNITS: Final = {"s": ("ms", 1e3), "rad": ("mrad", 1e3), "kg m^2": ("g m^2", 1e3
 
 def document(found: ServoIdentification) -> Document:
     """Return the numbers found, their intervals, and the fit."""
-    notes = _cautions(found) if found.right else []
+    notes, log = _cautions(found) if found.right else [], found.model.log
     return _document(
         found,
         "bad" if not found.right else "fair" if notes else "good",
         plan=None,
-        cautions=[Caution(one) for one in notes],
+        cautions=notes,
         found=_table(found, weak=True),
-        log=found.model.log.name,
-        motion=partial(_figure, found, found.model.log.cranks),
-        residuals=partial(_residual_figure, found),
+        log=log.name,
+        motion=partial(_figure, "crank angles", log.times, log.cranks),
+        residuals=partial(_figure, "residuals", log.times[found.model.counted], found.residuals),
     )
 
 
@@ -58,10 +56,10 @@ def plan_document(plan: ServoPlan) -> Document:
         duration=plan.log.times[-1],
         torque=number(plan.peak_torque, 2),
         speed=number(plan.peak_speed, 2),
-        cautions=[Caution(one) for one in notes],
+        cautions=notes,
         found=_table(plan.expected, weak=False),
         log="",
-        motion=partial(_figure, plan.expected, plan.log.setpoints),
+        motion=partial(_figure, "crank angles", plan.log.times, plan.log.setpoints),
         residuals=None,
     )
 
@@ -111,19 +109,7 @@ def _table(found: ServoIdentification, weak: bool) -> Table:
     return Table(head, rows, brief=True)
 
 
-def _curves(times: Array, values: Array) -> list[Curve]:
-    pairs = zip(LEGS, LEG_LINES, strict=True)
-    return [Curve(times, values[:, i], f"crank {leg}", look) for i, (leg, look) in enumerate(pairs)]
-
-
-def _figure(found: ServoIdentification, angles: Array) -> Figure:
-    """Draw crank angles (n, 6) over the log, in degrees."""
-    curves = _curves(found.model.log.times, np.degrees(angles))
-    return draw([Panel("crank angles  [deg]", curves, legend="panel", height=2.5)])
-
-
-def _residual_figure(found: ServoIdentification) -> Figure:
-    """Draw the residuals of the crank angles, in degrees."""
-    model = found.model
-    curves = _curves(model.log.times[model.counted], np.degrees(found.residuals))
-    return draw([Panel("residuals  [deg]", curves, legend="panel", height=2.5)])
+def _figure(name: str, times: Array, angles: Array) -> Figure:
+    """Draw crank angles (n, 6), rad, in degrees."""
+    curves = leg_curves(times, np.degrees(angles), "crank")
+    return draw([Panel(f"{name}  [deg]", curves, legend="panel", height=2.5)])

@@ -36,16 +36,12 @@ EVERY: Final = 10.0
 def echo(text: str, *, error: bool = False) -> None:
     """Print a text, with verdicts coloured on a terminal unless NO_COLOR is set."""
     for color, words in _COLORS.items():
-        text = re.sub(words, partial(_styled, color), text)
+        text = re.sub(words, typer.style(r"\g<0>", fg=color), text)
     try:
         typer.echo(text, err=error, color=False if os.environ.get("NO_COLOR") else None)
     except BrokenPipeError:  # the reader has left; the files are still to be written
         stream = sys.stderr if error else sys.stdout
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-
-
-def _styled(color: str, found: re.Match[str]) -> str:
-    return typer.style(found[0], fg=color)
 
 
 def shipped_table(kind: "Kind") -> str:
@@ -74,12 +70,7 @@ def _description(path: Path) -> str:
 def progress_bars(
     names: Iterable[str], duration: float, quiet: bool
 ) -> Iterator[dict[str, Callable[[float, float], None]]]:
-    """Show the progress of simulations on stderr.
-
-    Args:
-        names: of the runs.
-        duration: of each, s.
-        quiet: whether to print nothing.
+    """Show the progress of simulations of `duration` s each on stderr.
 
     Yields:
         By name, a function of simulated time in s and current error in % of peak to peak.
@@ -104,12 +95,7 @@ def progress_bars(
 def count_bar(
     name: str, quiet: bool, first: str = "preparing"
 ) -> Iterator[Callable[[int, int], None]]:
-    """Show on stderr how many of several pieces are done.
-
-    Args:
-        name: of the pieces.
-        quiet: whether to print nothing.
-        first: state until the number of pieces is known.
+    """Show on stderr how many of several pieces are done; `first` until their number is known.
 
     Yields:
         A function of the number done and the number of all.

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -12,7 +11,7 @@ from matplotlib.figure import Figure
 
 from stewart_drake.reporting.document import Document, Table, Tone, from_template, number
 from stewart_drake.reporting.panels import Curve, Panel, draw
-from stewart_drake.reporting.style import REFERENCE, RUN, TRUTH, Line, line, write_figures
+from stewart_drake.reporting.style import REFERENCE, RUN, TRUTH, Line, line
 from stewart_drake.tuner.source import ratio_of
 from stewart_drake.tuning.evaluation import HINDSIGHT, RULE, Evaluation
 from stewart_drake.tuning.families import FAULTS, fault_of
@@ -55,10 +54,9 @@ def training_document(summary: Mapping[str, Any]) -> Document:
     return from_template("tuner_training", regret=regret and summary, labels=not regret and summary)
 
 
-def training_figures(training: Training, directory: str | Path) -> list[Path]:
-    """Write the training curve and the regression plot, and return their paths."""
-    figures = {"training_curve": _curve(training), "regression": _regression(training)}
-    return write_figures(figures, directory)
+def training_figures(training: Training) -> dict[str, Figure]:
+    """Return the training curve and the regression plot by name."""
+    return {"training_curve": _curve(training), "regression": _regression(training)}
 
 
 def _unit(training: Training) -> str:

@@ -14,9 +14,9 @@ from matplotlib.patheffects import withStroke
 from stewart_drake.core.layout import DEAD_CENTRE_SINE
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.reporting.document import Document, from_template, number
-from stewart_drake.reporting.panels import Curve, Panel, draw
-from stewart_drake.reporting.style import FACTORS, LEG_LINES, LIMIT, UNITS, line
-from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS
+from stewart_drake.reporting.panels import Curve, Panel, draw, leg_curves
+from stewart_drake.reporting.style import FACTORS, LIMIT, UNITS, line
+from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.studies.clearance import Nearest
 from stewart_drake.studies.workspace import Sizing, WorkspaceStudy
 from stewart_drake.studies.workspace_map import Section, Travel
@@ -50,16 +50,15 @@ def document(study: WorkspaceStudy) -> Document:
         along=along,
         nearest_text=_nearest_text,
         crossing=_crossing,
+        crossings=[(str(one.pair), 1e3 * one.distance) for one in along.touching],
         largest=not np.isnan(study.factor.value) and study.factor,
         dead_centre=DEAD_CENTRE_SINE,
         singular=SINGULARITY_LIMIT,
         length=1e3 * summary["characteristic_length"],
-        legs=summary["legs"],
         margins_figure=partial(margins_figure, study),
         nearest=along.nearest[: max(crossing, _NEAREST)],
         clearance_figure=partial(clearance_figure, study),
         clear_travel=travelled and list(zip(_COORDINATES, travelled, strict=True)),
-        motors=sizing and summary["motors"],
         use=limited and 100 * max(m["use_of_limit"] for m in summary["motors"]),
         motors_figure=sizing and partial(motors_figure, sizing, limit),
         from_home=study.travel and travel_text(study.travel),
@@ -91,16 +90,11 @@ def _crossing(nearest: Nearest) -> str:
     return "crosses the disc as drawn" if "base" in nearest.pair else "they cross"
 
 
-def _legs(time: Array, values: Array) -> list[Curve]:
-    legs = zip(LEGS, LEG_LINES, values.T, strict=True)
-    return [Curve(time, column, f"leg {leg}", look) for leg, look, column in legs]
-
-
 def margins_figure(study: WorkspaceStudy) -> Figure:
     """Draw reach, dead centre, parallel singularity and condition along the reference."""
     margins, left = study.margins, study.exit
     time, top = margins.time, min(np.nanmax(margins.condition, initial=2.0), 1e4)
-    sines = _legs(time, margins.sines)
+    sines = leg_curves(time, margins.sines)
     lowest = float(np.nanmin(margins.sines))
     inside = [Curve(time, np.where(np.isnan(margins.condition), np.nan, margins.parallel))]
 
@@ -110,7 +104,7 @@ def margins_figure(study: WorkspaceStudy) -> Figure:
             ax.axvspan(left.time, time[-1], label="after leaving", **style)
 
     panels = [
-        ("reach margin  [mm]", _legs(time, 1e3 * margins.reach), {0.0: ""}, None),
+        ("reach margin  [mm]", leg_curves(time, 1e3 * margins.reach), {0.0: ""}, None),
         ("sine off dead centre  [-]", sines, {DEAD_CENTRE_SINE: ""}, (max(-0.05, lowest), 1.05)),
         ("parallel measure, det W  [-]", inside, {SINGULARITY_LIMIT: ""}, (-0.1, None)),
         ("condition number of A  [-]", [Curve(time, margins.condition)], {}, (0.95, 1.25 * top)),
@@ -145,7 +139,7 @@ def motors_figure(sizing: Sizing, torque_limit: float | None) -> Figure:
     ends = (0, sizing.time[-1])
     return draw(
         [
-            Panel(name, _legs(sizing.time, data), limits=levels, xlim=ends, height=1.9)
+            Panel(name, leg_curves(sizing.time, data), limits=levels, xlim=ends, height=1.9)
             for name, (data, levels) in values.items()
         ]
     )

@@ -102,21 +102,14 @@ def compare(
     scenarios = shown(scenario_name, settings, chosen)
     _check_makers(makers, reference, disturbance, taken={*LABELS, *scenarios})
     scenarios |= {name: load_compatible(scenario_name, settings=settings) for name in makers}
-    given = {
-        name: {
-            "controller": makers.get(name),
-            "reference": reference,
-            "disturbance": disturbance,
-        }
-        for name in scenarios
-    }
+    shared = {"reference": reference, "disturbance": disturbance}
     with TemporaryDirectory() as folder, ThreadPoolExecutor(1) as thread:
         # A row with time and error for each run; a 1 in the last row stops all of them.
         path = Path(folder) / "board"
         board = np.memmap(path, np.float64, "w+", shape=(len(scenarios) + 1, 2))
         keys = [f"run{i}_{_NO_KEY.sub('_', name)[:99]}" for i, name in enumerate(scenarios)]
         jobs = {
-            key: (name, scenarios[name], given[name], path, i)
+            key: (name, scenarios[name], shared | {"controller": makers.get(name)}, path, i)
             for i, (key, name) in enumerate(zip(keys, scenarios, strict=True))
         }
         # Own controllers first: what runs in this process does so while workers do the others.

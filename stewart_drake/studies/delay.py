@@ -15,6 +15,7 @@ from stewart_drake.law.delay_model import DelayedModel, double_integrators, line
 from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.law.stability import (
     LinearLoop,
+    Margins,
     Peak,
     amplification,
     fastest_pole,
@@ -107,12 +108,9 @@ class LoopMargins:
     radius: float  # spectral radius of the closed loop
     S: Peak  # of sensitivity at the motors
     T: Peak  # of complementary sensitivity
-    gain_up: float  # factor on the torques of all motors
-    gain_down: float
+    margins: Margins  # errors of the delay, and of all motors alike
     # classical margins of one motor at a time; None if the loop is unstable
     motor: MotorMargins | None
-    later: float  # error of the believed delay, s
-    earlier: float
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -123,11 +121,11 @@ class LoopMargins:
             "sensitivity_frequency": self.S.frequency,
             "complementary_peak": self.T.value,
             "complementary_frequency": self.T.frequency,
-            "gain_margin": [self.gain_down, self.gain_up],
+            "gain_margin": [self.margins.gain_down, self.margins.gain_up],
             "motor_gain_margin": self.motor and [self.motor.gain_down, self.motor.gain_up],
             "motor_phase_margin_deg": self.motor and self.motor.phase,
-            "delay_margin_later": self.later,
-            "delay_margin_earlier": self.earlier,
+            "delay_margin_later": self.margins.longer,
+            "delay_margin_earlier": self.margins.shorter,
         }
 
 
@@ -358,20 +356,11 @@ def loop_margins(found: Assessment, delays: Iterable[int] = DELAYS) -> list[Loop
 def _margins_of(loop: LinearLoop) -> LoopMargins:
     radius, true = spectral_radius(loop.matrix()), loop.sampled()
     S = T = Peak(math.nan, math.nan)
+    motor = None
     if radius < 1:
         S, T = peaks(true, loop.K, loop.period)
-    margins = worst_margins([loop])
-    return LoopMargins(
-        steps=loop.delay.steps,
-        radius=radius,
-        S=S,
-        T=T,
-        gain_up=margins.gain_up,
-        gain_down=margins.gain_down,
-        motor=_motor_margins(true, loop.K, loop.period) if radius < 1 else None,
-        later=margins.longer,
-        earlier=margins.shorter,
-    )
+        motor = _motor_margins(true, loop.K, loop.period)
+    return LoopMargins(loop.delay.steps, radius, S, T, worst_margins([loop]), motor)
 
 
 def _motor_margins(plant: DelayedModel, K: Array, period: float) -> MotorMargins:
@@ -429,24 +418,20 @@ def delay_map(scenario: Scenario, progress: Progress | None = None) -> tuple[lis
     """
     cells: dict[str, Cell] = {}
     variants: dict[str, Scenario] = {}
+    exact = replace(scenario, plant=scenario.plant.without_engine)
     for steps in map_delays(scenario.delay.steps):
         for factor in FACTORS:
             motion = scaled_motion(scenario.reference, factor)
             if motion is None:
                 continue
-            variant = replace(
-                scenario,
-                reference=motion,
-                plant=scenario.plant.without_engine,
-                delay=replace(scenario.delay, steps=steps),
-            )
+            delay = replace(scenario.delay, steps=steps)
+            variant = replace(exact, reference=motion, delay=delay)
             key = f"mu{steps}-x{factor}"
-            failure = assemble(variant).reference_failure()
-            if failure is None:
-                variants[key] = variant
-                cells[key] = Cell(steps, factor, "not_run", math.nan, math.nan)
+            cells[key] = Cell(steps, factor, "not_run", math.nan, math.nan)
+            if failure := assemble(variant).reference_failure():
+                cells[key] = cells[key]._replace(status="out_of_reach", time=float(failure.time))
             else:
-                cells[key] = Cell(steps, factor, "out_of_reach", math.nan, float(failure.time))
+                variants[key] = variant
     found, interrupted = run_scenarios(variants, progress)
     for key, one in found.items():
         cells[key] = cells[key]._replace(status=one.status, error=one.error, time=one.time)

@@ -7,6 +7,7 @@ torques it takes, have size 1, see `assess`.
 """
 
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -69,17 +70,16 @@ def describe(directions: NDArray[np.complex128], labels: list[Label]) -> str:
     """Return directions (n, d) in words: their number, and the states that they consist of."""
     d = directions.shape[1]
     share = (np.abs(directions) ** 2).sum(axis=1) / d
-    groups: dict[str, list[str]] = {}
-    for label, part in zip(labels, share, strict=True):
-        if part >= _SHOWN / NUM_TORQUES:
-            groups.setdefault(label.group, []).append(label.name)
-    sizes = {g: sum(label.group == g for label in labels) for g in groups}
-    named = [
-        group if len(names) == sizes[group] else f"{group} ({', '.join(names)})"
-        for group, names in groups.items()
-        if not group.startswith(_TORQUE)
-    ]
-    torques = [group.removeprefix(_TORQUE) for group in groups if group.startswith(_TORQUE)]
+    named, torques = list[str](), list[str]()
+    pairs = zip(labels, share, strict=True)
+    for group, states in groupby(pairs, key=lambda pair: pair[0].group):
+        shown = [(label.name, part >= _SHOWN / NUM_TORQUES) for label, part in states]
+        names = [name for name, large in shown if large]
+        if names and group.startswith(_TORQUE):
+            torques.append(group.removeprefix(_TORQUE))
+        elif names:
+            part_of_it = "" if len(names) == len(shown) else f" ({', '.join(names)})"
+            named.append(group + part_of_it)
     if len(torques) == 1:
         named.append(_TORQUE + torques[0])
     elif torques:
@@ -107,14 +107,16 @@ class System:
     m: int  # inputs
     reach: Hautus  # test of (A, B)
     view: Hautus  # test of (A', C')
+    radius: float  # spectral radius of A
     drake: dict[str, bool]  # Drake's answers to QUESTIONS
     words: tuple[str, ...]  # a sentence for each mode that fails
-    note: str  # why Drake disagrees, or empty
 
     @property
     def answers(self) -> dict[str, bool]:
         """Ours to QUESTIONS."""
-        return _answers(self.reach, self.view)
+        tests = (self.reach, self.view)
+        values = [answer for test in tests for answer in (test.complete, test.harmless)]
+        return dict(zip(QUESTIONS, values, strict=True))
 
     @property
     def margins(self) -> dict[str, float]:
@@ -122,6 +124,21 @@ class System:
         tests = (self.reach, self.view)
         values = [margin for test in tests for margin in (test.margin, test.lasting_margin)]
         return dict(zip(QUESTIONS, values, strict=True))
+
+    @property
+    def note(self) -> str:
+        """Why Drake disagrees, or empty."""
+        ours, drake, parts = self.answers, self.drake, []
+        if missed := [word for word in QUESTIONS if ours[word] and not drake[word]]:
+            decades = (self.n - 1) * abs(np.log10(max(self.radius, 1e-300)))
+            parts.append(
+                f"not {' and not '.join(missed)}, from the rank of powers up to the {self.n - 1}th "
+                f"of a matrix with spectral radius {self.radius:.3g}, which span {decades:.0f} "
+                "decades, where a double holds 16"
+            )
+        if passed := [word for word in QUESTIONS if drake[word] and not ours[word]]:
+            parts.append(f"{' and '.join(passed)}, taking anything above rounding for full rank")
+        return f"Drake says {'; '.join(parts)}" if parts else ""
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -264,29 +281,7 @@ def _test(
         for mode in test.deficient
     ]
     radius = float(np.abs(np.linalg.eigvals(A)).max())
-    note = _disagreement(_answers(reach, view), drake, n, radius)
-    return System(name, family, steps, time, n, m, reach, view, drake, tuple(words), note)
-
-
-def _answers(reach: Hautus, view: Hautus) -> dict[str, bool]:
-    values = (reach.complete, reach.harmless, view.complete, view.harmless)
-    return dict(zip(QUESTIONS, values, strict=True))
-
-
-def _disagreement(ours: dict[str, bool], drake: dict[str, bool], n: int, radius: float) -> str:
-    missed = [word for word in QUESTIONS if ours[word] and not drake[word]]
-    passed = [word for word in QUESTIONS if drake[word] and not ours[word]]
-    parts = []
-    if missed:
-        decades = (n - 1) * abs(np.log10(max(radius, 1e-300)))
-        parts.append(
-            f"not {' and not '.join(missed)}, from the rank of powers up to the {n - 1}th of a "
-            f"matrix with spectral radius {radius:.3g}, which span {decades:.0f} decades, where a "
-            "double holds 16"
-        )
-    if passed:
-        parts.append(f"{' and '.join(passed)}, taking anything above rounding for full rank")
-    return f"Drake says {'; '.join(parts)}" if parts else ""
+    return System(name, family, steps, time, n, m, reach, view, radius, drake, tuple(words))
 
 
 def _modes_summary(test: Hautus) -> list[dict[str, Any]]:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as checked
 from scipy.optimize import Bounds, differential_evolution
 
@@ -24,9 +23,9 @@ from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
-from stewart_drake.files.jsonio import load_json, sealed_json
+from stewart_drake.files.jsonio import sealed_json
 from stewart_drake.files.resources import resolve
-from stewart_drake.files.yamlio import validate, yaml_text
+from stewart_drake.files.yamlio import yaml_text
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.clearance import ClearanceScene
 from stewart_drake.loop.preparation import Experiment, assemble, check_instants
@@ -58,7 +57,7 @@ from stewart_drake.studies.layout_space import (
     singular,
     space_around,
 )
-from stewart_drake.studies.runs import Outcome, outcome_of
+from stewart_drake.studies.runs import STRICT, Outcome, outcome_of, read_kept
 from stewart_drake.studies.study_options import LayoutOptions
 from stewart_drake.types import Array
 
@@ -73,11 +72,9 @@ _SAME: Final = 0.02
 _REACH, _APART = 0.05, 0.05
 """Usual limits of reach and clearance, in cranks of the machine the search begins from."""
 _USUAL: Final = {"transmission": 0.3, "plate_joint_deg": 45.0, "crank_joint_deg": 45.0}
-_MAX_BYTES: Final = 1_000_000
-_STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
-@checked(config=_STRICT)
+@checked(config=STRICT)
 class Found:
     """Result of one search, as its file keeps it."""
 
@@ -89,7 +86,7 @@ class Found:
     evaluations: int
 
 
-@checked(config=_STRICT)
+@checked(config=STRICT)
 class Judged:
     """Measures and run of a machine, as their file keeps them."""
 
@@ -196,9 +193,7 @@ class LayoutStudy:
     """Result of `layout`."""
 
     problem: Problem  # of the searches
-    seed: int
-    starts: int
-    generations: int
+    options: LayoutOptions
     searches: dict[str, Found]  # result of each, by its key
     before: Layout  # the scenario's own machine
     layouts: list[Layout]  # the best few, the best first
@@ -237,9 +232,7 @@ class LayoutStudy:
         return {
             "verdict": self.verdict,
             **self.problem.summary,
-            "seed": self.seed,
-            "starts": self.starts,
-            "generations": self.generations,
+            **{name: getattr(self.options, name) for name in ("seed", "starts", "generations")},
             "evaluations": self.evaluations,
             "searches": {
                 key: {"measures": one.measures, "missed": one.missed}
@@ -258,50 +251,44 @@ def study_layout(
 ) -> LayoutStudy:
     """Search machines for a scenario's motion, or continue a search; write the best.
 
-    Args:
-        scenario: its machine, which has a pattern, is the start of the search.
-        directory: of the machines; finished searches go below it.
-        progress: as `run_jobs` takes it.
+    The search begins at the scenario's machine, which has a pattern. Machines go into the
+    directory, finished searches below it.
     """
-    best, starts, generations = options.best, options.starts, options.generations
-    seed, folder = options.seed, Path(directory)
-    problem = problem_of(
-        scenario, options.goal, options.limits or {}, options.vary or {}, options.keep
-    )
+    folder, problem = Path(directory), problem_of(scenario, options)
+    seed, generations = options.seed, options.generations
     jobs = {
         f"{arrangement.key}_{start}": (problem, arrangement, seed, start, generations)
         for arrangement in problem.space.arrangements()
-        for start in range(starts)
+        for start in range(options.starts)
     }
     searches = run_jobs(
         jobs,
         search,
         folder / "searches",
         settings=problem.summary | {"seed": seed, "generations": generations},
-        read=partial(_read, Found, "the file of a search"),
-        progress=part_of(progress, 0, len(jobs) + best + 1),
+        read=partial(read_kept, Found, "the file of a search"),
+        progress=part_of(progress, 0, len(jobs) + options.best + 1),
         **options.jobs,
     )
-    chosen = _best_of(problem, list(searches.values()), best)
+    chosen = _best_of(problem, list(searches.values()), options.best)
     texts = {}
     for k, one in enumerate(chosen, 1):
         arrangement = Arrangement(tuple(one.order), tuple(one.branches), 0.0)
         machine = problem.space.machine(one.values, arrangement, f"layout_{k}")
         texts[machine.name] = yaml_text(_plain(machine))
-    for name, text in texts.items():
-        write_whole(folder / f"{name}.yaml", text)
+        write_whole(folder / f"{machine.name}.yaml", texts[machine.name])
     number = len(texts) + 1
     while (old := folder / f"layout_{number}.yaml").exists():  # of an earlier start
         old.unlink()
         number += 1
-    own = scenario.mechanism
-    places = {"before": own} | {name: str((folder / f"{name}.yaml").resolve()) for name in texts}
+    places = {name: str((folder / f"{name}.yaml").resolve()) for name in texts}
+    places = {"before": scenario.mechanism} | places
     judged = run_jobs(
         {key: (problem, place) for key, place in places.items()},
         judge,
         folder / "judged",
         settings=problem.summary | {"machines": texts},
-        read=partial(_read, Judged, "the file of a judgement"),
+        read=partial(read_kept, Judged, "the file of a judgement"),
         workers=options.workers,
         progress=part_of(progress, len(jobs), len(jobs) + len(places)),
     )
@@ -309,24 +296,16 @@ def study_layout(
     def layout(key: str, order: Sequence[int], values: Sequence[float] | Array) -> Layout:
         one, mechanism = judged[key], load_mechanism(places[key])
         name, missed = key if key in texts else mechanism.name, problem.missed(one.measures)
-        order, values = tuple(order), np.array(values)
-        return Layout(
-            name, mechanism, order, values, one.measures, missed, one.nearest, one.outcome
-        )
+        own = name, mechanism, tuple(order), np.array(values)
+        return Layout(*own, one.measures, missed, one.nearest, one.outcome)
 
     space = problem.space
     before = layout("before", space.pattern.plate_order, own_values(space.spec))
     layouts = [layout(key, one.order, one.values) for key, one in zip(texts, chosen, strict=True)]
-    return LayoutStudy(problem, seed, starts, generations, searches, before, layouts)
+    return LayoutStudy(problem, options, searches, before, layouts)
 
 
-def problem_of(
-    scenario: Scenario,
-    goal: str,
-    limits: Mapping[str, float],
-    vary: Mapping[str, tuple[float, float]],
-    keep: Sequence[str],
-) -> Problem:
+def problem_of(scenario: Scenario, options: LayoutOptions) -> Problem:
     for field, value in (
         ("plant.mechanism", scenario.plant.mechanism),
         ("controller.calibration", scenario.controller.calibration),
@@ -336,13 +315,14 @@ def problem_of(
                 f"{field}: got {value}; expected null, as the machine is searched for"
             )
     experiment, spec = assemble(scenario), mechanism_spec(resolve("mechanism", scenario.mechanism))
-    space = space_around(spec, vary, keep)
+    space = space_around(spec, options.vary or {}, options.keep)
     crank = float(own_values(spec)[PARAMETERS.index("crank")])
     usual = {"reach": _REACH * crank, "clearance": _APART * crank, **_USUAL}
     if math.isfinite(experiment.torque_limit):
         usual["torque"] = experiment.torque_limit
     motion = motion_of(experiment.mechanism.home, experiment.reference, _instants(experiment))
-    return Problem(scenario, space, motion, requirements(goal, limits, usual))
+    wanted = requirements(options.goal, options.limits or {}, usual)
+    return Problem(scenario, space, motion, wanted)
 
 
 def _instants(experiment: Experiment) -> Array:
@@ -442,7 +422,3 @@ def _plain(spec: MechanismSpec) -> dict[str, Any]:
 def _finite(measures: Mapping[str, float]) -> dict[str, float]:
     """Return finite measures; a motion through a singularity has an infinite condition number."""
     return {name: float(value) for name, value in measures.items() if math.isfinite(value)}
-
-
-def _read(kind: type[Any], expected: str, path: Path) -> Any:
-    return validate(kind, load_json(path, _MAX_BYTES, expected, sealed=True), str(path))

@@ -58,17 +58,11 @@ PATIENCE: Final = 2
 
 @dataclass(frozen=True, eq=False)
 class Repetition:
-    """One repetition of a motion.
+    """One repetition of a motion."""
 
-    Attributes:
-        learned: torque or angles that were used, or None in the first one.
-        result: the run.
-        error: E of its last period, % s; infinite if it did not complete.
-    """
-
-    learned: LearnedSignal | None
+    learned: LearnedSignal | None  # torque or angles that were used, or None in the first one
     result: SimulationResult
-    error: float
+    error: float  # E of its last period, % s; infinite if it did not complete
 
     @property
     def largest(self) -> float:
@@ -81,21 +75,13 @@ class Repetition:
 
 @dataclass(frozen=True)
 class LearnStudy:
-    """Result of learning.
+    """Result of learning."""
 
-    Attributes:
-        experiment: of the scenario.
-        period: of the motion, s.
-        repetitions: in order.
-        asked: number of repetitions that were asked for.
-        interrupted: whether Ctrl-C ended it early.
-    """
-
-    experiment: Experiment
-    period: float
-    repetitions: Sequence[Repetition]
-    asked: int
-    interrupted: bool
+    experiment: Experiment  # of the scenario
+    period: float  # of the motion, s
+    repetitions: Sequence[Repetition]  # in order
+    asked: int  # number of repetitions that were asked for
+    interrupted: bool  # whether Ctrl-C ended it early
 
     @property
     def best(self) -> Repetition:
@@ -144,12 +130,7 @@ def study_learn(
     """Repeat the motion of a scenario, and learn from each repetition.
 
     Learning ends early after two repetitions without a smaller error. Each repetition has
-    other noise.
-
-    Args:
-        scenario: with a periodic motion, over a wire of known delay.
-        options: see `LearnOptions`.
-        progress: called for each repetition.
+    other noise. The motion is periodic, the link a wire of known delay.
 
     Raises:
         ConfigError: see `check_learning`.
@@ -208,15 +189,10 @@ def last_error(result: SimulationResult, scale: Array, period: float) -> float:
 
 
 class Fit(NamedTuple):
-    """Least-squares fit of torques or angles by harmonics of a motion.
+    """Least-squares fit of torques or angles by harmonics of a motion."""
 
-    Attributes:
-        coefficients: (1 + 2 H, 6), as of `law.learned.LearnedSignal`.
-        variance: sum of the variances of all coefficients.
-    """
-
-    coefficients: Array
-    variance: float
+    coefficients: Array  # (1 + 2 H, 6), as of `law.learned.LearnedSignal`
+    variance: float  # sum of the variances of all coefficients
 
 
 def fit(times: Array, values: Array, period: float, number: int) -> Fit:
@@ -232,13 +208,9 @@ def fit(times: Array, values: Array, period: float, number: int) -> Fit:
 
 
 def corrected_setpoints(used: Array, missed: Fit, period: float, lag: float) -> Fit:
-    """Return g(c) of setpoints.
+    """Return g(c) of setpoints, rad, for c = `used` (1 + 2 H, 6) and the angles that were missed.
 
-    Args:
-        used: (1 + 2 H, 6) c, rad.
-        missed: fit of the angles that the motion lacks.
-        period: of the motion, s.
-        lag: of the servos behind their setpoints, s.
+    `lag` in s is that of the servos behind their setpoints.
     """
     e = missed.coefficients
     turns = (lag * 2 * np.pi / period * np.arange(1, 1 + HARMONICS))[:, None]
@@ -250,15 +222,10 @@ def corrected_setpoints(used: Array, missed: Fit, period: float, lag: float) -> 
 def lacking_angles(
     experiment: Experiment, result: SimulationResult, period: float
 ) -> tuple[Array, Array]:
-    """Return the crank angles that the last period of a motion lacks, rad.
-
-    Args:
-        experiment: of the scenario.
-        result: a run of it.
-        period: of the motion, s.
+    """Return the angles that the cranks lack in the last period of a run.
 
     Returns:
-        Samples (n,), s, and angles of the motion less those of the state there (n, 6).
+        Samples (n,), s, and crank angles of the motion less those of the state there (n, 6), rad.
     """
     dt, angles = experiment.scenario.controller.period, experiment.mechanism.crank_angles
     first, _, states = _last_samples(experiment, result, period)
@@ -271,21 +238,15 @@ def lacking_angles(
     return np.array(times), np.reshape(found, (-1, 6))
 
 
-class _Last(NamedTuple):
-    """Samples of the last period of a run.
+def _last_samples(
+    experiment: Experiment, result: SimulationResult, period: float
+) -> tuple[int, NDArray[np.intp], Array]:
+    """Return the samples of the last period of a run.
 
-    Attributes:
-        first: number of the first one.
-        rows: (first + n,) of all samples up to the last one, in the signals.
-        states: (n, 12) of these, measured or else estimated.
+    Returns:
+        Number of the first one; rows (first + n,) in the signals of all samples up to the last;
+        states (n, 12) of the period, measured or else estimated.
     """
-
-    first: int
-    rows: NDArray[np.intp]
-    states: Array
-
-
-def _last_samples(experiment: Experiment, result: SimulationResult, period: float) -> _Last:
     sc, signals = experiment.scenario, result.signals
     dt, time = sc.controller.period, signals.time.values
     wanted = dt * np.arange(math.floor(time[-1] / dt + 1e-9) + 1)
@@ -293,18 +254,13 @@ def _last_samples(experiment: Experiment, result: SimulationResult, period: floa
     first = max(0, len(rows) - 1 - round(period / dt))
     measured = sc.sensor.measures_state and sc.sensor.delay == 0
     states = (signals.measurement if measured else signals.state_estimate).values
-    return _Last(first, rows, states[rows[first:]])
+    return first, rows, states[rows[first:]]
 
 
 def lacking_torques(
     experiment: Experiment, result: SimulationResult, period: float
 ) -> tuple[Array, Array]:
-    """Return the torques that the model lacks in the last period of a motion.
-
-    Args:
-        experiment: of the scenario.
-        result: a run of it.
-        period: of the motion, s.
+    """Return the torques that the model lacks in the last period of a run.
 
     Returns:
         Middles (n,) of the controller's periods, s, and torques (n, 6), N m.

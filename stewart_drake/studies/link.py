@@ -103,16 +103,13 @@ class LinkStudy:
         for cell in self.bounds:
             if best is None or cell is best or len(cell.errors) < len(best.errors):
                 continue
-            worse, errors = (
-                np.mean(cell.errors) / np.mean(best.errors) - 1,
-                (cell.errors, best.errors),
-            )
+            worse = np.mean(cell.errors) / np.mean(best.errors) - 1
+            errors = cell.errors, best.errors
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore", RuntimeWarning)  # of errors that hardly differ
-                if cell.completed == best.completed == 1:
-                    p = stats.ttest_rel(*errors, alternative="greater").pvalue
-                else:
-                    p = stats.ttest_ind(*errors, alternative="greater").pvalue
+                paired = cell.completed == best.completed == 1
+                test: Any = stats.ttest_rel if paired else stats.ttest_ind
+                p = test(*errors, alternative="greater").pvalue
             if worse < _SAME or not p < 1 - CONFIDENCE:
                 found.append(cell.bound)
         return found
@@ -152,11 +149,9 @@ class LinkStudy:
 def study_link(
     scenario: Scenario, options: LinkOptions, progress: Progress | None = None
 ) -> LinkStudy:
-    """Simulate a scenario on the exact plant over bounds, then over losses.
+    """Simulate a scenario with a network on the exact plant over bounds, then over losses.
 
-    Args:
-        scenario: with a network; its `playout` is not used.
-        progress: called for each finished simulation.
+    The scenario's own `playout` is not used.
     """
     link = scenario.assumed_link
     if link.kind != "network":
@@ -164,16 +159,13 @@ def study_link(
     runs, period = options.runs, scenario.controller.period
     base = replace(scenario, link=link, plant=scenario.plant.without_engine)
     losses = sorted({*LOSSES, link.loss})
-    done = 0
 
     def run(
         base: Scenario, wanted: list[tuple[float, float]], following: int
     ) -> tuple[list[Cell], bool]:
         """Simulate bounds and losses, before a number of `following` ones."""
-        nonlocal done
-        before = done
-        done += runs * len(wanted)
-        return _simulated(base, wanted, runs, part_of(progress, before, done + runs * following))
+        before, total = runs * len(found), runs * (len(found) + len(wanted) + following)
+        return _simulated(base, wanted, runs, part_of(progress, before, total))
 
     wanted, left_out, found = bounds_for(link, period), set[float](), list[Cell]()
     for step in (1.0, 0.5, 0.0):  # periods between the best bound and the next ones to try

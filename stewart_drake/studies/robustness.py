@@ -1,8 +1,6 @@
 """Monte Carlo study of a scenario: many runs, each with one drawn machine."""
 
-import csv
 import dataclasses
-import io
 import math
 import re
 from collections import Counter
@@ -19,7 +17,7 @@ from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.jobs import Progress, run_jobs
-from stewart_drake.studies.runs import Outcome, loops_of, read_outcome
+from stewart_drake.studies.runs import Outcome, read_outcome
 from stewart_drake.studies.statistics import (
     Correlation,
     Explanation,
@@ -122,8 +120,8 @@ class RobustnessStudy(NamedTuple):
 
     @property
     def loops(self) -> dict[str, int]:
-        """Number of runs by what ran them, see `loop.bulk.Ending`."""
-        return loops_of(self.outcomes)
+        """Number of runs by what ran them, the most frequent first, see `loop.bulk.Ending`."""
+        return dict(Counter(one.loop for one in self.outcomes if one.loop).most_common())
 
     def quantile(self, probability: float) -> Interval:
         """Return a quantile of E_ac over all runs, % s; an incomplete run counts as infinite."""
@@ -193,11 +191,8 @@ def study_robustness(
 ) -> RobustnessStudy:
     """Run a scenario undisturbed and then with drawn machines, or continue an earlier study.
 
-    Args:
-        scenario: to run; draws add to its own disturbances.
-        directory: of runs.csv; the runs are kept in runs/. A later call may ask for more runs.
-        options: see `RobustnessOptions`. Names in `also` become names of folders.
-        progress: as `run_jobs` takes it.
+    Draws add to the scenario's own disturbances. The directory gets runs.csv and the folder runs/;
+    a later call may ask for more runs. Names in `also` become names of folders.
 
     Raises:
         As `run_jobs`, and ConfigError for a scenario that does not suit, and for an undisturbed run
@@ -277,15 +272,18 @@ def factor_values(draws: list[Draw]) -> dict[str, Array]:
 
 def table(study: RobustnessStudy) -> str:
     """Return all runs as CSV, a row each; a missing number is empty."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    units, values = factors(study.draws), factor_values(study.draws)
-    head = [f"{name} [{unit}]" for name, unit in units.items()]
-    writer.writerow(
-        ["run", "status", "reason", "leg", "time [s]", "E_ac [% s]", "peak_torque [N m]", *head]
-    )
-    for i, one in enumerate(study.outcomes):
-        numbers = [one.time, one.error, one.peak_torque, *(values[name][i] for name in units)]
-        cells = [repr(float(v)) if math.isfinite(v) else "" for v in numbers]
-        writer.writerow([i, one.status, study.reason_of(one), one.leg or "", *cells])
-    return text.getvalue()
+    import pandas
+
+    outcomes, values = study.outcomes, factor_values(study.draws)
+    columns: dict[str, Any] = {
+        "run": range(len(outcomes)),
+        "status": [one.status for one in outcomes],
+        "reason": [study.reason_of(one) for one in outcomes],
+        "leg": [one.leg or "" for one in outcomes],
+        "time [s]": [one.time for one in outcomes],
+        "E_ac [% s]": study.errors,
+        "peak_torque [N m]": [one.peak_torque for one in outcomes],
+    }
+    columns |= {f"{name} [{unit}]": values[name] for name, unit in factors(study.draws).items()}
+    frame = pandas.DataFrame(columns).replace([np.inf, -np.inf], np.nan)
+    return str(frame.to_csv(index=False, lineterminator="\n"))

@@ -2,11 +2,10 @@
 
 import dataclasses
 import math
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, WrapValidator
 from pydantic.dataclasses import dataclass
@@ -17,9 +16,9 @@ from stewart_drake.loop.bulk import Ending, run_in_bulk
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.jobs import Progress, run_jobs
 
+_Kind = TypeVar("_Kind")
 _MAX_BYTES: Final = 1_000_000
-_EXPECTED: Final = "the file of one run of a study"
-_STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
 def _or_nan(value: Any, check: Any) -> float:
@@ -31,7 +30,7 @@ _Number = Annotated[float, Field(ge=0), WrapValidator(_or_nan)]
 """Number that is not negative; null, infinity and NaN become NaN."""
 
 
-@dataclass(config=_STRICT)
+@dataclass(config=STRICT)
 class Outcome:
     """End of a run."""
 
@@ -48,7 +47,7 @@ class Outcome:
     loop: str = ""  # what ran it, see `loop.bulk.Ending`; empty without a run
 
 
-@dataclass(config=_STRICT)
+@dataclass(config=STRICT)
 class _File:
     draw: dict[str, Any]
     outcome: Outcome
@@ -67,11 +66,6 @@ def outcome_of(ending: Ending) -> Outcome:
         loop=ending.loop,
         **ended,
     )
-
-
-def loops_of(outcomes: Iterable[Outcome]) -> dict[str, int]:
-    """Return the number of runs by what ran them, the most frequent first."""
-    return dict(Counter(one.loop for one in outcomes if one.loop).most_common())
 
 
 def run_file(outcome: Outcome, draw: dict[str, Any] | None = None) -> bytes:
@@ -106,4 +100,9 @@ def run_scenarios(
 
 def read_outcome(path: Path) -> Outcome:
     """Read how a run ended."""
-    return validate(_File, load_json(path, _MAX_BYTES, _EXPECTED, sealed=True), str(path)).outcome
+    return read_kept(_File, "the file of one run of a study", path).outcome
+
+
+def read_kept(kind: type[_Kind], expected: str, path: Path) -> _Kind:
+    """Read a dataclass from a file of `sealed_json`; `expected` describes the file."""
+    return validate(kind, load_json(path, _MAX_BYTES, expected, sealed=True), str(path))

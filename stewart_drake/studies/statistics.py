@@ -23,13 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import brentq
-from scipy.special import ndtri
-from scipy.stats import hypergeom, mannwhitneyu
 
 from stewart_drake.types import Array, ArrayLike
 
 CONFIDENCE: Final = 0.95
 """Default of every interval."""
+_DEVIATIONS: Final = float(stats.norm.ppf((1 + CONFIDENCE) / 2))
+"""Half width of an interval in standard deviations."""
 
 
 class Interval(NamedTuple):
@@ -69,22 +69,20 @@ def wilson_interval(successes: int, trials: int, confidence: float = CONFIDENCE)
     return Interval(share, min(share, float(ends.low)), max(share, float(ends.high)))
 
 
-def least_share(successes: int, trials: int, confidence: float = CONFIDENCE) -> float:
+def least_share(successes: int, trials: int) -> float:
     """Return the lower end of the one-sided Clopper-Pearson interval of a share of successes.
 
-    If all n trials succeed this is (1 - confidence)^(1/n), which is also the distribution-free
+    If all n trials succeed this is (1 - CONFIDENCE)^(1/n), which is also the distribution-free
     bound of Wilks: with this confidence at least this share of all trials has a value no larger
-    than the largest of the n. Both statements are wrong together in at most 1 - confidence of all
+    than the largest of the n. Both statements are wrong together in at most 1 - CONFIDENCE of all
     samples if the second is made only when all trials succeed.
     """
     if successes == 0:
         return 0.0
-    return float(stats.beta.ppf(1 - confidence, successes, trials - successes + 1))
+    return float(stats.beta.ppf(1 - CONFIDENCE, successes, trials - successes + 1))
 
 
-def quantile_interval(
-    values: ArrayLike, probability: float, confidence: float = CONFIDENCE
-) -> Interval:
+def quantile_interval(values: ArrayLike, probability: float) -> Interval:
     """Return a quantile of the distribution behind a sample, distribution-free.
 
     The number of values below the true quantile is binomial, which gives the ordered values that
@@ -94,12 +92,11 @@ def quantile_interval(
     Args:
         values: (n,) without NaN.
         probability: above 0, below 1.
-        confidence: of the interval.
     """
     x = np.asarray(values, dtype=np.float64)
     if len(x) == 0 or np.isnan(x).any():
         raise ValueError(f"got {len(x)} values, or NaN among them; expected at least one, none NaN")
-    ends: Any = stats.quantile_test(x, p=probability).confidence_interval(confidence)
+    ends: Any = stats.quantile_test(x, p=probability).confidence_interval(CONFIDENCE)
     return Interval(
         float(np.quantile(x, probability, method="inverted_cdf")),
         -np.inf if np.isnan(ends.low) else float(ends.low),
@@ -107,7 +104,7 @@ def quantile_interval(
     )
 
 
-def rank_correlation(x: ArrayLike, y: ArrayLike, confidence: float = CONFIDENCE) -> Correlation:
+def rank_correlation(x: ArrayLike, y: ArrayLike) -> Correlation:
     """Return Spearman's rank correlation of pairs, with interval and p-value.
 
     The p-value is of Student's distribution; the interval is Fisher's, atanh rho
@@ -115,7 +112,6 @@ def rank_correlation(x: ArrayLike, y: ArrayLike, confidence: float = CONFIDENCE)
 
     Args:
         x, y: (n,) each, without NaN.
-        confidence: of the interval.
     """
     a, b = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if len(a) < 4 or np.ptp(a) == 0 or np.ptp(b) == 0:
@@ -124,8 +120,7 @@ def rank_correlation(x: ArrayLike, y: ArrayLike, confidence: float = CONFIDENCE)
     rho = float(np.clip(found.statistic, -1.0, 1.0))
     if abs(rho) > 1 - 1e-12:
         return Correlation(rho, rho, rho, 0.0)
-    z = stats.norm.ppf((1 + confidence) / 2)
-    half = z * np.sqrt((1 + rho**2 / 2) / (len(a) - 3))
+    half = _DEVIATIONS * np.sqrt((1 + rho**2 / 2) / (len(a) - 3))
     low, high = np.tanh(np.arctanh(rho) + np.array([-half, half]))
     return Correlation(rho, float(low), float(high), float(found.pvalue))
 
@@ -237,7 +232,7 @@ def _adjusted(found: list[Any]) -> list[Any]:
     return [one._replace(p=float(p)) for one, p in zip(found, p_values, strict=True)]
 
 
-def auc_interval(auc: float, failing: int, others: int, confidence: float = CONFIDENCE) -> Interval:
+def auc_interval(auc: float, failing: int, others: int) -> Interval:
     """Return the AUC with Newcombe's interval (2006, method 5).
 
     The ends are those A for which |auc - A| is z deviations, with the variance of Hanley and McNeil
@@ -247,7 +242,7 @@ def auc_interval(auc: float, failing: int, others: int, confidence: float = CONF
 
     so that like Wilson's they stay in [0, 1], also if the two groups do not overlap.
     """
-    z, half = float(ndtri((1 + confidence) / 2)), (failing + others) / 2 - 1
+    z, half = _DEVIATIONS, (failing + others) / 2 - 1
 
     def beyond(a: float) -> float:
         spread = 1 + half * (1 - a) / (2 - a) + half * a / (1 + a)
@@ -261,7 +256,7 @@ def auc_interval(auc: float, failing: int, others: int, confidence: float = CONF
 
 def _separation(name: str, x: Array, failed: Flags) -> Separation:
     k, m = int(failed.sum()), int((~failed).sum())
-    test = mannwhitneyu(x[failed], x[~failed], alternative="two-sided")
+    test = stats.mannwhitneyu(x[failed], x[~failed], alternative="two-sided")
     auc = auc_interval(float(test.statistic) / (k * m), k, m)
     larger = auc.value >= 0.5
     bound = float(np.quantile(x, 2 / 3 if larger else 1 / 3))
@@ -301,4 +296,4 @@ def _both_needed(a: Flags, b: Flags, failed: Flags) -> float:
 def _more_often(failed: Flags, there: Flags) -> float:
     """Return P(at least this number of failing runs by chance), Fisher's exact test, one-sided."""
     together = int(np.sum(failed & there))
-    return float(hypergeom.sf(together - 1, len(failed), int(failed.sum()), int(there.sum())))
+    return float(stats.hypergeom.sf(together - 1, len(failed), int(failed.sum()), int(there.sum())))

@@ -136,30 +136,25 @@ class RobustnessOptions(JobOptions):
     )
 
 
-def _numbers(option: str, form: str, text: str, values: Iterable[str]) -> list[float]:
-    try:
-        return [float(value) for value in values]
-    except ValueError:
-        raise ConfigError(f"--{option}: got {text!r}; expected {form}") from None
+def _numbers(option: str, form: str, texts: list[str], most: int) -> dict[str, list[float]]:
+    """Return the numbers of texts such as `NAME=LOW:HIGH`, at most `most` in each."""
+    found = {}
+    for text in texts:
+        name, _, values = text.partition("=")
+        try:
+            found[name.strip()] = [float(value) for value in values.split(":", most - 1)]
+        except ValueError:
+            raise ConfigError(f"--{option}: got {text!r}; expected {form}") from None
+    return found
 
 
 def _read_limits(texts: list[str], _: object) -> dict[str, float]:
-    found = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        (found[name.strip()],) = _numbers("limit", "NAME=VALUE", text, [value])
-    return found
+    return {name: value for name, (value,) in _numbers("limit", "NAME=VALUE", texts, 1).items()}
 
 
 def _read_bounds(texts: list[str], _: object) -> dict[str, tuple[float, float]]:
-    found = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        low, colon, high = value.partition(":")
-        ends = [low, high if colon else low]
-        first, last = _numbers("vary", "NAME=LOW:HIGH or NAME=VALUE", text, ends)
-        found[name.strip()] = (first, last)
-    return found
+    found = _numbers("vary", "NAME=LOW:HIGH or NAME=VALUE", texts, 2)
+    return {name: (ends[0], ends[-1]) for name, ends in found.items()}
 
 
 class LayoutOptions(JobOptions):

@@ -237,12 +237,7 @@ class About(NamedTuple):
 
 
 def scales_of(experiment: Experiment, commanded: float) -> Scales:
-    """Return the scales of an experiment.
-
-    Args:
-        experiment: as `prepare` returns it.
-        commanded: largest torque that the undisturbed run commands, N m.
-    """
+    """Return the scales of an experiment whose undisturbed run commands up to `commanded` N m."""
     sc = experiment.scenario
     times = spread_instants(sc.duration, INSTANTS)
     sizing = size_motors(experiment.nominal, experiment.reference, times)

@@ -26,6 +26,7 @@ class Assessment(NamedTuple):
     # usual size of a torque, N m: the largest that following the reference takes. If it cannot be
     # followed, that of a median instant, because torques may grow without bound on the way out.
     torque: float
+    followed_until: float  # last instant at which the reference is known to be inside, s
 
     @property
     def obstacles(self) -> tuple[str, ...]:
@@ -42,11 +43,6 @@ class Assessment(NamedTuple):
             )
         return tuple(sentences)
 
-    @property
-    def followed_until(self) -> float:
-        """Last instant at which the reference is known to be in the workspace, s."""
-        return _end(self.experiment.scenario.duration, self.failure)
-
 
 def assess(scenario: Scenario) -> Assessment:
     """Assess a scenario.
@@ -58,7 +54,9 @@ def assess(scenario: Scenario) -> Assessment:
     experiment = assemble(scenario)
     mechanism, reference = experiment.mechanism, experiment.reference
     failure = experiment.reference_failure()
-    end, torque = _end(scenario.duration, failure), 0.0
+    end, torque = scenario.duration, 0.0
+    if failure is not None:
+        end = max(0.0, failure.time - REACH_CHECK_PERIOD)
     if end > 0:
         torques = reference_torques(experiment.nominal, reference, end)
         torque = float(torques.max() if failure is None else np.median(torques))
@@ -68,11 +66,8 @@ def assess(scenario: Scenario) -> Assessment:
         home_failure=diagnose(mechanism, 0.0, mechanism.home),
         motion=experiment.motion_scale,
         torque=max(torque, least_torque(experiment.nominal)),
+        followed_until=end,
     )
-
-
-def _end(duration: float, failure: Failure | None) -> float:
-    return duration if failure is None else max(0.0, failure.time - REACH_CHECK_PERIOD)
 
 
 HARDLY: Final = 10.0

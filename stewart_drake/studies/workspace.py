@@ -202,15 +202,16 @@ def study_workspace(scenario: Scenario) -> WorkspaceStudy:
 def _bounds(section: Section) -> dict[str, Any]:
     """Return the extent of a section and its best condition number."""
     inside = np.isfinite(section.condition)
-    found: dict[str, Any] = {}
-    found["coordinates"] = [COORDINATES[section.first], COORDINATES[section.second]]
-    for axis, values, used in (
-        ("x", section.x, inside.any(axis=0)),
-        ("y", section.y, inside.any(axis=1)),
-    ):
-        ends = values[used][[0, -1]] if used.any() else np.full(2, np.nan)
-        found[axis] = ends.tolist()
-    return found | {"best_condition": least(section.condition)}
+
+    def ends(values: Array, used: Any) -> list[float]:
+        return [float(values[used][k]) if used.any() else np.nan for k in (0, -1)]
+
+    return {
+        "coordinates": [COORDINATES[section.first], COORDINATES[section.second]],
+        "x": ends(section.x, inside.any(axis=0)),
+        "y": ends(section.y, inside.any(axis=1)),
+        "best_condition": least(section.condition),
+    }
 
 
 def least(values: Array) -> float:
