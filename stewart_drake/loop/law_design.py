@@ -362,7 +362,10 @@ def replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> Pre
         return law
     if law.longest_wait or replan == 0 or (sc.start == "rest" and not length):
         return law
-    short = max(2 * period, min(LONGEST_REPLAN, KNOWN_SHARE * law.timeline.eta))
+    short = min(LONGEST_REPLAN, KNOWN_SHARE * law.timeline.eta)
+    if experiment.planned_limit is not None:
+        short = LONGEST_REPLAN  # a short plan takes large torques
+    short = max(2 * period, short)
     return replace(law, planner=Replan(replan or length or short, experiment.scale))
 
 
