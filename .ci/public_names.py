@@ -7,6 +7,7 @@ options at run time are written with their signatures.
 import inspect
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import stewart_drake as sd
@@ -36,5 +37,6 @@ def text():
 
 if __name__ == "__main__":
     STUB.write_text(text())
-    subprocess.run(["ruff", "check", "-q", "--select", "I", "--fix", STUB], check=True)
-    subprocess.run(["ruff", "format", "-q", STUB], check=True)
+    ruff = sys.executable, "-m", "ruff"
+    subprocess.run([*ruff, "check", "-q", "--select", "I", "--fix", STUB], check=True)
+    subprocess.run([*ruff, "format", "-q", STUB], check=True)
