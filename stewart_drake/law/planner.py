@@ -25,8 +25,8 @@ from stewart_drake.types import Array
 
 EARLY = 0.5
 """No torque arrives before this share of the assumed delay."""
-
-
+SURE = 0.03
+"""Largest standard deviation of a predicted pose from which to plan, as a share of the motion."""
 ROUNDING = 1e-3
 """Periods; an instant that is nearer to a sample is there."""
 
@@ -96,7 +96,7 @@ class Replan:
 
     duration: float
     size: Array
-    sure: float = 0.03
+    sure: float = SURE
 
     def follow(
         self,

@@ -34,7 +34,7 @@ from stewart_drake.law.least_error import LeastError
 from stewart_drake.law.limited import LimitedLqi, QpLimits
 from stewart_drake.law.nominal import MultibodyModel, NominalPlant, PaperModel, TorqueLimit
 from stewart_drake.law.observers import CoreObserver, DelaySettings
-from stewart_drake.law.planner import NoPlanner, Replan
+from stewart_drake.law.planner import SURE, NoPlanner, Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.predictors import (
     ArrivalPredictor,
@@ -85,6 +85,9 @@ FOUND_SHARE = 0.75
 delay is taken back as fast."""
 KNOWN_SHARE = 0.2
 """The same with a known delay, after a start on the reference: the error is still small."""
+SURE_ON_REFERENCE = 0.01
+"""The value of `law.planner.SURE` there. A noisy prediction that is off now and then is left to the
+feedback: across long delays with gravity such plans would add to the noise."""
 TOLERATED = 0.004
 """Largest standard deviation of the torques' timing at which their weight is not raised, as a share
 of the loop's time constant: 0.7 ms for the motion of `paper`."""
@@ -365,8 +368,8 @@ def replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> Pre
     short = min(LONGEST_REPLAN, KNOWN_SHARE * law.timeline.eta)
     if experiment.planned_limit is not None:
         short = LONGEST_REPLAN  # a short plan takes large torques
-    short = max(2 * period, short)
-    return replace(law, planner=Replan(replan or length or short, experiment.scale))
+    given = (length, SURE) if length else (max(2 * period, short), SURE_ON_REFERENCE)
+    return replace(law, planner=Replan(replan or given[0], experiment.scale, given[1]))
 
 
 def tolerated_timing(experiment: Experiment) -> float:
