@@ -207,8 +207,10 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         learns=exact,
     )
     gaps = sc.sensor.kind == "state" and sc.sensor.loss > 0
-    clean = exact and not any(sc.sensor.noise_std)
-    observer = CoreObserver(settings if c.estimate else None, gaps=gaps, timing=clean)
+    clean = exact and not (isinstance(sc.sensor, StateSensorConfig) and any(sc.sensor.noise_std))
+    tolerated = tolerated_timing(experiment)
+    timing = clean and math.isfinite(tolerated)
+    observer = CoreObserver(settings if c.estimate else None, gaps=gaps, timing=timing)
     quiet = c.open_loop_start and sc.start == "rest"
     waits = longest_wait(sc)
     channel = link.channel(sc.link, experiment, timeline, waits)
@@ -226,7 +228,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         longest_wait=waits,
         kept=waits + (REPORTS if isinstance(channel, Packets) else 0),
         silence=_until_seen(timeline.delay, waits) if quiet else 0,
-        tolerated_timing=tolerated_timing(experiment),
+        tolerated_timing=tolerated,
     )
     if c.delay_estimator != "none":
         prior = timeline.eta, c.delay_std, c.delay_max
