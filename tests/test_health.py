@@ -288,7 +288,7 @@ def test_shipped_networks_cost_little_where_nothing_is_wrong(family, bound):
 
 
 def test_a_tuner_saves_a_plate_that_fixed_weights_lose():
-    late = scenario("delay.fraction=0.2", "controller.delay_steps=8", *BLIND)
+    late = scenario("delay.fraction=0.2", "controller.delay_steps=8", *BLIND, "controller.replan=0")
     assert run_in_bulk(late).status == "left_workspace"
     for kind in (("tuner.kind=rule",), ("tuner.kind=ann", "tuner.weights=health_N2")):
         one = scenario("delay.fraction=0.2", "controller.delay_steps=8", *BLIND, *kind)

@@ -283,7 +283,7 @@ def test_torques_reach_the_multibody_plant_in_their_own_steps(steps, fraction):
 
 @functools.cache
 def law():
-    settings = ["start=on_reference", "duration=1.0", "delay.steps=2"]
+    settings = ["start=on_reference", "duration=1.0", "delay.steps=2", "controller.replan=0"]
     return control_law(prepare(load_scenario("paper", settings=settings)))[0]
 
 
