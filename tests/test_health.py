@@ -129,7 +129,9 @@ def test_features_are_root_mean_squares_over_their_samples():
 
 def test_what_is_lost_is_finite_and_bounded():
     """Also of a run that is being lost, where signals grow without limit."""
-    one = scenario("delay.fraction=0.5", "controller.delay_steps=8", *FOLLOWS)
+    one = scenario(
+        *("delay.fraction=0.5", "controller.delay_steps=8", "controller.replan=0", *FOLLOWS)
+    )
     ending, found = watched_run(one, watching(*weights_of(1.0)), SAMPLES)
     values = found[np.isfinite(found).all(axis=1)]
     assert ending.stopped is not None
@@ -288,7 +290,7 @@ def test_shipped_networks_cost_little_where_nothing_is_wrong(family, bound):
 
 
 def test_a_tuner_saves_a_plate_that_fixed_weights_lose():
-    late = scenario("delay.fraction=0.2", "controller.delay_steps=8", *BLIND, "controller.replan=0")
+    late = scenario("delay.fraction=0.2", "controller.delay_steps=8", *BLIND, "controller.w_R=1")
     assert run_in_bulk(late).status == "left_workspace"
     for kind in (("tuner.kind=rule",), ("tuner.kind=ann", "tuner.weights=health_N2")):
         one = scenario("delay.fraction=0.2", "controller.delay_steps=8", *BLIND, *kind)
