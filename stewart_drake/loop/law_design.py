@@ -378,10 +378,12 @@ def tolerated_timing(experiment: Experiment) -> float:
     """Return the standard deviation of single torques' timing that the loop tolerates, s.
 
     It is a share of the time constant of the loop, 1 / bandwidth of theory.md, section 13. It is
-    infinite for weights that are given or set by a tuner.
+    infinite for weights that are given or set by a tuner, and for the paper's laws and baselines:
+    they predict linearly or not at all.
     """
     sc, c = experiment.scenario, experiment.scenario.controller
-    if c.w_R is not None or sc.tuner.kind != "fixed":
+    predicts = c.prediction == "nonlinear" and believed_delay(sc).eta(c.period) > 0
+    if c.w_R is not None or sc.tuner.kind != "fixed" or not (c.estimate or predicts):
         return math.inf
     times = spread_instants(sc.duration, _POSES)
     accelerations = np.array([evaluate(experiment.reference, t)[ACCELERATIONS] for t in times])

@@ -134,6 +134,7 @@ NEEDS: Final = (
     _needs("catch_up open_loop_start", "start", "rest"),
     _needs("replan", "link.kind", "wire", known_delay=True),
     _needs("replan", "controller.estimate", _CONSTANTS, known_delay=True),
+    _needs("replan", "controller.limits", "ignore"),
 )
 """Fields that have an effect only with certain values of another field."""
 
