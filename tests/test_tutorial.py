@@ -98,7 +98,7 @@ def test_a_machine_and_a_motion_of_one_s_own(do):
     for name, words in {
         "slow": given,
         "usual": given[:-2],
-        "fast": [*given[:-1], "controller.w_R=1"],
+        "fast": [*given[:-1], "controller.w_R=1", "--set", "controller.replan=0"],
     }.items():
         assert main([*words, "--out", f"out/{name}", "--quiet"]) == 0
     assert summary("slow")["accumulated_error"] < summary("usual")["accumulated_error"] / 25
