@@ -3,8 +3,8 @@
    A torque that comes delta late moves the rates at the next sample by -M^-1 B D delta, D the change of
    torque. As an impulse of the torques, u = dt (T(x, r / dt) - T(x, 0)) with the prediction's error r of
    the rates, that is u = -D delta. Unknown bias, payload and friction change u slowly, so that its second
-   difference w = u_k - 2 u_{k-1} + u_{k-2} counts, of variance c |D|^2 sigma^2 along D. What w has across
-   D, per direction, is no delay's:
+   difference w = u_k - 2 u_{k-1} + u_{k-2} counts. A delay gives it the variance c |D|^2 sigma^2 along D, and
+   none across D, so that the mean square across, of one direction, is subtracted:
 
        sigma^2 = sum((D.w)^2 - |D|^2 |w_across|^2 / 5) / sum(c |D|^4).
 
@@ -16,11 +16,11 @@
 #include "observers.h"
 #include "short.h"
 
-#define WITHIN ((real)6) /* c */
+#define WITHIN ((real)6) /* c for torques that change within a period, and at the samples */
 #define AT_SAMPLES ((real)2.8169011381620934)
-#define FADE ((real)0.98)
-#define LEAST ((real)1) /* of the second sum, in largest terms: a motion that turns around tells little */
-#define KEEP ((real)0.9) /* share of the sums that is left after a period */
+#define KEEP ((real)0.9)  /* share of the sums that is left after a period */
+#define FADE ((real)0.98) /* the same, of the largest term of the second one */
+#define LEAST ((real)1)   /* of the second sum, in largest terms: small changes of torque tell little */
 
 typedef struct {
     real impulses[2 * U], change[U]; /* u at the last two samples and D at the last; NaN without */
@@ -37,18 +37,25 @@ static Timing *timing_of(const stewart_law *law, real *memory)
     return (Timing *)(memory + stewart_plain_memory(law));
 }
 
+/* Forget the last samples, not the sums. */
+static void forget(Timing *timing)
+{
+    stewart_fill(2 * U, (real)NAN, timing->impulses);
+    stewart_fill(U, (real)NAN, timing->change);
+}
+
 static void timing_start(const stewart_law *law, real *memory)
 {
-    stewart_plain_start(law, memory);
-    stewart_fill(TIMING_NUMBERS, (real)NAN, memory + stewart_plain_memory(law));
     Timing *timing = timing_of(law, memory);
+    stewart_plain_start(law, memory);
+    forget(timing);
     timing->excess = timing->weight = timing->largest = 0;
 }
 
 static void timing_restart(const stewart_law *law, real *memory)
 {
     stewart_plain_restart(law, memory);
-    stewart_fill(3 * U, (real)NAN, memory + stewart_plain_memory(law));
+    forget(timing_of(law, memory));
 }
 
 /* u (6) of a predicted state and the one found. */
@@ -78,10 +85,10 @@ static void learn(Timing *timing, const real *u, const real *D, real c)
     }
     if (!(square > 0) || !isfinite(along)) /* or NaN */
         return;
-    const real across = (all - along * along / square) / (U - 1);
+    const real across = (all - along * along / square) / (U - 1), weight = c * square * square;
     timing->excess = KEEP * timing->excess + along * along - square * across;
-    timing->weight = KEEP * timing->weight + c * square * square;
-    timing->largest = REAL(fmax)(FADE * timing->largest, c * square * square);
+    timing->weight = KEEP * timing->weight + weight;
+    timing->largest = REAL(fmax)(FADE * timing->largest, weight);
 }
 
 static int timing_observe(const stewart_law *law, real *memory, int number, const real *torques,
@@ -92,22 +99,22 @@ static int timing_observe(const stewart_law *law, real *memory, int number, cons
     stewart_copy(X, memory, predicted);
     const int status = stewart_state_observer.observe(law, memory, number, torques, values, scratch);
     if (status || !stewart_all_finite(X, predicted) || !stewart_all_finite(X, memory)) {
-        stewart_fill(3 * U, (real)NAN, timing->impulses);
+        forget(timing);
         return status;
     }
     stewart_schedule schedule;
-    const real *following, *first, *last;
+    const real *following;
     stewart_last_periods(law, number, torques, 1, &schedule, &following, &scratch);
-    first = schedule.torques;
-    last = schedule.torques + U * (schedule.number - 1);
     stewart_move_on(law, number, torques, predicted, scratch);
     impulse_between(law, predicted, memory, u);
+    const int within = schedule.number > 1;
+    const real *first = schedule.torques, *last = within ? first + U * (schedule.number - 1) : following;
     for (int i = 0; i < U; i++) {
-        const real next = schedule.number > 1 ? last[i] - first[i] : following[i] - last[i];
-        D[i] = schedule.number > 1 ? next : (next + timing->change[i]) / 2;
-        timing->change[i] = next;
+        const real change = last[i] - first[i];
+        D[i] = within ? change : (change + timing->change[i]) / 2;
+        timing->change[i] = change;
     }
-    learn(timing, u, D, schedule.number > 1 ? WITHIN : AT_SAMPLES);
+    learn(timing, u, D, within ? WITHIN : AT_SAMPLES);
     stewart_copy(U, timing->impulses, timing->impulses + U);
     stewart_copy(U, u, timing->impulses);
     return status;

@@ -14,7 +14,6 @@ from stewart_drake.law.core_law import uncovered
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import KnownMotion, Motion, between
 from stewart_drake.law.observers import CoreObserver
-from stewart_drake.law.planner import Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
@@ -127,8 +126,7 @@ class Recorded:
         if law.finds_delay:
             assert isinstance(law.observer, CoreObserver)
             most = law.observer.max_schedule_length(period)
-        plan = law.planner.duration if isinstance(law.planner, Replan) else 0.0
-        return plan + (most + 4) * period
+        return law.longest_plan + (most + 4) * period
 
 
 def _trajectory(rows: Array, then: Trajectory) -> Trajectory:

@@ -15,7 +15,6 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.law.belief import Belief
-from stewart_drake.law.catch_up import periods_of
 from stewart_drake.law.channel import Packets, Report, Sent, Wire, packets_of, report_of
 from stewart_drake.law.compiled import Compiled, address_of, machine_of, resists
 from stewart_drake.law.cost import QuadraticCost
@@ -169,7 +168,7 @@ class CompiledLaw:
         plan, until = c.ffi.new("stewart_replan *"), law.timeline.queue_length
         if isinstance(law.observer, CoreObserver) and law.observer.delay is not None:
             until = law.observer.max_schedule_length(d.period)
-        plan.periods, plan.until = periods_of(planner.duration, d.period), until
+        plan.periods, plan.until = planner.periods(d.period), until
         plan.size, plan.sign = planner.size.tolist(), home_sign(law.plant.mechanism)
         plan.sure = planner.sure
         d.planner, d.planning = c.ffi.addressof(c.lib, "stewart_replanner"), plan

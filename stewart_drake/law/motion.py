@@ -43,8 +43,8 @@ class Preview:
         if not asked or len(self.reference) != len(times):
             raise ValueError(
                 f"preview: got {len(self.reference)} rows for {len(self.times)} instants; "
-                f"expected the {len(times)} instants that the law asks for (one that plans, with "
-                "controller.replan other than 0, asks for any: give it the motion)"
+                f"expected the {len(times)} that the law asks for. A law that plans (see "
+                "controller.replan) asks for any instants: give it the motion"
             )
         return self.reference
 

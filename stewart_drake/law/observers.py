@@ -357,11 +357,11 @@ def belief_of(
     if observer.delay is not None:
         return _delay_belief(law, memory, timeline, faults)
     n, m, last = NUM_STATE + p, law.measured, _last_values(observer, law)
-    measured = memory[last : last + m]
+    measured, uncertainty = memory[last : last + m], law.observer.uncertainty
+    timing = uncertainty(law, c.at(memory), c.ffi.NULL) if uncertainty else 0.0
     if observer.settings is not None:
         mean, root, rest = np.split(memory[:last], [n, n + n * n])
         L, (left_out, *innovations) = root.reshape(n, n), rest[[m + 2, m + 3, m + 4, -1]]
-        timing = law.observer.uncertainty(law, c.at(memory), c.ffi.NULL)
         belief = Belief(
             Estimate(mean, L @ L.T), timeline, measured, faults, timing=timing, memory=memory
         )
@@ -370,8 +370,6 @@ def belief_of(
     theta, std = np.empty(p), np.empty(p)
     law.observer.parameters(law, *map(c.at, (memory, theta, std)))
     belief = Belief.nothing(timeline, m, theta).at(memory[:NUM_STATE])
-    learns = law.observer.uncertainty != c.ffi.NULL
-    timing = law.observer.uncertainty(law, c.at(memory), c.ffi.NULL) if learns else 0.0
     return replace(belief, measured=measured, faults=faults, timing=timing, memory=memory)
 
 

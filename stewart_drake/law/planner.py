@@ -98,6 +98,10 @@ class Replan:
     size: Array
     sure: float = SURE
 
+    def periods(self, period: float) -> int:
+        """Return the length of a plan in periods, two at least."""
+        return periods_of(self.duration, period)
+
     def follow(
         self,
         path: Array | None,
@@ -131,7 +135,7 @@ class Replan:
         if belief.estimate.uncertain and not self._is_sure(belief, schedule, states, plant):
             return before
         model = Model(plant.dynamics.assuming(belief.parameters))
-        begin, periods = motion.now + timeline.eta, periods_of(self.duration, timeline.period)
+        begin, periods = motion.now + timeline.eta, self.periods(timeline.period)
         plan = model.plan(motion.reference, states[-1], begin, timeline.period, periods)
         if plan is None:
             return before  # no plan exists from here; it may at the next sample

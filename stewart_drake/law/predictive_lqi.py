@@ -27,7 +27,7 @@ from stewart_drake.law.memory import Counts, Memory
 from stewart_drake.law.motion import Course, Motion
 from stewart_drake.law.nominal import DesignModel, NominalPlant
 from stewart_drake.law.observers import CoreObserver, Observer
-from stewart_drake.law.planner import NoPlanner, Planner
+from stewart_drake.law.planner import NoPlanner, Planner, Replan
 from stewart_drake.law.predictors import PredictedState, Predictor
 from stewart_drake.law.sensing import Measurement, Sensing
 from stewart_drake.law.timeline import Timeline
@@ -117,6 +117,12 @@ class PredictiveLqi:
     def moves(self) -> bool:
         """Whether the law reads the motion at instants that it chooses itself."""
         return self.finds_delay or not isinstance(self.planner, NoPlanner)
+
+    @property
+    def longest_plan(self) -> float:
+        """Length of a plan back onto the reference, s; 0 without one."""
+        period = self.timeline.period
+        return self.planner.periods(period) * period if isinstance(self.planner, Replan) else 0.0
 
     def require_age(self, measurement: Measurement) -> None:
         """Check that a measurement is of the present, unless the law waits for late ones.

@@ -27,7 +27,6 @@ from stewart_drake.law.channel import Packets, Report
 from stewart_drake.law.core_law import CompiledLaw, CoreMemory
 from stewart_drake.law.memory import Counts
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
-from stewart_drake.law.planner import Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
@@ -36,7 +35,7 @@ from stewart_drake.loop.law_design import (
     compose_law,
     first_queue,
     followed_motion,
-    replanning,
+    on_its_way,
     sizing_of,
     way_onto,
 )
@@ -208,16 +207,11 @@ class Preparation:
         queue = experiment.torques_in_flight(law.timeline.delay).tobytes()
         if queue not in self._ways:
             self._ways[queue] = way_onto(experiment, law)
-        way, motion, length = self._ways[queue], experiment.reference, 0.0
-        if way is not None:
-            catch_up = experiment.scenario.controller.catch_up
-            motion, length = way.plan(catch_up, experiment.planned_limit)
-        law = replanning(law, experiment, length)
+        law, motion, _ = on_its_way(law, experiment, self._ways[queue])
         source = (tuner or weights_source)(experiment, law)
         previews = self._preview(motion, law)
         followed = followed_motion(law, motion, experiment.reference) or ()
-        longest = law.planner.duration if isinstance(law.planner, Replan) else 0.0
-        motions = tuple(self._pieces(one, followed, longest) for one in followed)
+        motions = tuple(self._pieces(one, followed, law.longest_plan) for one in followed)
         return Prepared(experiment, law, motion, previews, source, motions)
 
     def _preview(self, motion: Trajectory, law: PredictiveLqi | ServoPreview) -> Array:
@@ -237,6 +231,7 @@ class Preparation:
         if key not in self._motions:
             sc, c = self._base.scenario, self._base.scenario.controller
             delay = (c.delay_max or 0.0) + believed_delay(sc).eta(c.period)
+            # Delay, plan and horizon are read beyond the end; estimates of the delay may be longer.
             until = sc.duration + 2 * (delay + longest + 20 * c.period)
             self._motions[key] = motion, pieces_of(motion, followed, until)
         return self._motions[key][1]

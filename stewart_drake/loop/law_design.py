@@ -195,7 +195,8 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     torque_scale = max(machine_scale, peak_torque)
     motion_torque = max(STILL * machine_scale, peak_torque)
     parameters = estimated_parameters(experiment, torque_scale, motion_torque)
-    exact = sc.plant.kind == "exact" and isinstance(sc.sensor, StateSensorConfig)
+    noise = sc.sensor.noise_std if isinstance(sc.sensor, StateSensorConfig) else None
+    exact, tolerated = sc.plant.kind == "exact" and noise is not None, tolerated_timing(experiment)
     settings = filter_settings(
         motion,
         c.period,
@@ -203,13 +204,11 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         model_error=c.model_error,
         timing_std=c.timing_std,
         white=exact,
-        noisy=isinstance(sc.sensor, StateSensorConfig) and all(sc.sensor.noise_std),
+        noisy=noise is not None and all(noise),
         learns=exact,
     )
     gaps = sc.sensor.kind == "state" and sc.sensor.loss > 0
-    clean = exact and not (isinstance(sc.sensor, StateSensorConfig) and any(sc.sensor.noise_std))
-    tolerated = tolerated_timing(experiment)
-    timing = clean and math.isfinite(tolerated)
+    timing = exact and not any(noise or ()) and math.isfinite(tolerated)
     observer = CoreObserver(settings if c.estimate else None, gaps=gaps, timing=timing)
     quiet = c.open_loop_start and sc.start == "rest"
     waits = longest_wait(sc)
@@ -343,15 +342,22 @@ def longest_wait(scenario: Scenario) -> int:
 
 def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, float]:
     """Return the law, the motion that it follows, and the length of the blend, s."""
-    sc, law = experiment.scenario, compose_law(experiment)
-    way = way_onto(experiment, law)
-    if way is None:
-        return replanning(law, experiment, 0.0), experiment.reference, 0.0
-    motion, length = way.plan(sc.controller.catch_up, experiment.planned_limit)
-    return replanning(law, experiment, length), motion, length
+    law = compose_law(experiment)
+    return on_its_way(law, experiment, way_onto(experiment, law))
 
 
-def replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> PredictiveLqi:
+def on_its_way(
+    law: PredictiveLqi, experiment: Experiment, way: CatchUp | None
+) -> tuple[PredictiveLqi, Trajectory, float]:
+    """Return `control_law` for a composed law and its `way_onto` the reference."""
+    motion, length = experiment.reference, 0.0
+    if way is not None:
+        catch_up = experiment.scenario.controller.catch_up
+        motion, length = way.plan(catch_up, experiment.planned_limit)
+    return _replanning(law, experiment, length), motion, length
+
+
+def _replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> PredictiveLqi:
     """Return the law that plans a way back onto the reference, or `law` where it does not.
 
     After a start from rest with a catch-up of `length` s it plans again for as long: payload and
@@ -360,18 +366,18 @@ def replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> Pre
     rest without a catch-up (0 s), with a delay estimator or a linear prediction, over packets, with
     late measurements, with a quadratic program, or with `replan: 0`.
     """
-    sc = experiment.scenario
-    replan, period = sc.controller.replan, sc.controller.period
+    sc, replan = experiment.scenario, experiment.scenario.controller.replan
     plain = not isinstance(law, LimitedLqi) and isinstance(law.predictor, NonlinearPredictor)
     if not (law.estimates and plain and isinstance(law.channel, Wire)):
         return law
     if law.longest_wait or replan == 0 or (sc.start == "rest" and not length):
         return law
-    short = min(LONGEST_REPLAN, KNOWN_SHARE * law.timeline.eta)
-    if experiment.planned_limit is not None:
-        short = LONGEST_REPLAN  # a short plan takes large torques
-    given = (length, SURE) if length else (max(2 * period, short), SURE_ON_REFERENCE)
-    return replace(law, planner=Replan(replan or given[0], experiment.scale, given[1]))
+    usual, sure = length, SURE
+    if not length:
+        usual, sure = LONGEST_REPLAN, SURE_ON_REFERENCE
+        if experiment.planned_limit is None:  # a short plan takes large torques
+            usual = min(LONGEST_REPLAN, KNOWN_SHARE * law.timeline.eta)
+    return replace(law, planner=Replan(replan or usual, experiment.scale, sure))
 
 
 def tolerated_timing(experiment: Experiment) -> float:
