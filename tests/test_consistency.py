@@ -202,6 +202,18 @@ def test_a_learnt_timing_keeps_the_plate_across_a_delay_with_gravity(seed):
     assert kept.status == "completed" and kept.error_so_far < 0.3
 
 
+@pytest.mark.parametrize("controller", ["predictor_lqi", "adaptive_lqi"])
+def test_a_jitter_far_above_the_assumed_one_does_not_move_the_parameters(controller):
+    """10 ms, 17 times what the filter starts with; six seeds."""
+    jitter = (*ON, "duration=10", "delay.jitter_std=0.01")
+    runs = [
+        run_in_bulk(load_scenario("paper", controller, (*jitter, f"delay.seed={seed}")))
+        for seed in range(40, 46)
+    ]
+    assert all(run.status == "completed" for run in runs)
+    assert np.median([run.error_so_far for run in runs]) < 3
+
+
 # The timing of torques without an estimator.
 
 

@@ -7,7 +7,9 @@
 #define KNOWN ((real)0.01) /* a constant is known when its deviation is this share of the usual one */
 #define LEARNT ((real)0.3) /* the same, for a prediction over a few periods */
 #define UNTIMELY 70        /* factor t of the timing (noise.h) for a torque far too early or late */
-#define ONCE ((real)0.05)  /* after such a torque t is doubled, from this value at least */
+#define LATEST 700         /* the largest */
+#define ONCE ((real)0.05)  /* after such a torque t grows, from this value at least, */
+#define GROWTH 30          /* by this factor at the most */
 /* Shares of `usual_std` by which parameters may have changed. */
 #define CHANGED ((real)1e-3)      /* the least */
 #define MOST_CHANGED ((real)0.01) /* the largest for a single outlier */
@@ -275,15 +277,19 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
 {
     const stewart_filter *filter = a->filter;
     const int size = stewart_posterior_size(a->n, filter->sensing->size);
-    real late = -(real)INFINITY;
+    real late = -(real)INFINITY, untimely = 0;
     int found = 0;
     a->prior = before;
     a->hopeless = HOPELESS * filter->gate;
     stewart_copy(size, now->mean, before->mean);
-    if (filter->learns_timing && before->noise->timing < UNTIMELY) {
-        before->noise->timing = UNTIMELY;
-        if (attempt(a, scratch))
+    for (real t = UNTIMELY; filter->learns_timing && t <= LATEST; t *= 10) {
+        if (now->noise->timing >= t)
+            continue;
+        before->noise->timing = t;
+        if (attempt(a, scratch) && a->likelihood > late) {
             late = a->likelihood;
+            untimely = t;
+        }
     }
     /* The largest share has the least distance: if that one is hopeless, all are. */
     if (attempt_changed(a, now, before, most, scratch) || a->distance <= a->hopeless)
@@ -291,10 +297,11 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
             found = attempt_changed(a, now, before, share, scratch);
     if (isfinite(late) && !(found && a->likelihood >= late)) {
         stewart_copy(size, now->mean, before->mean);
-        before->noise->timing = UNTIMELY;
+        before->noise->timing = untimely;
         found = attempt(a, scratch);
         *a->after->noise = *now->noise; /* one late torque does not make all of them late */
-        a->after->noise->timing = 2 * (now->noise->timing > ONCE ? now->noise->timing : ONCE);
+        const real once = now->noise->timing > ONCE ? now->noise->timing : ONCE;
+        a->after->noise->timing = REAL(fmin)(GROWTH * once, untimely);
     }
     a->prior = now;
     a->hopeless = 0;

@@ -275,7 +275,7 @@ class LimitedLqi(OuterLqi):
         plan = last = None if memory.plan is None else search.continued(memory.plan)
         cause = None
         try:
-            cost = self._cost(after, ahead, holds, self.cautious(weights, belief))
+            cost = self._cost(after, ahead, holds, weights * [1.0, self.caution(belief)])
             try:
                 plan = search.within(last or search.reference, cost, until)
             except (ArithmeticError, np.linalg.LinAlgError):

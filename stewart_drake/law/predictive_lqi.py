@@ -208,7 +208,8 @@ class PredictiveLqi:
         )
         memory = replace(memory, in_flight=in_flight)
         belief, delayed, lag = self._observe(memory, measurement)
-        followed = self.planner.follow(memory.path, belief, in_flight, motion, self.plant)
+        careful = replace(belief, caution=self.caution(belief))
+        followed = self.planner.follow(memory.path, careful, in_flight, motion, self.plant)
         if followed.replanned:
             memory = memory.without_error()
         timeline = belief.timeline
@@ -376,7 +377,7 @@ class PredictiveLqi:
             model = self.model.at(ahead.state, torque, belief.parameters, self.plant)
             error = error - self.feedforward.offset(changes, model.B[RATES], belief.timeline)
             delayed = self.cost.sampled(model, belief.timeline)
-            K = self.cost.gain(delayed, self.cautious(weights, belief))
+            K = self.cost.gain(delayed, weights * [1.0, self.caution(belief)])
             return error, self.predictor.gain(K, delayed), None
         except UnreachablePoseError:  # nothing to regulate: the feedforward acts alone
             return error, self._no_gain(belief.timeline), "unreachable"
@@ -385,10 +386,9 @@ class PredictiveLqi:
             last = memory.gain if memory.gain.shape == none.shape else none  # of another delay
             return error, last, "riccati_failures"
 
-    def cautious(self, weights: Array, belief: Belief) -> Array:
-        """Return w_Q and w_R (2,), with w_R raised for an uncertain delay."""
-        caution = belief.caution * max(1.0, belief.timing / self.tolerated_timing) ** 2
-        return np.asarray(weights * [1.0, caution])
+    def caution(self, belief: Belief) -> float:
+        """Return the factor on w_R for an uncertain delay and uncertain timing."""
+        return belief.caution * max(1.0, belief.timing / self.tolerated_timing) ** 2
 
     def _no_gain(self, timeline: Timeline) -> Array:
         """Return NaN in the shape of a gain: on error, integral and pending torques."""
