@@ -444,6 +444,16 @@ def test_a_step_takes_no_more_scratch_than_stated(settings, monkeypatch):
     assert max(np.count_nonzero(array != UNTOUCHED) for array in used) > stated / 5
 
 
+def test_a_measurement_that_is_too_old_is_missing():
+    pair = Pair("paper", ("sensor.delay=0.2",))
+    law, native = pair.law, pair.native
+    y, motion = pair.states[0], KnownMotion(pair.planned, pair.goal, 0.0)
+    for age, missing in ((law.longest_wait, 0), (law.longest_wait + 1, 1)):
+        given = Measurement.of(y, age * law.timeline.period), motion, pair.weights
+        for one in (law.step(pair.one, *given), native.step(pair.other, *given)):
+            assert one.counts.measurements_missing == missing
+
+
 def test_shapes_that_do_not_fit_are_refused():
     law = law_of()
     native = CoreLqi(law)

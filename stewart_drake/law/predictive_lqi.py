@@ -268,8 +268,8 @@ class PredictiveLqi:
         """
         self.require_age(measurement)
         age = round(measurement.age / self.timeline.period)
-        valid = bool(np.any(measurement.valid)) and age >= 0
-        target = min(age, self.longest_wait) if valid else self.longest_wait
+        valid = bool(np.any(measurement.valid)) and 0 <= age <= self.longest_wait
+        target = age if valid else self.longest_wait
         delayed = memory.belief if memory.delayed is None else memory.delayed
         lag, flown = memory.lag + 1, memory.in_flight
         faults: tuple[str, ...] = () if valid else ("measurements_missing",)
