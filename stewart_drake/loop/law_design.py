@@ -34,7 +34,7 @@ from stewart_drake.law.least_error import LeastError
 from stewart_drake.law.limited import LimitedLqi, QpLimits
 from stewart_drake.law.nominal import MultibodyModel, NominalPlant, PaperModel, TorqueLimit
 from stewart_drake.law.observers import CoreObserver, DelaySettings
-from stewart_drake.law.planner import SURE, NoPlanner, Replan
+from stewart_drake.law.planner import SURE, Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.predictors import (
     ArrivalPredictor,
@@ -80,14 +80,11 @@ from stewart_drake.types import Array, ArrayLike
 
 LONGEST_REPLAN = 0.4
 """Longest plan back onto the reference where `controller.replan` is null, s."""
-FOUND_SHARE = 0.75
-"""The same as a share of the assumed delay, with a delay estimator: an error that grew over a short
-delay is taken back as fast."""
-KNOWN_SHARE = 0.2
-"""The same with a known delay, after a start on the reference: the error is still small."""
+REPLAN_SHARE = 0.2
+"""The same as a share of the assumed delay: the error is still small."""
 SURE_ON_REFERENCE = 0.01
-"""The value of `law.planner.SURE` there. A noisy prediction that is off now and then is left to the
-feedback: across long delays with gravity such plans would add to the noise."""
+"""`law.planner.SURE` after a start on the reference with a known delay. The feedback answers a noisy
+prediction that is off now and then: plans would add to the noise of long delays with gravity."""
 TOLERATED = 0.004
 """Largest standard deviation of the torques' timing at which their weight is not raised, as a share
 of the loop's time constant: 0.7 ms for the motion of `paper`."""
@@ -231,13 +228,11 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     )
     if c.delay_estimator != "none":
         prior = timeline.eta, c.delay_std, c.delay_max
-        back = min(LONGEST_REPLAN, FOUND_SHARE * timeline.eta)
         delay = DelaySettings.of(c.delay_estimator, *prior, quiet)
         law = replace(
             law,
             observer=CoreObserver(settings, delay),
             predictor=ArrivalPredictor(),
-            planner=NoPlanner() if c.replan == 0 else Replan(c.replan or back, experiment.scale),
             silence=0,  # until the delay is found
         )
     if c.limits == "qp":
@@ -362,22 +357,27 @@ def _replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> Pr
 
     After a start from rest with a catch-up of `length` s it plans again for as long: payload and
     bias were unknown before. After a start on the reference it takes back what they moved the plate
-    by before they were known. It does not plan without estimated parameters, after a start from
-    rest without a catch-up (0 s), with a delay estimator or a linear prediction, over packets, with
-    late measurements, with a quadratic program, or with `replan: 0`.
+    by before they were known. It does not plan without estimated parameters, with a linear
+    prediction, with a quadratic program, or with `replan: 0`. With a known delay it also does not
+    plan over packets, with late measurements, or after a start from rest without a catch-up (0 s).
     """
     sc, replan = experiment.scenario, experiment.scenario.controller.replan
-    plain = not isinstance(law, LimitedLqi) and isinstance(law.predictor, NonlinearPredictor)
-    if not (law.estimates and plain and isinstance(law.channel, Wire)):
+    exact = isinstance(law.predictor, NonlinearPredictor) and not isinstance(law, LimitedLqi)
+    if replan == 0 or not (law.estimates and exact):
         return law
-    if law.longest_wait or replan == 0 or (sc.start == "rest" and not length):
+    unclear = not isinstance(law.channel, Wire) or law.longest_wait > 0
+    if not law.finds_delay and (unclear or (sc.start == "rest" and not length)):
         return law
-    usual, sure = length, SURE
-    if not length:
-        usual, sure = LONGEST_REPLAN, SURE_ON_REFERENCE
-        if experiment.planned_limit is None:  # a short plan takes large torques
-            usual = min(LONGEST_REPLAN, KNOWN_SHARE * law.timeline.eta)
+    usual = length or _usual_replan(experiment, law.timeline.eta)
+    sure = SURE if length or law.finds_delay else SURE_ON_REFERENCE
     return replace(law, planner=Replan(replan or usual, experiment.scale, sure))
+
+
+def _usual_replan(experiment: Experiment, eta: float) -> float:
+    """Return the length of a plan back onto the reference across a delay, s."""
+    if experiment.planned_limit is not None:  # a short plan takes large torques
+        return LONGEST_REPLAN
+    return min(LONGEST_REPLAN, REPLAN_SHARE * eta)
 
 
 def tolerated_timing(experiment: Experiment) -> float:

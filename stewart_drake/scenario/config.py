@@ -297,8 +297,7 @@ class ControllerConfig:
         replan: duration of a plan back onto the reference, s; 0 for none. It is made where the
             prediction is certain and off the reference: once payload and bias are known, or after a
             jump of an estimated delay. null: that of the catch-up; after a start on the reference
-            0.2 times the delay; with a delay estimator 0.75 times the assumed one; both at least
-            two periods and at most 0.4 s.
+            0.2 times the assumed delay, at least two periods and at most 0.4 s.
         model_error: of the estimator's model: white noise of the accelerations, as a share of the
             motion's range per s^1.5; null is 2e-4 of it in each period, and less in
             a short one on an exact plant.
