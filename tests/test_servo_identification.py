@@ -125,6 +125,25 @@ def test_friction_of_ball_joints_is_found():
     assert found.residual < 1.1 * angle_std(12)
 
 
+@pytest.mark.slow
+def test_cranks_that_stick_do_not_move_the_delay():
+    """Cranks that stay behind by two codes where they are slow, which no friction of the fit does."""
+    motion = ROBOT.home + np.vstack(mixed_motion(np.repeat([0.2, 0.005], 3), 9.0, 0.02))
+    setpoints = np.array([ROBOT.crank_angles(pose) for pose in motion])
+    times = 0.02 * np.arange(len(setpoints))
+    given = ServoLog("log", times, setpoints, setpoints, ROBOT.home[None])
+    states = ServoModel(given, ROBOT, 0.8).states(TRUE)
+    rates = np.array([ROBOT.jacobian(x[:6]) @ x[6:] for x in states])
+    stuck = 2 * CODE * np.sign(rates) * np.exp(-np.abs(rates) / 0.1)
+    cranks = rounded(np.array([ROBOT.crank_angles(x[:6]) for x in states]) - stuck)
+    log = servo_log("log", times, setpoints, cranks, ROBOT)
+    found = identify_servos(log, ROBOT, angle_std(12))
+    first = found.theta - found.change
+    error, before = found.theta[0] - DELAY, first[0] - DELAY
+    assert 0.2 < found.fitted.mean() < 0.9
+    assert abs(error) < min(abs(before) / 2, found.intervals[0], 1e-3)
+
+
 def with_known_statistics(rng, number, blocks):
     """Return a linear fit under errors correlated over 0.3 s, and its error in every unknown."""
     t = 0.02 * np.arange(number)
@@ -143,6 +162,8 @@ def with_known_statistics(rng, number, blocks):
         theta,
         (noise.ravel() + flat @ error).reshape(number, 6),
         jacobian,
+        np.ones((number, 6), bool),
+        np.zeros(8),
         np.arange(1, 4),
         rounding=1e-3,
         ball_joints_tried=False,

@@ -14,6 +14,10 @@ friction of the ball joints.
 Output error. The exact plant under the setpoints of the log has crank angles a(t; theta); the least
 squares of their deviations r = a(theta) - measured begin at the regression.
 
+Sticking. Below some 4 s, tanh(a' / s) stands for sticking that no formula describes well, and delay
+and damping make up for its error. Where residuals are above the rounding, slower samples are
+therefore left out of a second fit: the friction of faster ones is F under any law.
+
 Intervals. Residuals are correlated in time, most of all those that the model leaves, which differ
 from one kind of motion to another: the covariance of white noise is far too small. The log is cut
 into B blocks, about as long as a kind of motion. With J = dr/dtheta,
@@ -21,7 +25,9 @@ H = J'J and g_b = J_b' r_b, whose sum is 0 at the fit, the fit without block b d
 
     delta_b = (H - H_b)^-1 g_b,   P = (B - 1) / B sum_b delta_b delta_b'       (jackknife)
 
-and the interval is t(B - 1) sqrt(P), with Student's t. Blocks may have any correlation inside.
+and the interval is t(B - 1) sqrt(P), with Student's t. Blocks may have any correlation inside. The
+change from the first fit to the second is added to it in quadrature: what is left of an effect is
+taken to be at most what was removed.
 """
 
 import math
@@ -33,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
-from scipy.signal import butter, sosfiltfilt
+from scipy.signal import butter, savgol_filter, sosfiltfilt
 from scipy.stats import t as student
 
 from stewart_drake.core.layout import DEFAULT_GRAVITY
@@ -79,6 +85,10 @@ CODES: Final = 3.0
 """Residual over that of rounding above which friction of the ball joints is tried."""
 GAIN: Final = 0.9
 """Share of the residual that must remain at most, for ball joints to be kept."""
+STICKS: Final = 4.0
+"""Crank speed over s below which a crank may stick."""
+SMOOTH: Final = 1.15
+"""Residual over that of rounding up to which no sticking is seen."""
 WRONG: Final = 0.3
 """Residual over the servos' deviation u(t - d) - a above which the fit is wrong."""
 
@@ -96,6 +106,8 @@ _GRID: Final = 2e-3  # s, of the regression
 _CUTOFF: Final = 6.0  # Hz
 _DELAYS: Final = np.arange(0.0, 0.3, 1e-3)  # s
 _START_SPEED: Final = 0.05  # rad/s
+_SPEED_WINDOW: Final = 0.14  # s, of the measured angles for a speed
+_ENOUGH: Final = 0.1  # least share of samples in the second fit
 
 
 @dataclass(frozen=True)
@@ -131,6 +143,14 @@ class ServoModel:
         """(n,) rows whose residuals count."""
         return self.log.times - self.log.times[0] >= _SETTLING
 
+    @cached_property
+    def speeds(self) -> Array:
+        """Measured speeds (m, 6) of the cranks, rad/s."""
+        step = float(np.median(np.diff(self.log.times)))
+        window = max(5, 2 * round(_SPEED_WINDOW / step / 2) + 1)
+        rates = savgol_filter(self.log.cranks, window, 2, deriv=1, delta=step, axis=0)
+        return np.abs(rates[self.counted])
+
     def residuals(self, theta: Array) -> Array:
         """Return crank angles minus measured ones (m, 6), rad; 1 if the plate leaves."""
         states, measured = self.states(theta), self.log.cranks[self.counted]
@@ -164,6 +184,8 @@ class ServoIdentification:
     theta: Array  # (8,) values found, of NAMES
     residuals: Array  # (m, 6) rad
     jacobian: Array  # (m, 6, k) by the free unknowns
+    fitted: NDArray[np.bool_]  # (m, 6) residuals that the fit minimises
+    change: Array  # (8,) of theta from the first fit to the second, 0 for one
     free: NDArray[np.intp]  # (k,) places of those in theta
     rounding: float  # standard deviation of the rounding of a measured angle, rad
     ball_joints_tried: bool  # whether friction of the ball joints was fitted
@@ -171,8 +193,8 @@ class ServoIdentification:
 
     @property
     def residual(self) -> float:
-        """Root mean square of the residuals, rad."""
-        return float(np.sqrt(np.mean(self.residuals**2)))
+        """Root mean square of the residuals that the fit minimises, rad."""
+        return float(np.sqrt(np.mean(self.residuals[self.fitted] ** 2)))
 
     @cached_property
     def deviation(self) -> float:
@@ -199,7 +221,8 @@ class ServoIdentification:
         inner = self.free[(self.theta > _LOW)[self.free]]
         scale = scale_of(self.theta)[inner]
         J = self.jacobian[:, :, np.isin(self.free, inner)] * scale
-        parts = zip(*(np.array_split(one, self.blocks) for one in (J, self.residuals)), strict=True)
+        both = J, self.residuals * self.fitted
+        parts = zip(*(np.array_split(one, self.blocks) for one in both), strict=True)
         pairs = [(np.vstack(list(j)), r.ravel()) for j, r in parts]
         H = sum(j.T @ j for j, _ in pairs)
         deltas = np.array([np.linalg.lstsq(H - j.T @ j, j.T @ r)[0] for j, r in pairs])
@@ -210,8 +233,9 @@ class ServoIdentification:
 
     def interval(self, slope: Array) -> float:
         """Return the half width of the 95 % interval of a function with this slope (8,)."""
-        variance = float(slope @ self.covariance @ slope)
-        return float(student.ppf(0.975, self.blocks - 1)) * math.sqrt(variance)
+        std = math.sqrt(float(slope @ self.covariance @ slope))
+        chance = float(student.ppf(0.975, self.blocks - 1)) * std
+        return math.hypot(chance, float(slope @ self.change))
 
     @cached_property
     def intervals(self) -> Array:
@@ -357,18 +381,27 @@ def identify_servos(
     limit = mechanism.effort_limit
     model = ServoModel(log, mechanism, math.inf if limit is None else limit, gravity)
     found = _fitted(model, regression(model, False), np.arange(BALL_FRICTION), rounding)
-    if found.residual < CODES * rounding:
+    if found.residual >= CODES * rounding:
+        rubbing = _fitted(model, regression(model, True), np.arange(len(NAMES)), rounding)
+        better = rubbing.residual < GAIN * found.residual
+        found = rubbing if better else replace(found, ball_joints_tried=True)
+    moving = model.speeds >= STICKS * found.theta[SPEED]
+    if found.residual < SMOOTH * rounding or np.mean(moving) < _ENOUGH:
         return found
-    rubbing = _fitted(model, regression(model, True), np.arange(len(NAMES)), rounding)
-    if rubbing.residual < GAIN * found.residual:
-        return rubbing
-    return replace(found, ball_joints_tried=True)
+    again = _fitted(model, found.theta, found.free, rounding, moving)
+    change = again.theta - found.theta
+    return replace(again, change=change, ball_joints_tried=found.ball_joints_tried)
 
 
 def _fitted(
-    model: ServoModel, start: Array, free: NDArray[np.intp], rounding: float
+    model: ServoModel,
+    start: Array,
+    free: NDArray[np.intp],
+    rounding: float,
+    samples: NDArray[np.bool_] | None = None,
 ) -> ServoIdentification:
-    """Return the fit of the free unknowns by output error."""
+    """Return the fit of the free unknowns to samples (m, 6), all if None, by output error."""
+    fitted = np.ones(model.speeds.shape, bool) if samples is None else samples
     first, scale = _in_reach(model, start), scale_of(start)[free]
 
     def whole(x: Array) -> Array:
@@ -377,10 +410,11 @@ def _fitted(
         return theta
 
     def residuals(x: Array) -> Array:
-        return model.residuals(whole(x)).ravel()
+        return (model.residuals(whole(x)) * fitted).ravel()
 
     def jacobian(x: Array) -> Array:
-        return model.jacobian(whole(x), free).reshape(-1, len(free)) * scale
+        J = model.jacobian(whole(x), free) * fitted[:, :, None]
+        return J.reshape(-1, len(free)) * scale
 
     found = least_squares(
         residuals,
@@ -392,11 +426,14 @@ def _fitted(
         max_nfev=_ITERATIONS,
     )
     J: Any = found.jac
+    theta = whole(found.x)
     return ServoIdentification(
         model=model,
-        theta=whole(found.x),
-        residuals=found.fun.reshape(-1, NUM_TORQUES),
+        theta=theta,
+        residuals=model.residuals(theta),
         jacobian=J.reshape(-1, NUM_TORQUES, len(free)) / scale,
+        fitted=fitted,
+        change=np.zeros(len(NAMES)),
         free=free,
         rounding=rounding,
         ball_joints_tried=bool(np.isin(BALL_FRICTION, free)),

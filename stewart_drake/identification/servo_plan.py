@@ -137,13 +137,15 @@ def plan_servos(
     rounded = code * (np.round(cranks / code - phase) + phase)
     log = servo_log("plan", model.log.times, model.log.setpoints, rounded, experiment.truth)
     seen_by = ServoModel(log, model.mechanism, model.torque_limit, model.gravity)
-    rubs = bool(np.any(planner.theta[-2:] > 0))
+    rubs, residuals = bool(np.any(planner.theta[-2:] > 0)), seen_by.residuals(planner.theta)
     free = np.arange(len(NAMES) if rubs else len(NAMES) - 2)
     expected = ServoIdentification(
         model=seen_by,
         theta=planner.theta,
-        residuals=seen_by.residuals(planner.theta),
+        residuals=residuals,
         jacobian=seen_by.jacobian(planner.theta, free),
+        fitted=np.ones(residuals.shape, bool),
+        change=np.zeros(len(NAMES)),
         free=free,
         rounding=rounding,
         ball_joints_tried=rubs,

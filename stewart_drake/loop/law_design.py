@@ -83,7 +83,7 @@ LONGEST_REPLAN = 0.4
 REPLAN_SHARE = 0.2
 """The same as a share of the assumed delay: the error is still small."""
 SURE_ON_REFERENCE = 0.01
-"""`law.planner.SURE` after a start on the reference with a known delay. The feedback answers a noisy
+"""`law.planner.SURE` with a known delay, after a start on the reference. Feedback answers a noisy
 prediction that is off now and then: plans would add to the noise of long delays with gravity."""
 TOLERATED = 0.004
 """Largest standard deviation of the torques' timing at which their weight is not raised, as a share
