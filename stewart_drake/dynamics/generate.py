@@ -227,12 +227,12 @@ def _derivatives() -> list[str]:
     leg, of_all = leg_numbers(legs.symbols), common_numbers(common.symbols)
     dF_dx, M = derivatives.plate_alone(of_all, s)
     crank_rate = derivatives.crank_rate(leg, of_all, s)
-    change, turn, mass, arm, _ = derivatives.leg_on_plate(leg, of_all, s, *(i.symbols for i in own))
+    change, turn, mass, arm = derivatives.leg_on_plate(leg, of_all, s, *(i.symbols for i in own))
     change[:3, :] -= turn
     M_sum, arms = (Input(name, ca.SX.sym(name, 6, 6)) for name in ("M", "arms"))
     arm_rates, slips = (Input(name, ca.SX.sym(name, 6)) for name in ("arm_rates", "slips"))
-    _, dF_dp, MN, _ = derivatives.assembled(
-        dF_dx, M_sum.symbols, arms.symbols, arm_rates.symbols, slips.symbols, s
+    dF_dp, MN = derivatives.assembled(
+        M_sum.symbols, arms.symbols, arm_rates.symbols, slips.symbols, s
     )
     plain = _inputs(s, "pose rates accelerations")
     return [
