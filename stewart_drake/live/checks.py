@@ -35,11 +35,8 @@ _KEPT: Final = 64
 def stays_within_reach(plant: NominalPlant, estimate: Estimate, torque: Array, span: float) -> bool:
     """Return whether the legs surely reach the pose after `span` s without measurements.
 
-    Args:
-        plant: nominal plant.
-        estimate: estimate at the last measurement; without a covariance the answer is yes.
-        torque: torque (6,) at that time, N m.
-        span: s.
+    Estimate and torque (6,) in N m are those at the last measurement; without a covariance the
+    answer is yes.
     """
     if not estimate.uncertain:
         return True
@@ -59,11 +56,7 @@ def stays_within_reach(plant: NominalPlant, estimate: Estimate, torque: Array, s
 
 
 class ReportCheck:
-    """Compares the torques that a machine reports with those that were sent for their periods.
-
-    Args:
-        limit: torque limit of the machine, N m.
-    """
+    """Compares reported torques with those that were sent for their periods, up to a limit."""
 
     def __init__(self, limit: float) -> None:
         self._limit = limit

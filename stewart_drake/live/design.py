@@ -99,11 +99,7 @@ def check_controller(scenario: Scenario) -> None:
 def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario:
     """Return the scenario with the measured link.
 
-    Args:
-        scenario: its delay, or the bound of its network, is the time from a measurement to its
-            torque.
-        link: measured link.
-        machine: message of the machine.
+    Its delay, or the bound of its network, is the time from a measurement to its torque.
     """
     loss = max(scenario.sensor.loss, link.loss_back)
     sensor = replace(scenario.sensor, delay=0.0, loss=loss, faults=[])
@@ -172,13 +168,7 @@ def read_learned(scenario: Scenario) -> tuple[Scenario, Learned]:
 
 
 def design(scenario: Scenario, machine: MachineMessage, learned: Learned = None) -> Design:
-    """Return the law for a scenario over the measured link.
-
-    Args:
-        scenario: as `as_seen` returns it.
-        machine: message of the machine.
-        learned: see `Learned`.
-    """
+    """Return the law for a scenario over the measured link, see `as_seen`."""
     experiment = prepare(scenario)
     if scenario.controller.command == "cranks":
         return _of_cranks(experiment, machine, learned)
@@ -216,12 +206,7 @@ def _step_times(
 ) -> tuple[list[float], str]:
     """Return the times of steps, s of this thread, and the name of their implementation.
 
-    Args:
-        law: control law.
-        motion: its reference.
-        first: queue or command before the first sample.
-        number: of steps.
-        given: weights or report of each step.
+    `first` is the queue or command before the first sample; weights or report are `given`.
     """
     served: Any
     served, backend = serving(law)

@@ -265,10 +265,7 @@ class Offers:
 
     A nonce is an HMAC of the session, its address and the number of sessions so far, under a secret
     of this process. Only the receiver of an offer knows it, and recorded sessions cannot be
-    replayed.
-
-    Args:
-        secret: 32 bytes; random by default.
+    replayed. The secret has 32 bytes, random ones by default.
     """
 
     def __init__(self, secret: bytes | None = None) -> None:

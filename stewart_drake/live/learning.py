@@ -158,13 +158,7 @@ class TorqueLessons(Viewer):
     It is the viewer of a run, and a log of it. A call returns the torque that the loop adds. It is
     blended from that of the last repetition into that of the present one.
 
-    Args:
-        experiment: of the scenario.
-        number: of repetitions.
-        say: prints a line.
-
     Attributes:
-        experiment: of the scenario.
         tried: added torques of the repetitions so far; those of the first one are zero.
         errors: E of the last period of each complete repetition, % s.
         done: whether learning has ended.

@@ -79,9 +79,6 @@ class Positions(NamedTuple):
 class Daemon:
     """Connection to the daemon, in a separate thread. It reconnects whenever it is lost.
 
-    Args:
-        address: of the daemon.
-
     Attributes:
         positions: the last ones, the newest last.
         simulated: whether the daemon reports that it simulates the robot.
@@ -221,12 +218,8 @@ class SoftSetpoints:
 
         u = h + g(s / T) (w - h),   g(s) = 10 s^3 - 15 s^4 + 6 s^5,
 
-    within range and speed of the servos. T is SOFT_START, or less after a short gap.
-
-    Args:
-        servo: range and speed.
-        period: s.
-        angles: (6,) of the cranks, at rest, rad.
+    within range and speed of the servos. T is SOFT_START, or less after a short gap. At first the
+    cranks rest at `angles` (6,), rad.
     """
 
     def __init__(self, servo: Stiffness, period: float, angles: Array) -> None:

@@ -34,13 +34,7 @@ def replanned(
 ) -> Steering | str:
     """Return a reference from the state after the torques in flight, or why there is none.
 
-    Args:
-        steering: present reference.
-        plant: model.
-        t: now, s.
-        state: (12,) now.
-        schedule: torques in flight.
-        parameters: estimated parameters, or None.
+    `state` (12,) is that at t in s; `schedule` has the torques in flight.
     """
     dynamics = plant.dynamics if parameters is None else plant.dynamics.assuming(parameters)
     states = np.vstack([state, plant.predict(state, schedule, parameters)])
@@ -67,15 +61,8 @@ def recovered(
 ) -> Steering | str | None:
     """Return a new reference if the prediction is too far from the old one, else None.
 
-    Args:
-        steering: present reference.
-        law: control law.
-        memory: its memory after the sample at t.
-        t: s.
-        size: (6,) size of the motion.
-
-    Returns:
-        The reference, or why there is none, or None.
+    Where there is none, the reason is returned. `memory` is that of the law after the sample at t
+    in s, `size` (6,) that of the motion.
     """
     belief, plant, in_flight = memory.belief, law.plant, memory.in_flight
     if not (belief.has_state and belief.feeds_back and belief.settled and not memory.silence):

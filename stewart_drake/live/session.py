@@ -83,11 +83,7 @@ def prepare_session(
 ) -> Ready:
     """Find a machine, measure the link and design the law for it.
 
-    Args:
-        scenario: law and motion.
-        address: address of the machine.
-        key: shared key; not needed on loopback.
-        learned: see `live.design.Learned`; by default that of `controller.learned`.
+    What was learned is by default that of `controller.learned`.
 
     Raises:
         ConfigError: no machine there, or one that does not fit the scenario.
@@ -243,12 +239,7 @@ def before_others() -> Iterator[str]:
 
 
 def open_logs(ready: Ready, options: LiveOptions, say: Callable[[str], None]) -> list[RunLog]:
-    """Open the logs that a run is asked for.
-
-    Args:
-        ready: result of `prepare_session`.
-        options: `log` and `mirror`.
-        say: prints a line.
+    """Open the logs that the options `log` and `mirror` ask for.
 
     Raises:
         ConfigError: a file that cannot be written, or no such host.
