@@ -47,7 +47,6 @@ class NativePlant:
     Attributes:
         states: (n, 12) result; the first `seen` are valid.
         wrench: (6,) on the plate, a view of the parameters that the run reads.
-        run: the `stewart_run`.
     """
 
     def __init__(
@@ -77,7 +76,6 @@ class NativePlant:
 
     @property
     def seen(self) -> int:
-        """Number of valid states."""
         return int(self.run.seen)
 
     @property

@@ -45,14 +45,11 @@ _WITHOUT_BALL_JOINTS: Final = NUM_CONSTANTS - NUM_BALL_JOINT_PARAMETERS
 
 
 class Linearization(NamedTuple):
-    """Derivatives of d[pose; rates]/dt at a point.
+    """Derivatives of d[pose; rates]/dt at a point."""
 
-    A (12, 12) by the state, B (12, 6) by the torque, G (12, p) by the free parameters.
-    """
-
-    A: Array
-    B: Array
-    G: Array
+    A: Array  # (12, 12) by the state
+    B: Array  # (12, 6) by the torque
+    G: Array  # (12, p) by the free parameters
 
 
 def _check(**arguments: ArrayLike) -> None:

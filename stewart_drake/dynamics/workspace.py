@@ -36,17 +36,12 @@ class Failure(NamedTuple):
 
 
 class Measures(NamedTuple):
-    """Distances from the workspace's boundary at a pose.
+    """Distances from the workspace's boundary at a pose."""
 
-    `sines` (6,): sines of the cranks' angles off dead centre, negative on the other branch.
-    `parallel`: signed measure of parallel singularity, 0 where the cranks do not hold the plate.
-    `pitch`: rad. `margin`: see the function of this name.
-    """
-
-    sines: Array
-    parallel: float
-    pitch: float
-    margin: float
+    sines: Array  # (6,) of the cranks' angles off dead centre, negative on the other branch
+    parallel: float  # signed, 0 where the cranks do not hold the plate
+    pitch: float  # rad
+    margin: float  # see the function of this name
 
 
 def measures_at(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> Measures:

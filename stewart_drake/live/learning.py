@@ -111,14 +111,8 @@ def learn_live(
 ) -> SimulationResult:
     """Repeat a motion on a machine, learn from each repetition, and write what was learned.
 
-    Learning ends early after two repetitions without a smaller error, or if one does not complete.
-
-    Args:
-        scenario: law and motion.
-        machine: HOST:PORT where it listens.
-        options: `learn`, `learned`, `armed`, `key`, `max_missing`, `accept_jitter`.
-        say: prints a line.
-        ending: returns whether to bring the plate to rest and end.
+    Learning ends early after two repetitions without a smaller error, or if one does not complete,
+    or once `ending` returns True.
 
     Returns:
         The run of all repetitions. With setpoints the best repetition, or the last one if none

@@ -56,22 +56,14 @@ _SOFT_STARTS: Final = (1.0, 2.0, 4.0, 8.0)
 
 
 class LiveLoop:
-    """Runs a law against a machine.
+    """Runs a law against a machine that has offered a session.
 
     Args:
-        design: law and settings.
-        steering: reference from t = 0 on.
-        contact: session that the machine has offered.
-        viewer: shows the run.
-        say: prints a line.
         max_missing: longest gap of usable measurements, s. By default as long as the estimator's
             uncertainty allows (`live.checks`).
         log: CSV file of the record, written as the run goes on; a temporary one by default.
-        logs: further logs of the same rows.
 
     Attributes:
-        exchange: datagrams of the run.
-        record: record of the run.
         memory: memory of the law after the last sample.
         recoveries: number of new references that were planned.
         taken_over: whether the plate was not at the scenario's start.
@@ -128,13 +120,9 @@ class LiveLoop:
     # -------------------------------------------------------------- run
 
     def run(self, duration: float, ending: Callable[[], bool] = lambda: False) -> End:
-        """Run for `duration` s, which may be infinite, then bring the plate to rest.
+        """Run for `duration` s, which may be infinite, or until `ending`; then stop the plate.
 
         A stop of the viewer, Ctrl-C or a failure ends the run at once.
-
-        Args:
-            duration: recorded time, s.
-            ending: returns whether to end before that.
         """
         end, k = End("completed", None), 0
         try:

@@ -290,7 +290,7 @@ class RobotMachine(Machine):
     def __init__(
         self,
         experiment: Experiment,
-        endpoint: Endpoint,
+        endpoint: Endpoint[ControllerMessage],
         options: MachineOptions,
         daemon: Daemon,
         say: Callable[[str], None] = print,

@@ -26,7 +26,13 @@ from stewart_drake.live.endpoint import Address, Endpoint
 from stewart_drake.live.governor import FASTEST, PACE, Governor, Steering, Way
 from stewart_drake.live.loop import CrankLoop, LiveLoop
 from stewart_drake.live.options import LiveOptions
-from stewart_drake.live.protocol import NOTHING, SECOND, ControllerFlags, MachineFlags
+from stewart_drake.live.protocol import (
+    NOTHING,
+    SECOND,
+    ControllerFlags,
+    MachineFlags,
+    MachineMessage,
+)
 from stewart_drake.live.viewer import Viewer
 from stewart_drake.loop.cautions import overconfidence
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
@@ -49,7 +55,7 @@ _MOST: Final = 0.5
 class Ready(NamedTuple):
     """A machine that was found, and the law for it, before anything moves."""
 
-    endpoint: Endpoint
+    endpoint: Endpoint[MachineMessage]
     contact: Contact
     design: Design  # law for the scenario over the link that was found
     margin: ControllerMargin  # stability margin of the loop with a constant delay eta
@@ -266,19 +272,13 @@ def drive(
     logs: Sequence[RunLog] = (),
     pace: float | None = None,
 ) -> SimulationResult:
-    """Run the loop; the machine moves.
+    """Run the loop; the machine moves. In the end socket and logs are closed.
 
     Args:
-        ready: result of `prepare_session`; its socket is closed.
-        duration: s, or infinite.
         armed: whether a real machine may be driven.
         accept_jitter: whether to start with more jitter than the loop is stable for.
-        viewer: shows the run and passes on requests.
         ending: whether to bring the plate to rest and end.
-        say: prints a line.
-        max_missing: see `LiveLoop`.
-        log: see `LiveLoop`.
-        logs: further logs, written while the run goes on; closed at the end.
+        max_missing, log: see `LiveLoop`.
         pace: pole of the governor, 1/s; by default it depends on the torque limit.
 
     Raises:

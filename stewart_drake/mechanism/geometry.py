@@ -33,18 +33,12 @@ _BRANCHES: Final = slice(2 * NUM_LEGS, 3 * NUM_LEGS)  # place of the crank branc
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body.
+    """A rigid body."""
 
-    Attributes:
-        mass: kg.
-        inertia: principal moments (3,) about its COM, kg m^2.
-        estimated: whether the moments are those of a uniform body, not measured ones.
-    """
-
-    mass: float
-    inertia: Array
+    mass: float  # kg
+    inertia: Array  # principal moments (3,) about its COM, kg m^2
     _: KW_ONLY
-    estimated: bool = False
+    estimated: bool = False  # whether the moments are those of a uniform body, not measured ones
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "inertia", _fixed("inertia", self.inertia, (3,)))
@@ -92,11 +86,7 @@ class Mechanism(kinematics.Legs):
     Attributes:
         name: identifier, used for file and model names.
         home: pose (6,) at which the machine is assembled.
-        p_WS: motor shaft centres (6, 3) in m.
-        R_WS: motor frames (6, 3, 3); columns x, y and the motor axis z.
-        p_PQ: plate joints (6, 3) in the plate frame, m.
-        crank_lengths, rod_lengths: (6,) m.
-        branches: (6,) of -1 or +1, the crank solution that a leg uses.
+        p_WS, R_WS, p_PQ, crank_lengths, rod_lengths, branches: see `kinematics.Legs`.
         base, plate, crank, rod: masses and inertias; the six cranks are alike, so are the rods.
         effort_limit: of each motor in N m, written to SDFormat and the default of a scenario's
             `actuator.torque_limit`; or None.

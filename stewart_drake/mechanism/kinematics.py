@@ -25,31 +25,18 @@ _HEIGHTS = 1000  # number of heights that `reachable_heights` evaluates
 
 @dataclass(frozen=True, eq=False)
 class Legs:
-    """Dimensions of the six legs, SI units.
+    """Dimensions of the six legs, SI units."""
 
-    Attributes:
-        p_WS: motor shaft centres (6, 3).
-        R_WS: motor frames (6, 3, 3); columns x, y and the motor axis z.
-        p_PQ: plate joints (6, 3) in the plate frame.
-        crank_lengths, rod_lengths: (6,).
-        branches: (6,) of -1 or +1, the crank solution that a leg uses.
-    """
-
-    p_WS: Array
-    R_WS: Array
-    p_PQ: Array
-    crank_lengths: Array
-    rod_lengths: Array
-    branches: Array
+    p_WS: Array  # motor shaft centres (6, 3)
+    R_WS: Array  # motor frames (6, 3, 3); columns x, y and the motor axis z
+    p_PQ: Array  # plate joints (6, 3) in the plate frame
+    crank_lengths: Array  # (6,)
+    rod_lengths: Array  # (6,)
+    branches: Array  # (6,) of -1 or +1, the crank solution that a leg uses
 
 
 class UnreachablePoseError(ValueError):
-    """Error for a pose out of reach.
-
-    Attributes:
-        margins: (6,) in m, negative for a leg that falls short.
-        legs: numbers of these legs, from one.
-    """
+    """Error for a pose out of reach: `margins` (6,) in m of `legs` (from one) are negative."""
 
     def __init__(self, margins: Array, prefix: str = "pose out of reach", suffix: str = "") -> None:
         self.margins = np.asarray(margins)
@@ -100,23 +87,14 @@ def angle_rate_map(angles: Array) -> Array:
 
 @dataclass(frozen=True)
 class LegGeometry:
-    """The six legs at some poses; unit vectors in W, arrays (..., 6, 3) or (..., 6).
+    """The six legs at some poses; unit vectors in W, arrays (..., 6, 3) or (..., 6)."""
 
-    Attributes:
-        crank_angles: rad.
-        p_PQ_W: plate joint from the plate's COM.
-        crank: direction of the crank.
-        tangent: direction in which the crank tip moves for growing crank angle.
-        rod: direction from the crank tip to the plate joint.
-        transmission: rod . tangent, zero at a dead centre, where crank and rod lie in one plane
-            with the motor axis.
-    """
-
-    crank_angles: Array
-    p_PQ_W: Array
-    crank: Array
-    tangent: Array
-    rod: Array
+    crank_angles: Array  # rad
+    p_PQ_W: Array  # plate joint from the plate's COM
+    crank: Array  # direction of the crank
+    tangent: Array  # direction in which the crank tip moves for growing crank angle
+    rod: Array  # direction from the crank tip to the plate joint
+    # rod . tangent, zero at a dead centre, where crank and rod lie in one plane with the motor axis
     transmission: Array
 
 
