@@ -45,7 +45,7 @@ from stewart_drake.live.simulated import (
     link_times,
 )
 from stewart_drake.loop.peer import FAULTS, Fault, Reason, identity_of, in_words
-from stewart_drake.loop.preparation import Experiment, prepare
+from stewart_drake.loop.preparation import Experiment
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.run_log import Background, RunLog, open_log
@@ -85,20 +85,6 @@ def socket_and_log(
             log = Background(open_log(options.log, scenario), str(options.log), say)
             opened.callback(log.close)
         yield endpoint, log
-
-
-@contextmanager
-def open_machine(
-    scenario: Scenario, options: MachineOptions, say: Callable[[str], None] = print
-) -> "Iterator[tuple[Machine, Address]]":
-    """Yield a machine and the address at which it listens.
-
-    Raises:
-        ConfigError: a scenario that the protocol does not cover, or an address in use.
-    """
-    check_scenario(scenario)
-    with socket_and_log(scenario, options, say) as (endpoint, log):
-        yield Machine(prepare(scenario), endpoint, options, say, log=log), endpoint.address
 
 
 def reason_of(failure: Failure) -> Reason:
