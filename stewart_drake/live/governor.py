@@ -38,7 +38,6 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import PITCH_LIMIT, home_sign, margins, measures_at
-from stewart_drake.law.catch_up import Model
 from stewart_drake.law.motion import between
 from stewart_drake.law.startup import sizes
 from stewart_drake.scenario.signals import (
@@ -160,10 +159,6 @@ class Governor:
         return tuple(np.geomspace(self.fastest, self.slowest, _PACES).tolist())
 
     @cached_property
-    def _model(self) -> Model:
-        return Model(self.dynamics)
-
-    @cached_property
     def _size(self) -> Array:
         return sizes(self.dynamics.mechanism)
 
@@ -193,7 +188,7 @@ class Governor:
         limit = TORQUE_SHARE * self.torque_limit
         if np.isinf(limit):
             return None
-        torques = np.abs(self._model.torques(states)).max(axis=0)
+        torques = np.abs(self.dynamics.torques_along(states)).max(axis=0)
         motor = int(np.argmax(torques))
         if torques[motor] <= _TORQUE_GUARD * limit:
             return None

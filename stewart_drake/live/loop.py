@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.dynamics.workspace import Failure, margins
 from stewart_drake.law.channel import Report
 from stewart_drake.law.core_law import serving
 from stewart_drake.law.sensing import Measurement
@@ -33,7 +33,6 @@ from stewart_drake.loop.recording import has_measured
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.run_log import RunLog
 from stewart_drake.scenario.signals import (
-    ACCELERATIONS,
     MODEL_TORQUE,
     NUM_REFERENCE,
     NUM_STATE,
@@ -428,15 +427,12 @@ class CrankLoop(LiveLoop):
 
     def _keeps_limits(self, way: Way, begins: float, duration: float) -> bool:
         """Return whether the start of a way is within reach and torque."""
-        plant = self._design.law.plant
-        for t in np.arange(begins, begins + duration, self._period):
-            x = way.at(t)
-            if diagnose(plant.mechanism, t, x[POSE]):
-                return False
-            torque = plant.dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
-            if np.abs(torque).max() > self._design.torque_limit:
-                return False
-        return True
+        plant, times = self._design.law.plant, np.arange(begins, begins + duration, self._period)
+        rows = np.array([way.at(t) for t in times])
+        if not margins(plant.mechanism, rows[:, POSE]).min() > 0:
+            return False
+        torques = plant.dynamics.torques_along(rows)
+        return not np.abs(torques).max() > self._design.torque_limit
 
     def _recover(self, t: float) -> None:
         """Do nothing: servos follow the reference by themselves."""
