@@ -17,7 +17,14 @@ from stewart_drake.dynamics.workspace import Failure, margins
 from stewart_drake.law.channel import Report
 from stewart_drake.law.core_law import serving
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.live.checks import LONGEST_GAP, ReportCheck, stays_within_reach
+from stewart_drake.live.checks import (
+    LONGEST_GAP,
+    ReportCheck,
+    recovered,
+    replanned,
+    stays_within_reach,
+    until_next,
+)
 from stewart_drake.live.contact import Contact
 from stewart_drake.live.design import Design
 from stewart_drake.live.endpoint import now
@@ -26,7 +33,6 @@ from stewart_drake.live.governor import Request, Steering, Way
 from stewart_drake.live.learned import LearnedSetpoints, LearnedTorques
 from stewart_drake.live.log import LiveRecord
 from stewart_drake.live.protocol import NEVER, SECOND, ControllerFlags, MachineMessage
-from stewart_drake.live.replanning import recovered, replanned, until_next
 from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.recording import has_measured
