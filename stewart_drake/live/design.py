@@ -33,7 +33,6 @@ from stewart_drake.loop.servos import commands_in_flight, servo_law
 from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.link_config import NetworkConfig, WireConfig
-from stewart_drake.scenario.packets import default_bound
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
@@ -94,7 +93,8 @@ def check_controller(scenario: Scenario) -> None:
 def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario:
     """Return the scenario with the measured link.
 
-    Its delay, or the bound of its network, is the time from a measurement to its torque.
+    Its delay, or the bound of its network, is the time from a measurement to its torque. A network
+    without a bound gets that of the measured link.
     """
     loss = max(scenario.sensor.loss, link.loss_back)
     sensor = replace(scenario.sensor, delay=0.0, loss=loss, faults=[])
@@ -115,7 +115,8 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
         burst=scenario.link.burst,
         dry="hold" if MachineFlags.HOLDS in machine.flags else "zero",
     )
-    eta, period = _whole_delay(scenario, network), c.period
+    chosen = scenario.link.kind == "wire" or scenario.link.playout is not None
+    eta, period = (scenario if chosen else replace(scenario, link=network)).eta, c.period
     if c.command == "cranks":
         _check_delay(eta, longest, period, 0)
         delay = DelayConfig(steps=round(eta / period))
@@ -137,16 +138,6 @@ def _check_delay(eta: float, longest: float, period: float, repeats: int) -> Non
             f"{longest:.3g} s there and back: expected at least --set delay.steps="
             f"{math.ceil(longest / period) + repeats}"
         )
-
-
-def _whole_delay(scenario: Scenario, found: NetworkConfig) -> float:
-    """Return the time from a measurement to its torque, of the scenario or else of the link, s."""
-    c, link = scenario.controller, scenario.link
-    if link.kind == "wire":
-        return scenario.eta
-    if link.playout is not None:
-        return link.playout + c.packet_repeats * c.period
-    return default_bound(found, c.packet_repeats, c.period) + c.packet_repeats * c.period
 
 
 def always(signal: LearnedSignal | None) -> Learned:
