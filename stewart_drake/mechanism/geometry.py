@@ -41,7 +41,7 @@ class Body:
     estimated: bool = False  # whether the moments are those of a uniform body, not measured ones
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "inertia", _fixed("inertia", self.inertia, (3,)))
+        object.__setattr__(self, "inertia", fixed("inertia", self.inertia, (3,)))
 
     def problem(self, field: str, *, massless: bool = False) -> str | None:
         """Return why no rigid body has this mass and inertia, opened by `field`, or None."""
@@ -115,7 +115,7 @@ class Mechanism(kinematics.Legs):
             *(("p_WS", (NUM_LEGS, 3)), ("R_WS", (NUM_LEGS, 3, 3)), ("p_PQ", (NUM_LEGS, 3))),
             *((name, (NUM_LEGS,)) for name in ("crank_lengths", "rod_lengths", "branches")),
         ):
-            object.__setattr__(self, name, _fixed(name, getattr(self, name), shape))
+            object.__setattr__(self, name, fixed(name, getattr(self, name), shape))
         self._check()
 
     def __repr__(self) -> str:
@@ -337,11 +337,14 @@ def _six(name: str, values: ArrayLike) -> Array:
     return numbers
 
 
-def _fixed(field: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+def fixed(field: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Return a read-only copy of finite numbers of this shape."""
-    copy = np.array(values, dtype=np.float64)
+    try:
+        copy = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigError(f"{field}: got {values!r}; expected numbers") from None
     if copy.shape != shape:
-        raise ConfigError(f"{field}: got shape {copy.shape}; expected {shape}")
+        raise ConfigError(f"{field}: got shape {copy.shape}; expected {shape or 'one number'}")
     if not np.all(np.isfinite(copy)):
         raise ConfigError(f"{field}: got {_listed(copy)}; expected finite numbers")
     copy.setflags(write=False)
