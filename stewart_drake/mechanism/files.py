@@ -15,7 +15,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import load_yaml, one_message, validate, yaml_text
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism, bar_inertia, disc_inertia
-from stewart_drake.mechanism.kinematics import Legs, UnreachablePoseError
+from stewart_drake.mechanism.kinematics import Legs, UnreachablePoseError, dot
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.types import Array
 
@@ -336,7 +336,7 @@ def _explicit_legs(
         return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
     n, x = unit("motor_axis"), unit("crank_zero")
-    lean = np.einsum("li,li->l", n, x)
+    lean = dot(n, x)
     for i in np.flatnonzero(np.abs(lean) > _MOST_LEAN)[:1]:
         raise ConfigError(
             f"legs[{i}].crank_zero: got {np.rad2deg(np.arccos(lean[i])):.6g} degrees to "

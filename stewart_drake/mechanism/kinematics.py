@@ -98,6 +98,11 @@ class LegGeometry:
     transmission: Array
 
 
+def dot(a: Array, b: Array) -> Array:
+    """Return the scalar products (...) of vectors (..., 3)."""
+    return np.einsum("...i,...i->...", a, b)
+
+
 def _joints(legs: Legs, poses: Array) -> tuple[Array, Array]:
     """Return p_PQ_W and p_SQ_S (..., 6, 3), the latter in each motor frame."""
     p_PQ_W = legs.p_PQ @ rotation(poses[..., ANGLES]).swapaxes(-1, -2)
@@ -153,7 +158,7 @@ def legs_along(legs: Legs, poses: Array) -> LegGeometry:
     u, rod = legs.crank_lengths, legs.rod_lengths
     p_PQ_W, p_SQ_S = _joints(legs, poses)
     a, b = 2 * u * p_SQ_S[..., 0], 2 * u * p_SQ_S[..., 1]
-    c = np.einsum("...li,...li->...l", p_SQ_S, p_SQ_S) + u**2 - rod**2
+    c = dot(p_SQ_S, p_SQ_S) + u**2 - rod**2
     # Rounding may lift |c| over hypot(a, b) by one ulp where the margin is exactly zero.
     swing = np.arccos(np.clip(c / np.hypot(a, b), -1.0, 1.0))
     swing = np.where(_margins(legs, p_SQ_S) >= 0, swing, np.nan)
@@ -164,7 +169,7 @@ def legs_along(legs: Legs, poses: Array) -> LegGeometry:
     crank, tangent = cos * x + sin * y, -sin * x + cos * y
     p_TQ_W = poses[..., None, POSITION] + p_PQ_W - legs.p_WS - u[:, None] * crank
     e_rod = p_TQ_W / rod[:, None]
-    transmission = np.einsum("...li,...li->...l", e_rod, tangent)
+    transmission = dot(e_rod, tangent)
     return LegGeometry(alpha, p_PQ_W, crank, tangent, e_rod, transmission)
 
 
