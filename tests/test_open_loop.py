@@ -176,26 +176,3 @@ def test_where_there_is_no_number_steps_are_cut_to_a_fifth():
     ended = plant.call("open_loop", *in_c([Drive(np.full(6, np.nan))]))
     assert ended == Ended.TOO_SHORT_STEPS
     assert plant.run.evaluations < 30 * 11
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"start": np.zeros(6)}, "start: got shape"),
-        ({"start": AT_HOME + 10}, "start: got pose"),
-        ({"times": [0.2, 0.1]}, "times: got"),
-        ({"times": []}, "times: got"),
-        ({"times": [-1.0]}, "times: got"),
-        ({"times": [np.nan]}, "times: got"),
-        ({"accuracy": 0.0}, "accuracy: got 0.0"),
-        ({"longest_step": 0.0}, "longest_step: got 0.0"),
-        ({"drives": []}, "drives: got starts"),
-        ({"drives": [Drive(start=0.1)]}, "drives: got starts"),
-        ({"drives": [Drive(), Drive()]}, "drives: got starts"),
-        ({"drives": [Drive(constant=[1.0])]}, "drives: constant: got shape"),
-    ],
-)
-def test_what_cannot_be_is_refused(changes, message):
-    given = {"start": AT_HOME, "drives": [Drive()], "times": [0.1]} | changes
-    with pytest.raises(ValueError, match=message):
-        integrate(HEAVY, **given)

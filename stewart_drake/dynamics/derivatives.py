@@ -17,12 +17,10 @@ The torque is that at the shaft, with d = damping, c = coulomb_friction, s = cou
 Slips are arguments here: no compiler vectorises tanh over the legs, so it is computed outside.
 """
 
-from typing import NamedTuple
-
 import casadi as ca
 
 from stewart_drake.dynamics import equations
-from stewart_drake.dynamics.equations import CommonNumbers, LegNumbers
+from stewart_drake.dynamics.equations import CommonNumbers, LegNumbers, PlateMotion
 from stewart_drake.scenario.signals import (
     COULOMB,
     COULOMB_SPEED,
@@ -33,47 +31,37 @@ from stewart_drake.scenario.signals import (
 )
 
 
-class Plate(NamedTuple):
-    """Motion of the plate with accelerations, in W."""
-
-    R_WP: ca.SX
-    w: ca.SX
-    w_dot: ca.SX
-    gravity: ca.SX
-
-
-def _plate(s: dict[str, ca.SX]) -> Plate:
-    pose, rates, accelerations = s["pose"], s["rates"], s["accelerations"]
-    E = equations.angle_rate_map(pose[:3])
-    w = ca.mtimes(E, rates[:3])
-    w_dot = ca.mtimes(E, accelerations[:3]) + ca.jtimes(w, pose[:3], rates[:3])
-    return Plate(equations.rotation(pose[:3]), w, w_dot, ca.vertcat(0, 0, -s["gravity"]))
+def _plate(s: dict[str, ca.SX]) -> tuple[PlateMotion, ca.SX]:
+    """Return the motion of the plate, and its angular acceleration, in W."""
+    pose, rates = s["pose"], s["rates"]
+    plate = equations.plate_motion(pose, rates, s["gravity"])
+    w_dot = ca.mtimes(equations.angle_rate_map(pose[:3]), s["accelerations"][:3])
+    w_dot += ca.jtimes(plate.w, pose[:3], rates[:3])
+    return plate, w_dot
 
 
 def plate_alone(common: CommonNumbers, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
     """Return the plate's part of dF/d[pose; rates] (6, 12) and of M (6, 6)."""
-    R_WP, w, _, g_W = plate = _plate(s)
-    payload = s["parameters"][PAYLOAD]
+    plate, w_dot = _plate(s)
+    R_WP, w, payload = plate.R_WP, plate.w, s["parameters"][PAYLOAD]
     I_W = ca.mtimes([R_WP, ca.diag(common.plate_inertia), R_WP.T])
     mass = common.plate_mass + payload
-    (r, turned), at_com = _payload(plate, s), s["accelerations"][3:] - g_W
-    moment = ca.mtimes(I_W, plate.w_dot) + ca.cross(w, ca.mtimes(I_W, w))
+    (r, turned), at_com = _payload(plate, w_dot, s), s["accelerations"][3:] - plate.gravity
+    moment = ca.mtimes(I_W, w_dot) + ca.cross(w, ca.mtimes(I_W, w))
     moment += ca.cross(r, payload * (at_com + turned))
     whole = ca.vertcat(moment, mass * at_com + payload * turned)
     state = ca.vertcat(s["pose"], s["rates"])
-    lever = payload * equations.cross_matrix(r)
-    M_ww = I_W + ca.mtimes(lever, equations.cross_matrix(r).T)
-    M = ca.vertcat(ca.horzcat(M_ww, lever), ca.horzcat(lever.T, mass * ca.SX.eye(3)))
+    M = equations.plate_alone(common, plate, s["parameters"]).mass
     return ca.jacobian(whole, state), M
 
 
-def _payload(plate: Plate, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
+def _payload(plate: PlateMotion, w_dot: ca.SX, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
     """Return the place r of the payload from the COM, and its relative acceleration, in W."""
     r = ca.mtimes(plate.R_WP, s["parameters"][PAYLOAD_POSITION])
-    return r, ca.cross(plate.w_dot, r) + ca.cross(plate.w, ca.cross(plate.w, r))
+    return r, ca.cross(w_dot, r) + ca.cross(plate.w, ca.cross(plate.w, r))
 
 
-def _joint(leg: LegNumbers, plate: Plate, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX, ca.SX]:
+def _joint(leg: LegNumbers, plate: PlateMotion, s: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Return b (3,) in W, and position q and velocity (3,) of Q in S."""
     b = ca.mtimes(plate.R_WP, leg.p_PQ)
     q = ca.mtimes(leg.R_WS.T, s["pose"][3:] + b - leg.p_WS)
@@ -82,7 +70,7 @@ def _joint(leg: LegNumbers, plate: Plate, s: dict[str, ca.SX]) -> tuple[ca.SX, c
 
 def crank_rate(leg: LegNumbers, common: CommonNumbers, s: dict[str, ca.SX]) -> ca.SX:
     """Return alpha_dot of a leg, rad/s."""
-    _, q, velocity = _joint(leg, _plate(s), s)
+    _, q, velocity = _joint(leg, _plate(s)[0], s)
     numbers = (*leg.symbols, *common.symbols)
     reduced = equations.Leg(*equations.leg_at_joint(leg, common)(q, velocity, 0, *numbers))
     return ca.dot(reduced.arm, velocity)
@@ -95,13 +83,13 @@ def leg_on_plate(
     torque: ca.SX,
     bias: ca.SX,
     slip: ca.SX,
-) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
-    """Return a leg's parts of dF/d[pose; rates] and M, its row (1, 6) of B', and its crank's rate.
+) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+    """Return a leg's parts of dF/d[pose; rates] and M, and its row (1, 6) of B'.
 
     The first has two parts: (6, 12), less (3, 12) in the first rows, because b turns.
     """
-    plate, R_WS = _plate(s), leg.R_WS
-    w, w_dot = plate.w, plate.w_dot
+    (plate, w_dot), R_WS = _plate(s), leg.R_WS
+    w = plate.w
     state = ca.vertcat(s["pose"], s["rates"])
     b, q, velocity = _joint(leg, plate, s)
     v_dot = s["accelerations"][3:] + ca.cross(w_dot, b) + ca.cross(w, ca.cross(w, b))
@@ -111,27 +99,27 @@ def leg_on_plate(
     f, df, m, g = _leg_residual(leg, common)(
         q, velocity, acceleration, torque, bias, slip, s["parameters"], gravity, *numbers
     )
-    at_joint = ca.vertcat(ca.mtimes(equations.cross_matrix(b), R_WS), R_WS)  # [b x R .; R .]
+    at_joint = ca.vertcat(ca.mtimes(ca.skew(b), R_WS), R_WS)  # [b x R .; R .]
     motion = ca.jacobian(ca.vertcat(q, velocity), state)
     change = ca.mtimes(df, motion) + ca.mtimes(m, ca.jacobian(acceleration, state))
-    turn = ca.mtimes(equations.cross_matrix(ca.mtimes(R_WS, f)), ca.jacobian(b, state))
+    turn = ca.mtimes(ca.skew(ca.mtimes(R_WS, f)), ca.jacobian(b, state))
     mass = ca.mtimes([at_joint, m, at_joint.T])
-    return ca.mtimes(at_joint, change), turn, mass, ca.mtimes(at_joint, g).T, ca.dot(g, velocity)
+    return ca.mtimes(at_joint, change), turn, mass, ca.mtimes(at_joint, g).T
 
 
 def assembled(
-    dF_dx: ca.SX, M: ca.SX, arm: ca.SX, arm_rates: ca.SX, slips: ca.SX, s: dict[str, ca.SX]
-) -> list[ca.SX]:
-    """Return the results of `residual_derivatives` from sums over plate and legs.
+    M: ca.SX, arm: ca.SX, arm_rates: ca.SX, slips: ca.SX, s: dict[str, ca.SX]
+) -> tuple[ca.SX, ca.SX]:
+    """Return dF/d[parameters] and M N from sums over plate and legs.
 
     The payload m takes the force m k, with k its acceleration less gravity. Its place changes k:
 
         dr = R dp,   dk = ([w_dot x] + [w x]^2) dr,   d[r x m k; m k] = m [dr x k + r x dk; dk].
     """
-    plate, p, cross = _plate(s), s["parameters"], equations.cross_matrix
-    r, turned = _payload(plate, s)
+    (plate, w_dot), p, cross = _plate(s), s["parameters"], ca.skew
+    r, turned = _payload(plate, w_dot, s)
     k = s["accelerations"][3:] - plate.gravity + turned
-    K = cross(plate.w_dot) + ca.mtimes(cross(plate.w), cross(plate.w))
+    K = cross(w_dot) + ca.mtimes(cross(plate.w), cross(plate.w))
     moving = ca.vertcat(ca.mtimes(cross(r), K) - cross(k), K)
     steep = p[COULOMB] * (1 - slips**2) * arm_rates / p[COULOMB_SPEED] ** 2
     dF_dp = ca.horzcat(
@@ -143,7 +131,7 @@ def assembled(
         -ca.SX.eye(6),  # a wrench at constant accelerations
     )
     E = equations.angle_rate_map(s["pose"][:3])
-    return [dF_dx, dF_dp, ca.mtimes(M, ca.diagcat(E, ca.SX.eye(3))), arm]
+    return dF_dp, ca.mtimes(M, ca.diagcat(E, ca.SX.eye(3)))
 
 
 def _leg_residual(leg: LegNumbers, common: CommonNumbers) -> ca.Function:

@@ -19,8 +19,14 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from stewart_drake.core.layout import COMMON_NUMBERS, DEAD_CENTRE_SINE, LEG_NUMBERS, SHAPES
-from stewart_drake.mechanism.geometry import Mechanism, plate_radius
+from stewart_drake.core.layout import (
+    COMMON_NUMBERS,
+    DEAD_CENTRE_SINE,
+    GEOMETRY,
+    LEG_NUMBERS,
+    SHAPES,
+)
+from stewart_drake.mechanism.geometry import Mechanism, geometry_of
 from stewart_drake.scenario.signals import (
     BIAS,
     COULOMB,
@@ -32,143 +38,115 @@ from stewart_drake.scenario.signals import (
     WRENCH,
 )
 
-Number = float | ca.SX
 Numbers = ca.DM | ca.SX
 
 
 class LegNumbers(NamedTuple):
     """Numbers of one leg; see `Mechanism`."""
 
-    crank_length: Number
-    rod_length: Number
-    branch: Number
+    crank_length: Numbers
+    rod_length: Numbers
+    branch: Numbers
     R_WS: Numbers
     p_PQ: Numbers
     p_WS: Numbers
-    symbols: tuple[ca.SX, ...] = ()
-    """Further arguments of a function of the numbers: none for floats."""
+    symbols: tuple[
+        ca.SX, ...
+    ]  # further arguments of a function of the numbers: none for known ones
 
 
 class CommonNumbers(NamedTuple):
     """Numbers of plate, cranks and rods; the crank's inertia is that about the motor axis."""
 
-    plate_mass: Number
+    plate_mass: Numbers
     plate_inertia: Numbers
-    crank_mass: Number
-    crank_center: Number
-    crank_inertia: Number
-    rod_mass: Number
-    rod_center: Number
-    rod_inertia: tuple[Number, Number, Number]
-    radius: Number
-    """Mean distance of the plate's joints from its COM, m."""
-    symbols: tuple[ca.SX, ...] = ()
+    crank_mass: Numbers
+    crank_center: Numbers
+    crank_inertia: Numbers
+    rod_mass: Numbers
+    rod_center: Numbers
+    rod_inertia: tuple[Numbers, Numbers, Numbers]
+    radius: Numbers  # mean distance of the plate's joints from its COM, m
+    symbols: tuple[ca.SX, ...]
 
 
 def numbers_of(mechanism: Mechanism) -> tuple[list[LegNumbers], CommonNumbers]:
-    """Return the numbers of a machine, floats."""
-    m = mechanism
-    legs = [
-        LegNumbers(float(u), float(rod), float(branch), ca.DM(R_WS), ca.DM(p_PQ), ca.DM(p_WS))
-        for u, rod, branch, R_WS, p_PQ, p_WS in zip(
-            m.crank_lengths, m.rod_lengths, m.branches, m.R_WS, m.p_PQ, m.p_WS, strict=True
-        )
-    ]
-    I_a, I_y, I_t = (float(moment) for moment in m.rod.inertia)
-    common = CommonNumbers(
-        m.plate.mass,
-        ca.DM(m.plate.inertia),
-        m.crank.mass,
-        m.crank.center,
-        float(m.crank.inertia[2]),
-        m.rod.mass,
-        m.rod.center,
-        (I_a, I_y, I_t),
-        plate_radius(m),
+    """Return the numbers of a machine."""
+    legs, common = ca.vertsplit(
+        ca.DM(geometry_of(mechanism)), [0, NUM_LEGS * LEG_NUMBERS, GEOMETRY]
     )
-    return legs, common
+    by_leg = ca.horzsplit(ca.reshape(legs, NUM_LEGS, LEG_NUMBERS).T)
+    return [leg_numbers(one) for one in by_leg], common_numbers(common)
 
 
-def leg_numbers(symbols: ca.SX) -> LegNumbers:
+def leg_numbers(numbers: Numbers) -> LegNumbers:
     """Return the numbers of a leg from its part (20,) of the geometry."""
     u, rod, branch, R_WS, p_PQ, p_WS, _ = ca.vertsplit(
-        symbols, [0, 1, 2, 3, 12, 15, 18, LEG_NUMBERS]
+        numbers, [0, 1, 2, 3, 12, 15, 18, LEG_NUMBERS]
     )
-    return LegNumbers(u, rod, branch, ca.reshape(R_WS, 3, 3), p_PQ, p_WS, (symbols,))
+    return LegNumbers(u, rod, branch, ca.reshape(R_WS, 3, 3), p_PQ, p_WS, _symbols_of(numbers))
 
 
-def common_numbers(symbols: ca.SX) -> CommonNumbers:
+def common_numbers(numbers: Numbers) -> CommonNumbers:
     """Return the numbers of all legs and the plate from the last part (13,) of the geometry."""
     ends = [0, 1, *range(4, COMMON_NUMBERS + 1)]
-    plate, inertia, m, center, I_crank, rod, f, I_a, I_y, I_t, radius = ca.vertsplit(symbols, ends)
-    moments = I_a, I_y, I_t
-    return CommonNumbers(plate, inertia, m, center, I_crank, rod, f, moments, radius, (symbols,))
+    plate, inertia, m, center, I_crank, rod, f, I_a, I_y, I_t, radius = ca.vertsplit(numbers, ends)
+    rods = rod, f, (I_a, I_y, I_t)
+    return CommonNumbers(plate, inertia, m, center, I_crank, *rods, radius, _symbols_of(numbers))
+
+
+def _symbols_of(numbers: Numbers) -> tuple[ca.SX, ...]:
+    return (numbers,) if isinstance(numbers, ca.SX) else ()
 
 
 class Leg(NamedTuple):
     """One leg reduced to its plate joint, in its motor frame S."""
 
-    mass: ca.SX
-    """m (3, 3) kg."""
-    bias: ca.SX
-    """c (3,) N, gravity included."""
-    arm: ca.SX
-    """g (3,) 1/m: crank rate alpha_dot = g' w, and force at Q per torque on the crank."""
-    potential: ca.SX
-    """J."""
+    mass: ca.SX  # m (3, 3), kg
+    bias: ca.SX  # c (3,), N, gravity included
+    arm: ca.SX  # g (3,), 1/m: crank rate alpha_dot = g' w, and force at Q per torque on the crank
+    potential: ca.SX  # J
 
 
 class Motion(NamedTuple):
     """Terms of (EOM) at symbolic pose, rates, parameters and gravity."""
 
-    mass: ca.SX
-    """M (6, 6)."""
-    bias: ca.SX
-    """h (6,)."""
-    arm: ca.SX
-    """B' (6, 6): d alpha_dot / d nu."""
-    crank_rates: ca.SX
-    """alpha_dot (6,) rad/s."""
-    nu_dot_bias: ca.SX
-    """(6,): nu_dot at zero accelerations of the pose."""
-    rates_map: ca.SX
-    """N (6, 6): nu = N rates."""
-    energy: ca.SX
-    """J, kinetic plus potential."""
+    mass: ca.SX  # M (6, 6)
+    bias: ca.SX  # h (6,)
+    arm: ca.SX  # B' (6, 6): d alpha_dot / d nu
+    crank_rates: ca.SX  # alpha_dot (6,), rad/s
+    nu_dot_bias: ca.SX  # nu_dot (6,) at zero accelerations of the pose
+    rates_map: ca.SX  # N (6, 6): nu = N rates
+    energy: ca.SX  # kinetic plus potential, J
 
 
 class Sums(NamedTuple):
-    """Sums over plate and legs."""
+    """Sums over plate and legs: blocks (3, 3) of M, parts (3,) of h, and the energy, J."""
 
     M_ww: ca.SX
-    """(3, 3), as the next two: blocks of M."""
     M_wv: ca.SX
     M_vv: ca.SX
     h_w: ca.SX
-    """(3,), as the next one: parts of h."""
     h_v: ca.SX
     energy: ca.SX
-    """J."""
 
     def plus(self, other: "Sums") -> "Sums":
         return Sums(*(a + b for a, b in zip(self, other, strict=True)))
+
+    @property
+    def mass(self) -> ca.SX:
+        """M (6, 6)."""
+        return ca.vertcat(ca.horzcat(self.M_ww, self.M_wv), ca.horzcat(self.M_wv.T, self.M_vv))
 
 
 class PlateMotion(NamedTuple):
     """Motion of the plate, in W."""
 
     R_WP: ca.SX
-    position: ca.SX
-    """(3,) m."""
+    position: ca.SX  # (3,), m
     w: ca.SX
     v: ca.SX
-    gravity: ca.SX
-    """(3,) m/s^2."""
-
-
-def cross_matrix(a: ca.SX) -> ca.SX:
-    """Return (3, 3) with cross_matrix(a) b = a x b."""
-    return ca.skew(a)
+    gravity: ca.SX  # (3,), m/s^2
 
 
 def _held_above(x: ca.SX, threshold: float) -> ca.SX:
@@ -255,12 +233,12 @@ def leg_at_joint(leg: LegNumbers, common: CommonNumbers) -> ca.Function:
     return ca.Function("leg", arguments, [mass, bias, g, potential], {"cse": True})
 
 
-def swing_cosine(q: ca.SX, u: Number, length: Number) -> ca.SX:
+def swing_cosine(q: ca.SX, u: Numbers, length: Numbers) -> ca.SX:
     """Return cos(delta) = C / hypot(A, B); beyond [-1, 1] the leg does not reach q."""
     return (ca.sumsqr(q) + u**2 - length**2) / (2 * u * ca.sqrt(q[0] ** 2 + q[1] ** 2))
 
 
-def crank_directions(q: ca.SX, u: Number, length: Number, branch: Number) -> tuple[ca.SX, ca.SX]:
+def crank_directions(q: ca.SX, u: Numbers, length: Numbers, branch: Numbers) -> tuple[ca.SX, ca.SX]:
     """Return directions c of the crank and t of its tip's motion, equation (2) without its angles.
 
     alpha = azimuth of Q + branch * delta with cos(delta) = C / hypot(A, B).
@@ -279,13 +257,13 @@ def crank_directions(q: ca.SX, u: Number, length: Number, branch: Number) -> tup
 
 
 def _unequal_sides(
-    inertia: Number,
+    inertia: Numbers,
     r: ca.SX,
     across: ca.SX,
     horizontal: ca.SX,
     d: ca.SX,
     a_T: ca.SX,
-    length: Number,
+    length: Numbers,
 ) -> tuple[ca.SX, ca.SX]:
     """Return mass (3, 3) and bias (3,), before D', of an inertia about y = n x r / |n x r|.
 
@@ -338,10 +316,10 @@ def plate_alone(common: CommonNumbers, plate: PlateMotion, parameters: ca.SX) ->
     mass = common.plate_mass + payload
     I_W = ca.mtimes([R_WP, ca.diag(common.plate_inertia), R_WP.T])
     r = ca.mtimes(R_WP, parameters[PAYLOAD_POSITION])
-    lever, turning = payload * cross_matrix(r), ca.cross(w, r)
+    lever, turning = payload * ca.skew(r), ca.cross(w, r)
     pull = payload * ca.cross(w, turning)
     return Sums(
-        M_ww=I_W + ca.mtimes(lever, cross_matrix(r).T),
+        M_ww=I_W + ca.mtimes(lever, ca.skew(r).T),
         M_wv=lever,
         M_vv=mass * ca.SX.eye(3),
         h_w=ca.cross(w, ca.mtimes(I_W, w)) + ca.cross(r, pull - payload * g_W),
@@ -366,10 +344,10 @@ def leg_on_plate(
     at_joint = Leg(*reduced(*arguments))
     m = _symmetric(ca.mtimes([R_WS, at_joint.mass, R_WS.T]))
     f = ca.mtimes(R_WS, at_joint.bias) + ca.mtimes(m, ca.cross(w, ca.cross(w, b)))
-    bx_m = ca.mtimes(cross_matrix(b), m)
+    bx_m = ca.mtimes(ca.skew(b), m)
     arm = ca.mtimes(R_WS, at_joint.arm)
     added = Sums(
-        M_ww=ca.mtimes(bx_m, cross_matrix(b).T),
+        M_ww=ca.mtimes(bx_m, ca.skew(b).T),
         M_wv=bx_m,
         M_vv=m,
         h_w=ca.cross(b, f),
@@ -384,9 +362,8 @@ def assembled(sums: Sums, arm: ca.SX, crank_rates: ca.SX, pose: ca.SX, rates: ca
     """Return (EOM) of plate and legs; `arm` is B'."""
     E = angle_rate_map(pose[:3])
     w = ca.mtimes(E, rates[:3])
-    M = ca.vertcat(ca.horzcat(sums.M_ww, sums.M_wv), ca.horzcat(sums.M_wv.T, sums.M_vv))
     return Motion(
-        mass=_symmetric(M),
+        mass=_symmetric(sums.mass),
         bias=ca.vertcat(sums.h_w, sums.h_v),
         arm=arm,
         crank_rates=crank_rates,

@@ -88,11 +88,7 @@ class FrozenMap:
 
 
 class FrozenDynamics(StewartDynamics):
-    """Dynamics of the paper's plant: the map at home, at any pose, in or out of reach.
-
-    Attributes:
-        map: (6, 6) accelerations per torque.
-    """
+    """Dynamics of the paper's plant: the map (6, 6) at home, at any pose, in or out of reach."""
 
     def __init__(self, mechanism: Mechanism, *arguments: Any, **named: Any) -> None:
         super().__init__(mechanism, *arguments, **named)
@@ -110,15 +106,10 @@ class FrozenDynamics(StewartDynamics):
 
 
 class Band(NamedTuple):
-    """Limits of a plate without a workspace: a band about its reference.
+    """Limits of a plate without a workspace: a band about its reference."""
 
-    Attributes:
-        reference: pose (6,) of the reference at a time in s.
-        width: (6,) rad and m, largest error in either direction.
-    """
-
-    reference: Callable[[float], Array]
-    width: Array
+    reference: Callable[[float], Array]  # pose (6,) at a time in s
+    width: Array  # largest error (6,) in either direction, rad and m
 
     def margin(self, time: float, pose: Array) -> float:
         """Return a margin in widths, positive inside."""

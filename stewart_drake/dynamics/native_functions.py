@@ -1,7 +1,6 @@
 """Compiled functions of a mechanism's dynamics, and the limit of threads for linear algebra."""
 
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from typing import Final, NamedTuple
@@ -37,14 +36,21 @@ class Buffers(NamedTuple):
     owner: object
 
 
-class Buffered(ABC):
-    """Function with fixed places for arguments and results, one set per thread.
+class NativeFunction:
+    """A function of core/dynamics.h for one machine, with fixed places for arguments and results.
 
-    The place of a matrix has its columns one after the other.
+    Each thread has its own places. That of a matrix has its columns one after the other.
+
+    Args:
+        name: in `core.layout.SIGNATURES`.
+        geometry: numbers of the machine.
+        points: number n of points that a call evaluates; arguments but parameters and gravity, and
+            results, are then (n, ...). None for one point.
     """
 
-    def __init__(self) -> None:
-        self._own = threading.local()
+    def __init__(self, name: str, geometry: Array, points: int | None = None) -> None:
+        self._name, self._geometry, self._own = name, geometry, threading.local()
+        self._points = () if points is None else (points,)
 
     def __call__(self, *arguments: ArrayLike) -> Sequence[Array]:
         places, results, evaluate, _ = self.own_buffers()
@@ -58,30 +64,10 @@ class Buffered(ABC):
         try:
             return self._own.buffers
         except AttributeError:
-            self._own.buffers = self.buffers()
+            self._own.buffers = self._buffers()
             return self._own.buffers
 
-    @abstractmethod
-    def buffers(self) -> Buffers:
-        """Make the buffers of one more thread."""
-
-
-class NativeFunction(Buffered):
-    """A function of core/dynamics.h for one machine.
-
-    Args:
-        name: in `core.layout.SIGNATURES`.
-        geometry: numbers of the machine.
-        points: number n of points that a call evaluates; arguments but parameters and gravity, and
-            results, are then (n, ...). None for one point.
-    """
-
-    def __init__(self, name: str, geometry: Array, points: int | None = None) -> None:
-        super().__init__()
-        self._name, self._geometry = name, geometry
-        self._points = () if points is None else (points,)
-
-    def buffers(self) -> Buffers:
+    def _buffers(self) -> Buffers:
         (names, shapes), c = SIGNATURES[self._name], core()
         lead = dict.fromkeys(names, self._points) | {"parameters": (), "gravity": ()}
         given = {name: np.zeros((*lead[name], *SHAPES[name])) for name in names}
@@ -110,11 +96,8 @@ class NativeFunction(Buffered):
 class NativeFunctions:
     """Functions of one machine, by the names of `core.layout.SIGNATURES`.
 
-    `measures` are the eight of the workspace (`equations.measures`); `measures_of_tree` takes known
-    crank angles (6,) too.
-
-    Raises:
-        ConfigError: the compiled core is missing.
+    `measures` are the eight of the workspace (`equations.workspace_measures`); `measures_of_tree`
+    takes known crank angles (6,) too.
     """
 
     accelerations: Call
@@ -126,13 +109,14 @@ class NativeFunctions:
 
     def __init__(self, mechanism: Mechanism) -> None:
         geometry = geometry_of(mechanism)
-        for name in SIGNATURES:
-            setattr(self, f"_{name}" if name == "change" else name, NativeFunction(name, geometry))
+        for name in SIGNATURES.keys() - {"change"}:
+            setattr(self, name, NativeFunction(name, geometry))
+        self._change = NativeFunction("change", geometry)
         self._first = core().at(geometry)
 
     def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
         """Return d[pose; rates]/dt (12,), in half the time of a `Call`."""
-        places, results, evaluate, _ = self._change.own_buffers()  # type: ignore[attr-defined]
+        places, results, evaluate, _ = self._change.own_buffers()
         places[0][...], places[1][...] = state, torque
         places[2][...], places[3][...] = parameters, gravity
         evaluate()

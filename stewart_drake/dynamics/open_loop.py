@@ -7,14 +7,13 @@ torques to the next and stops where the plate leaves its workspace (docs/theory.
 import math
 from collections.abc import Sequence
 from enum import IntEnum
-from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.dynamics.workspace import LEAST, Failure, diagnose, home_sign, margin
+from stewart_drake.dynamics.workspace import LEAST, Failure, diagnose, home_sign
 from stewart_drake.mechanism.geometry import geometry_of
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE, WRENCH
 from stewart_drake.types import Array, ArrayLike
@@ -48,7 +47,6 @@ class NativePlant:
     Attributes:
         states: (n, 12) result; the first `seen` are valid.
         wrench: (6,) on the plate, a view of the parameters that the run reads.
-        run: the `stewart_run`.
     """
 
     def __init__(
@@ -78,7 +76,6 @@ class NativePlant:
 
     @property
     def seen(self) -> int:
-        """Number of valid states."""
         return int(self.run.seen)
 
     @property
@@ -93,15 +90,7 @@ class NativePlant:
 
 
 class Drive(NamedTuple):
-    """Motor torques constant + amplitude sin(frequency t + phase), from `start` on.
-
-    Attributes:
-        constant: (6,) N m.
-        amplitude: (6,) N m.
-        frequency: rad/s.
-        phase: (6,) rad.
-        start: s.
-    """
+    """Motor torques constant + amplitude sin(frequency t + phase) in N m, from `start` in s on."""
 
     constant: ArrayLike = _NONE
     amplitude: ArrayLike = _NONE
@@ -116,25 +105,14 @@ class Drive(NamedTuple):
 
 
 class Course(NamedTuple):
-    """Result of `integrate`.
+    """Result of `integrate`."""
 
-    Attributes:
-        times: (n,) s, the requested times up to the end.
-        states: (n, 12) at those times.
-        end: s, the last requested time, or the instant at which the plate left its workspace.
-        final: (12,) state at the end.
-        failure: why the plate left its workspace, or None.
-        steps: number of steps.
-        evaluations: number of evaluations of the dynamics.
-    """
-
-    times: Array
-    states: Array
-    end: float
-    final: Array
-    failure: Failure | None
+    times: Array  # the requested times (n,) up to the end, s
+    states: Array  # (n, 12) at those times
+    end: float  # last requested time, or the instant at which the plate left its workspace, s
+    final: Array  # state (12,) at the end
+    failure: Failure | None  # why the plate left its workspace
     steps: int
-    evaluations: int
 
 
 def integrate(
@@ -159,13 +137,9 @@ def integrate(
         longest_step: s.
 
     Raises:
-        ValueError: a wrong shape, order or range.
         IntegrationError: no step is short enough for the accuracy.
     """
     x0, looks = np.array(start, dtype=np.float64), np.array(times, dtype=np.float64)
-    _check(x0, drives, looks, accuracy, longest_step)
-    if not margin(dynamics.mechanism, x0[POSE]) > 0:
-        raise ValueError(f"start: got pose {x0[POSE]}; expected one in the workspace")
     plant = NativePlant(dynamics, x0, looks, accuracy, longest_step)
     return _course(plant, dynamics, plant.call("open_loop", *in_c(drives)), looks, accuracy)
 
@@ -179,19 +153,9 @@ def follow(
     accuracy: float,
     longest_step: float,
 ) -> Course:
-    """Integrate the exact plant under servos with a constant setpoint, as `integrate`.
+    """Integrate the exact plant up to `end` in s under servos, as `integrate`.
 
-    Args:
-        dynamics: equations of motion, with the true parameters.
-        start: (12,) state at t = 0.
-        servo: the `stewart_position_servo *`.
-        setpoint: (6,) crank angles, rad.
-        end: s.
-        accuracy: as of `integrate`.
-        longest_step: s.
-
-    Raises:
-        IntegrationError: no step is short enough for the accuracy.
+    The servos, a `stewart_position_servo *`, have a constant setpoint (6,), rad.
     """
     looks, held, at = np.array([end]), np.array(setpoint, np.float64), core().at
     plant = NativePlant(dynamics, np.array(start), looks, accuracy, longest_step)
@@ -209,31 +173,8 @@ def _course(
     failure = None
     if ended == Ended.LEFT:
         failure = diagnose(dynamics.mechanism, plant.time, plant.final[POSE])
-    seen, run = plant.seen, plant.run
-    kept = looks[:seen], plant.states[:seen]
-    return Course(*kept, plant.time, plant.final, failure, run.steps, run.evaluations)
-
-
-def _check(
-    start: Array, drives: Sequence[Drive], times: Array, accuracy: float, longest_step: float
-) -> None:
-    if start.shape != (NUM_STATE,):
-        raise ValueError(f"start: got shape {start.shape}; expected {(NUM_STATE,)}")
-    ascending = times.ndim == 1 and len(times) > 0 and bool(np.all(np.diff(times) >= 0))
-    if not ascending or not 0 <= times[0] <= times[-1] < math.inf:
-        raise ValueError(f"times: got {times}; expected ascending ones from 0 s on")
-    if not 1e-14 <= accuracy <= 1e-2:
-        raise ValueError(f"accuracy: got {accuracy!r}; expected a number from 1e-14 to 1e-2")
-    if not longest_step > 0:
-        raise ValueError(f"longest_step: got {longest_step!r}; expected a time above 0 s")
-    starts = [drive.start for drive in drives]
-    if not drives or starts[0] != 0 or not all(a < b for a, b in pairwise(starts)):
-        raise ValueError(f"drives: got starts {starts}; expected ascending ones from 0 s on")
-    for drive in drives:
-        for name in ("constant", "amplitude", "phase"):
-            shape = np.shape(getattr(drive, name))
-            if shape != (NUM_TORQUES,):
-                raise ValueError(f"drives: {name}: got shape {shape}; expected {(NUM_TORQUES,)}")
+    kept = looks[: plant.seen], plant.states[: plant.seen]
+    return Course(*kept, plant.time, plant.final, failure, plant.run.steps)
 
 
 def in_c(drives: Sequence[Drive]) -> tuple[Any, int]:

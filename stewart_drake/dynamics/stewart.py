@@ -10,7 +10,7 @@ from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.workspace import measures_at
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.assembly import TorqueMap, torque_map
-from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.geometry import Mechanism, fixed
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, angle_rate_map
 from stewart_drake.scenario.signals import (
     ANGLES,
@@ -45,14 +45,11 @@ _WITHOUT_BALL_JOINTS: Final = NUM_CONSTANTS - NUM_BALL_JOINT_PARAMETERS
 
 
 class Linearization(NamedTuple):
-    """Derivatives of d[pose; rates]/dt at a point.
+    """Derivatives of d[pose; rates]/dt at a point."""
 
-    A (12, 12) by the state, B (12, 6) by the torque, G (12, p) by the free parameters.
-    """
-
-    A: Array
-    B: Array
-    G: Array
+    A: Array  # (12, 12) by the state
+    B: Array  # (12, 6) by the torque
+    G: Array  # (12, p) by the free parameters
 
 
 def _check(**arguments: ArrayLike) -> None:
@@ -66,20 +63,6 @@ def _shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> ArrayLike:
     if np.shape(value) != shape:
         raise ValueError(f"{name}: got shape {np.shape(value)}; expected {shape}")
     return value
-
-
-def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return a copy of finite numbers of this shape."""
-    try:
-        numbers = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ConfigError(f"{name}: got {value!r}; expected numbers") from None
-    if numbers.shape != shape:
-        expected = f"shape {shape}" if shape else "one number"
-        raise ConfigError(f"{name}: got shape {numbers.shape}; expected {expected}")
-    if not np.all(np.isfinite(numbers)):
-        raise ConfigError(f"{name}: got {numbers}; expected finite numbers")
-    return numbers
 
 
 def plant_parameters(values: ArrayLike | None = None) -> Array:
@@ -101,7 +84,7 @@ def plant_parameters(values: ArrayLike | None = None) -> Array:
     first = np.shape(values)
     if first not in ((NUM_PARAMETERS,), (_WITHOUT_BALL_JOINTS,), (NUM_CONSTANTS,)):
         first = (NUM_PLANT_PARAMETERS,)
-    whole[: first[0]] = _finite("parameters", values, first)
+    whole[: first[0]] = fixed("parameters", values, first)
     for place in _SPEEDS:
         if not whole[place] > 0:
             raise ConfigError(
@@ -162,7 +145,7 @@ class StewartDynamics:
         self.mechanism = mechanism
         switch = isinstance(gravity, bool | np.bool_)
         scale = DEFAULT_GRAVITY if switch else 1.0
-        self.gravity = float(scale * _finite("gravity", gravity, ()))
+        self.gravity = float(scale * fixed("gravity", gravity, ()))
         self.plant_parameters = plant_parameters(parameters)
         self.free = tuple(free)
         # Places of the plant's parameters among the free ones, and among all of the plant's.

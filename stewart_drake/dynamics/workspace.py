@@ -36,17 +36,12 @@ class Failure(NamedTuple):
 
 
 class Measures(NamedTuple):
-    """Distances from the workspace's boundary at a pose.
+    """Distances from the workspace's boundary at a pose."""
 
-    `sines` (6,): sines of the cranks' angles off dead centre, negative on the other branch.
-    `parallel`: signed measure of parallel singularity, 0 where the cranks do not hold the plate.
-    `pitch`: rad. `margin`: see the function of this name.
-    """
-
-    sines: Array
-    parallel: float
-    pitch: float
-    margin: float
+    sines: Array  # (6,) of the cranks' angles off dead centre, negative on the other branch
+    parallel: float  # signed, 0 where the cranks do not hold the plate
+    pitch: float  # rad
+    margin: float  # see the function of this name
 
 
 def measures_at(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> Measures:
@@ -55,17 +50,22 @@ def measures_at(mechanism: Mechanism, pose: Array, crank_angles: Array | None = 
     A crank that has passed its dead centre has a negative sine if the crank angles (6,) of a
     simulated tree are given. The pose alone does not show it.
     """
-    measures = _measures(mechanism, pose, crank_angles)
-    parallel, least = float(measures[NUM_LEGS]), _margin_of(measures, home_sign(mechanism))
-    return Measures(measures[:NUM_LEGS], parallel, float(pose[1]), least)
+    functions = functions_of(mechanism)
+    if crank_angles is None:
+        measures = functions.measures(pose)[0]
+    else:
+        measures = functions.measures_of_tree(pose, crank_angles)[0]
+    above = measures - LEAST
+    above[NUM_LEGS] = home_sign(mechanism) * measures[NUM_LEGS] - LEAST[NUM_LEGS]
+    parallel = float(measures[NUM_LEGS])
+    return Measures(measures[:NUM_LEGS], parallel, float(pose[1]), float(above.min()))
 
 
 def margin(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> float:
     """Return a margin, positive inside the workspace, zero on its boundary; NaN for NaN."""
-    sign = home_sign(mechanism)
     if crank_angles is None:
-        return functions_of(mechanism).margin(pose, sign, LEAST)
-    return _margin_of(_measures(mechanism, pose, crank_angles), sign)
+        return functions_of(mechanism).margin(pose, home_sign(mechanism), LEAST)
+    return measures_at(mechanism, pose, crank_angles).margin
 
 
 def margins(mechanism: Mechanism, poses: Array) -> Array:
@@ -73,24 +73,10 @@ def margins(mechanism: Mechanism, poses: Array) -> Array:
     return functions_of(mechanism).margins(poses, home_sign(mechanism), LEAST)
 
 
-def _margin_of(measures: Array, sign: float) -> float:
-    above = measures - LEAST
-    above[NUM_LEGS] = sign * measures[NUM_LEGS] - LEAST[NUM_LEGS]
-    return float(above.min())
-
-
-def _measures(mechanism: Mechanism, pose: Array, crank_angles: Array | None) -> Array:
-    """Return (8,): the six sines, the parallel measure, minus the size of the pitch in rad."""
-    functions = functions_of(mechanism)
-    if crank_angles is None:
-        return functions.measures(pose)[0]
-    return functions.measures_of_tree(pose, crank_angles)[0]
-
-
 @lru_cache(maxsize=64)
 def home_sign(mechanism: Mechanism) -> float:
     """Return the sign of `Measures.parallel` at home; continuous motions change it at 0 only."""
-    return float(np.sign(_measures(mechanism, mechanism.home, None)[NUM_LEGS]))
+    return float(np.sign(functions_of(mechanism).measures(mechanism.home)[0][NUM_LEGS]))
 
 
 def diagnose(

@@ -11,6 +11,7 @@ import subprocess
 import tempfile
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -37,16 +38,8 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array, ArrayLike
 
 SOURCES: Final = (
-    *(
-        "real.h",
-        "short.h",
-        "equations.h",
-        "packets.h",
-        "observer.h",
-        "law.h",
-        "legs.h",
-        "kinematics.h",
-    ),
+    *("real.h", "short.h", "equations.h", "packets.h"),
+    *("observer.h", "law.h", "legs.h", "kinematics.h"),
     *("matrix", "dynamics", "machine", "reach.c", "riccati", "design", "timeline.c"),
 )
 """Sources of core/ that every law needs; a name without a suffix stands for header and source."""
@@ -211,10 +204,7 @@ def _replay(
 ) -> dict[str, str]:
     """Return the recorded steps that the test replays."""
     steps, period = recorded.steps, recorded.law.timeline.period
-
-    def rows(arrays: Iterable[Array]) -> str:
-        return ",\n    ".join(numbers(array, suffix) for array in arrays)
-
+    rows = partial(_rows, suffix=suffix)
     values = {
         "STEPS": str(len(steps)),
         "MEASUREMENT": rows(step.measurement for step in steps),
@@ -281,14 +271,14 @@ def _example_data(experiment: Experiment, recorded: Recorded, suffix: str) -> di
             f'"{words.replace("{:", "%").replace("}", "")}"' for words in FAULTS.values()
         ),
         "KNOTS": str(len(rows)),
-        "MOTION": _table(rows),
+        "MOTION": _rows(rows),
         "GOAL": _goal(recorded.goal),
         "MOTION_TOLERANCE": f"{TOLERANCE:g}",
     }
 
 
-def _table(rows: Array) -> str:
-    return ",\n    ".join(numbers(row, "") for row in rows)
+def _rows(rows: Iterable[Array], suffix: str = "") -> str:
+    return ",\n    ".join(numbers(row, suffix) for row in rows)
 
 
 def _goal(rows: Array | None) -> str:
@@ -297,7 +287,7 @@ def _goal(rows: Array | None) -> str:
     number = len(rows)
     return (
         f"\nstatic const double goal[{number}][1 + STEWART_REFERENCE] = {{\n"
-        f"    {_table(rows)}}};\n\n"
+        f"    {_rows(rows)}}};\n\n"
         f"void stewart_goal(double t, real *reference) {{ along({number}, goal, t, reference); }}\n"
     )
 

@@ -92,6 +92,7 @@ class Recorded:
     """A recorded run."""
 
     law: PredictiveLqi | ServoPreview  # the law itself, not the one that records
+    duration: float  # of the run, s
     steps: list[Step] = field(default_factory=list)  # at most MOST_SAMPLES
     # (n, 6) torques in flight at t = 0, or (18,) the command before the first sample
     first: Array = field(default_factory=lambda: np.empty(0))
@@ -105,12 +106,29 @@ class Recorded:
         law = self.law
         return isinstance(law, PredictiveLqi) and law.moves
 
-    def tabulated(self, motion: Motion, duration: float) -> Motion:
+    def begin(self, first: Array) -> None:
+        """Begin anew with what is in flight."""
+        self.steps.clear()
+        self.first = first
+
+    def note(
+        self, measurement: Measurement, before: Any, after: Any, preview: Array, *rest: Any
+    ) -> None:
+        """Keep a step by its memories, with the last numbers of a `Step`."""
+        if len(self.steps) < MOST_SAMPLES:
+            new = np.subtract(after.counts, before.counts) > 0
+            status = int(new @ 2 ** np.arange(len(new)))
+            age = round(measurement.age / self.law.timeline.period)
+            answer = after.torque if isinstance(self.law, PredictiveLqi) else after.command
+            measured = measurement.known(self.law.sensing.size)
+            self.steps.append(Step(measured, age, preview, answer, status, *rest))
+
+    def tabulated(self, motion: Motion) -> Motion:
         """Return the motion interpolated between its knots, as C follows it."""
         if not (self.moves and isinstance(motion, KnownMotion)):
             return motion
         if self._along is None:
-            end = duration + self._furthest
+            end = self.duration + self._furthest
             self.motion, self.goal = knots(motion.planned, end), knots(motion.reference, end)
             pairs = (self.motion, motion.planned), (self.goal, motion.reference)
             self._along = tuple(_trajectory(rows, then) for rows, then in pairs)  # type: ignore[assignment]
@@ -139,11 +157,10 @@ class RecordedLqi(PredictiveLqi):
     """A law that records its steps since its memory was last initialised."""
 
     record: Recorded = field(kw_only=True)
-    duration: float = field(kw_only=True)
 
     def initial_memory(self, queue: Array) -> Memory:
-        self.record.steps.clear()
-        self.record.first, self.record.law = queue, PredictiveLqi(**self.parts)
+        self.record.begin(queue)
+        self.record.law = PredictiveLqi(**self.parts)
         return super().initial_memory(queue)
 
     def step(
@@ -154,14 +171,10 @@ class RecordedLqi(PredictiveLqi):
         weights: Array,
         report: Report | None = None,
     ) -> Memory:
-        motion = self.record.tabulated(motion, self.duration)
+        motion = self.record.tabulated(motion)
         after = super().step(memory, measurement, motion, weights, report)
-        if len(self.record.steps) < MOST_SAMPLES:
-            rows = np.empty(0) if self.record.moves else motion(self.preview_times)
-            given = _given(self, measurement, memory, after)
-            sent = after.plan.ravel()
-            step = Step(*given[:2], rows, after.torque, given[2], weights, sent, report)
-            self.record.steps.append(step)
+        rows = np.empty(0) if self.record.moves else motion(self.preview_times)
+        self.record.note(measurement, memory, after, rows, weights, after.plan.ravel(), report)
         return after
 
 
@@ -172,28 +185,16 @@ class RecordedServo(ServoPreview):
     record: Recorded = field(kw_only=True)
 
     def initial_memory(self, command: Array) -> ServoMemory:
-        self.record.steps.clear()
-        self.record.first = command
+        self.record.begin(command)
         return super().initial_memory(command)
 
     def step(
         self, memory: ServoMemory, measurement: Measurement, motion: Motion, report: Array
     ) -> ServoMemory:
         after = super().step(memory, measurement, motion, report)
-        if len(self.record.steps) < MOST_SAMPLES:
-            rows, given = motion(self.preview_times), _given(self, measurement, memory, after)
-            nothing = np.full(2, np.nan), np.full(6, np.nan)
-            step = Step(*given[:2], rows, after.command, given[2], *nothing, np.array(report))
-            self.record.steps.append(step)
+        rest = np.full(2, np.nan), np.full(6, np.nan), np.array(report)
+        self.record.note(measurement, memory, after, motion(self.preview_times), *rest)
         return after
-
-
-def _given(law: Any, measurement: Measurement, before: Any, after: Any) -> tuple[Array, int, int]:
-    """Return the measured values, their age in periods, and bits of the counted causes."""
-    new = np.subtract(after.counts, before.counts)
-    bits = int((new > 0) @ 2 ** np.arange(len(new)))
-    age = round(measurement.age / law.timeline.period)
-    return measurement.known(law.sensing.size), age, bits
 
 
 def record(scenario: Scenario) -> Recorded:
@@ -211,18 +212,13 @@ def record(scenario: Scenario) -> Recorded:
                 f"{problem}: is not exported as it is; expected what predictor_lqi, adaptive_lqi "
                 "or the controllers of servos have"
             )
-        found.append(Recorded(law))
-        parts = {f.name: getattr(law, f.name) for f in fields(law)}
-        if isinstance(law, PredictiveLqi):
-            return RecordedLqi(**parts, record=found[-1], duration=scenario.duration)
-        return RecordedServo(**parts, record=found[-1])
+        found.append(Recorded(law, scenario.duration))
+        kind = RecordedLqi if isinstance(law, PredictiveLqi) else RecordedServo
+        return kind(**{f.name: getattr(law, f.name) for f in fields(law)}, record=found[-1])
 
     exact: Callable[..., Any] = replace
-    result = simulate(
-        replace(scenario, plant=exact(scenario.plant, kind="exact")),
-        modify_law=recorded,
-        judge_stability=False,
-    )
+    scenario = replace(scenario, plant=exact(scenario.plant, kind="exact"))
+    result = simulate(scenario, modify_law=recorded, judge_stability=False)
     if result.failure is not None:
         raise ConfigError(
             f"scenario: {result.failure}; expected one whose run the test can replay to its end"

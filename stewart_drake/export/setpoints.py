@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final, Literal, NamedTuple
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from pydantic import Field
@@ -20,13 +20,7 @@ from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
 from stewart_drake.loop.servos import known_stiffness
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.field_types import Row, section
-from stewart_drake.scenario.signals import (
-    ACCELERATIONS,
-    LEGS,
-    NUM_TORQUES,
-    POSE,
-    RATES,
-)
+from stewart_drake.scenario.signals import ACCELERATIONS, LEGS, NUM_TORQUES, POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
@@ -202,13 +196,9 @@ def _checked(start: Sequence[float] | Array, experiment: Experiment) -> Array:
 
 
 def softened(wanted: Array, pose: Array, time: float, blend: float) -> Array:
-    """Return pose, rates and accelerations (18,) of a soft start.
+    """Return pose, rates and accelerations (18,) of a soft start of `blend` s.
 
-    Args:
-        wanted: (18,) of the reference at `time`.
-        pose: (6,) at which the plate rests at t = 0.
-        time: s.
-        blend: T, s.
+    `wanted` (18,) is the reference at `time` in s; the plate rests at `pose` (6,) at t = 0.
     """
     s = min(time / blend, 1.0)
     g = rise(s)
@@ -261,28 +251,18 @@ def _along(
     return found
 
 
-class _Limit(NamedTuple):
-    """Values (n, 6) of the motors and their bounds, scalars or (6,)."""
-
-    name: str
-    unit: str
-    values: Array
-    least: Array | float
-    most: Array | float
-
-
 def _check(found: Setpoints, servo: Stiffness | None, experiment: Experiment, rate: float) -> None:
     """Raise _BrokenLimit for the first setpoint beyond a limit."""
     speed = getattr(experiment.scenario.actuator, "speed_limit", None) or math.inf
     low, high = (-math.inf, math.inf) if servo is None else (servo.low, servo.high)
     moved = np.diff(found.angles, axis=0, prepend=found.angles[:1]) * rate
     torque = experiment.torque_limit
-    for limit in (
-        _Limit("setpoint", "rad", found.angles, low, high),
-        _Limit("speed of the setpoint", "rad/s", moved, -speed, speed),
-        _Limit("torque", "N m", found.torques, -torque, torque),
-    ):
-        name, unit, values, least, most = limit
+    limits: tuple[tuple[str, str, Array, Array | float, Array | float], ...] = (
+        ("setpoint", "rad", found.angles, low, high),
+        ("speed of the setpoint", "rad/s", moved, -speed, speed),
+        ("torque", "N m", found.torques, -torque, torque),
+    )
+    for name, unit, values, least, most in limits:
         excess = np.maximum(values - most, least - values)
         if np.any(excess > _ROUNDING):
             k = int(np.argmax(np.any(excess > _ROUNDING, axis=1)))

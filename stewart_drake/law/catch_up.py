@@ -16,10 +16,7 @@ from stewart_drake.law.compiled import machine_of
 from stewart_drake.law.least_error import LeastError
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.timeline import TorqueSchedule
-from stewart_drake.scenario.signals import (
-    NUM_REFERENCE,
-    NUM_TORQUES,
-)
+from stewart_drake.scenario.signals import NUM_REFERENCE
 from stewart_drake.scenario.trajectories import evaluate, through_states
 from stewart_drake.types import Array
 
@@ -192,15 +189,6 @@ class Model:
         results = c.at(pieces), c.at(peak), scratch
         number = c.lib.stewart_plan_way(self.data, self._sign, *given, *results)
         return Plan(pieces, float(peak[0])) if number else None
-
-    def torques(self, rows: Array) -> Array:
-        """Return the torques (n, 6) that rows (n, 18) take, N m."""
-        c, rows, torques = core(), np.array(rows, np.float64), np.empty((len(rows), NUM_TORQUES))
-        first, result = c.at(rows), c.at(torques)
-        for k in range(len(rows)):
-            given = first + NUM_REFERENCE * k, result + NUM_TORQUES * k
-            c.lib.stewart_required_torque(self.data, *given)
-        return torques
 
     def way(self, schedule: TorqueSchedule, states: Array, begin: float) -> Array:
         """Return the pieces (n, 38) of the motion through states (1 + n, 12) from `begin` s on."""

@@ -1,8 +1,9 @@
-"""Checks of a live run: the longest gap of measurements, and the machine's reports of torques.
+"""Checks of a live run, and references from where the plate is.
 
-A torque that acts up to eta after the last measurement is based on it or on earlier ones, so that a
-gap of up to eta changes nothing. Later torques are based on a prediction over the gap and eta. With
-A and G of the last measurement's state held, its covariance P of state and parameters becomes
+*Gaps of measurements.* A torque that acts up to eta after the last measurement is based on it or on
+earlier ones, so that a gap of up to eta changes nothing. Later torques are based on a prediction
+over the gap and eta. With A and G of the last measurement's state held, its covariance P of state
+and parameters becomes
 
     P(s) = F P F',   F = exp([[A, G], [0, 0]] s),   s = gap + eta,
 
@@ -11,14 +12,20 @@ too long if three standard deviations of a leg exceed its remaining reach.
 """
 
 from collections.abc import Mapping
-from typing import Final
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
 from scipy.linalg import expm
 
-from stewart_drake.law.belief import Estimate
+from stewart_drake.dynamics.workspace import diagnose
+from stewart_drake.law.belief import Belief, Estimate
 from stewart_drake.law.nominal import NominalPlant
-from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE, POSE, RATES
+from stewart_drake.law.timeline import Timeline, TorqueSchedule
+from stewart_drake.live.governor import Steering
+from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE, NUM_TORQUES, POSE, RATES
 from stewart_drake.types import Array
 
 LONGEST_GAP: Final = 1.0
@@ -30,16 +37,15 @@ _ROWS: Final = 8
 """Number of consecutive torques reported a period off that count as an error."""
 _KEPT: Final = 64
 """Number of periods whose sent torques are kept."""
+REPLAN_ERROR: Final = 0.08
+"""Prediction error at which a new reference is planned, as a share of the motion."""
 
 
 def stays_within_reach(plant: NominalPlant, estimate: Estimate, torque: Array, span: float) -> bool:
     """Return whether the legs surely reach the pose after `span` s without measurements.
 
-    Args:
-        plant: nominal plant.
-        estimate: estimate at the last measurement; without a covariance the answer is yes.
-        torque: torque (6,) at that time, N m.
-        span: s.
+    Estimate and torque (6,) in N m are those at the last measurement; without a covariance the
+    answer is yes.
     """
     if not estimate.uncertain:
         return True
@@ -59,11 +65,7 @@ def stays_within_reach(plant: NominalPlant, estimate: Estimate, torque: Array, s
 
 
 class ReportCheck:
-    """Compares the torques that a machine reports with those that were sent for their periods.
-
-    Args:
-        limit: torque limit of the machine, N m.
-    """
+    """Compares reported torques with those that were sent for their periods, up to a limit."""
 
     def __init__(self, limit: float) -> None:
         self._limit = limit
@@ -97,3 +99,81 @@ class ReportCheck:
 
     def _was_sent(self, number: int, torque: Array) -> bool:
         return any(np.array_equal(row, torque) for row in self._sent.get(number, []))
+
+
+# ---------------------------------------------------------------- new references
+
+
+def until_next(timeline: Timeline, in_flight: Array) -> TorqueSchedule:
+    """Return the schedule until the next torque acts, of torques (n >= L, 6) in flight."""
+    return timeline.until_next(timeline.queue(np.vstack([np.zeros(NUM_TORQUES), in_flight])))
+
+
+def replanned(
+    steering: Steering,
+    plant: NominalPlant,
+    t: float,
+    state: Array,
+    schedule: TorqueSchedule,
+    parameters: Array | None = None,
+) -> Steering | str:
+    """Return a reference from the state after the torques in flight, or why there is none.
+
+    `state` (12,) is that at t in s; `schedule` has the torques in flight.
+    """
+    dynamics = plant.dynamics if parameters is None else plant.dynamics.assuming(parameters)
+    states = np.vstack([state, plant.predict(state, schedule, parameters)])
+    if not np.all(np.isfinite(states)):
+        return "the plate leaves its workspace before a torque can act"
+    for x in states:
+        failure = diagnose(plant.mechanism, t, x[POSE])
+        if failure is not None:
+            return f"{failure.reason} before a torque can act"
+    torques = np.zeros((1, NUM_TORQUES))
+    if len(schedule.torques):
+        torques = np.vstack([schedule.torques[:1], schedule.torques])
+    full = np.array(
+        [
+            np.append(x, dynamics.accelerations(x[POSE], x[RATES], torque))
+            for x, torque in zip(states, torques, strict=True)
+        ]
+    )
+    return steering.replan(t + np.append(0.0, np.cumsum(schedule.durations)), full)
+
+
+def recovered(
+    steering: Steering, law: Any, memory: Any, t: float, size: Array
+) -> Steering | str | None:
+    """Return a new reference if the prediction is too far from the old one, else None.
+
+    Where there is none, the reason is returned. `memory` is that of the law after the sample at t
+    in s, `size` (6,) that of the motion.
+    """
+    belief, plant, in_flight = memory.belief, law.plant, memory.in_flight
+    if not (belief.has_state and belief.feeds_back and belief.settled and not memory.silence):
+        return None
+    until, period = until_next(belief.timeline, in_flight[:-1]), law.timeline.period
+    schedule = TorqueSchedule(
+        np.vstack([until.torques, in_flight[-1:]]), np.append(until.durations, period)
+    )
+    ahead = plant.predict(belief.state, schedule, belief.parameters)[-1]
+    away = np.abs(ahead - _wanted(steering, law, t, in_flight[-1], belief)) / np.tile(size, 2)
+    if not away.max() > REPLAN_ERROR:  # or NaN
+        return None
+    return replanned(steering, plant, t, belief.state, schedule, belief.parameters)
+
+
+def _wanted(steering: Steering, law: Any, t: float, torque: Array, belief: Belief) -> Array:
+    """Return the state (12,) that the next torque leads to at the end of its hold, if all is well.
+
+    Constant torques reach the poses of the reference there. The rates differ from its rates by
+    equation (rates) of `law.feedforward`.
+    """
+    way, timeline, dynamics = steering.way, belief.timeline, law.plant.dynamics
+    wanted = way.at(t + timeline.eta + timeline.period)[:NUM_STATE].copy()
+    nodes = [way.at(t + node) for node in law.feedforward.nodes(timeline, 0)]
+    changes = law.feedforward.held(np.array(nodes), dynamics, belief.parameters).changes
+    with suppress(ArithmeticError, np.linalg.LinAlgError):
+        B = law.model.at(wanted, torque, belief.parameters, law.plant).B[RATES]
+        wanted += law.feedforward.offset(changes[1:], B, replace(timeline, delay=Delay(1)))
+    return wanted

@@ -101,12 +101,7 @@ class Link:
 
 
 class Contact:
-    """A session with a machine.
-
-    Args:
-        endpoint: socket; the caller closes it.
-        address: address of the machine.
-        identity: identity of the machine that the controller is designed for.
+    """A session with a machine that the controller is designed for; the caller closes its socket.
 
     Attributes:
         last: newest message of the machine by its sequence, or None.
@@ -114,7 +109,9 @@ class Contact:
         heard: own clock when the last message was accepted, ns.
     """
 
-    def __init__(self, endpoint: Endpoint, address: Address, identity: Identity) -> None:
+    def __init__(
+        self, endpoint: Endpoint[MachineMessage], address: Address, identity: Identity
+    ) -> None:
         self.endpoint, self.identity, self.offered = endpoint, identity, 0
         self.session, self.link = Session.drawn(address), Link()
         self.last: MachineMessage | None = None
@@ -190,7 +187,6 @@ class Contact:
     def receive(self) -> Iterator[MachineMessage]:
         """Yield each message that has come, once, in the order of arrival."""
         for message, address in self.endpoint.receive():
-            assert isinstance(message, MachineMessage)
             time, newest = now(), self.session.window.newest
             refused = self.session.refusal(message.head, address, time)
             if refused is not None:
@@ -204,7 +200,6 @@ class Contact:
     def forget_waiting(self) -> None:
         """Count the messages that have waited in the socket, without their round trips."""
         for message, address in self.endpoint.receive():
-            assert isinstance(message, MachineMessage)
             if self.session.refusal(message.head, address, now()) is None:
                 self.link.came += 1
                 self._acknowledge(message)
@@ -273,7 +268,7 @@ def address_of(text: str, option: str = "--machine") -> Address:
     raise ConfigError(f"{option}: got {text!r}; expected the name or address of a host")
 
 
-def open_endpoint(address: Address, key: bytes | None) -> Endpoint:
+def open_endpoint(address: Address, key: bytes | None) -> Endpoint[MachineMessage]:
     """Return a socket for a controller of the machine at an address."""
     if key is None and not is_loopback(address[0]):
         raise ConfigError(

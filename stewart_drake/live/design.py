@@ -25,12 +25,7 @@ from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.live.contact import Link
-from stewart_drake.live.protocol import (
-    MOST_HISTORY,
-    MOST_ROWS,
-    MachineFlags,
-    MachineMessage,
-)
+from stewart_drake.live.protocol import MOST_HISTORY, MOST_ROWS, MachineFlags, MachineMessage
 from stewart_drake.loop.law_design import control_law, first_queue
 from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
@@ -38,7 +33,6 @@ from stewart_drake.loop.servos import commands_in_flight, servo_law
 from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.link_config import NetworkConfig, WireConfig
-from stewart_drake.scenario.packets import default_bound
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
@@ -99,11 +93,8 @@ def check_controller(scenario: Scenario) -> None:
 def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario:
     """Return the scenario with the measured link.
 
-    Args:
-        scenario: its delay, or the bound of its network, is the time from a measurement to its
-            torque.
-        link: measured link.
-        machine: message of the machine.
+    Its delay, or the bound of its network, is the time from a measurement to its torque. A network
+    without a bound gets that of the measured link.
     """
     loss = max(scenario.sensor.loss, link.loss_back)
     sensor = replace(scenario.sensor, delay=0.0, loss=loss, faults=[])
@@ -124,7 +115,8 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
         burst=scenario.link.burst,
         dry="hold" if MachineFlags.HOLDS in machine.flags else "zero",
     )
-    eta, period = _whole_delay(scenario, network), c.period
+    chosen = scenario.link.kind == "wire" or scenario.link.playout is not None
+    eta, period = (scenario if chosen else replace(scenario, link=network)).eta, c.period
     if c.command == "cranks":
         _check_delay(eta, longest, period, 0)
         delay = DelayConfig(steps=round(eta / period))
@@ -148,16 +140,6 @@ def _check_delay(eta: float, longest: float, period: float, repeats: int) -> Non
         )
 
 
-def _whole_delay(scenario: Scenario, found: NetworkConfig) -> float:
-    """Return the time from a measurement to its torque, of the scenario or else of the link, s."""
-    c, link = scenario.controller, scenario.link
-    if link.kind == "wire":
-        return scenario.eta
-    if link.playout is not None:
-        return link.playout + c.packet_repeats * c.period
-    return default_bound(found, c.packet_repeats, c.period) + c.packet_repeats * c.period
-
-
 def always(signal: LearnedSignal | None) -> Learned:
     """Return a function that returns this signal, or None for None."""
     return None if signal is None else lambda: signal
@@ -172,13 +154,7 @@ def read_learned(scenario: Scenario) -> tuple[Scenario, Learned]:
 
 
 def design(scenario: Scenario, machine: MachineMessage, learned: Learned = None) -> Design:
-    """Return the law for a scenario over the measured link.
-
-    Args:
-        scenario: as `as_seen` returns it.
-        machine: message of the machine.
-        learned: see `Learned`.
-    """
+    """Return the law for a scenario over the measured link, see `as_seen`."""
     experiment = prepare(scenario)
     if scenario.controller.command == "cranks":
         return _of_cranks(experiment, machine, learned)
@@ -216,12 +192,7 @@ def _step_times(
 ) -> tuple[list[float], str]:
     """Return the times of steps, s of this thread, and the name of their implementation.
 
-    Args:
-        law: control law.
-        motion: its reference.
-        first: queue or command before the first sample.
-        number: of steps.
-        given: weights or report of each step.
+    `first` is the queue or command before the first sample; weights or report are `given`.
     """
     served: Any
     served, backend = serving(law)

@@ -15,13 +15,15 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, Generic, NamedTuple, TypeVar
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.protocol import (
     LONGEST,
     SECOND,
+    ControllerMessage,
     Head,
+    MachineMessage,
     Message,
     Refusal,
     RefusedError,
@@ -31,6 +33,7 @@ from stewart_drake.live.protocol import (
 )
 
 Address = tuple[str, int]
+Taken = TypeVar("Taken", MachineMessage, ControllerMessage)
 
 WINDOW: Final = 64
 """Number of datagrams by which one may be overtaken without counting as late."""
@@ -62,14 +65,10 @@ class OtherVersion(NamedTuple):
     address: Address
 
 
-class Endpoint:
-    """A UDP socket that never blocks.
+class Endpoint(Generic[Taken]):
+    """A UDP socket that never blocks, for messages of one side; any others are malformed.
 
-    Args:
-        takes: class of the messages of the other side; any other is malformed.
-        host: name or number of an interface.
-        port: port; 0 is any free one.
-        key: shared key; without one only loopback addresses are allowed.
+    Port 0 is any free one. Without a key only loopback addresses are allowed.
 
     Attributes:
         refused: number of refused datagrams by cause.
@@ -83,12 +82,13 @@ class Endpoint:
 
     def __init__(
         self,
-        takes: type[Message],
+        takes: type[Taken],
         host: str = "127.0.0.1",
         port: int = 0,
         key: bytes | None = None,
     ) -> None:
-        self._takes, self._key, self.refused, self.unsent = takes, key, Counter[Refusal](), 0
+        self._takes: type[Taken] = takes
+        self._key, self.refused, self.unsent = key, Counter[Refusal](), 0
         self.refusal, self.versions = "", list[OtherVersion]()
         if key is not None and len(key) < SHORTEST_KEY:
             raise ConfigError(f"key: got {len(key)} bytes; expected at least {SHORTEST_KEY}")
@@ -138,7 +138,7 @@ class Endpoint:
         with contextlib.suppress(OSError):
             self._socket.sendto(version_refusal(other.session, other.sequence), other.address)
 
-    def receive(self) -> Iterator[tuple[Message, Address]]:
+    def receive(self) -> Iterator[tuple[Taken, Address]]:
         """Yield what has come, at most AT_ONCE datagrams."""
         for _ in range(AT_ONCE):
             try:
@@ -265,10 +265,7 @@ class Offers:
 
     A nonce is an HMAC of the session, its address and the number of sessions so far, under a secret
     of this process. Only the receiver of an offer knows it, and recorded sessions cannot be
-    replayed.
-
-    Args:
-        secret: 32 bytes; random by default.
+    replayed. The secret has 32 bytes, random ones by default.
     """
 
     def __init__(self, secret: bytes | None = None) -> None:

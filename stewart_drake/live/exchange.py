@@ -69,8 +69,7 @@ class Exchange:
     def begin(self, flags: ControllerFlags) -> bool:
         """Agree on the begin of the run and wait until then; return whether the plate is parked.
 
-        Args:
-            flags: requests of every datagram.
+        Every datagram of the run has these flags.
 
         Raises:
             ConfigError: another controller drives the machine.
@@ -159,14 +158,9 @@ class Exchange:
     # -------------------------------------------------------------- torques
 
     def send(self, k: int, rows: Array, first: int, eta: int, cranks: bool) -> None:
-        """Send torques or setpoints (n, 6).
+        """Send the torques, N m, or setpoints, rad, of the step of sample k.
 
-        Args:
-            k: sample of the step.
-            rows: torques, N m, or setpoints, rad.
-            first: sample that the first row is of.
-            eta: time from a sample to its torque, ns.
-            cranks: whether these are setpoints.
+        The first row (6,) is of the sample `first`. A torque acts `eta` ns after its sample.
         """
         P = round(self._period * SECOND)
         self._sequences[k] = self.contact.send(
@@ -191,29 +185,15 @@ class Exchange:
 
 
 class Watch:
-    """Reports changes of the machine's state, and ends a run without it.
-
-    Args:
-        exchange: datagrams of the run.
-        period: of the controller, s.
-        say: prints a line.
-
-    Attributes:
-        safe: why the safe torque acts, or None.
-    """
+    """Reports changes of the machine's state, and ends a run without it."""
 
     def __init__(self, exchange: Exchange, period: float, say: Callable[[str], None]) -> None:
         self._exchange, self._period, self._say = exchange, period, say
         self._flags, self._silent_since, self._stalled = MachineFlags(0), 0, False
-        self.safe: str | None = None
+        self.safe: str | None = None  # why the safe torque acts
 
     def ended(self, k: int, message: MachineMessage | None) -> End | None:
-        """Report changes until sample k; return the end of the run, or None.
-
-        Args:
-            k: sample.
-            message: message with its measurement, or None.
-        """
+        """Report changes until sample k, given its message; return the end of the run, or None."""
         self._report_stall(k)
         contact = self._exchange.contact
         silent = (now() - contact.heard) / SECOND

@@ -38,7 +38,6 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import PITCH_LIMIT, home_sign, margins, measures_at
-from stewart_drake.law.catch_up import Model
 from stewart_drake.law.motion import between
 from stewart_drake.law.startup import sizes
 from stewart_drake.scenario.signals import (
@@ -99,11 +98,7 @@ _CACHED: Final = 4096
 def response(state: Array, applied: Array, pace: float, times: Array) -> Array:
     """Return pose, rates and accelerations (n, 18) of the three poles with a constant target.
 
-    Args:
-        state: pose, rates and accelerations (18,) at time 0.
-        applied: target g (6,), rad and m.
-        pace: pole w, 1/s.
-        times: instants (n,), s, >= 0.
+    From a state (18,) at time 0 to the target g (6,), with the pole w = `pace`, at times (n,) >= 0.
     """
     e, v, a = state[POSE] - applied, state[RATES], state[ACCELERATIONS]
     c0, c1, c2 = e, v + pace * e, (a + 2 * pace * v + pace**2 * e) / 2
@@ -164,10 +159,6 @@ class Governor:
         return tuple(np.geomspace(self.fastest, self.slowest, _PACES).tolist())
 
     @cached_property
-    def _model(self) -> Model:
-        return Model(self.dynamics)
-
-    @cached_property
     def _size(self) -> Array:
         return sizes(self.dynamics.mechanism)
 
@@ -182,14 +173,14 @@ class Governor:
         worst = measures_at(mechanism, states[int(np.argmin(found)), POSE])
         leg = int(worst.sines.argmin())
         limits = {
-            f"leg {LEGS[leg]} comes to the end of its reach": worst.sines[leg],
-            "the pitch comes near 90 degrees": PITCH_LIMIT - abs(worst.pitch),
-            "the cranks would hardly hold the plate there": home_sign(mechanism) * worst.parallel,
+            f"leg {LEGS[leg]} is near the end of its reach": worst.sines[leg],
+            "the pitch is near 90 degrees": PITCH_LIMIT - abs(worst.pitch),
+            "the cranks could hardly hold the plate": home_sign(mechanism) * worst.parallel,
         }
         return min(limits, key=lambda limit: limits[limit])
 
     def _within(self, states: Array) -> bool:
-        """Return whether `problem` finds none."""
+        """Return whether reference states (n, 18) keep to all limits."""
         found = margins(self.dynamics.mechanism, states[:, POSE])
         return found.min() >= LEAST_MARGIN + _GUARD and self._torque_problem(states) is None
 
@@ -197,7 +188,7 @@ class Governor:
         limit = TORQUE_SHARE * self.torque_limit
         if np.isinf(limit):
             return None
-        torques = np.abs(self._model.torques(states)).max(axis=0)
+        torques = np.abs(self.dynamics.torques_along(states)).max(axis=0)
         motor = int(np.argmax(torques))
         if torques[motor] <= _TORQUE_GUARD * limit:
             return None
@@ -265,7 +256,7 @@ class Governor:
     def begin(self, state: Array) -> GovernorState | str:
         """Return a governor that stops a motion (18,), or the limit that prevents it.
 
-        Tries to stop at the slowest pace, then faster, then at poses nearer and nearer to home.
+        Tried in this order: the slowest pace, faster ones, then poses nearer and nearer to home.
         """
         stops = [
             GovernorState(state, stop_pose(state, pace), pace=pace) for pace in self.paces[::-1]
@@ -282,9 +273,10 @@ class Governor:
         return limit
 
     def onto(self, state: Array, time: float, motion: Trajectory) -> Trajectory | str:
-        """Return the shortest blend from a state (18,) at `time` s onto a motion within the limits.
+        """Return the shortest blend within the limits from a state (18,) at `time` s onto a motion.
 
-        It goes on as the motion. Without any the limit that the longest one exceeds is returned.
+        After the blend the trajectory is the motion. If no blend keeps to the limits, return the
+        limit that the longest one exceeds.
         """
         states, least = np.empty((0, NUM_REFERENCE)), min(4 / self.slowest, _BLENDS[-1])
         for duration in (one for one in _BLENDS if one >= least):
@@ -303,11 +295,11 @@ class Request(NamedTuple):
     """Request of a person."""
 
     target: Array | None = None  # pose (6,), rad and m, or None for the scenario's motion
-    rest: bool = False  # whether to come to rest instead
+    rest: bool = False  # whether to stop instead
 
 
 class Segment(NamedTuple):
-    """A part of the reference: states (18,) as a function of time, from `begin` in s on."""
+    """States (18,) of the reference as a function of time, from `begin` in s on."""
 
     begin: float
     at: Callable[[float], Array]
@@ -315,9 +307,9 @@ class Segment(NamedTuple):
 
 @dataclass(frozen=True)
 class Way:
-    """The reference in segments, ordered by their begin; the first one also holds before it.
+    """The reference in segments, the earliest first, which also holds before its begin.
 
-    A law asks for the same instants again at each sample, so that they are cached, to 1 ns.
+    A law reads the same instants again at each sample. They are therefore cached, to 1 ns.
     """
 
     segments: tuple[Segment, ...]
@@ -392,9 +384,7 @@ class Steering:
     def replan(self, times: Array, states: Array) -> "Steering | str":
         """Return a new reference from the state at which new torques can act, or the limit.
 
-        Args:
-            times: instants (n,) from now until then, s.
-            states: predicted states (n, 18) of the plate.
+        `states` (n, 18) are predicted at `times` (n,) in s, from now until then.
         """
         end, last = float(times[-1]), states[-1]
         way = self.way.then(float(times[0]), _through(times, states))

@@ -25,12 +25,7 @@ _SOFT_START: Final = 1.0
 
 
 class LearnedSetpoints:
-    """Learned part of the setpoints of a plan.
-
-    Args:
-        learned: what was learned at present.
-        period: of the controller, s.
-    """
+    """Learned part of the setpoints of a plan, by what was learned at present."""
 
     def __init__(self, learned: Callable[[], LearnedSignal], period: float) -> None:
         self.learned, self._period, self._share = learned, period, 0.0
@@ -51,28 +46,19 @@ class LearnedSetpoints:
 
 
 class LearnedTorques(LearnedSetpoints):
-    """Learned torques of a run, added to those of the law.
-
-    Args:
-        design: law and settings, with something learned.
-
-    Attributes:
-        saturated: number of samples whose sum was beyond the limit.
-    """
+    """Learned torques of a run, added to those of the law."""
 
     def __init__(self, design: Design) -> None:
         assert design.learned is not None
         super().__init__(design.learned, design.experiment.scenario.controller.period)
-        self._design, self._added, self.saturated = design, dict[int, Array](), 0
+        self._design, self._added = design, dict[int, Array]()
+        self.saturated = 0  # number of samples whose sum was beyond the limit
 
     def packet(self, k: int, memory: Any, rows: Array, by_hand: bool) -> Array:
         """Return the torques (n, 6) to send at sample k, and give the law its part of them.
 
-        Args:
-            k: sample.
-            memory: of the law after that; its torques are limited so that the sum is.
-            rows: torques of the law (n, 6), which begin with repeated ones.
-            by_hand: whether the reference is not the motion.
+        `rows` (n, 6) of the law begin with repeated torques. Those in its memory after the sample
+        are limited so that the sum is.
         """
         repeats, signal = self._design.repeats, self.learned()
         middle = k * self._period + self._design.law.timeline.eta + self._period / 2

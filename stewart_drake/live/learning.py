@@ -111,14 +111,8 @@ def learn_live(
 ) -> SimulationResult:
     """Repeat a motion on a machine, learn from each repetition, and write what was learned.
 
-    Learning ends early after two repetitions without a smaller error, or if one does not complete.
-
-    Args:
-        scenario: law and motion.
-        machine: HOST:PORT where it listens.
-        options: `learn`, `learned`, `armed`, `key`, `max_missing`, `accept_jitter`.
-        say: prints a line.
-        ending: returns whether to bring the plate to rest and end.
+    Learning ends early after two repetitions without a smaller error, or if one does not complete,
+    or once `ending` returns True.
 
     Returns:
         The run of all repetitions. With setpoints the best repetition, or the last one if none
@@ -158,13 +152,7 @@ class TorqueLessons(Viewer):
     It is the viewer of a run, and a log of it. A call returns the torque that the loop adds. It is
     blended from that of the last repetition into that of the present one.
 
-    Args:
-        experiment: of the scenario.
-        number: of repetitions.
-        say: prints a line.
-
     Attributes:
-        experiment: of the scenario.
         tried: added torques of the repetitions so far; those of the first one are zero.
         errors: E of the last period of each complete repetition, % s.
         done: whether learning has ended.

@@ -35,13 +35,7 @@ _KEPT: Final = 96
 
 
 class RowFile:
-    """A CSV file of rows of numbers that a thread writes, to be read back at the end.
-
-    Args:
-        path: file, which is replaced; None for a temporary one.
-        header: cells of the first line.
-        say: prints a line.
-    """
+    """A CSV file of rows of numbers, a temporary one without a path; a thread writes it."""
 
     def __init__(
         self, path: Path | None, header: Sequence[str], say: Callable[[str], None]
@@ -72,17 +66,10 @@ class RowFile:
 
 
 class LiveRecord(Record):
-    """Record of a live run in a CSV file.
+    """Record of a live run in a CSV file, a temporary one without a path, and in further logs.
 
     The columns are those of `reporting.csv_file.signals_csv` without the error, then computing time
-    and delay of the step (`step[s]`, `late[s]`).
-
-    Args:
-        experiment: prepared scenario.
-        limit: torque limit, N m.
-        path: file; None for a temporary one.
-        say: prints a line.
-        logs: further logs, with the same rows.
+    and delay of the step (`step[s]`, `late[s]`). `limit` is that of the torque, N m.
 
     Attributes:
         applied: reported torques (6,), N m, by the period that they began in.
@@ -134,16 +121,10 @@ class LiveRecord(Record):
         late: float,
         packets: Array,
     ) -> None:
-        """Add sample `number`.
+        """Add a sample with the memory of the law after it.
 
-        Args:
-            number: k.
-            memory: memory of the law after it.
-            measurement: measurement at it.
-            wanted: reference (18,).
-            seconds: computing time of the step, s.
-            late: time from the earliest arrival of the measurement to the sending of torques, s.
-            packets: counts (5,) of `scenario.signals.PACKETS`.
+        Its step took `seconds`. `late` is the time from the earliest arrival of the measurement to
+        the sending of torques, s; `packets` has the counts (5,) of `scenario.signals.PACKETS`.
         """
         state = np.array(memory.belief.state)
         if self.count(memory) and self._measures_state:

@@ -13,11 +13,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.dynamics.workspace import Failure, margins
 from stewart_drake.law.channel import Report
 from stewart_drake.law.core_law import serving
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.live.checks import LONGEST_GAP, ReportCheck, stays_within_reach
+from stewart_drake.live.checks import (
+    LONGEST_GAP,
+    ReportCheck,
+    recovered,
+    replanned,
+    stays_within_reach,
+    until_next,
+)
 from stewart_drake.live.contact import Contact
 from stewart_drake.live.design import Design
 from stewart_drake.live.endpoint import now
@@ -26,14 +33,12 @@ from stewart_drake.live.governor import Request, Steering, Way
 from stewart_drake.live.learned import LearnedSetpoints, LearnedTorques
 from stewart_drake.live.log import LiveRecord
 from stewart_drake.live.protocol import NEVER, SECOND, ControllerFlags, MachineMessage
-from stewart_drake.live.replanning import recovered, replanned, until_next
 from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.recording import has_measured
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.run_log import RunLog
 from stewart_drake.scenario.signals import (
-    ACCELERATIONS,
     MODEL_TORQUE,
     NUM_REFERENCE,
     NUM_STATE,
@@ -56,22 +61,14 @@ _SOFT_STARTS: Final = (1.0, 2.0, 4.0, 8.0)
 
 
 class LiveLoop:
-    """Runs a law against a machine.
+    """Runs a law against a machine that has offered a session.
 
     Args:
-        design: law and settings.
-        steering: reference from t = 0 on.
-        contact: session that the machine has offered.
-        viewer: shows the run.
-        say: prints a line.
         max_missing: longest gap of usable measurements, s. By default as long as the estimator's
             uncertainty allows (`live.checks`).
         log: CSV file of the record, written as the run goes on; a temporary one by default.
-        logs: further logs of the same rows.
 
     Attributes:
-        exchange: datagrams of the run.
-        record: record of the run.
         memory: memory of the law after the last sample.
         recoveries: number of new references that were planned.
         taken_over: whether the plate was not at the scenario's start.
@@ -128,13 +125,9 @@ class LiveLoop:
     # -------------------------------------------------------------- run
 
     def run(self, duration: float, ending: Callable[[], bool] = lambda: False) -> End:
-        """Run for `duration` s, which may be infinite, then bring the plate to rest.
+        """Run for `duration` s, which may be infinite, or until `ending`; then stop the plate.
 
         A stop of the viewer, Ctrl-C or a failure ends the run at once.
-
-        Args:
-            duration: recorded time, s.
-            ending: returns whether to end before that.
         """
         end, k = End("completed", None), 0
         try:
@@ -440,15 +433,12 @@ class CrankLoop(LiveLoop):
 
     def _keeps_limits(self, way: Way, begins: float, duration: float) -> bool:
         """Return whether the start of a way is within reach and torque."""
-        plant = self._design.law.plant
-        for t in np.arange(begins, begins + duration, self._period):
-            x = way.at(t)
-            if diagnose(plant.mechanism, t, x[POSE]):
-                return False
-            torque = plant.dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
-            if np.abs(torque).max() > self._design.torque_limit:
-                return False
-        return True
+        plant, times = self._design.law.plant, np.arange(begins, begins + duration, self._period)
+        rows = np.array([way.at(t) for t in times])
+        if not margins(plant.mechanism, rows[:, POSE]).min() > 0:
+            return False
+        torques = plant.dynamics.torques_along(rows)
+        return not np.abs(torques).max() > self._design.torque_limit
 
     def _recover(self, t: float) -> None:
         """Do nothing: servos follow the reference by themselves."""

@@ -45,7 +45,7 @@ from stewart_drake.live.simulated import (
     link_times,
 )
 from stewart_drake.loop.peer import FAULTS, Fault, Reason, identity_of, in_words
-from stewart_drake.loop.preparation import Experiment, prepare
+from stewart_drake.loop.preparation import Experiment
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.run_log import Background, RunLog, open_log
@@ -75,7 +75,7 @@ def check_scenario(scenario: Scenario) -> None:
 @contextmanager
 def socket_and_log(
     scenario: Scenario, options: MachineOptions, say: Callable[[str], None]
-) -> Iterator[tuple[Endpoint, RunLog | None]]:
+) -> Iterator[tuple[Endpoint[ControllerMessage], RunLog | None]]:
     """Yield the socket of a machine, and the log that its options ask for."""
     with ExitStack() as opened:
         endpoint = Endpoint(ControllerMessage, options.host, options.port, read_key(options.key))
@@ -85,20 +85,6 @@ def socket_and_log(
             log = Background(open_log(options.log, scenario), str(options.log), say)
             opened.callback(log.close)
         yield endpoint, log
-
-
-@contextmanager
-def open_machine(
-    scenario: Scenario, options: MachineOptions, say: Callable[[str], None] = print
-) -> "Iterator[tuple[Machine, Address]]":
-    """Yield a machine and the address at which it listens.
-
-    Raises:
-        ConfigError: a scenario that the protocol does not cover, or an address in use.
-    """
-    check_scenario(scenario)
-    with socket_and_log(scenario, options, say) as (endpoint, log):
-        yield Machine(prepare(scenario), endpoint, options, say, log=log), endpoint.address
 
 
 def reason_of(failure: Failure) -> Reason:
@@ -114,22 +100,17 @@ class Machine:
 
     Args:
         experiment: prepared scenario that passes `check_scenario`.
-        endpoint: socket.
-        say: prints a line.
         clock: monotonic clock, ns.
-        log: log of true state, acting torque and measurement at each sample of a run, by the
-            machine's clock; or None.
+        log: for true state, acting torque and measurement at each sample of a run, by the machine's
+            clock.
         body: makes plant and sensor, and their name; those of the scenario by default.
 
     Attributes:
         session: present or last session.
         begin: time at which the run began or will begin, ns, or NEVER.
         failure: how the plate left its workspace, or None.
-        identity: identity that a controller must be designed for.
-        offers: offers of sessions.
         reason: why torques do not act, or no fault.
         before: fault that preceded it.
-        counts: number of events by name.
         simulated_by: name of the integrator, see `live.simulated.body_of`.
         longest_lag: longest delay of an event while the plate moved, ns.
     """
@@ -137,7 +118,7 @@ class Machine:
     def __init__(
         self,
         experiment: Experiment,
-        endpoint: Endpoint,
+        endpoint: Endpoint[ControllerMessage],
         settings: Settings | None = None,
         say: Callable[[str], None] = print,
         clock: Callable[[], int] = now,
@@ -157,7 +138,7 @@ class Machine:
         self.session: Session | None = None
         self.identity, self.offers = identity_of(sc), Offers()
         self._refusal_said = 0
-        self._due: list[tuple[int, int, int, Callable[[int], None]]] = []
+        self._due: list[tuple[int, int, int, Callable[[int], object]]] = []
         self._number = self.sample = 0
         self.counts: Counter[str] = Counter()
         self.longest_lag, self._stalled_until = 0, -1
@@ -187,7 +168,7 @@ class Machine:
         """Return the machine's clock, ns."""
         return round((self._clock() - self._started) * self._settings.rate)
 
-    def _at(self, time: int, order: int, do: Callable[[int], None]) -> None:
+    def _at(self, time: int, order: int, do: Callable[[int], object]) -> None:
         self._number += 1
         heapq.heappush(self._due, (time, order, self._number, do))
 
@@ -218,7 +199,6 @@ class Machine:
     def poll(self, time: int) -> None:
         """Read the datagrams that have come; each arrives after its transit time."""
         for message, address in self._endpoint.receive():
-            assert isinstance(message, ControllerMessage)
             number = message.head.sequence
             if self.begin != NEVER and len(message.torques):
                 number = max(0, round((message.sampled - self.begin) / self.period))
@@ -481,10 +461,8 @@ class Machine:
             self.counts["measurements lost"] += 1
         else:
             self.counts["sent"] += 1
-            self._at(message.head.time + under_way, 3, lambda _: self._put(message, to))
-
-    def _put(self, message: MachineMessage, to: Address) -> None:
-        self._endpoint.send(message, to)
+            due = message.head.time + under_way
+            self._at(due, 3, lambda _: self._endpoint.send(message, to))
 
     def _flags(self) -> MachineFlags:
         states = {

@@ -11,7 +11,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
@@ -23,7 +23,7 @@ from stewart_drake.files.yamlio import brief
 from stewart_drake.law.servos import Stiffness, rise
 from stewart_drake.live.contact import address_of
 from stewart_drake.live.endpoint import Address, Endpoint, now
-from stewart_drake.live.machine import Machine, check_scenario, open_machine, socket_and_log
+from stewart_drake.live.machine import Machine, check_scenario, socket_and_log
 from stewart_drake.live.options import MachineOptions
 from stewart_drake.live.protocol import (
     NEVER,
@@ -78,9 +78,6 @@ class Positions(NamedTuple):
 
 class Daemon:
     """Connection to the daemon, in a separate thread. It reconnects whenever it is lost.
-
-    Args:
-        address: of the daemon.
 
     Attributes:
         positions: the last ones, the newest last.
@@ -221,12 +218,8 @@ class SoftSetpoints:
 
         u = h + g(s / T) (w - h),   g(s) = 10 s^3 - 15 s^4 + 6 s^5,
 
-    within range and speed of the servos. T is SOFT_START, or less after a short gap.
-
-    Args:
-        servo: range and speed.
-        period: s.
-        angles: (6,) of the cranks, at rest, rad.
+    within range and speed of the servos. T is SOFT_START, or less after a short gap. At first the
+    cranks rest at `angles` (6,), rad.
     """
 
     def __init__(self, servo: Stiffness, period: float, angles: Array) -> None:
@@ -297,7 +290,7 @@ class RobotMachine(Machine):
     def __init__(
         self,
         experiment: Experiment,
-        endpoint: Endpoint,
+        endpoint: Endpoint[ControllerMessage],
         options: MachineOptions,
         daemon: Daemon,
         say: Callable[[str], None] = print,
@@ -362,24 +355,25 @@ class RobotMachine(Machine):
             self._soft = None  # the daemon holds the last setpoint
 
 
-def check_robot(scenario: Scenario) -> None:
-    """Refuse a scenario that the robot cannot be driven with.
-
-    Raises:
-        ConfigError: motors other than position servos, or more samples than the daemon sends.
-    """
-    wanted = {"actuator.kind": "position_servo", "sensor.samples": (None, 1)}
-    if found := differing(scenario, wanted):
-        raise ConfigError(found.problem("with --reachy"))
-
-
+@contextmanager
 def open_chosen(
     scenario: Scenario, options: MachineOptions, say: Callable[[str], None] = print
-) -> AbstractContextManager[tuple[Machine, Address]]:
-    """Open the robot behind `options.reachy`, or a simulated machine; as `open_machine`."""
-    if options.ahead and not options.reachy:
+) -> Iterator[tuple[Machine, Address]]:
+    """Yield the robot behind `options.reachy`, or a simulated machine, and where it listens.
+
+    Raises:
+        ConfigError: a scenario that the protocol does not cover, an address in use, or see
+            `open_robot`.
+    """
+    if options.reachy:
+        with open_robot(scenario, options, say) as opened:
+            yield opened
+        return
+    if options.ahead:
         raise ConfigError(f"--ahead: got {options.ahead:g} s without --reachy; expected both")
-    return (open_robot if options.reachy else open_machine)(scenario, options, say)
+    check_scenario(scenario)
+    with socket_and_log(scenario, options, say) as (endpoint, log):
+        yield Machine(prepare(scenario), endpoint, options, say, log=log), endpoint.address
 
 
 @contextmanager
@@ -389,11 +383,13 @@ def open_robot(
     """Yield the machine of a robot, and the address at which it listens.
 
     Raises:
-        ConfigError: another machine than such a robot, no package websockets, no daemon that sends
-            positions, or an address in use.
+        ConfigError: motors other than position servos, more samples than the daemon sends, no
+            package websockets, no daemon that sends positions, or an address in use.
     """
     check_scenario(scenario)
-    check_robot(scenario)
+    wanted = {"actuator.kind": "position_servo", "sensor.samples": (None, 1)}
+    if found := differing(scenario, wanted):
+        raise ConfigError(found.problem("with --reachy"))
     try:
         import websockets  # noqa: F401
     except ImportError:

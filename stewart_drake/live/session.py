@@ -26,7 +26,13 @@ from stewart_drake.live.endpoint import Address, Endpoint
 from stewart_drake.live.governor import FASTEST, PACE, Governor, Steering, Way
 from stewart_drake.live.loop import CrankLoop, LiveLoop
 from stewart_drake.live.options import LiveOptions
-from stewart_drake.live.protocol import NOTHING, SECOND, ControllerFlags, MachineFlags
+from stewart_drake.live.protocol import (
+    NOTHING,
+    SECOND,
+    ControllerFlags,
+    MachineFlags,
+    MachineMessage,
+)
 from stewart_drake.live.viewer import Viewer
 from stewart_drake.loop.cautions import overconfidence
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
@@ -49,7 +55,7 @@ _MOST: Final = 0.5
 class Ready(NamedTuple):
     """A machine that was found, and the law for it, before anything moves."""
 
-    endpoint: Endpoint
+    endpoint: Endpoint[MachineMessage]
     contact: Contact
     design: Design  # law for the scenario over the link that was found
     margin: ControllerMargin  # stability margin of the loop with a constant delay eta
@@ -83,11 +89,7 @@ def prepare_session(
 ) -> Ready:
     """Find a machine, measure the link and design the law for it.
 
-    Args:
-        scenario: law and motion.
-        address: address of the machine.
-        key: shared key; not needed on loopback.
-        learned: see `live.design.Learned`; by default that of `controller.learned`.
+    What was learned is by default that of `controller.learned`.
 
     Raises:
         ConfigError: no machine there, or one that does not fit the scenario.
@@ -243,12 +245,7 @@ def before_others() -> Iterator[str]:
 
 
 def open_logs(ready: Ready, options: LiveOptions, say: Callable[[str], None]) -> list[RunLog]:
-    """Open the logs that a run is asked for.
-
-    Args:
-        ready: result of `prepare_session`.
-        options: `log` and `mirror`.
-        say: prints a line.
+    """Open the logs that the options `log` and `mirror` ask for.
 
     Raises:
         ConfigError: a file that cannot be written, or no such host.
@@ -275,19 +272,13 @@ def drive(
     logs: Sequence[RunLog] = (),
     pace: float | None = None,
 ) -> SimulationResult:
-    """Run the loop; the machine moves.
+    """Run the loop; the machine moves. In the end socket and logs are closed.
 
     Args:
-        ready: result of `prepare_session`; its socket is closed.
-        duration: s, or infinite.
         armed: whether a real machine may be driven.
         accept_jitter: whether to start with more jitter than the loop is stable for.
-        viewer: shows the run and passes on requests.
         ending: whether to bring the plate to rest and end.
-        say: prints a line.
-        max_missing: see `LiveLoop`.
-        log: see `LiveLoop`.
-        logs: further logs, written while the run goes on; closed at the end.
+        max_missing, log: see `LiveLoop`.
         pace: pole of the governor, 1/s; by default it depends on the torque limit.
 
     Raises:

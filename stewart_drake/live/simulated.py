@@ -90,8 +90,6 @@ class Motors:
     the first row counts, and acts when it arrives.
 
     Args:
-        limit: torque limit, N m.
-        period: dt.
         holds: whether a dry buffer holds the last torque; otherwise it outputs zero.
         delay_of: delay of the torque of sample k on a wire; None for a buffer.
         cranks: whether rows are setpoints of servos, in rad, which are never zero for lack of one.

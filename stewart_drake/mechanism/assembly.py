@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, levers, rotation
+from stewart_drake.mechanism.kinematics import angle_rate_map, dot, leg_geometry, levers, rotation
 from stewart_drake.scenario.signals import ANGLES, POSITION
 from stewart_drake.types import Array
 
@@ -73,7 +73,7 @@ def joint_state(mechanism: Mechanism, pose: Array, rates: Array) -> JointState:
     # `y_of_crank` is the y of the home pose, carried by the crank.
     y_of_crank = (now.R_WC @ home.R_WC.swapaxes(1, 2) @ home.R_WD[:, :, 1, None])[..., 0]
     y = now.R_WD[:, :, 1]
-    theta_1 = np.arctan2(_dot(np.cross(y_of_crank, y), axes), _dot(y_of_crank, y))
+    theta_1 = np.arctan2(dot(np.cross(y_of_crank, y), axes), dot(y_of_crank, y))
     theta_2 = _elevation(now.R_WD, axes) - _elevation(home.R_WD, axes)
     crank = (now.crank_angles - home.crank_angles + np.pi) % (2 * np.pi) - np.pi
 
@@ -83,15 +83,15 @@ def joint_state(mechanism: Mechanism, pose: Array, rates: Array) -> JointState:
     legs = leg_geometry(mechanism, pose)
     w_WP = angle_rate_map(pose[ANGLES]) @ rates[ANGLES]
     v_WQ = rates[POSITION] + np.cross(w_WP, legs.p_PQ_W)
-    along = _dot(legs.rod, v_WQ)
+    along = dot(legs.rod, v_WQ)
     # `levers` refuses a dead centre. A plate at rest has alpha_dot = 0 even there.
     alpha_dot = along / levers(mechanism, legs) if along.any() else along
     v_WT = (mechanism.crank_lengths * alpha_dot)[:, None] * legs.tangent
     swing = np.cross(legs.rod, v_WQ - v_WT) / mechanism.rod_lengths[:, None]
-    swing_n, rod_n = _dot(swing, axes), _dot(legs.rod, axes)
+    swing_n, rod_n = dot(swing, axes), dot(legs.rod, axes)
     w_WD = swing + (swing_n * rod_n / (1 - rod_n**2))[:, None] * legs.rod
-    theta_1_rate = _dot(w_WD, axes) - alpha_dot
-    theta_2_rate = _dot(w_WD, now.R_WD[:, :, 1])
+    theta_1_rate = dot(w_WD, axes) - alpha_dot
+    theta_2_rate = dot(w_WD, now.R_WD[:, :, 1])
     return JointState(
         crank=crank,
         universal=np.column_stack([theta_1, theta_2]),
@@ -103,11 +103,7 @@ def joint_state(mechanism: Mechanism, pose: Array, rates: Array) -> JointState:
 def _elevation(R_WD: Array, axes: Array) -> Array:
     """Return the angle (6,) of the rod x about y, from the direction n x y towards n."""
     x, y = R_WD[:, :, 0], R_WD[:, :, 1]
-    return np.asarray(np.arctan2(_dot(x, axes), _dot(x, np.cross(axes, y))), dtype=np.float64)
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return np.einsum("li,li->l", a, b)
+    return np.asarray(np.arctan2(dot(x, axes), dot(x, np.cross(axes, y))), dtype=np.float64)
 
 
 def torque_map(mechanism: Mechanism, pose: Array, form: TorqueMap = "virtual_work") -> Array:

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.mechanism.kinematics import LegGeometry, Legs
+from stewart_drake.mechanism.kinematics import LegGeometry, Legs, dot
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS, POSITION
 from stewart_drake.types import Array
 
@@ -67,14 +67,14 @@ def segment_distances(p: Array, u: Array, q: Array, v: Array) -> Array:
     leads to one. Lengths are not zero.
     """
     r = p - q
-    uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)
-    ur, vr = _dot(u, r), _dot(v, r)
+    uu, vv, uv = dot(u, u), dot(v, v), dot(u, v)
+    ur, vr = dot(u, r), dot(v, r)
     area = uu * vv - uv**2
     skew = area > 1e-14 * uu * vv
     s = np.clip(np.where(skew, (uv * vr - ur * vv) / np.where(skew, area, 1.0), 0.0), 0.0, 1.0)
     t = np.clip((uv * s + vr) / vv, 0.0, 1.0)
     s = np.clip((uv * t - ur) / uu, 0.0, 1.0)
-    return np.sqrt(_dot(d := r + s[..., None] * u - t[..., None] * v, d))
+    return np.sqrt(dot(d := r + s[..., None] * u - t[..., None] * v, d))
 
 
 def clearances(
@@ -96,7 +96,3 @@ def capsule_radii(mechanism: Legs) -> Array:
     size = proportions(mechanism)
     crank = float(np.hypot(size.crank_width, size.crank_thickness)) / 2
     return np.repeat([crank, size.rod_radius], NUM_LEGS)
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return np.einsum("...i,...i->...", a, b)

@@ -15,7 +15,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import load_yaml, one_message, validate, yaml_text
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism, bar_inertia, disc_inertia
-from stewart_drake.mechanism.kinematics import Legs, UnreachablePoseError
+from stewart_drake.mechanism.kinematics import Legs, UnreachablePoseError, dot
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.types import Array
 
@@ -66,53 +66,37 @@ Length = Annotated[
 
 @dataclass(config=_STRICT)
 class BodySpec:
-    """A body.
+    """A body."""
 
-    Attributes:
-        mass: kg.
-        inertia: principal moments about the COM, kg m^2; null estimates those of a uniform disc.
-    """
-
-    mass: Mass
+    mass: Mass  # kg
+    # principal moments about the COM, kg m^2; null estimates those of a uniform disc
     inertia: Moments | None = None
 
 
 @dataclass(config=_STRICT)
 class LinkSpec:
-    """All cranks, or all rods.
+    """All cranks, or all rods."""
 
-    Attributes:
-        length: m, one for all legs or one per leg.
-        mass: kg.
-        inertia: principal moments about the COM, along the link first, kg m^2; null estimates
-            those of a uniform bar of the mean length.
-        center: position of the COM along the link, 0 to 1.
-    """
-
-    length: Length
-    mass: Mass
+    length: Length  # m, one for all legs or one per leg
+    mass: Mass  # kg
+    # principal moments about the COM, along the link first, kg m^2; null estimates those of a
+    # uniform bar of the mean length
     inertia: Moments | None = None
-    center: float = 0.5
+    center: float = 0.5  # position of the COM along the link, 0 to 1
 
 
 @dataclass(config=_STRICT)
 class MotorSpec:
-    """All motors.
+    """All motors."""
 
-    Attributes:
-        effort_limit: torque limit, N m; null is none.
-    """
-
-    effort_limit: Annotated[float, Field(gt=0, le=1e6)] | None = None
+    effort_limit: Annotated[float, Field(gt=0, le=1e6)] | None = None  # N m; null is none
 
 
 @dataclass(config=_STRICT)
 class BallJointSpec:
-    """Ball joints with the friction of a scenario's `plant.ball_joint_...`.
+    """Legs, 1 to 6, whose ball joints have the friction of a scenario's `plant.ball_joint_...`.
 
-    Attributes:
-        crank: numbers of the legs, 1 to 6, whose joint between crank and rod has it.
-        plate: those whose joint between rod and plate has it.
+    `crank` joints are those between crank and rod, `plate` joints those between rod and plate.
     """
 
     crank: LegNumbers = Field(default_factory=lambda: list(LEGS))
@@ -143,22 +127,13 @@ class PatternSpec:
 
 @dataclass(config=_STRICT)
 class LegSpec:
-    """One leg.
+    """One leg."""
 
-    Attributes:
-        shaft: centre of the motor shaft in W, m.
-        motor_axis: direction of any length; the crank angle grows right-handed about it.
-        crank_zero: direction of the crank at angle zero, perpendicular to `motor_axis` but for
-            rounding.
-        plate_joint: position in P, m.
-        branch: -1 or 1, the crank solution.
-    """
-
-    shaft: Point
-    motor_axis: Point
-    crank_zero: Point
-    plate_joint: Point
-    branch: Branch
+    shaft: Point  # centre of the motor shaft in W, m
+    motor_axis: Point  # direction of any length; the crank angle grows right-handed about it
+    crank_zero: Point  # crank at angle zero, perpendicular to `motor_axis` but for rounding
+    plate_joint: Point  # position in P, m
+    branch: Branch  # -1 or 1, the crank solution
 
 
 @dataclass(config=_STRICT)
@@ -361,7 +336,7 @@ def _explicit_legs(
         return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
     n, x = unit("motor_axis"), unit("crank_zero")
-    lean = np.einsum("li,li->l", n, x)
+    lean = dot(n, x)
     for i in np.flatnonzero(np.abs(lean) > _MOST_LEAN)[:1]:
         raise ConfigError(
             f"legs[{i}].crank_zero: got {np.rad2deg(np.arccos(lean[i])):.6g} degrees to "

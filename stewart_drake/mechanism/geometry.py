@@ -33,21 +33,15 @@ _BRANCHES: Final = slice(2 * NUM_LEGS, 3 * NUM_LEGS)  # place of the crank branc
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body.
+    """A rigid body."""
 
-    Attributes:
-        mass: kg.
-        inertia: principal moments (3,) about its COM, kg m^2.
-        estimated: whether the moments are those of a uniform body, not measured ones.
-    """
-
-    mass: float
-    inertia: Array
+    mass: float  # kg
+    inertia: Array  # principal moments (3,) about its COM, kg m^2
     _: KW_ONLY
-    estimated: bool = False
+    estimated: bool = False  # whether the moments are those of a uniform body, not measured ones
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "inertia", _fixed("inertia", self.inertia, (3,)))
+        object.__setattr__(self, "inertia", fixed("inertia", self.inertia, (3,)))
 
     def problem(self, field: str, *, massless: bool = False) -> str | None:
         """Return why no rigid body has this mass and inertia, opened by `field`, or None."""
@@ -92,11 +86,7 @@ class Mechanism(kinematics.Legs):
     Attributes:
         name: identifier, used for file and model names.
         home: pose (6,) at which the machine is assembled.
-        p_WS: motor shaft centres (6, 3) in m.
-        R_WS: motor frames (6, 3, 3); columns x, y and the motor axis z.
-        p_PQ: plate joints (6, 3) in the plate frame, m.
-        crank_lengths, rod_lengths: (6,) m.
-        branches: (6,) of -1 or +1, the crank solution that a leg uses.
+        p_WS, R_WS, p_PQ, crank_lengths, rod_lengths, branches: see `kinematics.Legs`.
         base, plate, crank, rod: masses and inertias; the six cranks are alike, so are the rods.
         effort_limit: of each motor in N m, written to SDFormat and the default of a scenario's
             `actuator.torque_limit`; or None.
@@ -125,7 +115,7 @@ class Mechanism(kinematics.Legs):
             *(("p_WS", (NUM_LEGS, 3)), ("R_WS", (NUM_LEGS, 3, 3)), ("p_PQ", (NUM_LEGS, 3))),
             *((name, (NUM_LEGS,)) for name in ("crank_lengths", "rod_lengths", "branches")),
         ):
-            object.__setattr__(self, name, _fixed(name, getattr(self, name), shape))
+            object.__setattr__(self, name, fixed(name, getattr(self, name), shape))
         self._check()
 
     def __repr__(self) -> str:
@@ -347,11 +337,14 @@ def _six(name: str, values: ArrayLike) -> Array:
     return numbers
 
 
-def _fixed(field: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+def fixed(field: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Return a read-only copy of finite numbers of this shape."""
-    copy = np.array(values, dtype=np.float64)
+    try:
+        copy = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigError(f"{field}: got {values!r}; expected numbers") from None
     if copy.shape != shape:
-        raise ConfigError(f"{field}: got shape {copy.shape}; expected {shape}")
+        raise ConfigError(f"{field}: got shape {copy.shape}; expected {shape or 'one number'}")
     if not np.all(np.isfinite(copy)):
         raise ConfigError(f"{field}: got {_listed(copy)}; expected finite numbers")
     copy.setflags(write=False)

@@ -25,31 +25,18 @@ _HEIGHTS = 1000  # number of heights that `reachable_heights` evaluates
 
 @dataclass(frozen=True, eq=False)
 class Legs:
-    """Dimensions of the six legs, SI units.
+    """Dimensions of the six legs, SI units."""
 
-    Attributes:
-        p_WS: motor shaft centres (6, 3).
-        R_WS: motor frames (6, 3, 3); columns x, y and the motor axis z.
-        p_PQ: plate joints (6, 3) in the plate frame.
-        crank_lengths, rod_lengths: (6,).
-        branches: (6,) of -1 or +1, the crank solution that a leg uses.
-    """
-
-    p_WS: Array
-    R_WS: Array
-    p_PQ: Array
-    crank_lengths: Array
-    rod_lengths: Array
-    branches: Array
+    p_WS: Array  # motor shaft centres (6, 3)
+    R_WS: Array  # motor frames (6, 3, 3); columns x, y and the motor axis z
+    p_PQ: Array  # plate joints (6, 3) in the plate frame
+    crank_lengths: Array  # (6,)
+    rod_lengths: Array  # (6,)
+    branches: Array  # (6,) of -1 or +1, the crank solution that a leg uses
 
 
 class UnreachablePoseError(ValueError):
-    """Error for a pose out of reach.
-
-    Attributes:
-        margins: (6,) in m, negative for a leg that falls short.
-        legs: numbers of these legs, from one.
-    """
+    """Error for a pose out of reach: `margins` (6,) in m of `legs` (from one) are negative."""
 
     def __init__(self, margins: Array, prefix: str = "pose out of reach", suffix: str = "") -> None:
         self.margins = np.asarray(margins)
@@ -100,24 +87,20 @@ def angle_rate_map(angles: Array) -> Array:
 
 @dataclass(frozen=True)
 class LegGeometry:
-    """The six legs at some poses; unit vectors in W, arrays (..., 6, 3) or (..., 6).
+    """The six legs at some poses; unit vectors in W, arrays (..., 6, 3) or (..., 6)."""
 
-    Attributes:
-        crank_angles: rad.
-        p_PQ_W: plate joint from the plate's COM.
-        crank: direction of the crank.
-        tangent: direction in which the crank tip moves for growing crank angle.
-        rod: direction from the crank tip to the plate joint.
-        transmission: rod . tangent, zero at a dead centre, where crank and rod lie in one plane
-            with the motor axis.
-    """
-
-    crank_angles: Array
-    p_PQ_W: Array
-    crank: Array
-    tangent: Array
-    rod: Array
+    crank_angles: Array  # rad
+    p_PQ_W: Array  # plate joint from the plate's COM
+    crank: Array  # direction of the crank
+    tangent: Array  # direction in which the crank tip moves for growing crank angle
+    rod: Array  # direction from the crank tip to the plate joint
+    # rod . tangent, zero at a dead centre, where crank and rod lie in one plane with the motor axis
     transmission: Array
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Return the scalar products (...) of vectors (..., 3)."""
+    return np.einsum("...i,...i->...", a, b)
 
 
 def _joints(legs: Legs, poses: Array) -> tuple[Array, Array]:
@@ -175,7 +158,7 @@ def legs_along(legs: Legs, poses: Array) -> LegGeometry:
     u, rod = legs.crank_lengths, legs.rod_lengths
     p_PQ_W, p_SQ_S = _joints(legs, poses)
     a, b = 2 * u * p_SQ_S[..., 0], 2 * u * p_SQ_S[..., 1]
-    c = np.einsum("...li,...li->...l", p_SQ_S, p_SQ_S) + u**2 - rod**2
+    c = dot(p_SQ_S, p_SQ_S) + u**2 - rod**2
     # Rounding may lift |c| over hypot(a, b) by one ulp where the margin is exactly zero.
     swing = np.arccos(np.clip(c / np.hypot(a, b), -1.0, 1.0))
     swing = np.where(_margins(legs, p_SQ_S) >= 0, swing, np.nan)
@@ -186,7 +169,7 @@ def legs_along(legs: Legs, poses: Array) -> LegGeometry:
     crank, tangent = cos * x + sin * y, -sin * x + cos * y
     p_TQ_W = poses[..., None, POSITION] + p_PQ_W - legs.p_WS - u[:, None] * crank
     e_rod = p_TQ_W / rod[:, None]
-    transmission = np.einsum("...li,...li->...l", e_rod, tangent)
+    transmission = dot(e_rod, tangent)
     return LegGeometry(alpha, p_PQ_W, crank, tangent, e_rod, transmission)
 
 

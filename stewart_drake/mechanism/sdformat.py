@@ -95,13 +95,19 @@ def _plate(model: ET.Element, mechanism: Mechanism, home: Assembly) -> None:
     deck = float(mechanism.p_PQ[:, 2].mean())
     _solid(link, "disc", _pose([0, 0, deck + size.plate_thickness]), disc, PLATE_COLOR)
     # A pointer along x shows the yaw that a disc would hide.
-    bar = _box([0.85 * radius, 0.06 * radius, 0.4 * size.plate_thickness])
+    bar = _shape("box", size=[0.85 * radius, 0.06 * radius, 0.4 * size.plate_thickness])
     above = deck + 1.6 * size.plate_thickness
     _visual(link, "x_axis", _pose([0.425 * radius, 0, above]), bar, CRANK_COLOR)
     tip = _cylinder(0.09 * radius, 0.4 * size.plate_thickness)
     _visual(link, "x_axis_tip", _pose([0.85 * radius, 0, above]), tip, CRANK_COLOR)
     for leg, p_PQ in zip(LEGS, mechanism.p_PQ, strict=True):
-        _visual(link, f"joint_{leg}", _pose(p_PQ), _sphere(1.6 * size.rod_radius), JOINT_COLOR)
+        _visual(
+            link,
+            f"joint_{leg}",
+            _pose(p_PQ),
+            _shape("sphere", radius=[1.6 * size.rod_radius]),
+            JOINT_COLOR,
+        )
         _frame(model, f"plate_joint_{leg}", "plate", _pose(p_PQ))
 
 
@@ -112,11 +118,17 @@ def _leg(model: ET.Element, mechanism: Mechanism, home: Assembly, leg: int) -> N
     crank = _add(model, "link", name=f"crank_{leg}")
     _add(crank, "pose", _pose(mechanism.p_WS[i], home.R_WC[i]))
     _inertial(crank, mechanism.crank, np.array([mechanism.crank.center * u, 0, 0]))
-    arm = _box([u, size.crank_width, size.crank_thickness])
+    arm = _shape("box", size=[u, size.crank_width, size.crank_thickness])
     _solid(crank, "arm", _pose([u / 2, 0, 0]), arm, CRANK_COLOR)
     hub = _cylinder(1.2 * size.crank_thickness, 1.5 * size.crank_thickness)
     _visual(crank, "hub", _pose([0, 0, 0]), hub, CRANK_COLOR)
-    _visual(crank, "tip", _pose([u, 0, 0]), _sphere(1.6 * size.rod_radius), JOINT_COLOR)
+    _visual(
+        crank,
+        "tip",
+        _pose([u, 0, 0]),
+        _shape("sphere", radius=[1.6 * size.rod_radius]),
+        JOINT_COLOR,
+    )
     _frame(model, f"tip_{leg}", f"crank_{leg}", _pose([u, 0, 0]))
 
     rod = _add(model, "link", name=f"rod_{leg}")
@@ -218,19 +230,11 @@ def _visual(
 
 
 def _cylinder(radius: float, length: float) -> ET.Element:
-    cylinder = ET.Element("cylinder")
-    _add(cylinder, "radius", _numbers([radius]))
-    _add(cylinder, "length", _numbers([length]))
-    return cylinder
+    return _shape("cylinder", radius=[radius], length=[length])
 
 
-def _sphere(radius: float) -> ET.Element:
-    sphere = ET.Element("sphere")
-    _add(sphere, "radius", _numbers([radius]))
-    return sphere
-
-
-def _box(size: Iterable[float]) -> ET.Element:
-    box = ET.Element("box")
-    _add(box, "size", _numbers(size))
-    return box
+def _shape(kind: str, **sizes: Iterable[float]) -> ET.Element:
+    shape = ET.Element(kind)
+    for name, values in sizes.items():
+        _add(shape, name, _numbers(values))
+    return shape

@@ -54,8 +54,6 @@ static const char crank_bytes[] =
     "40420f0000000000000000000102000000180d8f000000000020bcbe0000000000ca9a3b00000000000000000000e03f"
     "000000000000d0bf0000000000000000000000000000f03f000000000000f0bf0000000000000040";
 
-static const stewart_head head = {0x1122334455667788u, 0x99aabbccddeeff01u, 7, 3, 2500000000u,
-                                  1234567890u, 1000000u, 0};
 static const stewart_key none = {NULL, 0};
 static const stewart_key key = {(const uint8_t *)"0123456789abcdef", 16};
 static int failed;
@@ -76,123 +74,95 @@ static size_t from_hex(const char *text, uint8_t *data)
     return size;
 }
 
-static int same(const uint8_t *data, size_t size, const char *text)
+static stewart_plan plan;
+static stewart_measured measured;
+
+/* Read a datagram and write it again, `written` bytes; return why it is refused. */
+static int through(const uint8_t *data, size_t size, stewart_key with, uint8_t *again, size_t *written)
 {
-    uint8_t wanted[STEWART_LONGEST + 1];
-    return size == from_hex(text, wanted) && memcmp(data, wanted, size) == 0;
+    const int report = size > 3 && data[3] == 'M';
+    const int cause = report ? stewart_read_measured(data, size, with, &measured)
+                             : stewart_read_plan(data, size, with, &plan);
+    *written = 0;
+    if (cause == STEWART_TAKEN)
+        *written = report ? stewart_write_measured(&measured, with, again)
+                          : stewart_write_plan(&plan, with, again);
+    return cause;
 }
 
-/* Every shorter datagram, and every one with a byte changed, is refused or is another message. */
-static void damage(const char *text, stewart_key with)
+/* A datagram is written as it was read. Every shorter one, and every one with a byte changed, is
+   refused or is another message. */
+static void test_bytes(const char *text, stewart_key with, const char *what)
 {
     uint8_t data[STEWART_LONGEST + 1], again[STEWART_LONGEST];
-    stewart_plan plan;
-    stewart_measured measured;
-    size_t size = from_hex(text, data);
+    size_t size = from_hex(text, data), written;
     for (size_t i = 0; i < size; i++) {
-        check(stewart_read_plan(data, i, with, &plan) != STEWART_TAKEN, "a short plan");
-        check(stewart_read_measured(data, i, with, &measured) != STEWART_TAKEN, "a short report");
+        check(through(data, i, with, again, &written) != STEWART_TAKEN, "a short datagram");
         data[i] ^= 0x10;
-        if (stewart_read_plan(data, size, with, &plan) == STEWART_TAKEN)
-            check(!with.size && stewart_write_plan(&plan, with, again) == size &&
-                      memcmp(data, again, size) == 0,
-                  "a changed plan");
-        if (stewart_read_measured(data, size, with, &measured) == STEWART_TAKEN)
-            check(!with.size && stewart_write_measured(&measured, with, again) == size &&
-                      memcmp(data, again, size) == 0,
-                  "a changed report");
+        if (through(data, size, with, again, &written) == STEWART_TAKEN)
+            check(!with.size && written == size && memcmp(data, again, size) == 0, "a changed one");
         data[i] ^= 0x10;
     }
+    check(through(data, size, with, again, &written) == STEWART_TAKEN && written == size &&
+              memcmp(data, again, size) == 0,
+          what);
 }
 
-static void test_plan(void)
+static int head_is_right(const stewart_head *h, uint32_t flags)
+{
+    return h->session == 0x1122334455667788u && h->nonce == 0x99aabbccddeeff01u && h->sequence == 7 &&
+           h->acknowledged == 3 && h->time == 2500000000u && h->echo == 1234567890u &&
+           h->held == 1000000u && h->flags == flags;
+}
+
+static void test_plans(void)
 {
     uint8_t data[STEWART_LONGEST + 1];
-    stewart_plan plan = {.head = head, .rows = 2, .sampled = 2400000000u, .playout = 3200000000u,
-                         .begin = 1000000000u,
-                         .torques = {{0.5, -0.25, 0, 1, -1, 2}, {0.125, 0, 0, 0, 0, -8}}};
-    stewart_plan read;
-    plan.head.flags = STEWART_ARMED;
-    check(same(data, stewart_write_plan(&plan, none, data), plan_bytes), "the plan");
-    check(same(data, stewart_write_plan(&plan, key, data), keyed_bytes), "the plan with a key");
+    test_bytes(plan_bytes, none, "the plan");
+    check(head_is_right(&plan.head, STEWART_ARMED) && plan.rows == 2 && plan.sampled == 2400000000u &&
+              plan.playout == 3200000000u && plan.begin == 1000000000u && plan.torques[0][1] == -0.25 &&
+              plan.torques[1][5] == -8,
+          "its values");
+    test_bytes(keyed_bytes, key, "the plan with a key");
     size_t size = from_hex(keyed_bytes, data);
-    check(stewart_read_plan(data, size, key, &read) == STEWART_TAKEN, "reading the plan");
-    check(read.rows == 2 && read.torques[1][5] == -8 && read.playout == 3200000000u, "its values");
-    check(stewart_read_plan(data, size, none, &read) == STEWART_KEY, "a tag and no key");
+    check(stewart_read_plan(data, size, none, &plan) == STEWART_KEY, "a tag and no key");
+    check(stewart_read_measured(data, size, key, &measured) == STEWART_MALFORMED, "a plan as report");
     data[size - 1] ^= 1;
-    check(stewart_read_plan(data, size, key, &read) == STEWART_KEY, "a wrong tag");
+    check(stewart_read_plan(data, size, key, &plan) == STEWART_KEY, "a wrong tag");
     data[4] = 1;
-    check(stewart_read_plan(data, size, key, &read) == STEWART_VERSION, "another version");
-    plan.head.flags = 0;
-    plan.rows = 1;
-    plan.content = STEWART_CRANKS;
-    check(same(data, stewart_write_plan(&plan, none, data), crank_bytes), "crank angles");
-    size = from_hex(crank_bytes, data);
-    check(stewart_read_plan(data, size, none, &read) == STEWART_TAKEN && read.content == STEWART_CRANKS,
-          "reading them");
-    damage(plan_bytes, none);
-    damage(keyed_bytes, key);
-    damage(crank_bytes, none);
+    check(stewart_read_plan(data, size, key, &plan) == STEWART_VERSION, "another version");
+    test_bytes(crank_bytes, none, "crank angles");
+    check(plan.content == STEWART_CRANKS && plan.rows == 1, "their values");
 }
 
-static void test_measured(void)
+static void test_reports(void)
 {
-    uint8_t data[STEWART_LONGEST + 1];
-    stewart_measured read;
-    stewart_measured state = {.head = head, .kind = STEWART_STATE, .samples = 1, .history = 1,
-                              .sampled = 2400000000u, .begin = 1000000000u, .period = 100000000u,
-                              .watchdog = 1000000000u, .rate = 1, .torque_limit = INFINITY,
-                              .arrived = 11, .acted_from = 2400000000u, .played = 23, .dry = 1,
-                              .refused = 4,
-                              .reason = {STEWART_REACH, 2, 0},
-                              .before = {STEWART_STOOD, 0, 330000000u},
-                              .state = {0, 0.5, -0.5, 0.25, 0, 0.375, 0, 0, 0, 1, 0, NAN},
-                              .acted = {{0.5, -0.25, 0, 1, -1, 2}}};
-    state.head.flags = STEWART_SIMULATION | STEWART_RUNNING | STEWART_HOLDS;
-    check(same(data, stewart_write_measured(&state, none, data), state_bytes), "the state");
-    size_t size = from_hex(encoder_bytes, data);
-    check(stewart_read_measured(data, size, none, &read) == STEWART_TAKEN, "reading encoders");
-    check(read.codes[0][3] == -4096 && read.codes[0][5] == STEWART_UNREAD && read.bits == 14 &&
-              read.zeros[5] == -0.5 && read.begin == STEWART_NEVER,
+    const stewart_measured *m = &measured;
+    test_bytes(state_bytes, none, "the state");
+    check(head_is_right(&m->head, STEWART_SIMULATION | STEWART_RUNNING | STEWART_HOLDS) &&
+              m->kind == STEWART_STATE && m->sampled == 2400000000u && m->begin == 1000000000u &&
+              m->period == 100000000u && m->watchdog == 1000000000u && m->rate == 1 &&
+              isinf(m->torque_limit) && m->arrived == 11 && m->acted_from == 2400000000u &&
+              m->played == 23 && m->dry == 1 && m->refused == 4 && m->reason.fault == STEWART_REACH &&
+              m->reason.leg == 2 && m->before.fault == STEWART_STOOD && m->before.lasted == 330000000u &&
+              m->state[5] == 0.375 && isnan(m->state[11]) && m->acted[0][5] == 2,
+          "its values");
+    test_bytes(encoder_bytes, none, "encoders");
+    check(m->codes[0][3] == -4096 && m->codes[0][5] == STEWART_UNREAD && m->bits == 14 &&
+              m->zeros[5] == -0.5 && m->begin == STEWART_NEVER,
           "their values");
-    check(same(data, stewart_write_measured(&read, none, data), encoder_bytes), "encoders");
-    damage(state_bytes, none);
-    damage(encoder_bytes, none);
 }
-
-static const stewart_identity paper = {{
-    {{0xcf, 0x64, 0xbb, 0x0b, 0x8b, 0x5d, 0xc5, 0x24}, "paper"},
-    {{0xa3, 0x4a, 0xf4, 0x52, 0x2a, 0x9c, 0x34, 0x7b}, "0.1 s"},
-    {{0xcf, 0x77, 0x1b, 0xba, 0x11, 0x62, 0x0d, 0x68}, "state"},
-    {{0x38, 0x51, 0x23, 0x28, 0x5c, 0x60, 0xd1, 0xe8}, "torque"}}};
 
 static void test_greeting(void)
 {
-    uint8_t data[STEWART_LONGEST + 1];
-    stewart_plan request = {.head = head, .content = STEWART_REQUEST, .begin = STEWART_NEVER,
-                            .identity = paper};
-    stewart_plan asked;
-    stewart_measured offer = {.head = head, .kind = STEWART_OFFER, .sampled = 2400000000u,
-                              .begin = STEWART_NEVER, .period = 100000000u, .watchdog = 1000000000u,
-                              .rate = 1, .torque_limit = 0.5, .arrived = 11,
-                              .acted_from = STEWART_NEVER, .identity = paper};
-    stewart_measured read;
-    offer.head.flags = STEWART_PARKED;
-    check(same(data, stewart_write_plan(&request, none, data), request_bytes), "the request");
-    check(same(data, stewart_write_measured(&offer, none, data), offer_bytes), "the offer");
-    size_t size = from_hex(offer_bytes, data);
-    check(stewart_read_measured(data, size, none, &read) == STEWART_TAKEN &&
-              strcmp(read.identity.parts[0].name, "paper") == 0,
-          "reading the offer");
-    size = from_hex(request_bytes, data);
-    check(stewart_read_plan(data, size, none, &asked) == STEWART_TAKEN &&
-              asked.content == STEWART_REQUEST,
-          "the request");
-    check(stewart_differing(&asked.identity, &read.identity) == 0, "the same identity");
-    asked.identity.parts[2].digest[7] ^= 1;
-    check(stewart_differing(&asked.identity, &read.identity) == 4, "another sensor");
-    damage(request_bytes, none);
-    damage(offer_bytes, none);
+    test_bytes(offer_bytes, none, "the offer");
+    test_bytes(request_bytes, none, "the request");
+    check(plan.content == STEWART_REQUEST && measured.kind == STEWART_OFFER &&
+              strcmp(measured.identity.parts[0].name, "paper") == 0,
+          "their values");
+    check(stewart_differing(&plan.identity, &measured.identity) == 0, "the same identity");
+    plan.identity.parts[2].digest[7] ^= 1;
+    check(stewart_differing(&plan.identity, &measured.identity) == 4, "another sensor");
 }
 
 /* Nonces are of session, address, secret and the sessions so far; answers have a rate. */
@@ -229,21 +199,12 @@ static void test_window(void)
 static int filter(stewart_key with)
 {
     static char line[4 * STEWART_LONGEST];
-    static uint8_t data[STEWART_LONGEST + 1];
-    static stewart_plan plan;
-    static stewart_measured measured;
+    static uint8_t data[STEWART_LONGEST + 1], again[STEWART_LONGEST];
     while (fgets(line, sizeof line, stdin)) {
-        size_t size = from_hex(line, data);
-        int report = size > 3 && data[3] == 'M';
-        int cause = report ? stewart_read_measured(data, size, with, &measured)
-                           : stewart_read_plan(data, size, with, &plan);
-        size = 0;
-        if (cause == STEWART_TAKEN)
-            size = report ? stewart_write_measured(&measured, with, data)
-                          : stewart_write_plan(&plan, with, data);
-        printf("%d ", cause);
-        for (size_t i = 0; i < size; i++)
-            printf("%02x", data[i]);
+        size_t written;
+        printf("%d ", through(data, from_hex(line, data), with, again, &written));
+        for (size_t i = 0; i < written; i++)
+            printf("%02x", again[i]);
         printf("\n");
     }
     return 0;
@@ -255,8 +216,8 @@ int main(int argc, char **argv)
         stewart_key with = {(const uint8_t *)argv[1], strlen(argv[1])};
         return filter(with);
     }
-    test_plan();
-    test_measured();
+    test_plans();
+    test_reports();
     test_greeting();
     test_offers();
     test_window();
