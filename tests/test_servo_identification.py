@@ -127,7 +127,7 @@ def test_friction_of_ball_joints_is_found():
 
 @pytest.mark.slow
 def test_cranks_that_stick_do_not_move_the_delay():
-    """Cranks that stay behind by two codes where they are slow, which no friction of the fit does."""
+    """Slow cranks stay behind by two codes, which no friction of the fit explains."""
     motion = ROBOT.home + np.vstack(mixed_motion(np.repeat([0.2, 0.005], 3), 9.0, 0.02))
     setpoints = np.array([ROBOT.crank_angles(pose) for pose in motion])
     times = 0.02 * np.arange(len(setpoints))
