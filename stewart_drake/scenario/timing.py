@@ -95,7 +95,8 @@ def step_problem(
     """Return the first number that does not fit a discrete plant, which has events at steps only.
 
     The metric's grid, the period, the delay's fraction and the play-out bound must be whole numbers
-    of steps (to 1e-9, relative), and the period divided by the sensor's samples too.
+    of steps (to 1e-9, relative), and the period divided by the sensor's samples too. A problem has
+    the field to change, its value, and the nearest that fits.
 
     Args:
         step: of the plant, s.
@@ -103,9 +104,6 @@ def step_problem(
         fraction: of a period, of the delay beyond whole periods.
         samples: of the sensor per period, or None.
         playout: bound of a network, s, or None.
-
-    Returns:
-        The scenario field to change, its value, and the nearest that fits; or None.
     """
     if not _is_whole(METRIC_PERIOD / step):
         nearest = _nearest_step(step, period)
@@ -145,10 +143,7 @@ def _multiple_problem(field: str, value: float, step: float) -> str | None:
 def log_problem(log_period: float | None, duration: float, step: float | None = None) -> str | None:
     """Return the problem with the period of a log, or None.
 
-    Args:
-        log_period: s, or None for the usual instants.
-        duration: of the run, s.
-        step: of a discrete plant, which is recorded at its own steps only, or None.
+    A discrete plant is recorded at its own steps of `step` s only.
     """
     if log_period is None:
         return None

@@ -184,9 +184,7 @@ class HautusStudy:
 def study_hautus(scenario: Scenario) -> HautusStudy:
     """Test every model of a scenario.
 
-    Raises:
-        ConfigError: one line. A motion or a home pose outside the workspace is reported in
-            `Assessment.obstacles` instead.
+    A motion or a home pose outside the workspace is reported in `Assessment.obstacles`.
     """
     with threadpool_limits(limits=1):
         found = assess(scenario)

@@ -277,10 +277,8 @@ def space_around(
 ) -> Space:
     """Return the layouts around a machine: by default half to twice its lengths, and all angles.
 
-    Args:
-        spec: of a machine with a pattern.
-        vary: lowest and highest value by parameter; equal ones fix it.
-        keep: parameters and choices that stay as they are.
+    `vary` has lowest and highest value by parameter; equal ones fix it. `keep` has parameters and
+    choices that stay as they are.
     """
     if spec.pattern is None:
         raise ConfigError(

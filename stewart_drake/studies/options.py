@@ -40,10 +40,9 @@ def option(
         name: on the command line, if it differs from the field's.
         bounds: as `pydantic.Field` takes them.
     """
-    extra = {"flag": name, "metavar": metavar, "read": read, "recorded": recorded}
+    extra: Any = {"flag": name, "metavar": metavar, "read": read, "recorded": recorded}
     extra["unit"] = unit
-    more: dict[str, Any] = {"description": help, "json_schema_extra": extra, **bounds}
-    return Field(default, **more)
+    return Field(default, description=help, json_schema_extra=extra, **bounds)
 
 
 _UNITS: Final[Mapping[str, Mapping[str, float]]] = {
@@ -53,11 +52,7 @@ _UNITS: Final[Mapping[str, Mapping[str, float]]] = {
 
 
 def quantity(name: str, text: str, unit: str) -> float:
-    """Return a text such as `300 mm`, `0.3 m` or `0.3` in a unit, m or kg.
-
-    Raises:
-        ConfigError: no number, or another unit; the message begins with the name.
-    """
+    """Return a text such as `300 mm`, `0.3 m` or `0.3` in a unit, m or kg."""
     number, word = re.fullmatch(r"\s*(.*?)\s*([^\W\d_]*)\s*", text, re.DOTALL).groups()  # type: ignore[union-attr]
     smallest, factor = next(iter(_UNITS[unit])), _UNITS[unit].get(word or unit)
     try:

@@ -11,7 +11,7 @@ input does not change. Its transposed counterpart is a motion that no output sho
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -31,36 +31,25 @@ _SAME: Final = 1e-7
 
 @dataclass(frozen=True)
 class Mode:
-    """One eigenvalue and its test.
+    """One eigenvalue and its test."""
 
-    Attributes:
-        eigenvalue: point at which the pencil fails, else the mean of the cluster. A conjugate pair
-            is represented by the one with imaginary part > 0.
-        multiplicity: number of eigenvalues in the cluster (conjugates not counted).
-        decays: whether it is inside the stability boundary.
-        margin: smallest singular value of the pencil over ||[A, B]||.
-        directions: (n, d) orthonormal, spanning what the input does not reach or the output does
-            not show; d = 0 for a mode that passes.
-    """
-
+    # point at which the pencil fails, else the mean of the cluster; a conjugate pair is represented
+    # by the one with imaginary part > 0
     eigenvalue: complex
-    multiplicity: int
-    decays: bool
-    margin: float
+    multiplicity: int  # number of eigenvalues in the cluster (conjugates not counted)
+    decays: bool  # whether it is inside the stability boundary
+    margin: float  # smallest singular value of the pencil over ||[A, B]||
+    # (n, d) orthonormal, spanning what the input does not reach or the output does not show; d = 0
+    # for a mode that passes
     directions: Complex
 
 
 @dataclass(frozen=True)
 class Hautus:
-    """The test of one pair.
+    """The test of one pair."""
 
-    Attributes:
-        modes: every distinct eigenvalue, least margin first.
-        tolerance: margin below which a mode fails.
-    """
-
-    modes: tuple[Mode, ...]
-    tolerance: float
+    tolerance: ClassVar[float] = TOLERANCE  # margin below which a mode fails
+    modes: tuple[Mode, ...]  # every distinct eigenvalue, least margin first
 
     @property
     def complete(self) -> bool:
@@ -88,20 +77,12 @@ class Hautus:
         return tuple(mode for mode in self.modes if mode.margin < self.tolerance)
 
 
-def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool, tolerance: float = TOLERANCE) -> Hautus:
+def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool) -> Hautus:
     """Test (A, B) for controllability and stabilisability, mode by mode.
 
-    Observability and detectability of (A, C) are `hautus(A.T, C.T)`. Margins depend on units:
-    scale states and inputs first, see `scaled`.
-
-    Args:
-        A: (n, n).
-        B: (n, m).
-        discrete: whether x_{k+1} = A x_k + B u_k, instead of the differential equation.
-        tolerance: margin, relative to ||[A, B]||, below which a mode fails.
-
-    Raises:
-        ValueError: wrong shapes or entries that are not finite.
+    It is that of x_{k+1} = A x_k + B u_k, or else of the differential equation. Observability and
+    detectability of (A, C) are `hautus(A.T, C.T)`. Margins depend on units: scale states and inputs
+    first, see `scaled`.
     """
     A, B = np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64)
     if A.ndim != 2 or A.shape[0] != A.shape[1] or A.size == 0:
@@ -123,7 +104,7 @@ def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool, tolerance: float = TOL
         # The pencil has full rank except at eigenvalues, so an additional point cannot fail.
         points = np.unique(np.append(members, center))
         margins = pbh_margins(A, B, points) / size
-        failing = margins < tolerance
+        failing = margins < TOLERANCE
         if not failing.any():
             found = [(center, float(margins.min()))]
         elif failing[points == center].any():  # a defective eigenvalue, see `cluster`
@@ -135,10 +116,10 @@ def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool, tolerance: float = TOL
         for value, margin in found:
             decays = abs(value) < 1 - BOUNDARY if discrete else value.real < -BOUNDARY * radius
             directions = np.empty((len(A), 0), dtype=np.complex128)
-            if margin < tolerance:
-                directions = _null_space(A, B, value, tolerance * size)
+            if margin < TOLERANCE:
+                directions = _null_space(A, B, value, TOLERANCE * size)
             modes.append(Mode(value, len(members), bool(decays), margin, directions))
-    return Hautus(tuple(sorted(modes, key=lambda mode: mode.margin)), tolerance)
+    return Hautus(tuple(sorted(modes, key=lambda mode: mode.margin)))
 
 
 def scaled(

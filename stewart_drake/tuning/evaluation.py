@@ -101,9 +101,8 @@ def evaluate(
     networks: Sequence[str | Path],
     directory: str | Path,
     *,
-    workers: int | None = None,
-    scheduler: str | None = None,
     progress: Progress | None = None,
+    **how: Any,
 ) -> Evaluation:
     """Run all candidates under all conditions, or continue.
 
@@ -112,7 +111,7 @@ def evaluate(
         networks: shipped names or files; none for the shipped one of the family.
         directory: of the runs, in fixed/, rule/ and NAME-HASH/, so that a second network needs its
             own runs only.
-        workers, scheduler, progress: as `run_jobs` takes them.
+        progress, how: as `run_jobs` takes them; `how` are workers and scheduler.
     """
     cells, gains = family.conditions, tuple(family.gains.values())
     if len(cells) < 2:
@@ -137,9 +136,8 @@ def evaluate(
             settings=about | ({"network": file["sha256"]} if file else {}),
             suffix=".npz",
             read=partial(read_condition, runs=number, samples=family.samples),
-            workers=workers,
-            scheduler=scheduler,
             progress=part_of(progress, len(table) * len(cells), len(candidates) * len(cells)),
+            **how,
         )
         table[name] = list(found.values())
     return _judged(family, table, files, _nominal_costs(family, tuners))
@@ -150,19 +148,17 @@ def _nominal_costs(family: Family, tuners: dict[str, Tuner]) -> dict[str, dict[s
 
     Only for a family with faults; the base of another one is varied.
     """
-    result: dict[str, dict[str, float]] = {}
     if not family.has_faults:
-        return result
+        return {}
     at_rest = (*FAMILIES[family.name].settings, "start=rest", "queue=zero", *family.settings)
-    bases = {
-        "on_reference": family.base,
-        "from_rest": load_scenario("paper", None, at_rest),
+    bases = {"on_reference": family.base, "from_rest": load_scenario("paper", None, at_rest)}
+    return {
+        name: {
+            where: run_in_bulk(replace(base, tuner=tuner)).figures.accumulated_error
+            for where, base in bases.items()
+        }
+        for name, tuner in {"default": family.base.tuner, **tuners}.items()
     }
-    for where, base in bases.items():
-        for name, tuner in {"default": base.tuner, **tuners}.items():
-            ending = run_in_bulk(replace(base, tuner=tuner))
-            result.setdefault(name, {})[where] = ending.figures.accumulated_error
-    return result
 
 
 # ---------------------------------------------------------------- the statistics

@@ -176,16 +176,9 @@ def fit(
 ) -> OptimizeResult:
     """Minimise the squared errors by Levenberg-Marquardt from `theta` on.
 
-    Args:
-        model: f.
-        theta: start.
-        train: standardised inputs (N, n) and targets (N, 2).
-        test: the same, of rows that training does not see; may be empty.
-        evaluations: of the residuals, at most.
-
-    Returns:
-        Of `least_squares`, with `curve` (iterations, 2): root mean square errors of training and
-        test rows, from the start on.
+    Rows are standardised inputs (N, n) and targets (N, 2); those to test with may be none. The
+    result is that of `least_squares`, with `curve` (iterations, 2): root mean square errors of
+    training and test rows, from the start on.
     """
     curve: list[tuple[float, float]] = []
 
