@@ -112,7 +112,7 @@ def watched_run(scenario: Scenario, tuner: MakeTuner, samples: int) -> tuple[End
 def run_condition(
     scenario: Scenario, gains: Gains = (), samples: int = SAMPLES, watch: bool = False
 ) -> bytes:
-    """Run a condition with each gain; return the bytes of an .npz file with so many samples.
+    """Run a condition with each gain; return the bytes of an .npz file with a number of samples.
 
     Without gains there is one run with the scenario's own tuner. With `watch` every second run
     records `health`.

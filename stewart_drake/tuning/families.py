@@ -307,11 +307,8 @@ def paper_grid(scenario: Scenario) -> Family:
 def disturbed_family(scenario: Scenario, number: int, seed: int, purpose: Purpose) -> Family:
     """Draw disturbed conditions of a scenario: nine pairs to train on, seven gains to evaluate.
 
-    Args:
-        scenario: base; its machine and motion give the scales.
-        number: of conditions; a larger number keeps the first ones.
-        seed: of all draws.
-        purpose: see `Purpose`.
+    The scenario's machine and motion give the scales. A larger number of conditions keeps the first
+    ones.
     """
     for_training = purpose == "training"
     if for_training:
@@ -333,14 +330,9 @@ def disturbed_family(scenario: Scenario, number: int, seed: int, purpose: Purpos
 def faulty_family(
     name: str, number: int, seed: int, purpose: Purpose, settings: tuple[str, ...] = ()
 ) -> Family:
-    """Draw conditions of T or N2, each with its own motion and fault.
+    """Draw conditions of one of FAMILIES, each with its own motion and fault.
 
-    Args:
-        name: of FAMILIES.
-        number: of conditions; a larger number keeps the first ones.
-        seed: of all draws.
-        purpose: see `Purpose`.
-        settings: further ones of the scenario.
+    A larger number of conditions keeps the first ones. `settings` are further ones of the scenario.
     """
     faults = FAMILIES[name]
     base = load_scenario("paper", None, (*faults.settings, *settings))
