@@ -103,11 +103,7 @@ class RunLog(Protocol):
 
 
 def kind_of_log(path: Path) -> Callable[[Path, Scenario], RunLog]:
-    """Return the class of a log, by the suffix of its file.
-
-    Raises:
-        ConfigError: another suffix, or no package mcap.
-    """
+    """Return the class of a log, by the suffix of its file."""
     if path.suffix == ".csv":
         return CsvLog
     if path.suffix != ".mcap":
@@ -178,14 +174,8 @@ class McapLog:
 class CsvFile:
     """A CSV file of rows of numbers, which read back exactly; empty cells are not finite.
 
-    Each row is written whole or not at all.
-
-    Args:
-        path: file, which is replaced; None for a temporary one without a name.
-        heads: cells of the first line.
-
-    Attributes:
-        descriptor: of the open file.
+    Each row is written whole or not at all. A file is replaced; without a path it is a temporary
+    one without a name. `heads` are the cells of the first line, `descriptor` is that of the file.
     """
 
     def __init__(self, path: Path | None, heads: Iterable[str]) -> None:

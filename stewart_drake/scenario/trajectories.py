@@ -57,16 +57,12 @@ def make_reference(config: ReferenceConfig, duration: float) -> Trajectory:
     cubic spline through its samples, with third derivatives continuous next to its ends. Before
     the first and after the last sample of either the pose is constant.
 
-    Args:
-        config: the scenario's section; `file` is a path.
-        duration: of the simulation, s.
-
     Returns:
         A 6x1 trajectory, defined for t >= 0, with derivatives of order 1 and 2.
 
     Raises:
         ConfigError: the samples or their file break a rule of `reference_files`, or a CSV motion
-            ends before `duration` while it still moves.
+            ends before `duration` in s while it still moves.
     """
     raise TypeError(f"config: got a {type(config).__name__}; expected a kind of reference")
 

@@ -221,13 +221,13 @@ def lacking_angles(
     """
     dt, angles = experiment.scenario.controller.period, experiment.mechanism.crank_angles
     first, _, states = _last_samples(experiment, result, period)
-    times, found = [], []
-    for k, state in enumerate(states[:-1], first):
-        if np.all(np.isfinite(state[POSE])):
-            wanted = experiment.reference.value(dt * k)[:, 0]
-            times.append(dt * k)
-            found.append(angles(wanted) - angles(state[POSE]))
-    return np.array(times), np.reshape(found, (-1, 6))
+    known = np.flatnonzero(np.isfinite(states[:-1, POSE]).all(axis=1))
+    times: Array = dt * (first + known).astype(np.float64)
+    found = [
+        angles(experiment.reference.value(t)[:, 0]) - angles(pose)
+        for t, pose in zip(times, states[known, POSE], strict=True)
+    ]
+    return times, np.reshape(found, (-1, 6))
 
 
 def _last_samples(

@@ -32,13 +32,10 @@ def option(
     unit: str | None = None,
     **bounds: Any,
 ) -> Any:
-    """Return the field of an option that the command line has too.
+    """Return the field of an option that the command line has too, see `Option`.
 
-    Args:
-        default: `...` for none.
-        help, metavar, read, recorded, unit: see `Option`.
-        name: on the command line, if it differs from the field's.
-        bounds: as `pydantic.Field` takes them.
+    The default is `...` for none; `name` is that on the command line, if it differs from the
+    field's; bounds are those of `pydantic.Field`.
     """
     extra: Any = {"flag": name, "metavar": metavar, "read": read, "recorded": recorded}
     extra["unit"] = unit
@@ -158,12 +155,7 @@ def takes(kind: type[Options]) -> Callable[[Callable[..., _R]], Callable[..., _R
 
 
 def refuse(options: Mapping[str, object], why: str) -> None:
-    """Refuse options that would be ignored, unless they are None or an empty list.
-
-    Args:
-        options: by name.
-        why: end of the message, after the value.
-    """
+    """Refuse options that would be ignored, unless they are None or an empty list."""
     for name, value in options.items():
         if value is not None and value != []:
             raise ConfigError(f"{name}: got {value} {why}")

@@ -81,11 +81,7 @@ def run_scenario(scenario: Scenario) -> bytes:
 def run_scenarios(
     scenarios: Mapping[str, Scenario], progress: Progress | None = None
 ) -> tuple[dict[str, Outcome], bool]:
-    """Run scenarios on all cores.
-
-    Returns:
-        Outcomes of the runs that finished, and whether Ctrl-C ended the runs early.
-    """
+    """Return outcomes of runs on all cores, as far as they finished, and whether Ctrl-C came."""
     interrupted = False
     with TemporaryDirectory() as folder:
         try:

@@ -61,14 +61,9 @@ _ARRAYS: Final = ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds")
 
 
 def density(window: ArrayLike, kind: Kind = "magnitude") -> Array:
-    """Return equation (45) for the newest sample of a window.
+    """Return equation (45) (..., m) for the newest sample of a window (..., WINDOW, m).
 
-    Args:
-        window: (..., WINDOW, m) samples, the newest last; unknown ones are not finite.
-        kind: `magnitude` or `signed`.
-
-    Returns:
-        (..., m) densities, finite: in [0, WINDOW], or in +-SIGNED_LIMIT.
+    Unknown samples are not finite. Densities are, in [0, WINDOW], or in +-SIGNED_LIMIT.
     """
     samples = np.asarray(window, dtype=np.float64)
     if samples.ndim < 2 or samples.shape[-2] != WINDOW:
@@ -93,15 +88,10 @@ def density(window: ArrayLike, kind: Kind = "magnitude") -> Array:
 
 
 def densities(samples: ArrayLike, kind: Kind = "magnitude") -> Array:
-    """Return equation (45) along a record of samples.
+    """Return equation (45) along a record (N, 18) of samples in time order.
 
-    Args:
-        samples: (N, 18) in time order, rows [measurement - reference (12); commanded torque (6)]
-            in rad, m, rad/s, m/s and N m; values that are not finite are unknown.
-        kind: `magnitude` or `signed`.
-
-    Returns:
-        (N, 18); row k is of samples max(0, k - WINDOW + 1) to k.
+    A sample is [measurement - reference (12); commanded torque (6)] in rad, m, rad/s, m/s and N m;
+    values that are not finite are unknown. Row k is of samples max(0, k - WINDOW + 1) to k.
     """
     record = np.asarray(samples, dtype=np.float64)
     if record.ndim != 2 or record.shape[1] != NUM_INPUTS:

@@ -52,13 +52,13 @@ def tune(
 
     They are clipped to the network's bounds, then limited in rate. Weights are scales, so the rate
     is a factor: last / factor <= w <= last * factor. The gain, which depends on w_Q / w_R, changes
-    with its square at most.
+    with its square at most. Where the network fails, they return to `fixed` (2,) at the same rate.
 
     Args:
         network: of the paper.
         densities: (18,).
         last: (2,) weights of the last sample; NaN before the first, which takes `fixed`.
-        fixed: (2,) weights to return to, at the same rate, where the network's are not finite.
+        fixed: (2,) weights.
         factor: above 1.
 
     Returns:

@@ -91,8 +91,7 @@ def cost(ending: Ending, duration: float) -> float:
 def watched_run(scenario: Scenario, tuner: MakeTuner, samples: int) -> tuple[Ending, Array]:
     """Run a scenario with a tuner of features `health`.
 
-    Returns:
-        How it ended, and the features (samples, 18) after every second sample, else NaN.
+    Return how it ended, and the features (samples, 18) after every second sample, else NaN.
     """
     made: list[WeightsSource] = []
 

@@ -104,14 +104,11 @@ def evaluate(
     progress: Progress | None = None,
     **how: Any,
 ) -> Evaluation:
-    """Run all candidates under all conditions, or continue.
+    """Run all candidates under all conditions of a family for evaluation, or continue.
 
-    Args:
-        family: drawn for evaluation.
-        networks: shipped names or files; none for the shipped one of the family.
-        directory: of the runs, in fixed/, rule/ and NAME-HASH/, so that a second network needs its
-            own runs only.
-        progress, how: as `run_jobs` takes them; `how` are workers and scheduler.
+    Networks are shipped names or files; none for the shipped one of the family. The directory keeps
+    the runs in fixed/, rule/ and NAME-HASH/, so that a second network needs its own runs only.
+    `how` are workers and scheduler, as `run_jobs` takes them.
     """
     cells, gains = family.conditions, tuple(family.gains.values())
     if len(cells) < 2:

@@ -40,7 +40,6 @@ from stewart_drake.files.versions import versions
 from stewart_drake.files.yamlio import validate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.scenario.renames import with_new_names
 from stewart_drake.studies.jobs import Progress, run_jobs
 from stewart_drake.tuner.network import NUM_INPUTS, NUM_OUTPUTS, Kind, Network, densities
 from stewart_drake.tuner.source import weights_of
@@ -412,7 +411,7 @@ def train_by_regret(
     best = first = trainer.network(theta, features, about)
     more: dict[str, Any] = {}
     if features == "health":
-        base = validate(Scenario, with_new_names(settings["scenario"]), "data")
+        base = validate(Scenario, settings["scenario"], "data")
         samples = data.sizes["sample"]
 
         def own_runs(network: Network, chosen: Indices, number: int) -> Curves:
