@@ -32,19 +32,12 @@ ROUNDING: Final = 1e-9  # relative error of a covariance that counts as rounding
 
 @dataclass(frozen=True)
 class Calibration:
-    """Parameters of one machine, with their covariance.
+    """Parameters of one machine, with their covariance, in SI units."""
 
-    Attributes:
-        mechanism: fingerprint of the machine's numbers, `mechanism.geometry.fingerprint`.
-        names: (n,) out of CALIBRATED, each at the most once; SI units.
-        mean: (n,).
-        covariance: (n, n); zero for exactly known parameters.
-    """
-
-    mechanism: str
-    names: tuple[str, ...]
-    mean: Array
-    covariance: Array
+    mechanism: str  # fingerprint of the machine's numbers, `mechanism.geometry.fingerprint`
+    names: tuple[str, ...]  # (n,) out of CALIBRATED, each at the most once
+    mean: Array  # (n,)
+    covariance: Array  # (n, n); zero for exactly known parameters
 
     def __post_init__(self) -> None:
         n, mean, P = len(self.names), np.array(self.mean), np.array(self.covariance)

@@ -140,16 +140,8 @@ class PlantConfig:
         """All constants, in the order of `scenario.signals.CONSTANTS`."""
         shafts = (self.joint_damping, self.coulomb_friction, self.coulomb_speed)
         loads = [*self.torque_bias, self.payload_mass, *shafts, *self.payload_position]
-        return [*loads, *self.ball_joints]
-
-    @property
-    def ball_joints(self) -> list[float]:
-        """Damping, Coulomb friction and its speed of each ball joint."""
-        return [
-            self.ball_joint_damping,
-            self.ball_joint_friction,
-            self.ball_joint_friction_speed,
-        ]
+        ball_joints = (self.ball_joint_damping, self.ball_joint_friction)
+        return [*loads, *ball_joints, self.ball_joint_friction_speed]
 
     @property
     def step(self) -> float | None:

@@ -163,10 +163,8 @@ def load_comparison(
         controllers: shipped names, rows of the scenario's `compare`, or paths; the row of a path
             is named after its file.
         refuse_idle: whether to refuse a field that has an effect in no row.
-        further: whether to add the rows of `compare` that are not among the controllers.
-
-    Returns:
-        Scenarios by row: the controllers, then the further rows in the file's order.
+        further: whether to add the rows of `compare` that are not among the controllers, in the
+            file's order.
     """
     settings = tuple(settings)
     others = tuple(s for s in settings if not s.strip().startswith("controller.delay_"))

@@ -114,9 +114,8 @@ def kind_of_log(path: Path) -> Callable[[Path, Scenario], RunLog]:
 
 def open_log(path: Path, scenario: Scenario) -> RunLog:
     """Open a log for writing, in a file that ends in .mcap or .csv."""
-    kind = kind_of_log(path)
     try:
-        return kind(path, scenario)
+        return kind_of_log(path)(path, scenario)
     except OSError as error:
         raise ConfigError(
             f"--log: {path} cannot be written ({error.strerror}); expected a file"

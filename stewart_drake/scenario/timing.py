@@ -76,7 +76,7 @@ def servo_ticks(period: float, time_step: float | None) -> int:
     """Return the number of samples of the servos' local loops in a period of the controller.
 
     It is the least for a rate of SERVO_RATE. With a discrete plant every sample is at one of its
-    steps; one at each step is the most. Both times are in s.
+    steps; one at each step is the most.
     """
     wanted = max(1, math.ceil(period * SERVO_RATE - 1e-9))
     if time_step is None:
@@ -97,13 +97,6 @@ def step_problem(
     The metric's grid, the period, the delay's fraction and the play-out bound must be whole numbers
     of steps (to 1e-9, relative), and the period divided by the sensor's samples too. A problem has
     the field to change, its value, and the nearest that fits.
-
-    Args:
-        step: of the plant, s.
-        period: of the controller, s.
-        fraction: of a period, of the delay beyond whole periods.
-        samples: of the sensor per period, or None.
-        playout: bound of a network, s, or None.
     """
     if not _is_whole(METRIC_PERIOD / step):
         nearest = _nearest_step(step, period)

@@ -144,23 +144,13 @@ def catch_up(
 ) -> Trajectory:
     """Return a reference that leaves the start state smoothly and ends on `reference`.
 
-    Up to `t_start` it keeps the constant rates of the start, as a plate on which no torque acts
-    yet. Over the next `duration` it is the quintic that continues pose and rates with zero
+    Up to `t_start` it keeps the constant rates of the start at t = 0, as a plate on which no torque
+    acts yet. Over the next `duration` it is the quintic that continues pose and rates with zero
     acceleration and reaches pose, rates and accelerations of the reference; then it is the
-    reference.
-
-    Args:
-        start_pose: (6,) at t = 0, rad and m.
-        start_rates: (6,) rad/s and m/s.
-        reference: the 6x1 trajectory to join.
-        t_start: when torques begin to act, s, >= 0; below 1e-6 it counts as 0.
-        duration: of the blend, s, >= 1e-6.
+    reference. Below 1e-6 s `t_start` counts as 0.
 
     Returns:
         A 6x1 trajectory, defined for t >= 0, with derivatives of order 1 and 2.
-
-    Raises:
-        ValueError: a wrong shape, or times outside their range.
     """
     pose, rates = np.asarray(start_pose, dtype=float), np.asarray(start_rates, dtype=float)
     if pose.shape != (6,) or rates.shape != (6,):
