@@ -223,8 +223,8 @@ class Measurements(Options):
 
     def __init__(self, **values: object) -> None:
         super().__init__(**values)
-        for name, value in self.lengths().items():
-            if value > LARGEST:
+        for name in list(type(self).model_fields)[:6]:  # the lengths
+            if (value := getattr(self, name)) > LARGEST:
                 raise ConfigError(
                     f"{name}: got {value:g} m; expected metres, {value / 1000:g} for {value:g} mm"
                 )
@@ -233,11 +233,7 @@ class Measurements(Options):
                 f"rod: got {self.rod:g} m with cranks of {self.crank:g} m; expected a rod longer "
                 "than its crank"
             )
-        for name, size in {
-            "plate": self.plate_radius,
-            "crank": self.crank,
-            "rod": self.rod,
-        }.items():
+        for name, size in (("plate", self.plate_radius), ("crank", self.crank), ("rod", self.rod)):
             mass = getattr(self, f"{name}_mass")
             if mass > STEEL * math.pi * size**3:
                 raise ConfigError(
@@ -251,7 +247,3 @@ class Measurements(Options):
                     f"{name}_distance: got {distance:g} m on a circle of radius {radius:g} m; "
                     f"expected less than {math.sqrt(3) * radius:.4g}, where pairs meet"
                 )
-
-    def lengths(self) -> dict[str, float]:
-        """Return the lengths by name, m."""
-        return {name: getattr(self, name) for name in list(type(self).model_fields)[:6]}
