@@ -211,7 +211,7 @@ def _judged(
 
 
 def compare_errors(names: Sequence[str], fixed: int, error: Array, seed: int) -> dict[str, Any]:
-    """Compare E_ac (c, n) in % s, NaN for a failure, of candidates: fixed gains, then a tuner.
+    """Compare E_ac (c, n) in % s, NaN for a failure, of the fixed gains first and the tuner last.
 
     Returns:
         `candidates`: by name, `failures` (of all conditions), `mean` with `interval` (95 %,

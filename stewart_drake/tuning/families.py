@@ -313,14 +313,8 @@ def disturbed_family(scenario: Scenario, number: int, seed: int, purpose: Purpos
     for_training = purpose == "training"
     if for_training:
         _check_samples(scenario)
-    draws, conditions = _drawn(
-        "disturbed{:04d}",
-        DISTURBED,
-        scenario,
-        _about(scenario),
-        number,
-        [seed, int(not for_training)],
-    )
+    about, seeds = _about(scenario), [seed, int(not for_training)]
+    draws, conditions = _drawn("disturbed{:04d}", DISTURBED, scenario, about, number, seeds)
     for one in conditions.values():
         prepare(one.scenario)  # refuses a motion that leaves the workspace
     gains = _pairs() if for_training else GAINS
