@@ -10,13 +10,13 @@ from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.csvio import ANGLE_UNITS, LENGTH_UNITS, read_table
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import load_yaml, validate
-from stewart_drake.scenario.field_types import Row, Seconds
+from stewart_drake.scenario.field_types import STRICT, Row, Seconds
 from stewart_drake.scenario.reference_config import WaypointsConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.types import Array
@@ -37,7 +37,7 @@ _MAX_KINK: Final = 0.05
 _LEAST_KINK: Final = 1e-3  # rad, m; less is noise of a sensor, not a jump
 
 
-@dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
+@dataclass(config=STRICT)
 class _WaypointFile:
     times: Annotated[list[Seconds], Field(min_length=2)]
     poses: Annotated[list[Row], Field(min_length=2)]

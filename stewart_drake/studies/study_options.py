@@ -6,12 +6,13 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import units_of, validate_pairs
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.studies.options import JobOptions, Options, option
 
 _TORQUE_SHARE: Final = "share of the reference's largest torque"
@@ -22,7 +23,7 @@ def _share(unit: str, **bounds: Any) -> Any:
     return Field(ge=0, description=unit, **bounds)
 
 
-@dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
+@dataclass(config=STRICT)
 class Ranges:
     """Size of the variation of each quantity; 0 (null for `torque_limit`) switches it off.
 

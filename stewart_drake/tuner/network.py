@@ -31,7 +31,6 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import pydantic.dataclasses
-from pydantic import ConfigDict
 from scipy.special import expit
 
 from stewart_drake.files.errors import ConfigError
@@ -39,6 +38,7 @@ from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.jsonio import load_json
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import brief, validate
+from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.scenario.signals import TUNER_INPUTS, WEIGHTS
 from stewart_drake.types import Array, ArrayLike
 
@@ -178,7 +178,7 @@ def _frozen(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 # --------------------------------------------------------------------- the file
 
 
-@pydantic.dataclasses.dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
+@pydantic.dataclasses.dataclass(config=STRICT)
 class _File:
     """The file's keys; `features` and `start` may be missing."""
 
