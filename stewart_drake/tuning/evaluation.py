@@ -111,8 +111,6 @@ def evaluate(
     `how` are workers and scheduler, as `run_jobs` takes them.
     """
     cells, gains = family.conditions, tuple(family.gains.values())
-    if len(cells) < 2:
-        raise ConfigError(f"--scenarios: got {len(cells)}; expected 2 or more")
     tuners, files = tuners_of(family, networks)
     about = {"family": family.name, "seed": family.seed, "scenario": scenario_to_dict(family.base)}
     candidates: dict[str, dict[str, Job]] = {
