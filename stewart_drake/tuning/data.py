@@ -71,14 +71,18 @@ Gains = tuple[tuple[float, float], ...]
 # ---------------------------------------------------------------- one condition
 
 
-def watching(w_Q: float, w_R: float) -> MakeTuner:
-    """Return the factory of a tuner that computes `health` while the weights are fixed."""
+def _with_health(policy: FixedPolicy | RatioPolicy) -> MakeTuner:
+    """Return the factory of a tuner that computes `health`."""
 
     def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
-        fixed = FixedPolicy(np.array([w_Q, w_R]))
-        return WeightsSource(law.plant, health_of(experiment, law), fixed)
+        return WeightsSource(law.plant, health_of(experiment, law), policy)
 
     return make
+
+
+def watching(w_Q: float, w_R: float) -> MakeTuner:
+    """Return the factory of a tuner that computes `health` while the weights are fixed."""
+    return _with_health(FixedPolicy(np.array([w_Q, w_R])))
 
 
 def cost(ending: Ending, duration: float) -> float:
@@ -128,11 +132,8 @@ def run_condition(
 
 def roll_out(scenario: Scenario, network: Network, samples: int) -> bytes:
     """Run a condition with a network; return the same file of one run."""
-
-    def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
-        return WeightsSource(law.plant, health_of(experiment, law), RatioPolicy(network))
-
-    return _file([watched_run(scenario, make, samples)], scenario.duration)
+    tuner = _with_health(RatioPolicy(network))
+    return _file([watched_run(scenario, tuner, samples)], scenario.duration)
 
 
 def _file(runs: list[tuple[Ending, Array]], duration: float) -> bytes:
