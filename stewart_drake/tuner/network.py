@@ -150,6 +150,15 @@ class Network:
                 raise ConfigError(
                     f"start: got {brief(self.start.tolist())}; expected (w_Q, w_R) within bounds"
                 )
+        for name, known in (
+            ("output", ("weights", "log_weights")),
+            ("density", ("magnitude", "signed")),
+            ("features", ("densities", "health")),
+        ):
+            if getattr(self, name) not in known:
+                raise ConfigError(
+                    f"{name}: got {brief(getattr(self, name))}; expected one of {', '.join(known)}"
+                )
 
     @property
     def hidden(self) -> int:
