@@ -15,8 +15,14 @@ from stewart_drake.law.delay_model import (
     with_integral,
 )
 from stewart_drake.mechanism.assembly import torque_map
-from stewart_drake.studies.hautus import describe, state_labels
-from stewart_drake.studies.pbh import TOLERANCE, cluster, hautus, scaled
+from stewart_drake.studies.hautus import (
+    TOLERANCE,
+    cluster,
+    describe,
+    hautus,
+    scaled,
+    state_labels,
+)
 from tests.mechanisms import PAPER
 
 PAPER_MODEL = double_integrators(torque_map(PAPER, PAPER.home))

@@ -1,5 +1,6 @@
 """Workspace of a mechanism: no dead centres, no parallel singularities, distinct angles."""
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple, Protocol
 
@@ -66,6 +67,16 @@ def margin(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None)
     if crank_angles is None:
         return functions_of(mechanism).margin(pose, home_sign(mechanism), LEAST)
     return measures_at(mechanism, pose, crank_angles).margin
+
+
+def border(
+    inside: Callable[[float], bool], low: float, high: float, tolerance: float
+) -> tuple[float, float]:
+    """Return two numbers closer than a tolerance, the first inside and the second not."""
+    while high - low > tolerance:
+        middle = (low + high) / 2
+        low, high = (middle, high) if inside(middle) else (low, middle)
+    return low, high
 
 
 def margins(mechanism: Mechanism, poses: Array) -> Array:

@@ -154,13 +154,9 @@ def identify(
     tolerances: Tolerances | None = None,
     delay: float | None = None,
 ) -> Identification:
-    """Return the machine that explains the logs best.
+    """Return the machine that explains its logs best.
 
-    Args:
-        logs: of one machine.
-        mechanism: as drawn.
-        tolerances: of the drawing, the defaults if None.
-        delay: believed one, s; None is that of the first log.
+    The mechanism is as drawn; the believed delay in s is by default that of the first log.
     """
     if len({log.gravity for log in logs}) > 1:
         raise ConfigError(
@@ -254,4 +250,4 @@ def _unknowns(
     torque = max(float(np.abs(log.torques).max()) for log, _ in pairs)
     unknowns = unknowns_of(mechanism, tolerances, believed, torque, max(speeds))
     has_encoders = any(log.measures(ANGLES) for log, _ in pairs)
-    return unknowns if has_encoders else unknowns.without_encoders()
+    return unknowns if has_encoders else unknowns.without(OFFSETS)

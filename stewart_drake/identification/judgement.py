@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stewart_drake.dynamics.workspace import margin
+from stewart_drake.dynamics.workspace import border, margin
 from stewart_drake.identification.model import MachineModel, Numbers
 from stewart_drake.identification.unknowns import (
     GEOMETRY,
@@ -88,13 +88,9 @@ def named_directions(mechanism: Mechanism) -> dict[str, Array]:
 def unseen(unknowns: Unknowns, covariance: Array) -> tuple[int, list[str]]:
     """Return number and names of the directions that the log does not show.
 
-    In units of the prior, the covariance of the unknowns has eigenvalues from 0 (found by the log)
-    to 1 (as uncertain as before). The eigenvectors above UNSEEN span a space. Whole-machine
-    directions in it are named, and the rest by its unknowns.
-
-    Args:
-        unknowns: before the log.
-        covariance: (k, k) of the free ones after it.
+    In units of the prior, the covariance of the free unknowns after the log has eigenvalues from 0
+    (found by the log) to 1 (as uncertain as before). The eigenvectors above UNSEEN span a space.
+    Whole-machine directions in it are named, and the rest by its unknowns.
     """
     free, std = unknowns.free, unknowns.std[unknowns.free]
     values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
@@ -131,21 +127,19 @@ def _mixture(free: NDArray[np.intp], space: Array) -> str:
     return ", ".join(f"{group} ({100 * share:.0f} %)" for group, share in ordered if share > 0.05)
 
 
-def workspace_poses(mechanism: Mechanism, middle: Array, seed: int = 0) -> Array:
+def workspace_poses(mechanism: Mechanism, middle: Array) -> Array:
     """Return poses (n, 6) all over the workspace around a pose, the first of them.
 
     They lie on rays in random directions, with at least a share of the margin in the middle.
     """
-    rng, size = np.random.default_rng(seed), np.repeat([1.0, mechanism.crank_lengths.mean()], 3)
+    rng, size = np.random.default_rng(0), np.repeat([1.0, mechanism.crank_lengths.mean()], 3)
     least, poses = _ROOM * margin(mechanism, middle), [middle]
     for ray in size * rng.standard_normal((_POSES - 1, 6)):
-        inside, outside = 0.0, 1.0
-        for _ in range(12):
-            between = (inside + outside) / 2
-            if margin(mechanism, middle + between * ray) > least:
-                inside = between
-            else:
-                outside = between
+
+        def is_inside(s: float, ray: Array = ray) -> bool:
+            return margin(mechanism, middle + s * ray) > least
+
+        inside, _ = border(is_inside, 0.0, 1.0, 2**-12)
         # Evenly in the volume of the six-dimensional ball that the ray is a radius of.
         poses.append(middle + inside * rng.uniform() ** (1 / 6) * ray)
     return np.array(poses)
@@ -158,12 +152,6 @@ def pose_uncertainty(
 
     alpha = h(pose; geometry) + offset stays as it is, so that
     d pose = -J^-1 (dh/dgeometry d geometry + d offset),   J = dh/dpose.
-
-    Args:
-        unknowns: before the log.
-        values: (NUM_UNKNOWNS,) as found.
-        covariance: (k, k) of the free ones.
-        middle: pose (6,) around which the workspace is taken.
     """
     of_angles = np.r_[GEOMETRY, OFFSETS]
     P = unknowns.whole(covariance)[np.ix_(of_angles, of_angles)]

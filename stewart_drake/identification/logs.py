@@ -94,11 +94,8 @@ class Precision(NamedTuple):
 def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bool = True) -> Log:
     """Read a log without empty rows, and with at most one row per `FINEST` s.
 
-    Args:
-        path: of a run: signals.nc, a log (.mcap, .csv) or a folder; else CSV of a machine.
-        mechanism: its motors' limit clips the torques of a CSV log.
-        precision: of a CSV log.
-        gravity: whether it acted, in a CSV log.
+    It is that of a run: signals.nc, .mcap, .csv or a folder; else CSV of a machine, in which the
+    motors' limit clips the torques. Precision and gravity are for CSV.
     """
     if is_run(path):
         log = _of_run(path, mechanism)
@@ -185,10 +182,7 @@ def _run_problem(scenario: Scenario) -> str | None:
 def _measured(measured: Array, scenario: Scenario, samples: Array) -> tuple[Array, Array, Array]:
     """Return instants (n,), values (n, 18) and their std (18,) of a run's measurements.
 
-    Args:
-        measured: at each sample of the controller.
-        scenario: of the run.
-        samples: instants of the controller's samples, s.
+    They are measured at each sample of the controller.
     """
     sensor = scenario.sensor
     if sensor.kind == "state":

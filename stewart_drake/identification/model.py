@@ -95,10 +95,8 @@ class SymbolicLegs(NamedTuple):
 class MachineModel:
     """Accelerations and crank angles of a machine with any numbers, and their derivatives.
 
-    Args:
-        mechanism: bodies, motor frames and branches, which stay.
-        gravity: m/s^2 along -z.
-        points: number of points that each call evaluates.
+    Bodies, motor frames and branches stay. Each call evaluates a number of points. Gravity is along
+    -z.
     """
 
     def __init__(self, mechanism: Mechanism, gravity: float, points: int) -> None:

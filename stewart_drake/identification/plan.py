@@ -21,14 +21,21 @@ import numpy as np
 from pydrake.trajectories import PiecewisePolynomial
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.dynamics.workspace import margin
+from stewart_drake.dynamics.workspace import margin, margins
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.fit import Evaluator, Guess, Problem, covariance, followed
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
 from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
 from stewart_drake.identification.start import segment_length, segments_of
 from stewart_drake.identification.tolerances import Tolerances
-from stewart_drake.identification.unknowns import DELAY, NAMES, UNITS, Unknowns, unknowns_of
+from stewart_drake.identification.unknowns import (
+    DELAY,
+    NAMES,
+    OFFSETS,
+    UNITS,
+    Unknowns,
+    unknowns_of,
+)
 from stewart_drake.law.feedforward import mean_torques
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.mechanism.geometry import Mechanism
@@ -48,6 +55,8 @@ _GOLDEN: Final = (np.sqrt(5) - 1) / 2
 _RISE: Final = 2.0  # s
 _ROOM: Final = 0.5  # least share of the workspace's margin at the middle of the motion
 _LEAST_SHARE: Final = 0.05
+_AMPLITUDE: Final = 0.5  # share of the scenario's motion
+_DURATION: Final = 20.0  # s
 
 
 @dataclass(frozen=True)
@@ -108,12 +117,9 @@ class Plan:
 
 
 def multisine(middle: Array, peak: Array, duration: float) -> tuple[Array, Array]:
-    """Return times (n,) in s and poses (n, 6) of the motion.
+    """Return times (n,) in s and poses (n, 6) of the motion around a pose (6,).
 
-    Args:
-        middle: (6,) pose.
-        peak: (6,) largest departure of each coordinate from it, rad and m.
-        duration: s.
+    `peak` (6,) is the largest departure of each coordinate.
     """
     time = GRID * np.arange(round(duration / GRID) + 1)
     line, coordinate = np.arange(_LINES)[:, None], np.arange(6) / 6
@@ -135,7 +141,7 @@ def fitted_multisine(
     least, share = _ROOM * margin(mechanism, middle), 1.0
     while share > _LEAST_SHARE:
         time, poses = multisine(middle, share * peak, duration)
-        if min(margin(mechanism, pose) for pose in poses) > least:
+        if margins(mechanism, poses).min() > least:
             return time, poses, share
         share *= 0.9
     raise ConfigError(
@@ -144,28 +150,17 @@ def fitted_multisine(
     )
 
 
-def plan(
-    experiment: Experiment,
-    std: Array,
-    tolerances: Tolerances | None = None,
-    amplitude: float = 0.5,
-    duration: float = 20.0,
-) -> Plan:
+def plan(experiment: Experiment, std: Array, tolerances: Tolerances | None = None) -> Plan:
     """Plan an experiment with a motion around the scenario's.
 
-    Args:
-        experiment: with the machine, period and delay.
-        std: (18,) of the measurements, as of a log; infinite for values that will be missing.
-        tolerances: of the machine, the defaults if None.
-        amplitude: share of the scenario's motion.
-        duration: s.
+    `std` (18,) is that of the measurements, as of a log; infinite for values that will be missing.
     """
     sc, mechanism = experiment.scenario, experiment.mechanism
     instants = np.linspace(0, sc.duration, 200)
     seen = np.array([experiment.reference.value(t)[:, 0] for t in instants])
     middle = (seen.min(axis=0) + seen.max(axis=0)) / 2
-    peak = amplitude * experiment.motion_scale
-    times, poses, share = fitted_multisine(mechanism, middle, peak, duration)
+    peak = _AMPLITUDE * experiment.motion_scale
+    times, poses, share = fitted_multisine(mechanism, middle, peak, _DURATION)
     motion = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(times, poses.T)
     log, states = _predicted(experiment, motion, times[-1], std)
     torque = float(np.abs(log.torques).max())
@@ -173,7 +168,7 @@ def plan(
     speed = float(np.abs(speeds).max())
     unknowns = unknowns_of(mechanism, tolerances or Tolerances(), sc.eta, torque, speed)
     if not np.isfinite(std[ANGLES]).all():
-        unknowns = unknowns.without_encoders()
+        unknowns = unknowns.without(OFFSETS)
     length = segment_length(log, log.values[:, POSE], mechanism, sc.eta)
     segments = segments_of(log, sc.eta, length)
     first = np.array([states[segment.rows[0]] for segment in segments])

@@ -367,13 +367,8 @@ def identify_servos(
     """Return the servos that explain a log best.
 
     Friction of the ball joints is fitted if residuals without it are more than rounding, and kept
-    if it explains a part of them.
-
-    Args:
-        log: of the machine.
-        mechanism: with its masses; `effort_limit` is the motors' torque limit.
-        rounding: standard deviation of the rounding of a measured angle, rad.
-        gravity: m/s^2 along -z.
+    if it explains a part of them. `effort_limit` of the mechanism is the motors' torque limit,
+    `rounding` the standard deviation of the rounding of a measured angle, rad.
     """
     for name, angles in (("setpoints", log.setpoints), ("crank angles", log.cranks)):
         if not np.ptp(angles, axis=0).max() > 20 * rounding:

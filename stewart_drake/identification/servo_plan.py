@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from stewart_drake.dynamics.workspace import margin
+from stewart_drake.dynamics.workspace import margin, margins
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.servo_fit import (
     NAMES,
@@ -83,11 +83,7 @@ class ServoPlan:
 def mixed_motion(scale: Array, duration: float, period: float, seed: int = 0) -> list[Array]:
     """Return the departures (n, 6) from the middle of the three motions, rad and m.
 
-    Args:
-        scale: (6,) amplitude of the scenario's motion.
-        duration: of all three, s.
-        period: between rows, s.
-        seed: of phases and steps.
+    `scale` (6,) is the amplitude of the scenario's motion; all three take `duration` s.
     """
     rng, number = np.random.default_rng(seed), round(duration / 3 / period)
     t: Array = period * np.arange(number, dtype=np.float64)
@@ -112,16 +108,9 @@ def mixed_motion(scale: Array, duration: float, period: float, seed: int = 0) ->
 def plan_servos(
     experiment: Experiment, rounding: float, duration: float = 12.0, seed: int = 0
 ) -> ServoPlan:
-    """Plan the setpoints of a log around the middle of the scenario's motion.
+    """Plan the setpoints of a log around the middle of the motion of a scenario with servos.
 
-    Args:
-        experiment: with position servos; its numbers are assumed.
-        rounding: standard deviation of the rounding of a measured angle, rad.
-        duration: s.
-        seed: of the motion.
-
-    Raises:
-        ConfigError: not even a small motion keeps the limits.
+    `rounding` is the standard deviation of the rounding of a measured angle, rad.
     """
     sc = experiment.scenario
     seen = np.array([experiment.reference.value(t)[POSE, 0] for t in np.linspace(0, sc.duration)])
@@ -164,14 +153,9 @@ def _cranks(mechanism: Mechanism, states: Array) -> Array:
 
 
 class _Planner:
-    """Check of motions against the limits of a scenario.
+    """Check of motions about a pose (6,) against the limits of a scenario with position servos.
 
-    Args:
-        experiment: with position servos.
-        middle: pose (6,) about which the motions are.
-
-    Attributes:
-        theta: (8,) the scenario's numbers, of `servo_fit.NAMES`.
+    `theta` (8,) has the scenario's numbers, of `servo_fit.NAMES`.
     """
 
     def __init__(self, experiment: Experiment, middle: Array) -> None:
@@ -222,7 +206,7 @@ class _Planner:
     def _setpoints(self, poses: Array) -> Array | None:
         """Return the crank angles (n, 6) of poses, or None beyond a limit."""
         machine, servo = self._experiment.mechanism, self._servo
-        if min(margin(machine, pose) for pose in poses) < self._least:
+        if margins(machine, poses).min() < self._least:
             return None
         wanted = np.unwrap([machine.crank_angles(pose) for pose in poses], axis=0)
         if not np.all((servo.low <= wanted) & (wanted <= servo.high)):
@@ -232,7 +216,7 @@ class _Planner:
             setpoints[k] = servo.limited(wanted[k], setpoints[k - 1])
         model = self.model(setpoints)
         states = model.states(self.theta)
-        if states is None or min(margin(machine, x[POSE]) for x in states) < self._least:
+        if states is None or margins(machine, states[:, POSE]).min() < self._least:
             return None
         torque, speed = self.peaks(model, states)
         most = _USED * self._experiment.torque_limit

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from stewart_drake.dynamics.workspace import margin
+from stewart_drake.dynamics.workspace import margin, margins
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.fit import (
     ASTRAY,
@@ -53,13 +53,8 @@ def length_needed(unknowns: Unknowns) -> float:
 def fit_short(pairs: Sequence[Pair], unknowns: Unknowns, worst: float) -> Solution:
     """Return the fit with the only delay that explains the logs.
 
-    Args:
-        pairs: logs of one machine with their poses.
-        unknowns: before the logs.
-        worst: largest chi^2 per value of a fit that explains the logs.
-
-    Raises:
-        ConfigError: no delay, or more than one, explains the logs; names the length needed.
+    `worst` is the largest chi^2 per value of a fit that explains them. If no delay does, or more
+    than one, the ConfigError names the length needed.
     """
     pairs = [_inside(*pair, unknowns.mechanism) for pair in pairs]
     right = list[Solution]()
@@ -87,7 +82,7 @@ def _inside(log: Log, poses: Array, mechanism: Mechanism) -> Pair:
     loss end in local minima there.
     """
     least = _ROOM * margin(mechanism, mechanism.home)
-    kept = ~np.array([margin(mechanism, pose) < least for pose in poses], dtype=bool)
+    kept = ~(margins(mechanism, poses) < least)
     log = replace(log, times=log.times[kept], values=log.values[kept])
     if log.before is not None:
         sent = np.r_[log.sent[0] - _LONG_AGO, log.sent]
@@ -97,14 +92,11 @@ def _inside(log: Log, poses: Array, mechanism: Mechanism) -> Pair:
 
 def _scanned(pairs: Sequence[Pair], unknowns: Unknowns) -> list[Array]:
     """Return values of the unknowns at the delays that explain the logs best."""
-    std, found = unknowns.std.copy(), list[Solution]()
-    std[GEOMETRY] = 0.0
-    middle, reach = unknowns.mean[DELAY], 3 * std[DELAY]
+    as_drawn, found = unknowns.without(GEOMETRY), list[Solution]()
+    middle, reach = unknowns.mean[DELAY], 3 * unknowns.std[DELAY]
     for delay in np.arange(max(0.0, middle - reach), middle + reach + _GRID / 2, _GRID):
-        values = unknowns.mean.copy()
-        values[DELAY] = delay
         with suppress(np.linalg.LinAlgError):
-            one = _fitted(pairs, replace(unknowns, std=std), values, _SCANNED, _FEW)
+            one = _fitted(pairs, as_drawn, unknowns.at_delay(float(delay)), _SCANNED, _FEW)
             found += [one] if one else []
     found.sort(key=_cost)
     kept = list[Solution]()
@@ -141,12 +133,10 @@ def _fitted(
     whole, guess = problem_of(
         pairs, unknowns, values, _LATE, longest=longest, step=_STEP, skip_short=True
     )
-    if not whole.segments:
-        return None
-    problem, guess = followed(whole, guess)
+    problem, begun = followed(whole, guess) if whole.segments else (whole, guess)
     if not problem.segments:
         return None
-    return Solution(whole, problem, guess, solve(problem, guess, most))
+    return Solution(whole, problem, begun, solve(problem, begun, most))
 
 
 def _grown(pairs: Sequence[Pair], unknowns: Unknowns, values: Array) -> Solution | None:

@@ -154,17 +154,11 @@ def problem_of(
     step: float = 0.02,
     skip_short: bool = False,
 ) -> tuple[Problem, Guess]:
-    """Return the problem of all logs and its first guess.
+    """Return the problem of all logs and its first guess, at values of the unknowns.
 
-    Args:
-        pairs: logs with their poses.
-        unknowns: before the logs.
-        values: of the unknowns (NUM_UNKNOWNS,); a log counts from the first torque's arrival on.
-        late: longest error of their delay, s.
-        share: length of the segments, relative to `segment_length`.
-        longest: length of a segment, s.
-        step: longest integration step, s.
-        skip_short: whether to leave out logs that are too short.
+    A log counts from the first torque's arrival on, whose delay may be `late` s too short. Segments
+    have a share of `segment_length` and are at most `longest` s long. With `skip_short` logs that
+    are too short are left out.
     """
     segments, delay = list[Segment](), float(values[DELAY])
     first = list[Array]()

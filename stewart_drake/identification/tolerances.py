@@ -3,15 +3,16 @@
 from collections.abc import Iterable
 from typing import Annotated, Final
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.yamlio import units_of, validate_pairs
+from stewart_drake.scenario.field_types import STRICT
 
 _Std = Annotated[float, Field(ge=0, le=1e3)]
 
 
-@dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
+@dataclass(config=STRICT)
 class Tolerances:
     """Prior standard deviations of a machine's unknowns; 0 is known, None depends on the machine.
 

@@ -84,17 +84,14 @@ class Unknowns:
         values[DELAY] = delay
         return values
 
-    def without_encoders(self) -> "Unknowns":
+    def without(self, known: slice) -> "Unknowns":
+        """Return a prior in which these unknowns are known."""
         std = self.std.copy()
-        std[OFFSETS] = 0.0
+        std[known] = 0.0
         return dataclasses.replace(self, std=std)
 
     def machine(self, values: Array) -> Mechanism:
-        """Return the mechanism with values (NUM_UNKNOWNS,) of the unknowns.
-
-        Raises:
-            ConfigError, UnreachablePoseError: no such machine can be assembled at home.
-        """
+        """Return the mechanism with values (NUM_UNKNOWNS,) of the unknowns."""
         legs = values[GEOMETRY].reshape(NUM_LEGS, -1)
         return dataclasses.replace(
             self.mechanism,
@@ -108,14 +105,9 @@ class Unknowns:
 def unknowns_of(
     mechanism: Mechanism, tolerances: Tolerances, delay: float, torque: float, speed: float
 ) -> Unknowns:
-    """Return the prior of a machine's unknowns.
+    """Return the prior of a machine's unknowns, around the drawing and the believed delay.
 
-    Args:
-        mechanism: as drawn.
-        tolerances: of the drawing.
-        delay: believed one, s.
-        torque: largest commanded one, N m, prior of bias and of friction at `speed`.
-        speed: largest of a crank, rad/s.
+    The largest commanded torque is the prior of bias and of friction at the largest crank speed.
     """
     mean, std = np.zeros(NUM_UNKNOWNS), np.zeros(NUM_UNKNOWNS)
     m, t = mechanism, tolerances

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import AfterValidator, ConfigDict, Field
+from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
@@ -16,10 +16,9 @@ from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import load_yaml, one_message, validate, yaml_text
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism, bar_inertia, disc_inertia
 from stewart_drake.mechanism.kinematics import Legs, UnreachablePoseError, dot
+from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.types import Array
-
-_STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 # Limits far beyond any platform keep squares and products finite.
 _SHORTEST, _LONGEST = 1e-6, 1e3
@@ -64,7 +63,7 @@ Length = Annotated[
 ]
 
 
-@dataclass(config=_STRICT)
+@dataclass(config=STRICT)
 class BodySpec:
     """A body."""
 
@@ -73,7 +72,7 @@ class BodySpec:
     inertia: Moments | None = None
 
 
-@dataclass(config=_STRICT)
+@dataclass(config=STRICT)
 class LinkSpec:
     """All cranks, or all rods."""
 
@@ -85,14 +84,14 @@ class LinkSpec:
     center: float = 0.5  # position of the COM along the link, 0 to 1
 
 
-@dataclass(config=_STRICT)
+@dataclass(config=STRICT)
 class MotorSpec:
     """All motors."""
 
     effort_limit: Annotated[float, Field(gt=0, le=1e6)] | None = None  # N m; null is none
 
 
-@dataclass(config=_STRICT)
+@dataclass(config=STRICT)
 class BallJointSpec:
     """Legs, 1 to 6, whose ball joints have the friction of a scenario's `plant.ball_joint_...`.
 
@@ -103,7 +102,7 @@ class BallJointSpec:
     plate: LegNumbers = Field(default_factory=lambda: list(LEGS))
 
 
-@dataclass(config=_STRICT)
+@dataclass(config=STRICT)
 class PatternSpec:
     """Anchors of a platform with threefold symmetry; lengths in m, angles in degrees.
 
@@ -125,7 +124,7 @@ class PatternSpec:
     plate_height: Coordinate = 0.0
 
 
-@dataclass(config=_STRICT)
+@dataclass(config=STRICT)
 class LegSpec:
     """One leg."""
 
@@ -136,7 +135,7 @@ class LegSpec:
     branch: Branch  # -1 or 1, the crank solution
 
 
-@dataclass(config=_STRICT)
+@dataclass(config=STRICT)
 class MechanismSpec:
     """A mechanism file: bodies, and anchors as a `pattern` or explicitly as six `legs`."""
 

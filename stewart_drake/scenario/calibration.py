@@ -9,6 +9,7 @@ from pydantic import AfterValidator
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
+from stewart_drake.files.jsonio import jsonable
 from stewart_drake.files.yamlio import brief, load_yaml, validate, yaml_text
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
@@ -31,22 +32,12 @@ ROUNDING: Final = 1e-9  # relative error of a covariance that counts as rounding
 
 @dataclass(frozen=True)
 class Calibration:
-    """Parameters of one machine, with their covariance.
+    """Parameters of one machine, with their covariance, in SI units."""
 
-    Attributes:
-        mechanism: fingerprint of the machine's numbers, `mechanism.geometry.fingerprint`.
-        names: (n,) out of CALIBRATED, each at the most once; SI units.
-        mean: (n,).
-        covariance: (n, n); zero for exactly known parameters.
-
-    Raises:
-        ConfigError: one line, opened by the attribute.
-    """
-
-    mechanism: str
-    names: tuple[str, ...]
-    mean: Array
-    covariance: Array
+    mechanism: str  # fingerprint of the machine's numbers, `mechanism.geometry.fingerprint`
+    names: tuple[str, ...]  # (n,) out of CALIBRATED, each at the most once
+    mean: Array  # (n,)
+    covariance: Array  # (n, n); zero for exactly known parameters
 
     def __post_init__(self) -> None:
         n, mean, P = len(self.names), np.array(self.mean), np.array(self.covariance)
@@ -111,14 +102,7 @@ class _File:
 
 
 def load_calibration(path: str | Path) -> Calibration:
-    """Read the calibration of a machine.
-
-    Args:
-        path: a YAML file with the keys `mechanism`, `names`, `mean`, `covariance`.
-
-    Raises:
-        ConfigError: unreadable, or refused by `Calibration`; one line, opened by the path.
-    """
+    """Read the calibration of a machine from YAML, with a key for each field of `Calibration`."""
     found = validate(_File, load_yaml(path), str(path))
     n = len(found.names)
     for row in found.covariance:
@@ -133,13 +117,7 @@ def load_calibration(path: str | Path) -> Calibration:
 
 def save_calibration(path: str | Path, calibration: Calibration) -> None:
     """Write a file that `load_calibration` reads back to the last digit."""
-    data = {
-        "mechanism": calibration.mechanism,
-        "names": list(calibration.names),
-        "mean": calibration.mean.tolist(),
-        "covariance": calibration.covariance.tolist(),
-    }
-    write_whole(Path(path), yaml_text(data))
+    write_whole(Path(path), yaml_text(jsonable(vars(calibration))))
 
 
 def calibration_file(scenario: Scenario) -> Calibration | None:

@@ -140,16 +140,8 @@ class PlantConfig:
         """All constants, in the order of `scenario.signals.CONSTANTS`."""
         shafts = (self.joint_damping, self.coulomb_friction, self.coulomb_speed)
         loads = [*self.torque_bias, self.payload_mass, *shafts, *self.payload_position]
-        return [*loads, *self.ball_joints]
-
-    @property
-    def ball_joints(self) -> list[float]:
-        """Damping, Coulomb friction and its speed of each ball joint."""
-        return [
-            self.ball_joint_damping,
-            self.ball_joint_friction,
-            self.ball_joint_friction_speed,
-        ]
+        ball_joints = (self.ball_joint_damping, self.ball_joint_friction)
+        return [*loads, *ball_joints, self.ball_joint_friction_speed]
 
     @property
     def step(self) -> float | None:
@@ -359,7 +351,6 @@ class TorqueActuatorConfig:
     """Motors that apply the torque that arrives, within their limit.
 
     Attributes:
-        kind: `torque`.
         torque_limit: of each motor, N m; null is the mechanism's `motor.effort_limit`, the text
             `none` no limit. The catch-up respects a number only, see `ControllerConfig.catch_up`.
     """
@@ -378,7 +369,6 @@ class ServoActuatorConfig:
     home, with the rotors. See `law.servos`.
 
     Attributes:
-        kind: `servo`.
         bandwidth: Hz.
         damping: relative to critical damping, for an inertia of J.
         speed_limit: of the commanded angle, rad/s; null is none.
@@ -411,7 +401,6 @@ class PositionServoConfig:
     these numbers, unless its `calibration` has others. See `law.servos`.
 
     Attributes:
-        kind: `position_servo`.
         stiffness: N m/rad.
         velocity_gain: of the servo's own loop, within the torque limit, N m s/rad.
         crank_damping: viscous, of motor and gear, N m s/rad.
@@ -471,7 +460,6 @@ class StateSensorConfig:
     """The measurement of pose and rates.
 
     Attributes:
-        kind: `state`.
         noise_std: of [pose; rates], in rad, m, rad/s and m/s.
         delay: age of a measurement when it arrives, s; it is used at the next sample after that.
         loss: share of the measurements that are lost.
@@ -495,7 +483,6 @@ class EncoderSensorConfig:
     """The measurement of the six crank angles, by an encoder at each motor.
 
     Attributes:
-        kind: `encoders`.
         bits: of a turn; null is exact.
         samples: readings of each encoder per period of the controller, the last one at its sample.
         offset: of each encoder on its shaft, unknown to the controller, rad.
@@ -521,11 +508,7 @@ SensorConfig = Annotated[StateSensorConfig | EncoderSensorConfig, ByKind()]
 
 @section
 class FixedTunerConfig:
-    """Constant w_Q and w_R, those of the controller.
-
-    Attributes:
-        kind: `fixed`.
-    """
+    """Constant w_Q and w_R, those of the controller."""
 
     kind: Literal["fixed"] = "fixed"
 
@@ -537,7 +520,6 @@ class AnnTunerConfig:
     It starts from the controller's w_Q and w_R and returns to them where it fails.
 
     Attributes:
-        kind: `ann`.
         weights: the network, a shipped name or a JSON file; null is the shipped `tuner`.
     """
 
@@ -553,7 +535,6 @@ class RuleTunerConfig:
     largest innovation; see `tuner.source.Rule`.
 
     Attributes:
-        kind: `rule`.
         ratio, slope, knee: see above; null is the shipped value for controllers with an estimator,
             or without one.
     """
@@ -654,9 +635,7 @@ class Scenario:
     def delay_max_problem(self, assumed: Delay | None = None) -> str | None:
         """Return why an estimator's longest delay excludes the assumed one, or None.
 
-        Args:
-            assumed: the delay that the controller assumes at first; None is that of the scenario,
-                unless a calibration may have another.
+        By default that is the delay of the scenario, unless a calibration may have another.
         """
         c = self.controller
         if c.delay_estimator == "none":
@@ -707,11 +686,7 @@ class Scenario:
     def check(self, where: str = "scenario") -> None:
         """Check every field again, and all rules that take several of them.
 
-        Args:
-            where: opening of a message.
-
-        Raises:
-            ConfigError: the first problem, in one line.
+        A ConfigError has the first problem, in one line that `where` opens.
         """
         # Assignment is validated, but a list can also be changed in place.
         validate(Scenario, dataclasses.asdict(self), where)

@@ -7,18 +7,10 @@ from stewart_drake.scenario.timing import LEAST_FRACTION
 
 @dataclass(frozen=True)
 class Delay:
-    """A delay eta = (steps + fraction) dt of a loop that is sampled every dt.
+    """A delay eta = (steps + fraction) dt of a loop that is sampled every dt."""
 
-    Attributes:
-        steps: mu, whole periods.
-        fraction: eta0 / dt, further part of a period, in [0, 1).
-
-    Raises:
-        ValueError: steps or fraction outside their range.
-    """
-
-    steps: int
-    fraction: float = 0.0
+    steps: int  # mu, whole periods
+    fraction: float = 0.0  # eta0 / dt, further part of a period, in [0, 1)
 
     def __post_init__(self) -> None:
         if self.steps < 0 or not 0 <= self.fraction < 1:

@@ -93,48 +93,46 @@ value of the first field."""
 
 
 class Needs(NamedTuple):
-    """Row of `NEEDS`: without an accepted value of `other` the `fields` have no effect.
+    """Row of `NEEDS`: without an accepted value of `other` the `names` have no effect.
 
     Except where a delay is estimated, for a row with `known_delay`.
     """
 
-    fields: tuple[str, ...]
+    names: str  # of fields of the controller
     other: str
     accepted: Any
     known_delay: bool = False
 
-
-def _needs(names: str, other: str, accepted: Any, known_delay: bool = False) -> Needs:
-    fields = tuple(f"controller.{name}" for name in names.split())
-    return Needs(fields, other, accepted, known_delay)
+    @property
+    def fields(self) -> list[str]:
+        return [f"controller.{name}" for name in self.names.split()]
 
 
 NEEDS: Final = (
-    _needs("kp kd", "controller.kind", "pd"),
-    _needs("integral integral_weight weight_scaling w_Q w_R", "controller.kind", "lqi"),
-    _needs("integral_weight", "controller.integral", True),
-    *(
-        _needs(f"prior.{name}", "controller.estimate", name)
-        for name in ("torque_bias", "payload", "damping")
-    ),
-    _needs("prior.rates model_error timing_std", "controller.estimate", _CONSTANTS),
-    _needs("prior.rates", "sensor.kind", "encoders"),
-    _needs("timing_std", "controller.command", "torque"),
-    _needs("prior.offsets", "controller.estimate", "offsets"),
-    _needs("prior.wrench prior.wrench_walk", "controller.estimate", "wrench"),
-    _needs("horizon", "controller.limits", "qp"),
-    _needs("delay_std delay_max", "controller.delay_estimator", _DELAYS),
-    _needs("w_Q w_R", "tuner.kind", ("fixed", "ann")),
-    _needs(
+    Needs("kp kd", "controller.kind", "pd"),
+    Needs("integral integral_weight weight_scaling w_Q w_R", "controller.kind", "lqi"),
+    Needs("integral_weight", "controller.integral", True),
+    Needs("prior.torque_bias", "controller.estimate", "torque_bias"),
+    Needs("prior.payload", "controller.estimate", "payload"),
+    Needs("prior.damping", "controller.estimate", "damping"),
+    Needs("prior.rates model_error timing_std", "controller.estimate", _CONSTANTS),
+    Needs("prior.rates", "sensor.kind", "encoders"),
+    Needs("timing_std", "controller.command", "torque"),
+    Needs("prior.offsets", "controller.estimate", "offsets"),
+    Needs("prior.wrench prior.wrench_walk", "controller.estimate", "wrench"),
+    Needs("horizon", "controller.limits", "qp"),
+    Needs("delay_std delay_max", "controller.delay_estimator", _DELAYS),
+    Needs("w_Q w_R", "tuner.kind", ("fixed", "ann")),
+    Needs(
         "kind kp kd integral integral_weight prediction model weight_scaling w_Q w_R "
         "packet_torques packet_repeats open_loop_start replan limits",
         "controller.command",
         "torque",
     ),
-    _needs("catch_up open_loop_start", "start", "rest"),
-    _needs("replan", "link.kind", "wire", known_delay=True),
-    _needs("replan", "controller.estimate", _CONSTANTS, known_delay=True),
-    _needs("replan", "controller.limits", "ignore"),
+    Needs("catch_up open_loop_start", "start", "rest"),
+    Needs("replan", "link.kind", "wire", known_delay=True),
+    Needs("replan", "controller.estimate", _CONSTANTS, known_delay=True),
+    Needs("replan", "controller.limits", "ignore"),
 )
 """Fields that have an effect only with certain values of another field."""
 
@@ -174,17 +172,11 @@ def contradiction(scenario: Any) -> str | None:
 
 
 class Idle(NamedTuple):
-    """A field that is not at its default and has no effect.
+    """A field that is not at its default and has no effect."""
 
-    Attributes:
-        field: dotted name, as in files.
-        other: the field that makes it so.
-        problem: both, and the accepted values, in one line.
-    """
-
-    field: str
-    other: str
-    problem: str
+    field: str  # dotted name, as in files
+    other: str  # field that makes it so
+    problem: str  # both, and the accepted values, in one line
 
 
 def idle_fields(scenario: Any) -> list[Idle]:
@@ -209,10 +201,11 @@ def idle_fields(scenario: Any) -> list[Idle]:
     return found
 
 
-def reset(scenario: Any, field: str) -> None:
-    """Set an existing field to its default."""
-    if place := _place(scenario, field):
-        setattr(*place, _default(*place))
+def reset_idle(scenario: Any) -> None:
+    """Set the fields without an effect to their defaults."""
+    for idle in idle_fields(scenario):
+        if place := _place(scenario, idle.field):
+            setattr(*place, _default(*place))
 
 
 def _place(scenario: Any, path: str) -> tuple[Any, str] | None:

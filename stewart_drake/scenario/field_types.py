@@ -11,20 +11,15 @@ from stewart_drake.files.yamlio import in_one_line, one_message
 from stewart_drake.scenario.timing import LEAST_FRACTION
 
 _T = TypeVar("_T")
-STRICT: Final = ConfigDict(
-    extra="forbid",
-    strict=True,
-    allow_inf_nan=False,
-    validate_assignment=True,
-    populate_by_name=True,
-)
-"""Configuration of every section: nothing is guessed, and assignments are checked too."""
+STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+"""Configuration of data in files: nothing is guessed."""
 
 
 @dataclass_transform(field_specifiers=(dataclasses.field, Field))
 def section(cls: type[_T]) -> type[_T]:
     """Return a strict dataclass; a wrong argument or assignment raises ConfigError."""
-    return in_one_line(pydantic.dataclasses.dataclass(config=STRICT)(cls))
+    config = ConfigDict(**STRICT, validate_assignment=True, populate_by_name=True)
+    return in_one_line(pydantic.dataclasses.dataclass(config=config)(cls))
 
 
 MOST_PERIODS: Final = 1000
@@ -83,7 +78,7 @@ _Fault = TypedDict(
         "share": NotRequired[Annotated[float, Field(gt=0, le=1)] | None],
     },
 )
-with_config(ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))(_Fault)
+with_config(STRICT)(_Fault)
 
 
 def _check_fault(fault: Any) -> Any:

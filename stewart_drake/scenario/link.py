@@ -65,12 +65,7 @@ def releases(period: float, delays: Array, delay: Delay) -> tuple[NDArray[np.int
     """Return the torques that ever act over a wire, and their arrivals in s, in that order.
 
     Torque k >= 0 is sent at k dt and has the delay `delays[k]`. Torques -L to -1 were sent before,
-    one a period, with the delay `delay` and its queue length L.
-
-    Args:
-        period: dt in s.
-        delays: (n,) s; less than 1e-9 of a period is 0.
-        delay: of torques sent before t = 0.
+    one a period, with the delay `delay` and its queue length L. Less than 1e-9 of a period is 0.
     """
     length = delay.queue_length
     waits = np.where(delays > SIMULTANEOUS * period, delays, 0.0)

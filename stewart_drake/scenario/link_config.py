@@ -13,11 +13,7 @@ ASSUMED_TIMES: Final = (0.8, 1.2)
 
 @section
 class WireConfig:
-    """A link that delays every torque by `delay`, and loses none.
-
-    Attributes:
-        kind: `wire`.
-    """
+    """A link that delays every torque by `delay`, and loses none."""
 
     back, burst, acknowledged, follows_delay = None, 1, True, False  # not annotated: no fields
     kind: Literal["wire"] = "wire"
@@ -69,7 +65,6 @@ class NetworkConfig(PacketsConfig):
     1.2 times the constant delay of the section `delay`; `Scenario.assumed_link` has the numbers.
 
     Attributes:
-        kind: `network`.
         playout: the bound, s; null is the one that makes late packets as rare as lost ones
             (`scenario.packets.default_bound`). The controller adds its `packet_repeats` periods.
         dry: output of a dry buffer, `hold` the last torque or `zero`.

@@ -22,14 +22,10 @@ from stewart_drake.scenario.config import (
     compatible_actuator,
     with_actuator,
 )
-from stewart_drake.scenario.dependencies import Idle, idle_fields, reset
+from stewart_drake.scenario.dependencies import Idle, idle_fields, reset_idle
 
 _SETTINGS = "settings"
-_FILES = (
-    "file",
-    "calibration",
-    "learned",
-)  # fields that are always a path; others may be a shipped name
+_FILES = {"file", "calibration", "learned"}  # always a path; others may be a shipped name
 _OVERLAY = "overlay"
 _KINDS = sections(Scenario)
 
@@ -58,7 +54,8 @@ def load_scenario(
     for idle in idle_fields(read.scenario):
         if place := read.place_to_mend(idle):
             raise ConfigError(f"{place}: {idle.problem}")
-    return _without_idle(read.scenario)
+    reset_idle(read.scenario)
+    return read.scenario
 
 
 def as_scenario(given: Scenario | str | Path) -> Scenario:
@@ -79,25 +76,18 @@ def load_compatible(
     scenario, where, *_ = read_scenario(name_or_path, controller, settings)
     scenario.actuator = compatible_actuator(scenario.controller.command, scenario.actuator)
     scenario.check(where)
-    return _without_idle(scenario)
+    reset_idle(scenario)
+    return scenario
 
 
 class Read(NamedTuple):
-    """A scenario that was read.
+    """A scenario that was read."""
 
-    Attributes:
-        scenario: its fields are checked one by one only.
-        where: opening of a message.
-        places: the file, or "settings", that set a field last, by the field's dotted name.
-        idle: names of the fields without an effect in the scenario's file by itself.
-        path: of that file.
-    """
-
-    scenario: Scenario
-    where: str
-    places: dict[str, str]
-    idle: set[str]
-    path: str
+    scenario: Scenario  # its fields are checked one by one only
+    where: str  # opening of a message
+    places: dict[str, str]  # the file, or "settings", that set a field last, by its dotted name
+    idle: set[str]  # names of the fields without an effect in the scenario's file by itself
+    path: str  # of that file
 
     def place_to_mend(self, idle: Idle) -> str | None:
         """Return the place that set an idle field, None if a higher layer made it idle.
@@ -142,22 +132,8 @@ def _dotted_names(data: dict[str, Any], above: str = "") -> Iterator[str]:
             yield from _dotted_names(value, f"{above}{name}.")
 
 
-def _without_idle(scenario: Scenario) -> Scenario:
-    """Return the scenario with the defaults of fields without an effect."""
-    for idle in idle_fields(scenario):
-        reset(scenario, idle.field)
-    return scenario
-
-
 def load_controller(name_or_path: str | Path) -> dict[str, Any]:
-    """Read a controller: fields of the scenario's section `controller` and their values.
-
-    Args:
-        name_or_path: a shipped name or a YAML file of flat keys, without `period`.
-
-    Raises:
-        ConfigError: unreadable file, unknown key, bad value, or a `period`.
-    """
+    """Read a controller: fields of the scenario's section `controller`, without `period`."""
     path = resolve("controller", name_or_path)
     data = load_yaml(path)
     if "period" in data:
@@ -187,13 +163,8 @@ def load_comparison(
         controllers: shipped names, rows of the scenario's `compare`, or paths; the row of a path
             is named after its file.
         refuse_idle: whether to refuse a field that has an effect in no row.
-        further: whether to add the rows of `compare` that are not among the controllers.
-
-    Returns:
-        Scenarios by row: the controllers, then the further rows in the file's order.
-
-    Raises:
-        ConfigError: bad input, or two controllers of one name.
+        further: whether to add the rows of `compare` that are not among the controllers, in the
+            file's order.
     """
     settings = tuple(settings)
     others = tuple(s for s in settings if not s.strip().startswith("controller.delay_"))
@@ -219,7 +190,8 @@ def load_comparison(
         for field in idle.keys() & {f"controller.{name}" for name in change}:
             raise ConfigError(f"{where}: {idle[field].problem}")
         everywhere &= idle.keys()
-        rows[row] = _without_idle(scenario)
+        reset_idle(scenario)
+        rows[row] = scenario
     for one in idle_fields(read.scenario) if refuse_idle else ():
         if one.field in everywhere and (place := read.place_to_mend(one)):
             raise ConfigError(f"{place}: {one.problem}")
@@ -227,11 +199,7 @@ def load_comparison(
 
 
 def _rows_of(controllers: Iterable[str | Path]) -> dict[str, str | Path]:
-    """Return controllers by the name of their row.
-
-    Raises:
-        ConfigError: a name occurs twice, or a file has the name of a shipped controller.
-    """
+    """Return controllers by the name of their row."""
     rows: dict[str, str | Path] = {}
     for one in controllers:
         row = Path(one).stem if is_path(one) else str(one)

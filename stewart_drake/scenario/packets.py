@@ -41,14 +41,10 @@ class BurstChain:
 
     A packet is lost where a < burst. It is kept where none of the last `burst` packets began one,
     so that 1 - loss = (1 - p)^burst. The chain reads the same backwards in time.
-
-    Attributes:
-        loss: share of the packets that are lost.
-        burst: number of packets that one burst loses.
     """
 
-    loss: float
-    burst: int
+    loss: float  # share of the packets that are lost
+    burst: int  # number of packets that one burst loses
 
     @cached_property
     def begins(self) -> float:
@@ -77,11 +73,7 @@ class BurstChain:
     def probability_none_in_time(self, late: Array) -> float:
         """Return the probability that each of consecutive packets is lost or late.
 
-        The distribution of the state is advanced packet by packet. At each the probability of
-        "kept" is multiplied by the probability that this packet is late.
-
-        Args:
-            late: (n,) probability that a packet is late if it is not lost.
+        `late` (n,) is the probability of that for a packet that is not lost.
         """
         shares = self.stationary.copy()
         shares[-1] *= late[0]

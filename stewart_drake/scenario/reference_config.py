@@ -33,7 +33,6 @@ class SineConfig:
     """offset + amplitude sin(frequency t).
 
     Attributes:
-        kind: `sine`.
         amplitude: [roll, pitch, yaw, x, y, z] in rad and m.
         offset: middle of the motion, rad and m.
         frequency: in `frequency_unit`; one for all coordinates, or a list of six.
@@ -64,7 +63,6 @@ class HoldConfig:
     """One constant pose.
 
     Attributes:
-        kind: `hold`.
         offset: the pose, [roll, pitch, yaw, x, y, z] in rad and m.
     """
 
@@ -80,7 +78,6 @@ class WaypointsConfig:
     """A smooth motion through poses, at rest in the first and the last; in lists or in a file.
 
     Attributes:
-        kind: `waypoints`.
         times: s, increasing.
         poses: one [roll, pitch, yaw, x, y, z] per time, rad and m.
         file: a YAML file of `times` and `poses`.
@@ -110,7 +107,6 @@ class CsvConfig:
     """A sampled motion.
 
     Attributes:
-        kind: `csv`.
         file: of time and six columns, see `scenario.reference_files.read_csv`.
     """
 
@@ -128,7 +124,6 @@ class ReachyMoveConfig:
     """A recorded move of Reachy Mini, in the format of its SDK.
 
     Attributes:
-        kind: `reachy_move`.
         file: JSON of `time` and `set_target_data`, see `machines.reachy_moves.read_move`.
     """
 

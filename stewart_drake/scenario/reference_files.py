@@ -10,13 +10,13 @@ from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.csvio import ANGLE_UNITS, LENGTH_UNITS, read_table
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import load_yaml, validate
-from stewart_drake.scenario.field_types import Row, Seconds
+from stewart_drake.scenario.field_types import STRICT, Row, Seconds
 from stewart_drake.scenario.reference_config import WaypointsConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.types import Array
@@ -37,7 +37,7 @@ _MAX_KINK: Final = 0.05
 _LEAST_KINK: Final = 1e-3  # rad, m; less is noise of a sensor, not a jump
 
 
-@dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
+@dataclass(config=STRICT)
 class _WaypointFile:
     times: Annotated[list[Seconds], Field(min_length=2)]
     poses: Annotated[list[Row], Field(min_length=2)]
@@ -53,11 +53,7 @@ def waypoints(config: WaypointsConfig) -> tuple[Array, Array]:
 
 
 def read_waypoints(path: str | Path) -> tuple[Array, Array]:
-    """Read `times` (s) and `poses` (rad, m) from a YAML file.
-
-    Raises:
-        ConfigError: not such a file, not one pose per time, or see `_check_samples`.
-    """
+    """Read `times` (s) and `poses` (rad, m) from a YAML file."""
     data = validate(_WaypointFile, load_yaml(path), str(path))
     if len(data.poses) != len(data.times):
         raise ConfigError(
@@ -115,17 +111,9 @@ Place = Callable[[int, str], str]
 def check_motion(
     path: Path, times: Array, poses: Array, place: Place, scales: Mapping[str, float]
 ) -> None:
-    """Check that samples are dense and smooth enough for a spline through them.
+    """Check that samples (n,), (n, 6) are dense and smooth enough for a spline through them.
 
-    Args:
-        path: of the file.
-        times: (n,) s.
-        poses: (n, 6) rad and m.
-        place: see `Place`.
-        scales: by coordinate, the SI units in the unit of the file.
-
-    Raises:
-        ConfigError: too few samples, a gap, a jump or a kink.
+    `scales` has by coordinate the SI units in the unit of the file.
     """
     _check_samples(times, poses, place, scales)
     if len(times) < _MIN_ROWS:
@@ -150,14 +138,7 @@ def check_motion(
 
 
 def _check_samples(times: Array, poses: Array, place: Place, scales: Mapping[str, float]) -> None:
-    """Check that times (n,) increase, and that poses (n, 6) are unique and do not jump by a turn.
-
-    Args:
-        times: s.
-        poses: rad and m.
-        place: see `Place`.
-        scales: by coordinate, the SI units in the unit of the file.
-    """
+    """Check that times (n,) increase, poses (n, 6) are unique and do not jump by a turn."""
 
     def check(
         bad: NDArray[np.bool_], problem: str, limit: float = 0.0, before: bool = False

@@ -37,7 +37,6 @@ from stewart_drake.scenario.signals import (
     COORDINATE_NAMES,
     COORDINATES,
     NUM_LEGS,
-    Signal,
     run_dimensions,
     run_signals,
 )
@@ -54,19 +53,12 @@ _ENCODER: Final = re.compile(r"measurement_A\d")
 
 
 class Channel(NamedTuple):
-    """A signal in a log.
+    """A signal in a log."""
 
-    Attributes:
-        name: of the signal.
-        fields: names of its components in JSON.
-        heads: of its columns in CSV, with units.
-        meaning: in words.
-    """
-
-    name: str
-    fields: tuple[str, ...]
-    heads: tuple[str, ...]
-    meaning: str
+    name: str  # of the signal
+    fields: tuple[str, ...]  # names of its components in JSON
+    heads: tuple[str, ...]  # of its columns in CSV, with units
+    meaning: str  # in words
 
 
 def headings(name: str, labels: Iterable[str | int], units: Iterable[str]) -> list[str]:
@@ -111,11 +103,7 @@ class RunLog(Protocol):
 
 
 def kind_of_log(path: Path) -> Callable[[Path, Scenario], RunLog]:
-    """Return the class of a log, by the suffix of its file.
-
-    Raises:
-        ConfigError: another suffix, or no package mcap.
-    """
+    """Return the class of a log, by the suffix of its file."""
     if path.suffix == ".csv":
         return CsvLog
     if path.suffix != ".mcap":
@@ -125,18 +113,9 @@ def kind_of_log(path: Path) -> Callable[[Path, Scenario], RunLog]:
 
 
 def open_log(path: Path, scenario: Scenario) -> RunLog:
-    """Open a log for writing.
-
-    Args:
-        path: ends in .mcap or .csv.
-        scenario: of the run.
-
-    Raises:
-        ConfigError: see `kind_of_log`, or a file that cannot be written.
-    """
-    kind = kind_of_log(path)
+    """Open a log for writing, in a file that ends in .mcap or .csv."""
     try:
-        return kind(path, scenario)
+        return kind_of_log(path)(path, scenario)
     except OSError as error:
         raise ConfigError(
             f"--log: {path} cannot be written ({error.strerror}); expected a file"
@@ -150,12 +129,7 @@ def _members(channel: Channel, values: Array) -> dict[str, float]:
 
 
 class McapLog:
-    """An MCAP file, with one topic for each signal.
-
-    Args:
-        path: file, which is replaced.
-        scenario: of the run.
-    """
+    """An MCAP file, which is replaced, with one topic for each signal."""
 
     def __init__(self, path: Path, scenario: Scenario) -> None:
         writer = _mcap("mcap.writer")
@@ -199,14 +173,8 @@ class McapLog:
 class CsvFile:
     """A CSV file of rows of numbers, which read back exactly; empty cells are not finite.
 
-    Each row is written whole or not at all.
-
-    Args:
-        path: file, which is replaced; None for a temporary one without a name.
-        heads: cells of the first line.
-
-    Attributes:
-        descriptor: of the open file.
+    Each row is written whole or not at all. A file is replaced; without a path it is a temporary
+    one without a name. `heads` are the cells of the first line, `descriptor` is that of the file.
     """
 
     def __init__(self, path: Path | None, heads: Iterable[str]) -> None:
@@ -240,12 +208,7 @@ class CsvFile:
 
 
 class CsvLog:
-    """A CSV file with a line per instant.
-
-    Args:
-        path: file, which is replaced; its scenario is in a file that ends in .yaml.
-        scenario: of the run.
-    """
+    """A CSV file, which is replaced, with a line per instant; its scenario is in a .yaml."""
 
     def __init__(self, path: Path, scenario: Scenario) -> None:
         self._channels = channels_of(scenario.sensor.samples)
@@ -255,9 +218,8 @@ class CsvLog:
     def write(self, time: float, values: Mapping[str, Array]) -> None:
         numbers = [time]
         for channel in self._channels:
-            found = values.get(channel.name)
-            width = len(channel.fields)
-            numbers += [math.nan] * width if found is None else np.atleast_1d(found).tolist()
+            missing = [math.nan] * len(channel.fields)
+            numbers += np.atleast_1d(values.get(channel.name, missing)).tolist()
         self._file.write(numbers)
 
     def close(self) -> None:
@@ -270,12 +232,7 @@ def csv_heads(channels: Iterable[Channel]) -> list[str]:
 
 
 class UdpMirror:
-    """JSON over UDP, one datagram per instant, for PlotJuggler's UDP server.
-
-    Args:
-        address: host and port to send to.
-        scenario: of the run.
-    """
+    """JSON over UDP, one datagram per instant, for PlotJuggler's UDP server."""
 
     def __init__(self, address: tuple[str, int], scenario: Scenario) -> None:
         self._channels = {one.name: one for one in channels_of(scenario.sensor.samples)}
@@ -295,13 +252,7 @@ class UdpMirror:
 
 
 class Background:
-    """A log or file that a thread writes, for a loop in real time; an error is reported once.
-
-    Args:
-        log: to write.
-        name: in the report.
-        say: prints a line.
-    """
+    """A log or file that a thread writes, for a loop in real time; an error is reported once."""
 
     def __init__(self, log: RunLog | CsvFile, name: str, say: Callable[[str], None]) -> None:
         self._log: Any = log
@@ -354,17 +305,19 @@ def dataset_of(
 ) -> xr.Dataset:
     """Return signals (n, size) by name as a Dataset over `time` (n,) in s, with the error.
 
-    Args:
-        times: s.
-        values: of the recorded signals; a missing one is left out.
-        scenario: YAML, or None.
-        samples: encoder readings per period, None for a measured state.
+    `scenario` is YAML; `samples` are encoder readings per period, None for a measured state.
     """
     values = dict(values)
     if "pose" in values and "reference" in values:
         values["error"] = values["pose"] - values["reference"]
-    known = run_signals(samples)
-    variables = {name: _variable(known[name], values[name]) for name in known if name in values}
+    variables: dict[str, Any] = {}
+    for name, signal in run_signals(samples).items():
+        if name in values:
+            about = {"units": signal.unit, "long_name": signal.long_name}
+            if dimension := signal.quantity.dimension:
+                variables[name] = ("time", dimension), values[name], about
+            else:
+                variables[name] = "time", values[name][:, 0], about
     coordinates: dict[str, Any] = {
         name: (name, list(dimension.labels), {"long_name": dimension.long_name})
         for name, dimension in run_dimensions(samples).items()
@@ -375,15 +328,6 @@ def dataset_of(
         "versions": json.dumps(versions()),
     } | ({} if scenario is None else {"scenario": scenario})
     return xr.Dataset(variables, coordinates, attributes)
-
-
-def _variable(signal: Signal, values: Array) -> tuple[tuple[str, ...], Array, dict[str, str]]:
-    """Return dimensions, values and attributes of a signal in the record."""
-    dimension = signal.quantity.dimension
-    attributes = {"units": signal.unit, "long_name": signal.long_name}
-    if dimension is None:
-        return ("time",), values[:, 0], attributes
-    return ("time", dimension), values, attributes
 
 
 def is_run(path: Path) -> bool:
@@ -415,22 +359,17 @@ def read_log(path: str | Path) -> xr.Dataset:
         raise ConfigError(f"{path}: no such file; expected {EXPECTED}")
     if path.suffix == ".nc":
         return load_netcdf(path, EXPECTED)
-    readers = {".mcap": _read_mcap, ".csv": _read_csv}
-    if path.suffix not in readers:
+    if path.suffix not in (".mcap", ".csv"):
         raise ConfigError(f"{path}: got a file of another kind; expected {EXPECTED}")
     try:
-        return readers[path.suffix](path)
+        return _read_csv(path) if path.suffix == ".csv" else _read_mcap(path)
     except (OSError, ValueError, KeyError) as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise ConfigError(f"{path}: cannot be read ({reason}); expected {EXPECTED}") from None
 
 
 def scenario_of(signals: xr.Dataset, path: Path) -> Scenario:
-    """Return the scenario of a log; `path` is for messages.
-
-    Raises:
-        ConfigError: it has none, or a bad one.
-    """
+    """Return the scenario of a log; `path` is for messages."""
     text = signals.attrs.get("scenario")
     if text is None:
         raise ConfigError(
@@ -466,23 +405,15 @@ def _read_mcap(path: Path) -> xr.Dataset:
         raise ValueError("no messages")
     if scenario is None:
         raise ValueError("no metadata of stewart_drake")
-    samples = _samples(scenario, f"{path}: scenario")
-    values = {}
+    sensor = parse_yaml(scenario, f"{path}: scenario").get("sensor", {})
+    samples = int(sensor.get("samples", 1)) if sensor.get("kind") == "encoders" else None
+    values, order = {}, sorted(times)
     for channel in channels_of(samples):
-        if rows := messages.get(channel.name):
-            values[channel.name] = np.array(
-                [
-                    [rows.get(row, {}).get(field, math.nan) for field in channel.fields]
-                    for row in sorted(times)
-                ]
-            )
-    return dataset_of(np.array([times[row] for row in sorted(times)]), values, scenario, samples)
-
-
-def _samples(scenario: str, place: str) -> int | None:
-    """Return the encoder readings per period of a scenario in YAML."""
-    sensor = parse_yaml(scenario, place).get("sensor", {})
-    return int(sensor.get("samples", 1)) if sensor.get("kind") == "encoders" else None
+        if found := messages.get(channel.name):
+            rows = (found.get(row, {}) for row in order)
+            numbers = [[row.get(field, math.nan) for field in channel.fields] for row in rows]
+            values[channel.name] = np.array(numbers)
+    return dataset_of(np.array([times[row] for row in order]), values, scenario, samples)
 
 
 def _read_csv(path: Path) -> xr.Dataset:
@@ -504,11 +435,9 @@ def _read_csv(path: Path) -> xr.Dataset:
     if not rows:
         raise ValueError("no rows")
     table = np.array([[float(cell.strip() or "nan") for cell in row] for row in rows])
-    values, at = {}, 1
-    for channel in channels:
-        width = len(channel.fields)
-        part, at = table[:, at : at + width], at + width
-        values[channel.name] = part
+    widths = [len(channel.fields) for channel in channels]
+    parts = np.split(table[:, 1 : len(expected)], np.cumsum(widths)[:-1], axis=1)
+    values = {channel.name: part for channel, part in zip(channels, parts, strict=True)}
     return dataset_of(table[:, 0], values, _scenario_near(path), samples)
 
 

@@ -119,24 +119,15 @@ class Quantity(NamedTuple):
 
 
 class Signal(NamedTuple):
-    """A signal of a run: one row of the table below, from which everything else follows.
+    """A signal of a run: one row of the table below, from which everything else follows."""
 
-    Attributes:
-        name: in the record.
-        quantity: dimension and units.
-        long_name: meaning.
-        source: its system, or "system.port" for a port of another name; "" for a signal that the
-            record computes.
-        port: of the closed loop, if its name is not the signal's.
-        part: of the port's components.
-    """
-
-    name: str
+    name: str  # in the record
     quantity: Quantity
-    long_name: str
+    long_name: str  # meaning
+    # system, or "system.port" for a port of another name; "" for a signal that the record computes
     source: str = ""
-    port: str = ""
-    part: slice = slice(None)
+    port: str = ""  # of the closed loop, if its name is not the signal's
+    part: slice = slice(None)  # of the port's components
 
     @property
     def labels(self) -> tuple[str, ...] | tuple[int, ...]:

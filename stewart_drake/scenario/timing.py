@@ -76,7 +76,7 @@ def servo_ticks(period: float, time_step: float | None) -> int:
     """Return the number of samples of the servos' local loops in a period of the controller.
 
     It is the least for a rate of SERVO_RATE. With a discrete plant every sample is at one of its
-    steps; one at each step is the most. Both times are in s.
+    steps; one at each step is the most.
     """
     wanted = max(1, math.ceil(period * SERVO_RATE - 1e-9))
     if time_step is None:
@@ -95,17 +95,8 @@ def step_problem(
     """Return the first number that does not fit a discrete plant, which has events at steps only.
 
     The metric's grid, the period, the delay's fraction and the play-out bound must be whole numbers
-    of steps (to 1e-9, relative), and the period divided by the sensor's samples too.
-
-    Args:
-        step: of the plant, s.
-        period: of the controller, s.
-        fraction: of a period, of the delay beyond whole periods.
-        samples: of the sensor per period, or None.
-        playout: bound of a network, s, or None.
-
-    Returns:
-        The scenario field to change, its value, and the nearest that fits; or None.
+    of steps (to 1e-9, relative), and the period divided by the sensor's samples too. A problem has
+    the field to change, its value, and the nearest that fits.
     """
     if not _is_whole(METRIC_PERIOD / step):
         nearest = _nearest_step(step, period)
@@ -145,10 +136,7 @@ def _multiple_problem(field: str, value: float, step: float) -> str | None:
 def log_problem(log_period: float | None, duration: float, step: float | None = None) -> str | None:
     """Return the problem with the period of a log, or None.
 
-    Args:
-        log_period: s, or None for the usual instants.
-        duration: of the run, s.
-        step: of a discrete plant, which is recorded at its own steps only, or None.
+    A discrete plant is recorded at its own steps of `step` s only.
     """
     if log_period is None:
         return None

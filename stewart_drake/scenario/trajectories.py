@@ -57,16 +57,12 @@ def make_reference(config: ReferenceConfig, duration: float) -> Trajectory:
     cubic spline through its samples, with third derivatives continuous next to its ends. Before
     the first and after the last sample of either the pose is constant.
 
-    Args:
-        config: the scenario's section; `file` is a path.
-        duration: of the simulation, s.
-
     Returns:
         A 6x1 trajectory, defined for t >= 0, with derivatives of order 1 and 2.
 
     Raises:
         ConfigError: the samples or their file break a rule of `reference_files`, or a CSV motion
-            ends before `duration` while it still moves.
+            ends before `duration` in s while it still moves.
     """
     raise TypeError(f"config: got a {type(config).__name__}; expected a kind of reference")
 
@@ -124,26 +120,17 @@ def peak_to_peak(config: ReferenceConfig, trajectory: Trajectory, duration: floa
     """Return the range of the motion (6,), the scale of tracking errors, rad and m.
 
     For a sine it is twice its amplitude, else the range within [0, duration]. It is 0 where the
-    coordinate is constant.
-
-    Args:
-        config: the scenario's section.
-        trajectory: `make_reference(config, duration)`.
-        duration: s.
+    coordinate is constant. The trajectory is `make_reference(config, duration)`.
     """
-    if isinstance(config, SineConfig):
-        return _without_rounding(2 * np.abs(np.array(config.amplitude)), trajectory)
-    return motion_range(trajectory, duration)
+    span = 2 * np.abs(config.amplitude) if isinstance(config, SineConfig) else None
+    return motion_range(trajectory, duration, span)
 
 
-def motion_range(trajectory: Trajectory, duration: float) -> Array:
+def motion_range(trajectory: Trajectory, duration: float, span: Array | None = None) -> Array:
     """Return the range (6,) of any motion within [0, duration], 0 where constant; rad and m."""
-    samples = int(np.clip(math.ceil(duration / _GRID), 1000, 1_000_000)) + 1
-    values = trajectory.vector_values(np.linspace(0.0, duration, samples))
-    return _without_rounding(np.ptp(values, axis=1), trajectory)
-
-
-def _without_rounding(span: Array, trajectory: Trajectory) -> Array:
+    if span is None:
+        samples = int(np.clip(math.ceil(duration / _GRID), 1000, 1_000_000)) + 1
+        span = np.ptp(trajectory.vector_values(np.linspace(0.0, duration, samples)), axis=1)
     furthest = np.abs(trajectory.value(0.0)[POSITION, 0]).max() + span[POSITION].max()
     return np.where(span < _CONSTANT * np.repeat([1.0, furthest], 3), 0.0, span)
 
@@ -157,23 +144,13 @@ def catch_up(
 ) -> Trajectory:
     """Return a reference that leaves the start state smoothly and ends on `reference`.
 
-    Up to `t_start` it keeps the constant rates of the start, as a plate on which no torque acts
-    yet. Over the next `duration` it is the quintic that continues pose and rates with zero
+    Up to `t_start` it keeps the constant rates of the start at t = 0, as a plate on which no torque
+    acts yet. Over the next `duration` it is the quintic that continues pose and rates with zero
     acceleration and reaches pose, rates and accelerations of the reference; then it is the
-    reference.
-
-    Args:
-        start_pose: (6,) at t = 0, rad and m.
-        start_rates: (6,) rad/s and m/s.
-        reference: the 6x1 trajectory to join.
-        t_start: when torques begin to act, s, >= 0; below 1e-6 it counts as 0.
-        duration: of the blend, s, >= 1e-6.
+    reference. Below 1e-6 s `t_start` counts as 0.
 
     Returns:
         A 6x1 trajectory, defined for t >= 0, with derivatives of order 1 and 2.
-
-    Raises:
-        ValueError: a wrong shape, or times outside their range.
     """
     pose, rates = np.asarray(start_pose, dtype=float), np.asarray(start_rates, dtype=float)
     if pose.shape != (6,) or rates.shape != (6,):
@@ -196,16 +173,10 @@ Piece = tuple[float, Array, float, Array]
 
 
 def through_states(pieces: Sequence[Piece], reference: Trajectory) -> Trajectory:
-    """Return quintics through given states, followed by `reference`.
+    """Return quintics through given states, followed by `reference`, with two derivatives.
 
-    Before the first piece the pose is on the straight line with its first rates.
-
-    Args:
-        pieces: one after the other; accelerations may jump between two.
-        reference: the 6x1 trajectory to join.
-
-    Returns:
-        A 6x1 trajectory, defined for t >= 0, with derivatives of order 1 and 2.
+    Before the first piece the pose is on the straight line with its first rates. Accelerations may
+    jump between two pieces.
     """
     t_start, leave, t_end = pieces[0][0], pieces[0][1], pieces[-1][2]
     after = FunctionHandleTrajectory(reference.value, 6, 1, t_end, math.inf)
@@ -248,11 +219,7 @@ def _through_waypoints(config: WaypointsConfig, duration: float) -> Trajectory:
 
 
 def through_samples(times: Array, poses: Array, duration: float, file: str) -> Trajectory:
-    """Return the cubic spline through samples (n,), (n, 6), followed by the last pose.
-
-    Raises:
-        ConfigError: the samples end before `duration`, in s, while they still move.
-    """
+    """Return the cubic spline through samples (n,), (n, 6), followed by the last pose."""
     from scipy.interpolate import CubicSpline  # slow to import
 
     # The free ends follow the samples; prescribed rest would bend the first and last interval of

@@ -109,8 +109,8 @@ def compare(
         board = np.memmap(path, np.float64, "w+", shape=(len(scenarios) + 1, 2))
         keys = [f"run{i}_{_NO_KEY.sub('_', name)[:99]}" for i, name in enumerate(scenarios)]
         jobs = {
-            key: (name, scenarios[name], shared | {"controller": makers.get(name)}, path, i)
-            for i, (key, name) in enumerate(zip(keys, scenarios, strict=True))
+            key: (name, one, shared | {"controller": makers.get(name)}, path, i)
+            for i, (key, (name, one)) in enumerate(zip(keys, scenarios.items(), strict=True))
         }
         # Own controllers first: what runs in this process does so while workers do the others.
         jobs = dict(sorted(jobs.items(), key=lambda job: job[1][0] not in makers))
@@ -140,12 +140,10 @@ def shown(
     settings: Iterable[str] = (),
     controllers: Sequence[str | Path] | None = None,
 ) -> dict[str, Scenario]:
-    """Return scenarios by controller.
+    """Return scenarios by controller: the given ones, or the shipped and those of `compare`.
 
-    These are the given controllers in their order. Without them, they are the shipped ones, then
-    the rows in the scenario's `compare`. ADAPTIVE is added then if the others' delay is not the
-    true one, or changes, and the scenario supports it; GRAVITY if gravity acts; SERVOS if the
-    scenario's motors are servos.
+    To the latter ADAPTIVE is added if the others' delay is not the true one, or changes, and the
+    scenario supports it; GRAVITY if gravity acts; SERVOS if the scenario's motors are servos.
     """
     settings = tuple(settings)
     if controllers is not None:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -224,9 +225,7 @@ def study_delay(
 ) -> DelayStudy:
     """Analyse a scenario's delay; `progress` is called for each finished simulation.
 
-    Raises:
-        ConfigError: one line. A motion or a home pose outside the workspace is reported in
-            `Assessment.obstacles` instead.
+    A motion or a home pose outside the workspace is reported in `Assessment.obstacles`.
     """
     with threadpool_limits(limits=1):
         found = assess(scenario)
@@ -328,10 +327,6 @@ def loop_margins(found: Assessment, delays: Iterable[int] = DELAYS) -> list[Loop
 
     The law is designed as the scenario's controller (model, prediction, weights, believed delay)
     and closed around the true plant. An estimator is assumed to have found payload and friction.
-
-    Raises:
-        RiccatiError: the Riccati equation has no solution.
-        numpy.linalg.LinAlgError: no torques hold the plate at that pose.
     """
     experiment, sc = found.experiment, found.experiment.scenario
     c, pose = sc.controller, evaluate(experiment.reference, 0.0)[POSE]
@@ -411,27 +406,23 @@ def scaled_motion(reference: ReferenceConfig, factor: float) -> ReferenceConfig 
 def delay_map(scenario: Scenario, progress: Progress | None = None) -> tuple[list[Cell], bool]:
     """Simulate a scenario on the exact plant over delays and amplitudes, on all cores.
 
-    Everything else stays the same, also the delay that the controller believes.
-
-    Returns:
-        Cells by delay, then factor, and whether Ctrl-C ended the simulations early.
+    Everything else stays the same, also the delay that the controller believes. Returns cells by
+    delay, then factor, and whether Ctrl-C ended the simulations early.
     """
     cells: dict[str, Cell] = {}
     variants: dict[str, Scenario] = {}
     exact = replace(scenario, plant=scenario.plant.without_engine)
-    for steps in map_delays(scenario.delay.steps):
-        for factor in FACTORS:
-            motion = scaled_motion(scenario.reference, factor)
-            if motion is None:
-                continue
-            delay = replace(scenario.delay, steps=steps)
-            variant = replace(exact, reference=motion, delay=delay)
-            key = f"mu{steps}-x{factor}"
-            cells[key] = Cell(steps, factor, "not_run", math.nan, math.nan)
-            if failure := assemble(variant).reference_failure():
-                cells[key] = cells[key]._replace(status="out_of_reach", time=float(failure.time))
-            else:
-                variants[key] = variant
+    for steps, factor in product(map_delays(scenario.delay.steps), FACTORS):
+        motion = scaled_motion(scenario.reference, factor)
+        if motion is None:
+            continue
+        variant = replace(exact, reference=motion, delay=replace(scenario.delay, steps=steps))
+        key = f"mu{steps}-x{factor}"
+        cells[key] = Cell(steps, factor, "not_run", math.nan, math.nan)
+        if failure := assemble(variant).reference_failure():
+            cells[key] = cells[key]._replace(status="out_of_reach", time=float(failure.time))
+        else:
+            variants[key] = variant
     found, interrupted = run_scenarios(variants, progress)
     for key, one in found.items():
         cells[key] = cells[key]._replace(status=one.status, error=one.error, time=one.time)

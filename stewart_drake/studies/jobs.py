@@ -90,10 +90,8 @@ def run_jobs(
 
     Raises:
         ConfigError: the folder belongs to other settings or another process is working in it; the
-            scheduler cannot be reached or its workers cannot be used; too few workers.
+            scheduler cannot be reached or its workers cannot be used.
         ChildProcessError: a worker process died, e.g. for want of memory.
-        OSError: a file cannot be written, e.g. because the disk is full.
-        KeyboardInterrupt: Ctrl-C.
         Exception: the exception of `function`, with a note that names the job.
     """
     for key in jobs:

@@ -37,6 +37,7 @@ from stewart_drake.mechanism.files import (
 )
 from stewart_drake.mechanism.geometry import Mechanism, with_rotors
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.clearance import Nearest, clearance_along
 from stewart_drake.studies.jobs import Progress, part_of, run_jobs
@@ -57,7 +58,7 @@ from stewart_drake.studies.layout_space import (
     singular,
     space_around,
 )
-from stewart_drake.studies.runs import STRICT, Outcome, outcome_of, read_kept
+from stewart_drake.studies.runs import Outcome, outcome_of, read_kept
 from stewart_drake.studies.study_options import LayoutOptions
 from stewart_drake.types import Array
 

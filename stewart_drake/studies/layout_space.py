@@ -8,7 +8,7 @@ with the distances of `mechanism.clearance`, which are lower bounds. The result 
 instants that are checked, with the shapes themselves.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Final, NamedTuple
@@ -146,16 +146,19 @@ def requirements(
     goal: str, limits: Mapping[str, float], usual: Mapping[str, float]
 ) -> Requirements:
     """Return the goal with the given limits, and the usual ones for other measures."""
-    for option, names in (("goal", [goal]), ("limit", limits)):
-        for name in names:
-            if name not in MEASURES:
-                expected = f"expected one of {', '.join(MEASURES)}"
-                raise ConfigError(f"--{option}: got {name}; {expected}")
+    _check_names("goal", [goal], MEASURES)
+    _check_names("limit", limits, MEASURES)
     for name, value in limits.items():
         if not np.isfinite(value):
             raise ConfigError(f"--limit {name}: got {value:g}; expected a number")
     merged = {**usual, **limits}
     return Requirements({name: merged[name] for name in MEASURES if name in merged}, goal)
+
+
+def _check_names(option: str, names: Iterable[str], known: Collection[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"--{option}: got {name}; expected one of {', '.join(known)}")
 
 
 def singular(found: Mapping[str, float]) -> float:
@@ -277,21 +280,16 @@ def space_around(
 ) -> Space:
     """Return the layouts around a machine: by default half to twice its lengths, and all angles.
 
-    Args:
-        spec: of a machine with a pattern.
-        vary: lowest and highest value by parameter; equal ones fix it.
-        keep: parameters and choices that stay as they are.
+    `vary` has lowest and highest value by parameter; equal ones fix it. `keep` has parameters and
+    choices that stay as they are.
     """
     if spec.pattern is None:
         raise ConfigError(
             f"mechanism: got {spec.name}, described leg by leg; expected one with a pattern, whose "
             "numbers can be varied"
         )
-    for option, names in (("vary", vary), ("keep", keep)):
-        known = PARAMETERS if option == "vary" else PARAMETERS + CHOICES
-        for name in names:
-            if name not in known:
-                raise ConfigError(f"--{option}: got {name}; expected one of {', '.join(known)}")
+    _check_names("vary", vary, PARAMETERS)
+    _check_names("keep", keep, PARAMETERS + CHOICES)
     for name in vary:
         if name in keep:
             raise ConfigError(f"--keep: got {name}, which --vary varies; expected one of the two")

@@ -111,11 +111,7 @@ class LearnStudy:
 
 
 def check_learning(scenario: Scenario) -> None:
-    """Refuse a scenario in which nothing can be learned.
-
-    Raises:
-        ConfigError: a motion that does not repeat, or a controller that takes no learned torque.
-    """
+    """Refuse a scenario in which nothing can be learned."""
     if scenario.controller.learned is not None:
         raise ConfigError("controller.learned: got a file; expected null, where learning begins")
     motion_period(scenario)
@@ -131,9 +127,6 @@ def study_learn(
 
     Learning ends early after two repetitions without a smaller error. Each repetition has
     other noise. The motion is periodic, the link a wire of known delay.
-
-    Raises:
-        ConfigError: see `check_learning`.
     """
     check_learning(scenario)
     period = motion_period(scenario)
@@ -222,30 +215,28 @@ def corrected_setpoints(used: Array, missed: Fit, period: float, lag: float) -> 
 def lacking_angles(
     experiment: Experiment, result: SimulationResult, period: float
 ) -> tuple[Array, Array]:
-    """Return the angles that the cranks lack in the last period of a run.
+    """Return the samples (n,), s, of the last period of a run, and the angles that the cranks lack.
 
-    Returns:
-        Samples (n,), s, and crank angles of the motion less those of the state there (n, 6), rad.
+    These are the angles (n, 6) of the motion less those of the state, rad.
     """
     dt, angles = experiment.scenario.controller.period, experiment.mechanism.crank_angles
     first, _, states = _last_samples(experiment, result, period)
-    times, found = [], []
-    for k, state in enumerate(states[:-1], first):
-        if np.all(np.isfinite(state[POSE])):
-            wanted = experiment.reference.value(dt * k)[:, 0]
-            times.append(dt * k)
-            found.append(angles(wanted) - angles(state[POSE]))
-    return np.array(times), np.reshape(found, (-1, 6))
+    known = np.flatnonzero(np.isfinite(states[:-1, POSE]).all(axis=1))
+    times: Array = dt * (first + known).astype(np.float64)
+    found = [
+        angles(experiment.reference.value(t)[:, 0]) - angles(pose)
+        for t, pose in zip(times, states[known, POSE], strict=True)
+    ]
+    return times, np.reshape(found, (-1, 6))
 
 
 def _last_samples(
     experiment: Experiment, result: SimulationResult, period: float
 ) -> tuple[int, NDArray[np.intp], Array]:
-    """Return the samples of the last period of a run.
+    """Return the number of the first sample of a run's last period, rows and states.
 
-    Returns:
-        Number of the first one; rows (first + n,) in the signals of all samples up to the last;
-        states (n, 12) of the period, measured or else estimated.
+    The rows (first + n,) in the signals are those of all samples up to the last; the states (n, 12)
+    are those of the period, measured or else estimated.
     """
     sc, signals = experiment.scenario, result.signals
     dt, time = sc.controller.period, signals.time.values
@@ -260,10 +251,9 @@ def _last_samples(
 def lacking_torques(
     experiment: Experiment, result: SimulationResult, period: float
 ) -> tuple[Array, Array]:
-    """Return the torques that the model lacks in the last period of a run.
+    """Return the middles (n,), s, of the controller's periods in the last period of a run.
 
-    Returns:
-        Middles (n,) of the controller's periods, s, and torques (n, 6), N m.
+    And the torques (n, 6), N m, that the model lacks there.
     """
     sc = experiment.scenario
     dt, delay = sc.controller.period, believed_delay(sc)

@@ -32,18 +32,14 @@ def option(
     unit: str | None = None,
     **bounds: Any,
 ) -> Any:
-    """Return the field of an option that the command line has too.
+    """Return the field of an option that the command line has too, see `Option`.
 
-    Args:
-        default: `...` for none.
-        help, metavar, read, recorded, unit: see `Option`.
-        name: on the command line, if it differs from the field's.
-        bounds: as `pydantic.Field` takes them.
+    The default is `...` for none; `name` is that on the command line, if it differs from the
+    field's; bounds are those of `pydantic.Field`.
     """
-    extra = {"flag": name, "metavar": metavar, "read": read, "recorded": recorded}
+    extra: Any = {"flag": name, "metavar": metavar, "read": read, "recorded": recorded}
     extra["unit"] = unit
-    more: dict[str, Any] = {"description": help, "json_schema_extra": extra, **bounds}
-    return Field(default, **more)
+    return Field(default, description=help, json_schema_extra=extra, **bounds)
 
 
 _UNITS: Final[Mapping[str, Mapping[str, float]]] = {
@@ -53,11 +49,7 @@ _UNITS: Final[Mapping[str, Mapping[str, float]]] = {
 
 
 def quantity(name: str, text: str, unit: str) -> float:
-    """Return a text such as `300 mm`, `0.3 m` or `0.3` in a unit, m or kg.
-
-    Raises:
-        ConfigError: no number, or another unit; the message begins with the name.
-    """
+    """Return a text such as `300 mm`, `0.3 m` or `0.3` in a unit, m or kg."""
     number, word = re.fullmatch(r"\s*(.*?)\s*([^\W\d_]*)\s*", text, re.DOTALL).groups()  # type: ignore[union-attr]
     smallest, factor = next(iter(_UNITS[unit])), _UNITS[unit].get(word or unit)
     try:
@@ -163,12 +155,7 @@ def takes(kind: type[Options]) -> Callable[[Callable[..., _R]], Callable[..., _R
 
 
 def refuse(options: Mapping[str, object], why: str) -> None:
-    """Refuse options that would be ignored, unless they are None or an empty list.
-
-    Args:
-        options: by name.
-        why: end of the message, after the value.
-    """
+    """Refuse options that would be ignored, unless they are None or an empty list."""
     for name, value in options.items():
         if value is not None and value != []:
             raise ConfigError(f"{name}: got {value} {why}")

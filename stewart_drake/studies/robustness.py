@@ -192,11 +192,8 @@ def study_robustness(
     """Run a scenario undisturbed and then with drawn machines, or continue an earlier study.
 
     Draws add to the scenario's own disturbances. The directory gets runs.csv and the folder runs/;
-    a later call may ask for more runs. Names in `also` become names of folders.
-
-    Raises:
-        As `run_jobs`, and ConfigError for a scenario that does not suit, and for an undisturbed run
-            that does not complete, also with another controller.
+    a later call may ask for more runs. Names in `also` become names of folders. An undisturbed run
+    that does not complete is an error, also with another controller.
     """
     ranges, seed = options.ranges or Ranges(), options.seed
     experiment, directory = prepare(scenario), Path(directory)

@@ -7,18 +7,18 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final, Literal, TypeVar
 
-from pydantic import ConfigDict, Field, WrapValidator
+from pydantic import Field, WrapValidator
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.jsonio import load_json, sealed_json
 from stewart_drake.files.yamlio import validate
 from stewart_drake.loop.bulk import Ending, run_in_bulk
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.studies.jobs import Progress, run_jobs
 
 _Kind = TypeVar("_Kind")
 _MAX_BYTES: Final = 1_000_000
-STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
 def _or_nan(value: Any, check: Any) -> float:
@@ -81,11 +81,7 @@ def run_scenario(scenario: Scenario) -> bytes:
 def run_scenarios(
     scenarios: Mapping[str, Scenario], progress: Progress | None = None
 ) -> tuple[dict[str, Outcome], bool]:
-    """Run scenarios on all cores.
-
-    Returns:
-        Outcomes of the runs that finished, and whether Ctrl-C ended the runs early.
-    """
+    """Return outcomes of runs on all cores, as far as they finished, and whether Ctrl-C came."""
     interrupted = False
     with TemporaryDirectory() as folder:
         try:

@@ -57,9 +57,6 @@ def wilson_interval(successes: int, trials: int, confidence: float = CONFIDENCE)
 
     Unlike those of s/n -+ z (s/n (1 - s/n) / n)^(1/2) its ends stay in [0, 1], and the coverage is
     close to the nominal one even if all trials succeed.
-
-    Raises:
-        ValueError: no trials, or successes beyond 0 ... trials.
     """
     if trials < 1 or not 0 <= successes <= trials:
         raise ValueError(f"got {successes} of {trials}; expected 0 to all of at least one trial")
@@ -88,10 +85,6 @@ def quantile_interval(values: ArrayLike, probability: float) -> Interval:
     The number of values below the true quantile is binomial, which gives the ordered values that
     enclose it, each tail with at most half of the rest. Infinite values, such as of failed runs,
     are values like all others. If the sample is too small, an end is infinite.
-
-    Args:
-        values: (n,) without NaN.
-        probability: above 0, below 1.
     """
     x = np.asarray(values, dtype=np.float64)
     if len(x) == 0 or np.isnan(x).any():
@@ -109,9 +102,6 @@ def rank_correlation(x: ArrayLike, y: ArrayLike) -> Correlation:
 
     The p-value is of Student's distribution; the interval is Fisher's, atanh rho
     -+ z ((1 + rho^2 / 2) / (n - 3))^(1/2), with the variance of Bonett and Wright (2000).
-
-    Args:
-        x, y: (n,) each, without NaN.
     """
     a, b = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if len(a) < 4 or np.ptp(a) == 0 or np.ptp(b) == 0:
@@ -206,12 +196,7 @@ class Explanation(NamedTuple):
 
 
 def explain(values: Mapping[str, Array], failed: Flags) -> Explanation:
-    """Compare failing runs with the others.
-
-    Args:
-        values: (n,) of every quantity; constant ones are left out.
-        failed: (n,).
-    """
+    """Compare failing runs with the others, in every quantity (n,) that is not constant."""
     k, m = int(failed.sum()), int((~failed).sum())
     asked = {name: x for name, x in values.items() if np.isfinite(x).all() and np.ptp(x) > 0}
     if not (k and m and asked):

@@ -6,12 +6,13 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import units_of, validate_pairs
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.studies.options import JobOptions, Options, option
 
 _TORQUE_SHARE: Final = "share of the reference's largest torque"
@@ -22,7 +23,7 @@ def _share(unit: str, **bounds: Any) -> Any:
     return Field(ge=0, description=unit, **bounds)
 
 
-@dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
+@dataclass(config=STRICT)
 class Ranges:
     """Size of the variation of each quantity; 0 (null for `torque_limit`) switches it off.
 
@@ -223,8 +224,8 @@ class Measurements(Options):
 
     def __init__(self, **values: object) -> None:
         super().__init__(**values)
-        for name, value in self.lengths().items():
-            if value > LARGEST:
+        for name in list(type(self).model_fields)[:6]:  # the lengths
+            if (value := getattr(self, name)) > LARGEST:
                 raise ConfigError(
                     f"{name}: got {value:g} m; expected metres, {value / 1000:g} for {value:g} mm"
                 )
@@ -233,11 +234,7 @@ class Measurements(Options):
                 f"rod: got {self.rod:g} m with cranks of {self.crank:g} m; expected a rod longer "
                 "than its crank"
             )
-        for name, size in {
-            "plate": self.plate_radius,
-            "crank": self.crank,
-            "rod": self.rod,
-        }.items():
+        for name, size in (("plate", self.plate_radius), ("crank", self.crank), ("rod", self.rod)):
             mass = getattr(self, f"{name}_mass")
             if mass > STEEL * math.pi * size**3:
                 raise ConfigError(
@@ -251,7 +248,3 @@ class Measurements(Options):
                     f"{name}_distance: got {distance:g} m on a circle of radius {radius:g} m; "
                     f"expected less than {math.sqrt(3) * radius:.4g}, where pairs meet"
                 )
-
-    def lengths(self) -> dict[str, float]:
-        """Return the lengths by name, m."""
-        return {name: getattr(self, name) for name in list(type(self).model_fields)[:6]}

@@ -50,11 +50,7 @@ class Variant:
         return validate(Scenario, self.fields, "drawn")
 
     def machine(self) -> Mechanism:
-        """Return the machine with the draw.
-
-        Raises:
-            ConfigError, UnreachablePoseError: such parts cannot be assembled at home.
-        """
+        """Return the machine with the draw, if its parts can be assembled at home."""
         return dataclasses.replace(self.mechanism, **self.parts) if self.parts else self.mechanism
 
 
@@ -346,13 +342,10 @@ def _run(scenario: Scenario, one: Draw) -> Outcome:
     try:
         changed = apply_draw(MACHINE, scenario, simulated_machine(scenario), one)
         variant = changed.as_scenario()
-    except ConfigError as error:
-        return Outcome("refused", str(error), time=0.0)
-    try:
-        truth = changed.machine()
-    except (ConfigError, UnreachablePoseError) as error:
-        return Outcome("not_assembled", str(error), time=0.0)
-    try:
+        try:
+            truth = changed.machine()
+        except (ConfigError, UnreachablePoseError) as error:
+            return Outcome("not_assembled", str(error), time=0.0)
         return outcome_of(run_in_bulk(variant, truth))
     except ConfigError as error:
         return Outcome("refused", str(error), time=0.0)

@@ -45,12 +45,7 @@ class Assessment(NamedTuple):
 
 
 def assess(scenario: Scenario) -> Assessment:
-    """Assess a scenario.
-
-    Raises:
-        ConfigError: one line.
-        UnreachablePoseError: the mechanism cannot be assembled at its home pose.
-    """
+    """Assess a scenario whose mechanism can be assembled at its home pose."""
     experiment = assemble(scenario)
     mechanism, reference = experiment.mechanism, experiment.reference
     failure = experiment.reference_failure()

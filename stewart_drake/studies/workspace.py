@@ -74,9 +74,6 @@ def size_motors(dynamics: StewartDynamics, reference: Trajectory, time: Array) -
     """Return torques and crank rates that follow a reference exactly, at `time` (n,) in s.
 
     T = inverse dynamics of (X, X', X''), crank rates = J X'.
-
-    Raises:
-        UnreachablePoseError, SingularPoseError: the reference is not within the workspace there.
     """
     wanted = np.array([evaluate(reference, t) for t in time])
     torque = [dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS]) for x in wanted]

@@ -19,7 +19,15 @@ from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 from scipy.ndimage import label
 
-from stewart_drake.dynamics.workspace import Failure, diagnose, home_sign, margin, measures_at
+from stewart_drake.dynamics.workspace import (
+    Failure,
+    border,
+    diagnose,
+    home_sign,
+    margin,
+    margins,
+    measures_at,
+)
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import LegGeometry, Legs, leg_geometry
 from stewart_drake.scenario.signals import COORDINATES, NUM_COORDINATES
@@ -166,7 +174,7 @@ def largest_factor(mechanism: Mechanism, reference: Trajectory, time: Array) -> 
     change = poses - poses[0]
 
     def fits(factor: float) -> bool:
-        return all(margin(mechanism, poses[0] + factor * row) > 0 for row in change)
+        return bool(np.all(margins(mechanism, poses[0] + factor * change) > 0))
 
     if not fits(0.0):
         return Factor(0.0, True)
@@ -175,16 +183,6 @@ def largest_factor(mechanism: Mechanism, reference: Trajectory, time: Array) -> 
     steps = round(LARGEST_FACTOR / FACTOR_STEP)
     factor = last_inside(fits, LARGEST_FACTOR, steps, _FACTOR_TOLERANCE)
     return Factor(factor, factor < LARGEST_FACTOR)
-
-
-def border(
-    inside: Callable[[float], bool], low: float, high: float, tolerance: float
-) -> tuple[float, float]:
-    """Return two numbers closer than a tolerance, the first inside and the second not."""
-    while high - low > tolerance:
-        middle = (low + high) / 2
-        low, high = (middle, high) if inside(middle) else (low, middle)
-    return low, high
 
 
 def last_inside(

@@ -31,7 +31,6 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import pydantic.dataclasses
-from pydantic import ConfigDict
 from scipy.special import expit
 
 from stewart_drake.files.errors import ConfigError
@@ -39,6 +38,7 @@ from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.jsonio import load_json
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import brief, validate
+from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.scenario.signals import TUNER_INPUTS, WEIGHTS
 from stewart_drake.types import Array, ArrayLike
 
@@ -61,17 +61,9 @@ _ARRAYS: Final = ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds")
 
 
 def density(window: ArrayLike, kind: Kind = "magnitude") -> Array:
-    """Return equation (45) for the newest sample of a window.
+    """Return equation (45) (..., m) for the newest sample of a window (..., WINDOW, m).
 
-    Args:
-        window: (..., WINDOW, m) samples, the newest last; unknown ones are not finite.
-        kind: `magnitude` or `signed`.
-
-    Returns:
-        (..., m) densities, finite: in [0, WINDOW], or in +-SIGNED_LIMIT.
-
-    Raises:
-        ValueError: a window of another length, or another kind.
+    Unknown samples are not finite. Densities are, in [0, WINDOW], or in +-SIGNED_LIMIT.
     """
     samples = np.asarray(window, dtype=np.float64)
     if samples.ndim < 2 or samples.shape[-2] != WINDOW:
@@ -87,29 +79,19 @@ def density(window: ArrayLike, kind: Kind = "magnitude") -> Array:
     usable = known[..., -1, :] & (largest > 0)
     relative = values / np.where(largest > 0, largest, 1.0)[..., None, :]
     newest, total = relative[..., -1, :], relative.sum(axis=-2)
-    if kind == "magnitude":
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         ratio = number * (newest / np.where(usable, total, 1.0))
-    else:
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            ratio = number * (newest / np.where(usable, total, 1.0))
+    if kind == "signed":
         ratio = np.clip(np.where(newest == 0, 0.0, ratio), -SIGNED_LIMIT, SIGNED_LIMIT)
     result: Any = np.where(usable, ratio, 1.0)
     return result
 
 
 def densities(samples: ArrayLike, kind: Kind = "magnitude") -> Array:
-    """Return equation (45) along a record of samples.
+    """Return equation (45) along a record (N, 18) of samples in time order.
 
-    Args:
-        samples: (N, 18) in time order, rows [measurement - reference (12); commanded torque (6)]
-            in rad, m, rad/s, m/s and N m; values that are not finite are unknown.
-        kind: `magnitude` or `signed`.
-
-    Returns:
-        (N, 18); row k is of samples max(0, k - WINDOW + 1) to k.
-
-    Raises:
-        ValueError: samples of another shape, or another kind.
+    A sample is [measurement - reference (12); commanded torque (6)] in rad, m, rad/s, m/s and N m;
+    values that are not finite are unknown. Row k is of samples max(0, k - WINDOW + 1) to k.
     """
     record = np.asarray(samples, dtype=np.float64)
     if record.ndim != 2 or record.shape[1] != NUM_INPUTS:
@@ -121,40 +103,23 @@ def densities(samples: ArrayLike, kind: Kind = "magnitude") -> Array:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Network:
-    """A trained network; the paper's has h = 10 hidden neurons.
+    """A trained network; the paper's has h = 10 hidden neurons."""
 
-    Attributes:
-        input_mean: (18,) of the training densities.
-        input_scale: (18,) their spread, above zero.
-        W1: (h, 18) into the hidden layer, with the sigmoid as activation.
-        b1: (h,) bias there.
-        W2: (2, h) into the output layer, which is linear.
-        b2: (2,) bias there.
-        bounds: (2, 2) lower, then upper bound of (w_Q, w_R), to which its users clip.
-        output: of the output layer: `weights` (w_Q, w_R) or `log_weights`, their natural
-            logarithms.
-        density: kind of the training densities, `magnitude` or `signed`.
-        features: of its input, `densities` (`tuner.network`) or `health` (`tuner.source`).
-        start: (2,) w_Q and w_R at the first sample, and to return to; null: the controller's. A
-            network with a start moves along w_Q / w_R, see `tuner.source`.
-        card: origin: data, seed, versions, errors; plain JSON values.
-
-    Raises:
-        ConfigError: shapes that do not fit, values that are not finite, a scale or a lower bound
-            that is not above zero, an upper bound that is not above the lower one.
-    """
-
-    input_mean: Array
-    input_scale: Array
-    W1: Array
-    b1: Array
-    W2: Array
-    b2: Array
-    bounds: Array
+    input_mean: Array  # (18,) of the training densities
+    input_scale: Array  # (18,) their spread, above zero
+    W1: Array  # (h, 18) into the hidden layer, with the sigmoid as activation
+    b1: Array  # (h,) bias there
+    W2: Array  # (2, h) into the output layer, which is linear
+    b2: Array  # (2,) bias there
+    bounds: Array  # (2, 2) lower, then upper bound of (w_Q, w_R), to which its users clip
+    # of the output layer, (w_Q, w_R) or their natural logarithms
     output: Literal["weights", "log_weights"] = "weights"
-    density: Literal["magnitude", "signed"] = "magnitude"
-    card: Mapping[str, Any] = field(default_factory=dict)
+    density: Kind = "magnitude"  # of the training
+    card: Mapping[str, Any] = field(default_factory=dict)  # data, seed, versions, errors; for JSON
+    # of the input, those of `tuner.network` or `tuner.source`
     features: Literal["densities", "health"] = "densities"
+    # (2,) w_Q and w_R at the first sample, and to return to, or None for the controller's; a
+    # network with a start moves along w_Q / w_R, see `tuner.source`
     start: Array | None = None
 
     def __post_init__(self) -> None:
@@ -201,14 +166,7 @@ class Network:
         return len(self.b1)
 
     def __call__(self, densities: ArrayLike) -> Array:
-        """Raw weights, neither clipped nor checked; not finite where the input is not.
-
-        Args:
-            densities: (18,) or (N, 18).
-
-        Returns:
-            (2,) or (N, 2), w_Q and w_R.
-        """
+        """Raw weights (2,) or (N, 2) of densities (18,) or (N, 18), neither clipped nor checked."""
         with np.errstate(over="ignore", invalid="ignore"):
             inputs = (np.asarray(densities, dtype=np.float64) - self.input_mean) / self.input_scale
             outputs = expit(inputs @ self.W1.T + self.b1) @ self.W2.T + self.b2
@@ -229,7 +187,7 @@ def _frozen(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 # --------------------------------------------------------------------- the file
 
 
-@pydantic.dataclasses.dataclass(config=ConfigDict(extra="forbid", strict=True, allow_inf_nan=False))
+@pydantic.dataclasses.dataclass(config=STRICT)
 class _File:
     """The file's keys; `features` and `start` may be missing."""
 
@@ -248,33 +206,20 @@ class _File:
 
 
 def save_network(network: Network, path: str | Path) -> None:
-    """Write one JSON file, whole or not; what is loaded from it is equal to the last bit.
-
-    Raises:
-        ConfigError: the card holds what JSON does not have.
-        OSError: the file cannot be written.
-    """
-    path = Path(path)
-    data = {f.name: getattr(network, f.name) for f in dataclasses.fields(network)}
-    data |= {name: data[name].tolist() for name in _ARRAYS}
-    data["start"] = None if network.start is None else network.start.tolist()
+    """Write one JSON file, whole or not; what is loaded from it is equal to the last bit."""
+    data = {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in vars(network).items()
+    }
     try:
         text = json.dumps(data | {"card": dict(network.card)}, indent=2, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"card: {error}; expected plain JSON values, null for NaN") from None
-    write_whole(path, text + "\n")
+    write_whole(Path(path), text + "\n")
 
 
 def load_network(name_or_path: str | Path) -> Network:
-    """Read a network; nothing in the file is executed.
-
-    Args:
-        name_or_path: a name in `models/weights/`, or a JSON file.
-
-    Raises:
-        ConfigError: no such file; not one JSON object with exactly the fields of `Network`, each
-            of them once, finite and of the right shape. One line, naming file and field.
-    """
+    """Read a network by its name in `models/weights/` or as a JSON file with its fields."""
     path = resolve("weights", name_or_path)
     file = validate(_File, load_json(path, MAX_BYTES, EXPECTED), str(path))
     for name in _ARRAYS:

@@ -52,13 +52,13 @@ def tune(
 
     They are clipped to the network's bounds, then limited in rate. Weights are scales, so the rate
     is a factor: last / factor <= w <= last * factor. The gain, which depends on w_Q / w_R, changes
-    with its square at most.
+    with its square at most. Where the network fails, they return to `fixed` (2,) at the same rate.
 
     Args:
-        network: gives the weights.
+        network: of the paper.
         densities: (18,).
         last: (2,) weights of the last sample; NaN before the first, which takes `fixed`.
-        fixed: (2,) weights to return to, at the same rate, where the network's are not finite.
+        fixed: (2,) weights.
         factor: above 1.
 
     Returns:
@@ -81,47 +81,29 @@ class DensityFeatures:
 
 @dataclass(frozen=True)
 class HealthFeatures:
-    """The features NAMES of a law that measures the state.
+    """The features NAMES of a law that measures the state."""
 
-    Attributes:
-        noise: (12,) standard deviation of a measurement.
-        motion: (12,) half the peak to peak of the reference, and the same per second.
-        tolerance: (12,) tolerable error of the pose, and per second of the rates.
-        torque: largest that the reference takes, N m.
-        prior: (p,) standard deviations of the estimated parameters, or None.
-        delay: assumed delay times the reference's angular frequency.
-    """
-
-    noise: Array
-    motion: Array
-    tolerance: Array
-    torque: float
-    prior: Array | None
-    delay: float
+    noise: Array  # (12,) standard deviation of a measurement
+    motion: Array  # (12,) half the peak to peak of the reference, and the same per second
+    tolerance: Array  # (12,) tolerable error of the pose, and per second of the rates
+    torque: float  # largest that the reference takes, N m
+    prior: Array | None  # (p,) standard deviations of the estimated parameters, or None
+    delay: float  # assumed delay times the reference's angular frequency
 
 
 @dataclass(frozen=True)
 class FixedPolicy:
-    """Fixed weights.
+    """Fixed weights."""
 
-    Attributes:
-        first: (2,) w_Q and w_R.
-    """
-
-    first: Array
+    first: Array  # (2,) w_Q and w_R
 
 
 @dataclass(frozen=True)
 class PaperPolicy:
-    """The paper's network, see `tune`.
-
-    Attributes:
-        network: gives the weights.
-        first: (2,) weights at the start, and to return to.
-    """
+    """The paper's network, see `tune`."""
 
     network: Network
-    first: Array
+    first: Array  # (2,) weights at the start, and to return to
 
 
 @dataclass(frozen=True)
@@ -178,17 +160,11 @@ class TunerMemory(NamedTuple):
 
 @dataclass(frozen=True)
 class WeightsSource:
-    """A tuner for one law.
+    """A tuner for one law."""
 
-    Attributes:
-        plant: model of the plant in the law.
-        features: input of the policy.
-        policy: gives the weights.
-    """
-
-    plant: NominalPlant
-    features: DensityFeatures | HealthFeatures
-    policy: FixedPolicy | PaperPolicy | RatioPolicy | Rule
+    plant: NominalPlant  # model of the plant in the law
+    features: DensityFeatures | HealthFeatures  # input of the policy
+    policy: FixedPolicy | PaperPolicy | RatioPolicy | Rule  # gives the weights
 
     @cached_property
     def compiled(self) -> Compiled:
@@ -255,34 +231,34 @@ class WeightsSource:
     ) -> TunerMemory:
         """Take a sample into the memory.
 
-        Args:
-            memory: before the sample.
-            decision: weights of the sample.
-            after: memory of the law after the sample.
-            wanted: (12,) pose and rates of the reference.
+        `after` is the memory of the law after it; `wanted` (12,) are pose and rates of the
+        reference.
         """
         c, before, data = core(), memory.law, memory.data.copy()
         belief, measured = before.belief, after.measurement
         if len(measured) != NUM_STATE:
             measured = after.belief.state
         schedule, following = belief.timeline.last_period(before.in_flight)
-        kept: dict[str, Any] = {
+        arrays: dict[str, Any] = {
             "state": belief.state,
             "theta": belief.parameters,
             "following": following,
             "measured": measured,
             "std": after.belief.estimate.parameter_std,
         }
-        kept = {name: numbers(value) for name, value in kept.items()}
+        kept = {name: numbers(value) for name, value in arrays.items()}
         acted = [numbers(part) for part in schedule]
-        pairs = [[numbers(m.torque), numbers(m.feedforward)] for m in (after, before)]
+        torques, feedforwards = (
+            [numbers(getattr(one, name)) for one in (after, before)]
+            for name in ("torque", "feedforward")
+        )
         given = c.ffi.new(
             "stewart_tuner_input *",
             {
                 "machine": machine_of(self.plant).it,
                 "schedule": [len(acted[0]), *map(c.at, acted), 0],
-                "torque": [c.at(pair[0]) for pair in pairs],
-                "feedforward": [c.at(pair[1]) for pair in pairs],
+                "torque": [*map(c.at, torques)],
+                "feedforward": [*map(c.at, feedforwards)],
                 **{name: c.at(value) for name, value in kept.items()},
             },
         )

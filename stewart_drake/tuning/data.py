@@ -32,7 +32,7 @@ from stewart_drake.loop.tuner import health_of
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import TUNER_INPUTS, WEIGHTS
-from stewart_drake.studies.jobs import Progress, run_jobs
+from stewart_drake.studies.jobs import run_jobs
 from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Network, densities
 from stewart_drake.tuner.source import FixedPolicy, HealthFeatures, RatioPolicy, WeightsSource
 from stewart_drake.tuning.families import SAMPLES, Family, with_gain
@@ -48,18 +48,21 @@ LEAST: Final = 1e-3
 """% s; least J in a logarithm, so that a run without error does not outweigh all others."""
 
 _NUMBERS: Final = ("accumulated_error", "cost", "rms_torque", "peak_torque", "torque_variation")
+_CONDITION: Final = ("delay_steps", "frequency", "disturbance")
 _EXPECTED: Final = "a data set that `tune dataset --out` has written"
-_SAMPLE: Final = ("run", "sample", "input")
 _VARIABLES: Final = {
-    "samples": _SAMPLE,
-    "density": _SAMPLE,
+    "samples": ("run", "sample", "input"),
+    "density": ("run", "sample", "input"),
     "valid": ("run", "sample"),
     "weights": ("run", "weight"),
-    **dict.fromkeys(
-        ("delay_steps", "frequency", "disturbance", "status", "stopped", *_NUMBERS), ("run",)
-    ),
+    **dict.fromkeys((*_CONDITION, "status", "stopped", *_NUMBERS), ("run",)),
 }
 """Dimensions of the variables of a data set; since 0.3 it also has `J`, with faults `health`."""
+_UNITS: Final = {
+    "frequency": {"units": "rad/s"},
+    "stopped": {"units": "s"},
+    "J": {"units": "% s"},
+}
 
 Gains = tuple[tuple[float, float], ...]
 """w_Q and w_R of each run of a condition."""
@@ -68,14 +71,18 @@ Gains = tuple[tuple[float, float], ...]
 # ---------------------------------------------------------------- one condition
 
 
-def watching(w_Q: float, w_R: float) -> MakeTuner:
-    """Return the factory of a tuner that computes `health` while the weights are fixed."""
+def _with_health(policy: FixedPolicy | RatioPolicy) -> MakeTuner:
+    """Return the factory of a tuner that computes `health`."""
 
     def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
-        fixed = FixedPolicy(np.array([w_Q, w_R]))
-        return WeightsSource(law.plant, health_of(experiment, law), fixed)
+        return WeightsSource(law.plant, health_of(experiment, law), policy)
 
     return make
+
+
+def watching(w_Q: float, w_R: float) -> MakeTuner:
+    """Return the factory of a tuner that computes `health` while the weights are fixed."""
+    return _with_health(FixedPolicy(np.array([w_Q, w_R])))
 
 
 def cost(ending: Ending, duration: float) -> float:
@@ -88,8 +95,7 @@ def cost(ending: Ending, duration: float) -> float:
 def watched_run(scenario: Scenario, tuner: MakeTuner, samples: int) -> tuple[Ending, Array]:
     """Run a scenario with a tuner of features `health`.
 
-    Returns:
-        How it ended, and the features (samples, 18) after every second sample, else NaN.
+    Return how it ended, and the features (samples, 18) after every second sample, else NaN.
     """
     made: list[WeightsSource] = []
 
@@ -109,13 +115,10 @@ def watched_run(scenario: Scenario, tuner: MakeTuner, samples: int) -> tuple[End
 def run_condition(
     scenario: Scenario, gains: Gains = (), samples: int = SAMPLES, watch: bool = False
 ) -> bytes:
-    """Run a condition with each gain; return the bytes of an .npz file.
+    """Run a condition with each gain; return the bytes of an .npz file with a number of samples.
 
-    Args:
-        scenario: the condition.
-        gains: w_Q and w_R of each run; without any there is one run with the scenario's own tuner.
-        samples: number of samples that are kept.
-        watch: whether `health` is recorded, for every second gain.
+    Without gains there is one run with the scenario's own tuner. With `watch` every second run
+    records `health`.
     """
     nothing, runs = np.full((samples, NUM_INPUTS), np.nan), []
     for i, gain in enumerate(gains):
@@ -129,11 +132,8 @@ def run_condition(
 
 def roll_out(scenario: Scenario, network: Network, samples: int) -> bytes:
     """Run a condition with a network; return the same file of one run."""
-
-    def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
-        return WeightsSource(law.plant, health_of(experiment, law), RatioPolicy(network))
-
-    return _file([watched_run(scenario, make, samples)], scenario.duration)
+    tuner = _with_health(RatioPolicy(network))
+    return _file([watched_run(scenario, tuner, samples)], scenario.duration)
 
 
 def _file(runs: list[tuple[Ending, Array]], duration: float) -> bytes:
@@ -175,23 +175,11 @@ def read_condition(path: Path, runs: int = 1, samples: int = SAMPLES) -> dict[st
 # ---------------------------------------------------------------- the data set
 
 
-def make_data(
-    family: Family,
-    directory: str | Path,
-    *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    progress: Progress | None = None,
-) -> xr.Dataset:
-    """Run all conditions, or continue, and write dataset.nc.
+def make_data(family: Family, directory: str | Path, **how: Any) -> xr.Dataset:
+    """Run all conditions of a family for training, or continue, and write dataset.nc.
 
-    Args:
-        family: for training.
-        directory: of dataset.nc; the runs are kept in conditions/, a file per condition.
-        workers, scheduler, progress: as `run_jobs` takes them.
-
-    Returns:
-        The data set, as `load_data` reads it.
+    The runs are kept in conditions/, a file per condition. `how` are workers, scheduler and
+    progress, as `run_jobs` takes them. Returns the data set, as `load_data` reads it.
     """
     directory, gains = Path(directory), tuple(family.gains.values())
     drawn = "" if family.name == "paper" else f", seed {family.seed}"
@@ -209,9 +197,7 @@ def make_data(
         settings=settings,
         suffix=".npz",
         read=partial(read_condition, runs=len(gains), samples=family.samples),
-        workers=workers,
-        scheduler=scheduler,
-        progress=progress,
+        **how,
     )
     settings |= {"draws": family.draws, "family": family.name, "seed": family.seed}
     data = assemble(family, kept, settings | {"gains": list(family.gains)})
@@ -236,26 +222,24 @@ def assemble(
     rho = np.where(valid[..., None], rho, np.nan)
     if family.has_faults:  # with many runs
         rows, rho = rows.astype(np.float32), rho.astype(np.float32)
-    variables: dict[str, Any] = {
-        "samples": (_SAMPLE, rows),
-        "density": (_SAMPLE, rho),
-        "valid": (("run", "sample"), valid),
-        "weights": (("run", "weight"), np.tile(gains, (len(conditions), 1))),
+    columns: dict[str, Any] = {
+        "samples": rows,
+        "density": rho,
+        "valid": valid,
+        "weights": np.tile(gains, (len(conditions), 1)),
         **{
-            name: ("run", np.repeat([getattr(one, name) for one in conditions], len(gains)), unit)
-            for name, unit in (
-                ("delay_steps", {}),
-                ("frequency", {"units": "rad/s"}),
-                ("disturbance", {}),
-            )
+            name: np.repeat([getattr(one, name) for one in conditions], len(gains))
+            for name in _CONDITION
         },
-        "status": ("run", list(map(str, joined("status")))),
-        "stopped": ("run", joined("stopped"), {"units": "s"}),
-        "J": ("run", joined("J"), {"units": "% s"}),
+        "status": list(map(str, joined("status"))),
+        **{name: joined(name) for name in ("stopped", "J", *_NUMBERS)},
     }
-    variables |= {name: ("run", joined(name)) for name in _NUMBERS}
+    variables = {
+        name: (_VARIABLES.get(name, "run"), values, _UNITS.get(name))
+        for name, values in columns.items()
+    }
     if family.has_faults:
-        variables["health"] = (("run", "sample", "feature"), joined("health"))
+        variables["health"] = (("run", "sample", "feature"), joined("health"), None)
     runs = [f"{key}_{name}" for key in family.conditions for name in family.gains]
     coordinates = {"run": runs, "input": list(TUNER_INPUTS), "weight": list(WEIGHTS)}
     attributes = {"settings": json.dumps(settings, sort_keys=True)}
@@ -296,7 +280,7 @@ def hash_of(*arrays: Any) -> str:
 
 def data_hash(data: xr.Dataset) -> str:
     """Return the SHA-256 of the values that training uses: samples, weights, conditions, costs."""
-    names = ("samples", "weights", "delay_steps", "frequency", "disturbance", *_NUMBERS)
+    names = ("samples", "weights", *_CONDITION, *_NUMBERS)
     return hash_of(*(data[name].values for name in names))
 
 
@@ -307,9 +291,7 @@ def log_cost(J: Array) -> Array:
 
 def cells(data: xr.Dataset) -> list[NDArray[np.intp]]:
     """Return the numbers of the runs that differ in their weights only, one entry per condition."""
-    conditions = np.column_stack(
-        [data[name].values for name in ("delay_steps", "frequency", "disturbance")]
-    )
+    conditions = np.column_stack([data[name].values for name in _CONDITION])
     _, group = np.unique(conditions, axis=0, return_inverse=True)
     return [np.flatnonzero(group == number) for number in range(group.max(initial=-1) + 1)]
 

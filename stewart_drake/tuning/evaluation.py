@@ -101,22 +101,16 @@ def evaluate(
     networks: Sequence[str | Path],
     directory: str | Path,
     *,
-    workers: int | None = None,
-    scheduler: str | None = None,
     progress: Progress | None = None,
+    **how: Any,
 ) -> Evaluation:
-    """Run all candidates under all conditions, or continue.
+    """Run all candidates under all conditions of a family for evaluation, or continue.
 
-    Args:
-        family: drawn for evaluation.
-        networks: shipped names or files; none for the shipped one of the family.
-        directory: of the runs, in fixed/, rule/ and NAME-HASH/, so that a second network needs its
-            own runs only.
-        workers, scheduler, progress: as `run_jobs` takes them.
+    Networks are shipped names or files; none for the shipped one of the family. The directory keeps
+    the runs in fixed/, rule/ and NAME-HASH/, so that a second network needs its own runs only.
+    `how` are workers and scheduler, as `run_jobs` takes them.
     """
     cells, gains = family.conditions, tuple(family.gains.values())
-    if len(cells) < 2:
-        raise ConfigError(f"--scenarios: got {len(cells)}; expected 2 or more")
     tuners, files = tuners_of(family, networks)
     about = {"family": family.name, "seed": family.seed, "scenario": scenario_to_dict(family.base)}
     candidates: dict[str, dict[str, Job]] = {
@@ -137,9 +131,8 @@ def evaluate(
             settings=about | ({"network": file["sha256"]} if file else {}),
             suffix=".npz",
             read=partial(read_condition, runs=number, samples=family.samples),
-            workers=workers,
-            scheduler=scheduler,
             progress=part_of(progress, len(table) * len(cells), len(candidates) * len(cells)),
+            **how,
         )
         table[name] = list(found.values())
     return _judged(family, table, files, _nominal_costs(family, tuners))
@@ -150,19 +143,17 @@ def _nominal_costs(family: Family, tuners: dict[str, Tuner]) -> dict[str, dict[s
 
     Only for a family with faults; the base of another one is varied.
     """
-    result: dict[str, dict[str, float]] = {}
     if not family.has_faults:
-        return result
+        return {}
     at_rest = (*FAMILIES[family.name].settings, "start=rest", "queue=zero", *family.settings)
-    bases = {
-        "on_reference": family.base,
-        "from_rest": load_scenario("paper", None, at_rest),
+    bases = {"on_reference": family.base, "from_rest": load_scenario("paper", None, at_rest)}
+    return {
+        name: {
+            where: run_in_bulk(replace(base, tuner=tuner)).figures.accumulated_error
+            for where, base in bases.items()
+        }
+        for name, tuner in {"default": family.base.tuner, **tuners}.items()
     }
-    for where, base in bases.items():
-        for name, tuner in {"default": base.tuner, **tuners}.items():
-            ending = run_in_bulk(replace(base, tuner=tuner))
-            result.setdefault(name, {})[where] = ending.figures.accumulated_error
-    return result
 
 
 # ---------------------------------------------------------------- the statistics
@@ -218,13 +209,7 @@ def _judged(
 
 
 def compare_errors(names: Sequence[str], fixed: int, error: Array, seed: int) -> dict[str, Any]:
-    """Compare E_ac: means with intervals, failures and worst cases; the last row is the tuner.
-
-    Args:
-        names: of the rows.
-        fixed: number of the fixed gains, the first rows.
-        error: (c, n) E_ac in % s, NaN for a failure.
-        seed: of the bootstrap.
+    """Compare E_ac (c, n) in % s, NaN for a failure, of the fixed gains first and the tuner last.
 
     Returns:
         `candidates`: by name, `failures` (of all conditions), `mean` with `interval` (95 %,
@@ -242,20 +227,7 @@ def compare_errors(names: Sequence[str], fixed: int, error: Array, seed: int) ->
         half = stats.t.ppf((1 + CONFIDENCE) / 2, number - 1) * stats.sem(some, axis=1)
     best = min(range(fixed), key=lambda i: (failures[i], mean[i]))
 
-    def improvement(tuner: Array, other: Array, axis: int = -1) -> Any:
-        return 1 - tuner.mean(axis=axis) / other.mean(axis=axis)
-
-    ends: Any = (np.nan, np.nan)
-    if number > 1:
-        ends = stats.bootstrap(
-            (common[-1], common[best]),
-            improvement,
-            paired=True,
-            n_resamples=RESAMPLES,
-            confidence_level=CONFIDENCE,
-            method="percentile",
-            random_state=np.random.default_rng(seed),
-        ).confidence_interval
+    improvement, *ends = _gain(some[-1], some[best], seed)
     return {
         "candidates": {
             name: {
@@ -268,9 +240,9 @@ def compare_errors(names: Sequence[str], fixed: int, error: Array, seed: int) ->
         },
         "common": number,
         "best_fixed": names[best],
-        "improvement": improvement(some[-1], some[best]),
+        "improvement": improvement,
         "hindsight": 1 - some[:fixed].min(axis=0).mean() / mean[best],
-        "improvement_interval": list(map(float, ends)),
+        "improvement_interval": ends if number > 1 else [np.nan, np.nan],
     }
 
 
@@ -282,15 +254,7 @@ def compare_costs(
     faults: NDArray[np.str_],
     seed: int,
 ) -> dict[str, Any]:
-    """Compare J: g, m and gains of every candidate.
-
-    Args:
-        names: of the candidates.
-        fixed: number of the fixed gains, the first rows.
-        J: (c, n) % s.
-        completed: (c, n).
-        faults: (n,) names.
-        seed: of the bootstrap.
+    """Compare J (c, n) in % s of candidates, the fixed gains first; conditions have `faults` (n,).
 
     Returns:
         `candidates`: by name g, m and the number `completed`; `best_g` and `best_m`, the names of
@@ -308,23 +272,13 @@ def compare_costs(
     )
     tuners = [name for name in rows if name not in names[:fixed]]
 
-    def gain(values: Array, others: Array, geometric: bool = True) -> list[float]:
-        """Return 1 - mean / mean of the others, and its interval, by a paired bootstrap."""
-        rng, n = np.random.default_rng(seed), len(values)
-        chosen = rng.integers(n, size=(RESAMPLES, n))
-        if geometric:
-            less = values - others
-            value, ends = np.exp(less.mean()), np.exp(_ends(less[chosen].mean(axis=1)))
-        else:
-            value = values.mean() / others.mean()
-            ends = _ends(values[chosen].mean(axis=1) / others[chosen].mean(axis=1))
-        return [float(1 - value), *(1 - ends).tolist()]
-
     by_fault: dict[str, dict[str, list[float]]] = {}
     for fault in FAULTS:
         here = np.flatnonzero(faults == fault)
         by_fault[fault] = {
-            name: gain(log_rows[name][here], log_J[best_g][here]) for name in tuners if len(here)
+            name: _gain(log_rows[name][here], log_J[best_g][here], seed, logarithms=True)
+            for name in tuners
+            if len(here)
         }
     return {
         "candidates": {
@@ -340,9 +294,9 @@ def compare_costs(
         "best_m": names[best_m],
         "gains": {
             name: {
-                "g": gain(log_rows[name], log_J[best_g]),
-                "m": gain(rows[name], J[best_m], geometric=False),
-                "rule": gain(log_rows[name], log_J[rule]),
+                "g": _gain(log_rows[name], log_J[best_g], seed, logarithms=True),
+                "m": _gain(rows[name], J[best_m], seed),
+                "rule": _gain(log_rows[name], log_J[rule], seed, logarithms=True),
             }
             for name in tuners
         },
@@ -350,5 +304,15 @@ def compare_costs(
     }
 
 
-def _ends(resampled: Array) -> Array:
-    return np.percentile(resampled, (97.5, 2.5))
+def _gain(values: Array, others: Array, seed: int, logarithms: bool = False) -> list[float]:
+    """Return 1 - mean / mean of the others, and its 95 % interval, by a paired bootstrap.
+
+    Of logarithms the means are geometric.
+    """
+    chosen = np.random.default_rng(seed).integers(len(values), size=(RESAMPLES, len(values)))
+    ratios: list[Any] = []
+    for some in (np.arange(len(values)), chosen):
+        one, other = values[some].mean(axis=-1), others[some].mean(axis=-1)
+        ratios.append(one - other if logarithms else one / other)
+    found = np.append(ratios[0], np.percentile(ratios[1], (97.5, 2.5)))
+    return (1 - (np.exp(found) if logarithms else found)).tolist()

@@ -287,11 +287,7 @@ def vary(model: Model, base: Scenario, one: Draw) -> Scenario:
 
 
 def paper_grid(scenario: Scenario) -> Family:
-    """Return the paper's grid: 5 delays and 4 frequencies, each with 9 pairs of weights.
-
-    Raises:
-        ConfigError: the scenario's reference is not a sine, or it is too short for 100 samples.
-    """
+    """Return the paper's grid: 5 delays and 4 frequencies, each with 9 pairs of weights."""
     _check_samples(scenario)
     conditions = {
         f"delay{steps:02d}_frequency{frequency:g}": Condition(
@@ -311,57 +307,42 @@ def paper_grid(scenario: Scenario) -> Family:
 def disturbed_family(scenario: Scenario, number: int, seed: int, purpose: Purpose) -> Family:
     """Draw disturbed conditions of a scenario: nine pairs to train on, seven gains to evaluate.
 
-    Args:
-        scenario: base; its machine and motion give the scales.
-        number: of conditions; a larger number keeps the first ones.
-        seed: of all draws.
-        purpose: see `Purpose`.
-
-    Raises:
-        ConfigError: as `paper_grid` for training, or a disturbed motion leaves the workspace.
+    The scenario's machine and motion give the scales. A larger number of conditions keeps the first
+    ones.
     """
     for_training = purpose == "training"
     if for_training:
         _check_samples(scenario)
-    draws = _draws(DISTURBED, _about(scenario), number, seed, 0 if for_training else 1)
-    conditions = _conditions("disturbed{:04d}", DISTURBED, scenario, draws)
+    about, seeds = _about(scenario), [seed, int(not for_training)]
+    draws, conditions = _drawn("disturbed{:04d}", DISTURBED, scenario, about, number, seeds)
     for one in conditions.values():
-        prepare(one.scenario)
-    return Family(
-        "disturbed", scenario, conditions, _pairs() if for_training else GAINS, seed, draws
-    )
+        prepare(one.scenario)  # refuses a motion that leaves the workspace
+    gains = _pairs() if for_training else GAINS
+    return Family("disturbed", scenario, conditions, gains, seed, draws)
 
 
 def faulty_family(
     name: str, number: int, seed: int, purpose: Purpose, settings: tuple[str, ...] = ()
 ) -> Family:
-    """Draw conditions of T or N2, each with its own motion and fault.
+    """Draw conditions of one of FAMILIES, each with its own motion and fault.
 
-    Args:
-        name: of FAMILIES.
-        number: of conditions; a larger number keeps the first ones.
-        seed: of all draws.
-        purpose: see `Purpose`.
-        settings: further ones of the scenario.
+    A larger number of conditions keeps the first ones. `settings` are further ones of the scenario.
     """
     faults = FAMILIES[name]
     base = load_scenario("paper", None, (*faults.settings, *settings))
     about = _about(load_scenario("paper", None, faults.settings), faults)
     stream = 2 * list(FAMILIES).index(name) + (purpose == "evaluation")
-    draws = _draws(FAULTY, about, number, seed, stream)
-    conditions = _conditions("{:05d}", FAULTY, base, draws)
+    draws, conditions = _drawn("{:05d}", FAULTY, base, about, number, [seed, stream])
     samples = round(base.duration / base.controller.period)
     return Family(name, base, conditions, FIXED, seed, draws, samples, settings)
 
 
-def _draws(model: Model, about: About, number: int, seed: int, stream: int) -> list[Draw]:
-    return [
-        draw_from(model, np.random.default_rng([seed, stream, i]), about) for i in range(number)
-    ]
-
-
-def _conditions(name: str, model: Model, base: Scenario, draws: list[Draw]) -> dict[str, Condition]:
-    return {
+def _drawn(
+    name: str, model: Model, base: Scenario, about: About, number: int, seed: list[int]
+) -> tuple[list[Draw], dict[str, Condition]]:
+    """Return draws of a model, and the conditions that they make of a scenario."""
+    draws = [draw_from(model, np.random.default_rng([*seed, i]), about) for i in range(number)]
+    return draws, {
         name.format(i): Condition(vary(model, base, one), one["delay_steps"], one["frequency"], i)
         for i, one in enumerate(draws)
     }

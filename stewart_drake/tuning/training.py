@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, least_squares
@@ -39,7 +40,6 @@ from stewart_drake.files.versions import versions
 from stewart_drake.files.yamlio import validate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.scenario.renames import with_new_names
 from stewart_drake.studies.jobs import Progress, run_jobs
 from stewart_drake.tuner.network import NUM_INPUTS, NUM_OUTPUTS, Kind, Network, densities
 from stewart_drake.tuner.source import weights_of
@@ -176,16 +176,9 @@ def fit(
 ) -> OptimizeResult:
     """Minimise the squared errors by Levenberg-Marquardt from `theta` on.
 
-    Args:
-        model: f.
-        theta: start.
-        train: standardised inputs (N, n) and targets (N, 2).
-        test: the same, of rows that training does not see; may be empty.
-        evaluations: of the residuals, at most.
-
-    Returns:
-        Of `least_squares`, with `curve` (iterations, 2): root mean square errors of training and
-        test rows, from the start on.
+    Rows are standardised inputs (N, n) and targets (N, 2); those to test with may be none. The
+    result is that of `least_squares`, with `curve` (iterations, 2): root mean square errors of
+    training and test rows, from the start on.
     """
     curve: list[tuple[float, float]] = []
 
@@ -213,15 +206,10 @@ def fit(
 def labels(data: xr.Dataset, kind: Labels) -> Array:
     """Return the weights (run, 2) that the rows of each run are labelled with.
 
-    Args:
-        data: as `load_data` returns it.
-        kind: `as_run`, the weights of the run, as the paper has it; `best_in_cell`, those of least
-            E_ac among the runs of the same delay, frequency and disturbance, w_Q w_R = 1;
-            `best_in_cell_torque`, the same of least E_ac + rms torque, each relative to its least
-            in the cell.
-
-    Returns:
-        w_Q and w_R; NaN if no run of the cell completed.
+    These are with `as_run` the weights of the run, as the paper has it; with `best_in_cell` those
+    of least E_ac among the runs of the same delay, frequency and disturbance, w_Q w_R = 1; with
+    `best_in_cell_torque` the same of least E_ac + rms torque, each relative to its least in the
+    cell. They are NaN if no run of the cell completed.
     """
     weights = np.array(data.weights.values, dtype=np.float64)
     if kind == "as_run":
@@ -282,17 +270,9 @@ def train(
 ) -> Training:
     """Train a network by labels; the same arguments give the same network.
 
-    Args:
-        data: as `load_data` returns it.
-        kind: of labels; with `as_run` the network's outputs are the weights, as the paper has it,
-            otherwise their logarithms.
-        split: unit of the 70 % for training: samples, as printed; runs, because the samples of a
-            run resemble each other; or cells, because the runs of a cell do.
-        density: kind of the inputs.
-        seed: of split, choice of rows and start.
-        hidden: number of hidden neurons.
-        max_rows: for training at most.
-        evaluations: of the residuals at most.
+    With labels `as_run` the network's outputs are the weights, as the paper has it, otherwise their
+    logarithms. The unit of the 70 % for training is a sample, as printed; a run, because the
+    samples of a run resemble each other; or a cell, because the runs of a cell do.
     """
     rows, rng = labelled_rows(data, kind, density), np.random.default_rng(seed)
     in_train = split_rows(rows, split, rng)
@@ -414,18 +394,11 @@ def train_by_regret(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Training:
-    """Train a network by regret; the same arguments give the same network.
+    """Train a network by regret, on data of a family with faults.
 
-    Args:
-        data: of a family with faults, as `load_data` returns it.
-        directory: of the runs with the network, so that a second start continues.
-        features: inputs of the network; the second round is for `health` alone.
-        seed: of the split, the first theta and the batches.
-        start: log10(w_Q / w_R) at which the network begins in the end; None for the best fixed one.
-        workers, progress: as `run_jobs` takes them.
-
-    Raises:
-        As `run_jobs`.
+    The same arguments give the same network. The directory keeps its runs, so that a second start
+    continues. The second round is for `health` alone. In the end the network begins at a ratio
+    log10(w_Q / w_R), by default the best fixed one.
     """
     if start is not None and not RATIOS[0] <= start <= RATIOS[-1]:
         raise ConfigError(f"--start: got {start:g}; expected {RATIOS[0]:g} to {RATIOS[-1]:g}")
@@ -438,7 +411,7 @@ def train_by_regret(
     best = first = trainer.network(theta, features, about)
     more: dict[str, Any] = {}
     if features == "health":
-        base = validate(Scenario, with_new_names(settings["scenario"]), "data")
+        base = validate(Scenario, settings["scenario"], "data")
         samples = data.sizes["sample"]
 
         def own_runs(network: Network, chosen: Indices, number: int) -> Curves:
@@ -599,13 +572,11 @@ def summarize(training: Training) -> dict[str, Any]:
     network, y, f = training.network, training.targets, training.outputs
     if not len(y):
         return dict(network.card) | {"curve": training.curve.tolist()}
-    spread = np.std(y, axis=0) * np.std(f, axis=0)
-    covariance = np.mean((y - y.mean(axis=0)) * (f - f.mean(axis=0)), axis=0)
-    correlation = np.where(spread > 0, covariance / np.where(spread > 0, spread, 1.0), np.nan)
+    labelled, answered = (pd.DataFrame(one, columns=["w_Q", "w_R"]) for one in (y, f))
     return {
         **network.card,
         "hidden": network.hidden,
         "density": network.density,
         "output": network.output,
-        "correlation": dict(zip(("w_Q", "w_R"), correlation, strict=True)),
+        "correlation": labelled.corrwith(answered).to_dict(),
     }
