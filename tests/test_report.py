@@ -7,7 +7,6 @@ import time
 from dataclasses import replace
 from html.parser import HTMLParser
 
-import joblib
 import pytest
 
 from stewart_drake.cli import main
@@ -39,9 +38,7 @@ def report(tmp_path_factory):
     """Return the folder of a report on two seconds of the paper's scenario."""
     folder = tmp_path_factory.mktemp("report")
     (folder / "summary.json").write_text("of an earlier run")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(joblib, "cpu_count", lambda: 1)  # tests/test_report_stopped.py has processes
-        assert main(["report", "paper", *SETTINGS, "--out", str(folder), "--quiet"]) == 0
+    assert main(["report", "paper", *SETTINGS, "--out", str(folder), "--quiet"]) == 0
     return folder
 
 
