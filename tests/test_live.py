@@ -15,6 +15,7 @@ import time
 import urllib.error
 import urllib.request
 from collections import deque
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -657,61 +658,60 @@ def test_wishes_are_in_degrees_and_mm():
     assert read_request(b'{"target": null, "stop": true}') == PageRequest(None, True)
 
 
-@pytest.mark.slow
-def test_the_page_does_what_its_own_buttons_ask_for_and_nobody_else():
-    viewer = PageViewer(load_mechanism("paper"), "live: a test")
-    try:
-        url = viewer.opened()
-        address, token = url.split("/?token=")
-        page = urllib.request.urlopen(url).read().decode()
-        assert "live: a test" in page and page.count('type="range"') == 6
-
-        def ask(headers, body=b'{"target": [0, 0, 0, 0, 0, 400]}'):
-            request = urllib.request.Request(f"{address}/wish", body, headers)
-            try:
-                return urllib.request.urlopen(request).status
-            except urllib.error.HTTPError as error:
-                return error.code
-
-        assert ask({}) == ask({"X-Token": "guess"}) == 403
-        assert ask({"X-Token": token, "Host": "elsewhere.example:80"}) == 403
-        assert ask({"X-Token": token}, b"nonsense") == 400
-        assert viewer.request() == Request() and not viewer.stopped()
-        assert ask({"X-Token": token}) == 200
-        np.testing.assert_allclose(viewer.request().target, [0, 0, 0, 0, 0, 0.4])
-        assert ask({"X-Token": token}, b'{"target": [1e303, -1e303, 0, 0, 0, 400]}') == 200
-        low, high = slider_range(load_mechanism("paper")) / FACTORS
-        np.testing.assert_allclose(viewer.request().target, [high[0], low[1], 0, 0, 0, 0.4])
-        assert ask({"X-Token": token}, b'{"stop": true}') == 200
-        viewer.request()
-        assert viewer.stopped()
-    finally:
-        viewer.close()
+@pytest.fixture
+def viewer():
+    with closing(PageViewer(load_mechanism("paper"), "live: a test")) as made:
+        yield made
 
 
 @pytest.mark.slow
-def test_the_page_answers_any_request_without_a_traceback(capfd):
-    viewer = PageViewer(load_mechanism("paper"), "live: a test")
-    try:
-        address, token = viewer.opened().split("/?token=")
-        host, port = address.removeprefix("http://").split(":")
+def test_the_page_does_what_its_own_buttons_ask_for_and_nobody_else(viewer):
+    url = viewer.opened()
+    address, token = url.split("/?token=")
+    page = urllib.request.urlopen(url).read().decode()
+    assert "live: a test" in page and page.count('type="range"') == 6
 
-        def answer(text):
-            with socket.create_connection((host, int(port)), 10.0) as connection:
-                connection.sendall(text.encode())
-                connection.shutdown(socket.SHUT_WR)
-                return connection.recv(4096).split()[1:2]
+    def ask(headers, body=b'{"target": [0, 0, 0, 0, 0, 400]}'):
+        request = urllib.request.Request(f"{address}/wish", body, headers)
+        try:
+            return urllib.request.urlopen(request).status
+        except urllib.error.HTTPError as error:
+            return error.code
 
-        known = f"Host: {host}:{port}\r\nX-Token: {token}\r\n"
-        for body in ("[" * 3000, f'{{"target": [0, 0, 0, 0, 0, {"9" * 400}]}}'):
-            asked = f"POST /wish HTTP/1.0\r\n{known}Content-Length: {len(body)}\r\n\r\n{body}"
-            assert answer(asked) == [b"400"]
-        longest = "9" * 5000
-        asked = f"POST /wish HTTP/1.0\r\n{known}Content-Length: {longest}\r\n\r\n"
-        assert answer(asked) == [b"413"]
-        assert answer(f"GET http://[ HTTP/1.0\r\n{known}\r\n") == [b"400"]
-    finally:
-        viewer.close()
+    assert ask({}) == ask({"X-Token": "guess"}) == 403
+    assert ask({"X-Token": token, "Host": "elsewhere.example:80"}) == 403
+    assert ask({"X-Token": token}, b"nonsense") == 400
+    assert viewer.request() == Request() and not viewer.stopped()
+    assert ask({"X-Token": token}) == 200
+    np.testing.assert_allclose(viewer.request().target, [0, 0, 0, 0, 0, 0.4])
+    assert ask({"X-Token": token}, b'{"target": [1e303, -1e303, 0, 0, 0, 400]}') == 200
+    low, high = slider_range(load_mechanism("paper")) / FACTORS
+    np.testing.assert_allclose(viewer.request().target, [high[0], low[1], 0, 0, 0, 0.4])
+    assert ask({"X-Token": token}, b'{"stop": true}') == 200
+    viewer.request()
+    assert viewer.stopped()
+
+
+@pytest.mark.slow
+def test_the_page_answers_any_request_without_a_traceback(viewer, capfd):
+    address, token = viewer.opened().split("/?token=")
+    host, port = address.removeprefix("http://").split(":")
+
+    def answer(text):
+        with socket.create_connection((host, int(port)), 10.0) as connection:
+            connection.sendall(text.encode())
+            connection.shutdown(socket.SHUT_WR)
+            return connection.recv(4096).split()[1:2]
+
+    known = f"Host: {host}:{port}\r\nX-Token: {token}\r\n"
+    for body in ("[" * 3000, f'{{"target": [0, 0, 0, 0, 0, {"9" * 400}]}}'):
+        asked = f"POST /wish HTTP/1.0\r\n{known}Content-Length: {len(body)}\r\n\r\n{body}"
+        assert answer(asked) == [b"400"]
+    longest = "9" * 5000
+    asked = f"POST /wish HTTP/1.0\r\n{known}Content-Length: {longest}\r\n\r\n"
+    assert answer(asked) == [b"413"]
+    assert answer(f"GET http://[ HTTP/1.0\r\n{known}\r\n") == [b"400"]
+    viewer.close()
     assert "Traceback" not in capfd.readouterr().err
 
 
@@ -743,74 +743,63 @@ def test_a_page_whose_loop_has_ended_ends_without_a_traceback(monkeypatch):
 
 @pytest.mark.slow
 @needs_chromium
-@pytest.mark.parametrize("width", [400, 1280])
-def test_after_a_loss_the_page_shows_reason_last_seconds_and_advice(width, tab):
-    viewer = PageViewer(load_mechanism("paper"), "live: a test")
-    try:
-        tab.open(viewer.opened(), width, 800)
-        for k in range(80):  # 8 s; the last 5 are shown
-            viewer.show(seen_at(0.1 * k, error=10.0 if k < 20 else 0.1 * k, torque=0.5))
-            tab.wait(f"window.live !== undefined && window.live.time >= {0.1 * k - 0.3}")
-            time.sleep(0.1)
-        failure = Failure(7.9, 3, -0.1, "crank 3 passed its dead centre")
-        viewer.ended(End("left_workspace", failure))
-        tab.wait(
-            "document.body.classList.contains('over') && !document.getElementById('last').hidden"
-        )
-        note = tab.evaluate("document.getElementById('note').textContent")
-        assert "left workspace" in note and "crank 3 passed its dead centre" in note
-        assert "Bring the plate back to its start" in note and "identify LOG" in note
-        last = tab.evaluate("document.getElementById('last').textContent")
-        span = float(last.split("last ")[1].split(" s:")[0])
-        assert 4.5 < span <= 5.0, "not the last seconds"
-        assert "at most 7.9 %" in last.replace("7.90", "7.9") and "at most 0.500 N m" in last
-        points = tab.evaluate("document.querySelector('#last polyline').points.length")
-        assert points > 20
+def test_after_a_loss_the_page_shows_reason_last_seconds_and_advice(tab, viewer):
+    tab.open(viewer.opened(), 400, 800)
+    for k in range(60):  # 6 s; the last 5 are shown
+        viewer.show(seen_at(0.1 * k, error=10.0 if k < 8 else 0.1 * k, torque=0.5))
+        tab.wait(f"window.live !== undefined && window.live.time >= {0.1 * k - 0.3}")
+        time.sleep(0.1)
+    failure = Failure(5.9, 3, -0.1, "crank 3 passed its dead centre")
+    viewer.ended(End("left_workspace", failure))
+    tab.wait("document.body.classList.contains('over') && !document.getElementById('last').hidden")
+    note = tab.evaluate("document.getElementById('note').textContent")
+    assert "left workspace" in note and "crank 3 passed its dead centre" in note
+    assert "Bring the plate back to its start" in note and "identify LOG" in note
+    last = tab.evaluate("document.getElementById('last').textContent")
+    span = float(last.split("last ")[1].split(" s:")[0])
+    assert 4.5 < span <= 5.0, "not the last seconds"
+    assert "at most 5.9 %" in last.replace("5.90", "5.9") and "at most 0.500 N m" in last
+    points = tab.evaluate("document.querySelector('#last polyline').points.length")
+    assert points > 20
+    for width in (400, 1280):
+        tab.resize(width, 800)
         assert tab.evaluate("document.documentElement.scrollWidth") == width
-        assert tab.evaluate(
-            "[...document.querySelectorAll('input, button')].every(x => x.disabled)"
-        )
-        assert tab.errors == []
-    finally:
-        viewer.close()
+    assert tab.evaluate("[...document.querySelectorAll('input, button')].every(x => x.disabled)")
+    assert tab.errors == []
 
 
 @pytest.mark.slow
 @needs_chromium
-def test_the_page_is_driven_by_keys_alone_on_a_narrow_screen(tab):
-    viewer = PageViewer(load_mechanism("paper"), "live: a test")
-    try:
-        tab.open(viewer.opened(), 400, 800)
-        viewer.show(seen_at(1.0))
-        tab.wait("window.live !== undefined")
-        sides = "[...document.querySelectorAll('input, button, dd')]"
-        sides += ".map(x => x.getBoundingClientRect())"
-        assert tab.evaluate(f"{sides}.every(x => x.left >= 0 && x.right <= 400 && x.width > 20)")
+def test_the_page_is_driven_by_keys_alone_on_a_narrow_screen(tab, viewer):
+    tab.open(viewer.opened(), 400, 800)
+    viewer.show(seen_at(1.0))
+    tab.wait("window.live !== undefined")
+    sides = "[...document.querySelectorAll('input, button, dd')]"
+    sides += ".map(x => x.getBoundingClientRect())"
+    assert tab.evaluate(f"{sides}.every(x => x.left >= 0 && x.right <= 400 && x.width > 20)")
 
-        def go_to(name):
-            for _ in range(40):
-                if tab.evaluate("document.activeElement.id") == name:
-                    return
-                tab.press("Tab")
-            raise AssertionError(f"{name} is not reached by Tab")
+    def go_to(name):
+        for _ in range(40):
+            if tab.evaluate("document.activeElement.id") == name:
+                return
+            tab.press("Tab")
+        raise AssertionError(f"{name} is not reached by Tab")
 
-        go_to("s2")
-        outline = "getComputedStyle(document.activeElement).outlineStyle"
-        assert tab.evaluate(outline) == "solid", "the focus is not visible"
-        before = float(tab.evaluate("document.activeElement.value"))
-        for _ in range(10):
-            tab.press("ArrowRight")
-        wait_until(lambda: viewer.request().target is not None)
-        wait_until(lambda: abs(np.rad2deg(viewer.request().target[2]) - before - 1.0) < 0.05)
-        go_to("motion")
-        tab.press("Space")
-        wait_until(lambda: viewer.request().target is None)
-        go_to("stop")
-        tab.press("Enter")
-        wait_until(lambda: (viewer.request(), viewer.stopped())[1])
-        assert tab.errors == []
-    finally:
-        viewer.close()
+    go_to("s2")
+    outline = "getComputedStyle(document.activeElement).outlineStyle"
+    assert tab.evaluate(outline) == "solid", "the focus is not visible"
+    before = float(tab.evaluate("document.activeElement.value"))
+    for _ in range(10):
+        tab.press("ArrowRight")
+    wait_until(lambda: viewer.request().target is not None)
+    wait_until(lambda: abs(np.rad2deg(viewer.request().target[2]) - before - 1.0) < 0.05)
+    go_to("motion")
+    tab.press("Space")
+    wait_until(lambda: viewer.request().target is None)
+    go_to("stop")
+    tab.press("Enter")
+    wait_until(lambda: (viewer.request(), viewer.stopped())[1])
+    assert tab.errors == []
 
 
 def wait_until(condition):
