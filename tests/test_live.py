@@ -95,7 +95,7 @@ def test_on_a_wire_it_does_what_the_simulation_does(jumping_clock):
         told = "\n".join(plans(ready, 2.5, "paper"))
         assert "a simulation" in told and "0.8 s after the measurement" in told
         result = drive(ready, 2.5, accept_jitter=True, say=lambda line: None)
-    simulated = sd.simulate(scenario_of("duration=2.4"))
+    simulated = sd.simulate(scenario_of("duration=2.4"), judge_stability=False)
     assert result.status == "completed" and result.signals.sizes["time"] == 25
     assert result.accumulated_error < simulated.accumulated_error + 0.05
     assert result.summary["live"]["samples"] >= 25
@@ -111,7 +111,7 @@ def test_over_a_network_packets_bridge_what_is_lost(tmp_path):
         link = ready.design.experiment.scenario.link
         assert 0.19 < link.low <= 0.24 and link.playout == pytest.approx(0.7)
         result = drive(ready, 5.0, say=lambda line: None)
-    simulated = sd.simulate(scenario_of("duration=4.9", *FROM_REST))
+    simulated = sd.simulate(scenario_of("duration=4.9", *FROM_REST), judge_stability=False)
     assert result.status == "completed"
     assert result.accumulated_error < simulated.accumulated_error + 0.5
     applied = result.signals.torque_applied.values
