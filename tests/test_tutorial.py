@@ -69,7 +69,7 @@ def more(arguments):
     """Return words that a test adds to a command of the text."""
     if "out/half" in arguments:  # as much of it as the second fit needs
         return ["--set", "duration=4"]
-    if "out/report" in arguments:
+    if {"out/report", "out/board"} & {*arguments}:
         return ["--set", "duration=3"]
     return ["--out", "out/slow"] if " ".join(arguments) == SLOW else []
 
@@ -79,8 +79,9 @@ def summary(name):
 
 
 @pytest.mark.slow
-def test_a_machine_and_a_motion_of_one_s_own(do):
+def test_a_machine_and_a_motion_of_one_s_own(do, monkeypatch):
     told = do(OTHERS)
+    leave_blank(monkeypatch)
     run = summary("waves")
     assert run["status"] == "completed" and run["accumulated_error"] < 0.01
     for file in ("signals.csv", "signals.nc", "replay.html", "states.png"):
