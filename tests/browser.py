@@ -96,8 +96,7 @@ class Browser:
 
     def open(self, path: Path | str, width: int = 1000, height: int = 700, **media: str) -> None:
         """Open a file or an address, and wait for its `load` event."""
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
-        self.call("Emulation.setDeviceMetricsOverride", **size)
+        self.resize(width, height)
         features = [{"name": name.replace("_", "-"), "value": v} for name, v in media.items()]
         self.call("Emulation.setEmulatedMedia", features=features)
         self.errors.clear()
@@ -106,6 +105,11 @@ class Browser:
         self.call("Page.navigate", url=url)
         self.wait("document.readyState === 'complete'")
         self.call("Page.bringToFront")  # gives it the keyboard
+
+    def resize(self, width: int, height: int) -> None:
+        """Give the window another size."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **size)
 
     def evaluate(self, expression: str) -> Any:
         """Return the value of a JavaScript expression, which may be a promise."""

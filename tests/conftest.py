@@ -3,12 +3,14 @@
 import signal
 from collections.abc import Iterator
 
+import joblib
 import pytest
 
+from stewart_drake.live import contact
 from stewart_drake.reporting import terminal
 from tests import building  # noqa: F401  (before the workers start: it makes their folder)
 from tests.browser import Browser, browser
-from tests.shorter import leave_blank
+from tests.shorter import leave_blank, map_few_poses
 
 # A shell that runs the tests in the background lets them ignore Ctrl-C, and the commands that they
 # start would inherit that; those are tested for what they do on Ctrl-C.
@@ -17,6 +19,12 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 
 # What takes long on a busy machine tells on stderr how far it is, where tests expect nothing.
 terminal.EVERY = 3600.0
+
+# A session begins after half a second of requests, in the place of two seconds.
+contact._ENOUGH_TRIPS = 25
+
+# Studies run here: processes import for seconds. Tests of processes ask for workers or for cores.
+joblib.cpu_count = lambda: 1
 
 
 @pytest.fixture(scope="session")
@@ -37,3 +45,9 @@ def tab(one_browser: Browser) -> Iterator[Browser]:
 def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write empty pictures."""
     leave_blank(monkeypatch)
+
+
+@pytest.fixture
+def few_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Map the workspace coarsely."""
+    map_few_poses(monkeypatch)

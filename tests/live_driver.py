@@ -2,7 +2,11 @@
 
 import functools
 import select
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +29,7 @@ from stewart_drake.loop.law_design import control_law, first_queue
 from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.run_log import RunLog
 
 
 def in_real_time(test):
@@ -43,6 +48,46 @@ def in_real_time(test):
         return test(*args, **kwargs)
 
     return repeated
+
+
+class Running(NamedTuple):
+    """A machine in a thread, its address, and what it says."""
+
+    machine: Machine
+    address: Address
+    lines: list[str]
+
+
+@contextmanager
+def in_a_thread(machine: Machine) -> Iterator[None]:
+    """Run a machine in slices, between which it does not stop."""
+    over = threading.Event()
+    vars(machine)["stop"] = lambda: None
+
+    def run() -> None:
+        while not over.is_set():
+            machine.run(machine.time() / SECOND + 0.05)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@contextmanager
+def running_machine(
+    scenario: Scenario, kind: type[Machine] = Machine, log: RunLog | None = None, **how: Any
+) -> Iterator[Running]:
+    """Run the machine of a scenario, with settings."""
+    lines: list[str] = []
+    endpoint = Endpoint(ControllerMessage, "127.0.0.1", 0)
+    with closing(endpoint):
+        machine = kind(prepare(scenario), endpoint, Settings(**how), lines.append, log=log)
+        with in_a_thread(machine):
+            yield Running(machine, endpoint.address, lines)
 
 
 @dataclass

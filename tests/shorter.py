@@ -19,7 +19,7 @@ def blank(kind: str) -> bytes:
 
 
 def leave_blank(patch: pytest.MonkeyPatch) -> None:
-    """Save figures without drawing them, which takes four seconds for one run."""
+    """Save figures without laying them out or drawing them: seconds for one run."""
     pictures = {kind: blank(kind) for kind in ("png", "svg")}
 
     def save(_: object, to: Any, format: str, **options: Any) -> None:
@@ -29,6 +29,15 @@ def leave_blank(patch: pytest.MonkeyPatch) -> None:
             to.write(pictures[format])
 
     patch.setattr("matplotlib.figure.Figure.savefig", save)
+    patch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", lambda *_: None)
+
+
+def map_few_poses(patch: pytest.MonkeyPatch) -> None:
+    """Map the workspace on a grid of 15 by 15 poses in the place of 51 by 51."""
+    from stewart_drake.studies.workspace_map import sections
+
+    patch.setattr("stewart_drake.studies.workspace_map._ROUGH", 15)
+    patch.setattr("stewart_drake.studies.workspace.sections", partial(sections, points=15))
 
 
 def judge_few_delays(patch: pytest.MonkeyPatch) -> None:

@@ -279,9 +279,8 @@ def test_out_of_reach_nothing_is_said_to_be_clear():
     assert "nothing is known" in found.verdict
 
 
-def test_the_command_names_the_links_that_cross(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("stewart_drake.studies.workspace_map.POINTS", 15)
-    monkeypatch.setattr("stewart_drake.studies.workspace_map._ROUGH", 15)
+@pytest.mark.usefixtures("few_poses")
+def test_the_command_names_the_links_that_cross(tmp_path, capsys):
     assert main(["analyze", "workspace", "paper", "--out", str(tmp_path)]) == 0
     told = " ".join(capsys.readouterr().out.split())
     found = json.loads((tmp_path / "summary.json").read_text())["clearance"]

@@ -9,7 +9,6 @@ import sys
 import time
 from pathlib import Path
 
-import joblib
 import numpy as np
 import pytest
 import xarray as xr
@@ -80,8 +79,7 @@ def test_quiet_prints_nothing(capsys):
     assert capsys.readouterr() == ("", "")
 
 
-def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(joblib, "cpu_count", lambda: 1)
+def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys):
     (tmp_path / "summary.json").write_text("of an earlier run")
     duration = ("--set", "duration=1.4")
     assert main(["compare", *EXACT, *duration, "--out", str(tmp_path)]) == 0

@@ -198,7 +198,9 @@ def test_faults_do_little_and_are_counted(faults, counted):
 @pytest.mark.parametrize("samples", [1, 100])
 def test_a_frozen_leg_is_called_so(samples):
     frozen = "sensor.faults=[{kind: frozen, leg: 3, from: 4, to: 4.4}]"
-    missing, stuck, rejected = bad(run(*ON_REFERENCE, f"sensor.samples={samples}", frozen))
+    missing, stuck, rejected = bad(
+        run(*ON_REFERENCE, f"sensor.samples={samples}", frozen, "duration=5")
+    )
     assert (missing, stuck + rejected) == (0, 4)
     assert stuck >= 3
 

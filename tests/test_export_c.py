@@ -202,17 +202,6 @@ def test_single_precision_is_close(name, settings, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_sizes_are_stated_and_kept(tmp_path):
-    """The text of `paper` is at most 194 kB, its state 16.4 kB."""
-    files = export_c.exported(load_scenario("paper", settings=(*SHORT, "duration=1.0")))
-    readme = files["README.md"]
-    text = int(readme.split("(TOTALS)")[0].splitlines()[-1].split()[0])
-    state = int(readme.split("state ")[1].split()[0])
-    assert 50_000 < text <= 194_000 and 3000 < state <= 16_400
-    assert "@" not in readme
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "settings"),
     [
@@ -277,19 +266,13 @@ def test_the_stack_is_not_deeper_than_stated(tmp_path, compiler):
     assert 5000 < used < 1000 * told
 
 
-@pytest.mark.parametrize(
-    ("settings", "field"),
-    [
-        (("controller.prediction=linear",), "controller.prediction"),
-        (("controller.model=paper",), "controller.model"),
-    ],
-)
-def test_what_is_not_exported_is_refused_by_its_field(settings, field, tmp_path, capsys):
+def test_what_is_not_exported_is_refused_by_its_field(tmp_path, capsys):
+    """tests/test_native_law.py has the fields."""
     folder = tmp_path / "board"
-    options = [word for setting in settings for word in ("--set", setting)]
-    assert main(["export-c", "paper", "--out", str(folder), *options]) == 2
+    options = ["--out", str(folder), "--set", "controller.prediction=linear"]
+    assert main(["export-c", "paper", *options]) == 2
     error = capsys.readouterr().err
-    assert error.count("\n") == 1 and f"{field}: is not exported as it is" in error
+    assert error.count("\n") == 1 and "controller.prediction: is not exported as it is" in error
     assert not folder.exists()
 
 
@@ -300,13 +283,19 @@ def test_a_run_that_does_not_end_is_refused():
 
 
 @pytest.mark.slow
-def test_the_command_writes_all_files_or_none(tmp_path, capsys):
+def test_the_command_writes_all_files_or_none_and_states_sizes(tmp_path, capsys):
+    """The text of `paper` is at most 194 kB, its state 16.4 kB."""
     folder = tmp_path / "board"
     command = ["export-c", "paper", "--out", str(folder), "--set", "duration=0.5"]
     assert main(command) == 0
     assert "make test" in capsys.readouterr().out
     names = sorted(path.name for path in folder.iterdir())
     assert {"law.h", "law.c", "stewart_config.c", "stewart_test.c", "Makefile"} < set(names)
+    readme = (folder / "README.md").read_text()
+    text = int(readme.split("(TOTALS)")[0].splitlines()[-1].split()[0])
+    state = int(readme.split("state ")[1].split()[0])
+    assert 50_000 < text <= 194_000 and 3000 < state <= 16_400
+    assert "@" not in readme
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     files = {**dict.fromkeys(names, "other"), "nowhere/law.c": ""}
     with pytest.raises(FileNotFoundError):

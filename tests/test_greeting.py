@@ -36,21 +36,13 @@ from stewart_drake.loop.peer import FAULTS, Fault, Part, Reason, identity_of, in
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.loading import load_scenario
 from tests.live_driver import Driver
-from tests.test_live import (
-    FROM_REST,
-    OVER_A_NETWORK,
-    Running,
-    driven,
-    quiet_machine,
-    scenario_of,
-)
+from tests.test_live import FROM_REST, OVER_A_NETWORK, driven, paper_machine, scenario_of
 from tests.test_machine import begun, messages, together
 from tests.test_protocol import HEAD, IDENTITY, KEY, OFFER, PLAN, changed
 
 ROOT = Path(__file__).resolve().parents[1]
 EXACT = "plant.kind=exact"
 SAMPLED = "sensor={kind: encoders, samples: 16, bits: 30}"
-__all__ = ["quiet_machine"]
 
 
 # ---------------------------------------------------------------- requests
@@ -221,8 +213,8 @@ def impatient(monkeypatch):
     monkeypatch.setattr(contacts, "_PATIENCE", 0.3)
 
 
-def test_a_machine_in_use_is_named(quiet_machine, impatient):
-    with Running(watchdog=0.5) as running:
+def test_a_machine_in_use_is_named(impatient):
+    with paper_machine(watchdog=0.5) as running:
         first = prepare_session(scenario_of(), running.address)
         await_free(first.contact)
         first.contact.join()
@@ -281,7 +273,7 @@ def test_reports_that_are_a_period_off_are_named(off, word):
 
 
 @pytest.mark.slow
-def test_a_machine_that_reports_a_period_too_late_is_refused(quiet_machine, monkeypatch):
+def test_a_machine_that_reports_a_period_too_late_is_refused(monkeypatch):
     message = Machine._message
 
     def off(self, *given):
@@ -290,7 +282,7 @@ def test_a_machine_that_reports_a_period_too_late_is_refused(quiet_machine, monk
         return replace(made, acted_from=made.acted_from + shift)
 
     monkeypatch.setattr(Machine, "_message", off)
-    with Running(OVER_A_NETWORK, *FROM_REST) as running:
+    with paper_machine(OVER_A_NETWORK, *FROM_REST) as running:
         result = driven(running, 6.0, *FROM_REST)
     assert result.status == "refused" and result.stopped is not None
     assert "acted_from in the machine's datagrams is one period late" in result.stopped.reason
@@ -393,10 +385,10 @@ class Watching(Viewer):
 
 
 @pytest.mark.slow
-def test_live_and_machine_say_a_loss_in_the_same_words(quiet_machine):
+def test_live_and_machine_say_a_loss_in_the_same_words():
     """A machine falls under gravity that is unknown to the controller."""
     watching = Watching()
-    with Running("plant.gravity=true") as running:
+    with paper_machine("plant.gravity=true", rate=2.0) as running:
         # Outliers alone would end the run before the plate has fallen.
         result = driven(running, 6.0, viewer=watching, max_missing=5.0)
         machine = running.machine
@@ -412,11 +404,10 @@ def test_live_and_machine_say_a_loss_in_the_same_words(quiet_machine):
 def test_a_machine_that_is_ended_ends_the_run_with_its_words():
     """At once, and not after ten seconds of silence."""
     said = list[str]()
-    with Running() as running:
+    with paper_machine() as running:
         machine = running.machine
-        running.machine.stop = lambda: None
         ready = prepare_session(scenario_of(), running.address)
-        ends = threading.Timer(2.0, lambda: Machine.stop(machine))
+        ends = threading.Timer(1.0, lambda: Machine.stop(machine))
         ends.start()
         began = time.monotonic()
         result = drive(ready, 8.0, accept_jitter=True, say=said.append)

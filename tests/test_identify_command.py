@@ -10,9 +10,11 @@ import xarray as xr
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
+from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.reporting.identification import file_names
 from stewart_drake.scenario.calibration import load_calibration
+from stewart_drake.scenario.loading import load_scenario
 from tests.mechanisms import PAPER
 from tests.screen import too_long
 
@@ -107,10 +109,9 @@ def lost(tmp_path_factory):
         "delay.steps=9", "delay.fraction=0.3", "plant.payload_mass=0.4",
         "sensor.noise_std=[1e-4,1e-4,1e-4,2e-5,2e-5,2e-5,1e-3,1e-3,1e-3,1e-4,1e-4,1e-4]",
     )  # fmt: skip
-    words = [word for setting in settings for word in ("--set", setting)]
-    assert main(["simulate", "paper", *words, "--out", str(folder), "--quiet"]) == 0
-    summary = json.loads((folder / "summary.json").read_text())
-    assert summary["status"] == "left_workspace" and summary["failure"]["time"] < 8
+    result = simulate(load_scenario("paper", settings=settings), judge_stability=False)
+    assert result.status == "left_workspace" and result.stopped.time < 8
+    result.save(folder)
     return folder / "signals.nc"
 
 

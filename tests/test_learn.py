@@ -223,6 +223,7 @@ def test_learning_leaves_to_the_estimator_what_it_finds():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 def test_the_command_writes_what_a_run_uses(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     settings = [word for one in (*EXACT, *UNMODELLED) for word in ("--set", one)]
@@ -323,6 +324,6 @@ def test_setpoints_are_refused_where_they_were_learned_with_others(tmp_path):
 def test_learned_setpoints_remove_what_plain_setpoints_lack():
     """Torque, velocity gain and damping, which no setpoint of these compensates."""
     sc = head("controller.feedforward=none")
-    found = study_learn(sc, LearnOptions(repetitions=5))
+    found = study_learn(sc, LearnOptions(repetitions=4))
     errors = [one.error for one in found.repetitions]
     assert found.best.error < 0.05 * errors[0]

@@ -1,8 +1,5 @@
 """`live --learn`: torques, or setpoints of servos, learned from a machine, in real time."""
 
-import contextlib
-import threading
-
 import numpy as np
 import pytest
 
@@ -14,19 +11,17 @@ from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servos import rise
 from stewart_drake.live import design as designing
 from stewart_drake.live import learning
-from stewart_drake.live.endpoint import Endpoint
 from stewart_drake.live.exchange import Exchange
 from stewart_drake.live.learned import LearnedSetpoints, LearnedTorques
 from stewart_drake.live.learning import learn_live
 from stewart_drake.live.log import LiveRecord
 from stewart_drake.live.loop import LiveLoop
-from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.options import LiveOptions
-from stewart_drake.live.protocol import ControllerMessage, MachineFlags
+from stewart_drake.live.protocol import MachineFlags
 from stewart_drake.loop.learned import HARMONICS, motion_period, save_learned
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.trajectories import evaluate
-from tests.live_driver import in_real_time
+from tests.live_driver import in_real_time, running_machine
 
 STEPS = "delay.steps=13"
 PERIOD = 2 * np.pi / 3.14159
@@ -176,41 +171,26 @@ ON_A_WIRE = ("start=on_reference", "queue=reference")
 OVER_A_NETWORK = ("start=rest", "queue=zero", f"link={{kind: network, {WAY}, return: {{{WAY}}}}}")
 
 
-@contextlib.contextmanager
-def machine_of(name, *settings, **how):
-    """Run a machine in a thread; yield its address."""
-    over, endpoint = threading.Event(), Endpoint(ControllerMessage, "127.0.0.1", 0)
-    experiment = prepare(sd.load_scenario(name, settings=settings))
-    machine = Machine(experiment, endpoint, Settings(**how), lambda line: None)
-
-    def run():
-        while not over.is_set():
-            machine.run(machine.time() / 1e9 + 0.05)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        yield f"127.0.0.1:{endpoint.address[1]}"
-    finally:
-        over.set()
-        thread.join()
-        endpoint.close()
+def learn(wanted, running, file, say):
+    """Return the run of three repetitions on a machine."""
+    host, port = running.address
+    options = LiveOptions(learn=3, learned=file, accept_jitter=True)
+    return learn_live(wanted, f"{host}:{port}", options, say)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", [ON_A_WIRE, OVER_A_NETWORK])
 @in_real_time
-def test_torques_of_a_machine_with_friction_and_payload_are_learned(monkeypatch, tmp_path, way):
+def test_torques_of_a_machine_with_friction_and_payload_are_learned(tmp_path, way):
     """Friction, a payload off its centre and biases; the machine's clock is 5 times as fast.
 
     Between the repetitions the plate rests at the start. The file serves a simulation, too.
     """
-    monkeypatch.setattr(Machine, "stop", lambda self: None)
     said, file = [], tmp_path / "learned.npz"
     wanted = sd.load_scenario("paper", settings=(*LAW, *way[:2]))
-    with machine_of("paper", *LAW, *UNKNOWN, *way, rate=5.0) as where:
-        options = LiveOptions(learn=3, learned=file, accept_jitter=True)
-        result = learn_live(wanted, where, options, said.append)
+    machine = sd.load_scenario("paper", settings=(*LAW, *UNKNOWN, *way))
+    with running_machine(machine, rate=5.0) as running:
+        result = learn(wanted, running, file, said.append)
     assert result.status == "completed"
     errors = [float(line.split()[-3]) for line in said if "E of one period" in line]
     assert len(errors) == 3
@@ -231,16 +211,13 @@ def test_torques_of_a_machine_with_friction_and_payload_are_learned(monkeypatch,
 @in_real_time
 def test_setpoints_of_a_machine_with_other_servos_are_learned(monkeypatch, tmp_path):
     """Twice the friction and 0.8 of the stiffness, over a network that loses packets."""
-    monkeypatch.setattr(Machine, "stop", lambda self: None)
     monkeypatch.setattr(learning, "_SETTLING", 4.0)  # the soft starts here take a second
     network = "link={kind: network, low: 0.01, high: 0.05, loss: 0.03, playout: 0.26}"
     said, file = [], tmp_path / "learned.npz"
-    with machine_of(
-        "reachy_mini", "actuator.friction=0.2", "actuator.stiffness=8", network
-    ) as where:
-        options = LiveOptions(learn=3, learned=file, accept_jitter=True)
-        wanted = sd.load_scenario("reachy_mini", settings=(STEPS,))
-        result = learn_live(wanted, where, options, said.append)
+    other = ("actuator.friction=0.2", "actuator.stiffness=8", network)
+    wanted = sd.load_scenario("reachy_mini", settings=(STEPS,))
+    with running_machine(sd.load_scenario("reachy_mini", settings=other)) as running:
+        result = learn(wanted, running, file, said.append)
     assert result.status == "completed"
     lacking = [float(line.split()[5]) for line in said if "degrees rms" in line]
     assert len(lacking) == 3

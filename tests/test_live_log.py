@@ -18,7 +18,6 @@ import pytest
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.live.log import LiveRecord, RowFile
-from stewart_drake.live.machine import Machine
 from stewart_drake.live.session import drive, prepare_session
 from stewart_drake.loop import results as metrics
 from stewart_drake.loop.law_design import control_law, first_queue
@@ -28,9 +27,7 @@ from stewart_drake.reporting.csv_file import signals_csv
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
 from tests.copies import status_of
-from tests.test_live import FROM_REST, OVER_A_NETWORK, SETTINGS, Running, quiet_machine, scenario_of
-
-__all__ = ["quiet_machine"]  # a fixture
+from tests.test_live import FROM_REST, OVER_A_NETWORK, SETTINGS, paper_machine, scenario_of
 
 
 def lines_of(path):
@@ -116,7 +113,7 @@ class Shadow(LiveRecord):
 
 
 @pytest.mark.slow
-def test_figures_from_the_file_are_those_from_memory(quiet_machine, tmp_path, monkeypatch):
+def test_figures_from_the_file_are_those_from_memory(tmp_path, monkeypatch):
     records = []
 
     def recorded(*those):
@@ -125,7 +122,7 @@ def test_figures_from_the_file_are_those_from_memory(quiet_machine, tmp_path, mo
 
     monkeypatch.setattr("stewart_drake.live.loop.LiveRecord", recorded)
     path = tmp_path / "log.csv"
-    with Running() as running:
+    with paper_machine(rate=2.0) as running:
         ready = prepare_session(scenario_of(), running.address)
         how = {"accept_jitter": True, "say": lambda line: None, "log": path}
         result = drive(ready, 3.0, **how)
@@ -154,9 +151,8 @@ def test_what_a_full_disk_leaves_of_a_run(tmp_path):
 
     def work():
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        Machine.stop = lambda self: None  # as `quiet_machine`, here
         said = []
-        with Running() as running:
+        with paper_machine(rate=2.0) as running:
             ready = prepare_session(scenario_of(), running.address)
             resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
             how = {"accept_jitter": True, "say": said.append, "log": path}
@@ -175,10 +171,10 @@ def test_what_a_full_disk_leaves_of_a_run(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_killed_run_leaves_all_but_its_last_second(quiet_machine, tmp_path):
+def test_a_killed_run_leaves_all_but_its_last_second(tmp_path):
     settings = (*SETTINGS, *FROM_REST)
     words = [word for setting in settings for word in ("--set", setting)]
-    with Running(OVER_A_NETWORK, *FROM_REST) as running:
+    with paper_machine(OVER_A_NETWORK, *FROM_REST) as running:
         where = f"127.0.0.1:{running.address[1]}"
         command = ["live", "paper", "--machine", where, "--no-browser", "--out", str(tmp_path)]
         live = subprocess.Popen(

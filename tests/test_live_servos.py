@@ -1,7 +1,7 @@
 """Servos over a network: plans of setpoints between `live` and a machine."""
 
-import threading
 from collections import Counter
+from contextlib import closing
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +10,6 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.design import check_controller, design
-from stewart_drake.live.endpoint import Endpoint
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.protocol import (
     ControllerFlags,
@@ -26,8 +25,7 @@ from stewart_drake.loop.servos import servo_law
 from stewart_drake.scenario.run_log import open_log, read_log
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
-from tests.live_driver import Clock, in_real_time
-from tests.test_live import Running
+from tests.live_driver import Clock, in_real_time, running_machine
 
 NETWORK = "link={kind: network, low: 0, high: 0, loss: 0, playout: 0.1}"
 SESSION, NONCE, ADDRESS = 7, 9, ("127.0.0.1", 50000)
@@ -171,15 +169,14 @@ def test_live_compensates_what_the_scenario_says_of_the_plant():
 
 @pytest.mark.slow
 @in_real_time
-def test_live_drives_servos_over_a_network_that_loses_packets(monkeypatch, tmp_path):
+def test_live_drives_servos_over_a_network_that_loses_packets(tmp_path):
     """Measured by the true state in the machine's log."""
-    monkeypatch.setattr(Machine, "stop", lambda self: None)
     way = "low: 0.02, high: 0.1, loss: 0.1"
     network = f"link={{kind: network, {way}, playout: 0.2, return: {{{way}}}}}"
     wanted = sd.load_scenario("reachy_mini", settings=("delay.steps=13",))
     machine = sd.load_scenario("reachy_mini", settings=(network,))
-    running = Running.__new__(Running)
-    with sd_machine(running, machine, tmp_path / "true.csv"):
+    log = open_log(tmp_path / "true.csv", machine)
+    with closing(log), running_machine(machine, log=log) as running:
         ready = prepare_session(wanted, running.address)
         said = "\n".join(plans(ready, 3.0, "reachy_mini"))
         assert "setpoints act 0.26 s" in said and "plans of 16 setpoints" in said
@@ -193,25 +190,3 @@ def test_live_drives_servos_over_a_network_that_loses_packets(monkeypatch, tmp_p
     assert late.sizes["time"] > 60
     expected = np.array([evaluate(motion, t - began)[:3] for t in late.time.values])
     assert np.abs(late.pose.values[:, :3] - expected).max() < 0.02
-
-
-class sd_machine:
-    """A machine of any scenario in a thread, with a log of its true state."""
-
-    def __init__(self, running, scenario, path):
-        running.lines, running.endpoint = [], Endpoint(ControllerMessage, "127.0.0.1", 0)
-        running.machine = Machine(
-            prepare(scenario), running.endpoint, Settings(), running.lines.append
-        )
-        self.log = running.machine._log = open_log(path, scenario)
-        running.address = running.endpoint.address
-        self.running = running
-
-    def __enter__(self):
-        self.running._stopping = threading.Event()
-        self.running._thread = threading.Thread(target=self.running._run)
-        return self.running.__enter__()
-
-    def __exit__(self, *args):
-        self.running.__exit__(*args)
-        self.log.close()

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import stewart_drake as sd
+from stewart_drake.cli import main
 from stewart_drake.export import controller as export_c
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.simulation import simulate
@@ -24,7 +25,10 @@ from stewart_drake.scenario.loading import load_scenario
 from tests.building import SANITIZED, c_compiler, make
 from tests.live_driver import Driver, drive_in_real_time, in_real_time
 
-SETTINGS = ("plant.kind=exact", "duration=4.0")
+SETTINGS = ("plant.kind=exact", "duration=2.5")
+SAMPLES = 25
+"""Of a run; the torques of all but the last eight act."""
+LONG = ("plant.kind=exact", "duration=4.0", "delay.steps=2")
 SLOW = 0.4
 """Rate of the machine's clock at which a busy computer still delivers measurements in time."""
 COMMAND = [sys.executable, "-m", "stewart_drake"]
@@ -125,7 +129,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def soon(tmp_path_factory):
     """Return the same for torques that act 0.2 s after their measurement."""
-    return exported(tmp_path_factory.mktemp("soon"), (*SETTINGS, "delay.steps=2"))
+    return exported(tmp_path_factory.mktemp("soon"), LONG)
 
 
 def c_controller(folder, port, *options):
@@ -163,12 +167,12 @@ def test_the_controller_in_c_drives_the_machine_in_python(folder, tmp_path):
         with process(c_controller(folder, port, f"log={log}")) as driving:
             assert driving.end() == 0, driving.lines
         assert running.end(signal.SIGINT) == 130
-    assert "completed after 40 samples, 0 of them without a measurement" in driving.lines[-2]
+    assert "completed after 25 samples, 0 of them without a measurement" in driving.lines[-2]
     assert driving.lines[-1] == (
         "refused: 0 malformed, 0 version, 0 key, 0 foreign, 0 replayed, 0 late, 0 rate"
     )
     assert "1 sessions, 1 runs" in running.said and "refused: none" in running.said
-    np.testing.assert_allclose(states_of(log), simulated(40), atol=1e-6)
+    np.testing.assert_allclose(states_of(log), simulated(SAMPLES), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -179,14 +183,14 @@ def test_a_lost_datagram_of_the_controller_in_c_costs_nothing(folder, tmp_path):
     settings = (*SETTINGS, lossy, "controller.packet_repeats=0")
     states, said = over(folder, settings, tmp_path / "log")
     lost = int(re.search(r"(\d+) lost by", said)[1])
-    assert lost >= 5 and "32 played, 0 periods dry" in said
-    np.testing.assert_allclose(states, simulated(40), atol=1e-6)
+    assert lost >= 5 and "17 played, 0 periods dry" in said
+    np.testing.assert_allclose(states, simulated(SAMPLES), atol=1e-6)
 
 
 def in_a_row(number, loss, seed):
     """Return a link with losses in a row; a torque acts 0.2 s after its measurement."""
     lossy = f"low: 0.0, high: 0.02, loss: {loss}, burst: {number}, playout: 0.1"
-    return (*SETTINGS, f"link={{kind: network, {lossy}, seed: {seed}}}")
+    return (*LONG[:2], f"link={{kind: network, {lossy}, seed: {seed}}}")
 
 
 MOTION = np.tile([0.26, 0.26, 0.26, 0.02, 0.02, 0.08], 2)
@@ -213,7 +217,7 @@ def test_the_controller_in_c_hears_what_has_acted(soon, tmp_path):
     settings = (*in_a_row(10, loss=0.2, seed=12), "controller.packet_torques=8")
     states, said = over(soon, settings, tmp_path / "log", SLOW)
     dry = int(re.search(r"(\d+) periods dry", said)[1])
-    undisturbed = simulated(40, (*SETTINGS, "delay.steps=2"))
+    undisturbed = simulated(40, LONG)
     assert dry >= 2
     most = np.abs(simulated(40, settings) - undisturbed) / MOTION
     assert (np.abs(states - undisturbed) / MOTION).max() < min(0.5, most.max())
@@ -226,11 +230,11 @@ def test_the_controller_in_python_drives_the_machine_in_c(folder):
     with process([str(folder / "stewart_machine"), str(port)]) as running:
         running.until("a simulated machine at port")
         driver = Driver(load_scenario("paper", settings=SETTINGS), ("127.0.0.1", port))
-        states = drive_in_real_time(driver, 40)
+        states = drive_in_real_time(driver, SAMPLES)
         running.until("the controller said stop")
         assert running.end(signal.SIGINT) == 0
-    assert "32 torques played, 0 periods dry, 0 silences" in running.lines[-2]
-    np.testing.assert_allclose(states, simulated(40), atol=1e-6)
+    assert "17 torques played, 0 periods dry, 0 silences" in running.lines[-2]
+    np.testing.assert_allclose(states, simulated(SAMPLES), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -269,7 +273,7 @@ def test_both_ends_in_c(folder, tmp_path):
             time.sleep(0.5)
             assert other.end(signal.SIGINT) == 1
         assert running.end(signal.SIGINT) == 0
-    np.testing.assert_allclose(states_of(log), simulated(40), atol=1e-6)
+    np.testing.assert_allclose(states_of(log), simulated(SAMPLES), atol=1e-6)
     assert sum("a session begins" in line for line in running.lines) == 1
     assert re.search(r"refused: 0 malformed, 0 version, [1-9]\d* key", running.lines[-1])
 
@@ -278,16 +282,14 @@ def test_both_ends_in_c(folder, tmp_path):
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_it_with_one_summary():
+def test_ctrl_c_ends_it_with_one_summary(capfd):
     with machine() as (running, _):
         assert running.end(signal.SIGINT) == 130
     begun = [line.split()[0] for line in running.lines if not line.startswith(" ")]
     assert begun == ["machine", "waits", "ended", "datagrams:", "torques:"]
-    said = [*COMMAND, "machine", "paper", "--set", "plant.kind=exact", "--port", "0"]
-    done = subprocess.run(
-        [*said, "--duration", "0.2", "--json"], capture_output=True, text=True, check=True
-    )
-    summary = json.loads(done.stdout)
+    said = ["machine", "paper", "--set", "plant.kind=exact", "--port", "0"]
+    assert main([*said, "--duration", "0.2", "--json"]) == 0
+    summary = json.loads(capfd.readouterr().out)
     assert summary["sessions"] == 0 and set(summary["refused"].values()) == {0}
 
 
@@ -298,13 +300,13 @@ def test_either_side_of_a_network_may_stand_still_for_a_second(side):
     that it promises, and the controller leads the plate back, or says why not."""
     way = "low: 0.1, high: 0.12"
     link = f"link={{kind: network, {way}, return: {{{way}}}}}"
-    live = [*COMMAND, "live", "paper", "--no-browser", "--duration", "8", "--machine"]
+    live = [*COMMAND, "live", "paper", "--no-browser", "--duration", "6", "--machine"]
     with (
         machine("--watchdog", "0.7", settings=("plant.kind=exact", link)) as (running, port),
         process([*live, f"127.0.0.1:{port}"]) as driving,
     ):
         running.until("the run began")
-        time.sleep(3.0)
+        time.sleep(2.0)
         suspended = running if side == "machine" else driving
         suspended.popen.send_signal(signal.SIGSTOP)
         time.sleep(1.0)
@@ -321,7 +323,7 @@ def test_either_side_of_a_network_may_stand_still_for_a_second(side):
         "nothing was heard from the controller for 0.7 s: the safe torque (zero) acts"
         in running.said
     )
-    # With a second of ten missing, E_ac is near the share of samples from which it is not given.
+    # With a second of six missing, E_ac is near the share of samples from which it is not given.
     told = r"E_ac +(none|[\d.]+ % s)," if survived else "left workspace|lost (machine|contact)"
     assert re.search(told, driving.said), driving.lines
 
@@ -401,8 +403,6 @@ def test_the_machine_in_c_is_safe_without_its_controller_and_the_next_one_takes_
 
 
 def test_wrong_commands_are_one_line(capfd, tmp_path):
-    from stewart_drake.cli import main
-
     busy = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     busy.bind(("127.0.0.1", 0))
     exact = ("machine", "paper", "--set", "plant.kind=exact")

@@ -408,7 +408,8 @@ def test_without_the_first_accelerations_the_run_begins_a_sample_later():
 
 @pytest.mark.parametrize("number", [5, 10])
 @pytest.mark.parametrize(
-    "first", [1, 2, 3, *(pytest.param(k, marks=pytest.mark.slow) for k in range(4, 80))]
+    "first",
+    [1, 2, 3, 10, 20, 40, *(pytest.param(k, marks=pytest.mark.soak) for k in range(4, 80))],
 )
 def test_a_longer_gap_does_not_lose_the_plate(first, number):
     """The whole run from rest has 21 % s; the same gaps on the reference."""

@@ -46,7 +46,7 @@ def test_live_drives_it_along_the_motion(machine):
     assert run.summary["live"]["periods_played"] >= 40
     error = np.abs(run.signals.error.values) / np.array(scenario.reference.amplitude)
     assert np.isfinite(error).any() and np.nanmax(error[-15:]) < 0.02
-    expected = sd.simulate(scenario).signals.torque_commanded
+    expected = sd.simulate(scenario, judge_stability=False).signals.torque_commanded
     sent = run.signals.torque_commanded.sel(time=slice(2.0, 4.0))
     same = expected.sel(time=sent.time, method="nearest")
     assert np.abs(sent.values - same.values).max() < 0.05 * np.abs(same).max()

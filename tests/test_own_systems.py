@@ -47,6 +47,19 @@ def controller(inputs=(("measurement", 12),), outputs=(("torque", 6),), value=0.
     return Constant(inputs, outputs, value)
 
 
+class OfTime(LeafSystem):
+    """A controller that asks the same of all motors, a function of the time."""
+
+    def __init__(self, torque):
+        super().__init__()
+        self.DeclareVectorInputPort("measurement", 12)
+        self.DeclareVectorOutputPort(
+            "torque",
+            6,
+            lambda context, output: output.SetFromVector(np.full(6, torque(context.get_time()))),
+        )
+
+
 def disturbance(name="torque", size=6, value=0.0):
     return Constant((), ((name, size),), value)
 
@@ -104,13 +117,9 @@ def test_disturbing_torque_is_the_same_as_a_bias(plant):
     system = ConstantVectorSource(bias)
     with pytest.raises(sd.ConfigError, match=r"and output torque \(6\)"):
         sd.simulate(scenario(*settings), disturbance=system)  # its port has another name
-
-    class Pushed(LeafSystem):
-        def __init__(self):
-            super().__init__()
-            self.DeclareVectorOutputPort("torque", 6, lambda _, output: output.SetFromVector(bias))
-
-    pushed = sd.simulate(scenario(*settings), disturbance=Pushed, judge_stability=False)
+    pushed = sd.simulate(
+        scenario(*settings), disturbance=lambda: disturbance(value=bias), judge_stability=False
+    )
     np.testing.assert_allclose(pushed.signals.pose, biased.signals.pose, atol=1e-12)
 
 
@@ -118,15 +127,6 @@ def test_disturbing_torque_is_the_same_as_a_bias(plant):
 
 
 def test_own_torque_is_sampled_held_limited_and_delayed():
-    class Ramp(LeafSystem):
-        def __init__(self):
-            super().__init__()
-            self.DeclareVectorInputPort("measurement", 12)
-            self.DeclareVectorOutputPort("torque", 6, self.calc)
-
-        def calc(self, context, output):
-            output.SetFromVector(np.full(6, context.get_time()))
-
     sc = scenario(
         "controller.period=0.1",
         "delay.steps=2",
@@ -135,7 +135,7 @@ def test_own_torque_is_sampled_held_limited_and_delayed():
         "reference.kind=hold",
         "duration=0.9",
     )
-    s = sd.simulate(sc, controller=Ramp).signals.sel(leg=1)
+    s = sd.simulate(sc, controller=lambda: OfTime(lambda t: t)).signals.sel(leg=1)
     held = 0.1 * np.floor(s.time.values / 0.1 + 1e-6)
     np.testing.assert_allclose(s.torque_commanded, held, atol=1e-9)
     late = 0.1 * np.floor((s.time.values - 0.25) / 0.1 + 1e-6)
@@ -143,18 +143,11 @@ def test_own_torque_is_sampled_held_limited_and_delayed():
 
 
 def test_what_is_no_number_is_sent_as_before_and_counted():
-    class Broken(LeafSystem):
-        def __init__(self):
-            super().__init__()
-            self.DeclareVectorInputPort("measurement", 12)
-            self.DeclareVectorOutputPort("torque", 6, self.calc)
-
-        def calc(self, context, output):
-            t = context.get_time()
-            output.SetFromVector(np.full(6, np.nan if 0.045 < t < 0.075 else 1e-3))
+    def broken():
+        return OfTime(lambda t: np.nan if 0.045 < t < 0.075 else 1e-3)
 
     faults = "sensor.faults=[{kind: missing, from: 0.02, to: 0.04}]"
-    result = sd.simulate(scenario("duration=0.1", faults), controller=Broken)
+    result = sd.simulate(scenario("duration=0.1", faults), controller=broken)
     counts = result.summary["counts"]
     assert counts["nonfinite_torque"] == 3 and counts["measurements_missing"] == 2
     assert (result.signals.torque_commanded == 1e-3).all()
@@ -163,17 +156,11 @@ def test_what_is_no_number_is_sent_as_before_and_counted():
 
 
 def test_a_mistake_in_a_system_is_an_exception():
-    class Wrong(LeafSystem):
-        def __init__(self):
-            super().__init__()
-            self.DeclareVectorInputPort("measurement", 12)
-            self.DeclareVectorOutputPort("torque", 6, self.calc)
-
-        def calc(self, context, output):
-            raise RuntimeError("my own mistake")
+    def mistake(time):
+        raise RuntimeError("my own mistake")
 
     with pytest.raises(RuntimeError, match="my own mistake"):
-        sd.simulate(scenario("duration=0.1"), controller=Wrong)
+        sd.simulate(scenario("duration=0.1"), controller=lambda: OfTime(mistake))
 
 
 # ------------------------------------------------------------------ the border

@@ -11,7 +11,6 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import joblib
 import numpy as np
 import pytest
 from pydrake.systems.framework import LeafSystem
@@ -207,6 +206,7 @@ def test_replay_as_a_file_in_a_notebook_or_in_meshcat(run, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_poses")
 def test_analyses_are_answers_that_can_be_printed_shown_and_saved(tmp_path):
     found = sd.analyze_workspace(sd.load_scenario("paper"))
     assert isinstance(found, sd.AnalysisResult) and "\n" in str(found)
@@ -218,8 +218,7 @@ def test_analyses_are_answers_that_can_be_printed_shown_and_saved(tmp_path):
     assert saved == jsonable(found.summary)
 
 
-def test_a_network_is_analysed(monkeypatch):
-    monkeypatch.setattr(joblib, "cpu_count", lambda: 1)
+def test_a_network_is_analysed():
     settings = (*SHORT, "link.kind=network")
     found = sd.analyze_link(sd.load_scenario("paper", settings=settings), runs=1)
     assert "A bound of" in found.verdict and found.study.runs == 1

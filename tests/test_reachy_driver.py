@@ -11,7 +11,6 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.servos import Stiffness
-from stewart_drake.live.machine import Machine
 from stewart_drake.live.options import MachineOptions
 from stewart_drake.live.protocol import (
     SECOND,
@@ -27,7 +26,7 @@ from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import servo_law
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
-from tests.live_driver import Clock, in_real_time
+from tests.live_driver import Clock, in_a_thread, in_real_time
 from tests.test_live_servos import Wire
 
 server = pytest.importorskip("websockets.sync.server")
@@ -278,27 +277,13 @@ def test_setpoints_ahead_are_of_a_robot_only(capsys):
 
 @pytest.mark.slow
 @in_real_time
-def test_live_moves_the_head(daemon, monkeypatch):
-    monkeypatch.setattr(Machine, "stop", lambda self: None)
+def test_live_moves_the_head(daemon):
     scenario = sd.load_scenario("reachy_mini", settings=("delay.steps=13",))
-    lines, over = [], threading.Event()
-    with open_robot(
-        scenario, MachineOptions(reachy=f"127.0.0.1:{daemon.port}", port=0), lines.append
-    ) as (running, address):
-
-        def run():
-            while not over.is_set():
-                running.run(running.time() / 1e9 + 0.05)
-
-        thread = threading.Thread(target=run)
-        thread.start()
-        try:
-            ready = prepare_session(scenario, address)
-            result = drive(ready, 4.0, accept_jitter=True, say=lambda line: None)
-            began = (running._started + running.begin) / 1e9
-        finally:
-            over.set()
-            thread.join()
+    options = MachineOptions(reachy=f"127.0.0.1:{daemon.port}", port=0)
+    with open_robot(scenario, options, [].append) as (running, address), in_a_thread(running):
+        ready = prepare_session(scenario, address)
+        result = drive(ready, 4.0, accept_jitter=True, say=lambda line: None)
+        began = (running._started + running.begin) / 1e9
     assert result.status == "completed" and result.summary["live"]["taken_over"]
     times, joints = (np.array(part) for part in zip(*daemon.sent, strict=True))
     assert np.abs(joints[0, 1:] - SLEEP).max() < 0.02  # it begins where the head is

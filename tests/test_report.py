@@ -7,7 +7,6 @@ import time
 from dataclasses import replace
 from html.parser import HTMLParser
 
-import joblib
 import pytest
 
 from stewart_drake.cli import main
@@ -24,6 +23,7 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 from tests.browser import needs_chromium
 from tests.screen import too_long
+from tests.shorter import judge_few_delays, map_few_poses
 
 EXACT = ("plant.kind=exact",)
 SETTINGS = ("--set", "plant.kind=exact", "--set", "duration=2.0")
@@ -40,7 +40,8 @@ def report(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     (folder / "summary.json").write_text("of an earlier run")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(joblib, "cpu_count", lambda: 1)  # tests/test_report_stopped.py has processes
+        map_few_poses(patch)
+        judge_few_delays(patch)
         assert main(["report", "paper", *SETTINGS, "--out", str(folder), "--quiet"]) == 0
     return folder
 
@@ -148,6 +149,7 @@ def collect_of(scenario, **changes):
     return report_document.ReportData(**(parts | changes))
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_run_that_ends_early_is_reported_at_once():
     scenario = load_scenario("paper", "lqr", ("plant.kind=exact",))
     page = report_document.document(collect_of(scenario), "mine")
@@ -166,6 +168,7 @@ def test_a_run_that_ends_early_is_reported_at_once():
         (("actuator.torque_limit=0.008",), "fair", "Caution: a mean error of"),
     ],
 )
+@pytest.mark.usefixtures("blank_figures")
 def test_the_worst_finding_makes_the_verdict(settings, tone, said):
     fixed = ("plant.kind=exact", "start=on_reference", "queue=reference")
     duration = "duration=1.5" if "delay_steps" in str(settings) else "duration=3"
@@ -175,6 +178,7 @@ def test_the_worst_finding_makes_the_verdict(settings, tone, said):
     assert page.tone == tone and re.search(said, page.verdict)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_machine_is_called_by_its_name_and_not_by_its_file(tmp_path):
     path = tmp_path / "machine.yaml"
     path.write_text(mechanism_yaml(replace(load_mechanism("paper"), name="ruler")))
@@ -183,6 +187,7 @@ def test_a_machine_is_called_by_its_name_and_not_by_its_file(tmp_path):
     assert page.facts["mechanism"] == "ruler"
 
 
+@pytest.mark.usefixtures("blank_figures", "few_poses")
 def test_a_motion_out_of_reach_gets_a_report_without_runs(tmp_path, capsys, monkeypatch):
     def only_workspace(scenario, scenarios, progress):
         assert not scenarios

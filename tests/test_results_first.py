@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 
-import joblib
 import pytest
 
 from stewart_drake.cli import main
@@ -52,7 +51,6 @@ def names(folder):
 def test_a_failure_while_drawing_costs_the_figures_only(
     arguments, module, name, kept, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(joblib, "cpu_count", lambda: 1)  # so that no process has to start
     judge_few_delays(monkeypatch)
     monkeypatch.setattr(module, name, broken(tmp_path))
     assert main([*arguments, "--quiet", "--out", str(tmp_path)]) == 0
@@ -79,7 +77,6 @@ def test_nothing_of_an_earlier_comparison_stays_beside_new_results(tmp_path, mon
     for name in LABELS:
         for old in (f"{name}.nc", f"torques_{name}.png", f"delay_{name}.svg", "weights.png"):
             (tmp_path / old).write_text("of an earlier comparison")
-    monkeypatch.setattr(joblib, "cpu_count", lambda: 1)
     monkeypatch.setattr(figures, "draw_comparison", broken(tmp_path))
     assert main(["compare", *EXACT, "--quiet", "--out", str(tmp_path)]) == 0
     assert names(tmp_path) == {"summary.json", *(f"{name}.nc" for name in CONTROLLERS)}

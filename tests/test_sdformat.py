@@ -20,6 +20,7 @@ from stewart_drake.loop.platforms import add_mechanism, set_pose
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
 from tests.mechanisms import PAPER, random_mechanism, random_pose
+from tests.singular import parallel_rods
 
 MODELS = data_root() / "models"
 LEGS = range(1, 7)
@@ -41,26 +42,17 @@ def any_machine(seed):
     return dataclasses.replace(random_mechanism(rng), branches=rng.choice([-1, 1], 6))
 
 
-def with_vertical(link):
-    """All cranks, or all rods, vertical at home: a pitch of 90 degrees. Crank angles are zero."""
-    azimuth = np.arange(6) * np.pi / 3
-    out = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros(6)])
-    up, across = np.array([0.0, 0.0, 1.0]), np.cross([0.0, 0.0, 1.0], out)
-    p_PQ = 0.12 * out + 0.06 * across
-    if link == "crank":
-        crank = np.tile(up, (6, 1))
-        p_WS = 0.2 * out
-    else:
-        crank = across
-        p_WS = PAPER.home[3:] + p_PQ - 0.35 * up - 0.1 * crank
+def vertical_cranks():
+    """All cranks vertical at home: a pitch of 90 degrees. Crank angles are zero."""
+    rods = parallel_rods()
+    out, up = rods.R_WS[:, :, 2], np.array([0.0, 0.0, 1.0])
+    p_WS, crank = 0.2 * out, np.tile(up, (6, 1))
     R_WS = np.stack([crank, np.cross(out, crank), out], axis=2)
-    p_SQ = PAPER.home[3:] + p_PQ - p_WS
+    p_SQ = PAPER.home[3:] + rods.p_PQ - p_WS
     return dataclasses.replace(
-        PAPER,
+        rods,
         p_WS=p_WS,
         R_WS=R_WS,
-        p_PQ=p_PQ,
-        crank_lengths=np.full(6, 0.1),
         rod_lengths=np.linalg.norm(p_SQ - 0.1 * crank, axis=1),
         branches=-np.sign(np.einsum("li,li->l", p_SQ, R_WS[:, :, 1])),
     )
@@ -198,7 +190,7 @@ def test_motors_are_the_only_actuators_in_the_order_of_the_legs(limit):
 
 @pytest.mark.parametrize(
     "mechanism",
-    [*map(any_machine, range(4)), with_vertical("crank"), with_vertical("rod")],
+    [*map(any_machine, range(4)), vertical_cranks(), parallel_rods()],
     ids=["paper", "random 1", "random 2", "random 3", "vertical cranks", "vertical rods"],
 )
 def test_frames_stand_where_the_mechanism_has_its_joints(mechanism):

@@ -27,7 +27,8 @@ def test_every_scenario_runs_on_both_plants(name, kind):
     if (name, kind) == ("reachy_mini", "multibody"):
         pytest.skip("its servos, given by their stiffness, are in the exact plant only")
     duration = 0.4 if (name, kind) in DIVERGES else SHORT
-    result = simulate(load_scenario(name, None, (f"plant.kind={kind}", f"duration={duration}")))
+    scenario = load_scenario(name, None, (f"plant.kind={kind}", f"duration={duration}"))
+    result = simulate(scenario, judge_stability=False)
     assert result.status == "completed"
     assert result.summary["counts"]["riccati_failures"] == 0
 
@@ -36,7 +37,7 @@ def test_every_scenario_runs_on_both_plants(name, kind):
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
 @pytest.mark.parametrize("name", OWN)
 def test_own_scenarios_complete_in_full(name, kind):
-    result = simulate(load_scenario(name, None, (f"plant.kind={kind}",)))
+    result = simulate(load_scenario(name, None, (f"plant.kind={kind}",)), judge_stability=False)
     assert result.status == "completed"
     assert result.accumulated_error < (1e-3 if kind == "exact" else 0.2)
 
@@ -44,7 +45,7 @@ def test_own_scenarios_complete_in_full(name, kind):
 @pytest.mark.parametrize("controller", [None, "adaptive_lqi"])
 def test_paper_clear_completes_the_papers_scenario_at_full_amplitude(controller):
     settings = ("mechanism=paper_clear", "plant.kind=exact")
-    result = simulate(load_scenario("paper", controller, settings))
+    result = simulate(load_scenario("paper", controller, settings), judge_stability=False)
     assert result.status == "completed"
     assert result.accumulated_error < 25  # % s; most of it is the wait for the first torque
 
@@ -53,7 +54,7 @@ def test_paper_clear_completes_the_papers_scenario_at_full_amplitude(controller)
 def test_own_scenarios_are_tracked_within_the_motors_limit(name):
     """The controller predictor_lqi equals the default of a scenario."""
     middle = load_scenario(name, "predictor_lqi", ("plant.kind=exact", "duration=3.0"))
-    result = simulate(middle)
+    result = simulate(middle, judge_stability=False)
     assert result.status == "completed"
     assert max(result.summary["peak_error"]) < 0.1  # % of peak to peak
     limit, effort = middle.actuator.torque_limit, load_mechanism(middle.mechanism).effort_limit

@@ -102,11 +102,7 @@ def single(tmp_path_factory):
 def test_a_filter_is_right_to_a_share_of_its_deviation(sensor, single, monkeypatch):
     """Every estimate to 3 % of its standard deviation, which is that of double to 0.1 %."""
     calls = observed("predictor_lqi", ("duration=4", *sensor), monkeypatch)
-    law, memory = None, None
-    for observer, before, measurement, in_flight, sensing, plant, after in calls:
-        if law is None:
-            law = single.law(observer, sensing, plant, before.timeline)
-        memory = single.observe(law, memory, measurement, in_flight)
+    for before, after, memory in alongside(single, calls):
         if not before.has_state:
             continue
         n = len(after.estimate.mean)
@@ -131,6 +127,16 @@ def observed(controller, settings, monkeypatch):
     return calls
 
 
+def alongside(single, calls):
+    """Yield beliefs before and after each call, and the memory of the same in single precision."""
+    law, memory = None, None
+    for observer, before, measurement, in_flight, sensing, plant, after in calls:
+        if law is None:
+            law = single.law(observer, sensing, plant, before.timeline)
+        memory = single.observe(law, memory, measurement, in_flight)
+        yield before, after, memory
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
@@ -149,11 +155,7 @@ def observed(controller, settings, monkeypatch):
 def test_the_delay_is_found_to_microseconds_of_that_in_double(settings, single, monkeypatch):
     """At every sample, through the search, a jump, and drift; 0.3 % of its deviation if larger."""
     calls = observed("adaptive_lqi", ("plant.kind=exact", *settings), monkeypatch)
-    law, memory = None, None
-    for observer, before, measurement, in_flight, sensing, plant, after in calls:
-        if law is None:
-            law = single.law(observer, sensing, plant, before.timeline)
-        memory = single.observe(law, memory, measurement, in_flight)
+    for _, after, memory in alongside(single, calls):
         found = single.ffi.from_buffer("stewart_delay_memory *", memory[12:])  # after the state
         bound = max(3e-6, 3e-3 * after.delay_std) if after.settled else 3e-6
         assert found.eta == pytest.approx(after.timeline.arrival, abs=bound)

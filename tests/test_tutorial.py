@@ -8,7 +8,6 @@ import json
 import re
 from pathlib import Path
 
-import joblib
 import pytest
 import xarray as xr
 
@@ -16,7 +15,7 @@ from stewart_drake.cli import main
 from stewart_drake.reporting import report
 from stewart_drake.studies import delay
 from tests import test_docs
-from tests.shorter import judge_few_delays, leave_blank
+from tests.shorter import judge_few_delays, leave_blank, map_few_poses
 from tests.test_report import BLANK
 
 TUTORIAL = test_docs.ROOT / "docs" / "tutorial.md"
@@ -25,8 +24,10 @@ FENCE = re.compile(r"^```(\w+) ?(\S*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 """Language, name under which the reader is told to save it, text."""
 BEFORE, _, _REST = TEXT.partition("\n## 6. ")
 IDENTIFICATION, _, _AFTER = _REST.partition("\n## ")
-SHORTER = ("--set", "duration=4")
-"""Part of the run at half the amplitude that the second fit needs."""
+SLOW = (
+    "simulate waves.yaml --set delay.fraction=0.1 --set controller.delay_steps=4 "
+    "--set controller.w_R=1000"
+)
 OTHERS = f"{BEFORE}\n## {_AFTER}"
 
 
@@ -37,9 +38,7 @@ def do(tmp_path, monkeypatch, capsys):
     # Its simulations over delay and amplitude have tests of their own, and take a while.
     monkeypatch.setattr(delay, "delay_map", lambda *_: ([], False))
     judge_few_delays(monkeypatch)
-    # The report's pieces in this process, which has loaded everything: tests/test_report_stopped.py
-    # has processes.
-    monkeypatch.setattr(joblib, "cpu_count", lambda: 1)
+    map_few_poses(monkeypatch)
     # Commands before it print these analyses.
     monkeypatch.setattr(report, "_analyse", lambda name, scenario: BLANK)
 
@@ -53,11 +52,10 @@ def do(tmp_path, monkeypatch, capsys):
                 capsys.readouterr()
             elif language == "sh":
                 for arguments in test_docs.command_lines(test_docs.Block(TUTORIAL, 0, "sh", text)):
-                    shorter = SHORTER if "out/half" in arguments else ()
                     with pytest.MonkeyPatch.context() as patch:
                         if not {"out/bench", "out/waves"} & {*arguments}:
                             leave_blank(patch)
-                        assert main([*arguments, *shorter]) == 0, arguments
+                        assert main([*arguments, *more(arguments)]) == 0, arguments
                     out, err = capsys.readouterr()
                     assert err == "", arguments
                     assert [line for line in out.splitlines() if len(line) > 80] == [], arguments
@@ -67,13 +65,23 @@ def do(tmp_path, monkeypatch, capsys):
     return done
 
 
+def more(arguments):
+    """Return words that a test adds to a command of the text."""
+    if "out/half" in arguments:  # as much of it as the second fit needs
+        return ["--set", "duration=4"]
+    if {"out/report", "out/board"} & {*arguments}:
+        return ["--set", "duration=3"]
+    return ["--out", "out/slow"] if " ".join(arguments) == SLOW else []
+
+
 def summary(name):
     return json.loads(Path(f"out/{name}/summary.json").read_text())
 
 
 @pytest.mark.slow
-def test_a_machine_and_a_motion_of_one_s_own(do):
+def test_a_machine_and_a_motion_of_one_s_own(do, monkeypatch):
     told = do(OTHERS)
+    leave_blank(monkeypatch)
     run = summary("waves")
     assert run["status"] == "completed" and run["accumulated_error"] < 0.01
     for file in ("signals.csv", "signals.nc", "replay.html", "states.png"):
@@ -89,14 +97,9 @@ def test_a_machine_and_a_motion_of_one_s_own(do):
     for words in ("--set delay.steps=5 --set controller.delay_steps=4", "--controller lqi"):
         out = told[f"simulate waves.yaml {words}"]
         assert "left workspace at" in out and re.search(r"leg \d", out)
-    slow = (
-        "simulate waves.yaml --set delay.fraction=0.1 --set controller.delay_steps=4 "
-        "--set controller.w_R=1000"
-    )
-    assert "completed" in told[slow]
-    given = slow.split()
+    assert "completed" in told[SLOW]
+    given = SLOW.split()
     for name, words in {
-        "slow": given,
         "usual": given[:-2],
         "fast": [*given[:-1], "controller.w_R=1", "--set", "controller.replan=0"],
     }.items():

@@ -184,6 +184,7 @@ def test_sections_meet_the_travel_on_their_axes():
 # ------------------------------------------------------------------ along a reference
 
 
+@pytest.mark.usefixtures("few_poses")
 def test_the_exit_of_a_heave_is_where_the_travel_says():
     """A sin(t) = travel; and at worst the leg is short by what its margin says at the peak."""
     up = travel(PAPER)[5]
@@ -201,6 +202,7 @@ def test_the_exit_of_a_heave_is_where_the_travel_says():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_poses")
 @pytest.mark.parametrize(("later", "fits"), [(-1e-3, True), (1e-3, False)])
 def test_a_motion_is_checked_up_to_its_end_and_not_beyond(later, fits):
     leaves = math.asin(travel(PAPER)[5].high / 0.2)
@@ -280,14 +282,8 @@ def test_the_motors_work_is_the_machine_s_energy():
 # ------------------------------------------------------------------ the command
 
 
-@pytest.fixture
-def quick(monkeypatch):
-    monkeypatch.setattr("stewart_drake.studies.workspace_map.POINTS", 15)
-    monkeypatch.setattr("stewart_drake.studies.workspace_map._ROUGH", 15)
-
-
 @pytest.mark.slow
-@pytest.mark.usefixtures("quick")
+@pytest.mark.usefixtures("few_poses")
 def test_the_command_writes_a_table_a_page_and_a_summary(tmp_path, capsys):
     assert main(["analyze", "workspace", "desktop", "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
@@ -309,7 +305,7 @@ def test_the_command_writes_a_table_a_page_and_a_summary(tmp_path, capsys):
     assert "stewart-drake analyze workspace desktop" in page
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.usefixtures("few_poses")
 def test_a_reference_that_leaves_is_analysed_not_refused(tmp_path, capsys):
     amplitude = "reference.amplitude=[0.3, 0.3, 0.3, 0.02, 0.02, 0.1]"
     arguments = ["analyze", "workspace", "--set", amplitude, "--out", str(tmp_path)]
@@ -326,7 +322,7 @@ def test_a_reference_that_leaves_is_analysed_not_refused(tmp_path, capsys):
     assert (tmp_path / "report.html").read_text().count("<img") == 3
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.usefixtures("few_poses")
 @pytest.mark.parametrize("machine", [parallel_rods(), stretched()], ids=["parallel", "dead centre"])
 def test_a_singular_home_pose_gets_a_verdict(machine, tmp_path, capsys):
     path = write_mechanism(machine, tmp_path / "singular.yaml")
