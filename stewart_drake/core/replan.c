@@ -123,17 +123,16 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     memory[2] = memory[2] < LATEST ? memory[2] + 1 : LATEST;
     /* While the delay is unknown, plan only before the first torque can have acted. */
     const int early = (memory[2] - ROUNDING) * law->period <= EARLY * outlook->eta;
-    const int known = !law->observer->outlook;
     if (!sample->goal || !(outlook->settled || early) || !stewart_all_finite(X, outlook->state))
         return 0;
-    if (known && outlook->caution > 1) /* late torques would undo a plan; raised weights bear them */
+    if (outlook->settled && outlook->caution > 1) /* late torques would undo a plan; raised weights bear them */
         return 0;
     stewart_copy(X, outlook->state, states);
     stewart_predict(&law->machine, outlook->theta, &outlook->until, states, states + X);
     look(law, memory, sample, 1, &outlook->eta, wanted);
     /* A known delay counts as found from the sample at which the first torque has acted for a period
        until the next plan. */
-    const int first = known && has_acted(law, outlook, memory) && !(memory[3] > 0);
+    const int first = !law->observer->outlook && has_acted(law, outlook, memory) && !(memory[3] > 0);
     if (!stewart_is_off(replan->size, states + X * outlook->until.number, wanted,
                         outlook->found || first))
         return 0;

@@ -118,8 +118,8 @@ class Replan:
         timeline, c = belief.timeline, core()
         # While the delay is unknown, plan only before a torque can have acted.
         early = motion.now + (1 - ROUNDING) * timeline.period <= EARLY * timeline.eta
-        known = math.isnan(belief.delay_mean)
-        if not (belief.has_state and (belief.settled or early)) or (known and belief.caution > 1):
+        late = belief.settled and belief.caution > 1  # late torques would undo a plan
+        if late or not (belief.has_state and (belief.settled or early)):
             return before
         schedule = timeline.until_next(timeline.queue(in_flight))
         states = np.vstack([belief.state, plant.predict(belief.state, schedule, belief.parameters)])
@@ -129,7 +129,7 @@ class Replan:
         # period until the next plan.
         acted = timeline.eta + (1 - ROUNDING) * timeline.period
         planned = 0.0 if path is None else path[0, 0]
-        first = known and motion.now >= acted > planned
+        first = math.isnan(belief.delay_mean) and motion.now >= acted > planned
         arrays = c.at(size), c.at(states[-1]), c.at(wanted)
         if not c.lib.stewart_is_off(*arrays, belief.found or first):
             return before
