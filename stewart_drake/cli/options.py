@@ -3,15 +3,13 @@
 import contextlib
 import inspect
 from collections.abc import Callable, Collection, Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.options import Option, Options
-
-if TYPE_CHECKING:
-    from stewart_drake.scenario.config import Scenario
 
 
 class Given:
@@ -43,7 +41,7 @@ class Given:
 
     def options(
         self,
-        load: "Callable[[str], Scenario] | None" = None,
+        load: Callable[[str], Scenario] | None = None,
         more: Mapping[str, Any] | None = None,
     ) -> Any:
         """Return the options.
