@@ -26,7 +26,7 @@ class Given:
     @property
     def missing(self) -> list[Option]:
         """Required options that were not given."""
-        return [one for one in _offered(self._kind) if one.required and not self._given(one)]
+        return [one for one in _offered(self._kind) if one.required and one.name not in self.given]
 
     @property
     def words(self) -> dict[str, Any]:
@@ -63,9 +63,6 @@ class Given:
         except ConfigError as error:
             name, colon, rest = str(error).partition(":")
             raise ConfigError(f"{flags.get(name, name)}{colon}{rest}") from None
-
-    def _given(self, one: Option) -> bool:
-        return self._typed[_name(one)] is not None
 
     def _value(self, one: Option, load: Any) -> Any:
         typed = self._typed[_name(one)]

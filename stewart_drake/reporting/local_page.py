@@ -20,7 +20,7 @@ _LONGEST: Final = 4096
 
 
 class LocalServer(ThreadingHTTPServer):
-    """Server on a free port of 127.0.0.1, in threads of its own.
+    """Server on a free port of 127.0.0.1, in background threads.
 
     Args:
         template: name of the page's template, which gets `values` and the `token`.
