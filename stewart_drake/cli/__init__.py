@@ -5,14 +5,16 @@ import functools
 import os
 import sys
 import tempfile
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import typer
 
+import stewart_drake as sd
 from stewart_drake.cli import analyze, identify, live, model, run, tune
 from stewart_drake.cli.common import INTERRUPTED, release
 from stewart_drake.cli.examples import add_examples
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import KINDS, shipped
 from stewart_drake.reporting.analyses import RENAMED
 from stewart_drake.reporting.terminal import echo
 
@@ -100,13 +102,11 @@ def _prepare_surroundings() -> None:
 @app.callback(invoke_without_command=True)
 def _root(
     context: typer.Context,
-    show_version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    show_version: bool = typer.Option(False, "--version", help="Print the version."),
 ) -> None:
     """Delay-aware control of rotary Stewart platforms, simulated with Drake."""
     if show_version:
-        from importlib.metadata import version
-
-        typer.echo(f"stewart-drake {version('stewart-drake')}")
+        typer.echo(f"stewart-drake {sd.__version__}")
         raise typer.Exit
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
@@ -115,7 +115,6 @@ def _root(
 @app.command("list")
 def list_shipped() -> None:
     """List the shipped models, scenarios and so on."""
-    from stewart_drake.files.resources import KINDS, shipped
     from stewart_drake.reporting.terminal import shipped_table
 
     for kind, heading in KINDS.items():

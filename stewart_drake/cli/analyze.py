@@ -3,7 +3,6 @@
 import contextlib
 from collections.abc import Callable
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import typer
 
@@ -21,9 +20,8 @@ from stewart_drake.cli.common import (
 from stewart_drake.cli.options import Given, with_options
 from stewart_drake.reporting.analyses import ANALYSES, analyze, options_of, words_of
 from stewart_drake.reporting.terminal import count_bar
-
-if TYPE_CHECKING:
-    from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import load_scenario
 
 app = typer.Typer(rich_markup_mode=None, help="Analyse a loop before it is built.")
 
@@ -51,12 +49,11 @@ def _callback(name: str) -> Callable[..., int]:
         as_json: AsJson = False,
     ) -> int:
         from stewart_drake.reporting.page import command_line
-        from stewart_drake.scenario.loading import load_scenario
 
         typed = settings or []
         fixed = ("plant.kind=exact",) if row.exact else ()
 
-        def load(controller: str | None) -> "Scenario":
+        def load(controller: str | None) -> Scenario:
             return load_scenario(scenario, controller, (*fixed, *typed))
 
         options = given.options(load)

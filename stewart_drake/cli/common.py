@@ -13,14 +13,16 @@ import typer
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials
+from stewart_drake.files.resources import Kind, shipped
+from stewart_drake.reporting.document import WIDTH, wrap
 from stewart_drake.reporting.terminal import echo
+from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import setting_choices
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from stewart_drake.files.resources import Kind
     from stewart_drake.reporting.results import AnalysisResult
-    from stewart_drake.scenario.config import Scenario
 
 INTERRUPTED: Final = 130
 """Exit status after Ctrl-C."""
@@ -30,39 +32,28 @@ _at_exit: Final = contextlib.ExitStack()
 """Clean-up when the running command ends."""
 
 
-def _shipped(kind: "Kind") -> Callable[[str], list[str]]:
-    """Return the completion of shipped names."""
-
+def _shipped_argument(kind: Kind) -> Any:
     def complete(incomplete: str) -> list[str]:
-        from stewart_drake.files.resources import shipped
-
         return [name for name in shipped(kind) if name.startswith(incomplete)]
 
-    return complete
+    help = "Shipped name or file."
+    return typer.Argument(metavar=kind.upper(), help=help, autocompletion=complete)
 
 
-def complete_setting(incomplete: str) -> list[str]:
+def _complete_setting(incomplete: str) -> list[str]:
     """Return completions of `--set`: field names, and the values of fields with few values."""
-    from stewart_drake.scenario.loading import setting_choices
-
     return [text for text in setting_choices() if text.startswith(incomplete)]
 
 
-def _shipped_argument(metavar: str, kind: "Kind") -> Any:
-    return typer.Argument(
-        metavar=metavar, help="Shipped name or file.", autocompletion=_shipped(kind)
-    )
-
-
-ScenarioName = Annotated[str, _shipped_argument("SCENARIO", "scenario")]
-MechanismName = Annotated[str, _shipped_argument("MECHANISM", "mechanism")]
+ScenarioName = Annotated[str, _shipped_argument("scenario")]
+MechanismName = Annotated[str, _shipped_argument("mechanism")]
 Settings = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
         metavar="FIELD=VALUE",
         help="Set a field, such as plant.gravity=true; repeatable.",
-        autocompletion=complete_setting,
+        autocompletion=_complete_setting,
     ),
 ]
 Controller = Annotated[
@@ -174,12 +165,10 @@ class Delivery:
 
     def say_wrapped(self, *lines: str) -> None:
         """Print lines, each wrapped at 80 columns."""
-        from stewart_drake.reporting.document import wrap
-
         for line in lines:
             self.say(wrap(line))
 
-    def say_link(self, scenario: "Scenario") -> None:
+    def say_link(self, scenario: Scenario) -> None:
         from stewart_drake.scenario.link import link_text
 
         if text := link_text(scenario):
@@ -244,7 +233,6 @@ class Delivery:
     def end(self, summary: Mapping[str, Any], interrupted: bool = False) -> int:
         """Print the names of the written files, or the summary as JSON; return the exit status."""
         from stewart_drake.files.jsonio import jsonable
-        from stewart_drake.reporting.document import WIDTH, wrap
 
         if self.out is not None:
             head, files = f"written to {self.out}:", ", ".join(self._written)

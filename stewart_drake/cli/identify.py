@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -10,62 +10,47 @@ from stewart_drake.cli.common import AsJson, Delivery, Out, Quiet, Settings
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.tolerances import TOLERANCE_UNITS, read_tolerances
 from stewart_drake.reporting.terminal import count_bar
+from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.options import refuse
 
 if TYPE_CHECKING:
     from stewart_drake.identification.logs import Precision
 
-Tolerance = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME=VALUE",
-        help="Standard deviation of an unknown, 0: known. Repeatable. "
-        + "; ".join(f"{name}: {unit}" for name, unit in TOLERANCE_UNITS.items())
-        + ".",
-    ),
-]
-Bits = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N",
-        help="Bits per turn of the encoders of a CSV log; 14, or 12 of position servos.",
-    ),
-]
-Gravity = Annotated[
-    bool | None,
-    typer.Option(help="Gravity acts on the machine of a CSV log, or is balanced."),
-]
+_UNITS = "; ".join(f"{name}: {unit}" for name, unit in TOLERANCE_UNITS.items())
 
 
 def identify(
-    logs: Annotated[
-        list[Path] | None,
-        typer.Argument(metavar="[LOG]...", help="Logs of one machine: of a run, or CSV."),
-    ] = None,
-    mechanism: Annotated[
-        str | None, typer.Option(metavar="NAME|FILE", help="Mechanism as drawn; needed with logs.")
-    ] = None,
-    plan: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SCENARIO", help="Plan a motion to log for this scenario, without logs."
-        ),
-    ] = None,
+    logs: list[Path] | None = typer.Argument(
+        None, metavar="[LOG]...", help="Logs of one machine: of a run, or CSV."
+    ),
+    mechanism: str | None = typer.Option(
+        None, metavar="NAME|FILE", help="Mechanism as drawn; needed with logs."
+    ),
+    plan: str | None = typer.Option(
+        None, metavar="SCENARIO", help="Plan a motion to log for this scenario, without logs."
+    ),
     settings: Settings = None,
-    delay: Annotated[
-        float | None,
-        typer.Option(metavar="S", help="Assumed delay; that of the log by default, or 0.1 s."),
-    ] = None,
-    tolerance: Tolerance = None,
-    bits: Bits = None,
-    pose_std: Annotated[
-        str | None,
-        typer.Option(
-            metavar="RAD,M",
-            help="Errors of measured poses; 1e-4,2e-5 in a CSV log. With --plan: measure poses.",
-        ),
-    ] = None,
-    gravity: Gravity = None,
+    delay: float | None = typer.Option(
+        None, metavar="S", help="Assumed delay; that of the log by default, or 0.1 s."
+    ),
+    tolerance: list[str] | None = typer.Option(
+        None,
+        metavar="NAME=VALUE",
+        help=f"Standard deviation of an unknown, 0: known. Repeatable. {_UNITS}.",
+    ),
+    bits: int | None = typer.Option(
+        None,
+        metavar="N",
+        help="Bits per turn of the encoders of a CSV log; 14, or 12 of position servos.",
+    ),
+    pose_std: str | None = typer.Option(
+        None,
+        metavar="RAD,M",
+        help="Errors of measured poses; 1e-4,2e-5 in a CSV log. With --plan: measure poses.",
+    ),
+    gravity: bool | None = typer.Option(
+        None, help="Gravity acts on the machine of a CSV log, or is balanced."
+    ),
     out: Out = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -102,7 +87,6 @@ def identify(
     from stewart_drake.identification.plan import MOTION
     from stewart_drake.identification.servo_plan import SETPOINTS_FILE
     from stewart_drake.reporting.page import command_line
-    from stewart_drake.scenario.loading import load_scenario
 
     chosen: Any = {"tolerances": tolerances, "precision": precision}
     if plan is not None:

@@ -9,7 +9,7 @@ import sys
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
@@ -27,6 +27,7 @@ from stewart_drake.cli.options import Given, with_options
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.options import LiveOptions, MachineOptions
 from stewart_drake.reporting.terminal import echo
+from stewart_drake.scenario.loading import load_scenario
 
 if TYPE_CHECKING:
     from stewart_drake.live.page import PageViewer
@@ -45,17 +46,13 @@ _REQUESTS: Final = (signal.SIGINT, signal.SIGTERM)
 def live(
     *,
     scenario: ScenarioName = "paper",
-    machine: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Address of the machine.")
-    ] = None,
-    demo: Annotated[
-        bool,
-        typer.Option(
-            "--demo",
-            help="Start a simulated machine too, with 0.35 to 0.4 of the delay each way.",
-        ),
-    ] = False,
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="Open no page.")] = False,
+    machine: str | None = typer.Option(None, metavar="HOST:PORT", help="Address of the machine."),
+    demo: bool = typer.Option(
+        False,
+        "--demo",
+        help="Start a simulated machine too, with 0.35 to 0.4 of the delay each way.",
+    ),
+    no_browser: bool = typer.Option(False, "--no-browser", help="Open no page."),
     given: Given,
     controller: Controller = None,
     settings: Settings = None,
@@ -68,8 +65,6 @@ def live(
     The law is that of `simulate`; a page in the browser has sliders for the pose. Ctrl-C brings the
     plate to rest and ends the run; Ctrl-C again, or Stop on the page, stops it at once.
     """
-    from stewart_drake.scenario.loading import load_scenario
-
     if (machine is None) != demo:
         raise ConfigError("--machine: expected either --machine HOST:PORT or --demo")
     options = given.options()
@@ -280,7 +275,6 @@ def machine(
         raise KeyboardInterrupt
 
     from stewart_drake.live.reachy import open_chosen
-    from stewart_drake.scenario.loading import load_scenario
 
     options, loaded = given.options(), load_scenario(scenario, controller, settings or ())
     delivery, interrupted = Delivery(None, quiet, as_json), False

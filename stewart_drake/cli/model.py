@@ -4,10 +4,10 @@ import re
 import sys
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import stewart_drake as sd
 from stewart_drake.cli.common import (
     AsJson,
     Delivery,
@@ -21,10 +21,9 @@ from stewart_drake.cli.options import Given, with_options
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.reporting.terminal import echo
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.studies.options import Option, quantity
 from stewart_drake.studies.study_options import LARGEST, Measurements
-
-if TYPE_CHECKING:
-    from stewart_drake.studies.options import Option
 
 app = typer.Typer(rich_markup_mode=None, help="Check and view a mechanism.")
 
@@ -32,15 +31,12 @@ app = typer.Typer(rich_markup_mode=None, help="Check and view a mechanism.")
 @app.command()
 def sdf(
     mechanism: MechanismName,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="File to write, in place of standard output."),
-    ] = None,
+    out: Path | None = typer.Option(
+        None, metavar="FILE", help="File to write, in place of standard output."
+    ),
 ) -> None:
     """Write a mechanism as SDFormat."""
-    from stewart_drake.functions import model_sdf
-
-    text = model_sdf(mechanism)
+    text = sd.model_sdf(mechanism)
     if out is None:
         typer.echo(text, nl=False)
     else:
@@ -52,14 +48,11 @@ def sdf(
 @app.command()
 def check(
     mechanism: MechanismName,
-    out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder of summary and drawing.")
-    ] = None,
+    out: Path | None = typer.Option(None, metavar="DIR", help="Folder of summary and drawing."),
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
     """Check a mechanism and describe it at its home pose, under gravity."""
-    from stewart_drake.functions import check_model
     from stewart_drake.reporting.mechanism import document
 
     def draw(folder: Path) -> None:
@@ -69,7 +62,7 @@ def check(
         write_figures({"mechanism": mechanism_figure(found.mechanism)}, folder)
 
     delivery = Delivery(out, quiet, as_json)
-    found = check_model(mechanism)
+    found = sd.check_model(mechanism)
     delivery.say(document(found).plain())
     delivery.discard("mechanism.png", "mechanism.svg")
     delivery.write(found.summary)
@@ -80,17 +73,16 @@ def check(
 @app.command()
 def view(
     mechanism: MechanismName,
-    out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write a page of the home pose, and end.")
-    ] = None,
+    out: Path | None = typer.Option(
+        None, metavar="DIR", help="Write a page of the home pose, and end."
+    ),
     quiet: Quiet = False,
 ) -> None:
     """Show a mechanism in a browser, with sliders for its pose."""
-    from stewart_drake.mechanism.files import load_mechanism
     from stewart_drake.reporting.viewer import STOP, PoseViewer
 
     delivery = Delivery(out, quiet)
-    viewer = PoseViewer(load_mechanism(mechanism), open_meshcat())
+    viewer = PoseViewer(sd.load_mechanism(mechanism), open_meshcat())
     if out is not None:
         write_whole(out / "view.html", viewer.meshcat.StaticHtml())
         delivery.wrote("view.html")
@@ -107,11 +99,9 @@ def view(
 @with_options(Measurements)
 def new(
     *,
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the files.")],
+    folder: Path = typer.Argument(metavar="DIR", help="Folder of the files."),
     given: Given,
-    form: Annotated[
-        bool, typer.Option("--form", help="Ask by a form in a browser, with a drawing.")
-    ] = False,
+    form: bool = typer.Option(False, "--form", help="Ask by a form in a browser, with a drawing."),
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
@@ -150,7 +140,6 @@ def _new(
     from stewart_drake.reporting.page import Provenance, command_line, html
     from stewart_drake.reporting.report import first_report
     from stewart_drake.reporting.results import PAGE
-    from stewart_drake.scenario.loading import load_scenario
     from stewart_drake.studies import new_machine as study
     from stewart_drake.studies.verdict import Verdict, loop_verdict
 
@@ -204,9 +193,7 @@ def _measured(given: Given, asking: bool) -> Measurements:
             return measurements
 
 
-def _ask(one: "Option") -> float:
-    from stewart_drake.studies.options import quantity
-
+def _ask(one: Option) -> float:
     question, unit = one.help[0].lower() + one.help[1:-1], one.unit or ""
     while True:
         text = str(typer.prompt(question)).strip()

@@ -3,15 +3,13 @@
 import contextlib
 import inspect
 from collections.abc import Callable, Collection, Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.options import Option, Options
-
-if TYPE_CHECKING:
-    from stewart_drake.scenario.config import Scenario
 
 
 class Given:
@@ -28,7 +26,7 @@ class Given:
     @property
     def missing(self) -> list[Option]:
         """Required options that were not given."""
-        return [one for one in _offered(self._kind) if one.required and not self._given(one)]
+        return [one for one in _offered(self._kind) if one.required and one.name not in self.given]
 
     @property
     def words(self) -> dict[str, Any]:
@@ -43,7 +41,7 @@ class Given:
 
     def options(
         self,
-        load: "Callable[[str], Scenario] | None" = None,
+        load: Callable[[str], Scenario] | None = None,
         more: Mapping[str, Any] | None = None,
     ) -> Any:
         """Return the options.
@@ -65,9 +63,6 @@ class Given:
         except ConfigError as error:
             name, colon, rest = str(error).partition(":")
             raise ConfigError(f"{flags.get(name, name)}{colon}{rest}") from None
-
-    def _given(self, one: Option) -> bool:
-        return self._typed[_name(one)] is not None
 
     def _value(self, one: Option, load: Any) -> Any:
         typed = self._typed[_name(one)]

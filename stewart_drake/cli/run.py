@@ -5,10 +5,11 @@ import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Final
 
 import typer
 
+import stewart_drake as sd
 from stewart_drake.cli.common import (
     AsJson,
     Controller,
@@ -24,12 +25,12 @@ from stewart_drake.cli.common import (
     open_meshcat,
 )
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.reporting.document import Caution
 from stewart_drake.reporting.terminal import count_bar, echo, progress_bars
+from stewart_drake.scenario.loading import load_compatible, load_scenario
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pydrake.geometry import Meshcat
-
 
 CSV: Final = "signals.csv"
 REPLAY: Final = "replay.html"
@@ -45,27 +46,21 @@ def simulate(
     controller: Controller = None,
     settings: Settings = None,
     out: Out = None,
-    csv: Annotated[
-        bool, typer.Option("--csv", help="Also write signals.csv; needs --out.")
-    ] = False,
-    replay: Annotated[
-        bool, typer.Option("--replay", help="Write replay.html, a 3-D animation; needs --out.")
-    ] = False,
+    csv: bool = typer.Option(False, "--csv", help="Also write signals.csv; needs --out."),
+    replay: bool = typer.Option(
+        False, "--replay", help="Write replay.html, a 3-D animation; needs --out."
+    ),
     log: Log = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
-    meshcat: Annotated[
-        bool, typer.Option("--meshcat", help="Show the run in a browser, live and as a replay.")
-    ] = False,
+    meshcat: bool = typer.Option(
+        False, "--meshcat", help="Show the run in a browser, live and as a replay."
+    ),
 ) -> int:
     """Run one scenario."""
     from stewart_drake.loop.cautions import cautions_before
     from stewart_drake.loop.controller_margin import controller_margin
     from stewart_drake.loop.preparation import prepare
-    from stewart_drake.loop.simulation import simulate as run
-    from stewart_drake.reporting.document import Caution
-    from stewart_drake.reporting.run import run_document
-    from stewart_drake.scenario.loading import load_scenario
     from stewart_drake.studies.verdict import Verdict, loop_verdict
 
     for option, given in (("--csv", csv), ("--replay", replay)):
@@ -85,19 +80,13 @@ def simulate(
         _await_viewer(viewer)
     name = Path(scenario).stem
     with progress_bars([name], experiment.scenario.duration, quiet) as progress:
-        shown = progress[name]
-        result = run(experiment, progress=shown, meshcat=viewer, judge_stability=margin, log=log)
-    delivery.say(run_document(result).plain())
-
-    def draw() -> "dict[str, Figure]":
-        from stewart_drake.reporting.figures import draw_run
-
-        return draw_run(result)
+        result = sd.simulate(
+            experiment, progress=progress[name], meshcat=viewer, judge_stability=margin, log=log
+        )
+    delivery.say(result.table())
 
     def film(folder: Path) -> None:
-        from stewart_drake.reporting.replay import write_replay
-
-        write_replay(result, experiment.truth, folder / REPLAY, name)
+        result.replay(folder / REPLAY, mechanism=experiment.truth, title=name)
 
     # The summary is written last of the results: where it exists, the signals are of the same run.
     delivery.discard(CSV, REPLAY, *_pictures(RUN_FIGURES))
@@ -108,16 +97,14 @@ def simulate(
             write_csv(result.signals, out / CSV)
         result.save(out)
         delivery.wrote("summary.json", "signals.nc", *[CSV] * csv)
-    delivery.figures(draw)
+    delivery.figures(result.plot)
     if replay or meshcat:
         delivery.draw(REPLAY, film)
     if log is not None:
         delivery.say(f"log written to {log}")
     status = delivery.end(result.summary, interrupted=result.status == "interrupted")
     if viewer is not None:
-        from stewart_drake.reporting.replay import replay as play
-
-        play(result.signals, experiment.truth, viewer)
+        result.replay(meshcat=viewer, mechanism=experiment.truth)
         if sys.stdin.isatty():
             input(f"replay at {viewer.web_url()}, Enter ends")
     return status
@@ -139,22 +126,19 @@ def _pictures(names: Iterable[str]) -> list[str]:
 
 
 def export(
-    signals: Annotated[
-        Path, typer.Argument(metavar="FILE", help="signals.nc, log (.mcap, .csv), or run's folder.")
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="File to write, in place of standard output."),
-    ] = None,
+    signals: Path = typer.Argument(
+        metavar="FILE", help="signals.nc, log (.mcap, .csv), or run's folder."
+    ),
+    out: Path | None = typer.Option(
+        None, metavar="FILE", help="File to write, in place of standard output."
+    ),
 ) -> None:
     """Convert saved signals to CSV.
 
     A line per instant; the header has the unit of each column.
     """
-    from stewart_drake import functions
-
     check_file(out)
-    text = functions.export_csv(signals, out)
+    text = sd.export_csv(signals, out)
     if out is None:
         typer.echo(text, nl=False)
     else:
@@ -162,61 +146,49 @@ def export(
 
 
 def replay(
-    log: Annotated[
-        Path,
-        typer.Argument(metavar="LOG", help="Log (.mcap, .csv), signals.nc, or run's folder."),
-    ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Page to write.")] = Path(REPLAY),
+    log: Path = typer.Argument(
+        metavar="LOG", help="Log (.mcap, .csv), signals.nc, or run's folder."
+    ),
+    out: Path = typer.Option(REPLAY, metavar="FILE", help="Page to write."),
 ) -> None:
     """Write a log as a 3-D animation, one HTML file."""
-    from stewart_drake.functions import replay_log
-
     check_file(out)
-    replay_log(log, out)
+    sd.replay_log(log, out)
     echo(f"written to {out}")
 
 
 def export_c(
     scenario: ScenarioName = "paper",
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")] = Path(
-        "out/export-c"
-    ),
+    out: Path = typer.Option("out/export-c", metavar="DIR", help="Folder to write."),
     controller: Controller = None,
     settings: Settings = None,
-    single: Annotated[bool, typer.Option("--single", help="Use single precision.")] = False,
+    single: bool = typer.Option(False, "--single", help="Use single precision."),
 ) -> None:
     """Write the controller as C, for a board.
 
     A folder that builds with its own Makefile; its test replays a run of the scenario.
     """
-    from stewart_drake.functions import export_c as export
-
     check_writable(out)
-    files = export(scenario, out, controller, settings or (), single=single)
+    files = sd.export_c(scenario, out, controller, settings or (), single=single)
     echo(f"written to {out}: {len(files)} files; make test replays the run")
 
 
 def setpoints(
     scenario: ScenarioName = "reachy_mini",
-    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="File to write.")] = Path(
-        "out/setpoints.csv"
+    out: Path = typer.Option("out/setpoints.csv", metavar="FILE.csv", help="File to write."),
+    rate: float = typer.Option(50.0, metavar="HZ", help="Setpoints per second."),
+    plain: bool = typer.Option(
+        False, "--plain", help="Angles of the reference, without compensation."
     ),
-    rate: Annotated[float, typer.Option(metavar="HZ", help="Setpoints per second.")] = 50.0,
-    plain: Annotated[
-        bool, typer.Option("--plain", help="Angles of the reference, without compensation.")
-    ] = False,
-    start: Annotated[
-        str | None,
-        typer.Option(
-            "--from",
-            metavar="POSE",
-            help="Pose where the plate rests: roll,pitch,yaw in rad, x,y,z in m.",
-        ),
-    ] = None,
-    units: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Units of the servos: rad, deg or ticks, offset, sign."),
-    ] = None,
+    start: str | None = typer.Option(
+        None,
+        "--from",
+        metavar="POSE",
+        help="Pose where the plate rests: roll,pitch,yaw in rad, x,y,z in m.",
+    ),
+    units: Path | None = typer.Option(
+        None, metavar="FILE", help="Units of the servos: rad, deg or ticks, offset, sign."
+    ),
     controller: Controller = None,
     settings: Settings = None,
 ) -> None:
@@ -225,14 +197,11 @@ def setpoints(
     They are compensated for the torque of the motion, and checked for reach, and for range, speed
     and torque of each motor.
     """
-    from stewart_drake.functions import setpoints as make
-
     check_file(out)
-    pose = None if start is None else _pose(start)
-    made = make(
+    made = sd.setpoints(
         *(scenario, rate, out),
         plain=plain,
-        start=pose,
+        start=None if start is None else _pose(start),
         units=units,
         controller=controller,
         settings=settings or (),
@@ -260,10 +229,9 @@ def _pose(text: str) -> list[float]:
 
 def compare(
     scenario: ScenarioName = "paper",
-    controllers: Annotated[
-        str | None,
-        typer.Option(metavar="A,B,...", help="Names or files of controllers, in this order."),
-    ] = None,
+    controllers: str | None = typer.Option(
+        None, metavar="A,B,...", help="Names or files of controllers, in this order."
+    ),
     settings: Settings = None,
     out: Out = None,
     quiet: Quiet = False,
@@ -271,15 +239,8 @@ def compare(
 ) -> int:
     """Compare controllers on a scenario: by default the shipped ones."""
     from stewart_drake.loop.preparation import prepare
-    from stewart_drake.reporting.run import comparison_document
-    from stewart_drake.scenario.loading import load_compatible
     from stewart_drake.studies import compare as study
     from stewart_drake.studies.verdict import delay_verdict
-
-    def draw() -> "dict[str, Figure]":
-        from stewart_drake.reporting.figures import draw_comparison
-
-        return draw_comparison(results)
 
     chosen = None if controllers is None else [one.strip() for one in controllers.split(",")]
     names = tuple(study.shown(scenario, settings or (), chosen))
@@ -288,20 +249,20 @@ def compare(
     delivery.say_link(experiment.scenario)
     delivery.say_wrapped(str(delay_verdict(experiment)))
     with progress_bars(names, experiment.scenario.duration, quiet) as progress:
-        results = study.compare(
+        results = sd.compare(
             scenario,
             settings or (),
             lambda name, time, error: progress[name](time, error),
             controllers=chosen,
         )
-    delivery.say(comparison_document(results).plain())
+    delivery.say(results.table())
     known = dict.fromkeys((*names, *study.LABELS))
     drawn = [f"{what}_{name}" for what in OF_CONTROLLERS for name in known]
     delivery.discard(*(f"{name}.nc" for name in known), *_pictures((*COMPARED_FIGURES, *drawn)))
     if out is not None:
-        study.save_comparison(results, out)
+        results.save(out)
         delivery.wrote("summary.json", f"{len(results)} signal files")
-    delivery.figures(draw)
+    delivery.figures(results.plot)
     ended = [result.status for result in results.values()]
     interrupted = "interrupted" in ended or len(ended) < len(names)
     return delivery.end(study.comparison_summary(results), interrupted)
@@ -311,7 +272,7 @@ def report(
     scenario: ScenarioName = "paper",
     controller: Controller = None,
     settings: Settings = None,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")] = Path("out/report"),
+    out: Path = typer.Option("out/report", metavar="DIR", help="Folder to write."),
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import stewart_drake as sd
 from stewart_drake.cli.common import (
     GO_ON,
     AsJson,
@@ -46,11 +47,9 @@ def dataset(
 
     The grid varies delay, frequency and weights. A family has faults of timing, friction and noise.
     """
-    from stewart_drake.functions import make_tuner_data
-
     chosen, delivery = dict(given.options()), Delivery(out, quiet, as_json)
     with given.named(), stopping(GO_ON), count_bar("conditions", quiet) as progress:
-        found = make_tuner_data(
+        found = sd.make_tuner_data(
             out, scenario, controller, settings or (), progress=progress, **chosen
         )
     delivery.write(found.summary)
@@ -63,13 +62,13 @@ def dataset(
 @with_options(TrainingOptions)
 def train(
     *,
-    data: Annotated[
-        Path, typer.Argument(metavar="DATA", help="Folder or file that tune dataset wrote.")
-    ],
+    data: Path = typer.Argument(metavar="DATA", help="Folder or file that tune dataset wrote."),
     given: Given,
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="File of the network; figures go to its folder.")
-    ] = Path("out/tuner/tuner.json"),
+    out: Path = typer.Option(
+        "out/tuner/tuner.json",
+        metavar="FILE",
+        help="File of the network; figures go to its folder.",
+    ),
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
@@ -78,7 +77,6 @@ def train(
     By Levenberg-Marquardt on labels. With --regret on the runs of a family, then on runs of the
     network itself.
     """
-    from stewart_drake.functions import train_tuner
 
     def draw() -> "dict[str, Figure]":
         from stewart_drake.reporting.tuner import training_figures
@@ -94,7 +92,7 @@ def train(
     name, kept = ("own runs", GO_ON) if options.regret else ("training", "nothing written")
     first = "training" if options.regret else "computing"
     with given.named(), stopping(kept), count_bar(name, delivery.silent, first) as progress:
-        found = train_tuner(data, out, progress=progress, **dict(options))
+        found = sd.train_tuner(data, out, progress=progress, **dict(options))
     delivery.discard()
     delivery.wrote(out.name, *([f"{out.stem}-runs/"] if options.regret else []))
     delivery.write(found.summary)
@@ -108,14 +106,11 @@ def train(
 @with_options(EvaluationOptions)
 def evaluate(
     *,
-    weights: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[WEIGHTS]...", help="Shipped name or file; several with --family."),
-    ] = None,
+    weights: list[str] | None = typer.Argument(
+        None, metavar="[WEIGHTS]...", help="Shipped name or file; several with --family."
+    ),
     out: Out = Path("out/tuner/evaluation"),
-    scenario: Annotated[
-        str, typer.Option(metavar="SCENARIO", help="Shipped name or file.")
-    ] = "paper",
+    scenario: str = typer.Option("paper", metavar="SCENARIO", help="Shipped name or file."),
     controller: Controller = None,
     settings: Settings = None,
     given: Given,
@@ -126,7 +121,6 @@ def evaluate(
 
     With --family on fresh conditions of a family, where runs that end early count too.
     """
-    from stewart_drake.functions import evaluate_tuner
     from stewart_drake.reporting.page import command_line, write_page
 
     options, delivery = given.options(), Delivery(out, quiet, as_json)
@@ -140,7 +134,7 @@ def evaluate(
         options={"family": words.pop("family"), **names, **dict(sorted(words.items()))},
     )
     with given.named(), stopping(GO_ON), count_bar("conditions", quiet) as progress:
-        found = evaluate_tuner(
+        found = sd.evaluate_tuner(
             out,
             weights or [],
             scenario,

@@ -16,13 +16,7 @@ Shapes = Mapping[str, tuple[str, tuple[int, ...]]]
 
 
 def load_npz(path: Path, shapes: Shapes, expected: str) -> dict[str, NDArray[Any]]:
-    """Read exactly these arrays from a file of `numpy.savez`; nothing is unpickled.
-
-    Args:
-        path: of the file.
-        shapes: of its arrays.
-        expected: description of the file, closing every message.
-    """
+    """Read exactly these arrays from a file of `numpy.savez`; nothing is unpickled."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
@@ -38,10 +32,6 @@ def load_netcdf(path: Path, expected: str) -> xr.Dataset:
     """Read a NetCDF 4 file; times stay the numbers that they are in the file.
 
     The HDF5 library may hang or end the process on a damaged file.
-
-    Args:
-        path: of the file.
-        expected: description of the file, closing every message.
     """
     try:
         return xr.load_dataset(path, engine="h5netcdf", decode_times=False, decode_timedelta=False)

@@ -7,7 +7,6 @@ listen on this computer only (`reporting.local_page`).
 import json
 import logging
 import multiprocessing
-import secrets
 import threading
 import time
 from collections.abc import Iterator
@@ -23,8 +22,7 @@ from stewart_drake.files.jsonio import jsonable
 from stewart_drake.live.governor import Request
 from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.reporting.local_page import LocalHandler, LocalServer
-from stewart_drake.reporting.page import environment
+from stewart_drake.reporting.local_page import LocalServer
 from stewart_drake.reporting.style import FACTORS
 from stewart_drake.reporting.viewer import slider_range
 from stewart_drake.scenario.signals import COORDINATE_NAMES, POSE, RATES
@@ -135,6 +133,12 @@ class Readouts:
             self._changed.wait_for(lambda: self._number != number, timeout=5.0)
             return self._text, self._number
 
+    def events(self) -> Iterator[str]:
+        number = -1
+        while True:
+            text, number = self.after(number)
+            yield text
+
 
 def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
     """Serve the page until the loop closes the connection."""
@@ -148,24 +152,25 @@ def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
     logging.getLogger("drake").setLevel(logging.WARNING)  # hides Meshcat's own address
     meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
     scene, readouts = Scene(mechanism, meshcat), Readouts()
-    token, lock = secrets.token_urlsafe(24), threading.Lock()
-    low, high = slider_range(mechanism)
+    lock, (low, high) = threading.Lock(), slider_range(mechanism)
 
-    def ask(request: PageRequest) -> None:
+    def ask(_: str, data: bytes) -> str | None:
+        request = read_request(data)
+        if request is None:
+            return None
         if request.target is not None:
             target = np.clip(request.target, low / FACTORS, high / FACTORS)
             request = request._replace(target=target)
         with lock, suppress(OSError):
             connection.send(request)
+        return "{}"
 
     sliders = [
         {"name": name, "unit": "deg" if i < 3 else "mm", "low": low[i], "high": high[i]}
         for i, name in enumerate(COORDINATE_NAMES)
     ]
-    page = environment().get_template("live.html.j2")
-    text = page.render(title=title, meshcat=meshcat.web_url(), token=token, sliders=sliders)
-    server = LocalServer(_handler(text, token, readouts, ask))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
+    values = {"title": title, "meshcat": meshcat.web_url(), "sliders": sliders}
+    server = LocalServer("live.html.j2", values, {"/events": readouts.events}, ask)
     with suppress(EOFError, OSError):  # the loop is gone
         with lock:
             connection.send(server.url)
@@ -221,35 +226,6 @@ def _values(seen: Snapshot) -> dict[str, Any]:
         "byHand": seen.by_hand,
         "limit": seen.limit,
     }
-
-
-def _handler(page: str, secret: str, readouts: Readouts, ask: Any) -> type[LocalHandler]:
-    class Handler(LocalHandler):
-        token, text = secret, page
-
-        def get(self, path: str) -> bool:
-            if path != "/events":
-                return False
-            self.send_response(200)
-            self.send_header("Content-Type", "text/event-stream")
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
-            number = -1
-            with suppress(OSError):  # the browser is gone
-                while True:
-                    text, number = readouts.after(number)
-                    self.wfile.write(f"data: {text}\n\n".encode())
-                    self.wfile.flush()
-            return True
-
-        def post(self, path: str, data: bytes) -> bytes | None:
-            request = read_request(data)
-            if request is None:
-                return None
-            ask(request)
-            return b"{}"
-
-    return Handler
 
 
 class _Asked(BaseModel):

@@ -6,26 +6,47 @@ know, and one of this computer's names, since a foreign name may resolve to its 
 
 import secrets
 import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 from urllib.parse import parse_qs, urlsplit
+
+from stewart_drake.reporting.page import environment
 
 _LONGEST: Final = 4096
 """Longest request of a browser, bytes."""
 
 
 class LocalServer(ThreadingHTTPServer):
-    """Server on a free port of 127.0.0.1."""
+    """Server on a free port of 127.0.0.1, in background threads.
+
+    Args:
+        template: name of the page's template, which gets `values` and the `token`.
+        values: for the template.
+        get: by path, another page or a stream of events.
+        post: returns the answer to a path and data, in JSON, or None for a malformed request.
+    """
 
     daemon_threads = True
 
-    def __init__(self, handler: "type[LocalHandler]") -> None:
-        super().__init__(("127.0.0.1", 0), handler)
-        self._token = handler.token
+    def __init__(
+        self,
+        template: str,
+        values: Mapping[str, Any],
+        get: Mapping[str, Callable[[], str | Iterator[str]]],
+        post: Callable[[str, bytes], str | None],
+    ) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.token = secrets.token_urlsafe(24)
+        page = environment().get_template(template).render(token=self.token, **values)
+        self.get, self.post = {"/": lambda: page, **get}, post
+        threading.Thread(target=self.serve_forever, daemon=True).start()
 
     @property
     def url(self) -> str:
-        return f"http://127.0.0.1:{self.server_port}/?token={self._token}"
+        return f"http://127.0.0.1:{self.server_port}/?token={self.token}"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Report an error, except that a browser has closed its connection."""
@@ -33,22 +54,11 @@ class LocalServer(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
 
-class LocalHandler(BaseHTTPRequestHandler):
-    """Answers of a page; derive from it and set `token` and `text`."""
-
-    token: ClassVar[str]
-    text: ClassVar[str]
+class _Handler(BaseHTTPRequestHandler):
+    server: LocalServer
 
     def log_message(self, *_: Any) -> None:
         pass
-
-    def get(self, path: str) -> bool:
-        """Answer a request for another path than the page; return whether there is such a path."""
-        return False
-
-    def post(self, path: str, data: bytes) -> bytes | None:
-        """Return the answer to a request with data, in JSON, or None for a malformed one."""
-        return None
 
     def do_GET(self) -> None:
         try:
@@ -58,10 +68,14 @@ class LocalHandler(BaseHTTPRequestHandler):
             return
         if not self._allowed(parse_qs(parts.query).get("token", [""])[0]):
             return
-        if parts.path == "/":
-            self._answer("text/html; charset=utf-8", self.text.encode())
-        elif not self.get(parts.path):
+        if parts.path not in self.server.get:
             self.send_error(404)
+            return
+        answer = self.server.get[parts.path]()
+        if isinstance(answer, str):
+            self._answer("text/html; charset=utf-8", answer)
+        else:
+            self._stream(answer)
 
     def do_POST(self) -> None:
         if not self._allowed(self.headers.get("X-Token", "")):
@@ -72,22 +86,23 @@ class LocalHandler(BaseHTTPRequestHandler):
         if not (few and length.isdecimal() and int(length) <= _LONGEST):
             self.send_error(413)
             return
-        answer = self.post(self.path, self.rfile.read(int(length)))
+        answer = self.server.post(self.path, self.rfile.read(int(length)))
         if answer is None:
             self.send_error(400)
-            return
-        self._answer("application/json", answer)
+        else:
+            self._answer("application/json", answer)
 
     def _allowed(self, given: str) -> bool:
         host = self.headers.get("Host", "").rpartition(":")[0]
-        good = host in ("127.0.0.1", "localhost") and secrets.compare_digest(
-            given.encode(), self.token.encode()
-        )
+        token = self.server.token.encode()
+        good = host in ("127.0.0.1", "localhost")
+        good = good and secrets.compare_digest(given.encode(), token)
         if not good:
             self.send_error(403)
         return good
 
-    def _answer(self, kind: str, data: bytes) -> None:
+    def _answer(self, kind: str, text: str) -> None:
+        data = text.encode()
         self.send_response(200)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(data)))
@@ -95,3 +110,13 @@ class LocalHandler(BaseHTTPRequestHandler):
         self.send_header("Referrer-Policy", "no-referrer")
         self.end_headers()
         self.wfile.write(data)
+
+    def _stream(self, events: Iterator[str]) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "text/event-stream")
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        with suppress(OSError):  # the browser is gone
+            for text in events:
+                self.wfile.write(f"data: {text}\n\n".encode())
+                self.wfile.flush()

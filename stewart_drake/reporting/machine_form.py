@@ -2,7 +2,6 @@
 
 import json
 import re
-import secrets
 import threading
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,9 +11,9 @@ from typing import Any, Final, Literal, get_args, get_origin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
-from stewart_drake.reporting.local_page import LocalHandler, LocalServer
+from stewart_drake.reporting.local_page import LocalServer
 from stewart_drake.reporting.mechanism import mechanism_figure
-from stewart_drake.reporting.page import environment, source
+from stewart_drake.reporting.page import source
 from stewart_drake.studies.new_machine import machine_text
 from stewart_drake.studies.options import Option
 from stewart_drake.studies.study_options import Measurements
@@ -91,24 +90,22 @@ class MachineForm:
         self._asked, self._ready, self._fetched = (threading.Event() for _ in range(3))
         self._report = ""
         fields = [_field(one, given.get(one.name)) for one in Measurements.described()]
-        page = environment().get_template("machine_form.html.j2")
-        secret = secrets.token_urlsafe(24)
+        values = {"title": title, "fields": fields}
         self._server = LocalServer(
-            _handler(self, page.render(title=title, token=secret, fields=fields), secret)
+            "machine_form.html.j2", values, {"/report": self._report_page}, self._take
         )
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        self.url = self._server.url
 
-    @property
-    def url(self) -> str:
-        return self._server.url
-
-    def take(self, entries: Entries) -> dict[str, Any]:
-        """Take complete entries; return `answer`."""
+    def _take(self, path: str, data: bytes) -> str | None:
+        """Return `answer` as JSON; take complete entries that are to be written."""
+        entries = read_entries(data)
+        if entries is None or path not in ("/check", "/write"):
+            return None
         found = answer(entries)
-        if found["problem"] is None:
+        if path == "/write" and found["problem"] is None:
             self._entries = entries
             self._asked.set()
-        return found
+        return json.dumps(found)
 
     def wait(self) -> Measurements:
         """Wait for complete measurements."""
@@ -116,7 +113,7 @@ class MachineForm:
             pass
         return measurements_of(self._entries)
 
-    def report(self) -> str:
+    def _report_page(self) -> str:
         """Wait for the page that follows the form."""
         self._ready.wait()
         self._fetched.set()
@@ -132,25 +129,6 @@ class MachineForm:
         self._ready.set()
         self._server.shutdown()
         self._server.server_close()
-
-
-def _handler(form: MachineForm, page: str, secret: str) -> type[LocalHandler]:
-    class Handler(LocalHandler):
-        token, text = secret, page
-
-        def get(self, path: str) -> bool:
-            if path == "/report":
-                self._answer("text/html; charset=utf-8", form.report().encode())
-            return path == "/report"
-
-        def post(self, path: str, data: bytes) -> bytes | None:
-            entries = read_entries(data)
-            if entries is None or path not in ("/check", "/write"):
-                return None
-            found = answer(entries) if path == "/check" else form.take(entries)
-            return json.dumps(found).encode()
-
-    return Handler
 
 
 def _field(one: Option, given: Any) -> dict[str, Any]:

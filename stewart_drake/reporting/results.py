@@ -10,19 +10,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import pandas
+import xarray
+
 from stewart_drake.files.jsonio import write_json
 from stewart_drake.loop import results as loop_results
 from stewart_drake.loop.preparation import simulated_machine
 from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.reporting.csv_file import columns_of
+from stewart_drake.reporting.document import Document, Picture
+from stewart_drake.reporting.run import comparison_document, run_document
 from stewart_drake.studies.compare import save_comparison
 
 if TYPE_CHECKING:
-    import pandas
-    import xarray
     from matplotlib.figure import Figure
     from pydrake.geometry import Meshcat
 
-    from stewart_drake.reporting.document import Document
     from stewart_drake.reporting.page import Provenance
 
 PAGE: Final = "report.html"
@@ -66,20 +69,14 @@ class SimulationResult(loop_results.SimulationResult):
 
     def table(self) -> str:
         """Return status, errors and torques as text."""
-        from stewart_drake.reporting.run import run_document
-
         return run_document(self).plain()
 
-    def to_pandas(self) -> "pandas.DataFrame":
+    def to_pandas(self) -> pandas.DataFrame:
         """Return the signals over `time[s]`, with a column per component as in the CSV file."""
-        import pandas
-
-        from stewart_drake.reporting.csv_file import columns_of
-
         header, rows = columns_of(self.signals)
         return pandas.DataFrame(rows, columns=header).set_index(header[0])
 
-    def to_xarray(self) -> "xarray.Dataset":
+    def to_xarray(self) -> xarray.Dataset:
         """Return a copy of the signals, over `time` in s."""
         return self.signals.copy(deep=True)
 
@@ -134,28 +131,22 @@ class ComparisonResult(dict[str, SimulationResult]):
 
     def table(self) -> str:
         """Return a row per controller as text."""
-        from stewart_drake.reporting.run import comparison_document
-
         return comparison_document(self).plain()
 
-    def to_pandas(self) -> "pandas.DataFrame":
+    def to_pandas(self) -> pandas.DataFrame:
         """Return a row per controller with the numbers and words of its summary.
 
         A nested entry is the column `counts.saturated_steps`, an item `peak_error.0`. Scenario,
         versions and warnings are left out.
         """
-        import pandas
-
         rows = {name: dict(_flat(run.summary)) for name, run in self.items()}
         return pandas.DataFrame.from_dict(rows, orient="index").rename_axis("controller")
 
-    def to_xarray(self) -> "xarray.Dataset":
+    def to_xarray(self) -> xarray.Dataset:
         """Return the signals of all runs over `controller` and `time`.
 
         A run that ended early has NaN afterwards.
         """
-        import xarray
-
         runs = [run.signals.drop_attrs(deep=False) for run in self.values()]
         whole = xarray.concat(runs, "controller", join="outer", combine_attrs="drop")
         return whole.assign_coords(controller=list(self))
@@ -209,7 +200,7 @@ class AnalysisResult:
 
     study: Any
     summary: dict[str, Any]
-    document: "Document"
+    document: Document
     made: "Provenance"
     write: Callable[[Any, Path], list[str]] | None = None
 
@@ -239,8 +230,6 @@ class AnalysisResult:
 
     def plot(self, directory: str | Path | None = None) -> Figures:
         """Return the figures of the page; see `SimulationResult.plot`."""
-        from stewart_drake.reporting.document import Picture
-
         pictures = [one for section in self.document.sections for one in section.all(Picture)]
         return _drawn({f"figure_{k}": one.drawn for k, one in enumerate(pictures, 1)}, directory)
 
@@ -261,7 +250,7 @@ class AnalysisResult:
 
 def analysis_result(
     study: Callable[[], Any],
-    document: "Callable[[Any], Document]",
+    document: Callable[[Any], Document],
     command: str,
     write: Callable[[Any, Path], list[str]] | None = None,
 ) -> AnalysisResult:
