@@ -10,6 +10,7 @@
    sample of the plan. */
 #define HEAD 4
 #define EARLY ((real)0.5)  /* no torque arrives before this share of the assumed delay */
+#define UNPUNCTUAL 2       /* factor on the weight of torques above which no plan is made */
 #define LATEST ((real)1e6) /* largest count of samples since the start */
 #define ROUNDING ((real)1e-3) /* samples; an instant that is nearer to a sample is there */
 
@@ -125,7 +126,7 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     const int early = (memory[2] - ROUNDING) * law->period <= EARLY * outlook->eta;
     if (!sample->goal || !(outlook->settled || early) || !stewart_all_finite(X, outlook->state))
         return 0;
-    if (outlook->settled && outlook->caution > 1) /* late torques would undo a plan; raised weights bear them */
+    if (outlook->settled && outlook->caution > UNPUNCTUAL) /* late torques would undo a plan; raised weights bear them */
         return 0;
     stewart_copy(X, outlook->state, states);
     stewart_predict(&law->machine, outlook->theta, &outlook->until, states, states + X);

@@ -27,6 +27,8 @@ EARLY = 0.5
 """No torque arrives before this share of the assumed delay."""
 SURE = 0.03
 """Largest standard deviation of a predicted pose from which to plan, as a share of the motion."""
+UNPUNCTUAL = 2.0
+"""Factor on the weight of torques above which no plan is made."""
 ROUNDING = 1e-3
 """Periods; an instant that is nearer to a sample is there."""
 
@@ -118,7 +120,7 @@ class Replan:
         timeline, c = belief.timeline, core()
         # While the delay is unknown, plan only before a torque can have acted.
         early = motion.now + (1 - ROUNDING) * timeline.period <= EARLY * timeline.eta
-        late = belief.settled and belief.caution > 1  # late torques would undo a plan
+        late = belief.settled and belief.caution > UNPUNCTUAL  # late torques would undo a plan
         if late or not (belief.has_state and (belief.settled or early)):
             return before
         schedule = timeline.until_next(timeline.queue(in_flight))

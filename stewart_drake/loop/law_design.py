@@ -193,7 +193,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     motion_torque = max(STILL * machine_scale, peak_torque)
     parameters = estimated_parameters(experiment, torque_scale, motion_torque)
     noise = sc.sensor.noise_std if isinstance(sc.sensor, StateSensorConfig) else None
-    exact, tolerated = sc.plant.kind == "exact" and noise is not None, tolerated_timing(experiment)
+    exact, tolerated = _learns(sc), tolerated_timing(experiment)
     settings = filter_settings(
         motion,
         c.period,
@@ -380,16 +380,24 @@ def _usual_replan(experiment: Experiment, eta: float) -> float:
     return min(LONGEST_REPLAN, REPLAN_SHARE * eta)
 
 
+def _learns(scenario: Scenario) -> bool:
+    """Return whether the estimator learns its noise: the errors of plant and sensor are white."""
+    return scenario.plant.kind == "exact" and isinstance(scenario.sensor, StateSensorConfig)
+
+
 def tolerated_timing(experiment: Experiment) -> float:
     """Return the standard deviation of single torques' timing that the loop tolerates, s.
 
     It is a share of the time constant of the loop, 1 / bandwidth of theory.md, section 13. It is
-    infinite for weights that are given or set by a tuner, and for the paper's laws and baselines:
-    they predict linearly or not at all.
+    infinite for weights that are given or set by a tuner, where the timing is only assumed, and for
+    the paper's laws and baselines: they predict linearly or not at all.
     """
     sc, c = experiment.scenario, experiment.scenario.controller
     predicts = c.prediction == "nonlinear" and believed_delay(sc).eta(c.period) > 0
     if c.w_R is not None or sc.tuner.kind != "fixed" or not (c.estimate or predicts):
+        return math.inf
+    learnt = _learns(sc) or c.delay_estimator != "none"
+    if not learnt and c.timing_std is None:
         return math.inf
     times = spread_instants(sc.duration, _POSES)
     accelerations = np.array([evaluate(experiment.reference, t)[ACCELERATIONS] for t in times])
