@@ -339,6 +339,10 @@ REFUSED = [
     ("duration.x=5", "duration: got {'x': 5}"),
     ("reference.times=[0, 1]", "reference.times: got [0, 1], which kind 'sine' does not use"),
     (
+        "link.loss=0.1",
+        "link.loss: got 0.1, which kind 'wire' does not use; expected link.kind=network",
+    ),
+    (
         "controller.period=0.1234567",
         "with settings: controller.period: got 0.1234567; expected a whole number of "
         "plant.time_step (0.001 s), nearest 0.123",

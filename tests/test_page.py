@@ -164,9 +164,9 @@ def test_command_lines_are_quoted_for_a_shell():
         "delay",
         "my file.yaml",
         settings=["delay.steps=4", "reference.amplitude=[1, 2]"],
-        options={"controller": None, "out": Path("out")},
+        options={"controller": None, "out": Path("out"), "gravity": True, "browser": False},
     )
     assert line == (
         "stewart-drake analyze delay 'my file.yaml' --set delay.steps=4 "
-        "--set 'reference.amplitude=[1, 2]' --out out"
+        "--set 'reference.amplitude=[1, 2]' --out out --gravity --no-browser"
     )

@@ -272,9 +272,8 @@ def _explain_unknown(type_: type, data: Any, error: Any) -> str:
     start = f"{_cut(place, 60)}: "
     if (plain := re.sub(r"\[\d+\]", "", place)) in known:
         got = f"got {brief(error['input'])}, which kind {error['loc'][-2]!r} does not use"
-        kind = dataclasses.fields(known[plain])[0].default
         section = place.rpartition(".")[0]
-        return f"{start}{got}; expected {section}.kind={kind}"
+        return f"{start}{got}; expected {section}.kind={known[plain].kind}"
     above, dot, name = plain.rpartition(".")
     section = place.rpartition(".")[0] + dot
     siblings = [one.rpartition(".")[2] for one in known if one.rpartition(".")[0] == above]

@@ -134,7 +134,7 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
     except (KeyError, AttributeError, ValueError, TypeError) as error:
         raise ConfigError(f"{path}: lacks a signal ({error}); expected {EXPECTED}") from None
     if problem := _run_problem(scenario):
-        raise ConfigError(f"{path}: {problem}; expected {EXPECTED}")
+        raise ConfigError(f"{path}: {problem}; expected another run, or CSV")
     period = scenario.controller.period
     # Signals show a sample's value from its instant on, and every sample has a row.
     count = int(min(time[-1] / period + 1e-9, len(time))) + 1
@@ -171,7 +171,7 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
 def _run_problem(scenario: Scenario) -> str | None:
     """Return why a run cannot serve as a log, or None."""
     if scenario.link.kind == "network" and scenario.link.back is not None:
-        return "its measurements came over a network and have different ages (link.return)"
+        return "the ages of its measurements differ (link.return)"
     if scenario.actuator.kind != "torque":
         return f"its motors got no torques (actuator.kind {scenario.actuator.kind!r})"
     if scenario.sensor.delay > 0:

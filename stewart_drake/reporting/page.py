@@ -68,12 +68,14 @@ def command_line(
 ) -> str:
     """Return a command as typed: words, `--set` for each setting, and options that are not None.
 
-    An option with a list or tuple is repeated for each item.
+    An option with a list or tuple is repeated for each item; one that is on or off has no value.
     """
     parts = ["stewart-drake", *words]
     for name, value in {"set": list(settings), **(options or {})}.items():
         for one in value if isinstance(value, list | tuple) else (value,):
-            if one is not None:
+            if isinstance(one, bool):
+                parts.append(f"--{name}" if one else f"--no-{name}")
+            elif one is not None:
                 parts += [f"--{name}", str(one)]
     return shlex.join(parts)
 
