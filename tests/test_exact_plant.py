@@ -428,3 +428,10 @@ def test_an_accuracy_that_means_nothing_is_refused(accuracy):
     simulator, _ = simulator_of(ExactPlant(FREE), AT_HOME, np.zeros(6), USUAL)
     with pytest.raises(ValueError, match=r"^accuracy: got .*; expected a number from 1e-12"):
         set_accuracy(simulator, accuracy)
+
+
+def test_a_torque_that_is_no_number_is_refused():
+    """The integrator would shorten its steps for ever."""
+    simulator, _ = simulator_of(ExactPlant(FREE), AT_HOME, np.full(6, np.nan), USUAL)
+    with pytest.raises(ValueError, match=r"torque: got .*nan.*; expected finite numbers"):
+        simulator.AdvanceTo(0.01)

@@ -117,3 +117,21 @@ def test_bad_input_is_one_line(changes, message):
     with pytest.raises(ConfigError) as refused:
         sd.design_law(**(given | changes))
     assert message in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_the_names_to_estimate_are_those_of_the_options_or_of_the_dynamics():
+    """Those of the dynamics where both are given the same, an error where they differ."""
+
+    def free(names, **given):
+        options = sd.ControllerConfig(estimate=names)
+        dynamics = sd.StewartDynamics(PAPER, **given)
+        reference = make_reference(sd.load_scenario("paper").reference, 2.0)
+        law = sd.design_law(dynamics, reference, 0.1, 0.8, horizon=2.0, options=options)
+        return law.law.plant.dynamics.free
+
+    usual = sd.ControllerConfig().estimate
+    assert free([*usual, "coulomb"])[-1] == "coulomb_friction"
+    assert free(["payload"]) == ("payload_mass",)
+    assert free(usual, free=("payload_mass",)) == ("payload_mass",)
+    with pytest.raises(ConfigError, match=r"options.estimate: got torque_bias_1, .* are free"):
+        free(["torque_bias"], free=("payload_mass",))

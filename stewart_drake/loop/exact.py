@@ -136,6 +136,10 @@ def ExactPlant_(T):
             if self._wrench is not None and self._wrench.HasValue(context):
                 wrench = self._wrench.Eval(context)
             if T is float:
+                if not np.all(
+                    np.isfinite(torque)
+                ):  # the integrator would shorten its steps for ever
+                    raise ValueError(f"torque: got {torque.tolist()}; expected finite numbers, N m")
                 change = dynamics.change(x, torque)
                 if wrench is not None:
                     change[RATES] += dynamics.wrench_accelerations(x[POSE], wrench)

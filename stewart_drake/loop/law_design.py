@@ -57,7 +57,12 @@ from stewart_drake.loop.controller import DelayLqiController, Reference
 from stewart_drake.loop.kinds import LINKS, REPORTS, SENSORS
 from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.own import Own, own_motion
-from stewart_drake.loop.preparation import Experiment, calibration_of, check_instants
+from stewart_drake.loop.preparation import (
+    Experiment,
+    calibration_of,
+    check_instants,
+    estimated_names,
+)
 from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.scenario.calibration import OFFSETS, believed_delay
 from stewart_drake.scenario.config import ControllerConfig, Scenario, StateSensorConfig
@@ -514,7 +519,8 @@ def design_law(
     """Design the delayed LQI law for a machine and a motion.
 
     Args:
-        dynamics: the machine that the law assumes.
+        dynamics: the machine that the law assumes. Its `free` parameters are estimated; those of
+            `options.estimate` where they are the default ones.
         reference: 6 x 1 trajectory of the pose, rad and m, with derivatives of order 1 and 2; held
             after its end.
         period: of the controller, s.
@@ -553,6 +559,15 @@ def design_law(
     }
     scenario = validate(Scenario, sections, "design_law")
     scenario.check("design_law")
+    names = estimated_names(scenario)
+    if dynamics.free == PARAMETERS:
+        parts = dynamics.mechanism, dynamics.gravity, dynamics.plant_parameters
+        dynamics = type(dynamics)(*parts, names)
+    elif names not in (PARAMETERS, dynamics.free):
+        raise ConfigError(
+            f"options.estimate: got {', '.join(names)}, with dynamics in which "
+            f"{', '.join(dynamics.free)} are free; expected one of the two"
+        )
     motion = own_motion(reference, horizon)
     first = evaluate(motion, 0.0)[:NUM_STATE]
     at = first if start is None else np.array(start, dtype=np.float64)

@@ -248,7 +248,7 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
         truth=with_rotors(simulated_machine(scenario) if truth is None else truth, rotors),
         reference=reference,
         peak_to_peak=span,
-        nominal=dynamics(mechanism, scenario.plant.gravity, parameters, _estimated(scenario)),
+        nominal=dynamics(mechanism, scenario.plant.gravity, parameters, estimated_names(scenario)),
         start=start,
         network=network,
         own=own,
@@ -264,11 +264,11 @@ def known_dynamics(experiment: Experiment) -> StewartDynamics:
         for i, name in enumerate(CONSTANTS):
             value = experiment.calibration.value(name)
             parameters[i] = parameters[i] if value is None else value
-    names = _estimated(scenario)
+    names = estimated_names(scenario)
     return StewartDynamics(experiment.mechanism, scenario.plant.gravity, parameters, names)
 
 
-def _estimated(scenario: Scenario) -> tuple[str, ...]:
+def estimated_names(scenario: Scenario) -> tuple[str, ...]:
     """Return the names of the estimated parameters, those of the plant first.
 
     Without any, return the eight recorded ones, which linear models then take as known.
