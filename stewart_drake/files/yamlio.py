@@ -270,7 +270,8 @@ def explain(data: Any, error: Any) -> str:
 def _explain_unknown(type_: type, data: Any, error: Any) -> str:
     place, known = _place(data, error["loc"]), dict(dotted_names(type_))
     start = f"{_cut(place, 60)}: "
-    if (plain := re.sub(r"\[\d+\]", "", place)) in known:
+    plain = re.sub(r"\[\d+\]", "", place)
+    if hasattr(known.get(plain), "kind"):
         got = f"got {brief(error['input'])}, which kind {error['loc'][-2]!r} does not use"
         section = place.rpartition(".")[0]
         return f"{start}{got}; expected {section}.kind={known[plain].kind}"

@@ -171,7 +171,7 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
 def _run_problem(scenario: Scenario) -> str | None:
     """Return why a run cannot serve as a log, or None."""
     if scenario.link.kind == "network" and scenario.link.back is not None:
-        return "the ages of its measurements differ (link.return)"
+        return "measurements over its network have different ages (link.return)"
     if scenario.actuator.kind != "torque":
         return f"its motors got no torques (actuator.kind {scenario.actuator.kind!r})"
     if scenario.sensor.delay > 0:
