@@ -444,6 +444,20 @@ def test_a_step_takes_no_more_scratch_than_stated(settings, monkeypatch):
     assert max(np.count_nonzero(array != UNTOUCHED) for array in used) > stated / 5
 
 
+def test_a_missing_preview_over_a_network_leaves_the_torques_as_they_are():
+    """Its instants repeat but for rounding, so that rows between two of them are no motion."""
+    network = "link.kind=network", "link.low=0.5", "link.high=0.9"
+    pair = Pair("paper", (*network, "start=on_reference", "queue=reference"))
+    peak = {}
+    for k in range(52):
+        pair.step(k, 0.0, None, lambda k, rows: rows * np.nan if k == 40 else rows)
+        for name, one in (("python", pair.one), ("core", pair.other)):
+            size = float(np.abs(one.torque).max())
+            peak[name, k < 40] = max(peak.get((name, k < 40), 0.0), size)
+    for name in ("python", "core"):
+        assert peak[name, False] < 2 * peak[name, True]
+
+
 def test_a_measurement_that_is_too_old_is_missing():
     pair = Pair("paper", ("sensor.delay=0.2",))
     law, native = pair.law, pair.native

@@ -196,6 +196,8 @@ void stewart_packets_update(const stewart_packets *p, real *memory, const stewar
 {
     const int kept = p->kept, size = packet_size(p);
     real *arrived = memory + 1, *packets = arrived + kept, *newest = in_flight + U * (number - 1);
+    if (report && report->age < 0)
+        report = NULL;
     int since = report ? report->age : (int)memory[0] + 1, known = 0;
     since = since < kept ? since : kept;
     memory[0] = (real)since;

@@ -7,6 +7,7 @@
 #define FURTHER ((real)1.25) /* times as far as to its rest, a continued motion stays within reach */
 #define DOUBLINGS 6          /* of the rate of coming to rest, at the most */
 #define CATCH_UP ((real)0.3) /* s, of a way back */
+#define ROUNDING ((real)1e-4) /* periods, between instants that are the same */
 
 void stewart_between(const real *from, const real *to, real h, real s, real *row)
 {
@@ -95,14 +96,18 @@ void stewart_complete(const real *geometry, real period, real eta, const stewart
             look(&n, last->times[j] - given->times[i] - period, last->rows + ROW * j);
         const real *const *next = n.next;
         const real *later = n.later;
-        if (next[0] && next[1])
+        const real near = ROUNDING * period; /* instants of a preview repeat but for rounding */
+        const int same = -later[0] < near || later[1] < near;
+        if (same)
+            stewart_copy(ROW, next[!(-later[0] < near)], found);
+        else if (next[0] && next[1])
             stewart_between(next[0], next[1], later[1] - later[0], later[0] / (later[0] - later[1]),
                             found);
         else if (next[0] || next[1])
             continued(geometry, next[!next[0]], -later[!next[0]], 2 / (eta + period), found);
         else
             return;
-        if (stewart_all_finite(6, row + 6))
+        if (stewart_all_finite(6, row + 6) && !same)
             slopes(next, later, row + 6, period / 20, found + 12);
         for (int k = 0; k < ROW; k++)
             if (!isfinite(row[k]))

@@ -53,7 +53,7 @@ static void look(const stewart_law *law, const real *memory, const stewart_sampl
     for (int i = 0; i < number && pieces > 0; i++) {
         real *row = rows + ROW * i;
         if (!stewart_along(pieces, memory + HEAD, now + times[i], row))
-            sample->goal(sample->about, 1, times + i, row);
+            (sample->goal ? sample->goal : sample->reference)(sample->about, 1, times + i, row);
     }
 }
 
