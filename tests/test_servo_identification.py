@@ -163,7 +163,6 @@ def with_known_statistics(rng, number, blocks):
         (noise.ravel() + flat @ error).reshape(number, 6),
         jacobian,
         np.ones((number, 6), bool),
-        np.zeros(8),
         np.arange(1, 4),
         rounding=1e-3,
         ball_joints_tried=False,

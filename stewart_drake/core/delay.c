@@ -24,7 +24,7 @@
 #define KNOWN ((real)0.01) /* a constant is known at this share of its usual standard deviation */
 #define HEARD 10           /* measurements after which a misfit may be a jump of parameters */
 #define MEMORY 5           /* s over which the timing of single torques is estimated */
-#define UNTIMELY ((real)0.1) /* periods, largest standard deviation of the timing */
+#define UNTIMELY ((real)0.1)  /* periods, largest standard deviation of the timing */
 #define JERKED ((real)0.02)   /* periods, standard deviation of a small step of the delay */
 #define EDGE ((real)0.1)      /* periods before and after one from which a torque may move into it */
 #define BEFORE ((real)1 / 120) /* see stewart_period_late */

@@ -97,9 +97,9 @@ void stewart_complete(const real *geometry, real period, real eta, const stewart
         const real *const *next = n.next;
         const real *later = n.later;
         const real near = ROUNDING * period; /* instants of a preview repeat but for rounding */
-        const int same = -later[0] < near || later[1] < near;
+        const real *same = -later[0] < near ? next[0] : later[1] < near ? next[1] : NULL;
         if (same)
-            stewart_copy(ROW, next[!(-later[0] < near)], found);
+            stewart_copy(ROW, same, found);
         else if (next[0] && next[1])
             stewart_between(next[0], next[1], later[1] - later[0], later[0] / (later[0] - later[1]),
                             found);

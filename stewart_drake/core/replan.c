@@ -126,7 +126,8 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     const int early = (memory[2] - ROUNDING) * law->period <= EARLY * outlook->eta;
     if (!sample->goal || !(outlook->settled || early) || !stewart_all_finite(X, outlook->state))
         return 0;
-    if (outlook->settled && outlook->caution > UNPUNCTUAL) /* late torques would undo a plan; raised weights bear them */
+    /* Late torques would undo a plan. */
+    if (outlook->settled && outlook->caution > UNPUNCTUAL)
         return 0;
     stewart_copy(X, outlook->state, states);
     stewart_predict(&law->machine, outlook->theta, &outlook->until, states, states + X);

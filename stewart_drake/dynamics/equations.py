@@ -50,9 +50,8 @@ class LegNumbers(NamedTuple):
     R_WS: Numbers
     p_PQ: Numbers
     p_WS: Numbers
-    symbols: tuple[
-        ca.SX, ...
-    ]  # further arguments of a function of the numbers: none for known ones
+    # Further arguments of a function of the numbers: none for known ones.
+    symbols: tuple[ca.SX, ...]
 
 
 class CommonNumbers(NamedTuple):

@@ -31,7 +31,7 @@ taken to be at most what was removed.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -185,11 +185,12 @@ class ServoIdentification:
     residuals: Array  # (m, 6) rad
     jacobian: Array  # (m, 6, k) by the free unknowns
     fitted: NDArray[np.bool_]  # (m, 6) residuals that the fit minimises
-    change: Array  # (8,) of theta from the first fit to the second, 0 for one
     free: NDArray[np.intp]  # (k,) places of those in theta
     rounding: float  # standard deviation of the rounding of a measured angle, rad
     ball_joints_tried: bool  # whether friction of the ball joints was fitted
     iterations: int  # evaluations of the fit
+    # (8,) of theta from the first fit to the second, 0 for one
+    change: Array = field(default_factory=lambda: np.zeros(len(NAMES)))
 
     @property
     def residual(self) -> float:
@@ -428,7 +429,6 @@ def _fitted(
         residuals=model.residuals(theta),
         jacobian=J.reshape(-1, NUM_TORQUES, len(free)) / scale,
         fitted=fitted,
-        change=np.zeros(len(NAMES)),
         free=free,
         rounding=rounding,
         ball_joints_tried=bool(np.isin(BALL_FRICTION, free)),

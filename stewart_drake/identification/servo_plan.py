@@ -134,7 +134,6 @@ def plan_servos(
         residuals=residuals,
         jacobian=seen_by.jacobian(planner.theta, free),
         fitted=np.ones(residuals.shape, bool),
-        change=np.zeros(len(NAMES)),
         free=free,
         rounding=rounding,
         ball_joints_tried=rubs,

@@ -136,9 +136,8 @@ def ExactPlant_(T):
             if self._wrench is not None and self._wrench.HasValue(context):
                 wrench = self._wrench.Eval(context)
             if T is float:
-                if not np.all(
-                    np.isfinite(torque)
-                ):  # the integrator would shorten its steps for ever
+                # The integrator would shorten its steps for ever.
+                if not np.all(np.isfinite(torque)):
                     raise ValueError(f"torque: got {torque.tolist()}; expected finite numbers, N m")
                 change = dynamics.change(x, torque)
                 if wrench is not None:

@@ -367,11 +367,11 @@ def _replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> Pr
     plan over packets, with late measurements, or after a start from rest without a catch-up (0 s).
     """
     sc, replan = experiment.scenario, experiment.scenario.controller.replan
-    exact = isinstance(law.predictor, NonlinearPredictor) and not isinstance(law, LimitedLqi)
-    if replan == 0 or not (law.estimates and exact):
+    nonlinear = isinstance(law.predictor, NonlinearPredictor) and not isinstance(law, LimitedLqi)
+    if replan == 0 or not (law.estimates and nonlinear):
         return law
-    unclear = not isinstance(law.channel, Wire) or law.longest_wait > 0
-    if not law.finds_delay and (unclear or (sc.start == "rest" and not length)):
+    prompt = isinstance(law.channel, Wire) and law.longest_wait == 0
+    if not law.finds_delay and not (prompt and (length or sc.start != "rest")):
         return law
     usual = length or _usual_replan(experiment, law.timeline.eta)
     sure = SURE if length or law.finds_delay else SURE_ON_REFERENCE
