@@ -111,7 +111,7 @@ class Filter:
         memory = np.concatenate([estimate.mean, root.ravel(), outlier, counts, noise])
         torques, durations, following = map(numbers, period[:3])
         schedule = [len(torques), c.at(torques), c.at(durations), period.substeps]
-        interval = c.ffi.new("stewart_interval *", [schedule, c.at(following)])
+        interval = c.ffi.new("stewart_interval *", [schedule, c.at(torques), c.at(following)])
         history = c.ffi.new("stewart_history *", [c.at(self.last), c.at(self.still)])
         y = None if values is None else numbers(values)
         given = interval, c.at(y), history, c.at(memory)

@@ -5,6 +5,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 import stewart_drake as sd
+from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import Innovations
 from stewart_drake.law.filter_settings import (
@@ -200,6 +201,24 @@ def test_a_learnt_timing_keeps_the_plate_across_a_delay_with_gravity(seed):
     kept = run_in_bulk(load_scenario("gravity", "predictor_lqi", (exact, *noisy)))
     assert lost.status == "left_workspace"
     assert kept.status == "completed" and kept.error_so_far < 0.3
+
+
+@pytest.mark.parametrize(
+    ("times", "wide", "low", "high"), [(9, 1, 7, 11), (1, 1, 0.5, 1.5), (0, 5, 0, 0.3)]
+)
+def test_late_torques_are_told_from_a_wrong_model_by_the_direction(times, wide, low, high):
+    """Innovations (12) drawn with variances wide^2 (1 + times k k'); a wide one is a push."""
+    c, rng, kick = core(), np.random.default_rng(4), 3.0 * np.eye(12)[7]
+    noise, found = c.ffi.new("stewart_noise *"), []
+    c.lib.stewart_noise_start(noise)
+    nothing = np.zeros(12 * 13), np.zeros(1)
+    for _ in range(600):
+        drawn = wide * rng.standard_normal(12) * np.sqrt(1 + times * kick**2)
+        stated = 1 + noise.timing * kick**2
+        given = 12, c.at(drawn), c.at(stated), c.at(np.eye(12)), 1, c.at(kick)
+        c.lib.stewart_noise_learn(*given, 1, *map(c.at, nothing), 0.98, noise)
+        found.append(noise.timing)
+    assert low <= np.mean(found[100:]) <= high
 
 
 @pytest.mark.parametrize("controller", ["predictor_lqi", "adaptive_lqi"])

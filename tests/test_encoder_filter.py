@@ -249,13 +249,16 @@ def test_a_step_is_what_batch_least_squares_finds(samples, free):
         pushes = np.array([*PERIOD.torques, PERIOD.following])
         a = [DYNAMICS.accelerations(end[POSE], end[RATES], T, xi[12:20]) for T in pushes]
         left = DT - np.cumsum(PERIOD.durations)
-        drift = model + early**2 * np.sum((left[:, None] * np.diff(a, axis=0)) ** 2, axis=0)
+        late = early * left[:, None] * np.diff(a, axis=0)
+        drift = model + 0.01 * np.sum(late**2, axis=0)
         rows = []
         for share, g in zip(shares, G, strict=True):
             held = np.maximum([min(share * DT, 0.03), share * DT - min(share * DT, 0.03)], 1e-12)
             pose = DYNAMICS.predict(xi[:12], PERIOD.torques, held, 20, xi[12:20])[-1, POSE]
             J = PAPER.jacobian(pose)
-            rows.append(encoders.std**2 * g @ g + share**2 * J**2 @ drift)
+            rows.append(
+                encoders.std**2 * g @ g + share**2 * (J**2 @ drift + np.sum((J @ late.T) ** 2, 1))
+            )
         return np.array(rows)
 
     # The filter takes the variances where it linearises; they hardly change.

@@ -208,36 +208,51 @@ def test_without_a_measurement_the_model_goes_on_alone():
     assert np.array_equal(after.covariance, after.covariance.T)
 
 
-@pytest.mark.parametrize(("split", "tolerance"), [(1.0, 1e-3), (0.7, 0.1)])
 @pytest.mark.parametrize("late", [1e-5, -1e-5])
+@pytest.mark.parametrize(("split", "tolerance"), [(0.0, 0.2), (0.7, 0.1), (1.0, 1e-3)])
 def test_kicks_are_what_early_and_late_torques_do(split, tolerance, late):
-    """A change at the end exactly; one before the end but for what its kick feeds back by then."""
+    """One change: at the start, within the period, or at the end.
+
+    The last is exact, the others but for what a kick feeds back by the end. A change at a sample
+    has its effect in this period only if it is late, or early: half the variance of both.
+    """
     rng = np.random.default_rng(5)
     pose, rates, accelerations = motion(0.8)
     x, theta = np.concatenate([pose, rates]), inside(rng)
-    held = PLANT.inverse_dynamics(pose, rates, accelerations, theta)
-    three = held + rng.normal(0, 0.05, (3, 6))
-    durations = PERIOD * np.array([split, 1 - split])[: 1 if split == 1 else 2]
-    torques = three[: len(durations)].copy()
-    after = PLANT.predict(x, torques, durations, 8, theta)[-1]
-    c, kick, following = core(), np.empty(12), three[1].copy()  # one change alone
-    schedule = [len(torques), c.at(torques), c.at(durations), 8]
-    period = c.ffi.new("stewart_schedule *", schedule)
-    machine = machine_of(NominalPlant(PLANT, 1, np.inf, TorqueLimit())).it
-    c.lib.stewart_kicks(machine, period, *map(c.at, (following, after, theta, kick)))
-    kick = np.sqrt(kick)
+    old, new = PLANT.inverse_dynamics(pose, rates, accelerations, theta) + rng.normal(
+        0, 0.05, (2, 6)
+    )
+    inside_period = 0 < split < 1
+    acted = np.array([old, new] if inside_period else [new if split == 0 else old])
+    durations = PERIOD * np.array([split, 1 - split] if inside_period else [1.0])
+    after = PLANT.predict(x, acted, durations, 8, theta)[-1]
 
-    # The same second in three pieces, the first change `late` after its time.
-    parts = [split * PERIOD + late, PERIOD * (1 - split) - late]
+    c, kicks = core(), np.empty((len(acted) + 1, 12))
+    schedule = [len(acted), c.at(acted), c.at(durations), 8]
+    period = c.ffi.new("stewart_interval *", [schedule, c.at(old), c.at(new)])
+    machine = machine_of(NominalPlant(PLANT, 1, np.inf, TorqueLimit())).it
+    assert c.lib.stewart_changes(period) == len(kicks)
+    c.lib.stewart_kicks(machine, period, *map(c.at, (after, theta, kicks)))
+    changed = np.flatnonzero(np.any(kicks, axis=1))
+    assert len(changed) == 1
+    kick = late * kicks[changed[0]] * (1 if inside_period else np.sqrt(2))
+
     if split == 1.0 and late > 0:  # still the old torque when the new one should act
-        forwards = PLANT.predict(x, three[:1], np.array(parts[:1]), 8, theta)[-1]
-        expected = PLANT.predict(x, three[:2], np.array([PERIOD, late]), 8, theta)[-1]
-        assert relative(np.abs(forwards - expected)[6:], abs(late) * kick[6:]) < tolerance
+        parts = np.array([PERIOD, late])
+        expected = PLANT.predict(x, acted, parts[:1] + late, 8, theta)[-1]
+        moved = expected - PLANT.predict(x, np.array([old, new]), parts, 8, theta)[-1]
+    elif split == 0.0 and late < 0:  # the new torque before this period
+        parts = np.array([-late, PERIOD])
+        begun = PLANT.predict(x, old[None], parts[:1], 8, theta)[-1]
+        early = PLANT.predict(x, new[None], parts[:1], 8, theta)[-1]
+        moved = PLANT.predict(early, acted, durations, 8, theta)[-1]
+        moved = moved - PLANT.predict(begun, acted, durations, 8, theta)[-1]
     else:
-        moved = np.abs(PLANT.predict(x, three[:2], np.array(parts), 8, theta)[-1] - after)
-        assert relative(moved[6:], abs(late) * kick[6:]) < tolerance
-        if split < 1:  # else there is no time to move the pose
-            assert relative(moved[:6], abs(late) * kick[:6]) < tolerance
+        parts = np.array([split * PERIOD + late, PERIOD * (1 - split) - late])
+        moved = PLANT.predict(x, np.array([old, new]), parts, 8, theta)[-1] - after
+    assert relative(moved[6:], kick[6:]) < tolerance
+    if split < 1:  # else there is no time to move the pose
+        assert relative(moved[:6], kick[:6]) < tolerance
 
 
 def test_a_period_of_two_torques_is_two_shorter_ones():

@@ -92,13 +92,15 @@ def test_bounds_hold_in_an_update_and_nan_is_no_result():
 def test_a_prediction_has_the_sum_of_both_covariances():
     c, n = core(), 20
     H, std, L = RNG.normal(size=(12, n)), RNG.uniform(0, 1, 12), RNG.normal(size=(n, n))
-    walk = np.linspace(0, 1, n - 12)
+    walk, K = np.linspace(0, 1, n - 12), RNG.normal(size=(3, 12))
     std[3] = 0.0
     F = np.eye(n)
     F[:12], Q = H, np.diag(np.append(std, walk) ** 2)
+    Q[:12, :12] += K.T @ K
     expected = F @ L @ L.T @ F.T + Q
-    scratch = c.scratch(2 * n * n + n)
-    c.lib.stewart_root_of_prediction(n, c.at(H), c.at(std), c.at(walk), c.at(L), scratch)
+    scratch = c.scratch((2 * n + len(K)) * n + n)
+    given = c.at(H), c.at(std), c.at(walk), len(K), c.at(K), c.at(L)
+    c.lib.stewart_root_of_prediction(n, *given, scratch)
     assert pytest.approx(expected, abs=1e-11) == L @ L.T
     assert not np.triu(L, 1).any()
 

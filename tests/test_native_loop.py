@@ -90,7 +90,7 @@ LOOPS = {
     "network": scenario("paper", "duration=2", "tuner.kind=ann", *FOLLOWS, *DIRTY),
     "packets": scenario("paper", "duration=3", *PACKETS, *FOLLOWS, *DIRTY),
     "packets between samples": scenario(
-        "paper", "duration=3", *PACKETS, "link.playout=0.33", "link.dry=zero", "link.seed=5", *DIRTY
+        "paper", "duration=3", *PACKETS, "link.playout=0.33", "link.dry=zero", "link.seed=6", *DIRTY
     ),
     "packets one way": scenario(
         "paper", "duration=3", *PACKETS[:4], "link.acknowledged=false", *FOLLOWS, *DIRTY

@@ -316,7 +316,8 @@ def test_controller_topology_and_initial_state():
         assert through == (name in ("torque", "estimate", "memory"))
     context = controller.CreateDefaultContext()
     memory = controller.memory(context)
-    assert np.array_equal(memory.in_flight[1:], in_flight)
+    assert np.array_equal(memory.in_flight[-2:], in_flight)
+    assert np.all(memory.in_flight[:-2] == in_flight[0])  # the oldest has acted before
 
     def shown(name):
         return controller.GetOutputPort(name).Eval(context)

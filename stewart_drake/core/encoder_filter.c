@@ -53,7 +53,8 @@ static stewart_schedule cut(const stewart_schedule *schedule, int n, const real 
 
        H_j = J(q_j) F_j[pose],   R_j = diag(var_j) + diag(s_j^2 J Q J'),
 
-   Q the drift of the pose over a period, which counts as noise here as it does there. Each leg is
+   Q the drift of the pose over a period, which counts as noise here as it does there, and so do late
+   torques. Each leg is
    judged by itself at each node: one with e^2 > 30 S, S = H P H' + R, is left out, and the step goes on
    with the rest; if that is less than half, the measurement is an outlier. */
 
@@ -135,6 +136,10 @@ static int rows_of_legs(void *model, const real *xi, real *e, real *H, stewart_s
             variance[row] = s->reading.variance[row];
             for (int i = 0; i < 6; i++) {
                 const real moved = share * J[6 * leg + i] * a->drift[i];
+                variance[row] += moved * moved;
+            }
+            for (int k = 0; k < a->changes; k++) {
+                const real moved = share * stewart_dot(6, J + 6 * leg, a->late + X * k);
                 variance[row] += moved * moved;
             }
             if (offsets >= 0)

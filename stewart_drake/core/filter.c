@@ -6,6 +6,8 @@
 #define ITERATIONS 4       /* at the most; one is enough when the parameters are roughly known */
 #define KNOWN ((real)0.01) /* a constant is known when its deviation is this share of the usual one */
 #define LEARNT ((real)0.3) /* the same, for a prediction over a few periods */
+#define ASIDE ((real)0.01) /* share of a kick's variances that is added without correlation, */
+#define DIRECTED ((real)0.1) /* if constants are known as above; if not, nor is the kick's direction */
 #define UNTIMELY 70        /* factor t of the timing (noise.h) for a torque far too early or late */
 #define LATEST 700         /* the largest */
 #define ONCE ((real)0.05)  /* after such a torque t grows, from this value at least, */
@@ -44,11 +46,18 @@ static int is_known(const stewart_filter *filter, const real *root, real share)
 void stewart_attempt_predicted(stewart_attempt *a)
 {
     const stewart_filter *f = a->filter;
-    stewart_kicks(f->machine, &a->period->schedule, a->period->following, a->end, a->after->mean + X,
-                  a->kicks);
+    const real t = a->prior->noise->timing;
+    const real aside = is_known(f, a->prior->root, DIRECTED) ? ASIDE : 1;
+    stewart_kicks(f->machine, a->period, a->end, a->after->mean + X, a->kicks);
     for (int i = 0; i < X; i++) {
-        a->kicks[i] *= f->timing_std * f->timing_std;
-        a->drift[i] = REAL(sqrt)(f->model_std[i] * f->model_std[i] + a->prior->noise->timing * a->kicks[i]);
+        real square = f->model_std[i] * f->model_std[i];
+        for (int k = 0; k < a->changes; k++) {
+            real *kick = a->kicks + X * k + i;
+            *kick *= f->timing_std;
+            square += aside * t * *kick * *kick;
+            a->late[X * k + i] = REAL(sqrt)((1 - aside) * t) * *kick;
+        }
+        a->drift[i] = REAL(sqrt)(square);
     }
 }
 
@@ -63,7 +72,7 @@ int stewart_attempt_ended(stewart_attempt *a, stewart_scratch scratch)
         const real own = a->filter->walk_std[i], wander = a->filter->wander_std[i];
         walk[i] = REAL(sqrt)(own * own + after->noise->used * wander * wander);
     }
-    stewart_root_of_prediction(n, a->last, a->drift, walk, after->root, scratch);
+    stewart_root_of_prediction(n, a->last, a->drift, walk, a->changes, a->late, after->root, scratch);
     stewart_copy(X, a->end, after->mean);
     *after->left_out = (real)a->left_out;
     return stewart_all_finite(n, after->mean) && stewart_all_finite(n * n, after->root);
@@ -127,7 +136,6 @@ static void learn(const Sample *s, const real *innovations, const real *variance
 {
     const stewart_attempt *a = s->attempt;
     const stewart_filter *f = a->filter;
-    const real nothing[X] = {0};
     const int m = f->sensing->size;
     real *K = s->instant.J; /* C^-1 dh/dx */
     if (!f->sensing->jacobian) {
@@ -136,8 +144,8 @@ static void learn(const Sample *s, const real *innovations, const real *variance
             K[(X + 1) * i] = 1;
     }
     stewart_whiten(m, X, s->instant.C, K);
-    stewart_noise_learn(m, innovations, variances, K, f->learns_timing ? a->kicks : nothing, a->n - X,
-                        a->last, f->wander_std, f->keep, a->after->noise);
+    stewart_noise_learn(m, innovations, variances, K, f->learns_timing ? a->changes : 0, a->kicks,
+                        a->n - X, a->last, f->wander_std, f->keep, a->after->noise);
 }
 
 static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
@@ -161,20 +169,20 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     stewart_attempt_predicted(a);
     if (!a->values)
         return stewart_attempt_ended(a, scratch);
-    if (!stewart_innovation_root(f->sensing, a->end, 0, NULL, a->drift, s.instant.C, scratch))
+    if (!stewart_innovation_root(f->sensing, a->end, a->changes, a->late, a->drift, s.instant.C, scratch))
         return 0;
     const stewart_kalman update = {n, m, ITERATIONS, prior->mean, prior->root, f->lower, f->upper, &s,
                                    stewart_instant_rows, stewart_instant_settle, a->hopeless,
                                    innovations, variances};
     if (!stewart_kalman_update(&update, xi, a->after->root, &a->distance, &spread, scratch))
         return 0;
+    a->likelihood = -(a->distance + spread) / 2;
+    for (int i = 0; i < m; i++)
+        a->likelihood -= REAL(log)(s.instant.C[(m + 1) * i]);
     if (!(a->distance <= f->gate)) /* or NaN */
         return 0;
     *a->after->squares += a->distance;
     *a->after->values += (real)m;
-    a->likelihood = -(a->distance + spread) / 2;
-    for (int i = 0; i < m; i++)
-        a->likelihood -= REAL(log)(s.instant.C[(m + 1) * i]);
     learn(&s, innovations, variances);
     return stewart_attempt_ended(a, scratch);
 }
@@ -184,6 +192,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
 static int attempt(stewart_attempt *a, stewart_scratch scratch)
 {
     a->left_out = a->gated = 0;
+    a->likelihood = -(real)INFINITY;
     stewart_copy(a->n, a->prior->mean, a->after->mean);
     *a->after->squares = *a->prior->squares;
     *a->after->values = *a->prior->values;
@@ -269,15 +278,24 @@ static int attempt_changed(stewart_attempt *a, const stewart_posterior *now,
     return attempt(a, scratch);
 }
 
+/* The largest log-density of an outlier, of all factors on its covariance: what a cause has to exceed. */
+static real without_cause(const stewart_attempt *a)
+{
+    const real m = (real)a->filter->sensing->size;
+    if (!isfinite(a->likelihood))
+        return -(real)INFINITY;
+    return a->likelihood + (a->distance - m - m * REAL(log)(a->distance / m)) / 2;
+}
+
 /* Compute `after` of an outlier that the model explains after all, from `now` with more noise or widened
    variances in `before`: a torque came far too early or late, or parameters changed by the least share
-   that explains it. Returns 0 if neither does. */
+   that explains it. Late torques must be likelier than `without`. Returns 0 if neither does. */
 static int explain(stewart_attempt *a, const stewart_posterior *now, const stewart_posterior *before,
-                   real most, stewart_scratch scratch)
+                   real most, real without, stewart_scratch scratch)
 {
     const stewart_filter *filter = a->filter;
     const int size = stewart_posterior_size(a->n, filter->sensing->size);
-    real late = -(real)INFINITY, untimely = 0;
+    real late = without, untimely = 0;
     int found = 0;
     a->prior = before;
     a->hopeless = HOPELESS * filter->gate;
@@ -295,7 +313,7 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
     if (attempt_changed(a, now, before, most, scratch) || a->distance <= a->hopeless)
         for (real share = CHANGED; !found && share <= most; share *= REAL(sqrt)(10))
             found = attempt_changed(a, now, before, share, scratch);
-    if (isfinite(late) && !(found && a->likelihood >= late)) {
+    if (untimely > 0 && !(found && a->likelihood >= late)) {
         stewart_copy(size, now->mean, before->mean);
         before->noise->timing = untimely;
         found = attempt(a, scratch);
@@ -323,7 +341,11 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
                          .values = values, .history = history, .after = &after};
     a.kept = stewart_take(&scratch, kept_numbers(n, period->schedule.number));
     a.kept[0] = (real)NAN;
+    a.changes = stewart_changes(period);
+    a.kicks = stewart_take(&scratch, X * a.changes);
+    a.late = stewart_take(&scratch, X * a.changes);
     int fits = values && attempt(&a, scratch);
+    const real without = without_cause(&a);
     if (values && filter->jump_std && (!fits || a.gated)) {
         if (jump(&a, &now, &before, scratch)) {
             accept(n, m, &after, &now);
@@ -346,7 +368,7 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
     a.prior = &now;
     const real most = outliers > 1 || *now.values <= YOUNG * (real)m ? MOST_AGREEING : MOST_CHANGED;
     if (values && !filter->legs
-        && explain(&a, &now, &before, most * (real)1.1, scratch)) {
+        && explain(&a, &now, &before, most * (real)1.1, without, scratch)) {
         accept(n, m, &after, &now);
         return;
     }
@@ -369,9 +391,9 @@ int stewart_filter_scratch(const stewart_filter *filter, int torques)
 {
     const stewart_legs *legs = filter->legs;
     const int n = size_of(filter), p = n - X, m = filter->sensing->size;
-    const int sample = m * (m + 3 + X) + X * (n + 1) * torques + stewart_kalman_scratch(n, m);
+    const int sample = m * (m + 3 + X) + m * (torques + 1) + X * (n + 1) * torques + stewart_kalman_scratch(n, m);
     const int step = legs ? legs->scratch(filter, torques) : sample;
-    const int within = step + stewart_transitions_scratch(p) + 2 * n * n + (X + 2) * n;
+    const int within = step + stewart_transitions_scratch(p) + 2 * n * n + (X + 3 + torques) * n;
     const int start = X * X + m + LEGS * (6 + p) + (legs ? legs->start_scratch(filter) : 0);
-    return 2 * stewart_posterior_size(n, m) + kept_numbers(n, torques) + (within > start ? within : start);
+    return 2 * stewart_posterior_size(n, m) + kept_numbers(n, torques) + 2 * X * (torques + 1) + (within > start ? within : start);
 }

@@ -56,12 +56,6 @@ typedef struct {
     const real *upper;
 } stewart_filter;
 
-/* Torques between two samples, under the assumed delay. */
-typedef struct {
-    stewart_schedule schedule; /* with its substeps */
-    const real *following; /* (6) N m, the next torque */
-} stewart_interval;
-
 /* Codes of encoders before a measurement. */
 typedef struct {
     const real *last;  /* (m) the last measurement, NaN without one */

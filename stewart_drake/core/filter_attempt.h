@@ -13,10 +13,11 @@ typedef struct {
     const stewart_history *history;
     stewart_posterior *after;   /* result; its mean begins as that of the prior */
     real end[STEWART_STATES];   /* state at the end of the period */
-    real drift[STEWART_STATES]; /* standard deviation of the model's error there */
-    real kicks[STEWART_STATES]; /* variance of `end` by the torques' timing, at t = 1 (noise.h) */
+    real drift[STEWART_STATES]; /* standard deviation of the model's other errors there */
+    int changes;        /* of torque, see noise.h */
+    real *kicks, *late; /* (changes, 12) effect on `end` of the torques' timing at t = 1, and now */
     real distance;              /* of the last innovation, as of `stewart_kalman` */
-    real likelihood;            /* log of the density of the values, without a constant */
+    real likelihood;            /* log of the density of the values, without a constant; -inf without one */
     const real *last;           /* (12, n) d[end]/d[xi] */
     real *kept; /* of the last prediction from a prior: 1 if F was of fourth order, 0 if not, NaN for none;
                    the prior's mean, the state at the end, states, H (see filter.c) */
@@ -25,11 +26,11 @@ typedef struct {
     int gated;                  /* number of legs with a value that does not fit */
 } stewart_attempt;
 
-/* Fill in `kicks` and `drift` from `end` of the prior. */
+/* Fill in `kicks`, `late` and `drift` from `end` of the prior. */
 void stewart_attempt_predicted(stewart_attempt *attempt);
 
 /* Predict mean and root in `after` over the period, with `end` and `last` of that mean; without values
-   the root is that of the prior. Returns 0 if a result is not finite. Scratch: 2 n n + n numbers. */
+   the root is that of the prior. Returns 0 if a result is not finite. Scratch: (2 n + changes) n + n numbers. */
 int stewart_attempt_ended(stewart_attempt *attempt, stewart_scratch scratch);
 
 /* Measurement by encoders, whose readings depend on the motion within the period. */

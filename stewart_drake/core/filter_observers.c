@@ -68,8 +68,7 @@ static stewart_filter filter_of(const stewart_law *law, const stewart_sensing *s
 static stewart_interval last_interval(const stewart_law *law, int number, const real *torques,
                                        stewart_scratch *scratch)
 {
-    stewart_interval period;
-    stewart_last_periods(law, number, torques, 1, &period.schedule, &period.following, scratch);
+    stewart_interval period = stewart_last_periods(law, number, torques, 1, scratch);
     period.schedule.substeps =
         stewart_substeps(&law->machine, period.schedule.number, period.schedule.torques);
     return period;

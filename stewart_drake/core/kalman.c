@@ -89,10 +89,10 @@ void stewart_absorb(int n, int m, real *R, real *W, stewart_scratch scratch)
     }
 }
 
-void stewart_root_of_prediction(int n, const real *H, const real *std, const real *walk, real *L,
-                                stewart_scratch scratch)
+void stewart_root_of_prediction(int n, const real *H, const real *std, const real *walk, int k,
+                                const real *K, real *L, stewart_scratch scratch)
 {
-    real *R = stewart_take(&scratch, n * n), *W = stewart_take(&scratch, n * n);
+    real *R = stewart_take(&scratch, n * n), *W = stewart_take(&scratch, n * (n + k));
     stewart_fill(n * n, 0, R);
     for (int i = 0; i < n; i++)
         R[(n + 1) * i] = i < X ? std[i] : walk[i - X];
@@ -101,14 +101,15 @@ void stewart_root_of_prediction(int n, const real *H, const real *std, const rea
             W[n * j + i] = L[n * i + j];
     for (int j = 0; j < n; j++) {
         real *w = W + n * j, moved[X];
-        for (int i = 0; i < X; i++) {
-            moved[i] = 0;
-            for (int k = 0; k < n; k++)
-                moved[i] += H[n * i + k] * w[k];
-        }
+        for (int i = 0; i < X; i++)
+            moved[i] = stewart_dot(n, H + n * i, w);
         stewart_copy(X, moved, w);
     }
-    stewart_absorb(n, n, R, W, scratch);
+    for (int row = 0; row < k; row++) {
+        stewart_fill(n, 0, W + n * (n + row));
+        stewart_copy(X, K + X * row, W + n * (n + row));
+    }
+    stewart_absorb(n, n + k, R, W, scratch);
     for (int i = 0; i < n; i++)
         for (int j = 0; j < n; j++)
             L[n * i + j] = j <= i ? R[n * j + i] : 0;
@@ -121,7 +122,7 @@ void stewart_widen_root(int n, const real *jump, real *L, stewart_scratch scratc
     stewart_fill(X, 0, none);
     for (int i = 0; i < X; i++)
         same[(n + 1) * i] = 1;
-    stewart_root_of_prediction(n, same, none, jump, L, scratch);
+    stewart_root_of_prediction(n, same, none, jump, 0, NULL, L, scratch);
 }
 
 int stewart_root(int n, real *P)

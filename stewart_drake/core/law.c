@@ -69,8 +69,8 @@ void stewart_start(const stewart_law *law, real *memory, int number, const real 
     const int length = in_flight_length(law);
     stewart_fill(law->memory, (real)NAN, memory);
     stewart_fill(U * length, 0, memory + l->in_flight.at);
-    for (int i = 0; i < number && i < length; i++)
-        keep(queue + U * (number - 1 - i), memory + l->in_flight.at + U * (length - 1 - i));
+    for (int i = 0; number > 0 && i < length; i++) /* the oldest has acted before, too */
+        keep(queue + U * (i < number ? number - 1 - i : 0), memory + l->in_flight.at + U * (length - 1 - i));
     stewart_fill(U, 0, memory + l->torque.at);
     if (number > 0)
         stewart_copy(U, memory + l->in_flight.at + U * (length - 1), memory + l->torque.at);
@@ -111,7 +111,6 @@ static void fixed_delay_outlook(const stewart_law *law, const real *in_flight, s
     const real *torques = in_flight + U * (length - queue);
     real *times = stewart_take(scratch, law->steps + 1);
     real *durations = stewart_take(scratch, queue + 1);
-    stewart_schedule last;
     for (int k = 0; k < law->steps; k++)
         times[k] = law->period * (real)(k + 1);
     for (int k = 0; k < queue; k++)
@@ -123,7 +122,7 @@ static void fixed_delay_outlook(const stewart_law *law, const real *in_flight, s
     outlook->samples = law->steps;
     outlook->times = times;
     outlook->pending = pending;
-    stewart_last_periods(law, length, in_flight, 1, &last, NULL, scratch);
+    const stewart_schedule last = stewart_last_periods(law, length, in_flight, 1, scratch).schedule;
     outlook->limited = stewart_at_limit(&law->machine, last.number, last.torques);
 }
 
@@ -170,8 +169,8 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
     stewart_copy(X, observed, outlook->state);
     observer->parameters(law, observed, outlook->theta, std);
     if (behind > 0 && stewart_all_finite(X, outlook->state)) {
-        stewart_schedule schedule;
-        stewart_last_periods(law, length, in_flight, behind, &schedule, NULL, scratch);
+        const stewart_schedule schedule =
+            stewart_last_periods(law, length, in_flight, behind, scratch).schedule;
         real *states = stewart_take(scratch, X * schedule.number);
         stewart_predict(&law->machine, outlook->theta, &schedule, outlook->state, states);
         stewart_copy(X, states + X * (schedule.number - 1), outlook->state);

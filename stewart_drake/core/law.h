@@ -163,7 +163,6 @@ int stewart_limit(const stewart_machine *machine, const real *torque, real *limi
 stewart_schedule stewart_schedule_of(const stewart_law *law, int periods, const real *torques,
                                  stewart_scratch *scratch);
 
-/* For observers of a fixed delay: what acted in the last `periods` of torques (number, 6), and the
-   torque that acts next. */
-void stewart_last_periods(const stewart_law *law, int number, const real *torques, int periods,
-                          stewart_schedule *schedule, const real **following, stewart_scratch *scratch);
+/* For observers of a fixed delay: what acted in the last `periods` of torques (number, 6). */
+stewart_interval stewart_last_periods(const stewart_law *law, int number, const real *torques, int periods,
+                                      stewart_scratch *scratch);

@@ -32,6 +32,12 @@ typedef struct {
     int substeps;          /* for each of them; 0: by the largest torque */
 } stewart_schedule;
 
+/* What acts between two samples, under the assumed delay. */
+typedef struct {
+    stewart_schedule schedule;
+    const real *preceding, *following; /* (6) N m, the torques before and after */
+} stewart_interval;
+
 /* A machine with estimated parameters in the place of those known beforehand. */
 typedef struct {
     stewart_plant plant;

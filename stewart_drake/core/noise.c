@@ -8,6 +8,7 @@
 #define WIDER 12
 #define ODD 3       /* largest nu^2 / S - 1 of a value in the slope of w */
 #define LATEST 1000 /* largest t */
+#define SQRT_HALF ((real)0.70710678118654752)
 #define UNTIMELY 4  /* t of torques that are off by twice the assumed standard deviation */
 
 void stewart_noise_start(stewart_noise *noise)
@@ -23,17 +24,16 @@ static real scored(real factor, real slope, real information)
 }
 
 void stewart_noise_learn(int m, const real *innovations, const real *variances, const real *H,
-                         const real *timing, int p, const real *G, const real *wander, real keep,
-                         stewart_noise *noise)
+                         int changes, const real *kicks, int p, const real *G, const real *wander,
+                         real keep, stewart_noise *noise)
 {
-    real timing_slope = 0, wander_slope = 0;
+    real wander_slope = 0, all = 0;
     noise->known_timing *= keep;
     noise->known_wander *= keep;
     for (int i = 0; i < m; i++) {
         const real *h = H + X * i;
-        real K = 0, W = 0, S = variances[i];
-        for (int j = 0; j < X; j++)
-            K += h[j] * h[j] * timing[j];
+        real W = 0, S = variances[i];
+        all += innovations[i] * innovations[i] / S;
         for (int k = 0; k < p; k++) {
             real change = 0;
             for (int j = 0; j < X; j++)
@@ -44,11 +44,24 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
         const real S_at_w = S - (noise->used - noise->wander) * W; /* not at the factor in use */
         S = S_at_w > S / 10 ? S_at_w : S / 10;
         const real off = innovations[i] * innovations[i] / S - 1;
-        timing_slope += K * off / (2 * S);
         wander_slope += W * (off < ODD ? off : ODD) / (2 * S);
-        noise->known_timing += K * K / (2 * S * S);
         noise->known_wander += W * W / (2 * S * S);
     }
+    real pulls = 0, squares = 0, along = 0;
+    for (int c = 0; c < changes; c++) {
+        real pull = 0, square = 0;
+        for (int i = 0; i < m; i++) {
+            const real k = stewart_dot(X, H + X * i, kicks + X * c);
+            pull += k * innovations[i] / variances[i];
+            square += k * k / variances[i];
+        }
+        pulls += pull * pull;
+        squares += square;
+        along += square > 0 ? pull * pull / square : 0;
+        noise->known_timing += square * square / 2;
+    }
+    const real across = m > changes ? (all - along) / (real)(m - changes) : 1;
+    const real timing_slope = (pulls - squares * (across > 1 ? across : 1)) / 2;
     const real t = noise->timing > 1 ? noise->timing : 1;
     const real found = scored(noise->timing, timing_slope, noise->known_timing + ONE_TORQUE / (t * t));
     noise->timing = found < LATEST ? found : LATEST;
@@ -61,26 +74,28 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
         noise->used = WIDER * excess;
 }
 
-void stewart_kicks(const stewart_machine *machine, const stewart_schedule *schedule,
-                   const real *following, const real *state, const real *theta, real *squares)
+int stewart_changes(const stewart_interval *period) { return period->schedule.number + 1; }
+
+void stewart_kicks(const stewart_machine *machine, const stewart_interval *period, const real *state,
+                   const real *theta, real *kicks)
 {
+    const stewart_schedule *schedule = &period->schedule;
+    const int number = schedule->number;
     stewart_belief belief;
     real before[6], after[6], left = 0; /* s from a change of torque to the end */
     stewart_believe(machine, theta, &belief);
-    stewart_fill(X, 0, squares);
-    for (int k = 0; k < schedule->number; k++)
+    for (int k = 0; k < number; k++)
         left += schedule->durations[k];
-    stewart_accelerate(&belief, state, schedule->torques, before);
-    for (int k = 0; k < schedule->number; k++) {
-        const int last = k + 1 == schedule->number;
-        stewart_accelerate(&belief, state, last ? following : schedule->torques + U * (k + 1),
-                           after);
-        left = last ? 0 : left - schedule->durations[k];
+    stewart_accelerate(&belief, state, period->preceding, before);
+    for (int k = 0; k <= number; k++, kicks += X) {
+        const real share = k == 0 || k == number ? SQRT_HALF : 1;
+        const real *torque = k < number ? schedule->torques + U * k : period->following;
+        stewart_accelerate(&belief, state, torque, after);
         for (int i = 0; i < 6; i++) {
-            const real change = after[i] - before[i];
-            squares[i] += left * change * left * change;
-            squares[6 + i] += change * change;
+            kicks[6 + i] = share * (before[i] - after[i]);
+            kicks[i] = left * kicks[6 + i];
             before[i] = after[i];
         }
+        left = k + 1 < number ? left - schedule->durations[k] : 0;
     }
 }

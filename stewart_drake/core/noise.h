@@ -2,18 +2,20 @@
 
    The covariance of an innovation nu (m) is
 
-       S = S_0 + t K + w W,
+       S = S_0 + t sum_c k_c k_c' + w W,
 
-   t K is due to torques that act early or late: K holds for the assumed standard deviation of their
-   timing. w W is due to parameters that wander: W holds for their assumed change in a period. S_0 is the
-   rest. The factors t >= 0 and w >= 0 are unknown. The log-density of single values,
-   -1/2 (nu_i^2 / S_ii + ln S_ii), has the slope and the information
+   k_c is the effect of a change of torque that comes early or late by the assumed standard deviation of
+   the timing. w W is due to parameters that wander: W holds for their assumed change in a period. S_0 is
+   the rest. The factors t >= 0 and w >= 0 are unknown. With S diagonal the log-density has the slopes and
+   the information
 
-       g = 1/2 sum_i d_i (nu_i^2 - S_ii) / S_ii^2,   I = 1/2 sum_i d_i^2 / S_ii^2,   d_i = K_ii or W_ii,
+       g_t = 1/2 sum_c (a_c^2 - b_c r),              I_t = 1/2 sum_c b_c^2,
+       g_w = 1/2 sum_i W_ii (nu_i^2 - S_ii) / S_ii^2,   I_w = 1/2 sum_i W_ii^2 / S_ii^2,
 
-   and Fisher scoring is t <- t + g / J, with J the sum of the information; each period keeps the share
-   `keep` of J. In the slope of w, nu_i^2 / S_ii - 1 is at most ODD, so that a few values do not
-   decide.
+   a_c = k_c' S^-1 nu and b_c = k_c' S^-1 k_c, and Fisher scoring is t <- t + g / J, with J the sum of
+   the information; each period keeps the share `keep` of J. r is the mean square of the innovation
+   across all k_c, but at least 1: where the model is wrong in every direction, the timing is not the
+   cause. In the slope of w, nu_i^2 / S_ii - 1 is at most ODD, so that a few values do not decide.
 
    Torques begin with t = 1, and with the information of one torque. Parameters begin as constants,
    w = 0. The covariance is widened only by the excess of w over SURE standard deviations J^-1/2:
@@ -38,15 +40,18 @@ void stewart_noise_start(stewart_noise *noise);
 
 /* Update the factors by values (m) with innovations nu and variances S. H (m, 12) is the derivative of
    the values by the state, and G (12, 12 + p) that of the state by state and parameters a period before.
-   `timing` (12) are the variances of the state at t = 1, `wander` (p) the standard deviations of the
-   parameters at w = 1; both may be 0. `keep` is the share of J that is kept in a period. */
+   `kicks` (changes, 12) are the effects on the state at t = 1, `wander` (p) the standard deviations of
+   the parameters at w = 1; both may be 0. `keep` is the share of J that is kept in a period. */
 void stewart_noise_learn(int m, const real *innovations, const real *variances, const real *H,
-                         const real *timing, int p, const real *G, const real *wander, real keep,
-                         stewart_noise *noise);
+                         int changes, const real *kicks, int p, const real *G, const real *wander,
+                         real keep, stewart_noise *noise);
 
-/* squares (12) <- squared changes of the state at a period's end, per second that a torque comes early,
-   summed over the changes of torque in the period. The last change is to `following`, at the end. To
+/* Changes of torque in a period, those at both of its samples included. */
+int stewart_changes(const stewart_interval *period);
+
+/* kicks (changes, 12) <- change of the state at the period's end, per second that a torque comes late. To
    first order the acceleration differs by B dT for that time: this stays in the rates, and moves the
-   pose for the rest of the period. */
-void stewart_kicks(const stewart_machine *machine, const stewart_schedule *schedule, const real *following,
-                   const real *state, const real *theta, real *squares);
+   pose for the rest of the period. A torque that changes at a sample acts in the period after it if it is
+   late and in the one before if it is early: each has half the variance. */
+void stewart_kicks(const stewart_machine *machine, const stewart_interval *period, const real *state,
+                   const real *theta, real *kicks);

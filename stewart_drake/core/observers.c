@@ -8,8 +8,7 @@ static int estimated(const stewart_law *law) { return law->machine.estimated; }
 void stewart_move_on(const stewart_law *law, int number, const real *torques, real *state,
                      stewart_scratch scratch)
 {
-    stewart_schedule schedule;
-    stewart_last_periods(law, number, torques, 1, &schedule, NULL, &scratch);
+    const stewart_schedule schedule = stewart_last_periods(law, number, torques, 1, &scratch).schedule;
     real *states = stewart_take(&scratch, X * schedule.number);
     stewart_predict(&law->machine, NULL, &schedule, state, states);
     stewart_copy(X, states + X * (schedule.number - 1), state);

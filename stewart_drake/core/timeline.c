@@ -36,22 +36,20 @@ stewart_schedule stewart_schedule_of(const stewart_law *law, int periods, const 
     return schedule;
 }
 
-void stewart_last_periods(const stewart_law *law, int number, const real *torques, int periods,
-                          stewart_schedule *schedule, const real **following, stewart_scratch *scratch)
+stewart_interval stewart_last_periods(const stewart_law *law, int number, const real *torques, int periods,
+                                      stewart_scratch *scratch)
 {
     const int queue = stewart_queue_length(law);
     const real *first = torques + U * (number - queue - periods);
-    if (law->parts > 0) { /* the motors decide the next torque; use the last one */
+    if (law->parts > 0) { /* the motors decide the next torque: assume no change */
         real *durations = stewart_take(scratch, number);
         stewart_fill(number, law->period / (real)law->parts, durations);
-        *schedule = (stewart_schedule){number, torques, durations, 0};
-        if (following)
-            *following = torques + U * (number - 1);
-        return;
+        return (stewart_interval){{number, torques, durations, 0}, torques, torques + U * (number - 1)};
     }
-    *schedule = stewart_schedule_of(law, periods, first, scratch);
-    if (following) /* without a delay it is not computed yet: assume no change */
-        *following = queue > 0 ? first + U * periods : first + U * (periods - 1);
+    /* Without a delay the next torque is not computed yet; the one before may not be remembered. */
+    const real *before = first > torques ? first - U : first;
+    const real *after = first + U * (queue > 0 ? periods : periods - 1);
+    return (stewart_interval){stewart_schedule_of(law, periods, first, scratch), before, after};
 }
 
 void stewart_given_rows(void *about, int number, const real *times, real *rows)

@@ -102,13 +102,13 @@ static int timing_observe(const stewart_law *law, real *memory, int number, cons
         forget(timing);
         return status;
     }
-    stewart_schedule schedule;
-    const real *following;
-    stewart_last_periods(law, number, torques, 1, &schedule, &following, &scratch);
+    const stewart_interval period = stewart_last_periods(law, number, torques, 1, &scratch);
+    const stewart_schedule *schedule = &period.schedule;
     stewart_move_on(law, number, torques, predicted, scratch);
     impulse_between(law, predicted, memory, u);
-    const int within = schedule.number > 1;
-    const real *first = schedule.torques, *last = within ? first + U * (schedule.number - 1) : following;
+    const int within = schedule->number > 1;
+    const real *first = schedule->torques;
+    const real *last = within ? first + U * (schedule->number - 1) : period.following;
     for (int i = 0; i < U; i++) {
         const real change = last[i] - first[i];
         D[i] = within ? change : (change + timing->change[i]) / 2;

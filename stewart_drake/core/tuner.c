@@ -399,13 +399,16 @@ int stewart_tuned_step(const stewart_law *law, const stewart_tuner *t, real *mem
         .feedforward = {memory + l->feedforward.at, before + l->feedforward.at},
         .std = std,
     };
-    if (law->observer->last_period)
-        law->observer->last_period(law, before + l->observer.at, l->in_flight.rows,
-                                   before + l->in_flight.at, &input.schedule, &input.following,
-                                   &scratch);
-    else
-        stewart_last_periods(law, l->in_flight.rows, before + l->in_flight.at, 1, &input.schedule,
-                             &input.following, &scratch);
+    const int number = l->in_flight.rows;
+    const real *in_flight = before + l->in_flight.at;
+    if (law->observer->last_period) {
+        law->observer->last_period(law, before + l->observer.at, number, in_flight, &input.schedule,
+                                   &input.following, &scratch);
+    } else {
+        const stewart_interval period = stewart_last_periods(law, number, in_flight, 1, &scratch);
+        input.schedule = period.schedule;
+        input.following = period.following;
+    }
     law->observer->parameters(law, memory + l->observer.at, theta, std);
     stewart_tuner_observe(t, tuner_memory, &input, wanted, sample->weights, fell_back, scratch);
     return status;

@@ -163,8 +163,9 @@ class PredictiveLqi:
                 for an observer whose estimate of the delay may grow.
         """
         nothing = np.zeros(NUM_TORQUES)
+        before = queue[0] if len(queue) else nothing  # the oldest has acted before, too
         return Memory(
-            in_flight=np.vstack([np.zeros((1 + self.kept, NUM_TORQUES)), queue]),
+            in_flight=np.vstack([np.tile(before, (1 + self.kept, 1)), queue]),
             belief=self.observer.start(self.timeline, self.sensing, self.plant),
             measurement=np.full(self.sensing.size, np.nan),
             error=np.zeros(NUM_COORDINATES),

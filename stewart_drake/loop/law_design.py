@@ -213,6 +213,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     timing = exact and not any(noise or ()) and math.isfinite(tolerated)
     observer = CoreObserver(settings if c.estimate else None, gaps=gaps, timing=timing)
     quiet = c.open_loop_start and sc.start == "rest"
+    before = int(bool(c.estimate) and c.delay_estimator == "none")  # torques, as the filter asks
     waits = longest_wait(sc)
     channel = link.channel(sc.link, experiment, timeline, waits)
     motors = TorqueLimit(experiment.torque_limit)
@@ -227,7 +228,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         cost=cost_of(experiment, peak_torque),
         channel=channel,
         longest_wait=waits,
-        kept=waits + (REPORTS if isinstance(channel, Packets) else 0),
+        kept=waits + (REPORTS if isinstance(channel, Packets) else before),
         silence=_until_seen(timeline.delay, waits) if quiet else 0,
         tolerated_timing=tolerated,
     )
