@@ -17,7 +17,7 @@
 static int most_pieces(const stewart_law *law)
 {
     const stewart_replan *replan = law->planning;
-    return replan->until + stewart_plan_pieces(law->period, replan->periods);
+    return replan->until + stewart_plan_pieces(law->period, replan->most);
 }
 
 static int replan_memory(const stewart_law *law) { return HEAD + PIECE * most_pieces(law); }
@@ -27,7 +27,7 @@ static int replan_scratch(const stewart_law *law)
     const stewart_replan *replan = law->planning;
     const int p = law->machine.estimated;
     const int judged = (X + p) * (X + p) + stewart_sure_scratch(p, replan->until);
-    const int planned = PIECE * most_pieces(law) + stewart_plan_scratch(law->period, replan->periods);
+    const int planned = PIECE * most_pieces(law) + stewart_plan_scratch(law->period, replan->most);
     return X * (replan->until + 1) + (judged > planned ? judged : planned);
 }
 
@@ -63,17 +63,22 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
                 const real *states, real *memory, stewart_scratch scratch)
 {
     const stewart_replan *replan = law->planning;
+    int periods = replan->periods, further;
     real times[3], rows[3 * ROW], peak, *pieces = stewart_take(&scratch, PIECE * most_pieces(law));
     const real *last = states + X * outlook->until.number;
     stewart_belief belief;
     stewart_believe(&law->machine, outlook->theta, &belief);
-    stewart_plan_times(outlook->eta, law->period, replan->periods, times);
-    sample->goal(sample->about, 3, times, rows);
-    int number = stewart_predicted_pieces(&belief, &outlook->until, states, 0, pieces);
-    int further = stewart_plan_way(&belief, replan->sign, last, outlook->eta, law->period,
-                                   replan->periods, rows, pieces + PIECE * number, &peak, scratch);
-    if (further == 0)
-        return 0;
+    const int number = stewart_predicted_pieces(&belief, &outlook->until, states, 0, pieces);
+    for (;; periods = 2 * periods < replan->most ? 2 * periods : replan->most) {
+        stewart_plan_times(outlook->eta, law->period, periods, times);
+        sample->goal(sample->about, 3, times, rows);
+        further = stewart_plan_way(&belief, replan->sign, last, outlook->eta, law->period, periods, rows,
+                                   pieces + PIECE * number, &peak, scratch);
+        if (further == 0)
+            return 0;
+        if (peak <= law->machine.torque_limit || periods >= replan->most)
+            break;
+    }
     memory[0] = 0;
     memory[1] = (real)(number + further);
     memory[3] = (real)has_acted(law, outlook, memory);

@@ -14,7 +14,8 @@
 #include "planning.h"
 
 typedef struct {
-    int periods;  /* length of a plan, at least two */
+    int periods;  /* length of a plan, at least two; doubled while the plan exceeds the torque limit, */
+    int most;     /* up to this */
     int until;    /* largest number of torques that act before the next one does */
     real size[6]; /* of the motion, peak to peak, rad and m */
     real sure;    /* largest standard deviation of the predicted pose for a plan, share of `size` */

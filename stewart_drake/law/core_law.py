@@ -168,7 +168,8 @@ class CompiledLaw:
         plan, until = c.ffi.new("stewart_replan *"), law.timeline.queue_length
         if isinstance(law.observer, CoreObserver) and law.observer.delay is not None:
             until = law.observer.max_schedule_length(d.period)
-        plan.periods, plan.until = planner.periods(d.period), until
+        plan.periods, plan.most = planner.lengths(d.period)
+        plan.until = until
         plan.size, plan.sign = planner.size.tolist(), home_sign(law.plant.mechanism)
         plan.sure = planner.sure
         d.planner, d.planning = c.ffi.addressof(c.lib, "stewart_replanner"), plan

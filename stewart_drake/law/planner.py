@@ -90,19 +90,22 @@ class Replan:
     """Plans a way back where the prediction is off the reference.
 
     Attributes:
-        duration: of the plan, s.
+        duration: of the plan, s. It is doubled while the plan exceeds the motors' limit.
+        longest: s, up to which; a plan of this length may exceed the limit.
         size: (6,) of the motion, peak to peak, rad and m.
         sure: largest standard deviation of the predicted pose at which a plan is made, as a share
             of the size. A plan from an uncertain state can make things worse.
     """
 
     duration: float
+    longest: float
     size: Array
     sure: float = SURE
 
-    def periods(self, period: float) -> int:
-        """Return the length of a plan in periods, two at least."""
-        return periods_of(self.duration, period)
+    def lengths(self, period: float) -> tuple[int, int]:
+        """Return the usual and the greatest length of a plan in periods, two at least."""
+        usual = periods_of(self.duration, period)
+        return usual, max(usual, periods_of(self.longest, period))
 
     def follow(
         self,
@@ -138,8 +141,12 @@ class Replan:
         if belief.estimate.uncertain and not self._is_sure(belief, schedule, states, plant):
             return before
         model = Model(plant.dynamics.assuming(belief.parameters))
-        begin, periods = motion.now + timeline.eta, self.periods(timeline.period)
-        plan = model.plan(motion.reference, states[-1], begin, timeline.period, periods)
+        given = motion.reference, states[-1], motion.now + timeline.eta, timeline.period
+        periods, most = self.lengths(timeline.period)
+        plan = model.plan(*given, periods)
+        while plan is not None and plan.peak > plant.motors.limit and periods < most:
+            periods = min(2 * periods, most)
+            plan = model.plan(*given, periods)
         if plan is None:
             return before  # no plan exists from here; it may at the next sample
         pieces = np.vstack([model.way(schedule, states, motion.now), plan.pieces])

@@ -374,16 +374,10 @@ def _replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> Pr
     prompt = isinstance(law.channel, Wire) and law.longest_wait == 0
     if not law.finds_delay and not (prompt and (length or sc.start != "rest")):
         return law
-    usual = length or _usual_replan(experiment, law.timeline.eta)
+    usual = replan or length or min(LONGEST_REPLAN, REPLAN_SHARE * law.timeline.eta)
+    longest = replan or length or LONGEST_REPLAN
     sure = SURE if length or law.finds_delay else SURE_ON_REFERENCE
-    return replace(law, planner=Replan(replan or usual, experiment.scale, sure))
-
-
-def _usual_replan(experiment: Experiment, eta: float) -> float:
-    """Return the length of a plan back onto the reference across a delay, s."""
-    if experiment.planned_limit is not None:  # a short plan takes large torques
-        return LONGEST_REPLAN
-    return min(LONGEST_REPLAN, REPLAN_SHARE * eta)
+    return replace(law, planner=Replan(usual, longest, experiment.scale, sure))
 
 
 def _learns(scenario: Scenario) -> bool:
