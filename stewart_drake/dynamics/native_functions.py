@@ -146,17 +146,11 @@ class NativeFunctions:
         N[ANGLES, ANGLES] = angle_rate_map(np.asarray(pose)[ANGLES])
         return N.T @ MN.T, N.T @ B
 
-    def margin(self, pose: Array, sign: float, least: Array) -> float:
-        """Return the least distance of the measures of a pose above `least` (8,); NaN for NaN.
-
-        `sign` is that of the parallel measure at home.
-        """
-        c = core()
-        pose = np.array(pose, np.float64)
-        return float(c.lib.stewart_margin(self._first, c.at(pose), sign, c.at(least)))
-
     def margins(self, poses: Array, sign: float, least: Array) -> Array:
-        """Return `margin` (n,) of poses (n, 6)."""
+        """Return the least distances (n,) of the measures of poses (n, 6) above `least` (8,).
+
+        `sign` is that of the parallel measure at home. NaN gives NaN.
+        """
         c, function = core(), core().lib.stewart_margin
         rows = np.array(poses, np.float64)
         first, limits = c.at(rows), c.at(least)

@@ -107,7 +107,6 @@ def resists(dynamics: StewartDynamics) -> bool:
 
 @Once
 def machine_of(plant: NominalPlant) -> Compiled:
-    """Return the `stewart_machine` of a plant."""
     machine, dynamics = core().ffi.new("stewart_machine *"), plant.dynamics
     machine.geometry = list(geometry(dynamics.mechanism))
     machine.parameters = list(dynamics.plant_parameters)

@@ -126,7 +126,6 @@ class CompiledLaw:
         }
 
     def _fill(self, data: Any) -> None:
-        """Fill in what both kinds of laws have."""
         c, law, part, timeline = core(), self.law, self._part, self.law.timeline
         machine = machine_of(law.plant)
         if resists(law.plant.dynamics):
@@ -213,7 +212,6 @@ class CoreMemory:
 
     @property
     def law(self) -> Any:
-        """The law."""
         return self.compiled.law
 
     def field(self, name: str) -> Array:
@@ -257,7 +255,6 @@ class CoreMemory:
 
     @cached_property
     def counts(self) -> Counts:
-        """Numbers of survived problems, by cause."""
         return Counts(*(int(count) for count in self.field("counts")))
 
     @cached_property
@@ -269,7 +266,6 @@ class CoreMemory:
         return belief.at(self.field("state"))
 
     def without_error(self) -> "CoreMemory":
-        """Return the memory with error and integral reset."""
         after = CoreMemory(self.data.copy(), self.compiled)
         after.field("error")[:] = after.field("integral")[:] = 0.0
         return after
@@ -344,7 +340,6 @@ class CoreServo:
         self._law, self._compiled = law, CompiledLaw(law)
 
     def initial_memory(self, command: Array) -> CoreMemory:
-        """Return the memory before the first sample, with the command (18,) that was sent last."""
         return CoreMemory(self._compiled.start(command), self._compiled)
 
     def step(

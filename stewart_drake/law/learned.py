@@ -77,7 +77,6 @@ class LearnedMemory(OuterMemory):
 
     @property
     def counts(self) -> Counts:
-        """Numbers of survived problems, by cause."""
         counts: Counts = self.free.counts
         return counts._replace(saturated_steps=self.saturated_steps)
 
@@ -93,7 +92,6 @@ class LearnedLqi(OuterLqi):
     learned: LearnedSignal = field(kw_only=True)
 
     def initial_memory(self, queue: Array) -> Any:
-        """Return the memory before the first sample; see `PredictiveLqi.initial_memory`."""
         begun = self._served.initial_memory(queue)
         ago = np.arange(-len(queue), 0)
         free = self._served.initial_memory(np.subtract(queue, self._acting(ago)))
@@ -111,7 +109,6 @@ class LearnedLqi(OuterLqi):
         weights: Array,
         report: Report | None = None,
     ) -> Any:
-        """Compute the torque of one sample; see `PredictiveLqi.step`."""
         free = self._served.step(memory.free, measurement, motion, weights, report)
         (learned,) = self._acting(np.array([memory.samples]))
         torque = free.torque + learned

@@ -91,7 +91,6 @@ class LimitedMemory(OuterMemory):
 
     @property
     def counts(self) -> Counts:
-        """Numbers of survived problems, by cause."""
         counts: Counts = self.free.counts
         return counts._replace(
             limited_steps=self.limited_steps, qp_failures=self.qp_failures, qp_late=self.qp_late
@@ -107,7 +106,6 @@ class LimitedMemory(OuterMemory):
         return after if cause is None else replace(after, **{cause: getattr(self, cause) + 1})
 
     def without_error(self) -> "LimitedMemory":
-        """Return the memory with error and integral reset."""
         return replace(self, free=self.free.without_error())
 
 
@@ -237,7 +235,6 @@ class LimitedLqi(OuterLqi):
         return np.concatenate([self.free.times_for(timeline), ends, nodes.ravel()])
 
     def initial_memory(self, queue: Array) -> Any:
-        """Return the memory before the first sample; see `PredictiveLqi.initial_memory`."""
         return LimitedMemory(self._served.initial_memory(queue))
 
     def step(

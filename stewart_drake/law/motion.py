@@ -149,7 +149,6 @@ class Course:
         return replace(course, missing=bool(found.missing), gap=bool(found.gap), **way)
 
     def _compiled(self) -> Any:
-        """Return the `stewart_course`."""
         c = core()
         arrays = map(c.at, (self.times, self.reference, self.followed))
         back = [self.offset.tolist(), self.holds, self.samples]

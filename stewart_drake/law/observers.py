@@ -261,7 +261,6 @@ def _law_of(
     fraction: float,
     parts: int,
 ) -> Compiled:
-    """Return a `stewart_law` with all that an observer reads of it."""
     law, machine = core().ffi.new("stewart_law *"), machine_of(plant)
     part = part_of(observer, sensing, plant, period)
     part.fill(law)
@@ -294,7 +293,6 @@ def _assumed(settings: FilterSettings) -> dict[str, Array]:
 
 @Once
 def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
-    """Return the `stewart_filter_settings` of a filter for `size` measured values."""
     c, known, p = core(), settings.parameters, len(settings.parameters.names)
     free = np.full(NUM_STATE, np.inf)
     it, prior = c.ffi.new("stewart_filter_settings *"), numbers(known.prior)
@@ -316,7 +314,6 @@ def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
 def _delay_settings_of(
     observer: CoreObserver, settings: FilterSettings, size: int, period: float
 ) -> Compiled:
-    """Return the `stewart_delay_settings` for `size` values of one instant."""
     c, delay = core(), observer.delay
     assert delay is not None
     it = c.ffi.new("stewart_delay_settings *")

@@ -138,7 +138,6 @@ class PositionServo:
 
     @cached_property
     def compiled(self) -> Any:
-        """The `stewart_position_servo *`."""
         numbers = self.stiffness, self.velocity_gain, self.torque_limit
         return core().ffi.new("stewart_position_servo *", numbers)
 
@@ -274,7 +273,6 @@ class ReportLayout:
 
     @property
     def size(self) -> int:
-        """Size of the report."""
         return self.periods * self.width + NUM_TORQUES
 
     def written(self, put_out: Array, asked: Array, motors: TorqueLimit) -> Array:

@@ -200,7 +200,6 @@ def weights_source(experiment: Experiment, law: PredictiveLqi) -> WeightsSource 
 
 
 def health_of(experiment: Experiment, law: PredictiveLqi) -> HealthFeatures:
-    """Return the features `health` of a law."""
     sc = experiment.scenario
     sensing = law.sensing
     if not isinstance(sensing, StateSensing) or law.longest_wait:

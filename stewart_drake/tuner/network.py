@@ -132,7 +132,6 @@ class Network:
 
 
 def _frozen(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return a read-only copy, checked."""
     array = np.array(value, dtype=np.float64)
     if array.shape != shape:
         raise ConfigError(f"{name}: got shape {array.shape}; expected {shape}")

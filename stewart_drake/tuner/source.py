@@ -94,7 +94,6 @@ class RatioPolicy:
 
     @property
     def first(self) -> Array:
-        """Weights (2,) of the first sample."""
         assert self.network.start is not None
         return self.network.start
 
@@ -115,7 +114,6 @@ class Rule:
 
     @property
     def first(self) -> Array:
-        """Weights (2,) of the first sample."""
         return weights_of(self.ratio)
 
 
