@@ -200,15 +200,10 @@ class CompiledLaw:
 
 @dataclass(frozen=True)
 class CoreMemory:
-    """Memory of a law in C, with the names of `law.memory.Memory`.
+    """Memory of a law in C, with the names of `law.memory.Memory`."""
 
-    Attributes:
-        data: (n,) all fields.
-        compiled: the law.
-    """
-
-    data: Array
-    compiled: CompiledLaw
+    data: Array  # (n,) all fields
+    compiled: CompiledLaw  # the law
 
     @property
     def law(self) -> Any:
@@ -430,13 +425,9 @@ class OuterLqi(PredictiveLqi):
 
 @dataclass(frozen=True)
 class OuterMemory:
-    """Memory of an `OuterLqi`; other names are those of the free law's memory.
+    """Memory of an `OuterLqi`; other names are those of the free law's memory."""
 
-    Attributes:
-        free: memory of the free law.
-    """
-
-    free: Any
+    free: Any  # memory of the free law
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_") or name == "free":

@@ -105,15 +105,10 @@ def state_within_hold(change: Array, B: Array, period: float, passed: float) -> 
 
 
 class HeldTorques(NamedTuple):
-    """Torques of h consecutive holds.
+    """Torques of h consecutive holds."""
 
-    Attributes:
-        torques: (h, 6) N m, held; the last is that of the torque to be computed.
-        changes: (h + 2, 6) of the exact torque over these holds and a neighbour on each side.
-    """
-
-    torques: Array
-    changes: Array
+    torques: Array  # (h, 6) N m, held; the last is that of the torque to be computed
+    changes: Array  # (h + 2, 6) of the exact torque over these holds and a neighbour on each side
 
 
 class Feedforward(ABC):

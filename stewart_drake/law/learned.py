@@ -37,15 +37,10 @@ def harmonics(phase: Array, number: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class LearnedSignal:
-    """Periodic torque or angle l(t) = `harmonics`(2 pi t / T) @ coefficients, N m or rad.
+    """Periodic torque or angle l(t) = `harmonics`(2 pi t / T) @ coefficients, N m or rad."""
 
-    Attributes:
-        period: T of the motion, s.
-        coefficients: (1 + 2 H, 6), N m or rad.
-    """
-
-    period: float
-    coefficients: Array
+    period: float  # T of the motion, s
+    coefficients: Array  # (1 + 2 H, 6), N m or rad
 
     def __call__(self, times: Array) -> Array:
         """Return the torque or angle (n, 6) at instants (n,) in s of the motion, N m or rad."""
@@ -83,12 +78,9 @@ class LearnedMemory(OuterMemory):
 
 @dataclass(frozen=True)
 class LearnedLqi(OuterLqi):
-    """`PredictiveLqi` with a learned torque.
+    """`PredictiveLqi` with a learned torque."""
 
-    Attributes:
-        learned: by the time of the motion, which begins with the first sample.
-    """
-
+    # by the time of the motion, which begins with the first sample
     learned: LearnedSignal = field(kw_only=True)
 
     def initial_memory(self, queue: Array) -> Any:

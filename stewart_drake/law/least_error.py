@@ -50,19 +50,12 @@ _BEYOND: Final = 0.05
 
 @dataclass(frozen=True)
 class LeastError:
-    """Plans of least error.
+    """Plans of least error."""
 
-    Attributes:
-        plant: model of the plant.
-        space: distances to keep.
-        Q: (6,) weights of the pose error.
-        R: (6, 6) weights of the torques.
-    """
-
-    plant: NominalPlant
-    space: ClearSpace
-    Q: Array
-    R: Array
+    plant: NominalPlant  # model of the plant
+    space: ClearSpace  # distances to keep
+    Q: Array  # (6,) weights of the pose error
+    R: Array  # (6, 6) weights of the torques
 
     def pieces(
         self,

@@ -185,21 +185,13 @@ class CoreObserver:
 
 
 class Part(NamedTuple):
-    """An observer in the core.
+    """An observer in the core."""
 
-    Attributes:
-        table: name of its table of functions.
-        sensor: C structure of the sensor.
-        own: whether the sensor is written in Python.
-        estimation: C structure of its assumptions, or None.
-        sources: files of the core for it, see `export.controller.SOURCES`.
-    """
-
-    table: str
-    sensor: Compiled
-    own: bool
-    estimation: Compiled | None
-    sources: tuple[str, ...]
+    table: str  # name of its table of functions
+    sensor: Compiled  # C structure of the sensor
+    own: bool  # whether the sensor is written in Python
+    estimation: Compiled | None  # C structure of its assumptions, or None
+    sources: tuple[str, ...]  # files of the core for it, see `export.controller.SOURCES`
 
     def fill(self, law: Any) -> None:
         """Set the observer of a `stewart_law`."""

@@ -131,21 +131,13 @@ def closed_loop(plant: DelayedModel, K: Array, gain: float = 1.0) -> Array:
 
 @dataclass(frozen=True)
 class LinearLoop:
-    """True plant with the linearised law.
+    """True plant with the linearised law."""
 
-    Attributes:
-        plant: the true one, without integral states.
-        K: (m, n + m L) of (law).
-        period: s.
-        delay: the true one.
-        integral: whether the law integrates the error.
-    """
-
-    plant: ContinuousModel
-    K: Array
-    period: float
-    delay: Delay
-    integral: bool
+    plant: ContinuousModel  # the true one, without integral states
+    K: Array  # (m, n + m L) of (law)
+    period: float  # s
+    delay: Delay  # the true one
+    integral: bool  # whether the law integrates the error
 
     def sampled(self, longer: float = 0.0, step: float | None = None) -> DelayedModel:
         """Return the plant over one period, with a delay that is `longer` by a time in s.
