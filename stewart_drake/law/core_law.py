@@ -395,10 +395,8 @@ AnyMemory = Memory | CoreMemory
 class Serving(NamedTuple):
     """A law with the code that steps it."""
 
-    law: Any
-    """The law, or the same in C."""
-    backend: str
-    """`native`, or `python` and why."""
+    law: Any  # the law, or the same in C
+    backend: str  # `native`, or `python` and why
 
 
 def serving(law: PredictiveLqi | ServoPreview) -> Serving:

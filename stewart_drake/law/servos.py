@@ -168,14 +168,10 @@ class Segment(NamedTuple):
     linear: with commands a period apart, setpoint, rates and torque are continuous.
     """
 
-    begin: float
-    """s."""
-    end: float
-    """s; when the command is to be reached."""
-    start: Array
-    """(18,) angles, rates, torques."""
-    stop: Array
-    """(18,)."""
+    begin: float  # s
+    end: float  # s; when the command is to be reached
+    start: Array  # (18,) angles, rates, torques
+    stop: Array  # (18,)
 
     def at(self, time: float, coast: float) -> Array:
         """Return (18,) at a time in s; after the end it moves on for `coast` s, then stays."""
@@ -222,12 +218,9 @@ def still(command: Array, time: float) -> Segment:
 class Reported(NamedTuple):
     """Torques of the servos between two measurements."""
 
-    torques: Array
-    """(n, 6) N m, means over equal parts of the time."""
-    asked: Array
-    """(6,) N m, before the limit, when it ended."""
-    saturated: int
-    """Periods of the controller in which a torque was at its limit."""
+    torques: Array  # (n, 6) N m, means over equal parts of the time
+    asked: Array  # (6,) N m, before the limit, when it ended
+    saturated: int  # periods of the controller in which a torque was at its limit
 
 
 @dataclass(frozen=True)

@@ -232,14 +232,10 @@ def peaks(plant: DelayedModel, K: Array, period: float) -> tuple[Peak, Peak]:
 class Margins(NamedTuple):
     """Errors of delay and motors at which the loop becomes unstable; 0 and 1 if it is already."""
 
-    shorter: float
-    """Error of a true delay that is shorter, s; infinite if it may be 0."""
-    longer: float
-    """Error of a true delay that is longer, s; infinite beyond 30 periods."""
-    gain_down: float
-    """Factor on the torques of all motors, < 1; 0 if they may fail."""
-    gain_up: float
-    """Factor on the torques of all motors, > 1."""
+    shorter: float  # error of a true delay that is shorter, s; infinite if it may be 0
+    longer: float  # error of a true delay that is longer, s; infinite beyond 30 periods
+    gain_down: float  # factor on the torques of all motors, < 1; 0 if they may fail
+    gain_up: float  # factor on the torques of all motors, > 1
 
 
 def first_instability(loop: Callable[[float], Array], start: float, limit: float) -> float:

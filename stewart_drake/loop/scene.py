@@ -48,7 +48,7 @@ class Scene:
     def __init__(self, mechanism: Mechanism, meshcat: Meshcat) -> None:
         self._mechanism, self._meshcat = mechanism, meshcat
         meshcat.Delete("/" + "/".join(_VISUALIZER))  # removes the colours of an earlier scene
-        self._diagram, self._plant, _ = build_viewer(mechanism, meshcat)
+        self._diagram, self._plant = build_viewer(mechanism, meshcat)
         self._context = self._diagram.CreateDefaultContext()
         self._tree = self._plant.GetMyMutableContextFromRoot(self._context)
         self._disc, radius = _drawn_plate(self._diagram, self._plant)

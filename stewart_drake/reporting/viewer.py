@@ -76,9 +76,8 @@ class PoseViewer:
 
     def __init__(self, mechanism: Mechanism, meshcat: Meshcat) -> None:
         self._mechanism, self.meshcat = mechanism, meshcat
-        diagram, plant, _ = build_viewer(mechanism, meshcat)
-        self._diagram, self._plant = diagram, plant
-        self._context = diagram.CreateDefaultContext()
+        self._diagram, self._plant = build_viewer(mechanism, meshcat)
+        self._context = self._diagram.CreateDefaultContext()
         self._label = ""
         rod, radius = mechanism.rod_lengths.min(), np.linalg.norm(mechanism.p_PQ[:, :2], axis=1)
         meshcat.SetObject("wanted", Cylinder(float(1.08 * radius.max()), 0.03 * rod), _GHOST)
