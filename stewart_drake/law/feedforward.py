@@ -77,10 +77,15 @@ def held_torques(means: Array, changes: Array) -> Array:
 
 
 class HeldTorques(NamedTuple):
-    """Torques of h consecutive holds."""
+    """Torques of h consecutive holds.
 
-    torques: Array  # (h, 6) N m, held; the last is that of the torque to be computed
-    changes: Array  # (h + 2, 6) of the exact torque over these holds and a neighbour on each side
+    Attributes:
+        torques: (h, 6) N m, held; the last is that of the torque to be computed.
+        changes: (h + 2, 6) of the exact torque over these holds and a neighbour on each side.
+    """
+
+    torques: Array
+    changes: Array
 
 
 class Feedforward(ABC):

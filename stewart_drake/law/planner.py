@@ -34,11 +34,17 @@ ROUNDING = 1e-3
 
 
 class FollowedMotion(NamedTuple):
-    """Motion to follow."""
+    """Motion to follow.
 
-    motion: Motion  # as a function of the time from now
-    path: Array | None  # (n, 38) pieces of the last plan, see core/planning.h, or None
-    replanned: bool  # whether it was made at this sample
+    Attributes:
+        motion: as a function of the time from now.
+        path: (n, 38) pieces of the last plan, see core/planning.h, or None.
+        replanned: whether it was made at this sample.
+    """
+
+    motion: Motion
+    path: Array | None
+    replanned: bool
 
 
 class Planner(Protocol):

@@ -37,15 +37,25 @@ from stewart_drake.types import Array
 
 
 class StepResult(NamedTuple):
-    """Torque of one sample and its origin."""
+    """Torque of one sample and its origin.
 
-    torque: Array  # (6,) N m
-    error: Array  # (6,) of the pose, for the integral
-    integral: Array  # (6,) of the pose error
-    predicted: PredictedState  # where the torque acts
-    gain: Array  # (6, g), NaN without feedback
-    cause: str | None  # of a missing model or gain, as the name of a count, or None
-    feedforward: Array  # (6,) N m, share of the torque without feedback
+    Attributes:
+        torque: (6,) N m.
+        error: (6,) of the pose, for the integral.
+        integral: (6,) of the pose error.
+        predicted: where the torque acts.
+        gain: (6, g), NaN without feedback.
+        cause: of a missing model or gain, as the name of a count, or None.
+        feedforward: (6,) N m, share of the torque without feedback.
+    """
+
+    torque: Array
+    error: Array
+    integral: Array
+    predicted: PredictedState
+    gain: Array
+    cause: str | None
+    feedforward: Array
 
 
 @dataclass(frozen=True)
