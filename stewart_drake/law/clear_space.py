@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.dynamics.workspace import border
 from stewart_drake.mechanism.clearance import APART, clearances
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import legs_along, reach_margins
@@ -100,8 +101,4 @@ class ClearSpace:
 
         if fits(1.0):
             return 1.0
-        low, high = 0.0, 1.0
-        while high - low > 1e-3:
-            middle = (low + high) / 2
-            low, high = (middle, high) if fits(middle) else (low, middle)
-        return low
+        return border(fits, 0.0, 1.0, 1e-3)[0]

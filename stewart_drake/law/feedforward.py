@@ -34,6 +34,7 @@ from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     NUM_COORDINATES,
+    NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
     POSE,
@@ -50,12 +51,9 @@ def torques_at_nodes(
     dynamics: StewartDynamics, motion: Trajectory, starts: Array, ends: Array
 ) -> Array:
     """Return inverse-dynamics torques (n, 2, 6) in N m along `motion` at the nodes of each hold."""
-    torques = np.empty((len(starts), 2, NUM_TORQUES))
-    for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
-        for j, node in enumerate(GAUSS_NODES):
-            x = evaluate(motion, start + (end - start) * node)
-            torques[i, j] = dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
-    return torques
+    times = starts[:, None] + (ends - starts)[:, None] * GAUSS_NODES
+    rows = np.reshape([evaluate(motion, t) for t in times.flat], (-1, NUM_REFERENCE))
+    return dynamics.torques_along(rows).reshape(-1, 2, NUM_TORQUES)
 
 
 def mean_torques(
