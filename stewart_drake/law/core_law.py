@@ -66,20 +66,16 @@ def uncovered(law: PredictiveLqi | ServoPreview) -> str | None:
         "actuator.kind": type(law.plant.motors) is TorqueLimit,
     }
     if isinstance(law, PredictiveLqi):
+        predictor = ArrivalPredictor if law.finds_delay else NonlinearPredictor
         covered |= {
             "controller.delay_steps": type(law.timeline) is Timeline,
             "controller.replan": type(law.planner) in (NoPlanner, Replan),
-            "controller.prediction": type(law.predictor) is _predictor(law),
+            "controller.prediction": type(law.predictor) is predictor,
             "controller.model": type(law.model) is MultibodyModel,
             "controller.kind": type(law.cost) is QuadraticCost,
             "link.kind": type(law.channel) in (Wire, Packets),
         }
     return next((field for field, yes in covered.items() if not yes), None)
-
-
-def _predictor(law: PredictiveLqi) -> type:
-    """Return the predictor of the core for the observer of a law."""
-    return ArrivalPredictor if law.finds_delay else NonlinearPredictor
 
 
 class CompiledLaw:
