@@ -21,7 +21,7 @@ from stewart_drake.law.delay_model import (
     delayed_model,
     double_integrators,
 )
-from stewart_drake.law.riccati import augmented_gain, full_gain, reduced_gain
+from stewart_drake.law.riccati import full_gain, prediction_matrix, reduced_gain
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.types import Array
 
@@ -84,7 +84,7 @@ def comparison(fraction: float) -> tuple[list[str], list[list[str]]]:
         calls: list[Callable[[], Array]] = [
             lambda delayed=delayed: full_gain(delayed, Q, R)[0],
             lambda s=system, w=weight: gain(s, solve_discrete_are(s.A, s.B, w, R)),
-            lambda delayed=delayed: augmented_gain(delayed, Q, R),
+            lambda delayed=delayed: reduced_gain(delayed, Q, R) @ prediction_matrix(delayed),
         ]
         full, by_scipy, reduced = least_ms(calls, 2.0)
         K, other, ours = (call() for call in calls)

@@ -39,6 +39,7 @@ from pydrake.multibody.tree import (
 from scipy.integrate import solve_ivp
 
 from stewart_drake.dynamics.stewart import plant_parameters
+from stewart_drake.law.riccati import prediction_matrix, reduced_gain
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, leg_geometry
 from stewart_drake.mechanism.sdformat import to_sdformat
@@ -261,6 +262,11 @@ def off_dead_centre(mechanism: Mechanism, pose: Array) -> float:
     p_SQ_W = pose[3:] + legs.p_PQ_W - mechanism.p_WS
     across, along = (np.einsum("li,li->l", p_SQ_W, e) for e in (legs.tangent, legs.crank))
     return float((np.abs(across) / np.hypot(across, along)).min())
+
+
+def augmented_gain(model, Q, R):
+    """Return K_aug (m, n + m L) = K [A^mu, A^(mu-1) B, ..., B]."""
+    return reduced_gain(model, Q, R) @ prediction_matrix(model)
 
 
 def relative(value: Array, expected: Array) -> float:

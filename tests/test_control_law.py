@@ -14,10 +14,9 @@ from stewart_drake.law.delay_model import (
 )
 from stewart_drake.law.feedforward import (
     GAUSS_NODES,
+    InverseDynamicsFeedforward,
     held_torques,
     means_and_changes,
-    rates_at_samples,
-    state_within_hold,
 )
 from stewart_drake.law.memory import Counts, Memory
 from stewart_drake.law.motion import Preview
@@ -26,9 +25,11 @@ from stewart_drake.law.predictors import LinearPredictor, NonlinearPredictor
 from stewart_drake.law.riccati import RiccatiError, full_gain
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.startup import weight_scales
+from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.preparation import assemble, prepare
 from stewart_drake.mechanism.assembly import torque_map
+from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate, make_reference
 from tests.mechanisms import PAPER
@@ -298,7 +299,7 @@ def test_held_torques_meet_a_sine_at_fourth_order(passed):
     rates there by O(dt^3) after subtracting their offset; holding plain means leaves O(dt^2). The
     offset is looked at when the share `passed` of each hold is over.
     """
-    B = np.diag([0.5, 1.0, 2.0, 3.0, 4.0, 5.0])
+    B, offset_of = np.diag([0.5, 1.0, 2.0, 3.0, 4.0, 5.0]), InverseDynamicsFeedforward().offset
     omega, phase = np.array([1.0, 1.5, 2.0, 0.7, 1.2, 1.0]), np.arange(6.0)
 
     def motion(t, order):
@@ -311,16 +312,15 @@ def test_held_torques_meet_a_sine_at_fourth_order(passed):
         torques = held_torques(means, changes) if corrected else means[1:-1]
         x, v = motion(0.0, 0), motion(0.0, 1)
         if corrected:
-            v = v + rates_at_samples(changes[:2], B, dt)
+            v = v + offset_of(changes, B, Timeline(dt, Delay(0)))[6:]
         pose, rates = 0.0, 0.0
         for k, torque in enumerate(torques):
             now, part = k * dt, passed * dt
             x_in, v_in = x + part * v + part**2 / 2 * B @ torque, v + part * B @ torque
             offset = np.zeros(12)
-            if corrected and passed == 0:
-                offset[6:] = rates_at_samples(changes[k : k + 2], B, dt)
-            elif corrected:
-                offset = state_within_hold(changes[k + 1], B, dt, passed)
+            if corrected:  # the share that is still to pass, 0 between two holds
+                left = Delay(0, 1 - passed if passed else 0)
+                offset = offset_of(changes[k : k + 2], B, Timeline(dt, left))
             pose = max(pose, np.abs(x_in - offset[:6] - motion(now + part, 0)).max())
             rates = max(rates, np.abs(v_in - offset[6:] - motion(now + part, 1)).max())
             x, v = x + dt * v + dt**2 / 2 * B @ torque, v + dt * B @ torque

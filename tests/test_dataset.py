@@ -17,8 +17,8 @@ from stewart_drake.loop.bulk import run_in_bulk, samples_of
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.tuner.network import WINDOW, densities
-from stewart_drake.tuner.source import ratio_of, weights_of
+from stewart_drake.tuner.network import WINDOW
+from stewart_drake.tuner.source import densities, ratio_of, weights_of
 from stewart_drake.tuning import families
 from stewart_drake.tuning.data import (
     LOST,

@@ -15,7 +15,6 @@ from stewart_drake.law.delay_model import (
     double_integrators,
     linear_model,
 )
-from stewart_drake.law.riccati import augmented_gain
 from stewart_drake.law.stability import (
     amplification,
     closed_loop,
@@ -33,6 +32,7 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.delay import error_floor, loop_margins, simulated_growth
 from stewart_drake.studies.verdict import assess
 from tests.mechanisms import PAPER
+from tests.oracles import augmented_gain
 
 HEAVY = sd.StewartDynamics(PAPER, gravity=True)
 

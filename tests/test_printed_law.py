@@ -12,10 +12,10 @@ import pytest
 from scipy.linalg import expm
 
 from stewart_drake.law.delay_model import DelayedModel, delayed_model, double_integrators
-from stewart_drake.law.riccati import augmented_gain
 from stewart_drake.loop.results import accumulated_error
 from stewart_drake.mechanism.assembly import torque_map
 from tests.mechanisms import PAPER
+from tests.oracles import augmented_gain
 
 AMPLITUDE = np.array([math.pi / 12] * 3 + [0.02, 0.02, 0.08])
 PERIOD, STEPS, PARTS = 0.1, 8, 5

@@ -15,11 +15,11 @@ from stewart_drake.law.delay_model import (
     double_integrators,
     linear_model,
 )
-from stewart_drake.law.riccati import RiccatiError, augmented_gain, full_gain, lqr, reduced_gain
+from stewart_drake.law.riccati import RiccatiError, full_gain, lqr, reduced_gain
 from stewart_drake.law.stability import is_stable
 from stewart_drake.mechanism.assembly import torque_map
 from tests.mechanisms import PAPER
-from tests.oracles import relative
+from tests.oracles import augmented_gain, relative
 
 Extended = NDArray[np.longdouble]
 

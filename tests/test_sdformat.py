@@ -360,7 +360,8 @@ def test_shapes_change_no_run_of_the_machine_alone():
     states = []
     for collision in (False, True):
         builder, plant, _ = scene([])
-        add_mechanism(plant, PAPER, gravity=False, collision=collision)
+        plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
+        add_mechanism(plant, PAPER, collision)
         simulator = Simulator(builder.Build())
         context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
         set_pose(plant, context, PAPER, PAPER.home, np.zeros(6))

@@ -18,6 +18,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop.preparation import assemble, check_instants, prepare
 from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rotation
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import HoldConfig, SineConfig
@@ -25,7 +26,6 @@ from stewart_drake.scenario.trajectories import make_reference
 from stewart_drake.studies.workspace import size_motors, study_workspace
 from stewart_drake.studies.workspace_map import (
     LARGEST_FACTOR,
-    characteristic_length,
     first_exit,
     largest_factor,
     last_inside,
@@ -67,7 +67,7 @@ def test_condition_and_play_are_those_of_the_jacobian_in_twists(seed):
     if found.margin <= 0:  # a random pose may lie beyond a parallel singularity
         return
     to_rates = np.eye(6)
-    to_rates[:3, :3] = np.linalg.inv(angle_rate_map(pose[:3])) / characteristic_length(mechanism)
+    to_rates[:3, :3] = np.linalg.inv(angle_rate_map(pose[:3])) / plate_radius(mechanism)
     values = np.linalg.svd(mechanism.jacobian(pose) @ to_rates, compute_uv=False)
     np.testing.assert_allclose(found.condition, values[0] / values[-1], rtol=1e-8)
     np.testing.assert_allclose(found.play, 1 / values[-1], rtol=1e-8)
@@ -105,7 +105,7 @@ def test_condition_depends_neither_on_size_nor_on_the_frame(seed, turn, size):
 def test_wrenches_are_what_shortens_rods_on_locked_cranks():
     """Virtual work: d |p_TQ| = W' [rho omega; v] dt, by central differences of the twist."""
     pose = PAPER.home + [0.1, -0.2, 0.15, 0.01, -0.02, 0.03]
-    legs, rho = leg_geometry(PAPER, pose), characteristic_length(PAPER)
+    legs, rho = leg_geometry(PAPER, pose), plate_radius(PAPER)
     tips = PAPER.p_WS + PAPER.crank_lengths[:, None] * legs.crank
 
     def lengths(twist):

@@ -43,18 +43,17 @@ void stewart_hold(const stewart_machine *machine, const stewart_cost *cost, cons
         }
 }
 
-/* Subtract from an error the offset that held torques cause at the sample whose error is regulated; with
-   B of the model. From -dt B s / 12 at the beginning of a hold on, when the share x of it has passed: rates
+/* From -dt B s / 12 at the beginning of a hold on, when the share x of it has passed: rates
    -dt B s (1/12 - x (1 - x) / 2), pose -dt^2 B s x (1 - x) (1 - 2 x) / 12. */
-static void subtract_offset(real period, real fraction, const stewart_held *held, const real *B,
-                            real *error)
+void stewart_subtract_offset(real period, real fraction, const real *changes, const real *B,
+                             real *error)
 {
     const real passed = 1 - fraction, left = passed * (1 - passed);
     for (int i = 0; i < 6; i++) {
         real push = 0;
         for (int j = 0; j < U; j++) {
-            real change = held->change[1][j] + (fraction > 0 ? 0 : held->change[0][j]);
-            push -= period * B[U * (6 + i) + j] * change;
+            real change = changes[U + j] + (fraction > 0 ? 0 : changes[j]);
+            push -= period * B[U * i + j] * change;
         }
         if (fraction > 0) {
             error[i] -= period * left * (1 - 2 * passed) / 12 * push;
@@ -181,7 +180,7 @@ int stewart_linearize(const stewart_machine *machine, const real *theta, real pe
     stewart_believe(machine, theta, &belief);
     if (!stewart_derivatives(machine, &belief, state, held->torque[fraction > 0], A, B, NULL, scratch))
         return STEWART_RICCATI_FAILURE;
-    subtract_offset(period, fraction, held, B, error);
+    stewart_subtract_offset(period, fraction, held->change[0], B + 6 * U, error);
     return 0;
 }
 

@@ -30,6 +30,11 @@ int stewart_order(const stewart_cost *cost, int pending);
 void stewart_hold(const stewart_machine *machine, const stewart_cost *cost, const real *theta,
                   int pending, const real *nodes, stewart_held *held);
 
+/* Subtract from an error (12) the offset that held torques cause at the sample whose error is regulated,
+   for the first two changes (2, 6) of `stewart_held` and B (6, 6), accelerations per torque. */
+void stewart_subtract_offset(real period, real fraction, const real *changes, const real *B,
+                             real *error);
+
 /* Linear model where a torque acts: A (12, 12), B (12, 6) of the error. The offset that held torques
    cause is subtracted from `error` (12); the pending torque acts for another `fraction` of a period.
    Returns 0, or the cause of failure, of `stewart_status`. */

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stewart_drake.dynamics.native_functions import Call
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.mechanism.assembly import TorqueMap, torque_map
@@ -71,20 +70,17 @@ class FrozenMap:
     def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
         return np.concatenate([state[RATES], self.map @ (torque + parameters[BIAS])])
 
-    def many_steps(self, steps: int) -> Call:
-        """Return the function for steps along parabolas."""
-
-        def through(*arguments: ArrayLike) -> Sequence[Array]:
-            state, torques, parameters, _, h = map(np.asarray, arguments)
-            accelerations = (torques + parameters[BIAS]) @ self.map.T
-            states = np.empty((steps, NUM_STATE))
-            for k, (a, s) in enumerate(zip(accelerations, h, strict=True)):
-                pose, rates = state[POSE], state[RATES]
-                state = np.concatenate([pose + s * rates + s**2 / 2 * a, rates + s * a])
-                states[k] = state
-            return [states]
-
-        return through
+    def many_steps(
+        self, state: ArrayLike, torques: Array, parameters: Array, gravity: float, h: Array
+    ) -> Array:
+        """Return the states (n, 12) after steps along parabolas."""
+        accelerations = (torques + parameters[BIAS]) @ self.map.T
+        states = [np.asarray(state)]
+        for a, s in zip(accelerations, h, strict=True):
+            pose, rates = states[-1][POSE], states[-1][RATES]
+            after = pose + s * rates + s**2 / 2 * a, rates + s * a
+            states.append(np.concatenate(after))
+        return np.array(states[1:])
 
 
 class FrozenDynamics(StewartDynamics):

@@ -146,42 +146,30 @@ class NativeFunctions:
         N[ANGLES, ANGLES] = angle_rate_map(np.asarray(pose)[ANGLES])
         return N.T @ MN.T, N.T @ B
 
-    def margin(self, pose: Array, sign: float, least: Array) -> float:
-        """Return the least distance of the measures of a pose above `least` (8,); NaN for NaN.
-
-        `sign` is that of the parallel measure at home.
-        """
-        c = core()
-        pose = np.array(pose, np.float64)
-        return float(c.lib.stewart_margin(self._first, c.at(pose), sign, c.at(least)))
-
     def margins(self, poses: Array, sign: float, least: Array) -> Array:
-        """Return `margin` (n,) of poses (n, 6)."""
+        """Return the least distances (n,) of the measures of poses (n, 6) above `least` (8,).
+
+        `sign` is that of the parallel measure at home. NaN gives NaN.
+        """
         c, function = core(), core().lib.stewart_margin
         rows = np.array(poses, np.float64)
         first, limits = c.at(rows), c.at(least)
         number = range(0, rows.size, NUM_TORQUES)
         return np.array([function(self._first, first + i, sign, limits) for i in number])
 
-    def many_steps(self, steps: int) -> Call:
-        """Return (state, torques (n, 6), parameters, gravity, h (n,)) -> states (n, 12).
+    def many_steps(
+        self, state: ArrayLike, torques: Array, parameters: Array, gravity: float, h: Array
+    ) -> Array:
+        """Return the states (n, 12) after classical Runge-Kutta steps of h (n,) s each.
 
-        Steps are those of the classical Runge-Kutta method.
+        The torques (n, 6) are constant in each step.
         """
-
-        def call(*arguments: ArrayLike) -> Sequence[Array]:
-            c = core()
-            shapes = (NUM_STATE,), (steps, NUM_TORQUES), (NUM_PLANT_PARAMETERS,), (1,), (steps,)
-            given = [np.empty(shape) for shape in shapes]
-            for place, argument in zip(given, arguments, strict=True):
-                place[...] = argument
-            states = np.empty((steps, NUM_STATE))
-            state, torques, parameters, gravity, h, result = map(c.at, (*given, states))
-            plant = c.plant(self._first, parameters, gravity)
-            c.lib.stewart_steps(plant, steps, state, torques, h, result)
-            return [states]
-
-        return call
+        c, states = core(), np.empty((len(torques), NUM_STATE))
+        given = state, torques, parameters, [gravity], h
+        x, held, p, g, steps = (c.at(np.array(one, np.float64, order="C")) for one in given)
+        plant = c.plant(self._first, p, g)
+        c.lib.stewart_steps(plant, len(states), x, held, steps, c.at(states))
+        return states
 
 
 @lru_cache(maxsize=64)

@@ -354,11 +354,7 @@ class StewartDynamics:
         if np.ndim(durations):
             _shaped("durations", durations, (n,))
         h = np.broadcast_to(np.asarray(durations, dtype=np.float64), n) / substeps
-        states = self._functions.many_steps(n * substeps)(
-            state,
-            np.repeat(torques, substeps, axis=0),
-            self.complete(parameters),
-            self.gravity,
-            np.repeat(h, substeps),
-        )[0]
-        return states.reshape(n, substeps, NUM_STATE)[:, -1]
+        held, steps = np.repeat(torques, substeps, axis=0), np.repeat(h, substeps)
+        given = self.complete(parameters), self.gravity, steps
+        states: Array = self._functions.many_steps(state, held, *given)
+        return states[substeps - 1 :: substeps]

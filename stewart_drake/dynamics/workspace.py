@@ -65,7 +65,7 @@ def measures_at(mechanism: Mechanism, pose: Array, crank_angles: Array | None = 
 def margin(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> float:
     """Return a margin, positive inside the workspace, zero on its boundary; NaN for NaN."""
     if crank_angles is None:
-        return functions_of(mechanism).margin(pose, home_sign(mechanism), LEAST)
+        return float(margins(mechanism, pose)[0])
     return measures_at(mechanism, pose, crank_angles).margin
 
 

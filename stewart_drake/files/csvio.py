@@ -29,23 +29,14 @@ _LABEL: Final = re.compile(r"\s*(\w+)\s*\[\s*([\w ]+?)\s*\]\s*")
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of a file in SI units.
+    """Columns of a file in SI units."""
 
-    Attributes:
-        path: of the file.
-        header: description of the expected header.
-        labels: by name, the header's cell of each column that was read.
-        scales: by name, the factor to SI units.
-        lines: (n,) line number of each row.
-        columns: by name, the numbers (n,); NaN for an empty cell.
-    """
-
-    path: Path
-    header: str
-    labels: dict[str, str]
-    scales: dict[str, float]
-    lines: NDArray[np.intp]
-    columns: dict[str, Array]
+    path: Path  # of the file
+    header: str  # description of the expected header
+    labels: dict[str, str]  # by name, the header's cell of each column that was read
+    scales: dict[str, float]  # by name, the factor to SI units
+    lines: NDArray[np.intp]  # (n,) line number of each row
+    columns: dict[str, Array]  # by name, the numbers (n,); NaN for an empty cell
 
     def place(self, row: int, name: str | None = None) -> str:
         """Return the opening of a message about a row, or about one of its cells."""

@@ -50,7 +50,6 @@ def sections(type_: type) -> dict[str, dict[str, Any]]:
 
 
 def field_names(section: type) -> list[str]:
-    """Return the names of a section's fields, as in files."""
     return [spelling(section, name) for name in typing.get_type_hints(section)]
 
 

@@ -50,8 +50,6 @@ LEAST_ANGLE: Final = 1e-6  # crank angle, rad
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """One log."""
-
     name: str  # of the file
     sent: Array  # (m,) increasing times of the torques, s
     torques: Array  # (m, 6) within the motors' limit, N m; each acts until the next one does

@@ -142,7 +142,6 @@ class Belief:
 
     @property
     def parameters(self) -> Array:
-        """Parameters (p,)."""
         return self.estimate.parameters
 
     @property

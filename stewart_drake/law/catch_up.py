@@ -32,15 +32,10 @@ PIECE = 0.025
 
 
 class Plan(NamedTuple):
-    """A plan as of core/planning.h.
+    """A plan as of core/planning.h."""
 
-    Attributes:
-        pieces: (n, 38) of the planned motion.
-        peak: N m, its largest torque.
-    """
-
-    pieces: Array
-    peak: float
+    pieces: Array  # (n, 38) of the planned motion
+    peak: float  # N m, its largest torque
 
 
 class CatchUp:

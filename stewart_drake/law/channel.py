@@ -171,7 +171,6 @@ def report_of(report: Report | None) -> Compiled:
 
 @Once
 def packets_of(channel: Packets) -> Compiled:
-    """Return the `stewart_packets` of core/packets.h."""
     c, kept = core(), len(channel.arrived_by)
     shares = numbers(channel.in_time), numbers(channel.arrived_by)
     values = {

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.dynamics.workspace import border
 from stewart_drake.mechanism.clearance import APART, clearances
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import legs_along, reach_margins
@@ -21,32 +22,20 @@ _STEP = 1e-6
 
 
 class Near(NamedTuple):
-    """Distances with little room.
+    """Distances with little room."""
 
-    Attributes:
-        pose: (r,) number of the pose of each.
-        room: (r,) distance beyond the least one, in cranks.
-        slopes: (r, 6) its derivative by the pose.
-    """
-
-    pose: NDArray[np.intp]
-    room: Array
-    slopes: Array
+    pose: NDArray[np.intp]  # (r,) number of the pose of each
+    room: Array  # (r,) distance beyond the least one, in cranks
+    slopes: Array  # (r, 6) its derivative by the pose
 
 
 @dataclass(frozen=True, eq=False)
 class ClearSpace:
-    """Distances at a pose, each with the least value that a plan keeps, in shortest cranks.
+    """Distances at a pose, each with the least value that a plan keeps, in shortest cranks."""
 
-    Attributes:
-        mechanism: the machine.
-        pairs: (k,) indices of guarded pairs of links in `mechanism.clearance.APART`.
-        least: (6 + k,) least distances of the six legs and of the pairs.
-    """
-
-    mechanism: Mechanism
-    pairs: NDArray[np.intp]
-    least: Array
+    mechanism: Mechanism  # the machine
+    pairs: NDArray[np.intp]  # (k,) indices of guarded pairs of links in `mechanism.clearance.APART`
+    least: Array  # (6 + k,) least distances of the six legs and of the pairs
 
     @classmethod
     def along(cls, mechanism: Mechanism, poses: Array) -> "ClearSpace":
@@ -112,8 +101,4 @@ class ClearSpace:
 
         if fits(1.0):
             return 1.0
-        low, high = 0.0, 1.0
-        while high - low > 1e-3:
-            middle = (low + high) / 2
-            low, high = (middle, high) if fits(middle) else (low, middle)
-        return low
+        return border(fits, 0.0, 1.0, 1e-3)[0]

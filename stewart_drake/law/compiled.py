@@ -18,17 +18,11 @@ Made = TypeVar("Made")
 
 
 class Compiled(NamedTuple):
-    """A structure of the core.
+    """A structure of the core."""
 
-    Attributes:
-        it: pointer to it.
-        keeps: objects that it points to.
-        raised: errors of Python parts that C has called.
-    """
-
-    it: Any
-    keeps: tuple[Any, ...] = ()
-    raised: tuple[list[BaseException], ...] = ()
+    it: Any  # pointer to it
+    keeps: tuple[Any, ...] = ()  # objects that it points to
+    raised: tuple[list[BaseException], ...] = ()  # errors of Python parts that C has called
 
     def raise_errors(self) -> None:
         """Raise the first error of a Python part since the last call."""
@@ -107,7 +101,6 @@ def resists(dynamics: StewartDynamics) -> bool:
 
 @Once
 def machine_of(plant: NominalPlant) -> Compiled:
-    """Return the `stewart_machine` of a plant."""
     machine, dynamics = core().ffi.new("stewart_machine *"), plant.dynamics
     machine.geometry = list(geometry(dynamics.mechanism))
     machine.parameters = list(dynamics.plant_parameters)

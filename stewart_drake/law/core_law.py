@@ -66,20 +66,16 @@ def uncovered(law: PredictiveLqi | ServoPreview) -> str | None:
         "actuator.kind": type(law.plant.motors) is TorqueLimit,
     }
     if isinstance(law, PredictiveLqi):
+        predictor = ArrivalPredictor if law.finds_delay else NonlinearPredictor
         covered |= {
             "controller.delay_steps": type(law.timeline) is Timeline,
             "controller.replan": type(law.planner) in (NoPlanner, Replan),
-            "controller.prediction": type(law.predictor) is _predictor(law),
+            "controller.prediction": type(law.predictor) is predictor,
             "controller.model": type(law.model) is MultibodyModel,
             "controller.kind": type(law.cost) is QuadraticCost,
             "link.kind": type(law.channel) in (Wire, Packets),
         }
     return next((field for field, yes in covered.items() if not yes), None)
-
-
-def _predictor(law: PredictiveLqi) -> type:
-    """Return the predictor of the core for the observer of a law."""
-    return ArrivalPredictor if law.finds_delay else NonlinearPredictor
 
 
 class CompiledLaw:
@@ -126,7 +122,6 @@ class CompiledLaw:
         }
 
     def _fill(self, data: Any) -> None:
-        """Fill in what both kinds of laws have."""
         c, law, part, timeline = core(), self.law, self._part, self.law.timeline
         machine = machine_of(law.plant)
         if resists(law.plant.dynamics):
@@ -202,19 +197,13 @@ class CompiledLaw:
 
 @dataclass(frozen=True)
 class CoreMemory:
-    """Memory of a law in C, with the names of `law.memory.Memory`.
+    """Memory of a law in C, with the names of `law.memory.Memory`."""
 
-    Attributes:
-        data: (n,) all fields.
-        compiled: the law.
-    """
-
-    data: Array
-    compiled: CompiledLaw
+    data: Array  # (n,) all fields
+    compiled: CompiledLaw  # the law
 
     @property
     def law(self) -> Any:
-        """The law."""
         return self.compiled.law
 
     def field(self, name: str) -> Array:
@@ -258,7 +247,6 @@ class CoreMemory:
 
     @cached_property
     def counts(self) -> Counts:
-        """Numbers of survived problems, by cause."""
         return Counts(*(int(count) for count in self.field("counts")))
 
     @cached_property
@@ -270,7 +258,6 @@ class CoreMemory:
         return belief.at(self.field("state"))
 
     def without_error(self) -> "CoreMemory":
-        """Return the memory with error and integral reset."""
         after = CoreMemory(self.data.copy(), self.compiled)
         after.field("error")[:] = after.field("integral")[:] = 0.0
         return after
@@ -345,7 +332,6 @@ class CoreServo:
         self._law, self._compiled = law, CompiledLaw(law)
 
     def initial_memory(self, command: Array) -> CoreMemory:
-        """Return the memory before the first sample, with the command (18,) that was sent last."""
         return CoreMemory(self._compiled.start(command), self._compiled)
 
     def step(
@@ -406,10 +392,8 @@ AnyMemory = Memory | CoreMemory
 class Serving(NamedTuple):
     """A law with the code that steps it."""
 
-    law: Any
-    """The law, or the same in C."""
-    backend: str
-    """`native`, or `python` and why."""
+    law: Any  # the law, or the same in C
+    backend: str  # `native`, or `python` and why
 
 
 def serving(law: PredictiveLqi | ServoPreview) -> Serving:
@@ -436,13 +420,9 @@ class OuterLqi(PredictiveLqi):
 
 @dataclass(frozen=True)
 class OuterMemory:
-    """Memory of an `OuterLqi`; other names are those of the free law's memory.
+    """Memory of an `OuterLqi`; other names are those of the free law's memory."""
 
-    Attributes:
-        free: memory of the free law.
-    """
-
-    free: Any
+    free: Any  # memory of the free law
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_") or name == "free":

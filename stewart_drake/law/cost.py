@@ -78,11 +78,9 @@ class QuadraticCost:
 
     @property
     def integrates(self) -> bool:
-        """Whether the law has an integral."""
         return self.integrals is not None
 
     def regulated(self, integral: Array) -> Array:
-        """Return the part of an integral (6,) that the gain multiplies: all or nothing."""
         return integral if self.integrates else np.empty(0)
 
     def matrices(self, weights: Array) -> tuple[Array, Array]:
@@ -166,7 +164,6 @@ class PdGain:
         return np.empty(0)
 
     def sampled(self, model: ContinuousModel, timeline: Timeline) -> DelayedModel:
-        """Return `law.delay_model.delayed_model` without an integral."""
         steps, fraction = timeline.steps, timeline.fraction
         return delayed_model(model, timeline.period, steps, fraction, integral=False)
 

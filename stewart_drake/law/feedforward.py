@@ -27,11 +27,14 @@ from typing import NamedTuple
 import numpy as np
 from pydrake.trajectories import Trajectory
 
+from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law.compiled import numbers
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     NUM_COORDINATES,
+    NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
     POSE,
@@ -48,12 +51,9 @@ def torques_at_nodes(
     dynamics: StewartDynamics, motion: Trajectory, starts: Array, ends: Array
 ) -> Array:
     """Return inverse-dynamics torques (n, 2, 6) in N m along `motion` at the nodes of each hold."""
-    torques = np.empty((len(starts), 2, NUM_TORQUES))
-    for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
-        for j, node in enumerate(GAUSS_NODES):
-            x = evaluate(motion, start + (end - start) * node)
-            torques[i, j] = dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
-    return torques
+    times = starts[:, None] + (ends - starts)[:, None] * GAUSS_NODES
+    rows = np.reshape([evaluate(motion, t) for t in times.flat], (-1, NUM_REFERENCE))
+    return dynamics.torques_along(rows).reshape(-1, 2, NUM_TORQUES)
 
 
 def mean_torques(
@@ -72,36 +72,6 @@ def means_and_changes(at_nodes: Array) -> tuple[Array, Array]:
 def held_torques(means: Array, changes: Array) -> Array:
     """Return torques (n - 2, 6) by (hold) for the inner ones of n >= 3 consecutive holds."""
     return means[1:-1] - (changes[2:] - changes[:-2]) / 24
-
-
-def rates_at_samples(changes: Array, B: Array, period: float) -> Array:
-    """Return the offset (6,) by (rates) of the rates at the instant between two holds.
-
-    Args:
-        changes: (2, 6) of the torque over the hold before and the hold after.
-        B: (6, 6) accelerations per torque.
-        period: s.
-    """
-    return -period / 24 * B @ (changes[0] + changes[1])
-
-
-def state_within_hold(change: Array, B: Array, period: float, passed: float) -> Array:
-    """Return the offset (12,) of pose and rates when the share `passed` of a hold is over.
-
-    From (rates) at its start on, with x = passed and constant slope of T:
-    rates -dt B s (1/12 - x (1 - x) / 2),  pose -dt^2 B s x (1 - x) (1 - 2 x) / 12.
-
-    Args:
-        change: (6,) of the torque over the hold.
-        B: (6, 6) accelerations per torque.
-        period: s.
-        passed: 0 to 1.
-    """
-    left = passed * (1 - passed)
-    push = -period * B @ change
-    return np.concatenate(
-        [period * left * (1 - 2 * passed) / 12 * push, (1 / 12 - left / 2) * push]
-    )
 
 
 class HeldTorques(NamedTuple):
@@ -179,8 +149,8 @@ class InverseDynamicsFeedforward(Feedforward):
         return HeldTorques(held_torques(means, changes), changes)
 
     def offset(self, changes: Array, B: Array, timeline: Timeline) -> Array:
-        """Return equation (rates), or its counterpart within a hold."""
-        if timeline.fraction > 0:  # between the second hold's ends
-            return state_within_hold(changes[1], B, timeline.period, 1 - timeline.fraction)
-        rates = rates_at_samples(changes[:2], B, timeline.period)
-        return np.concatenate([np.zeros(NUM_COORDINATES), rates])
+        """Return equation (rates), or its counterpart within a hold (core/design.c)."""
+        c, error = core(), np.zeros(NUM_STATE)
+        given = map(c.at, (numbers(changes), numbers(B, 6, 6), error))
+        c.lib.stewart_subtract_offset(timeline.period, timeline.fraction, *given)
+        return -error

@@ -36,31 +36,22 @@ class ParameterSet:
     The names are those of `free` of the dynamics, of `scenario.signals.PLANT_PARAMETERS` and
     `scenario.calibration.OFFSETS`.
 
-    Attributes:
-        names: of n parameters, those of the equations of motion first.
-        units: of each.
-        prior: (n,) mean before any measurement.
-        std: (n,) of the prior.
-        lower, upper: (n,) physical bounds.
-        correlation: (n, n) of the prior; None: uncorrelated.
-        usual: (n,) standard deviation without a calibration; None: std.
-        walk: (n,) standard deviation of the change per root second; None: constants.
-        jump: (n,) standard deviation of a sudden change; None: constants.
-
     Raises:
         ValueError: wrong shapes; a prior beyond its bounds or without a standard deviation above 0.
     """
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    prior: Array
-    std: Array
+    names: tuple[str, ...]  # of n parameters, those of the equations of motion first
+    units: tuple[str, ...]  # of each
+    prior: Array  # (n,) mean before any measurement
+    std: Array  # (n,) of the prior
+    # lower, upper: (n,) physical bounds
     lower: Array
     upper: Array
-    correlation: Array | None = None
-    usual: Array | None = None
+    correlation: Array | None = None  # (n, n) of the prior; None: uncorrelated
+    usual: Array | None = None  # (n,) standard deviation without a calibration; None: std
+    # (n,) standard deviation of the change per root second; None: constants
     walk: Array | None = None
-    jump: Array | None = None
+    jump: Array | None = None  # (n,) standard deviation of a sudden change; None: constants
 
     def __post_init__(self) -> None:
         columns = (self.units, self.prior, self.std, self.lower, self.upper)
@@ -134,29 +125,20 @@ class ParameterSet:
 
 @dataclass(frozen=True)
 class FilterSettings:
-    """Assumptions of the filter; standard deviations in SI units.
+    """Assumptions of the filter; standard deviations in SI units."""
 
-    Attributes:
-        parameters: estimated together with the state.
-        model_std: (12,) error of one step of the model. Without it the filter would attribute
-            integration errors to parameters where a sensor has no noise.
-        timing_std: s, of the instant of a torque.
-        walk_std: (p,) change of a parameter in a period; None: constants.
-        jump_std: (p,) sudden change of a parameter; None: constants.
-        learns_timing: whether innovations correct `timing_std`.
-        wander: assumed change of a parameter in a period, as a share of its usual standard
-            deviation, if innovations show that parameters change (core/noise.h); 0: constants.
-        keep: forgetting factor of the noise estimate, per period.
-    """
-
-    parameters: ParameterSet
+    parameters: ParameterSet  # estimated together with the state
+    # (12,) error of one step of the model. Without it the filter would attribute integration
+    # errors to parameters where a sensor has no noise
     model_std: Array
-    timing_std: float
-    walk_std: Array | None = None
-    jump_std: Array | None = None
-    learns_timing: bool = False
+    timing_std: float  # s, of the instant of a torque
+    walk_std: Array | None = None  # (p,) change of a parameter in a period; None: constants
+    jump_std: Array | None = None  # (p,) sudden change of a parameter; None: constants
+    learns_timing: bool = False  # whether innovations correct `timing_std`
+    # assumed change of a parameter in a period, as a share of its usual standard deviation,
+    # if innovations show that parameters change (core/noise.h); 0: constants
     wander: float = 0.0
-    keep: float = 1.0
+    keep: float = 1.0  # forgetting factor of the noise estimate, per period
 
 
 EXACT = 1e-6

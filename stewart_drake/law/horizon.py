@@ -34,17 +34,11 @@ NODES = len(GAUSS_NODES)
 
 
 class Plan(NamedTuple):
-    """States and torques of N holds, with the feedback that keeps the plant to them.
+    """States and torques of N holds, with the feedback that keeps the plant to them."""
 
-    Attributes:
-        states: (N + 1, 12).
-        torques: (N, 6) N m.
-        gains: (N, 6, 12), torque T_j - K_j (x - x_j) for a state x off the plan.
-    """
-
-    states: Array
-    torques: Array
-    gains: Array
+    states: Array  # (N + 1, 12)
+    torques: Array  # (N, 6) N m
+    gains: Array  # (N, 6, 12), torque T_j - K_j (x - x_j) for a state x off the plan
 
     def later(self, state: Array, torque: Array) -> "Plan":
         """Return the plan without its first hold, and with a last one of this state and torque."""
@@ -56,20 +50,14 @@ class Plan(NamedTuple):
 
 
 class Linearised(NamedTuple):
-    """Model (plan) of N holds.
+    """Model (plan) of N holds."""
 
-    Attributes:
-        Phi, Gamma: (N, 12, 12) and (N, 12, 6).
-        defects: (N, 12).
-        nodes: (N, 2, 6) poses of the plan at the Gauss nodes of each hold.
-        node_maps: (N, 2, 6, 18) of [dx_j; dT_j] to the poses there.
-    """
-
+    # Phi, Gamma: (N, 12, 12) and (N, 12, 6)
     Phi: Array
     Gamma: Array
-    defects: Array
-    nodes: Array
-    node_maps: Array
+    defects: Array  # (N, 12)
+    nodes: Array  # (N, 2, 6) poses of the plan at the Gauss nodes of each hold
+    node_maps: Array  # (N, 2, 6, 18) of [dx_j; dT_j] to the poses there
 
 
 class HoldModel:
@@ -162,33 +150,23 @@ class HorizonCost(NamedTuple):
 
     Two Gauss nodes integrate the squared error of a motion between samples. A cost at the samples
     alone allows large torques of alternating sign there.
-
-    Attributes:
-        wanted: (N, 2, 6) poses of the reference at the nodes.
-        end: (12,) reference at the end of the last hold.
-        torques: (N, 6) feedforward, N m.
-        Q: (6,) diagonal.
-        R: (6, 6).
-        P: (12, 12).
     """
 
-    wanted: Array
-    end: Array
-    torques: Array
-    Q: Array
-    R: Array
-    P: Array
+    wanted: Array  # (N, 2, 6) poses of the reference at the nodes
+    end: Array  # (12,) reference at the end of the last hold
+    torques: Array  # (N, 6) feedforward, N m
+    Q: Array  # (6,) diagonal
+    R: Array  # (6, 6)
+    P: Array  # (12, 12)
 
 
 class Policy(NamedTuple):
     """Solution of the Riccati equation without limits: dT_j = d_j - K_j dx_j.
 
     A further c_j on dT_j costs c_j' S_j c_j / 2 more, S_j = L_j L_j'.
-
-    Attributes:
-        K, d, L: (N, 6, 12), (N, 6), (N, 6, 6).
     """
 
+    # K, d, L: (N, 6, 12), (N, 6), (N, 6, 6)
     K: Array
     d: Array
     L: Array
@@ -233,14 +211,12 @@ class Condensed(NamedTuple):
     """Deviations of a plan by v (6 N,), c_j = L_j^-T v_j: an affine map.
 
     The cost is |v|^2 / 2 and a constant.
-
-    Attributes:
-        states, torques: (N + 1, 12) and (N, 6) at v = 0, deviations from the plan.
-        state_map, torque_map: (N + 1, 12, 6 N) and (N, 6, 6 N).
     """
 
+    # states, torques: (N + 1, 12) and (N, 6) at v = 0, deviations from the plan
     states: Array
     torques: Array
+    # state_map, torque_map: (N + 1, 12, 6 N) and (N, 6, 6 N)
     state_map: Array
     torque_map: Array
 

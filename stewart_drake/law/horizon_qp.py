@@ -32,21 +32,16 @@ MOST_ITERATIONS = 1000
 
 
 class LeastDistance(NamedTuple):
-    """Problem (qp): minimise h.z^2 / 2 + g.z, z = [s; v], for s >= 0 and lower <= A z <= upper.
+    """Problem (qp): minimise h.z^2 / 2 + g.z, z = [s; v], for s >= 0 and lower <= A z <= upper."""
 
-    Attributes:
-        h, g: (n,) with n = slacks + 6 N.
-        A: (m, n).
-        lower, upper: (m,); the upper one may be infinite.
-        slacks: number of s.
-    """
-
+    # h, g: (n,) with n = slacks + 6 N
     h: Array
     g: Array
-    A: Array
+    A: Array  # (m, n)
+    # lower, upper: (m,); the upper one may be infinite
     lower: Array
     upper: Array
-    slacks: int
+    slacks: int  # number of s
 
 
 class QpError(ArithmeticError):

@@ -37,15 +37,10 @@ def harmonics(phase: Array, number: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class LearnedSignal:
-    """Periodic torque or angle l(t) = `harmonics`(2 pi t / T) @ coefficients, N m or rad.
+    """Periodic torque or angle l(t) = `harmonics`(2 pi t / T) @ coefficients, N m or rad."""
 
-    Attributes:
-        period: T of the motion, s.
-        coefficients: (1 + 2 H, 6), N m or rad.
-    """
-
-    period: float
-    coefficients: Array
+    period: float  # T of the motion, s
+    coefficients: Array  # (1 + 2 H, 6), N m or rad
 
     def __call__(self, times: Array) -> Array:
         """Return the torque or angle (n, 6) at instants (n,) in s of the motion, N m or rad."""
@@ -77,23 +72,18 @@ class LearnedMemory(OuterMemory):
 
     @property
     def counts(self) -> Counts:
-        """Numbers of survived problems, by cause."""
         counts: Counts = self.free.counts
         return counts._replace(saturated_steps=self.saturated_steps)
 
 
 @dataclass(frozen=True)
 class LearnedLqi(OuterLqi):
-    """`PredictiveLqi` with a learned torque.
+    """`PredictiveLqi` with a learned torque."""
 
-    Attributes:
-        learned: by the time of the motion, which begins with the first sample.
-    """
-
+    # by the time of the motion, which begins with the first sample
     learned: LearnedSignal = field(kw_only=True)
 
     def initial_memory(self, queue: Array) -> Any:
-        """Return the memory before the first sample; see `PredictiveLqi.initial_memory`."""
         begun = self._served.initial_memory(queue)
         ago = np.arange(-len(queue), 0)
         free = self._served.initial_memory(np.subtract(queue, self._acting(ago)))
@@ -111,7 +101,6 @@ class LearnedLqi(OuterLqi):
         weights: Array,
         report: Report | None = None,
     ) -> Any:
-        """Compute the torque of one sample; see `PredictiveLqi.step`."""
         free = self._served.step(memory.free, measurement, motion, weights, report)
         (learned,) = self._acting(np.array([memory.samples]))
         torque = free.torque + learned

@@ -22,14 +22,16 @@ from stewart_drake.dynamics.workspace import margins
 from stewart_drake.law.clear_space import ClearSpace
 from stewart_drake.law.feedforward import (
     GAUSS_NODES,
+    InverseDynamicsFeedforward,
     mean_torques,
     means_and_changes,
-    rates_at_samples,
     torques_at_nodes,
 )
 from stewart_drake.law.horizon import HoldModel, HorizonCost, condense, riccati
 from stewart_drake.law.horizon_qp import LeastDistance, problem_of, solve_by_daqp
 from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.timeline import Timeline
+from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
@@ -50,19 +52,12 @@ _BEYOND: Final = 0.05
 
 @dataclass(frozen=True)
 class LeastError:
-    """Plans of least error.
+    """Plans of least error."""
 
-    Attributes:
-        plant: model of the plant.
-        space: distances to keep.
-        Q: (6,) weights of the pose error.
-        R: (6, 6) weights of the torques.
-    """
-
-    plant: NominalPlant
-    space: ClearSpace
-    Q: Array
-    R: Array
+    plant: NominalPlant  # model of the plant
+    space: ClearSpace  # distances to keep
+    Q: Array  # (6,) weights of the pose error
+    R: Array  # (6, 6) weights of the torques
 
     def pieces(
         self,
@@ -113,8 +108,8 @@ class LeastError:
             torques_at_nodes(dynamics, reference, after[:1], after[1:])
         )
         B = dynamics.linearize(state[POSE], state[RATES], means[0])[1][RATES]
-        state[RATES] += rates_at_samples(np.array([np.zeros(6), changes[0]]), B, period)
-        return state
+        timeline, pair = Timeline(period, Delay(0)), np.array([np.zeros(6), changes[0]])
+        return np.asarray(state + InverseDynamicsFeedforward().offset(pair, B, timeline))
 
     def _solved(
         self, start: Array, torques: Array, hold: float, limit: float, cost: HorizonCost

@@ -59,18 +59,12 @@ _EDGE: Final = 0.25
 
 @dataclass(frozen=True, eq=False)
 class QpLimits:
-    """Limits that a plan keeps.
+    """Limits that a plan keeps."""
 
-    Attributes:
-        horizon: N, number of periods.
-        space: distances to keep.
-        solver: of (qp).
-        budget: time for a step, s, infinite in a simulation. Beyond it the last plan is continued.
-    """
-
-    horizon: int
-    space: ClearSpace
-    solver: Solver = solve_by_daqp
+    horizon: int  # N, number of periods
+    space: ClearSpace  # distances to keep
+    solver: Solver = solve_by_daqp  # of (qp)
+    # time for a step, s, infinite in a simulation. Beyond it the last plan is continued
     budget: float = math.inf
 
 
@@ -91,7 +85,6 @@ class LimitedMemory(OuterMemory):
 
     @property
     def counts(self) -> Counts:
-        """Numbers of survived problems, by cause."""
         counts: Counts = self.free.counts
         return counts._replace(
             limited_steps=self.limited_steps, qp_failures=self.qp_failures, qp_late=self.qp_late
@@ -107,24 +100,16 @@ class LimitedMemory(OuterMemory):
         return after if cause is None else replace(after, **{cause: getattr(self, cause) + 1})
 
     def without_error(self) -> "LimitedMemory":
-        """Return the memory with error and integral reset."""
         return replace(self, free=self.free.without_error())
 
 
 class _Ahead(NamedTuple):
-    """Reference over the horizon.
+    """Reference over the horizon."""
 
-    Attributes:
-        rows: (N + 1, 18) at the beginning of each hold and the end of the last.
-        nodes: (2 (N + 2), 18) at the Gauss nodes of the holds and a neighbour on each side.
-        share: factor on its distance from home that keeps the reach, at most 1.
-        torques: (N, 6) feedforward of the shrunk reference, N m.
-    """
-
-    rows: Array
-    nodes: Array
-    share: float
-    torques: Array
+    rows: Array  # (N + 1, 18) at the beginning of each hold and the end of the last
+    nodes: Array  # (2 (N + 2), 18) at the Gauss nodes of the holds and a neighbour on each side
+    share: float  # factor on its distance from home that keeps the reach, at most 1
+    torques: Array  # (N, 6) feedforward of the shrunk reference, N m
 
     def states(self, mechanism: Mechanism) -> Array:
         """Return the states (N + 1, 12) of the shrunk reference."""
@@ -133,21 +118,13 @@ class _Ahead(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """Search for a plan within the limits, from one state.
+    """Search for a plan within the limits, from one state."""
 
-    Attributes:
-        plant: model of the plant.
-        limits: to keep.
-        holds: motion of the plant over single holds.
-        start: (12,) state at the beginning of the plan.
-        reference: plan that replaces another one after the edge of the workspace.
-    """
-
-    plant: NominalPlant
-    limits: QpLimits
-    holds: HoldModel
-    start: Array
-    reference: Plan
+    plant: NominalPlant  # model of the plant
+    limits: QpLimits  # to keep
+    holds: HoldModel  # motion of the plant over single holds
+    start: Array  # (12,) state at the beginning of the plan
+    reference: Plan  # plan that replaces another one after the edge of the workspace
 
     def continued(self, last: Plan) -> Plan:
         """Return the motion of the plant along the last plan, a hold later."""
@@ -221,13 +198,9 @@ class _Search:
 
 @dataclass(frozen=True)
 class LimitedLqi(OuterLqi):
-    """`PredictiveLqi` whose torques come from a quadratic program where a limit binds.
+    """`PredictiveLqi` whose torques come from a quadratic program where a limit binds."""
 
-    Attributes:
-        limits: to keep.
-    """
-
-    limits: QpLimits = field(kw_only=True)
+    limits: QpLimits = field(kw_only=True)  # to keep
 
     def times_for(self, timeline: Timeline) -> Array:
         """Return the times (p,) of a preview: those of the free law, then those of the horizon."""
@@ -237,7 +210,6 @@ class LimitedLqi(OuterLqi):
         return np.concatenate([self.free.times_for(timeline), ends, nodes.ravel()])
 
     def initial_memory(self, queue: Array) -> Any:
-        """Return the memory before the first sample; see `PredictiveLqi.initial_memory`."""
         return LimitedMemory(self._served.initial_memory(queue))
 
     def step(

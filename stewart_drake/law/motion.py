@@ -23,15 +23,10 @@ them may be negative."""
 
 @dataclass(frozen=True)
 class Preview:
-    """A motion that is known at the instants that a law asks for.
+    """A motion that is known at the instants that a law asks for."""
 
-    Attributes:
-        times: (p,) s from now.
-        reference: (p, 18).
-    """
-
-    times: Array
-    reference: Array
+    times: Array  # (p,) s from now
+    reference: Array  # (p, 18)
 
     def __call__(self, times: Array) -> Array:
         """Return the reference at all of `times`.
@@ -85,27 +80,17 @@ class KnownMotion:
 
 @dataclass(frozen=True)
 class Course:
-    """Preview of a sample, and the rows that the law followed, see core/reference.h.
+    """Preview of a sample, and the rows that the law followed, see core/reference.h."""
 
-    Attributes:
-        times: (p,) s from the sample.
-        reference: (p, 18), with numbers for what was missing; NaN before the first preview.
-        followed: (p, 18) the same with the way back after a gap.
-        missing: whether anything was missing in the preview.
-        gap: whether its last row was.
-        offset: (12,) from the reference where the next torque acts, after a gap.
-        holds: number of holds until the offset is zero.
-        samples: number of samples after that until no torque of the way back is in flight.
-    """
-
-    times: Array
-    reference: Array
-    followed: Array
-    missing: bool = False
-    gap: bool = False
+    times: Array  # (p,) s from the sample
+    reference: Array  # (p, 18), with numbers for what was missing; NaN before the first preview
+    followed: Array  # (p, 18) the same with the way back after a gap
+    missing: bool = False  # whether anything was missing in the preview
+    gap: bool = False  # whether its last row was
+    # (12,) from the reference where the next torque acts, after a gap
     offset: Array = field(default_factory=lambda: np.zeros(NUM_STATE))
-    holds: int = 0
-    samples: int = 0
+    holds: int = 0  # number of holds until the offset is zero
+    samples: int = 0  # number of samples after that until no torque of the way back is in flight
 
     @classmethod
     def unknown(cls, times: Array) -> "Course":
@@ -149,7 +134,6 @@ class Course:
         return replace(course, missing=bool(found.missing), gap=bool(found.gap), **way)
 
     def _compiled(self) -> Any:
-        """Return the `stewart_course`."""
         c = core()
         arrays = map(c.at, (self.times, self.reference, self.followed))
         back = [self.offset.tolist(), self.holds, self.samples]

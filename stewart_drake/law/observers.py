@@ -185,21 +185,13 @@ class CoreObserver:
 
 
 class Part(NamedTuple):
-    """An observer in the core.
+    """An observer in the core."""
 
-    Attributes:
-        table: name of its table of functions.
-        sensor: C structure of the sensor.
-        own: whether the sensor is written in Python.
-        estimation: C structure of its assumptions, or None.
-        sources: files of the core for it, see `export.controller.SOURCES`.
-    """
-
-    table: str
-    sensor: Compiled
-    own: bool
-    estimation: Compiled | None
-    sources: tuple[str, ...]
+    table: str  # name of its table of functions
+    sensor: Compiled  # C structure of the sensor
+    own: bool  # whether the sensor is written in Python
+    estimation: Compiled | None  # C structure of its assumptions, or None
+    sources: tuple[str, ...]  # files of the core for it, see `export.controller.SOURCES`
 
     def fill(self, law: Any) -> None:
         """Set the observer of a `stewart_law`."""
@@ -261,7 +253,6 @@ def _law_of(
     fraction: float,
     parts: int,
 ) -> Compiled:
-    """Return a `stewart_law` with all that an observer reads of it."""
     law, machine = core().ffi.new("stewart_law *"), machine_of(plant)
     part = part_of(observer, sensing, plant, period)
     part.fill(law)
@@ -294,7 +285,6 @@ def _assumed(settings: FilterSettings) -> dict[str, Array]:
 
 @Once
 def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
-    """Return the `stewart_filter_settings` of a filter for `size` measured values."""
     c, known, p = core(), settings.parameters, len(settings.parameters.names)
     free = np.full(NUM_STATE, np.inf)
     it, prior = c.ffi.new("stewart_filter_settings *"), numbers(known.prior)
@@ -316,7 +306,6 @@ def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
 def _delay_settings_of(
     observer: CoreObserver, settings: FilterSettings, size: int, period: float
 ) -> Compiled:
-    """Return the `stewart_delay_settings` for `size` values of one instant."""
     c, delay = core(), observer.delay
     assert delay is not None
     it = c.ffi.new("stewart_delay_settings *")

@@ -86,7 +86,7 @@ def lqr_by_doubling(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Arra
 def full_gain(model: DelayedModel, Q: Array, R: Array, solver: Solver = lqr) -> tuple[Array, Array]:
     """Return (42)-(44) on the whole chain (37)-(39): K (m, n + m L) and P, with Q on y = C e.
 
-    The queue makes the equation large; `augmented_gain` finds the same K without it.
+    The queue makes the equation large; `law.cost.law_gain` finds the same K without it.
 
     Raises:
         RiccatiError: see `lqr`.
@@ -147,15 +147,6 @@ def prediction_matrix(model: DelayedModel) -> Array:
     newest = np.zeros((m * extra, n + length))
     newest[:, n + length - m * extra :] = np.eye(m * extra)
     return np.vstack([np.hstack([power, torques]), newest])
-
-
-def augmented_gain(model: DelayedModel, Q: Array, R: Array) -> Array:
-    """Return K_aug (m, n + m L) = K [A^mu, A^(mu-1) B, ..., B], equal to that of `full_gain`.
-
-    Raises:
-        RiccatiError: see `lqr`.
-    """
-    return reduced_gain(model, Q, R) @ prediction_matrix(model)
 
 
 def _check(A: Array, B: Array, Q: Array, R: Array) -> None:

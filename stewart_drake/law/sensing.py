@@ -164,7 +164,6 @@ class StateSensing:
 
 @Once
 def state_sensor(sensing: StateSensing) -> Compiled:
-    """Return the `stewart_state_sensor`."""
     sensor = core().ffi.new("stewart_state_sensor *")
     sensor.noise_std = list(numbers(sensing.noise_std, NUM_STATE))
     sensor.motion = list(numbers(sensing.motion, NUM_COORDINATES))
@@ -327,7 +326,6 @@ def _sensing_of(sensing: EncoderSensing) -> Compiled:
 
 @Once
 def encoders_of(sensing: EncoderSensing) -> Compiled:
-    """Return the `stewart_encoders`."""
     c, it, shares = core(), core().ffi.new("stewart_encoders *"), node_shares(sensing.samples)
     machine, noise = geometry(sensing.mechanism), sensing.noise_std
     it.geometry, it.noise_std = c.at(machine), c.at(noise)

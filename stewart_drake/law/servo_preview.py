@@ -44,30 +44,19 @@ from stewart_drake.types import Array
 
 @dataclass(frozen=True)
 class ServoMemory:
-    """Memory of the law, with the names of `law.memory.Memory`.
+    """Memory of the law, with the names of `law.memory.Memory`."""
 
-    Attributes:
-        command: (18,) sent last.
-        belief: of the observer, at the last measurement.
-        lag: age of that measurement, periods.
-        measurement: (m,) at the last sample, as it came; NaN before the first.
-        torque: (6,) of the servos before their limit, in the last report.
-        in_flight: (1, 6) the same within the limit.
-        counts: see `law.memory.Counts`.
-        integral, weights: NaN.
-        samples: number of samples so far.
-    """
-
-    command: Array
-    belief: Belief
-    measurement: Array
-    torque: Array
-    in_flight: Array
-    counts: Counts
-    lag: int
+    command: Array  # (18,) sent last
+    belief: Belief  # of the observer, at the last measurement
+    measurement: Array  # (m,) at the last sample, as it came; NaN before the first
+    torque: Array  # (6,) of the servos before their limit, in the last report
+    in_flight: Array  # (1, 6) the same within the limit
+    counts: Counts  # see `law.memory.Counts`
+    lag: int  # age of that measurement, periods
+    # integral, weights: NaN
     integral: Array
     weights: Array
-    samples: int = 0
+    samples: int = 0  # number of samples so far
 
 
 @dataclass(frozen=True)

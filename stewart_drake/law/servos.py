@@ -68,23 +68,14 @@ def turned(angles: Array, near: Array) -> Array:
 
 @dataclass(frozen=True)
 class ServoLoop:
-    """Local loop of each motor: (servo), sampled.
+    """Local loop of each motor: (servo), sampled."""
 
-    Attributes:
-        inertia: J, kg m^2.
-        bandwidth: w, rad/s.
-        damping: d.
-        period: h between two torques, s.
-        motors: the limit of their torque.
-        speed_limit: of the setpoint, rad/s, infinite for none.
-    """
-
-    inertia: float
-    bandwidth: float
-    damping: float
-    period: float
-    motors: TorqueLimit
-    speed_limit: float = math.inf
+    inertia: float  # J, kg m^2
+    bandwidth: float  # w, rad/s
+    damping: float  # d
+    period: float  # h between two torques, s
+    motors: TorqueLimit  # the limit of their torque
+    speed_limit: float = math.inf  # of the setpoint, rad/s, infinite for none
 
     def torque(self, setpoint: Array, model: Array, cranks: Array) -> Array:
         """Return (servo), before any limit, N m.
@@ -124,21 +115,14 @@ class ServoLoop:
 
 @dataclass(frozen=True)
 class PositionServo:
-    """The six servos of a machine, given by their stiffness (core/position_servo.h).
+    """The six servos of a machine, given by their stiffness (core/position_servo.h)."""
 
-    Attributes:
-        stiffness: k, N m/rad.
-        velocity_gain: k_v, N m s/rad.
-        torque_limit: N m, infinite for none.
-    """
-
-    stiffness: float
-    velocity_gain: float
-    torque_limit: float
+    stiffness: float  # k, N m/rad
+    velocity_gain: float  # k_v, N m s/rad
+    torque_limit: float  # N m, infinite for none
 
     @cached_property
     def compiled(self) -> Any:
-        """The `stewart_position_servo *`."""
         numbers = self.stiffness, self.velocity_gain, self.torque_limit
         return core().ffi.new("stewart_position_servo *", numbers)
 
@@ -158,20 +142,14 @@ class PositionServo:
 
 @dataclass(frozen=True)
 class Stiffness:
-    """Servos given by their stiffness, as the controller knows them; their setpoints are held.
+    """Servos given by their stiffness, as the controller knows them; their setpoints are held."""
 
-    Attributes:
-        stiffness: k, N m/rad.
-        velocity_gain: k_v, N m s/rad.
-        low, high: (6,) range of the setpoints, rad, infinite for none.
-        most: largest change of a setpoint per period, rad, infinite for none.
-    """
-
-    stiffness: float
-    velocity_gain: float
+    stiffness: float  # k, N m/rad
+    velocity_gain: float  # k_v, N m s/rad
+    # low, high: (6,) range of the setpoints, rad, infinite for none
     low: Array
     high: Array
-    most: float
+    most: float  # largest change of a setpoint per period, rad, infinite for none
 
     def setpoint(self, angles: Array, rates: Array, torque: Array) -> Array:
         """Return (setpoint) (6,) in rad, without limits, for angles, rates and torques (6,)."""
@@ -190,14 +168,10 @@ class Segment(NamedTuple):
     linear: with commands a period apart, setpoint, rates and torque are continuous.
     """
 
-    begin: float
-    """s."""
-    end: float
-    """s; when the command is to be reached."""
-    start: Array
-    """(18,) angles, rates, torques."""
-    stop: Array
-    """(18,)."""
+    begin: float  # s
+    end: float  # s; when the command is to be reached
+    start: Array  # (18,) angles, rates, torques
+    stop: Array  # (18,)
 
     def at(self, time: float, coast: float) -> Array:
         """Return (18,) at a time in s; after the end it moves on for `coast` s, then stays."""
@@ -244,12 +218,9 @@ def still(command: Array, time: float) -> Segment:
 class Reported(NamedTuple):
     """Torques of the servos between two measurements."""
 
-    torques: Array
-    """(n, 6) N m, means over equal parts of the time."""
-    asked: Array
-    """(6,) N m, before the limit, when it ended."""
-    saturated: int
-    """Periods of the controller in which a torque was at its limit."""
+    torques: Array  # (n, 6) N m, means over equal parts of the time
+    asked: Array  # (6,) N m, before the limit, when it ended
+    saturated: int  # periods of the controller in which a torque was at its limit
 
 
 @dataclass(frozen=True)
@@ -258,14 +229,10 @@ class ReportLayout:
 
     A row for each period, the oldest first: the means of the torques over equal parts of it
     (6 parts), and whether one was at the limit (1 or 0). Then the last torque before the limit (6).
-
-    Attributes:
-        parts: of a period.
-        periods: rows; one report fewer may be lost in a row without loss of information.
     """
 
-    parts: int
-    periods: int
+    parts: int  # of a period
+    periods: int  # rows; one report fewer may be lost in a row without loss of information
 
     @property
     def width(self) -> int:
@@ -274,7 +241,6 @@ class ReportLayout:
 
     @property
     def size(self) -> int:
-        """Size of the report."""
         return self.periods * self.width + NUM_TORQUES
 
     def written(self, put_out: Array, asked: Array, motors: TorqueLimit) -> Array:

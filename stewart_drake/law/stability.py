@@ -131,21 +131,13 @@ def closed_loop(plant: DelayedModel, K: Array, gain: float = 1.0) -> Array:
 
 @dataclass(frozen=True)
 class LinearLoop:
-    """True plant with the linearised law.
+    """True plant with the linearised law."""
 
-    Attributes:
-        plant: the true one, without integral states.
-        K: (m, n + m L) of (law).
-        period: s.
-        delay: the true one.
-        integral: whether the law integrates the error.
-    """
-
-    plant: ContinuousModel
-    K: Array
-    period: float
-    delay: Delay
-    integral: bool
+    plant: ContinuousModel  # the true one, without integral states
+    K: Array  # (m, n + m L) of (law)
+    period: float  # s
+    delay: Delay  # the true one
+    integral: bool  # whether the law integrates the error
 
     def sampled(self, longer: float = 0.0, step: float | None = None) -> DelayedModel:
         """Return the plant over one period, with a delay that is `longer` by a time in s.
@@ -240,14 +232,10 @@ def peaks(plant: DelayedModel, K: Array, period: float) -> tuple[Peak, Peak]:
 class Margins(NamedTuple):
     """Errors of delay and motors at which the loop becomes unstable; 0 and 1 if it is already."""
 
-    shorter: float
-    """Error of a true delay that is shorter, s; infinite if it may be 0."""
-    longer: float
-    """Error of a true delay that is longer, s; infinite beyond 30 periods."""
-    gain_down: float
-    """Factor on the torques of all motors, < 1; 0 if they may fail."""
-    gain_up: float
-    """Factor on the torques of all motors, > 1."""
+    shorter: float  # error of a true delay that is shorter, s; infinite if it may be 0
+    longer: float  # error of a true delay that is longer, s; infinite beyond 30 periods
+    gain_down: float  # factor on the torques of all motors, < 1; 0 if they may fail
+    gain_up: float  # factor on the torques of all motors, > 1
 
 
 def first_instability(loop: Callable[[float], Array], start: float, limit: float) -> float:

@@ -16,7 +16,6 @@ from stewart_drake.law.feedforward import mean_torques
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
-    ACCELERATIONS,
     COULOMB,
     COULOMB_SPEED,
     NUM_STATE,
@@ -113,9 +112,8 @@ def weight_scales(
 
 def reference_torques(dynamics: StewartDynamics, reference: Trajectory, duration: float) -> Array:
     """Return the largest of the six motor torques (INSTANTS,) along the reference, N m."""
-    states = (evaluate(reference, t) for t in spread_instants(duration, INSTANTS))
-    torques = [dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS]) for x in states]
-    return np.abs(torques).max(axis=1)
+    rows = np.array([evaluate(reference, t) for t in spread_instants(duration, INSTANTS)])
+    return np.abs(dynamics.torques_along(rows)).max(axis=1)
 
 
 def reference_torque(dynamics: StewartDynamics, reference: Trajectory, duration: float) -> float:

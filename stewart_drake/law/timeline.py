@@ -158,7 +158,6 @@ class Arrivals(Timeline):
 
     @property
     def eta(self) -> float:
-        """Delay of the torque that is computed now, s."""
         return self.arrival * (1 + self.rate)
 
     @property
@@ -173,11 +172,9 @@ class Arrivals(Timeline):
         return in_flight
 
     def until_next(self, queue: Array) -> TorqueSchedule:
-        """Return the schedule from now until the next torque acts."""
         return self.within(queue, 0.0, self.eta)
 
     def last_period(self, in_flight: Array) -> tuple[TorqueSchedule, Array]:
-        """Return the schedule since the last sample, and the torque (6,) that acts next."""
         schedule = self.within(in_flight, -self.period, 0.0)
         return schedule, self.within(in_flight, 0.0, self.period).torques[0]
 

@@ -406,7 +406,6 @@ class CompiledServo:
         return survived.summary() | {"tuner_fallbacks": 0}
 
     def run(self, plant: NativePlant, loop: Any) -> Ended:
-        """Run a plant with its servos in the loop."""
         loop.servo = self._servo
         ended = plant.call("closed_loop_of_servo", loop, self.data)
         self._saturated = loop.saturated

@@ -113,7 +113,6 @@ def overconfidence(summary: RunSummary) -> list[str]:
 
 
 def cautions_after(experiment: Experiment, summary: RunSummary) -> list[str]:
-    """Return the warnings after a run."""
     found, period = [], 1e3 * experiment.scenario.controller.period
     median, worst = (summary["controller_step_ms"][which] for which in ("median", "worst"))
     if median > period:  # a single slow step may be due to the computer

@@ -35,8 +35,6 @@ REPORTS: Final = 10
 
 
 class SensorKind(NamedTuple):
-    """A kind of sensor."""
-
     # the sensor, a Drake system with the ports `state` and `measurement`
     system: Callable[[Any, Experiment], System]
     sensing: Callable[[Any, Experiment], Sensing]  # part of the law that models the measurement

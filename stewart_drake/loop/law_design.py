@@ -141,17 +141,11 @@ def quadratic_cost(experiment: Experiment, peak_torque: float) -> QuadraticCost:
 
 
 class Sizing(NamedTuple):
-    """Step size and torque scales of a law, computed from its machine and motion.
+    """Step size and torque scales of a law, computed from its machine and motion."""
 
-    Attributes:
-        substeps: of the prediction, per period.
-        reference_torque: largest along the reference, N m.
-        machine_torque: see `law.startup.machine_torque`, N m.
-    """
-
-    substeps: int
-    reference_torque: float
-    machine_torque: float
+    substeps: int  # of the prediction, per period
+    reference_torque: float  # largest along the reference, N m
+    machine_torque: float  # see `law.startup.machine_torque`, N m
 
 
 def sizing_of(experiment: Experiment) -> Sizing:

@@ -175,7 +175,6 @@ def _make(what: str, given: Any, kind: type) -> Any:
 
 
 def _check(role: str, system: System) -> None:
-    """Check the ports of a system for its role."""
     needed, may, offered = (
         {name: _SIZES[name] for name in names.split()} for names in ROLES[role][:3]
     )

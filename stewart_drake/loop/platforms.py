@@ -63,16 +63,10 @@ from stewart_drake.types import Array, ArrayLike
 
 
 def add_mechanism(
-    plant: MultibodyPlant,
-    mechanism: Mechanism,
-    *,
-    gravity: bool = True,
-    collision: bool = False,
+    plant: MultibodyPlant, mechanism: Mechanism, collision: bool = False
 ) -> ModelInstanceIndex:
     """Add the mechanism to an otherwise empty `plant`, and finalize it."""
     model = add_model(plant, mechanism, collision=collision)
-    if not gravity:
-        plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
     plant.Finalize()
     return model
 
@@ -629,16 +623,14 @@ class MultibodyStewart(Diagram):
         return diagnose(self.mechanism, context.get_time(), state[POSE], cranks)
 
 
-def build_viewer(
-    mechanism: Mechanism, meshcat: Meshcat
-) -> tuple[Diagram, MultibodyPlant, MeshcatVisualizer]:
+def build_viewer(mechanism: Mechanism, meshcat: Meshcat) -> tuple[Diagram, MultibodyPlant]:
     """Build a diagram that shows the SDFormat model in Meshcat."""
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(time_step=1e-3, discrete_contact_approximation="sap")
     plant, scene_graph = AddMultibodyPlant(config, builder)
     add_mechanism(plant, mechanism)
-    visualizer = MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
-    return builder.Build(), plant, visualizer
+    MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+    return builder.Build(), plant
 
 
 class StartCheck(LeafSystem):

@@ -94,8 +94,7 @@ class Sample(NamedTuple):
     """Result of one step of a law."""
 
     memory: Any
-    seconds: float
-    """Computing time; 0 before the first step."""
+    seconds: float  # computing time; 0 before the first step
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Sample":
         """Return the same object: a memory is never changed."""

@@ -48,12 +48,12 @@ class Scene:
     def __init__(self, mechanism: Mechanism, meshcat: Meshcat) -> None:
         self._mechanism, self._meshcat = mechanism, meshcat
         meshcat.Delete("/" + "/".join(_VISUALIZER))  # removes the colours of an earlier scene
-        self._diagram, self._plant, _ = build_viewer(mechanism, meshcat)
+        self._diagram, self._plant = build_viewer(mechanism, meshcat)
         self._context = self._diagram.CreateDefaultContext()
         self._tree = self._plant.GetMyMutableContextFromRoot(self._context)
         self._disc, radius = _drawn_plate(self._diagram, self._plant)
         self._diagram.ForcedPublish(self._context)
-        _arrange(meshcat, mechanism)
+        arrange(meshcat, mechanism)
         shapes: dict[str, Any] = {"ring": ring(radius), "pointer": pointer(radius)}
         for name, (vertices, faces) in shapes.items():
             meshcat.SetTriangleMesh(f"{_GHOST}/{name}", vertices, faces, _GHOST_COLOR)
@@ -102,7 +102,6 @@ class Live:
         self._largest: list[float] = []
 
     def show(self, context: Context) -> None:
-        """Show the loop in its context."""
         state, reference, torque = (np.asarray(port.Eval(context)) for port in self._ports)
         self._largest.append(float(np.abs(torque).max()))
         self._scene.show(state[POSE], reference[POSE], context.get_time())
@@ -172,7 +171,7 @@ def _linear(color: Array) -> list[float]:
     return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4).tolist()
 
 
-def _arrange(meshcat: Meshcat, mechanism: Mechanism) -> None:
+def arrange(meshcat: Meshcat, mechanism: Mechanism) -> None:
     """Set a camera that sees the whole machine, and a floor with squares of a round size."""
     joints = mechanism.p_PQ @ rotation(mechanism.home[ANGLES]).T + mechanism.home[POSITION]
     points = np.vstack([mechanism.p_WS, joints])

@@ -5,21 +5,13 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    EventStatus,
-    LeafSystem,
-    State,
-)
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.scenario.field_types import SPIKE
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS, NUM_STATE, POSE
-from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array, ArrayLike
 
 _EARLY = 1e-9
@@ -83,9 +75,9 @@ def faulty(
     return read
 
 
-def white_noise(seed: int, k: int, stream: int = 0) -> Array:
+def white_noise(seed: int, k: int) -> Array:
     """Return normal numbers (12,) of sample k, a function of (seed, k)."""
-    return draws(seed, stream, k).standard_normal(NUM_STATE)
+    return draws(seed, 0, k).standard_normal(NUM_STATE)
 
 
 def white_noises(seed: int, number: int) -> Array:
@@ -139,9 +131,7 @@ class Sensor(LeafSystem):
         self._state = self.DeclareVectorInputPort("state", NUM_STATE)
         if self._faults:
             self.DeclareDiscreteState(np.full(NUM_STATE, np.nan))
-            self.DeclareInitializationDiscreteUpdateEvent(weak(self._remember_first))
-            early = event_time(period)
-            self.DeclarePeriodicDiscreteUpdateEvent(early, early, weak(self._remember))
+            update_every(self, period, self._remember)
         self.DeclareVectorOutputPort("measurement", NUM_STATE, weak(self._measure))
 
     def noise(self, k: int) -> Array:
@@ -158,12 +148,9 @@ class Sensor(LeafSystem):
             y = faulty(self._faults, y, last, time, self._seed, k, self._scale)
         output.SetFromVector(y)
 
-    def _remember_first(self, context: Context, state: DiscreteValues) -> EventStatus:
-        self._remember(context, state)
-        return EventStatus.Succeeded()
-
-    def _remember(self, context: Context, state: DiscreteValues) -> None:
-        state.set_value(self.get_output_port().Eval(context))
+    def _remember(self, context: Context, state: State) -> None:
+        read = self.get_output_port().Eval(context)
+        state.get_mutable_discrete_state().get_mutable_vector().SetFromVector(read)
 
 
 _PHASES: Final = 7

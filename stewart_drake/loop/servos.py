@@ -67,16 +67,11 @@ from stewart_drake.types import Array
 class ServoState(NamedTuple):
     """Memory of servos."""
 
-    segment: Segment
-    """Path of the setpoint to the newest command."""
-    arrived: float
-    """Arrival of that command, s; NaN before the first."""
-    setpoint: Array
-    """(12,) last setpoint."""
-    asked: Array
-    """(6,) torque before the limit, N m."""
-    put_out: Array
-    """(n, 6) torques of the reported periods, oldest first; NaN before the start."""
+    segment: Segment  # path of the setpoint to the newest command
+    arrived: float  # arrival of that command, s; NaN before the first
+    setpoint: Array  # (12,) last setpoint
+    asked: Array  # (6,) torque before the limit, N m
+    put_out: Array  # (n, 6) torques of the reported periods, oldest first; NaN before the start
 
     @property
     def torque(self) -> Array:

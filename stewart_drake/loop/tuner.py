@@ -17,9 +17,8 @@ from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sampling import Sample, SteppedLaw
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES, RATES, WEIGHTS
 from stewart_drake.scenario.trajectories import evaluate, spread_instants
-from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Kind, Network, density
+from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Kind, Network
 from stewart_drake.tuner.source import (
-    MAX_FACTOR,
     DensityFeatures,
     HealthFeatures,
     PaperPolicy,
@@ -27,7 +26,7 @@ from stewart_drake.tuner.source import (
     Rule,
     TunerMemory,
     WeightsSource,
-    tune,
+    density_source,
 )
 from stewart_drake.types import Array
 
@@ -40,7 +39,7 @@ class DensityWindow(SteppedLaw):
 
     Initialise: window = [unknown, ..., unknown], then the update of k = 0.
     Update:     at k dt   window <- [window without its oldest; s_k].
-    Output:     density = `tuner.network.density`(window), hence of samples up to k from k dt on.
+    Output:     density = (45) of the window, hence of samples up to k from k dt on.
 
     Values of s_k that are not finite are left out of the window's mean. While the window fills, the
     mean is over the samples so far. The update is early and unrestricted like the controller's, so
@@ -64,9 +63,10 @@ class DensityWindow(SteppedLaw):
         self._reference = self.DeclareVectorInputPort("reference", NUM_REFERENCE)
         self._torque = self.DeclareVectorInputPort("torque", NUM_TORQUES)
         self._begin(np.full((WINDOW, NUM_INPUTS), np.nan), period)
+        density = density_source(kind).values
 
         def densities(window: Array) -> Array:
-            return density(window, kind) if np.isfinite(window).any() else window[-1]
+            return density(window) if np.isfinite(window).any() else window[-1]
 
         self._put_out("density", NUM_INPUTS, densities)
 
@@ -87,7 +87,7 @@ class AnnTuner(SteppedLaw):
     """Sets w_Q and w_R at every sample by a network (III-D), within its bounds and a rate limit.
 
     With w the weights of the last sample, n the count of fallbacks, rho the densities of samples up
-    to k - 1 and `tune` the law (`tuner.source.tune`):
+    to k - 1 and `tune` the law (`tuner.source.PaperPolicy`):
 
     Initialise: w unknown, n = 0, then the update of k = 0.
     Update:     at k dt   (w, n) <- (w_k, n + fallback_k).
@@ -107,14 +107,12 @@ class AnnTuner(SteppedLaw):
         network: the network.
         fixed: (2,) w_Q and w_R at the first sample and after fallbacks.
         period: dt in s.
-        factor: largest factor on a weight from one sample to the next.
     """
 
-    def __init__(
-        self, network: Network, fixed: Array, period: float, factor: float = MAX_FACTOR
-    ) -> None:
+    def __init__(self, network: Network, fixed: Array, period: float) -> None:
         super().__init__()
-        self._network, self._fixed, self._factor = network, np.array(fixed), factor
+        policy = PaperPolicy(network, np.array(fixed))
+        self._source = WeightsSource(None, DensityFeatures(network.density), policy)
         self._density = self.DeclareVectorInputPort("density", NUM_INPUTS)
         self._begin((np.full(len(WEIGHTS), np.nan), 0), period)
         self._put_out("weights", len(WEIGHTS), lambda memory: memory[0], now=True)
@@ -127,7 +125,9 @@ class AnnTuner(SteppedLaw):
         densities = np.asarray(self._density.Eval(context))
 
         def step() -> tuple[Array, int]:
-            weights, fell_back = tune(self._network, densities, last, self._fixed, self._factor)
+            if np.isnan(last).any():
+                return self._source.policy.first, count
+            weights, fell_back = self._source.decide_by(densities, last)
             return weights, count + fell_back
 
         return step
@@ -200,7 +200,6 @@ def weights_source(experiment: Experiment, law: PredictiveLqi) -> WeightsSource 
 
 
 def health_of(experiment: Experiment, law: PredictiveLqi) -> HealthFeatures:
-    """Return the features `health` of a law."""
     sc = experiment.scenario
     sensing = law.sensing
     if not isinstance(sensing, StateSensing) or law.longest_wait:

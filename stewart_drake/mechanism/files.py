@@ -65,8 +65,6 @@ Length = Annotated[
 
 @dataclass(config=STRICT)
 class BodySpec:
-    """A body."""
-
     mass: Mass  # kg
     # principal moments about the COM, kg m^2; null estimates those of a uniform disc
     inertia: Moments | None = None
@@ -86,8 +84,6 @@ class LinkSpec:
 
 @dataclass(config=STRICT)
 class MotorSpec:
-    """All motors."""
-
     effort_limit: Annotated[float, Field(gt=0, le=1e6)] | None = None  # N m; null is none
 
 
@@ -126,8 +122,6 @@ class PatternSpec:
 
 @dataclass(config=STRICT)
 class LegSpec:
-    """One leg."""
-
     shaft: Point  # centre of the motor shaft in W, m
     motor_axis: Point  # direction of any length; the crank angle grows right-handed about it
     crank_zero: Point  # crank at angle zero, perpendicular to `motor_axis` but for rounding

@@ -200,7 +200,6 @@ def _parameters(run: SimulationResult) -> Figure:
 
 
 def _delay(run: SimulationResult) -> Figure:
-    """Draw the estimated delay with its band, and its error."""
     signals, panels = run.signals, []
     time, true, width = signals.time.values, signals.delay_true.values, 2 * signals.delay_std.values
     # Both the final band and an error several times as large are visible on this axis.

@@ -12,6 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.loop.platforms import build_viewer, set_pose
 from stewart_drake.loop.sampling import dispose
+from stewart_drake.loop.scene import arrange
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.reporting.style import FACTORS
@@ -75,9 +76,8 @@ class PoseViewer:
 
     def __init__(self, mechanism: Mechanism, meshcat: Meshcat) -> None:
         self._mechanism, self.meshcat = mechanism, meshcat
-        diagram, plant, _ = build_viewer(mechanism, meshcat)
-        self._diagram, self._plant = diagram, plant
-        self._context = diagram.CreateDefaultContext()
+        self._diagram, self._plant = build_viewer(mechanism, meshcat)
+        self._context = self._diagram.CreateDefaultContext()
         self._label = ""
         rod, radius = mechanism.rod_lengths.min(), np.linalg.norm(mechanism.p_PQ[:, :2], axis=1)
         meshcat.SetObject("wanted", Cylinder(float(1.08 * radius.max()), 0.03 * rod), _GHOST)
@@ -85,7 +85,7 @@ class PoseViewer:
             meshcat.SetObject(f"margins/leg_{leg}", Sphere(0.025 * rod), _GOOD)
         meshcat.AddButton(STOP, "Escape")
         self._deck = np.array([0.0, 0.0, mechanism.p_PQ[:, 2].mean() + 0.03 * rod])
-        aim_camera(meshcat, mechanism)
+        arrange(meshcat, mechanism)
         home = FACTORS * mechanism.home
         for name, low, high, value in zip(SLIDERS, *slider_range(mechanism), home, strict=True):
             meshcat.AddSlider(name, low, high, 0.1, value)
@@ -135,21 +135,6 @@ class PoseViewer:
                 say(str(self.step(values)))
                 shown = values
             time.sleep(0.03)
-
-
-def aim_camera(meshcat: Meshcat, mechanism: Mechanism) -> None:
-    """Show a machine of any size in most of the window, over a grid of its scale."""
-    joints = mechanism.home[3:] + mechanism.p_PQ
-    target = np.array([0.0, 0.0, (joints[:, 2].mean() + mechanism.p_WS[:, 2].mean()) / 2])
-    radius = np.linalg.norm(np.vstack([joints, mechanism.p_WS]) - target, axis=1).max()
-    eye: Any = target + radius * np.array([2.0, -1.6, 0.6])
-    meshcat.SetCameraPose(eye, target)  # type: ignore[arg-type]
-    # Meshcat's grid has squares of a metre, too large for a small machine.
-    meshcat.SetProperty("/Grid", "scale", [10.0 ** np.floor(np.log10(radius))] * 3)
-    meshcat.SetProperty("/Grid", "position", [0.0, 0.0, -0.06 * radius])
-    meshcat.SetProperty("/Grid", "opacity", 0.25)
-    meshcat.SetProperty("/Background", "top_color", [1.0, 1.0, 1.0])
-    meshcat.SetProperty("/Background", "bottom_color", [0.86, 0.88, 0.91])
 
 
 def slider_range(mechanism: Mechanism) -> tuple[Array, Array]:

@@ -80,7 +80,6 @@ class PushConfig:
         return self.wrench if self.start <= time < self.end else [0.0] * 6
 
     def problem(self) -> str | None:
-        """Return the problem with the times, or None."""
         if self.start < self.end:
             return None
         return (
@@ -652,7 +651,6 @@ class Scenario:
         )
 
     def _times_problem(self, link: NetworkConfig) -> str | None:
-        """Return the first problem with the transit times, or None."""
         if not link.follows_delay:
             return link.problem("link")
         zero = self.delay.steps + self.delay.fraction == 0
@@ -666,7 +664,6 @@ class Scenario:
         )
 
     def _network_problem(self) -> str | None:
-        """Return the first problem with a network and the assumptions about it, or None."""
         link = self.link
         if link.kind == "wire":
             return None

@@ -188,11 +188,9 @@ class CsvFile:
         self._add(heads)
 
     def write(self, row: Iterable[float]) -> None:
-        """Add a row of numbers."""
         self._add(repr(x) if math.isfinite(x) else "" for x in row)
 
     def close(self) -> None:
-        """Close the file."""
         os.close(self.descriptor)
 
     def _add(self, cells: Iterable[str]) -> None:

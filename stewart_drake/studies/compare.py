@@ -34,8 +34,6 @@ CONTROLLERS: Final = ("lqr", "lqi", "delay_lqr", "delay_lqi", "predictor_lqi")
 """Shipped names, in the order of tables and legends: the paper's four, and ours."""
 GRAVITY: Final = ("pd_gravity", "lqr_gravity")
 """Added if gravity acts: baselines that compensate gravity and ignore the delay."""
-LIMITED: Final = "predictor_mpc"
-"""Shown where it is chosen."""
 SERVOS: Final = ("servo_preview", "servo_feedforward")
 """Added if the machine has servos."""
 LABELS: Final = {

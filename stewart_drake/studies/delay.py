@@ -103,8 +103,6 @@ class MotorMargins(NamedTuple):
 
 @dataclass(frozen=True)
 class LoopMargins:
-    """Margins of the loop of one delay."""
-
     steps: int  # mu
     radius: float  # spectral radius of the closed loop
     S: Peak  # of sensitivity at the motors

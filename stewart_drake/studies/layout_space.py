@@ -34,7 +34,7 @@ from stewart_drake.mechanism.kinematics import (
     reach_margins,
     rotation,
 )
-from stewart_drake.scenario.signals import ACCELERATIONS, ANGLES, POSE, RATES
+from stewart_drake.scenario.signals import ANGLES, POSE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.workspace_map import rate_gains, wrenches
 from stewart_drake.types import Array
@@ -113,10 +113,7 @@ def geometry(mechanism: Legs, motion: Motion) -> dict[str, float]:
 
 def peak_torque(dynamics: StewartDynamics, motion: Motion) -> float:
     """Return the largest torque in N m of any motor that follows the reference exactly."""
-    torques = [
-        dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS]) for x in motion.wanted
-    ]
-    return float(np.abs(torques).max())
+    return float(np.abs(dynamics.torques_along(motion.wanted)).max())
 
 
 class Requirements(NamedTuple):

@@ -28,7 +28,7 @@ from stewart_drake.law.startup import reference_torque
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import PatternSpec, load_mechanism, pattern_legs
-from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.geometry import Mechanism, plate_radius
 from stewart_drake.mechanism.kinematics import leg_geometry, reachable_heights
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
@@ -37,7 +37,6 @@ from stewart_drake.studies.study_options import Measurements
 from stewart_drake.studies.workspace_map import (
     Measures,
     Travel,
-    characteristic_length,
     measure,
     travel,
 )
@@ -86,7 +85,7 @@ class MechanismCheck(NamedTuple):
                 name for name in BODIES if getattr(self.mechanism, name).estimated
             ],
             "crank_angles": self.crank_angles,
-            "characteristic_length": characteristic_length(self.mechanism),
+            "characteristic_length": plate_radius(self.mechanism),
             "measures": self.measures._asdict(),
             "torque": self.torque,
             "torque_limit": np.nan if limit is None else limit,

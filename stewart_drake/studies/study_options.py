@@ -83,22 +83,16 @@ def read_ranges(settings: Iterable[str]) -> Ranges:
 
 
 class DelayOptions(Options):
-    """Options of `study_delay`."""
-
     simulations: Annotated[
         bool, Field(description="Whether to simulate over delay and amplitude too, on all cores.")
     ] = True
 
 
 class LearnOptions(Options):
-    """Options of `study_learn`."""
-
     repetitions: int = option(6, "Largest number of repetitions.", "N", ge=1, le=1000)
 
 
 class LinkOptions(Options):
-    """Options of `study_link`."""
-
     runs: int = option(5, "Number of seeds for each bound and loss.", "N", ge=1)
 
 
@@ -112,8 +106,6 @@ def _read_also(names: list[str], load: Callable[[str], Scenario]) -> dict[str, S
 
 
 class RobustnessOptions(JobOptions):
-    """Options of `study_robustness`."""
-
     ranges: Ranges | None = option(
         None,
         "Size of a variation, 0: none. "
@@ -159,8 +151,6 @@ def _read_bounds(texts: list[str], _: object) -> dict[str, tuple[float, float]]:
 
 
 class LayoutOptions(JobOptions):
-    """Options of `study_layout`."""
-
     goal: str = option(
         "condition",
         "Goal of the search: condition, torque, reach, clearance, "

@@ -11,8 +11,9 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.loop.preparation import Experiment, assemble, check_instants, first_pose_text
+from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.signals import ACCELERATIONS, COORDINATES, LEGS, POSE, RATES
+from stewart_drake.scenario.signals import COORDINATES, LEGS, POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.clearance import ClearanceStudy, study_clearance
 from stewart_drake.studies.workspace_map import (
@@ -20,7 +21,6 @@ from stewart_drake.studies.workspace_map import (
     Margins,
     Section,
     Travel,
-    characteristic_length,
     first_exit,
     largest_factor,
     margins_along,
@@ -76,9 +76,8 @@ def size_motors(dynamics: StewartDynamics, reference: Trajectory, time: Array) -
     T = inverse dynamics of (X, X', X''), crank rates = J X'.
     """
     wanted = np.array([evaluate(reference, t) for t in time])
-    torque = [dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS]) for x in wanted]
     speed = [dynamics.mechanism.jacobian(x[POSE]) @ x[RATES] for x in wanted]
-    return Sizing(np.asarray(time), np.array(torque), np.array(speed))
+    return Sizing(np.asarray(time), dynamics.torques_along(wanted), np.array(speed))
 
 
 @dataclass(frozen=True)
@@ -160,7 +159,7 @@ class WorkspaceStudy:
                 }
                 for i in range(len(LEGS))
             ],
-            "characteristic_length": characteristic_length(mechanism),
+            "characteristic_length": plate_radius(mechanism),
             "least_parallel": m.parallel.min(),
             "least_held": least(m.held),
             "worst_condition": -least(-m.condition),

@@ -28,7 +28,7 @@ from stewart_drake.dynamics.workspace import (
     margins,
     measures_at,
 )
-from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.geometry import Mechanism, plate_radius
 from stewart_drake.mechanism.kinematics import LegGeometry, Legs, leg_geometry
 from stewart_drake.scenario.signals import COORDINATES, NUM_COORDINATES
 from stewart_drake.types import Array
@@ -70,14 +70,9 @@ class Measures(NamedTuple):
     play: float
 
 
-def characteristic_length(mechanism: Legs) -> float:
-    """Return rho in m, the mean distance of the plate joints from the plate's centre of mass."""
-    return float(np.linalg.norm(mechanism.p_PQ, axis=1).mean())
-
-
 def wrenches(mechanism: Legs, legs: LegGeometry) -> Array:
     """Return W (..., 6, 6), a column per rod, of the legs at some poses."""
-    moments = np.cross(legs.p_PQ_W, legs.rod) / characteristic_length(mechanism)
+    moments = np.cross(legs.p_PQ_W, legs.rod) / plate_radius(mechanism)
     return np.concatenate([moments, legs.rod], axis=-1).swapaxes(-1, -2)
 
 

@@ -11,7 +11,8 @@ is over the known ones, so that a window that is not full has a value too. Where
 or only zeros are known, rho(k) = 1.
 
 The mean of n magnitudes is at least |eps(k)| / n, hence 0 <= rho <= n <= 31. The signed mean passes
-through zero while eps(k) does not, so that (45) as printed is unbounded; it is cut at SIGNED_LIMIT.
+through zero while eps(k) does not, so that (45) as printed is unbounded; it is cut at 1e6,
+with the sign of eps(k) where the mean is exactly zero.
 
 The network is
 
@@ -48,8 +49,6 @@ WINDOW: Final = 31
 """w_in + 1 samples."""
 NUM_INPUTS: Final = len(TUNER_INPUTS)
 """12 state errors (pose, rates) and 6 torques."""
-SIGNED_LIMIT: Final = 1e6
-"""Largest |rho| of kind `signed`, with the sign of eps(k) where the mean is exactly zero."""
 DEFAULT: Final = "tuner"
 """The shipped network."""
 NUM_OUTPUTS: Final = len(WEIGHTS)
@@ -58,47 +57,6 @@ MAX_BYTES: Final = 10_000_000
 EXPECTED: Final = "the JSON file of one network"
 """For messages."""
 _ARRAYS: Final = ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds")
-
-
-def density(window: ArrayLike, kind: Kind = "magnitude") -> Array:
-    """Return equation (45) (..., m) for the newest sample of a window (..., WINDOW, m).
-
-    Unknown samples are not finite. Densities are, in [0, WINDOW], or in +-SIGNED_LIMIT.
-    """
-    samples = np.asarray(window, dtype=np.float64)
-    if samples.ndim < 2 or samples.shape[-2] != WINDOW:
-        raise ValueError(f"window: got shape {samples.shape}; expected (..., {WINDOW}, m)")
-    if kind not in ("magnitude", "signed"):
-        raise ValueError(f"kind: got {kind!r}; expected 'magnitude' or 'signed'")
-    known = np.isfinite(samples)
-    number = known.sum(axis=-2)
-    values = np.where(known, np.abs(samples) if kind == "magnitude" else samples, 0.0)
-    # In units of the largest, no sum overflows. A rounded sum of magnitudes is never below one of
-    # them, so share <= 1 and the bound holds to the last bit.
-    largest = np.abs(values).max(axis=-2)
-    usable = known[..., -1, :] & (largest > 0)
-    relative = values / np.where(largest > 0, largest, 1.0)[..., None, :]
-    newest, total = relative[..., -1, :], relative.sum(axis=-2)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        ratio = number * (newest / np.where(usable, total, 1.0))
-    if kind == "signed":
-        ratio = np.clip(np.where(newest == 0, 0.0, ratio), -SIGNED_LIMIT, SIGNED_LIMIT)
-    result: Any = np.where(usable, ratio, 1.0)
-    return result
-
-
-def densities(samples: ArrayLike, kind: Kind = "magnitude") -> Array:
-    """Return equation (45) along a record (N, 18) of samples in time order.
-
-    A sample is [measurement - reference (12); commanded torque (6)] in rad, m, rad/s, m/s and N m;
-    values that are not finite are unknown. Row k is of samples max(0, k - WINDOW + 1) to k.
-    """
-    record = np.asarray(samples, dtype=np.float64)
-    if record.ndim != 2 or record.shape[1] != NUM_INPUTS:
-        raise ValueError(f"samples: got shape {record.shape}; expected (N, {NUM_INPUTS})")
-    padded = np.vstack([np.full((WINDOW, NUM_INPUTS), np.nan), record])
-    windows = np.lib.stride_tricks.sliding_window_view(padded, WINDOW, axis=0)[1:]
-    return density(np.moveaxis(windows, -1, -2), kind)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -174,7 +132,6 @@ class Network:
 
 
 def _frozen(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return a read-only copy, checked."""
     array = np.array(value, dtype=np.float64)
     if array.shape != shape:
         raise ConfigError(f"{name}: got shape {array.shape}; expected {shape}")

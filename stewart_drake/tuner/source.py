@@ -6,7 +6,8 @@ densities (45), or `health`, which relates timing, surprise, error and feedback 
 
 Weights move along the ratio r = log10(w_Q / w_R), on which alone the gain depends, with
 w_Q w_R = 1. From one sample to the next r falls by 0.35 at the most and rises by 0.15: caution is
-needed at once, and is given up slowly. The paper's network moves each weight by a factor instead.
+needed at once, and is given up slowly. The paper's network moves each weight by a factor instead,
+of at most 1.5.
 """
 
 from dataclasses import dataclass
@@ -20,11 +21,9 @@ from stewart_drake.law.compiled import Compiled, machine_of, numbers
 from stewart_drake.law.core_law import AnyMemory
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.scenario.signals import NUM_STATE
-from stewart_drake.tuner.network import NUM_INPUTS, Kind, Network
-from stewart_drake.types import Array
+from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Kind, Network
+from stewart_drake.types import Array, ArrayLike
 
-MAX_FACTOR: Final = 1.5
-"""Largest change of w_Q and w_R from one sample to the next, as a factor up or down."""
 NAMES: Final = (
     "timing_31", "timing_10", "timing_bound", "timing_detectable",
     "error_10", "error_31", "feedback_4", "feedback_20", "surprise_3", "surprise_15",
@@ -45,38 +44,15 @@ def weights_of(ratio: float) -> Array:
     return np.array([10 ** (ratio / 2), 10 ** (-ratio / 2)])
 
 
-def tune(
-    network: Network, densities: Array, last: Array, fixed: Array, factor: float = MAX_FACTOR
-) -> tuple[Array, bool]:
-    """Compute the weights of the next sample by the paper's network.
-
-    They are clipped to the network's bounds, then limited in rate. Weights are scales, so the rate
-    is a factor: last / factor <= w <= last * factor. The gain, which depends on w_Q / w_R, changes
-    with its square at most. Where the network fails, they return to `fixed` (2,) at the same rate.
-
-    Args:
-        network: of the paper.
-        densities: (18,).
-        last: (2,) weights of the last sample; NaN before the first, which takes `fixed`.
-        fixed: (2,) weights.
-        factor: above 1.
-
-    Returns:
-        w_Q and w_R (2,), finite and above zero, and whether the network failed.
-    """
-    if not np.all(np.isfinite(last)):
-        return fixed, False
-    raw = network(densities)
-    usable = bool(np.all(np.isfinite(raw)))
-    goal = np.clip(raw, *network.bounds) if usable else fixed
-    return np.clip(goal, last / factor, last * factor), not usable
-
-
 @dataclass(frozen=True)
 class DensityFeatures:
     """The paper's densities (45), see `tuner.network`."""
 
     kind: Kind = "magnitude"
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("magnitude", "signed"):
+            raise ValueError(f"kind: got {self.kind!r}; expected 'magnitude' or 'signed'")
 
 
 @dataclass(frozen=True)
@@ -100,7 +76,11 @@ class FixedPolicy:
 
 @dataclass(frozen=True)
 class PaperPolicy:
-    """The paper's network, see `tune`."""
+    """The paper's network, whose output is clipped to its bounds, then limited in rate.
+
+    Weights are scales, so the rate is a factor. The gain, which depends on w_Q / w_R, changes with
+    its square at most. Where the network fails, the weights return to `first` at the same rate.
+    """
 
     network: Network
     first: Array  # (2,) weights at the start, and to return to
@@ -114,7 +94,6 @@ class RatioPolicy:
 
     @property
     def first(self) -> Array:
-        """Weights (2,) of the first sample."""
         assert self.network.start is not None
         return self.network.start
 
@@ -135,7 +114,6 @@ class Rule:
 
     @property
     def first(self) -> Array:
-        """Weights (2,) of the first sample."""
         return weights_of(self.ratio)
 
 
@@ -162,7 +140,7 @@ class TunerMemory(NamedTuple):
 class WeightsSource:
     """A tuner for one law."""
 
-    plant: NominalPlant  # model of the plant in the law
+    plant: NominalPlant | None  # model of the plant in the law, for `health`
     features: DensityFeatures | HealthFeatures  # input of the policy
     policy: FixedPolicy | PaperPolicy | RatioPolicy | Rule  # gives the weights
 
@@ -255,7 +233,7 @@ class WeightsSource:
         given = c.ffi.new(
             "stewart_tuner_input *",
             {
-                "machine": machine_of(self.plant).it,
+                "machine": c.ffi.NULL if self.plant is None else machine_of(self.plant).it,
                 "schedule": [len(acted[0]), *map(c.at, acted), 0],
                 "torque": [*map(c.at, torques)],
                 "feedforward": [*map(c.at, feedforwards)],
@@ -268,3 +246,23 @@ class WeightsSource:
             *(decision.fell_back, c.scratch(NUM_STATE * len(acted[0]))),
         )
         return TunerMemory(data, after)
+
+
+def densities(samples: ArrayLike, kind: Kind = "magnitude") -> Array:
+    """Return equation (45) along a record (N, 18) of samples in time order.
+
+    A sample is [measurement - reference (12); commanded torque (6)] in rad, m, rad/s, m/s and N m;
+    values that are not finite are unknown. Row k is of samples max(0, k - WINDOW + 1) to k.
+    """
+    record = np.asarray(samples, dtype=np.float64)
+    if record.ndim != 2 or record.shape[1] != NUM_INPUTS:
+        raise ValueError(f"samples: got shape {record.shape}; expected (N, {NUM_INPUTS})")
+    values = density_source(kind).values
+    padded = np.vstack([np.full((WINDOW - 1, NUM_INPUTS), np.nan), record])
+    rho = [values(padded[k : k + WINDOW]) for k in range(len(record))]
+    return np.reshape(rho, record.shape)
+
+
+def density_source(kind: Kind) -> WeightsSource:
+    """Return a source of densities, with fixed weights."""
+    return WeightsSource(None, DensityFeatures(kind), FixedPolicy(np.ones(2)))

@@ -33,8 +33,14 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import TUNER_INPUTS, WEIGHTS
 from stewart_drake.studies.jobs import run_jobs
-from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Network, densities
-from stewart_drake.tuner.source import FixedPolicy, HealthFeatures, RatioPolicy, WeightsSource
+from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Network
+from stewart_drake.tuner.source import (
+    FixedPolicy,
+    HealthFeatures,
+    RatioPolicy,
+    WeightsSource,
+    densities,
+)
 from stewart_drake.tuning.families import SAMPLES, Family, with_gain
 from stewart_drake.types import Array
 

@@ -74,8 +74,6 @@ class DataOptions(FamilyOptions):
 
 
 class EvaluationOptions(FamilyOptions):
-    """Options of the evaluation of a tuner."""
-
     purpose = "evaluation"
     scenarios: int = option(40, "Number of scenarios.", "N", ge=2)
 
@@ -85,8 +83,6 @@ class EvaluationOptions(FamilyOptions):
 
 
 class TrainingOptions(Options):
-    """Options of the training of a network."""
-
     regret: bool = option(False, "Train by regret, on data of a --family; else as in the paper.")
     start: float | None = option(
         None, "With --regret: log10 w_Q / w_R at first; else the best.", "RATIO"

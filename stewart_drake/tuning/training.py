@@ -41,8 +41,8 @@ from stewart_drake.files.yamlio import validate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.studies.jobs import Progress, run_jobs
-from stewart_drake.tuner.network import NUM_INPUTS, NUM_OUTPUTS, Kind, Network, densities
-from stewart_drake.tuner.source import weights_of
+from stewart_drake.tuner.network import NUM_INPUTS, NUM_OUTPUTS, Kind, Network
+from stewart_drake.tuner.source import densities, weights_of
 from stewart_drake.tuning.data import (
     EVERY,
     LEAST,
