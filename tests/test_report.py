@@ -135,6 +135,27 @@ def test_the_mean_error_leaves_out_the_time_in_which_nothing_can_act(summary):
     assert mean_error(run) == pytest.approx(share)
 
 
+@pytest.mark.parametrize(
+    ("amplitude", "moved", "said"),
+    [
+        (0.03, 1, r"on average over what moves \(z\)\. Largest error: z \d+ % of its motion\."),
+        (0.0, 6, r"of 1 rad and 1 m on average, as no .* Largest error: z 0\.\d+ mm\."),
+    ],
+)
+def test_still_coordinates_do_not_dilute_the_error(amplitude, moved, said):
+    """A still plate has errors in its own units, and one that only rises has that of z."""
+    settings = (f"reference.amplitude=[0,0,0,0,0,{amplitude}]", "reference.offset=[0,0,0,0,0,0.37]")
+    run = simulate(load_scenario("paper", None, (*EXACT, "duration=2", *settings)))
+    s = run.summary
+    left = 2.0 - (0.8 if s["delay_floor"] else 0.0)
+    whole = 6 * (s["accumulated_error"] - s["delay_floor"])
+    assert mean_error(run) == pytest.approx(whole / moved / left, rel=1e-6)
+    text, _ = report_document.verdict(collect_of(run.scenario, run=run))
+    assert re.search(said, text)
+    still = run.table().partition("peak error")[2].split("torque")[0]
+    assert still.count("deg") == 3 and still.count("mm") == (3 if moved == 6 else 2)
+
+
 # ---------------------------------------------------------------- other scenarios
 
 
