@@ -256,6 +256,17 @@ def test_a_pipe_gets_a_line_now_and_then(capsys):
 
 
 @pytest.mark.usefixtures("often")
+def test_a_phase_is_shown(capsys):
+    with terminal.phase_bar("identify", False) as show:
+        time.sleep(0.12)
+        show("start 2 of at most 4")
+        time.sleep(0.12)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "identify: computing, after 0 s"
+    assert lines[-1] == "identify: start 2 of at most 4, after 0 s"
+
+
+@pytest.mark.usefixtures("often")
 def test_simulations_tell_their_time(capsys):
     with terminal.progress_bars(["lqr", "lqi"], 20.0, False) as show:
         time.sleep(0.12)
