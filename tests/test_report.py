@@ -199,6 +199,14 @@ def test_the_worst_finding_makes_the_verdict(settings, tone, said):
     assert page.tone == tone and re.search(said, page.verdict)
 
 
+def test_links_that_cross_are_in_the_verdict():
+    run = simulate(load_scenario("paper", None, (*EXACT, "duration=0.3", "start=on_reference")))
+    crossing = {"clearance": {"touching": ["crank 1"], "verdict": "one pair of links crosses"}}
+    analyses = dict.fromkeys(ANALYSES, BLANK) | {"workspace": replace(BLANK, summary=crossing)}
+    text, tone = report_document.verdict(collect_of(run.scenario, run=run, analyses=analyses))
+    assert "Caution: one pair of links crosses" in text and tone == "fair"
+
+
 @pytest.mark.usefixtures("blank_figures")
 def test_a_machine_is_called_by_its_name_and_not_by_its_file(tmp_path):
     path = tmp_path / "machine.yaml"

@@ -290,6 +290,9 @@ def verdict(found: ReportData) -> tuple[str, Tone]:
             text += f" {label(best)} completes it, with an E_ac of {number(done[best])} % s."
         return text, "bad"
     findings, duration = _findings(run), f"all of {run.scenario.duration:g} s"
+    clearance = found.analyses["workspace"].summary.get("clearance", {})
+    if clearance.get("touching"):
+        findings.append(("fair", clearance["verdict"]))
     bad, fair = (
         "; ".join(text for level, text in findings if level == tone) for tone in ("bad", "fair")
     )
@@ -363,6 +366,7 @@ def first_report(made: NewMachine, result: SimulationResult, findings: Iterable[
     `findings` are sentences about the motors, the loop and its delay.
     """
     check, completed = made.check, result.status == "completed"
+    good: Tone = "fair" if made.crossings else "good"
     drawing = Picture(lambda: mechanism_figure(check.mechanism), "The machine at its home pose.")
     figures = [
         Picture(figure, f"{name.capitalize()}.") for name, figure in draw_run(result).items()
@@ -370,10 +374,10 @@ def first_report(made: NewMachine, result: SimulationResult, findings: Iterable[
     motion = "Up and down by a quarter of the travel, once in two seconds."
     return Document(
         f"First report on {check.mechanism.name}",
-        " ".join(sentence(text) for text in (check.verdict, *findings)),
+        " ".join(sentence(text) for text in (check.verdict, *made.crossings, *findings)),
         [
             Section("The machine", drawing, *_blocks(describe(check))),
             Section("A first run", Paragraph(motion), *_blocks(run_document(result)), *figures),
         ],
-        "good" if completed else "bad",
+        good if completed else "bad",
     )
