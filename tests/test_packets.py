@@ -498,6 +498,8 @@ def test_bounds_are_alike_where_the_seeds_do_not_tell_them_apart(known_outcomes)
     assert "4 seeds are not enough to tell it from 0.3 s, where E_ac may be up to 22 % larger" in (
         text := verdict(cells)
     )
+    assert document(study).tone == "fair"
+    assert document(replace(study, bounds=cells[:2])).tone == "good"
     assert "--runs 16 would about halve this. As good, within 1 %: 0.4 s. Default" in text
     assert "Every other bound is worse (t-test, 95 % confidence). Default" in verdict(cells[:2])
     alone = [cell._replace(runs=1, errors=cell.errors[:1]) for cell in cells[:2]]

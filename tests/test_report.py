@@ -19,7 +19,7 @@ from stewart_drake.reporting.page import Provenance
 from stewart_drake.reporting.page import html as html_of
 from stewart_drake.reporting.report import ANALYSES, collect, mean_error
 from stewart_drake.reporting.results import AnalysisResult
-from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.loading import load_scenario, title_of
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 from tests.browser import needs_chromium
 from tests.screen import too_long
@@ -197,6 +197,11 @@ def test_the_worst_finding_makes_the_verdict(settings, tone, said):
     assert run.status == "completed"
     page = report_document.document(collect_of(run.scenario, run=run), "mine")
     assert page.tone == tone and re.search(said, page.verdict)
+
+
+def test_a_scenario_of_new_is_called_by_its_folder(tmp_path):
+    assert title_of("paper") == "paper" and title_of("b/waves.yaml") == "waves"
+    assert title_of(tmp_path / "mine" / "scenario.yaml") == "mine"
 
 
 def test_links_that_cross_are_in_the_verdict():

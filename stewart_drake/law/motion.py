@@ -39,8 +39,8 @@ class Preview:
         Raises:
             ValueError: at other instants than those.
         """
-        asked = times is self.times or np.array_equal(times, self.times)
-        if not asked or len(self.reference) != len(times):
+        expected = times is self.times or np.array_equal(times, self.times)
+        if not expected or len(self.reference) != len(times):
             raise ValueError(
                 f"preview: got {len(self.reference)} rows for {len(self.times)} instants; "
                 f"expected the {len(times)} that the law asks for. A law that plans (see "
@@ -56,7 +56,7 @@ class KnownMotion:
     Attributes:
         planned: trajectory (6, 1) to follow: the way onto the reference, then the reference.
         reference: trajectory that a new plan leads back to.
-        now: s, on the clock of both.
+        now: time of the sample on the clock of both trajectories, s.
         pieces: (n, 38) of a plan made in flight, see core/planning.h, which replaces `planned`
             until its end; then the reference follows.
     """
@@ -85,12 +85,12 @@ class KnownMotion:
 
 @dataclass(frozen=True)
 class Course:
-    """Preview of a sample, and the rows that the law followed, see core/reference.h.
+    """Preview of a sample, and the rows that the law follows, see core/reference.h.
 
     Attributes:
         times: (p,) s from the sample.
         reference: (p, 18), with numbers for what was missing; NaN before the first preview.
-        followed: (p, 18) the same with the way back after a gap.
+        followed: (p, 18) that the law follows: the same, after a gap with the way back.
         missing: whether anything was missing in the preview.
         gap: whether its last row was.
         offset: (12,) from the reference where the next torque acts, after a gap.

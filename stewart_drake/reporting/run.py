@@ -13,10 +13,11 @@ from stewart_drake.loop.results import SimulationResult
 from stewart_drake.reporting.document import Document, from_template, listed, number
 from stewart_drake.reporting.style import FACTORS, UNITS
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.signals import ANGLES, COORDINATE_NAMES, POSITION
+from stewart_drake.scenario.signals import ANGLES, COORDINATE_NAMES, NUM_COORDINATES, POSITION
 from stewart_drake.studies.compare import PAPER_ERRORS, is_papers, label
 from stewart_drake.studies.verdict import loop_word
 from stewart_drake.studies.workspace_map import largest_factor
+from stewart_drake.types import Array
 
 _STILL: Final = 1e-9
 """Motion below which a coordinate counts as still, rad or m."""
@@ -38,9 +39,15 @@ def run_document(result: SimulationResult) -> Document:
     )
 
 
+def _span(run: SimulationResult) -> Array:
+    """Return the peak to peak (6,) of the recorded reference, rad and m."""
+    poses = run.signals.reference.values
+    return np.ptp(poses, axis=0) if len(poses) else np.zeros(NUM_COORDINATES)
+
+
 def moving(run: SimulationResult) -> NDArray[np.bool_]:
     """Return which coordinates (6,) the reference moves."""
-    return np.ptp(run.signals.reference.values, axis=0) > _STILL
+    return _span(run) > _STILL
 
 
 def _peaks(run: SimulationResult) -> list[str]:
@@ -49,7 +56,7 @@ def _peaks(run: SimulationResult) -> list[str]:
     return [
         f"{name} {number(percent[k], 2)} %"
         if moved[k]
-        else f"{name} {number(FACTORS[k] * percent[k] / 100)} {UNITS[k]}"
+        else f"{name} {number(round(FACTORS[k] * percent[k] / 100, 9))} {UNITS[k]}"
         for k, name in enumerate(COORDINATE_NAMES)
     ]
 
@@ -59,7 +66,7 @@ def worst(run: SimulationResult) -> str:
 
     The error of a still coordinate is compared with the largest motion in its unit.
     """
-    percent, span = np.array(run.summary["peak_error"]), np.ptp(run.signals.reference.values, 0)
+    percent, span = np.array(run.summary["peak_error"]), _span(run)
     largest = np.repeat([max(span[ANGLES].max(), _STILL), max(span[POSITION].max(), _STILL)], 3)
     share = np.where(moving(run), percent, percent / largest)
     return _peaks(run)[int(np.argmax(share))]
