@@ -53,6 +53,7 @@ from stewart_drake.studies import compare
 from stewart_drake.studies.compare import LABELS, is_papers, label
 from stewart_drake.studies.jobs import Job, Progress, run_jobs
 from stewart_drake.studies.new_machine import NewMachine
+from stewart_drake.studies.verdict import fold
 from stewart_drake.tuner.network import DEFAULT
 
 ANALYSES: Final = ("delay", "hautus", "workspace")
@@ -319,7 +320,7 @@ def _findings(run: SimulationResult) -> list[tuple[Tone, str]]:
     s, found, mean = run.summary, list[tuple[Tone, str]](), mean_error(run)
     margin, counts = s["controller_margin"], s["counts"]
     if margin is not None and margin["stable"] is False:
-        growth = f"errors grow {margin['spectral_radius']:.3g} fold per period"
+        growth = f"errors grow {fold(margin['spectral_radius'])} per period"
         found.append(("bad", f"the loop is unstable, {growth}"))
     samples = number_sent(run.scenario.duration, run.scenario.controller.period)
     wrong = counts["bad_measurements"]
