@@ -91,11 +91,11 @@ def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys):
     assert all(f"{n} ({LABELS[n]})" in " ".join(out.split()) for n in CONTROLLERS)
     assert "left workspace" in rows[0] and "at 1.36 s, leg 2" in lines[lines.index(rows[0]) + 1]
     assert [row.split()[1] for row in rows] == ["NaN", "NaN", "225", "80", "-"]
-    assert rows[-1].split()[3] == "15.2", "the delay floor stands beside E_ac"
+    assert rows[-1].split()[3:7] == ["15.2", "roll", "36", "%"], "floor and worst beside E_ac"
     heads = next(line for line in lines if "asked" in line)
-    assert heads.split()[-4:-2] == ["asked", "acted"] and "(commanded)" in out
+    assert heads.split()[-3:] == ["asked", "acted", "var."] and "(commanded)" in out
     # The LQI asked for a torque that never acted: the plate was gone before it arrived.
-    assert [float(x) for x in rows[3].split()[-4:-2]] == [1.7, 0.13]
+    assert [float(x) for x in rows[3].split()[-3:-1]] == [1.7, 0.13]
     torques = {f"torques_{name}" for name in ("delay_lqr", "delay_lqi", "predictor_lqi")}
     assert files(tmp_path) == {
         *(f"{n}.{s}" for n in {"states", "errors", *torques} for s in ("png", "svg")),

@@ -25,15 +25,15 @@ def document(study: LinkStudy) -> Document:
     """Return the results by bound, then by loss at the best bound."""
     best, checked = study.best, study.checked
     own = best is not None and all(one is None or one.completed == 1 for one in (best, checked))
-    open = {bound: excess for bound, excess in study.alike.items() if not excess < SAME}
+    undecided = {bound: excess for bound, excess in study.alike.items() if not excess < SAME}
     return from_template(
         "link",
-        "bad" if not own else "fair" if open else "good",
+        "bad" if not own else "fair" if undecided else "good",
         study=study,
         mean=_mean,
         spread=lambda cell: float(np.std(cell.errors, ddof=1)),
         same=", ".join(f"{bound:g}" for bound, excess in study.alike.items() if excess < SAME),
-        open=open,
+        undecided=undecided,
         most=lambda cell: max(cell.errors, default=math.nan),
         assured=_ASSURED,
         wanted=math.ceil(math.log(1 - CONFIDENCE) / math.log(_ASSURED)),
