@@ -288,7 +288,7 @@ def test_the_command_names_the_links_that_cross(tmp_path, capsys):
     for one in found["touching"]:
         name = " and ".join(one["parts"])
         assert one["distance"] < 0 and name in told and name in page
-    assert "9 pairs of links cross" in told and len(found["touching"]) == 9
+    assert "workspace, but 9 pairs of links cross" in told and len(found["touching"]) == 9
     assert found["least"]["distance"] == min(one["distance"] for one in found["touching"])
     assert len(found["pairs"]) == len(ClearanceScene(PAPER).pairs)
     assert found["base"]["distance"] < 0

@@ -91,11 +91,11 @@ def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys):
     assert all(f"{n} ({LABELS[n]})" in " ".join(out.split()) for n in CONTROLLERS)
     assert "left workspace" in rows[0] and "at 1.36 s, leg 2" in lines[lines.index(rows[0]) + 1]
     assert [row.split()[1] for row in rows] == ["NaN", "NaN", "225", "80", "-"]
-    assert rows[-1].split()[3] == "15.2", "the delay floor stands beside E_ac"
+    assert rows[-1].split()[3:7] == ["15.2", "roll", "36", "%"], "floor and worst beside E_ac"
     heads = next(line for line in lines if "asked" in line)
-    assert heads.split()[-4:-2] == ["asked", "acted"] and "(commanded)" in out
+    assert heads.split()[-3:] == ["asked", "acted", "var."] and "(commanded)" in out
     # The LQI asked for a torque that never acted: the plate was gone before it arrived.
-    assert [float(x) for x in rows[3].split()[-4:-2]] == [1.7, 0.13]
+    assert [float(x) for x in rows[3].split()[-3:-1]] == [1.7, 0.13]
     torques = {f"torques_{name}" for name in ("delay_lqr", "delay_lqi", "predictor_lqi")}
     assert files(tmp_path) == {
         *(f"{n}.{s}" for n in {"states", "errors", *torques} for s in ("png", "svg")),
@@ -253,6 +253,17 @@ def test_a_pipe_gets_a_line_now_and_then(capsys):
     # Twenty in 0.2 to 0.4 s leaves 1.4 to 2.8 s for 140; the forty of an earlier start took none.
     assert re.fullmatch(r"runs: 60 of 200, about [1-9] s left, after \d s", lines[-1]), said
     assert "\r" not in said and "\x1b" not in said
+
+
+@pytest.mark.usefixtures("often")
+def test_a_phase_is_shown(capsys):
+    with terminal.phase_bar("identify", False) as show:
+        time.sleep(0.12)
+        show("start 2 of at most 4")
+        time.sleep(0.12)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "identify: computing, after 0 s"
+    assert lines[-1] == "identify: start 2 of at most 4, after 0 s"
 
 
 @pytest.mark.usefixtures("often")

@@ -28,7 +28,7 @@ from stewart_drake.scenario.signals import NUM_TORQUES, POSE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.compare import CONTROLLERS
 from stewart_drake.studies.delay import loop_margins
-from stewart_drake.studies.verdict import assess
+from stewart_drake.studies.verdict import assess, fold
 from tests.mechanisms import PAPER
 
 HOLD = ("reference.kind=hold", "plant.kind=exact")
@@ -252,6 +252,7 @@ def test_the_first_line_is_about_the_loop(capsys, monkeypatch):
     assert main(run) == 0
     first, *others = capsys.readouterr().out.splitlines()
     assert first.startswith("this loop is unstable: linearised along the reference")
+    assert (fold(1.2345), fold(1.0004)) == ("1.23 fold", "by 0.04 %")
     assert any("left workspace" in line for line in others)
 
 

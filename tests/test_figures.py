@@ -13,6 +13,7 @@ from matplotlib.image import imread
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.reporting.figures import draw_comparison, draw_run
+from stewart_drake.reporting.run import run_document
 from stewart_drake.reporting.style import (
     controller_lines,
     figure_style,
@@ -124,6 +125,18 @@ def test_a_run_stopped_before_its_first_sample_can_be_drawn(run):
     drawn["states"].draw_without_rendering()
     assert list(drawn) == ["states", "errors", "torques"]
     assert draw_comparison({}) == {}
+    assert "peak error" in run_document(nothing).plain()
+
+
+def test_rounding_is_no_motion(run):
+    """A coordinate that stays where it should gets no axis of 1e-14 deg."""
+    still = run.signals.copy()
+    still["reference"] = still.reference * 0
+    still["error"] = still.reference + 1e-13 * np.sin(still.time)
+    still["pose"] = still.reference + still.error
+    drawn = draw_run(dataclasses.replace(run, signals=still))
+    for name in ("states", "errors"):
+        assert all(np.ptp(limits(ax)) > 1e-6 for ax in drawn[name].axes)
 
 
 @pytest.mark.parametrize("number", [3, 12])

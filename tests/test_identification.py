@@ -36,6 +36,7 @@ from stewart_drake.identification.model import (
     MachineModel,
 )
 from stewart_drake.identification.plan import fitted_multisine, multisine
+from stewart_drake.identification.progress import shown_by
 from stewart_drake.identification.shooting import Segment, integrate, plan_steps
 from stewart_drake.identification.start import coarse_delay, measured_poses
 from stewart_drake.identification.tolerances import Tolerances
@@ -443,7 +444,11 @@ def test_a_delay_to_begin_with_is_found_from_far_away(log_and_truth, believed):
 
 def test_a_machine_is_found_from_encoders_of_14_bit(log_and_truth):
     log, true = log_and_truth
-    found = identify([log], PAPER, Tolerances(offsets=0.0))
+    said = list[str]()
+    with shown_by(said.append):
+        found = identify([log], PAPER, Tolerances(offsets=0.0))
+    assert said[:2] == ["start 1 of at most 4", "start 1 of at most 4, iteration 1 of at most 15"]
+    assert [one for one in said[2:] if "iteration" not in one] == ["whole log", "shorter steps"]
     free, std = found.unknowns.free, np.sqrt(np.diag(found.fit.covariance))
     away = (found.fit.guess.values - true)[free]
     assert found.right and 0.9 < found.chi2["all"] < 1.1
@@ -517,10 +522,14 @@ def up_to(log, end):
 
 @pytest.mark.slow
 def test_a_log_that_ends_before_its_torques_act_is_refused(short_run_log):
-    with pytest.raises(
-        ConfigError, match=r"expected one delay.* a log of at least 1\.9 s"
-    ) as caught:
+    with (
+        pytest.raises(
+            ConfigError, match=r"expected one delay.* a log of at least 1\.9 s"
+        ) as caught,
+        shown_by((said := list[str]()).append),
+    ):
         identify([up_to(short_run_log, 0.9)], PAPER)
+    assert said[:2] == ["delay 1 of 19", "delay 1 of 19, iteration 1 of at most 4"]
     assert "got a log of 0.9 s" in str(caught.value) and "\n" not in str(caught.value)
 
 

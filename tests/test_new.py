@@ -104,6 +104,19 @@ def test_what_it_proposes_runs_and_is_reported(tmp_path, capsys):
     assert texts[0] == texts[1]
 
 
+@pytest.mark.usefixtures("blank_figures")
+def test_links_that_cross_are_a_warning_below_the_findings(tmp_path, capsys):
+    """Shafts of two cranks are nearer to each other than both cranks are long."""
+    folder = tmp_path / "mine"
+    assert main(["new", str(folder), *flags(cranks="together", shaft_distance=0.08)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    crossing = r"warning: \d+ pairs of links cross, at worst [\d.]+ mm deep \(crank \d and crank \d"
+    assert re.search(f"prediction errors grow [^:]*{crossing}.* written to", said)
+    assert "cross, at worst" in json.loads((folder / "summary.json").read_text())["crossings"][0]
+    page = (folder / "report.html").read_text()
+    assert re.search(r"dead centre\. \d+ pairs of links cross", " ".join(page.split()))
+
+
 def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(tmp_path, capsys):
     for other, words in (
         ({"rod": 260}, "--rod: got 260 m; expected metres, 0.26 for 260 mm"),

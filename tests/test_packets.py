@@ -468,7 +468,7 @@ def test_the_study_finds_the_best_bound_and_the_loss_that_is_borne(known_outcome
     text = " ".join(table.split())
     assert "A bound of 0.45 s has the least mean E_ac of those tried: 1.03 % s over 3 seeds" in text
     assert "standard deviation 0.0100 % s" in text and "up to a loss of 20 %" in text
-    assert "do not tell it from 0.4 s" in text  # 1.04 % s, 0.97 % more
+    assert "As good, within 1 %: 0.4 s." in text  # 1.04 % s, 0.97 % more
     assert max(len(line) for line in table.splitlines()) <= 80
     page = html(told_of_it, Provenance("stewart-drake analyze link", {}))
     assert page.count("<svg") + page.count("image/svg") >= 1
@@ -487,10 +487,23 @@ def test_bounds_are_alike_where_the_seeds_do_not_tell_them_apart(known_outcomes)
     }
     cells = [Cell(b, 0.0, 0.0, 0.0, 4, tuple(errors)) for b, errors in rows.items()]
     study = replace(study, runs=4, bounds=cells)
-    assert study.best is not None and study.best.bound == 0.1 and study.alike == [0.3, 0.4]
+    assert study.best is not None and study.best.bound == 0.1 and list(study.alike) == [0.3, 0.4]
     assert study.summary["alike_bounds"] == [0.3, 0.4]
-    alone = " ".join(document(replace(study, bounds=cells[:2])).plain().split())
-    assert "Every other bound is worse beyond the spread." in alone
+    # Differences of 0.0375 +- 0.1601, t of three degrees of freedom, over a mean of 1.05.
+    assert study.alike[0.3] == pytest.approx((0.0375 + 2.3534 * 0.1601 / 2) / 1.05, rel=1e-3)
+
+    def verdict(cells):
+        return " ".join(document(replace(study, bounds=cells)).plain().split())
+
+    assert "4 seeds are not enough to tell it from 0.3 s, where E_ac may be up to 22 % larger" in (
+        text := verdict(cells)
+    )
+    assert document(study).tone == "fair"
+    assert document(replace(study, bounds=cells[:2])).tone == "good"
+    assert "--runs 16 would about halve this. As good, within 1 %: 0.4 s. Default" in text
+    assert "Every other bound is worse (t-test, 95 % confidence). Default" in verdict(cells[:2])
+    alone = [cell._replace(runs=1, errors=cell.errors[:1]) for cell in cells[:2]]
+    assert "One seed is not enough to compare bounds" in verdict(alone)
 
 
 def test_the_worst_run_has_an_interval_from_runs_that_chose_nothing(known_outcomes):

@@ -19,7 +19,7 @@ from stewart_drake.reporting.page import Provenance
 from stewart_drake.reporting.page import html as html_of
 from stewart_drake.reporting.report import ANALYSES, collect, mean_error
 from stewart_drake.reporting.results import AnalysisResult
-from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.loading import load_scenario, title_of
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 from tests.browser import needs_chromium
 from tests.screen import too_long
@@ -135,6 +135,27 @@ def test_the_mean_error_leaves_out_the_time_in_which_nothing_can_act(summary):
     assert mean_error(run) == pytest.approx(share)
 
 
+@pytest.mark.parametrize(
+    ("amplitude", "moved", "said"),
+    [
+        (0.03, 1, r"on average over what moves \(z\)\. Largest error: z \d+ % of its motion\."),
+        (0.0, 6, r"of 1 rad and 1 m on average, as no .* Largest error: z 0\.\d+ mm\."),
+    ],
+)
+def test_still_coordinates_do_not_dilute_the_error(amplitude, moved, said):
+    """A still plate has errors in its own units, and one that only rises has that of z."""
+    settings = (f"reference.amplitude=[0,0,0,0,0,{amplitude}]", "reference.offset=[0,0,0,0,0,0.37]")
+    run = simulate(load_scenario("paper", None, (*EXACT, "duration=2", *settings)))
+    s = run.summary
+    left = 2.0 - (0.8 if s["delay_floor"] else 0.0)
+    whole = 6 * (s["accumulated_error"] - s["delay_floor"])
+    assert mean_error(run) == pytest.approx(whole / moved / left, rel=1e-6)
+    text, _ = report_document.verdict(collect_of(run.scenario, run=run))
+    assert re.search(said, text)
+    still = run.table().partition("peak error")[2].split("torque")[0]
+    assert still.count("deg") == 3 and still.count("mm") == (3 if moved == 6 else 2)
+
+
 # ---------------------------------------------------------------- other scenarios
 
 
@@ -176,6 +197,19 @@ def test_the_worst_finding_makes_the_verdict(settings, tone, said):
     assert run.status == "completed"
     page = report_document.document(collect_of(run.scenario, run=run), "mine")
     assert page.tone == tone and re.search(said, page.verdict)
+
+
+def test_a_scenario_of_new_is_called_by_its_folder(tmp_path):
+    assert title_of("paper") == "paper" and title_of("b/waves.yaml") == "waves"
+    assert title_of(tmp_path / "mine" / "scenario.yaml") == "mine"
+
+
+def test_links_that_cross_are_in_the_verdict():
+    run = simulate(load_scenario("paper", None, (*EXACT, "duration=0.3", "start=on_reference")))
+    crossing = {"clearance": {"touching": ["crank 1"], "verdict": "one pair of links crosses"}}
+    analyses = dict.fromkeys(ANALYSES, BLANK) | {"workspace": replace(BLANK, summary=crossing)}
+    text, tone = report_document.verdict(collect_of(run.scenario, run=run, analyses=analyses))
+    assert "Caution: one pair of links crosses" in text and tone == "fair"
 
 
 @pytest.mark.usefixtures("blank_figures")

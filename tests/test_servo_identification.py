@@ -12,6 +12,7 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.logs import angle_std
+from stewart_drake.identification.progress import shown_by
 from stewart_drake.identification.servo_fit import (
     NAMES,
     ServoIdentification,
@@ -120,7 +121,11 @@ def test_friction_of_ball_joints_is_found():
     given = ServoLog("log", times, setpoints, setpoints, ROBOT.home[None])
     states = ServoModel(given, ROBOT, 0.8).states(true)
     cranks = rounded(np.array([ROBOT.crank_angles(x[:6]) for x in states]))
-    found = identify_servos(servo_log("log", times, setpoints, cranks, ROBOT), ROBOT, angle_std(12))
+    log, said = servo_log("log", times, setpoints, cranks, ROBOT), list[str]()
+    with shown_by(said.append):
+        found = identify_servos(log, ROBOT, angle_std(12))
+    assert said[:2] == ["servos", "servos, iteration 1 of at most 20"]
+    assert "friction of the ball joints" in said
     assert found.theta[6:] == pytest.approx(true[6:], rel=0.1)
     assert found.residual < 1.1 * angle_std(12)
 

@@ -8,8 +8,9 @@ import typer
 
 from stewart_drake.cli.common import AsJson, Delivery, Out, Quiet, Settings
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification.progress import shown_by
 from stewart_drake.identification.tolerances import TOLERANCE_UNITS, read_tolerances
-from stewart_drake.reporting.terminal import count_bar
+from stewart_drake.reporting.terminal import phase_bar
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.options import refuse
 
@@ -57,9 +58,9 @@ def identify(
 ) -> int:
     """Find delay, friction and geometry in a log.
 
-    The run may have ended early. Writes mechanism.yaml and calibration.yaml for simulate, and a
-    page. A CSV log has the columns time[s], torque_1[N m] to torque_6 (commanded), angle_1[rad] to
-    angle_6 and, if measured, roll[rad] to z[m].
+    A log of 10 s takes 10 to 30 s. The run may have ended early. Writes mechanism.yaml and
+    calibration.yaml for simulate, and a page. A CSV log has the columns time[s], torque_1[N m] to
+    torque_6 (commanded), angle_1[rad] to angle_6 and, if measured, roll[rad] to z[m].
 
     A CSV log with time[s], setpoint_1[rad] to setpoint_6 and crank_1[rad] to crank_6 shows the
     numbers of position servos. Writes servos.yaml, for --set overlay=FILE.
@@ -94,14 +95,14 @@ def identify(
         chosen["command"] = command_line(
             "identify", settings=settings or [], options={"plan": plan, **typed}
         )
-        with count_bar("plan", quiet, "computing"):
+        with phase_bar("plan", quiet):
             found = functions.plan_identification(loaded, poses=pose_std is not None, **chosen)
         delivery.discard(MOTION, functions.SCENARIO, SETPOINTS_FILE)
     else:
         words = [*map(str, logs or []), *(["--no-gravity"] if gravity is False else [])]
         options = {"mechanism": mechanism, **typed}
         chosen["command"] = command_line("identify", *words, options=options)
-        with count_bar("identify", quiet, "computing"):
+        with phase_bar("identify", quiet) as show, shown_by(show):
             found = functions.identify(
                 logs or [], mechanism or "", delay=delay, gravity=gravity is not False, **chosen
             )

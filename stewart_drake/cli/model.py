@@ -136,6 +136,7 @@ def _new(
 ) -> tuple[int, str]:
     """Write the files; return the exit status and the report as HTML."""
     from stewart_drake.loop.simulation import simulate
+    from stewart_drake.reporting.document import Caution
     from stewart_drake.reporting.mechanism import document
     from stewart_drake.reporting.page import Provenance, command_line, html
     from stewart_drake.reporting.report import first_report
@@ -151,6 +152,8 @@ def _new(
     findings = [made.verdict, loop_verdict(margin), str(delay)]
     delivery.say(document(made.check).plain())
     delivery.say_wrapped(*findings)
+    for text in made.crossings:
+        delivery.say(Caution(text).plain())
     delivery.discard(PAGE)
     delivery.write(made.summary)
     text = ""

@@ -27,7 +27,7 @@ from stewart_drake.cli.common import (
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.reporting.document import Caution
 from stewart_drake.reporting.terminal import count_bar, echo, progress_bars
-from stewart_drake.scenario.loading import load_compatible, load_scenario
+from stewart_drake.scenario.loading import load_compatible, load_scenario, title_of
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -78,7 +78,7 @@ def simulate(
         delivery.say(Caution(text).plain())
     if viewer is not None:
         _await_viewer(viewer)
-    name = Path(scenario).stem
+    name = title_of(scenario)
     with progress_bars([name], experiment.scenario.duration, quiet) as progress:
         result = sd.simulate(
             experiment, progress=progress[name], meshcat=viewer, judge_stability=margin, log=log
@@ -287,7 +287,7 @@ def report(
     from stewart_drake.reporting.results import PAGE, AnalysisResult
 
     delivery = Delivery(out, quiet, as_json)
-    started, name = time.perf_counter(), Path(scenario).stem
+    started, name = time.perf_counter(), title_of(scenario)
     with count_bar("runs, analyses", delivery.silent) as progress:
         found = collect(scenario, settings or (), progress, controller)
     delivery.discard(REPLAY, PAGE)

@@ -220,11 +220,11 @@ static void search(Search *s, const real *y, stewart_scratch scratch)
     const int n = s->n, k = s->since.view.num_own;
     const real near = NEAR * d->period;
     real top, rival;
-    int busy, best = 0, kept = 0;
+    int best = 0, kept = 0;
     if (k < s->flights && (real)(k - 1) * d->period < d->longest)
         spawn(s, k, scratch);
     const int cells = (int)memory->cells;
-    busy = cells > AT_ONCE;
+    const int many = cells > AT_ONCE;
     for (int i = 0; i <= cells; i++)
         update(s, i, y, scratch);
     top = guess_at(s, 0)->weight;
@@ -260,7 +260,7 @@ static void search(Search *s, const real *y, stewart_scratch scratch)
     copy_guess(n, found, guess_at(s, 0));
     memory->searching = memory->cells = memory->best = 0;
     memory->found = 1;
-    memory->fresh = (real)busy;
+    memory->fresh = (real)many;
 }
 
 /* ---- jumps and new starts --------------------------------------------------------------------- */
@@ -343,14 +343,14 @@ static int compare(const Search *s, const stewart_period *t, const stewart_guess
     return 1;
 }
 
-/* Return the place of the lowest local minimum, other than `chosen` (-1 for none), or -1. */
-static int valley(int number, const real *cost, int chosen)
+/* Return the place of the lowest local minimum, other than `excluded` (-1 for none), or -1. */
+static int valley(int number, const real *cost, int excluded)
 {
     int best = -1;
     for (int i = 0; i < number; i++) {
         const int falls = i == 0 || cost[i] <= cost[i - 1];
         const int rises = i == number - 1 || cost[i] <= cost[i + 1];
-        if (i != chosen && falls && rises && isfinite(cost[i]) && (best < 0 || cost[i] < cost[best]))
+        if (i != excluded && falls && rises && isfinite(cost[i]) && (best < 0 || cost[i] < cost[best]))
             best = i;
     }
     return best;
@@ -367,7 +367,7 @@ static int jump(Search *s, const real *y, stewart_scratch scratch)
     const int wanted = (int)REAL(ceil)((d->longest / d->period - GRID) / GRID);
     const int number = wanted < 2 * s->flights ? wanted : 2 * s->flights;
     stewart_guess *guess = guess_at(s, 0);
-    stewart_guess *ended[BEST], *moved = (stewart_guess *)stewart_take(&scratch, size);
+    stewart_guess *tried[BEST], *moved = (stewart_guess *)stewart_take(&scratch, size);
     real *cost = stewart_take(&scratch, number), states[2][X], roots[2][X * X], total[BEST];
     real *before = stewart_take(&scratch, U * (s->since.view.num_others + 1));
     stewart_period periods[2] = {s->since, s->since};
@@ -385,30 +385,30 @@ static int jump(Search *s, const real *y, stewart_scratch scratch)
     for (int i = 0; i < 2; i++)
         if (!compare(s, periods + i, guess, states[i], roots[i], seen[i + 1], number, cost, scratch))
             return 0;
-    int chosen = 0, place = -1;
-    for (; chosen < BEST; chosen++) {
-        const int next = valley(number, cost, place);
-        if (next < 0 || (chosen > 0 && !(cost[next] <= HOPELESS + 10 * cost[place])))
+    int tries = 0, lowest = -1;
+    for (; tries < BEST; tries++) {
+        const int place = valley(number, cost, lowest);
+        if (place < 0 || (tries > 0 && !(cost[place] <= HOPELESS + 10 * cost[lowest])))
             break;
-        place = chosen > 0 ? place : next;
-        const real eta = (real)(next + 1) * GRID * d->period;
-        ended[chosen] = (stewart_guess *)stewart_take(&scratch, size);
+        lowest = tries > 0 ? lowest : place;
+        const real eta = (real)(place + 1) * GRID * d->period;
+        tried[tries] = (stewart_guess *)stewart_take(&scratch, size);
         begin_at(s, guess, eta, d->period / SQRT_12, LOOSENED_BY_JUMP, states[0], roots[0],
-                 ended[chosen], scratch);
-        ended[chosen]->low = eta > d->period ? eta - d->period : 0;
-        ended[chosen]->high = eta + d->period < d->longest ? eta + d->period : d->longest;
-        total[chosen] = 0;
+                 tried[tries], scratch);
+        tried[tries]->low = eta > d->period ? eta - d->period : 0;
+        tried[tries]->high = eta + d->period < d->longest ? eta + d->period : d->longest;
+        total[tries] = 0;
         for (int i = 0; i < 2; i++) {
-            stewart_delay_advance(periods + i, ended[chosen], seen[i + 1], moved, scratch);
-            copy_guess(n, moved, ended[chosen]);
-            total[chosen] += moved->log_likelihood;
+            stewart_delay_advance(periods + i, tried[tries], seen[i + 1], moved, scratch);
+            copy_guess(n, moved, tried[tries]);
+            total[tries] += moved->log_likelihood;
         }
     }
-    if (!chosen) /* not finite */
+    if (!tries) /* not finite */
         return 0;
-    const int second = chosen > 1, best = second && total[1] > total[0];
-    stewart_guess *found = ended[best];
-    if (second && distance_of(n, ended[0], ended[1]) > near
+    const int second = tries > 1, best = second && total[1] > total[0];
+    stewart_guess *found = tried[best];
+    if (second && distance_of(n, tried[0], tried[1]) > near
         && !(total[best] - total[1 - best] >= SETTLED))
         return 0;
     if (!(found->fits > 0) || !(stewart_guess_std(found, n) < near)

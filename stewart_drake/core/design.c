@@ -77,8 +77,8 @@ static void sample(const stewart_cost *cost, real period, real fraction, const r
 {
     const int pending = fraction > 0, n = m->n, first = X + 6 * (cost->integrates != 0);
     const real half = period / 2;
-    real *Phi[2], *S[2], *scaled = stewart_take(&scratch, X * X);
-    real *pushed = stewart_take(&scratch, X * U), *product = stewart_take(&scratch, X * X);
+    real *Phi[2], *S[2], *A_h = stewart_take(&scratch, X * X);
+    real *B_h = stewart_take(&scratch, X * U), *product = stewart_take(&scratch, X * X);
     for (int part = 0; part < 2; part++) { /* after the torque changes, before it */
         Phi[part] = stewart_take(&scratch, X * X);
         S[part] = stewart_take(&scratch, X * U);
@@ -86,10 +86,10 @@ static void sample(const stewart_cost *cost, real period, real fraction, const r
     for (int part = 0; part < 1 + pending; part++) {
         const real h = (part == 0 ? 1 - fraction : fraction) * period;
         for (int i = 0; i < X * X; i++)
-            scaled[i] = h * A[i];
+            A_h[i] = h * A[i];
         for (int i = 0; i < X * U; i++)
-            pushed[i] = h * B[i];
-        stewart_exponential(X, U, scaled, pushed, Phi[part], S[part], scratch);
+            B_h[i] = h * B[i];
+        stewart_exponential(X, U, A_h, B_h, Phi[part], S[part], scratch);
     }
     if (pending) {
         stewart_multiply(X, X, U, Phi[0], S[1], product);

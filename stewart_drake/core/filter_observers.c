@@ -16,15 +16,30 @@ int stewart_filtered_memory(const stewart_law *law)
     return estimate_numbers(law) + law->measured + LEGS;
 }
 
+/* Views of the memory, in its order. */
+typedef struct {
+    stewart_posterior estimate;
+    real *values; /* (m) last valid value of each measured quantity */
+    real *still;  /* (LEGS) periods for which each encoder code has been constant */
+} Filtered;
+
+static Filtered filtered_at(const stewart_law *law, real *memory)
+{
+    real *values = memory + estimate_numbers(law);
+    return (Filtered){stewart_posterior_at(memory, X + estimated(law), law->measured), values,
+                      values + law->measured};
+}
+
 void stewart_filtered_restart(const stewart_law *law, real *memory)
 {
     const int n = X + estimated(law);
-    const stewart_posterior e = stewart_posterior_at(memory, n, law->measured);
+    const Filtered f = filtered_at(law, memory);
+    const stewart_posterior e = f.estimate;
     stewart_fill(X, (real)NAN, e.mean);
     stewart_fill(n * n, (real)NAN, e.root);
     stewart_fill(law->measured, (real)NAN, e.outlier);
     *e.outliers = *e.unseen = *e.left_out = 0;
-    stewart_fill(LEGS, 0, memory + stewart_filtered_memory(law) - LEGS);
+    stewart_fill(LEGS, 0, f.still);
 }
 
 void stewart_filtered_start(const stewart_law *law, real *memory)
@@ -32,28 +47,29 @@ void stewart_filtered_start(const stewart_law *law, real *memory)
     const stewart_filter_settings *settings = law->estimation;
     stewart_fill(stewart_filtered_memory(law), (real)NAN, memory);
     stewart_filtered_restart(law, memory);
-    const stewart_posterior e = stewart_posterior_at(memory, X + estimated(law), law->measured);
+    const stewart_posterior e = filtered_at(law, memory).estimate;
     *e.squares = *e.values = 0;
     stewart_noise_start(e.noise);
-    stewart_copy(estimated(law), settings->prior, memory + X);
+    stewart_copy(estimated(law), settings->prior, e.mean + X);
 }
 
 void stewart_filtered_parameters(const stewart_law *law, const real *memory, real *theta, real *std)
 {
     const int n = X + estimated(law);
-    stewart_copy(estimated(law), memory + X, theta);
+    const stewart_posterior e = filtered_at(law, (real *)memory).estimate;
+    stewart_copy(estimated(law), e.mean + X, theta);
     for (int i = X; i < n; i++)
-        std[i - X] = stewart_norm(n, memory + n + n * i);
+        std[i - X] = stewart_norm(n, e.root + n * i);
 }
 
 real stewart_filtered_uncertainty(const stewart_law *law, const real *memory, real *L)
 {
     const int n = X + estimated(law);
     const stewart_filter_settings *settings = law->estimation;
-    const stewart_noise *noise = (const stewart_noise *)(memory + estimate_numbers(law) - STEWART_NOISE);
+    const stewart_posterior e = filtered_at(law, (real *)memory).estimate;
     if (L)
-        stewart_copy(n * n, memory + n, L);
-    return REAL(sqrt)(noise->timing) * settings->filter.timing_std;
+        stewart_copy(n * n, e.root, L);
+    return REAL(sqrt)(e.noise->timing) * settings->filter.timing_std;
 }
 
 static stewart_filter filter_of(const stewart_law *law, const stewart_sensing *sensing)
@@ -80,16 +96,17 @@ int stewart_filtered_observe(const stewart_law *law, real *memory, int number, c
     const int n = X + estimated(law), m = law->measured;
     const stewart_sensing sensing = stewart_sensing_of(law);
     const stewart_filter filter = filter_of(law, &sensing);
-    const stewart_posterior e = stewart_posterior_at(memory, n, m);
-    real *kept = memory + estimate_numbers(law), *last = stewart_take(&scratch, m);
-    const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, kept);
+    const Filtered f = filtered_at(law, memory);
+    const stewart_posterior e = f.estimate;
+    real *last = stewart_take(&scratch, m);
+    const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, f.values);
     const stewart_interval period = last_interval(law, number, torques, &scratch);
-    const stewart_history history = {last, kept + m};
+    const stewart_history history = {last, f.still};
     int same = 1;
     if (sensing.legs)
-        sensing.legs->count_still(&sensing, values, kept, kept + m);
-    stewart_copy(m, kept, last);
-    stewart_keep_last(m, values, kept);
+        sensing.legs->count_still(&sensing, values, f.values, f.still);
+    stewart_copy(m, f.values, last);
+    stewart_keep_last(m, values, f.values);
     for (int i = 0; i < m; i++)
         same &= values[i] == last[i];
     if (isnan(e.root[0])) {
@@ -147,7 +164,22 @@ const stewart_observer stewart_filter_observer = {
 
 enum { GAP_TORQUES = 2 * (LONGEST_GAP + 1) };
 
-/* After that of the filter: the anchor, torques, durations, the number of both, and of periods. */
+/* Views of the memory after that of the filter, in its order. */
+typedef struct {
+    real *anchor;    /* estimate, as of the filter */
+    real *torques;   /* (GAP_TORQUES, 6) since the anchor, N m */
+    real *durations; /* (GAP_TORQUES) s */
+    real *pieces;    /* number of both */
+    real *periods;   /* number of periods since the anchor; 0 without one */
+} Gap;
+
+static Gap gap_at(const stewart_law *law, real *memory)
+{
+    real *anchor = memory + stewart_filtered_memory(law), *torques = anchor + estimate_numbers(law);
+    real *durations = torques + U * GAP_TORQUES, *counts = durations + GAP_TORQUES;
+    return (Gap){anchor, torques, durations, counts, counts + 1};
+}
+
 static int gap_memory(const stewart_law *law)
 {
     return stewart_filtered_memory(law) + estimate_numbers(law) + (U + 1) * GAP_TORQUES + 2;
@@ -164,39 +196,38 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
 {
     const int size = estimate_numbers(law), n = X + estimated(law), m = law->measured;
     const stewart_filter_settings *settings = law->estimation;
-    const stewart_posterior now = stewart_posterior_at(memory, n, m);
-    real *anchor = memory + stewart_filtered_memory(law), *since = anchor + size;
-    real *durations = since + U * GAP_TORQUES, *pieces = durations + GAP_TORQUES, *periods = pieces + 1;
+    const Filtered now = filtered_at(law, memory);
+    const Gap gap = gap_at(law, memory);
     real *known = stewart_take(&scratch, size), *last = stewart_take(&scratch, m);
     real longer[X], walk[STEWART_MAX_ESTIMATED], wander[STEWART_MAX_ESTIMATED];
     const stewart_sensing sensing = stewart_sensing_of(law);
     stewart_filter filter = filter_of(law, &sensing);
     stewart_copy(size, memory, known);
-    stewart_copy(m, memory + size, last);
+    stewart_copy(m, now.values, last);
     const stewart_posterior before = stewart_posterior_at(known, n, m);
     const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, last);
     const int status = stewart_filtered_observe(law, memory, number, torques, values, scratch);
-    const int had_anchor = *periods > 0, parts = (int)*pieces;
+    const int had_anchor = *gap.periods > 0, parts = (int)*gap.pieces;
     stewart_interval period = last_interval(law, number, torques, &scratch);
     const stewart_history history = {last, NULL};
-    const int gone = isnan(before.root[0]) || *before.outliers > 0 || *periods >= LONGEST_GAP;
-    const int unseen = *now.unseen > *before.unseen && !(*now.outliers > 0);
-    if (!gone && (unseen || had_anchor)) {
+    const int unusable = isnan(before.root[0]) || *before.outliers > 0 || *gap.periods >= LONGEST_GAP;
+    const int unseen = *now.estimate.unseen > *before.unseen && !(*now.estimate.outliers > 0);
+    if (!unusable && (unseen || had_anchor)) {
         if (!had_anchor)
-            stewart_copy(size, known, anchor);
-        stewart_copy(U * period.schedule.number, period.schedule.torques, since + U * parts);
-        stewart_copy(period.schedule.number, period.schedule.durations, durations + parts);
-        *pieces += (real)period.schedule.number;
-        *periods += 1;
+            stewart_copy(size, known, gap.anchor);
+        stewart_copy(U * period.schedule.number, period.schedule.torques, gap.torques + U * parts);
+        stewart_copy(period.schedule.number, period.schedule.durations, gap.durations + parts);
+        *gap.pieces += (real)period.schedule.number;
+        *gap.periods += 1;
     }
-    if (!gone && unseen)
+    if (!unusable && unseen)
         return status;
-    const real passed = *periods, h = law->period;
-    period.schedule = (stewart_schedule){(int)*pieces, since, durations, 0};
-    *periods = *pieces = 0;
-    if (gone || !had_anchor || fault)
+    const real passed = *gap.periods, h = law->period;
+    period.schedule = (stewart_schedule){(int)*gap.pieces, gap.torques, gap.durations, 0};
+    *gap.periods = *gap.pieces = 0;
+    if (unusable || !had_anchor || fault)
         return status;
-    period.schedule.substeps = stewart_substeps(&law->machine, period.schedule.number, since);
+    period.schedule.substeps = stewart_substeps(&law->machine, period.schedule.number, gap.torques);
     for (int i = 0; i < 6; i++) {
         const real pose = settings->filter.model_std[i], rate = settings->filter.model_std[6 + i];
         const real drifts = (passed - 1) * passed * (2 * passed - 1) / 6 * h * h;
@@ -211,10 +242,10 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
     filter.walk_std = walk;
     filter.wander_std = wander;
     filter.keep = REAL(pow)(filter.keep, passed);
-    stewart_filter_advance(&filter, &period, values, &history, anchor, scratch);
-    if (*stewart_posterior_at(anchor, n, m).outliers > 0)
+    stewart_filter_advance(&filter, &period, values, &history, gap.anchor, scratch);
+    if (*stewart_posterior_at(gap.anchor, n, m).outliers > 0)
         return status;
-    stewart_copy(size, anchor, memory);
+    stewart_copy(size, gap.anchor, memory);
     return 0;
 }
 

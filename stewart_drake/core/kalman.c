@@ -161,7 +161,7 @@ typedef struct {
 } Active;
 
 /* push = P_hh^-1 (mean_h - value_h), after releasing components that are pushed inwards. */
-static int pushed(Active *h, int n, const real *mean, const real *L, real *P)
+static int find_pushes(Active *h, int n, const real *mean, const real *L, real *P)
 {
     while (h->number) {
         int least = 0;
@@ -227,7 +227,7 @@ int stewart_within_bounds(int n, const real *mean, const real *L, const real *lo
         h.at[place] = worst;
         h.upper[place] = moved[worst] > upper[worst];
         h.value[place] = h.upper[place] ? upper[worst] : lower[worst];
-        if (!pushed(&h, n, mean, L, P))
+        if (!find_pushes(&h, n, mean, L, P))
             return 0;
         stewart_fill(n, 0, along);
         for (int a = 0; a < h.number; a++)

@@ -67,7 +67,7 @@ static void before(const stewart_packets *p, real *values)
 typedef struct {
     int n;              /* packets that count */
     const real *newest; /* whether the newest has arrived; the older ones lie before it */
-    real *kept;         /* (n) probability that it is not lost, by what older ones tell */
+    real *kept;         /* (n) probability that it is not lost, by the evidence on older ones */
     real *evidence;     /* (n) c_i */
     real *absent;       /* (n) probability that it had not arrived by the report if it is not lost */
     real *states;       /* (burst + 1) */
@@ -89,11 +89,11 @@ static Evidence condition(const stewart_packets *p, int known, const real *arriv
         }
     stationary(p, c.states);
     for (int i = c.n - 1; i >= 0; i--) {
-        int told = i + 1 - since;
+        int age = i + 1 - since; /* of the packet at the last report, periods */
         real sum = 0, absent = 1;
-        if (told > 0 && !there(&c, i) && since < p->kept) {
-            told = told < p->told ? told : p->told;
-            absent = 1 - p->arrived_by[told < p->kept ? told : p->kept - 1];
+        if (age > 0 && !there(&c, i) && since < p->kept) {
+            age = age < p->told ? age : p->told;
+            absent = 1 - p->arrived_by[age < p->kept ? age : p->kept - 1];
         }
         c.absent[i] = absent > LEAST ? absent : LEAST;
         c.kept[i] = c.states[p->burst];

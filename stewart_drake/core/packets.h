@@ -4,13 +4,13 @@
 
 #include "matrix.h"
 
-/* Packet k has the torques of `repeats` earlier samples, word for word, then T_k and the plan of
+/* Packet k has the torques of `repeats` earlier samples, unchanged, then T_k and the plan of
    those that follow: rows = repeats + torques, of 6 numbers each. */
 typedef struct {
     int torques; /* N >= 1 */
     int repeats; /* r */
     int kept;    /* packets that are remembered, >= 1 */
-    int told;    /* periods that a report looks back */
+    int told;    /* periods that a report covers */
     int holds;   /* whether a dry buffer holds the last torque, or puts out zero */
     int burst;   /* packets that are lost together, >= 1 */
     real loss;   /* share of the packets that are lost */
@@ -49,8 +49,8 @@ void stewart_packets_send(const stewart_packets *packets, real *memory, const re
                           const real *in_flight);
 
 /* Probabilities (n + 1) of the sources of T_{k-1-d}: chances[i], i < n, that the packet sent i + 1
-   samples ago is in time and no newer one is; chances[n] that no packet is. Returns n <= known. Place
-   for known + 1 numbers.
+   samples ago is in time and no newer one is; chances[n] that no packet is. Returns n <= known.
+   `chances` has room for known + 1 numbers.
 
    known: packets that were sent so far, of those that are remembered.
    arrived: (known) whether each is known to have arrived, the newest last.

@@ -228,10 +228,10 @@ static int sample(const dop853 *s, stewart_loop *o, long k, stewart_controller l
 static int advance_pushed(dop853 *s, stewart_run *r, const stewart_loop *o, double end)
 {
     for (;;) {
-        const int pushed = o->push_from <= s->time && s->time < o->push_to;
-        const double change = pushed ? o->push_to : s->time < o->push_from ? o->push_from : HUGE_VAL;
+        const int acts = o->push_from <= s->time && s->time < o->push_to;
+        const double change = acts ? o->push_to : s->time < o->push_from ? o->push_from : HUGE_VAL;
         for (int i = 0; i < 6; i++)
-            o->wrench[i] = pushed ? o->push[i] : 0.;
+            o->wrench[i] = acts ? o->push[i] : 0.;
         const int how = advance(s, r, fmin(change, end));
         if (how != STEWART_INSIDE || end <= change)
             return how;

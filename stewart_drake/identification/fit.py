@@ -19,6 +19,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.identification import progress
 from stewart_drake.identification.logs import ANGLES, KINDS, NUM_MEASURED, POSE
 from stewart_drake.identification.model import NUM_DYNAMIC, DrawnModel, MachineModel
 from stewart_drake.identification.shooting import (
@@ -232,6 +233,7 @@ def solve(problem: Problem, start: Guess, most: int = MOST_ITERATIONS) -> Fit:
     gained = np.inf
     while iterations < most and gained >= ENOUGH:
         iterations += 1
+        progress.iteration(iterations, most)
         before, gained = residuals.chi2, 0.0
         while damping < _DAMPING[2] and gained == 0.0:
             trial = _moved(guess, *_step(normal, damping), evaluator.free)

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.identification import short_logs, start
+from stewart_drake.identification import progress, short_logs, start
 from stewart_drake.identification.fit import (
     ASTRAY,
     Fit,
@@ -178,7 +178,8 @@ def identify(
         # Long trajectories lead nowhere after a loss of the plate; and the coarse delay may err.
         starts = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5), (coarse, _SHORT)]
     tried = list[_Begun]()
-    for first_delay, share in starts:
+    for number, (first_delay, share) in enumerate(starts, start=1):
+        progress.phase(f"start {number} of at most {len(starts)}")
         begun = _begin(unknowns.at_delay(first_delay), share, pairs, unknowns)
         if share == _SHORT:  # a wrong drawing explains short segments, too
             begun = _begin(begun.guess.values, 1.0, pairs, unknowns)
@@ -187,6 +188,7 @@ def identify(
             break
     else:
         found = _grown(min(tried, key=lambda one: one.chi2))
+    progress.phase("shorter steps")
     while (halved := finer(found.problem, found.fit.guess)) is not None:
         found = found.refitted(halved)
     return Identification(logs, unknowns, found, middle)
@@ -218,6 +220,7 @@ def _grown(begun: _Begun) -> Solution:
     such as the last before a plate was lost. Such segments are left out, as long as more than the
     nearest remain.
     """
+    progress.phase("whole log")
     problem, guess = followed(begun.whole, begun.guess)
     if not problem.segments:
         raise ConfigError(

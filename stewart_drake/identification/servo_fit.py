@@ -33,6 +33,7 @@ taken to be at most what was removed.
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import count
 from typing import Any, Final
 
 import numpy as np
@@ -47,6 +48,7 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.open_loop import Ended, NativePlant
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification import progress
 from stewart_drake.identification.servo_logs import ServoLog
 from stewart_drake.law.servos import PositionServo, turned
 from stewart_drake.mechanism.geometry import Mechanism, with_rotors
@@ -376,14 +378,17 @@ def identify_servos(
             raise ConfigError(f"{log.name}: got {name} that hardly change; expected a motion")
     limit = mechanism.effort_limit
     model = ServoModel(log, mechanism, math.inf if limit is None else limit, gravity)
+    progress.phase("servos")
     found = _fitted(model, regression(model, False), np.arange(BALL_FRICTION), rounding)
     if found.residual >= CODES * rounding:
+        progress.phase("friction of the ball joints")
         rubbing = _fitted(model, regression(model, True), np.arange(len(NAMES)), rounding)
         better = rubbing.residual < GAIN * found.residual
         found = rubbing if better else replace(found, ball_joints_tried=True)
     moving = model.speeds >= STICKS * found.theta[SPEED]
     if found.residual < SMOOTH * rounding or np.mean(moving) < _ENOUGH:
         return found
+    progress.phase("moving cranks only")
     again = _fitted(model, found.theta, found.free, rounding, moving)
     change = again.theta - found.theta
     return replace(again, change=change, ball_joints_tried=found.ball_joints_tried)
@@ -399,6 +404,7 @@ def _fitted(
     """Return the fit of the free unknowns to samples (m, 6), all if None, by output error."""
     fitted = np.ones(model.speeds.shape, bool) if samples is None else samples
     first, scale = _in_reach(model, start), scale_of(start)[free]
+    iterations = count(1)
 
     def whole(x: Array) -> Array:
         theta = first.copy()
@@ -409,6 +415,7 @@ def _fitted(
         return (model.residuals(whole(x)) * fitted).ravel()
 
     def jacobian(x: Array) -> Array:
+        progress.iteration(next(iterations), _ITERATIONS)
         J = model.jacobian(whole(x), free) * fitted[:, :, None]
         return J.reshape(-1, len(free)) * scale
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from stewart_drake.dynamics.workspace import margin, margins
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification import progress
 from stewart_drake.identification.fit import (
     ASTRAY,
     MOST_ITERATIONS,
@@ -58,7 +59,9 @@ def fit_short(pairs: Sequence[Pair], unknowns: Unknowns, worst: float) -> Soluti
     """
     pairs = [_inside(*pair, unknowns.mechanism) for pair in pairs]
     right = list[Solution]()
-    for values in _scanned(pairs, unknowns):
+    scanned = _scanned(pairs, unknowns)
+    for number, values in enumerate(scanned, start=1):
+        progress.phase(f"candidate {number} of {len(scanned)}")
         with suppress(np.linalg.LinAlgError):  # a trajectory grew beyond all bounds
             one = _grown(pairs, unknowns, values)
             if one and _explains(one, worst) and _is_apart(one, right):
@@ -94,7 +97,9 @@ def _scanned(pairs: Sequence[Pair], unknowns: Unknowns) -> list[Array]:
     """Return values of the unknowns at the delays that explain the logs best."""
     as_drawn, found = unknowns.without(GEOMETRY), list[Solution]()
     middle, reach = unknowns.mean[DELAY], 3 * unknowns.std[DELAY]
-    for delay in np.arange(max(0.0, middle - reach), middle + reach + _GRID / 2, _GRID):
+    delays = np.arange(max(0.0, middle - reach), middle + reach + _GRID / 2, _GRID)
+    for number, delay in enumerate(delays, start=1):
+        progress.phase(f"delay {number} of {len(delays)}")
         with suppress(np.linalg.LinAlgError):
             one = _fitted(pairs, as_drawn, unknowns.at_delay(float(delay)), _SCANNED, _FEW)
             found += [one] if one else []

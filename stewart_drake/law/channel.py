@@ -144,10 +144,10 @@ class Packets:
     def in_flight(
         self, sent: Sent, in_flight: Array, timeline: Timeline, report: Report | None
     ) -> tuple[Sent, Array]:
-        c, channel, told = core(), packets_of(self).it, report_of(report)
+        c, channel, compiled = core(), packets_of(self).it, report_of(report)
         memory, flying = sent.memory.copy(), in_flight.copy()
         c.lib.stewart_packets_update(
-            *(channel, c.at(memory), told.it, timeline.steps, len(flying), c.at(flying)),
+            *(channel, c.at(memory), compiled.it, timeline.steps, len(flying), c.at(flying)),
             c.scratch(c.lib.stewart_packets_scratch(channel)),
         )
         return Sent(memory, sent.rows), flying

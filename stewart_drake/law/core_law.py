@@ -290,11 +290,11 @@ class CoreLqi:
         values, weights = measurement.known(law.sensing.size), _row_major(weights)
         if weights.shape != (len(WEIGHTS),):
             raise ValueError(f"weights: got shape {weights.shape}; expected {(len(WEIGHTS),)}")
-        told = report_of(report)
+        compiled = report_of(report)
         sample = c.ffi.new("stewart_sample *")
         sample.measurement, sample.age = c.at(values), _age(law, measurement)
         asked = self._asked(sample, motion)
-        sample.report = told.it
+        sample.report = compiled.it
         sample.weights = weights.tolist()
         data, scratch, torque = (
             memory.data.copy(),

@@ -2,9 +2,9 @@
 
 The prediction can be far off the reference, for example when the delay has just been found or has
 changed. Feedback of such an error through a long delay responds badly. The torques in flight cannot
-be changed, so `law.catch_up` plans a motion from the instant at which the next one acts. Held
-torques follow it without error. The law then follows the predicted motion, the plan, and the
-reference: no error is left to feed back, and the integral begins anew.
+be changed, so `law.catch_up` plans a motion from the instant at which the next one acts. Torques
+that are constant over each period follow it without error. The law then follows the predicted
+motion, the plan, and the reference: no error is left to feed back, and the integral starts at 0.
 """
 
 import math

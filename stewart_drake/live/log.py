@@ -29,7 +29,7 @@ from stewart_drake.types import Array
 _WAITS: Final = 24
 """Longest wait of a row for the report of the torque that acted, samples."""
 _LATEST: Final = 0.5
-"""Longest wait, s."""
+"""The same, s."""
 _KEPT: Final = 96
 """Number of periods whose applied torques are kept."""
 

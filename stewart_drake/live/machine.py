@@ -101,8 +101,8 @@ class Machine:
     Args:
         experiment: prepared scenario that passes `check_scenario`.
         clock: monotonic clock, ns.
-        log: for true state, acting torque and measurement at each sample of a run, by the machine's
-            clock.
+        log: of true state, acting torque and measurement at each sample of a run, at times of the
+            machine's clock.
         body: makes plant and sensor, and their name; those of the scenario by default.
 
     Attributes:

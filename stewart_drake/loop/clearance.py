@@ -69,10 +69,10 @@ class ClearanceScene:
         self.pairs = tuple(pair for pair in pairs if base or not pair.fixed)
         self._ids = [(parts[pair.first], parts[pair.second]) for pair in self.pairs]
         rods = {LINKS[i]: i for i in range(NUM_LEGS, len(LINKS))}
-        known = [k for k, pair in enumerate(self.pairs) if all(name in rods for name in pair)]
-        asked = [k for k in range(len(self.pairs)) if k not in known]
-        self._known, self._asked = np.array(known), np.array(asked)
-        self._rods = np.array([[rods[name] for name in self.pairs[k]] for k in known]).T
+        of_rods = [k for k, pair in enumerate(self.pairs) if all(name in rods for name in pair)]
+        others = [k for k in range(len(self.pairs)) if k not in of_rods]
+        self._of_rods, self._others = np.array(of_rods), np.array(others)
+        self._rods = np.array([[rods[name] for name in self.pairs[k]] for k in of_rods]).T
 
     def distances(self, pose: Array) -> Array:
         """Return the distances of all pairs (p,), in m, at a pose (6,); negative for an overlap.
@@ -84,15 +84,15 @@ class ClearanceScene:
         set_pose(self._plant, self._tree, m, pose, _AT_REST)
         query = cast(QueryObject, self._query.Eval(self._shapes))
         found = np.empty(len(self.pairs))
-        found[self._asked] = [
+        found[self._others] = [
             query.ComputeSignedDistancePairClosestPoints(*self._ids[k]).distance
-            for k in self._asked
+            for k in self._others
         ]
         one = np.asarray(pose)[None]
         start, along = (x[0] for x in center_lines(m, one, legs_along(m, one)))
         first, second = self._rods
         apart = segment_distances(start[first], along[first], start[second], along[second])
-        found[self._known] = apart - 2 * proportions(m).rod_radius
+        found[self._of_rods] = apart - 2 * proportions(m).rod_radius
         return found
 
 

@@ -19,7 +19,7 @@ from stewart_drake.types import Array
 HARMONICS: Final = 8
 """Harmonics of the motion that are learned; those above half the control rate are zero."""
 _POSES: Final = 32
-"""Number of poses of the motion that a file has, over one period."""
+"""Number of poses, over one period, by which a file identifies the motion."""
 _SAME: Final = 1e-9
 """Largest difference of two motions that are the same, rad and m, and of two times, s."""
 
@@ -80,12 +80,9 @@ def learned_signal(experiment: Experiment) -> LearnedSignal | None:
         text = value.dtype.kind == "U"
         same = found[name] == value if text else np.allclose(found[name], value, 0, _SAME)
         if not same:
-            exact = "" if np.ndim(value) or value.dtype.kind == "U" else ".9g"
-            numbers = (
-                ""
-                if np.ndim(value)
-                else f" ({found[name][()]:{exact}}); expected {value[()]:{exact}}"
-            )
+            form, numbers = "" if text else ".9g", ""
+            if not np.ndim(value):
+                numbers = f" ({found[name][()]:{form}}); expected {value[()]:{form}}"
             raise ConfigError(
                 f"controller.learned: got {file}, learned with another {_TEXTS[name]}{numbers}"
                 + (", as in the scenario" if numbers else "; expected that of the scenario")
@@ -113,7 +110,7 @@ def _command(scenario: Scenario) -> str:
 
 
 def _marks(experiment: Experiment) -> dict[str, Array]:
-    """Return the arrays by which a file names machine, motion, period and delay."""
+    """Return the arrays that identify machine, command, motion, periods and delay in a file."""
     sc = experiment.scenario
     period = motion_period(sc)
     times = period / _POSES * np.arange(_POSES)

@@ -188,7 +188,7 @@ class RunSummary(TypedDict):
     torque_variation: float
     """Mean over the motors of sum |T_{k+1} - T_k| of the law's torques, N m."""
     peak_error: list[float]
-    """(6,) of the pose, % of peak to peak."""
+    """(6,) of the pose, % of peak to peak; of 1 rad or 1 m where the reference is constant."""
     delay_floor: float
     """E_ac in % s of a plate that rests until a torque acts; 0 without rest."""
     controller_step_ms: StepTimes

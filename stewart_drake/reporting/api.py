@@ -13,7 +13,7 @@ from stewart_drake.loop.preparation import simulated_machine
 from stewart_drake.reporting.analyses import ANALYSES, RENAMED, analyze, options_of, words_of
 from stewart_drake.reporting.results import AnalysisResult, ComparisonResult, SimulationResult
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import as_scenario
+from stewart_drake.scenario.loading import as_scenario, title_of
 from stewart_drake.studies import compare as comparison
 from stewart_drake.studies.options import argument_lines
 
@@ -57,10 +57,10 @@ def report(
     found = report_document.collect(scenario, settings, controller=controller)
     film = ""
     if found.run is not None:
-        film = replay_html(found.run, simulated_machine(found.scenario), Path(scenario).stem)
+        film = replay_html(found.run, simulated_machine(found.scenario), title_of(scenario))
     own = "" if controller is None else f", {str(controller)!r}"
     made = Provenance(f"sd.report({str(scenario)!r}, {list(settings)}{own})")
-    document = report_document.document(found, Path(scenario).stem, film)
+    document = report_document.document(found, title_of(scenario), film)
     return AnalysisResult(found, report_document.report_summary(found), document, made)
 
 

@@ -42,6 +42,8 @@ _LEAST_SIGMAS: Final = 0.02
 """Least half width of a parameter's axis, as a share of its largest standard deviation."""
 _LEAST_SPAN: Final = 0.02
 """Least span of a coordinate's axis, as a share of the largest motion in its unit."""
+_ROUNDING: Final = 1e-6
+"""Least span of a coordinate's axis, deg or mm: less is rounding."""
 _MARGIN: Final = 0.06
 """Margin of an axis beyond the data, as a share."""
 _AFTER_END: Final = 1.1
@@ -109,7 +111,8 @@ def _states(runs: _Runs) -> Figure:
     wanted = max((run.signals for run, _ in runs.values()), key=lambda s: s.sizes["time"])
     reference = FACTORS * wanted.reference.values
     spans = _spans(reference)
-    least = _LEAST_SPAN * np.repeat([spans[ANGLES].max(), spans[POSITION].max()], 3)
+    motion = np.repeat([spans[ANGLES].max(), spans[POSITION].max()], 3)
+    least = np.maximum(_LEAST_SPAN * motion, _ROUNDING)
     time = wanted.time.values
     curves = [Curve(time, column, "reference", style.REFERENCE) for column in reference.T]
     return _coordinates(runs, "pose", _STATE_REACH * spans, least, curves)
@@ -117,7 +120,7 @@ def _states(runs: _Runs) -> Figure:
 
 def _errors(runs: _Runs) -> Figure:
     spans = np.max([_spans(FACTORS * run.signals.reference.values) for run, _ in runs.values()], 0)
-    return _coordinates(runs, "error", _ERROR_REACH * spans, np.zeros(6))
+    return _coordinates(runs, "error", _ERROR_REACH * spans, np.full(6, _ROUNDING))
 
 
 def _coordinates(

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from stewart_drake.reporting.document import Document, from_template
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import Line, line
-from stewart_drake.studies.link import Cell, LinkStudy
+from stewart_drake.studies.link import SAME, Cell, LinkStudy
 from stewart_drake.studies.statistics import CONFIDENCE
 
 _ASSURED: Final = 0.9
@@ -25,13 +25,15 @@ def document(study: LinkStudy) -> Document:
     """Return the results by bound, then by loss at the best bound."""
     best, checked = study.best, study.checked
     own = best is not None and all(one is None or one.completed == 1 for one in (best, checked))
+    undecided = {bound: excess for bound, excess in study.alike.items() if not excess < SAME}
     return from_template(
         "link",
-        "good" if own else "bad",
+        "bad" if not own else "fair" if undecided else "good",
         study=study,
         mean=_mean,
         spread=lambda cell: float(np.std(cell.errors, ddof=1)),
-        alike=", ".join(f"{bound:g}" for bound in study.alike),
+        same=", ".join(f"{bound:g}" for bound, excess in study.alike.items() if excess < SAME),
+        undecided=undecided,
         most=lambda cell: max(cell.errors, default=math.nan),
         assured=_ASSURED,
         wanted=math.ceil(math.log(1 - CONFIDENCE) / math.log(_ASSURED)),

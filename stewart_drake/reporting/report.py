@@ -4,6 +4,7 @@ That on a scenario shows its own run, the shipped controllers in the manner of t
 and figures 5, 6 and 7, the analyses, and the scenario itself.
 """
 
+import math
 import pickle
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -43,14 +44,16 @@ from stewart_drake.reporting.figures import (
 from stewart_drake.reporting.mechanism import document as describe
 from stewart_drake.reporting.mechanism import mechanism_figure
 from stewart_drake.reporting.results import AnalysisResult
-from stewart_drake.reporting.run import comparison_document, run_document
+from stewart_drake.reporting.run import comparison_document, moving, run_document, worst
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.link import link_text, number_sent
 from stewart_drake.scenario.loading import load_compatible, scenario_yaml
+from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.studies import compare
 from stewart_drake.studies.compare import LABELS, is_papers, label
 from stewart_drake.studies.jobs import Job, Progress, run_jobs
 from stewart_drake.studies.new_machine import NewMachine
+from stewart_drake.studies.verdict import fold
 from stewart_drake.tuner.network import DEFAULT
 
 ANALYSES: Final = ("delay", "hautus", "workspace")
@@ -288,6 +291,9 @@ def verdict(found: ReportData) -> tuple[str, Tone]:
             text += f" {label(best)} completes it, with an E_ac of {number(done[best])} % s."
         return text, "bad"
     findings, duration = _findings(run), f"all of {run.scenario.duration:g} s"
+    clearance = found.analyses["workspace"].summary.get("clearance", {})
+    if clearance.get("touching"):
+        findings.append(("fair", clearance["verdict"]))
     bad, fair = (
         "; ".join(text for level, text in findings if level == tone) for tone in ("bad", "fair")
     )
@@ -295,7 +301,7 @@ def verdict(found: ReportData) -> tuple[str, Tone]:
     if bad:
         text = f"Not reliable: {bad}. The run completed {duration}: E_ac is "
     error, floor = number(s["accumulated_error"]), s["delay_floor"]
-    average = f"{number(mean_error(run), 2)} % of peak to peak on average"
+    average = f"{number(mean_error(run), 2)} % {_of_what(run)}"
     if floor > 0:
         text += (
             f"{error} % s. The time before any torque can act contributes {number(floor)} % s; "
@@ -303,6 +309,7 @@ def verdict(found: ReportData) -> tuple[str, Tone]:
         )
     else:
         text += f"{error} % s, {average}."
+    text += f" Largest error: {worst(run).replace('%', '% of its motion')}."
     if fair:
         text += f" Caution: {fair}."
     return text, max((level for level, _ in findings), key=_LEVELS.index, default="good")
@@ -313,7 +320,7 @@ def _findings(run: SimulationResult) -> list[tuple[Tone, str]]:
     s, found, mean = run.summary, list[tuple[Tone, str]](), mean_error(run)
     margin, counts = s["controller_margin"], s["counts"]
     if margin is not None and margin["stable"] is False:
-        growth = f"errors grow {margin['spectral_radius']:.3g} fold per period"
+        growth = f"errors grow {fold(margin['spectral_radius'])} per period"
         found.append(("bad", f"the loop is unstable, {growth}"))
     samples = number_sent(run.scenario.duration, run.scenario.controller.period)
     wrong = counts["bad_measurements"]
@@ -331,11 +338,27 @@ def _findings(run: SimulationResult) -> list[tuple[Tone, str]]:
     return found
 
 
+def _of_what(run: SimulationResult) -> str:
+    """Return of what, and over which coordinates, `mean_error` is a mean."""
+    moved = moving(run)
+    if not moved.any():
+        return "of 1 rad and 1 m on average, as no coordinate moves"
+    names = ", ".join(np.array(COORDINATE_NAMES)[moved])
+    return "of peak to peak on average" + ("" if moved.all() else f" over what moves ({names})")
+
+
 def mean_error(run: SimulationResult) -> float:
-    """Return the mean error once torques can act, % of peak to peak; NaN if the run ended early."""
-    s, sc = run.summary, run.scenario
+    """Return the mean error of the moving coordinates once torques can act, % of peak to peak.
+
+    The mean is over all six if none moves, and NaN if the run ended early.
+    """
+    s, sc, moved = run.summary, run.scenario, moving(run)
     left = sc.duration - (sc.eta if s["delay_floor"] else 0.0)
-    return float((s["accumulated_error"] - s["delay_floor"]) / left) if left > 0 else np.nan
+    whole, signals = 6 * (s["accumulated_error"] - s["delay_floor"]), run.signals
+    if moved.any():  # E_ac has the others in % of 1 rad and 1 m
+        still = 100 * np.abs(signals.error.values[:, ~moved])
+        whole -= float(np.trapezoid(still, signals.time.values, axis=0).sum())
+    return whole / ((moved.sum() or 6) * left) if left > 0 else math.nan
 
 
 def first_report(made: NewMachine, result: SimulationResult, findings: Iterable[str]) -> Document:
@@ -344,6 +367,7 @@ def first_report(made: NewMachine, result: SimulationResult, findings: Iterable[
     `findings` are sentences about the motors, the loop and its delay.
     """
     check, completed = made.check, result.status == "completed"
+    good: Tone = "fair" if made.crossings else "good"
     drawing = Picture(lambda: mechanism_figure(check.mechanism), "The machine at its home pose.")
     figures = [
         Picture(figure, f"{name.capitalize()}.") for name, figure in draw_run(result).items()
@@ -351,10 +375,10 @@ def first_report(made: NewMachine, result: SimulationResult, findings: Iterable[
     motion = "Up and down by a quarter of the travel, once in two seconds."
     return Document(
         f"First report on {check.mechanism.name}",
-        " ".join(sentence(text) for text in (check.verdict, *findings)),
+        " ".join(sentence(text) for text in (check.verdict, *made.crossings, *findings)),
         [
             Section("The machine", drawing, *_blocks(describe(check))),
             Section("A first run", Paragraph(motion), *_blocks(run_document(result)), *figures),
         ],
-        "good" if completed else "bad",
+        good if completed else "bad",
     )

@@ -3,16 +3,24 @@
 import math
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from stewart_drake.loop.preparation import assemble, check_instants
 from stewart_drake.loop.results import SimulationResult
-from stewart_drake.reporting.document import Document, from_template, number
+from stewart_drake.reporting.document import Document, from_template, listed, number
+from stewart_drake.reporting.style import FACTORS, UNITS
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.signals import COORDINATE_NAMES
+from stewart_drake.scenario.signals import ANGLES, COORDINATE_NAMES, NUM_COORDINATES, POSITION
 from stewart_drake.studies.compare import PAPER_ERRORS, is_papers, label
 from stewart_drake.studies.verdict import loop_word
 from stewart_drake.studies.workspace_map import largest_factor
+from stewart_drake.types import Array
+
+_STILL: Final = 1e-9
+"""Motion below which a coordinate counts as still, rad or m."""
 
 _Runs = Mapping[str, SimulationResult]
 
@@ -25,10 +33,43 @@ def run_document(result: SimulationResult) -> Document:
         run=result,
         s=s,
         inf=math.inf,
-        names=COORDINATE_NAMES,
+        peaks=listed(_peaks(result)),
         events=[(n, name) for name, n in s["counts"].items() if n],
         cautions=s["warnings"],
     )
+
+
+def _span(run: SimulationResult) -> Array:
+    """Return the peak to peak (6,) of the recorded reference, rad and m."""
+    poses = run.signals.reference.values
+    return np.ptp(poses, axis=0) if len(poses) else np.zeros(NUM_COORDINATES)
+
+
+def moving(run: SimulationResult) -> NDArray[np.bool_]:
+    """Return which coordinates (6,) the reference moves."""
+    return _span(run) > _STILL
+
+
+def _peaks(run: SimulationResult) -> list[str]:
+    """Return the largest error of each coordinate, in % of its motion; of a still one absolute."""
+    percent, moved = run.summary["peak_error"], moving(run)
+    return [
+        f"{name} {number(percent[k], 2)} %"
+        if moved[k]
+        else f"{name} {number(round(FACTORS[k] * percent[k] / 100, 9))} {UNITS[k]}"
+        for k, name in enumerate(COORDINATE_NAMES)
+    ]
+
+
+def worst(run: SimulationResult) -> str:
+    """Return the coordinate with the largest error and that error, as in `_peaks`.
+
+    The error of a still coordinate is compared with the largest motion in its unit.
+    """
+    percent, span = np.array(run.summary["peak_error"]), _span(run)
+    largest = np.repeat([max(span[ANGLES].max(), _STILL), max(span[POSITION].max(), _STILL)], 3)
+    share = np.where(moving(run), percent, percent / largest)
+    return _peaks(run)[int(np.argmax(share))]
 
 
 def comparison_document(results: _Runs, tuned: _Runs | None = None) -> Document:
@@ -76,10 +117,11 @@ def _row(title: str, name: str, run: SimulationResult) -> dict[str, Any]:
     s, stopped = run.summary, run.stopped
     row = {"title": title, "name": name, "paper": _paper_error(name, run), "s": s}
     if stopped is None:
-        return row | {"error": s["accumulated_error"], "floor": s["delay_floor"], "cost": s["cost"]}
+        numbers = {"error": s["accumulated_error"], "floor": s["delay_floor"], "cost": s["cost"]}
+        return row | numbers | {"worst": worst(run)}
     leg = "" if stopped.leg is None else f", leg {stopped.leg}"
     ended = f"{run.status.replace('_', ' ')}\nat {stopped.time:.2f} s{leg}"
-    return row | {"error": ended, "floor": "-", "cost": "-"}
+    return row | {"error": ended, "worst": "-", "floor": "-", "cost": "-"}
 
 
 def _shared_warnings(results: _Runs) -> list[str]:

@@ -113,6 +113,14 @@ def count_bar(
         yield show
 
 
+@contextmanager
+def phase_bar(name: str, quiet: bool) -> Iterator[Callable[[str], None]]:
+    """Show on stderr the phase of a computation; yields a function of its text."""
+    with _bars(quiet, lambda: f"{name}: {bars.tasks[0].fields['state']}") as bars:
+        task = bars.add_task(name, total=None, state="computing")
+        yield lambda text: bars.update(task, state=text)
+
+
 def _update(bars: "Progress", task: "TaskID", completed: float, text: str) -> None:
     """Advance a bar and show its text with the estimated time left."""
     bars.update(task, completed=completed)

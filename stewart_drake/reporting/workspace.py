@@ -79,8 +79,7 @@ def _nearest_text(nearest: Nearest | None) -> str:
     if nearest is None:
         return "-"
     crossing = _crossing(nearest)
-    where = f"{nearest.pair}, t = {nearest.time:.2f} s"
-    return f"{number(1e3 * nearest.distance)} mm, {where}{crossing and f', {crossing}'}"
+    return f"{number(1e3 * nearest.distance)} mm, {nearest.where}{crossing and f', {crossing}'}"
 
 
 def _crossing(nearest: Nearest) -> str:

@@ -63,6 +63,12 @@ def as_scenario(given: Scenario | str | Path) -> Scenario:
     return given if isinstance(given, Scenario) else load_scenario(given)
 
 
+def title_of(scenario: str | Path) -> str:
+    """Return the name of a scenario in titles: its file's, or the folder's of scenario.yaml."""
+    path = Path(scenario)
+    return path.stem if path.stem != "scenario" else path.resolve().parent.name
+
+
 def load_compatible(
     name_or_path: str | Path,
     controller: str | Path | None = None,

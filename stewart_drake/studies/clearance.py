@@ -29,6 +29,10 @@ class Nearest(NamedTuple):
     time: float
 
     @property
+    def where(self) -> str:
+        return f"{self.pair}, t = {self.time:.2f} s"
+
+    @property
     def summary(self) -> dict[str, Any]:
         return {"parts": list(self.pair), "distance": self.distance, "time": self.time}
 
@@ -61,6 +65,21 @@ class ClearanceAlong(NamedTuple):
     def touching(self) -> list[Nearest]:
         """Links that cross somewhere, the deepest first."""
         return [one for one in self.nearest if not one.pair.fixed and one.distance < 0]
+
+    @property
+    def crossings(self) -> list[str]:
+        """Sentences about links that cross, and about a link inside the base's disc."""
+        found, disc = list[str](), self.disc
+        if self.touching:
+            worst, count = self.touching[0], len(self.touching)
+            pairs = "one pair of links crosses" if count == 1 else f"{count} pairs of links cross"
+            found.append(f"{pairs}, at worst {-1e3 * worst.distance:.3g} mm deep ({worst.where})")
+        if disc is not None and disc.distance < 0:
+            deep = f"{-1e3 * disc.distance:.3g} mm"
+            found.append(
+                f"{disc.pair.second} would enter the base's disc, as it is drawn, by {deep}"
+            )
+        return found
 
 
 class ClearTravel(NamedTuple):
@@ -107,19 +126,12 @@ class ClearanceStudy(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        least, disc = self.along.least(fixed=False), self.along.disc
+        least, apart = self.along.least(fixed=False), list[str]()
         if least is None:
             return "no pose is in reach, so that nothing is known of links that touch"
-        where = f"{least.pair}, t = {least.time:.2f} s"
-        drawn = ""
-        if disc is not None and disc.distance < 0:
-            deep = f"{-1e3 * disc.distance:.3g} mm"
-            drawn = f"; {disc.pair.second} would enter the base's disc, as it is drawn, by {deep}"
         if least.distance >= 0:
-            return f"links stay {1e3 * least.distance:.3g} mm apart at least ({where}){drawn}"
-        count = len(self.along.touching)
-        pairs = "one pair of links crosses" if count == 1 else f"{count} pairs of links cross"
-        return f"{pairs}, at worst {-1e3 * least.distance:.3g} mm deep ({where}){drawn}"
+            apart = [f"links stay {1e3 * least.distance:.3g} mm apart at least ({least.where})"]
+        return "; ".join(apart + self.along.crossings)
 
     @property
     def summary(self) -> dict[str, Any]:

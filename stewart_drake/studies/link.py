@@ -36,7 +36,7 @@ _FEW: Final = 0.4
 _NEARLY_ALL: Final = 0.999
 """Shares of the packets that arrive within the shortest and the longest bound tried."""
 _MOST_BOUNDS: Final = 12
-_SAME: Final = 0.01
+SAME: Final = 0.01
 """Relative difference of E_ac that does not matter."""
 
 
@@ -92,26 +92,27 @@ class LinkStudy:
         return best_of(self.bounds)
 
     @property
-    def alike(self) -> list[float]:
-        """Bounds whose E_ac the seeds do not tell from that of the best, s.
+    def alike(self) -> dict[float, float]:
+        """Bounds in s that the seeds do not show to be worse than the best, each with its excess.
 
-        They lost no more runs, and their mean is less than 1 % larger, or not larger at 5 % by a
-        one-sided t-test: of the differences, as the runs have the same seeds, or of two samples
-        where some runs were lost.
+        Excess: how much larger than the best's the mean E_ac may be, with 95 % confidence, as a
+        share; NaN for one seed. The interval is that of a t-test: of the differences, as the runs
+        have the same seeds, or of two samples where some runs were lost. A bound is worse if it
+        lost more runs, or if its mean is larger by 1 % and the one-sided test says so.
         """
-        best, found = self.best, list[float]()
+        best, found = self.best, dict[float, float]()
         for cell in self.bounds:
             if best is None or cell is best or len(cell.errors) < len(best.errors):
                 continue
-            worse = np.mean(cell.errors) / np.mean(best.errors) - 1
-            errors = cell.errors, best.errors
+            mean = np.mean(best.errors)
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore", RuntimeWarning)  # of errors that hardly differ
                 paired = cell.completed == best.completed == 1
                 test: Any = stats.ttest_rel if paired else stats.ttest_ind
-                p = test(*errors, alternative="greater").pvalue
-            if worse < _SAME or not p < 1 - CONFIDENCE:
-                found.append(cell.bound)
+                # Each end of the two-sided interval of 90 % is a one-sided one of 95 %.
+                ends = test(cell.errors, best.errors).confidence_interval(2 * CONFIDENCE - 1)
+            if np.mean(cell.errors) / mean - 1 < SAME or not ends.low > 0:
+                found[cell.bound] = float(ends.high / mean)
         return found
 
     @property
@@ -135,7 +136,7 @@ class LinkStudy:
     def summary(self) -> dict[str, Any]:
         return {
             "best_bound": None if self.best is None else self.best.bound,
-            "alike_bounds": self.alike,
+            "alike_bounds": list(self.alike),
             "usual_bound": self.usual,
             "survivable_loss": self.survivable,
             "runs": self.runs,

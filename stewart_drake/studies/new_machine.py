@@ -25,6 +25,7 @@ from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.law.startup import reference_torque
+from stewart_drake.loop.clearance import ClearanceScene
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import PatternSpec, load_mechanism, pattern_legs
@@ -33,6 +34,7 @@ from stewart_drake.mechanism.kinematics import leg_geometry, reachable_heights
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COORDINATES
+from stewart_drake.studies.clearance import clearance_along
 from stewart_drake.studies.study_options import Measurements
 from stewart_drake.studies.workspace_map import (
     Measures,
@@ -121,16 +123,20 @@ SCENARIO: Final = "scenario.yaml"
 _HEIGHTS: Final = 400
 _SHARE: Final = 0.25
 """Share of the travel of z that the first motion takes."""
+_ONCE: Final = 2.0
+_LOOKS: Final = 41
+"""Period of that motion, s, and number of its poses at which links are checked."""
 _PERIODS: Final = 25
 """Periods of delay up to which torques are computed every 20 ms, beyond that every 100 ms."""
 
 
 class NewMachine(NamedTuple):
-    """New machine with a first check; `peak_torque` in N m is that of the proposed motion."""
+    """New machine with a first check; torque and crossings are those of the proposed motion."""
 
     check: MechanismCheck
     margin: ControllerMargin
-    peak_torque: float
+    peak_torque: float  # N m
+    crossings: list[str]  # `ClearanceAlong.crossings`
 
     @property
     def verdict(self) -> str:
@@ -148,6 +154,7 @@ class NewMachine(NamedTuple):
         return self.check.summary | {
             "peak_torque": self.peak_torque,
             "controller_margin": self.margin.summary,
+            "crossings": self.crossings,
         }
 
 
@@ -228,7 +235,7 @@ reference:              # up and down
   kind: sine
   amplitude: [0, 0, 0, 0, 0, {amplitude}]
   offset: {home}
-  frequency: 0.5
+  frequency: {1 / _ONCE}
   frequency_unit: Hz
 
 plant: {{kind: exact, gravity: {str(m.gravity).lower()}}}
@@ -256,12 +263,16 @@ def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
             raise ConfigError(f"{check.verdict}; expected other lengths")
         scenario.write_text(scenario_text(m, mechanism))
         experiment = prepare(load_scenario(scenario))
+        time = np.linspace(0.0, _ONCE, _LOOKS)
+        poses = np.array([experiment.reference.value(t)[:, 0] for t in time])
+        along = clearance_along(ClearanceScene(mechanism), mechanism, time, poses)
         made = NewMachine(
             check,
             controller_margin(experiment),
             reference_torque(
                 experiment.nominal, experiment.reference, experiment.scenario.duration
             ),
+            along.crossings,
         )
         for path in (machine, scenario):
             write_whole(folder / path.name, path.read_bytes())

@@ -116,8 +116,8 @@ def loop_verdict(loop: ControllerMargin) -> str:
     assumed = f" ({'; '.join(assumptions)})" if assumptions else ""
     if not loop.stable:
         return (
-            f"this loop is unstable: linearised along the reference, errors grow {loop.radius:.3g} "
-            f"fold per period of {loop.period:g} s at t = {loop.time:.1f} s{assumed}"
+            "this loop is unstable: linearised along the reference, errors grow "
+            f"{fold(loop.radius)} per period of {loop.period:g} s at t = {loop.time:.1f} s{assumed}"
         )
     m = loop.margins
     up = f"{m.gain_up:.4g}" if math.isfinite(m.gain_up) else "any"
@@ -128,12 +128,17 @@ def loop_verdict(loop: ControllerMargin) -> str:
     )
 
 
+def fold(growth: float) -> str:
+    """Return a growth as `1.23 fold`, near 1 as `by 0.04 %`."""
+    return f"{growth:.3g} fold" if growth > 1.005 else f"by {100 * (growth - 1):.2g} %"
+
+
 def loop_word(margin: MarginSummary | None) -> str:
     """Return a few words on `controller_margin` in a run's summary."""
     if margin is None or margin["stable"] is None:
         return "not judged"
     if not margin["stable"]:
-        return f"unstable, {margin['spectral_radius']:.3g} fold per period"
+        return f"unstable, {fold(margin['spectral_radius'])} per period"
     return f"stable, delay margin {milliseconds(min(margin['delay_margin_s']))}"
 
 

@@ -110,18 +110,22 @@ class WorkspaceStudy:
     def verdict(self) -> str:
         opening = "" if self.home is None else f"the home pose is singular ({self.home.reason}); "
         time, leg, margin = self.worst
-        closing = f"{self._amplitude}; {self.clearance.verdict}"
+        parts = [self._amplitude, self.clearance.verdict]
         if self.exit is None:
-            return (
-                f"yes: {opening}the reference stays in the workspace, leg {leg} is nearest to the "
-                f"end of its reach with {1e3 * margin:.3g} mm left at t = {time:.2f} s; {closing}"
+            inside = f"yes: {opening}the reference stays in the workspace"
+            if self.clearance.along.touching:
+                inside += f", but {parts.pop()}"
+            nearest = (
+                f"leg {leg} is nearest to the end of its reach with {1e3 * margin:.3g} mm left at "
+                f"t = {time:.2f} s"
             )
+            return "; ".join([inside, nearest, *parts])
         short = ""
         if margin < 0:
             short = f", at worst leg {leg} is short by {-1e3 * margin:.3g} mm at t = {time:.2f} s"
         return (
             f"no: {opening}the reference leaves the workspace at t = {self.exit.time:.3f} s, "
-            f"{self.exit.reason}{short}; {closing}"
+            f"{self.exit.reason}{short}; {'; '.join(parts)}"
         )
 
     @property

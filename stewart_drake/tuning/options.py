@@ -98,7 +98,7 @@ class TrainingOptions(Options):
     workers: int | None = option(None, "Number of processes; all cores by default.", "N")
 
     def check(self) -> None:
-        """Refuse options of the other loss."""
+        """Refuse options of the other kind of training."""
         of_labels = {"labels": self.labels, "split": self.split, "density": self.density}
         of_regret = {"start": self.start, "workers": self.workers}
         if self.regret:

@@ -1,5 +1,5 @@
-/* See protocol.h. Numbers are put together byte by byte: neither the order of bytes nor the alignment
-   of this processor counts. */
+/* See protocol.h. Numbers are put together byte by byte, so that the byte order and the alignment of
+   this processor do not matter. */
 
 #include <math.h>
 #include <string.h>
@@ -114,7 +114,7 @@ static void hmac(stewart_key key, const uint8_t *data, size_t size, uint8_t *out
     digest_end(&s, outer);
 }
 
-/* Its first STEWART_TAG bytes. */
+/* The first STEWART_TAG bytes of the HMAC. */
 static void tag_of(stewart_key key, const uint8_t *data, size_t size, uint8_t *tag)
 {
     uint8_t whole[32];
@@ -230,8 +230,8 @@ static int same_kind(const uint8_t *data, const char *magic)
     return memcmp(data, magic, 4) == 0;
 }
 
-/* What head and tag of a datagram of a kind say; `at` is left at the body, of `body` bytes, at least
-   `least`. */
+/* Read and check head and tag of a datagram of a kind. `at` ends at the body, of `body` bytes, which are
+   at least `least`. */
 static int get_head(const char *magic, size_t least, const uint8_t *data, size_t size, stewart_key key,
                     stewart_head *h, const uint8_t **at, size_t *body)
 {
@@ -287,7 +287,7 @@ static void put_identity(uint8_t **at, const stewart_identity *identity)
     }
 }
 
-/* Whether all names can be printed. */
+/* Read an identity; return whether all names can be printed. */
 static int get_identity(const uint8_t **at, stewart_identity *identity)
 {
     int printable = 1;
@@ -381,7 +381,7 @@ int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key, ste
     if (m->kind == STEWART_OFFER)
         return get_identity(&at, &m->identity) ? STEWART_TAKEN : STEWART_MALFORMED;
     if (m->kind == STEWART_STATE)
-        get_numbers(&at, m->state, 8, 12); /* NaN is what was lost */
+        get_numbers(&at, m->state, 8, 12); /* NaN for a lost value */
     if (m->kind == STEWART_ENCODERS) {
         get_numbers(&at, m->zeros, 8, 6);
         get_numbers(&at, m->codes, 4, 6u * m->samples);

@@ -18,7 +18,7 @@
 
 #define WAITING 1024         /* largest number of waiting torques */
 #define WATCHDOG SECOND      /* ns of silence */
-#define FURTHEST (3600ull * SECOND)
+#define FURTHEST (3600ull * SECOND) /* longest time ahead for a begin or a plan */
 #define STALL (SECOND / 5)   /* delay of the process that is reported, ns */
 #define RECENT (10ull * SECOND) /* time for which a fault counts as preceding the next one */
 #define LAST_DATAGRAMS 3     /* datagrams at the end: some may be lost */
@@ -33,7 +33,7 @@ typedef struct {
     stewart_session session;
     stewart_offers offers;
     struct sockaddr_in driver;
-    uint64_t refused_session; /* session of it */
+    uint64_t refused_session; /* last session whose refusal was printed */
     int driven, stopped;
     /* torques */
     stewart_link buffer;
