@@ -27,6 +27,7 @@ and `disk_margins` expect. S leads from a torque added at the motors to the torq
 import math
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -50,7 +51,7 @@ from stewart_drake.law.stability import (
     spectral_radius,
     worst_margins,
 )
-from stewart_drake.loop.law_design import compose_law, longest_wait
+from stewart_drake.loop.law_design import DesignedLaw, compose_law, longest_wait
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.scenario.config import Scenario
@@ -77,6 +78,8 @@ _LARGEST: Final = 330
 """Rows of a loop above which it is not judged: fifty periods of delay."""
 _FEWEST: Final = 6
 _UNJUDGED: Final = Margins(*[math.nan] * 4)
+Judged = Scenario | str | Path | Experiment | DesignedLaw
+"""A loop of a scenario, or of a designed law with the machine that it assumes."""
 
 
 @dataclass(frozen=True)
@@ -150,18 +153,28 @@ class ControllerMargin:
         }
 
 
-def controller_margin(experiment: Experiment, until: float | None = None) -> ControllerMargin:
-    """Judge a scenario's loop along its reference, up to `until` in s, by default its duration.
+def controller_margin(loop: Judged, until: float | None = None) -> ControllerMargin:
+    """Judge stability and margins of a loop along its reference.
 
     Takes 0.2 s for a delay of ten periods.
+
+    Args:
+        loop: a scenario, a shipped name or a path; or a `DesignedLaw` with the machine it assumes.
+        until: s; None is the duration, or the horizon of the design.
+
+    Raises:
+        ConfigError: bad input, an unreachable reference.
     """
+    experiment = _experiment_of(loop)
     sc = experiment.scenario
     end = sc.duration if until is None else until
+    if not (isinstance(end, Real) and 0 <= end < math.inf):
+        raise ConfigError(f"until: got {end!r}; expected a number of seconds, 0 or more")
     if sc.controller.command != "torque":
         # The loops of servos are checked where the servos are made.
         problem = "servos close theirs at the machine, and nothing is fed back across the delay"
         return ControllerMargin(sc.controller.period, sc.eta, problem=problem, span=end)
-    truth, law = experiment.true_dynamics(), _law_at_last(experiment)
+    truth, law = _parts(loop, experiment)
     times = np.linspace(0.0, end, INSTANTS)
     poses = [evaluate(experiment.reference, t)[POSE] for t in times]
     inside = [margin(truth.mechanism, pose) > 0 for pose in poses]
@@ -228,18 +241,28 @@ def true_model(experiment: Experiment, truth: StewartDynamics, time: float) -> C
     return linear_model(*truth.derivatives(x[POSE], x[RATES], torque)[:2])
 
 
-def loop_at(experiment: Experiment, time: float) -> LinearLoop:
-    """Return the loop of a scenario about its reference at `time` in s."""
-    truth, law = experiment.true_dynamics(), _law_at_last(experiment)
-    return _loops(experiment, truth, law, np.array([time]))[0]
+def loop_at(loop: Judged, time: float) -> LinearLoop:
+    """Return a loop about its reference at `time` in s."""
+    experiment = _experiment_of(loop)
+    return _loops(experiment, *_parts(loop, experiment), np.array([time]))[0]
 
 
-def _law_at_last(experiment: Experiment) -> PredictiveLqi:
-    """Return the law, with the true delay if it estimates the delay."""
-    law = compose_law(experiment)
+def _experiment_of(loop: Judged) -> Experiment:
+    if isinstance(loop, DesignedLaw):
+        return loop.experiment
+    return loop if isinstance(loop, Experiment) else prepare(as_scenario(loop))
+
+
+def _parts(loop: Judged, experiment: Experiment) -> tuple[StewartDynamics, PredictiveLqi]:
+    """Return the true machine, and the law with the true delay if it estimates the delay."""
+    if isinstance(loop, DesignedLaw):
+        truth, law = loop.law.plant.dynamics, loop.law
+    else:
+        truth, law = experiment.true_dynamics(), compose_law(experiment)
     if not law.finds_delay:
-        return law
-    return replace(law, timeline=replace(law.timeline, delay=experiment.scenario.true_delay))
+        return truth, law
+    late = replace(law.timeline, delay=experiment.scenario.true_delay)
+    return truth, replace(law, timeline=late)
 
 
 def _loops(
@@ -313,28 +336,28 @@ class LinearModels(NamedTuple):
         )
 
 
-def linear_models(scenario: Scenario | str | Path, time: float | None = None) -> LinearModels:
-    """Return the loop of a scenario, linearised about its moving reference ("frozen").
+def linear_models(scenario: Judged, time: float | None = None) -> LinearModels:
+    """Return a loop, linearised about its moving reference ("frozen").
 
     An estimator, a tuner and torque limits are left out, see `controller_margin`.
 
     Args:
-        scenario: or a shipped name or a path.
+        scenario: or a shipped name, a path or a `DesignedLaw`.
         time: s; None is that of the largest spectral radius.
 
     Raises:
         ConfigError: bad input, an unreachable reference; no time, and a loop that was not judged.
     """
-    loaded = as_scenario(scenario)
-    experiment = prepare(loaded)
+    loop = scenario if isinstance(scenario, DesignedLaw) else _experiment_of(scenario)
+    duration = _experiment_of(loop).scenario.duration
     if time is None:
-        margin = controller_margin(experiment)
+        margin = controller_margin(loop)
         if margin.problem:
             raise ConfigError(f"time: got None, but {margin.problem}; expected a time in s")
         time = margin.time
-    elif not 0 <= time <= loaded.duration:
-        raise ConfigError(f"time: got {time!r}; expected 0 to {loaded.duration:g} s")
-    return state_spaces(loop_at(experiment, time), time)
+    elif not (isinstance(time, Real) and 0 <= time <= duration):
+        raise ConfigError(f"time: got {time!r}; expected 0 to {duration:g} s")
+    return state_spaces(loop_at(loop, time), time)
 
 
 def state_spaces(loop: LinearLoop, time: float = 0.0) -> LinearModels:

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -12,8 +13,9 @@ from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.yamlio import validate
+from stewart_drake.files.yamlio import brief, validate
 from stewart_drake.law.catch_up import CatchUp
 from stewart_drake.law.channel import Packets, Wire
 from stewart_drake.law.clear_space import ClearSpace
@@ -61,9 +63,10 @@ from stewart_drake.loop.preparation import (
     Experiment,
     calibration_of,
     check_instants,
+    check_reach,
     estimated_names,
 )
-from stewart_drake.mechanism.geometry import plate_radius
+from stewart_drake.mechanism.geometry import fixed, plate_radius, positive
 from stewart_drake.scenario.calibration import OFFSETS, believed_delay
 from stewart_drake.scenario.config import ControllerConfig, Scenario, StateSensorConfig
 from stewart_drake.scenario.delay import Delay
@@ -464,6 +467,7 @@ class DesignedLaw:
         planned: trajectory that the law follows: the reference, or first a way onto it.
         queue: (L, 6) assumed torques in flight at t = 0 in N m, oldest first.
         weights: (2,) w_Q and w_R.
+        experiment: from which `sd.controller_margin` and `sd.linear_models` make the loop.
     """
 
     law: PredictiveLqi
@@ -471,6 +475,7 @@ class DesignedLaw:
     planned: Trajectory
     queue: Array
     weights: Array
+    experiment: Experiment
 
     def __repr__(self) -> str:
         timeline, dynamics = self.law.timeline, self.law.plant.dynamics
@@ -531,31 +536,34 @@ def design_law(
             gravity and `equilibrium` with it.
         noise_std: (12,) of the measurement, rad, m and per s.
         torque_limit: of each motor, N m; None is the mechanism's, if it has one.
-        horizon: part of the reference for the choice of weights and steps, s; by default all of it,
-            or 10 s of an endless one.
+        horizon: part of the reference for the choice of weights and steps, and for the check of
+            its reach, s; by default all of it, or 10 s of an endless one.
         options: other options, as a scenario's `controller`; its period and delay are ignored.
 
     Raises:
         ConfigError: one line.
     """
-    if not (math.isfinite(delay) and delay >= 0):
+    options = ControllerConfig() if options is None else options
+    kinds = {"dynamics": StewartDynamics, "reference": Trajectory, "options": ControllerConfig}
+    for (name, kind), value in zip(kinds.items(), (dynamics, reference, options), strict=True):
+        if not isinstance(value, kind):
+            raise ConfigError(f"{name}: got {brief(value)}; expected a {kind.__name__}")
+    period = positive("period", period)
+    if not (isinstance(delay, Real) and 0 <= delay < math.inf):
         raise ConfigError(f"delay: got {delay!r}; expected a number of seconds, 0 or more")
-    if not (math.isfinite(period) and period > 0):
-        raise ConfigError(f"period: got {period!r}; expected a number of seconds above 0")
-    chosen = dataclasses.asdict(ControllerConfig() if options is None else options)
     if horizon is None:
         horizon = reference.end_time() if math.isfinite(reference.end_time()) else _HORIZON
     believed = Delay.of(delay, period)
     sections = {
-        "duration": horizon,
+        "duration": positive("horizon", horizon),
         "start": "on_reference" if start is None else "rest",
         "queue": ("zero" if dynamics.gravity == 0 else "equilibrium") if queue is None else queue,
         "plant": {"kind": "exact", "gravity": dynamics.gravity != 0},
         "delay": dataclasses.asdict(believed),
-        "controller": chosen
+        "controller": dataclasses.asdict(options)
         | {"period": period, "delay_steps": believed.steps, "delay_fraction": believed.fraction},
         "actuator": {"torque_limit": torque_limit},
-        "sensor": {"noise_std": np.asarray(noise_std, dtype=float).tolist()},
+        "sensor": {"noise_std": fixed("noise_std", noise_std, (NUM_STATE,)).tolist()},
     }
     scenario = validate(Scenario, sections, "design_law")
     scenario.check("design_law")
@@ -570,10 +578,7 @@ def design_law(
         )
     motion = own_motion(reference, horizon)
     first = evaluate(motion, 0.0)[:NUM_STATE]
-    at = first if start is None else np.array(start, dtype=np.float64)
-    if at.shape != (NUM_STATE,):
-        raise ConfigError(f"start: got shape {at.shape}; expected ({NUM_STATE},), pose and rates")
-    dynamics.equilibrium_torque(at[POSE])  # raises if out of reach
+    at = first if start is None else fixed("start", start, (NUM_STATE,))
     experiment = Experiment(
         scenario=scenario,
         mechanism=dynamics.mechanism,
@@ -586,7 +591,10 @@ def design_law(
         own=Own(reference=reference),
         calibration=calibration_of(scenario, dynamics.mechanism),
     )
+    check_reach(experiment)
+    if outside := diagnose(dynamics.mechanism, 0.0, at[POSE]):
+        raise ConfigError(f"start: {outside.reason}; expected a pose within reach")
     law, planned, _ = control_law(experiment)
     c = scenario.controller
     flying = first_queue(experiment, law)
-    return DesignedLaw(law, motion, planned, flying, np.array(c.weights))
+    return DesignedLaw(law, motion, planned, flying, np.array(c.weights), experiment)

@@ -25,7 +25,6 @@ from stewart_drake.loop.sampling import dispose
 from stewart_drake.loop.scene import Live
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.run_log import RunLog, open_log
 from stewart_drake.scenario.timing import instants, look_time
 
@@ -93,13 +92,6 @@ def simulate(
         ConfigError: bad input, an unreachable reference.
         TypeError: another type of scenario, or systems of your own with an `Experiment`.
     """
-    if isinstance(scenario, str | Path):
-        scenario = load_scenario(scenario)
-    if not isinstance(scenario, Scenario | Experiment):
-        raise TypeError(
-            f"scenario: got a {type(scenario).__name__}; expected a Scenario, or the name or path "
-            "of one"
-        )
     # Matrices of twenty rows are slower on several threads, up to fifty times on busy cores.
     with one_blas_thread:
         experiment = concrete(

@@ -12,10 +12,12 @@ Frames, in Drake's monogram notation, leg by leg (leading axis of length six):
 """
 
 import hashlib
+import math
 import re
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
-from typing import Final
+from numbers import Integral, Real
+from typing import Any, Final
 
 import numpy as np
 
@@ -349,6 +351,20 @@ def fixed(field: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
         raise ConfigError(f"{field}: got {_listed(copy)}; expected finite numbers")
     copy.setflags(write=False)
     return copy
+
+
+def positive(field: str, value: Any) -> float:
+    """Return a finite number above 0."""
+    if not (isinstance(value, Real) and 0 < float(value) < math.inf):
+        raise ConfigError(f"{field}: got {value!r}; expected a finite number above 0")
+    return float(value)
+
+
+def whole(field: str, value: Any, least: int) -> int:
+    """Return a whole number of at least `least`."""
+    if not isinstance(value, Integral) or value < least:
+        raise ConfigError(f"{field}: got {value!r}; expected a whole number, {least} or more")
+    return int(value)
 
 
 def _listed(values: Array) -> str:
