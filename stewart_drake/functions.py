@@ -36,7 +36,8 @@ from stewart_drake.reporting.page import Provenance
 from stewart_drake.reporting.results import AnalysisResult, SimulationResult, analysis_result
 from stewart_drake.scenario.calibration import save_calibration
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import as_scenario, load_scenario, scenario_yaml
+from stewart_drake.scenario.loading import as_scenario, scenario_yaml
+from stewart_drake.scenario.run_log import is_run
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.new_machine import (
     MechanismCheck,
@@ -44,7 +45,7 @@ from stewart_drake.studies.new_machine import (
     check_mechanism,
     new_machine,
 )
-from stewart_drake.studies.options import takes
+from stewart_drake.studies.options import refuse, takes
 from stewart_drake.studies.study_options import Measurements
 from stewart_drake.tuning.options import DataOptions, EvaluationOptions, TrainingOptions
 
@@ -84,10 +85,17 @@ def identify(
     paths = [logs] if isinstance(logs, str | Path) else list(logs)
     machine = as_mechanism(mechanism)
     typed = command or f"sd.identify({[str(path) for path in paths]!r}, {mechanism!r})"
+    if not paths:
+        raise ConfigError("logs: got none; expected one or more")
+    if delay is not None and not 0 <= delay <= 100:
+        raise ConfigError(f"delay: got {delay!r}; expected 0 to 100 s")
+    if all(is_run(Path(path)) for path in paths):
+        of_csv = {"precision": precision, "gravity": None if gravity else gravity}
+        refuse(of_csv, "with logs of runs, which contain it; expected it with a CSV log only")
     if any(is_servo_log(Path(path)) for path in paths):
         if len(paths) > 1 or delay is not None or tolerances is not None:
             raise ConfigError(
-                f"{paths[0]}: got more than one log of setpoints, --delay or --tolerance; expected "
+                f"{paths[0]}: got more than one log of setpoints, a delay or tolerances; expected "
                 "one log, whose delay is found without any"
             )
         log = read_servo_log(Path(paths[0]), machine)
@@ -133,7 +141,7 @@ def plan_identification(
     if loaded.actuator.kind == "position_servo":
         if poses or tolerances is not None:
             raise ConfigError(
-                "--plan: got --pose-std or --tolerance with position servos; expected neither, "
+                "plan: got measured poses or tolerances with position servos; expected neither, "
                 "their log has setpoints and crank angles"
             )
         rounding = _CODE_12_BITS if precision is None else precision.angle
@@ -244,10 +252,12 @@ def setpoints(
     Raises:
         ConfigError: bad input, or a motion beyond a limit, with time and motor.
     """
-    if not isinstance(scenario, Scenario):
-        scenario = load_scenario(scenario, controller, settings)
+    if out is None:
+        refuse({"units": units}, "without out; expected both or neither")
     told = None if units is None else load_units(units)
-    made = make_setpoints(scenario, rate, plain=plain, start=start)
+    made = make_setpoints(
+        as_scenario(scenario, controller, settings), rate, plain=plain, start=start
+    )
     if out is not None:
         made.save(out, told)
     return made
@@ -276,11 +286,9 @@ def export_c(
     Raises:
         ConfigError: a law that has no C.
     """
-    if not isinstance(scenario, Scenario):
-        scenario = load_scenario(scenario, controller, settings)
-    folder = Path(directory)
+    loaded, folder = as_scenario(scenario, controller, settings), Path(directory)
     folder.mkdir(parents=True, exist_ok=True)
-    return write(exported(scenario, single), folder)
+    return write(exported(loaded, single), folder)
 
 
 @takes(Measurements)
@@ -444,7 +452,7 @@ def train_tuner(
 @takes(EvaluationOptions)
 def evaluate_tuner(
     directory: str | Path,
-    networks: Sequence[str | Path] = (),
+    networks: str | Path | Sequence[str | Path] = (),
     scenario: str | Path = "paper",
     controller: str | Path | None = None,
     settings: Iterable[str] = (),
@@ -457,7 +465,7 @@ def evaluate_tuner(
 
     Args:
         directory: where the runs are kept, so that a second call goes on with them.
-        networks: shipped names or files; none for the shipped one.
+        networks: shipped name or file, or several; none for the shipped one.
         scenario: shipped name or path.
         controller: laid over the scenario's own.
         settings: as `load_scenario` takes them.
@@ -469,6 +477,7 @@ def evaluate_tuner(
     from stewart_drake.tuning.evaluation import evaluate
 
     family, started = options.conditions(scenario, controller, settings), time.perf_counter()
+    networks = [networks] if isinstance(networks, str | Path) else networks
     found = evaluate(family, networks, directory, progress=progress, **options.jobs)
     command = command or f"sd.evaluate_tuner({str(directory)!r}, {list(networks)!r})"
     return _timed(

@@ -15,7 +15,7 @@ from stewart_drake.reporting.results import AnalysisResult, ComparisonResult, Si
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import as_scenario
 from stewart_drake.studies import compare as comparison
-from stewart_drake.studies.options import argument_lines
+from stewart_drake.studies.options import argument_lines, naming_arguments
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -77,7 +77,7 @@ def analysis_function(name: str) -> Callable[..., AnalysisResult]:
         loaded = as_scenario(scenario)
         if row.exact:
             loaded, given = _exact(loaded), _exact(given)
-        with TemporaryDirectory() as scratch:
+        with TemporaryDirectory() as scratch, naming_arguments(options_of(name), signature):
             return analyze(
                 name,
                 loaded,

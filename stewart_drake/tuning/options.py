@@ -87,7 +87,7 @@ class EvaluationOptions(FamilyOptions):
 class TrainingOptions(Options):
     """Options of the training of a network."""
 
-    regret: bool = option(False, "Train by regret, on data of a --family; else as in the paper.")
+    regret: bool = option(False, "Train by regret, on data of a family; else as in the paper.")
     start: float | None = option(
         None, "With --regret: log10 w_Q / w_R at first; else the best.", "RATIO"
     )
