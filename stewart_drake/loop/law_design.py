@@ -14,8 +14,9 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import diagnose
+from stewart_drake.files.arguments import fixed, of_kind, positive
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.yamlio import brief, validate
+from stewart_drake.files.yamlio import validate
 from stewart_drake.law.catch_up import CatchUp
 from stewart_drake.law.channel import Packets, Wire
 from stewart_drake.law.clear_space import ClearSpace
@@ -66,7 +67,7 @@ from stewart_drake.loop.preparation import (
     check_reach,
     estimated_names,
 )
-from stewart_drake.mechanism.geometry import fixed, plate_radius, positive
+from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.scenario.calibration import OFFSETS, believed_delay
 from stewart_drake.scenario.config import ControllerConfig, Scenario, StateSensorConfig
 from stewart_drake.scenario.delay import Delay
@@ -546,8 +547,7 @@ def design_law(
     options = ControllerConfig() if options is None else options
     kinds = {"dynamics": StewartDynamics, "reference": Trajectory, "options": ControllerConfig}
     for (name, kind), value in zip(kinds.items(), (dynamics, reference, options), strict=True):
-        if not isinstance(value, kind):
-            raise ConfigError(f"{name}: got {brief(value)}; expected a {kind.__name__}")
+        of_kind(name, value, kind)
     period = positive("period", period)
     if not (isinstance(delay, Real) and 0 <= delay < math.inf):
         raise ConfigError(f"delay: got {delay!r}; expected a number of seconds, 0 or more")
@@ -563,7 +563,7 @@ def design_law(
         "controller": dataclasses.asdict(options)
         | {"period": period, "delay_steps": believed.steps, "delay_fraction": believed.fraction},
         "actuator": {"torque_limit": torque_limit},
-        "sensor": {"noise_std": fixed("noise_std", noise_std, (NUM_STATE,)).tolist()},
+        "sensor": {"noise_std": fixed("noise_std", noise_std, (NUM_STATE,), 0.0).tolist()},
     }
     scenario = validate(Scenario, sections, "design_law")
     scenario.check("design_law")

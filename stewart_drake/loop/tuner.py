@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context
 
+from stewart_drake.files import arguments
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
@@ -60,6 +61,7 @@ class DensityWindow(SteppedLaw):
 
     def __init__(self, period: float, kind: Kind = "magnitude") -> None:
         super().__init__()
+        arguments.one_of("kind", kind, get_args(Kind))
         self._measurement = self.DeclareVectorInputPort("measurement", NUM_STATE)
         self._reference = self.DeclareVectorInputPort("reference", NUM_REFERENCE)
         self._torque = self.DeclareVectorInputPort("torque", NUM_TORQUES)
@@ -114,7 +116,9 @@ class AnnTuner(SteppedLaw):
         self, network: Network, fixed: Array, period: float, factor: float = MAX_FACTOR
     ) -> None:
         super().__init__()
-        self._network, self._fixed, self._factor = network, np.array(fixed), factor
+        arguments.of_kind("network", network, Network)
+        self._network, self._fixed = network, arguments.fixed("fixed", fixed, (len(WEIGHTS),), 0.0)
+        self._factor = arguments.positive("factor", factor)
         self._density = self.DeclareVectorInputPort("density", NUM_INPUTS)
         self._begin((np.full(len(WEIGHTS), np.nan), 0), period)
         self._put_out("weights", len(WEIGHTS), lambda memory: memory[0], now=True)
