@@ -240,7 +240,7 @@ def setpoints(
     has the equations.
 
     Args:
-        scenario: or a shipped name or a path; its `actuator.kind` is `position_servo`.
+        scenario: a Scenario, a shipped name or a path; its `actuator.kind` is `position_servo`.
         rate: of the setpoints, Hz.
         out: CSV file to write, if not None.
         plain: whether to send the angles of the reference, without compensation.
@@ -274,7 +274,7 @@ def export_c(
     """Write the controller as a folder of C that builds with its own Makefile.
 
     Args:
-        scenario: or a shipped name or a path.
+        scenario: a Scenario, a shipped name or a path.
         directory: of the files; it is made.
         controller: laid over the scenario's own; for a name or a path.
         settings: as `load_scenario` takes them; for a name or a path.
@@ -337,7 +337,7 @@ def run_live(
     """Drive a machine over UDP in real time.
 
     Args:
-        scenario: or a shipped name or a path.
+        scenario: a Scenario, a shipped name or a path.
         machine: HOST:PORT where it listens.
         OPTIONS
 
@@ -369,7 +369,7 @@ def run_machine(scenario: Scenario | str | Path, *, options: MachineOptions) -> 
     Returns what happened.
 
     Args:
-        scenario: or a shipped name or a path; its plant, sensor, delay, link and limits.
+        scenario: a Scenario, a shipped name or a path; its plant, sensor, delay, link and limits.
         OPTIONS
     """
     from stewart_drake.live.reachy import open_chosen

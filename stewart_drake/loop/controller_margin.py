@@ -84,23 +84,38 @@ Judged = Scenario | str | Path | Experiment | DesignedLaw
 
 @dataclass(frozen=True)
 class ControllerMargin:
-    """The loop at its worst along the reference."""
+    """The loop at its worst along the reference.
 
-    period: float  # of the controller, s
-    eta: float  # true total delay, s
-    # largest spectral radius, the factor on an error per period; NaN with a `problem`
+    Attributes:
+        period: of the controller, s.
+        eta: true total delay, s.
+        radius: largest spectral radius, the factor on an error per period; NaN with a `problem`.
+        time: of that radius, s.
+        margins: the least errors of the delay in s, `shorter` and `longer`, and factors of the
+            motors, `gain_down` and `gain_up`, at the edge of stability; NaN with a `problem`.
+        pole: fastest unstable pole of the open loop, 1/s; 0 without one.
+        pole_time: of that pole, s.
+        estimated: whether an estimator is assumed to have found the unknown parameters.
+        delay_found: whether it is assumed to have found the delay too.
+        tuned: whether a tuner changes the weights.
+        problem: why the loop was not judged, or empty.
+        loops: the judged ones in the order of time, evenly over `span`; none with a `problem`.
+        span: s.
+    """
+
+    period: float
+    eta: float
     radius: float = math.nan
-    time: float = math.nan  # of that radius, s
-    margins: Margins = _UNJUDGED  # the least of each kind; NaN with a `problem`
-    pole: float = 0.0  # fastest unstable pole of the open loop, 1/s; 0 without one
-    pole_time: float = 0.0  # of that pole, s
-    estimated: bool = False  # whether an estimator is assumed to have found the unknown parameters
-    delay_found: bool = False  # whether it is assumed to have found the delay too
-    tuned: bool = False  # whether a tuner changes the weights
-    problem: str = ""  # why the loop was not judged, or empty
-    # the judged ones in the order of time, evenly over `span`; none with a `problem`
+    time: float = math.nan
+    margins: Margins = _UNJUDGED
+    pole: float = 0.0
+    pole_time: float = 0.0
+    estimated: bool = False
+    delay_found: bool = False
+    tuned: bool = False
+    problem: str = ""
     loops: tuple[LinearLoop, ...] = field(default=(), repr=False)
-    span: float = 0.0  # s
+    span: float = 0.0
     _growths: dict[float, float] = field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -156,10 +171,11 @@ class ControllerMargin:
 def controller_margin(loop: Judged, until: float | None = None) -> ControllerMargin:
     """Judge stability and margins of a loop along its reference.
 
-    Takes 0.2 s for a delay of ten periods.
+    Takes 0.2 s for a delay of ten periods. An estimator, a tuner and torque limits are left out.
 
     Args:
-        loop: a scenario, a shipped name or a path; or a `DesignedLaw` with the machine it assumes.
+        loop: a scenario, prepared or not, a shipped name or a path; or a `DesignedLaw`, with the
+            machine and the delay that it assumes.
         until: s; None is the duration, or the horizon of the design.
 
     Raises:
@@ -342,7 +358,7 @@ def linear_models(scenario: Judged, time: float | None = None) -> LinearModels:
     An estimator, a tuner and torque limits are left out, see `controller_margin`.
 
     Args:
-        scenario: or a shipped name, a path or a `DesignedLaw`.
+        scenario: a Scenario, a shipped name or a path; or a `DesignedLaw`.
         time: s; None is that of the largest spectral radius.
 
     Raises:

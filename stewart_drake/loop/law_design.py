@@ -524,6 +524,8 @@ def design_law(
 ) -> DesignedLaw:
     """Design the delayed LQI law for a machine and a motion.
 
+    `sd.controller_margin` computes the stability margins of the result.
+
     Args:
         dynamics: the machine that the law assumes. Its `free` parameters are estimated; those of
             `options.estimate` where they are the default ones.
@@ -542,7 +544,7 @@ def design_law(
         options: other options, as a scenario's `controller`; its period and delay are ignored.
 
     Raises:
-        ConfigError: one line.
+        ConfigError: bad input, a reference or a start out of reach.
     """
     options = ControllerConfig() if options is None else options
     kinds = {"dynamics": StewartDynamics, "reference": Trajectory, "options": ControllerConfig}

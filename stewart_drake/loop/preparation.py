@@ -211,7 +211,7 @@ def concrete(
     """Prepare a scenario with the user's systems, or return an Experiment as it is.
 
     Args:
-        scenario: either, or a shipped name or a path.
+        scenario: a scenario, prepared or not, or a shipped name or a path.
         true_mechanism: the machine to simulate, that of the scenario's plant if None.
         **own: see `loop.simulation.simulate`.
 

@@ -79,7 +79,8 @@ def simulate(
             `controller.period`, and of the inputs `density` (18), `measurement` (12) and
             `reference` (18) those that it needs. With encoders `measurement` is the estimate of the
             sample before.
-        progress: called every 20 ms of simulated time; its exceptions reach the caller.
+        progress: called every 20 ms of simulated time, with that time in s and the error in % of
+            peak to peak; its exceptions reach the caller.
         meshcat: shows the machine, its reference and the torques live, at most in real time, or
             None.
         true_mechanism: the machine to simulate; by default that of the scenario's plant.

@@ -114,7 +114,7 @@ def _signature(name: str) -> inspect.Signature:
 
 def _documentation(name: str) -> str:
     row = ANALYSES[name]
-    meanings = {"scenario": "or a shipped name or a path."}
+    meanings = {"scenario": "a Scenario, a shipped name or a path."}
     meanings |= {one.name: one.help for one in options_of(name).described()}
     if row.keeps:
         meanings["directory"] = f"folder of the {row.keeps}, from which a second call continues."

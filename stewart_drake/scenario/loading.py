@@ -40,7 +40,7 @@ def load_scenario(
     Args:
         name_or_path: a shipped name or a YAML file. Paths inside the file start from its folder;
             missing fields keep their defaults.
-        controller: a controller to lay over it, as `load_controller` takes it.
+        controller: a shipped name or a YAML file, laid over the scenario's own.
         settings: `section.field=value` or `field=value`, the value in YAML, e.g.
             `plant.gravity=true`; paths start from the working directory. A setting of a section's
             kind also drops the file's fields of another kind. `overlay=dirty` lays the fields of a
