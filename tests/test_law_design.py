@@ -99,7 +99,7 @@ def test_without_a_start_it_begins_on_the_reference():
     [
         ({"delay": -0.1}, "delay: got -0.1"),
         ({"delay": np.nan}, "delay: got nan"),
-        ({"delay": "late"}, "delay: got 'late'; expected a number of seconds"),
+        ({"delay": "late"}, "delay: got 'late'; expected numbers"),
         ({"period": 0.0}, "period: got 0.0"),
         ({"period": "0.1"}, "period: got '0.1'; expected a finite number above 0"),
         ({"horizon": np.inf}, "horizon: got inf; expected a finite number above 0"),
@@ -108,7 +108,7 @@ def test_without_a_start_it_begins_on_the_reference():
         ({"reference": PiecewisePolynomial((PAPER.home + 9.0).reshape(6, 1))}, "reference: leg"),
         ({"options": {}}, "options: got {}; expected a ControllerConfig"),
         ({"start": np.full(12, np.nan)}, "start: got [nan"),
-        ({"start": np.full(12, 9.0)}, "start: leg"),
+        ({"start": np.full(12, 9.0)}, "start: got a pose where leg"),
         ({"noise_std": "low"}, "noise_std: got 'low'; expected numbers"),
         ({"start": np.zeros(6)}, "start: got shape (6,); expected (12,)"),
         ({"reference": PiecewisePolynomial(np.zeros((3, 1)))}, "got shape (3, 1)"),

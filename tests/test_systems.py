@@ -210,11 +210,11 @@ NETWORK = load_network(resolve("weights", "tuner"))
         (lambda: StateSensing(TWELVE[:6], SIX), "noise_std: got shape (6,)"),
         (
             lambda: EncoderSensing(PAPER, 1, NAN, TWELVE, SIX, SIX, np.zeros(6)),
-            "quantum: got [nan]",
+            "quantum: got nan",
         ),
         (lambda: DelaySettings(0.1, 0.0, 1.0), "std: got 0.0"),
         (lambda: DelaySettings(0.1, 0.1, NAN), "longest: got nan"),
-        (lambda: Replan(NAN, SIX), "duration: got [nan]"),
+        (lambda: Replan(NAN, SIX), "duration: got nan"),
     ],
 )
 def test_a_bad_argument_is_one_line_at_construction(make, message):

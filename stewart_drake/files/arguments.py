@@ -17,9 +17,12 @@ def fixed(
 ) -> Array:
     """Return a read-only copy of finite numbers of this shape, of at least `least`."""
     try:
-        copy = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ConfigError(f"{field}: got {values!r}; expected numbers") from None
+        given = np.array(values)
+    except (TypeError, ValueError):  # ragged
+        given = np.array(None)
+    if given.dtype.kind not in "biuf":
+        raise ConfigError(f"{field}: got {brief(values)}; expected numbers")
+    copy = given.astype(np.float64)
     if copy.shape != shape:
         raise ConfigError(f"{field}: got shape {copy.shape}; expected {shape or 'one number'}")
     if not np.all(np.isfinite(copy)):
@@ -31,7 +34,9 @@ def fixed(
 
 
 def listed(values: Array) -> str:
-    return "[" + ", ".join(f"{v:g}" for v in np.ravel(values)) + "]"
+    """Return numbers as text, an array in brackets."""
+    text = ", ".join(f"{v:g}" for v in np.ravel(values))
+    return f"[{text}]" if np.ndim(values) else text
 
 
 def positive(field: str, value: Any) -> float:

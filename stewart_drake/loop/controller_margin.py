@@ -27,7 +27,6 @@ and `disk_margins` expect. S leads from a torque added at the motors to the torq
 import math
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from numbers import Real
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -35,6 +34,7 @@ import numpy as np
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
+from stewart_drake.files.arguments import fixed
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.cost import law_gain
 from stewart_drake.law.delay_model import ContinuousModel, chain, linear_model
@@ -183,9 +183,7 @@ def controller_margin(loop: Judged, until: float | None = None) -> ControllerMar
     """
     experiment = _experiment_of(loop)
     sc = experiment.scenario
-    end = sc.duration if until is None else until
-    if not (isinstance(end, Real) and 0 <= end < math.inf):
-        raise ConfigError(f"until: got {end!r}; expected a number of seconds, 0 or more")
+    end = sc.duration if until is None else float(fixed("until", until, (), 0.0))
     if sc.controller.command != "torque":
         # The loops of servos are checked where the servos are made.
         problem = "servos close theirs at the machine, and nothing is fed back across the delay"
@@ -371,7 +369,8 @@ def linear_models(scenario: Judged, time: float | None = None) -> LinearModels:
         if margin.problem:
             raise ConfigError(f"time: got None, but {margin.problem}; expected a time in s")
         time = margin.time
-    elif not (isinstance(time, Real) and 0 <= time <= duration):
+    time = float(fixed("time", time, ()))
+    if not 0 <= time <= duration:
         raise ConfigError(f"time: got {time!r}; expected 0 to {duration:g} s")
     return state_spaces(loop_at(loop, time), time)
 

@@ -4,7 +4,6 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from numbers import Real
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -550,12 +549,10 @@ def design_law(
     kinds = {"dynamics": StewartDynamics, "reference": Trajectory, "options": ControllerConfig}
     for (name, kind), value in zip(kinds.items(), (dynamics, reference, options), strict=True):
         of_kind(name, value, kind)
-    period = positive("period", period)
-    if not (isinstance(delay, Real) and 0 <= delay < math.inf):
-        raise ConfigError(f"delay: got {delay!r}; expected a number of seconds, 0 or more")
+    period, late = positive("period", period), float(fixed("delay", delay, (), 0.0))
     if horizon is None:
         horizon = reference.end_time() if math.isfinite(reference.end_time()) else _HORIZON
-    believed = Delay.of(delay, period)
+    believed = Delay.of(late, period)
     sections = {
         "duration": positive("horizon", horizon),
         "start": "on_reference" if start is None else "rest",
@@ -595,7 +592,7 @@ def design_law(
     )
     check_reach(experiment)
     if outside := diagnose(dynamics.mechanism, 0.0, at[POSE]):
-        raise ConfigError(f"start: {outside.reason}; expected a pose within reach")
+        raise ConfigError(f"start: got a pose where {outside.reason}; expected one within reach")
     law, planned, _ = control_law(experiment)
     c = scenario.controller
     flying = first_queue(experiment, law)
