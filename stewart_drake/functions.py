@@ -354,6 +354,8 @@ def run_live(
 
     options.check_learned()
     if options.learn:
+        of_run = options.model_dump(include={"duration", "log", "mirror"})
+        refuse(of_run, "with --learn; expected none")
         learnt = learn_live(as_scenario(scenario), machine, options, print)
         return SimulationResult.of(learnt)
     ready = prepare_session(as_scenario(scenario), address_of(machine), read_key(options.key))

@@ -77,6 +77,10 @@ def test_the_signature_of_an_analysis_shows_its_options():
         (lambda: sd.evaluate_tuner("none", ["a", "b"]), "networks: got 2 without family"),
         (lambda: sd.evaluate_tuner("none", "nowhere"), "weights: got 'nowhere'"),
         (lambda: sd.run_live("paper", "nowhere"), "machine: got 'nowhere'; expected HOST:PORT"),
+        (
+            lambda: sd.run_live("paper", "127.0.0.1:9", learn=2, duration=1.0),
+            "duration: got 1.0 with learn; expected none",
+        ),
         (lambda: sd.simulate("paper", log="run.txt"), "log: got 'run.txt'; expected a file"),
         (
             lambda: sd.plan_identification("reachy_mini", poses=True),

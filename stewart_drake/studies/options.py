@@ -142,7 +142,7 @@ def in_python(text: str, kind: type[Options], function: inspect.Signature) -> st
     """Return a text with arguments of a Python function in place of the command's options."""
     names = {f"--{name}": name for name in function.parameters}
     names |= {f"--{one.dashed}": one.name for one in kind.described()}
-    names |= {"SCENARIO": "scenario", "WEIGHTS": "networks"}
+    names |= {"SCENARIO": "scenario", "WEIGHTS": "networks", "--set": "the setting"}
     pattern = r"--[a-z]+(?:-[a-z]+)*|[A-Z]{4,}"
     return re.sub(pattern, lambda found: names.get(found[0], found[0]), text)
 
