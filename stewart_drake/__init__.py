@@ -16,7 +16,7 @@ _PUBLIC: Final = {
     "loop.exact": "ExactPlant set_accuracy",
     "loop.law_design": "DesignedLaw design_law",
     "loop.platforms": "AddStewartPlatform StewartPlatform",
-    "loop.controller_margin": "linear_models",
+    "loop.controller_margin": "ControllerMargin controller_margin linear_models",
     "mechanism.files": "load_mechanism",
     "mechanism.geometry": "Mechanism",
     "mechanism.kinematics": "ForwardKinematicsError UnreachablePoseError",

@@ -21,6 +21,8 @@ from stewart_drake.functions import plan_identification as plan_identification
 from stewart_drake.functions import replay_log as replay_log
 from stewart_drake.functions import setpoints as setpoints
 from stewart_drake.functions import view_model as view_model
+from stewart_drake.loop.controller_margin import ControllerMargin as ControllerMargin
+from stewart_drake.loop.controller_margin import controller_margin as controller_margin
 from stewart_drake.loop.controller_margin import linear_models as linear_models
 from stewart_drake.loop.diagram import ClosedLoop as ClosedLoop
 from stewart_drake.loop.diagram import build_closed_loop as build_closed_loop
@@ -73,6 +75,7 @@ __all__ = [
     "ComparisonResult",
     "ConfigError",
     "ControllerConfig",
+    "ControllerMargin",
     "CsvConfig",
     "DelayConfig",
     "DesignedLaw",
@@ -109,6 +112,7 @@ __all__ = [
     "build_closed_loop",
     "check_model",
     "compare",
+    "controller_margin",
     "design_law",
     "evaluate_tuner",
     "export_c",
@@ -140,7 +144,7 @@ __all__ = [
 
 def evaluate_tuner(
     directory: str | pathlib.Path,
-    networks: collections.abc.Sequence[str | pathlib.Path] = (),
+    networks: str | pathlib.Path | collections.abc.Sequence[str | pathlib.Path] = (),
     scenario: str | pathlib.Path = "paper",
     controller: str | pathlib.Path | None = None,
     settings: collections.abc.Iterable[str] = (),

@@ -36,7 +36,8 @@ from stewart_drake.reporting.page import Provenance
 from stewart_drake.reporting.results import AnalysisResult, SimulationResult, analysis_result
 from stewart_drake.scenario.calibration import save_calibration
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import as_scenario, load_scenario, scenario_yaml
+from stewart_drake.scenario.loading import as_scenario, scenario_yaml
+from stewart_drake.scenario.run_log import is_run
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.new_machine import (
     MechanismCheck,
@@ -44,7 +45,7 @@ from stewart_drake.studies.new_machine import (
     check_mechanism,
     new_machine,
 )
-from stewart_drake.studies.options import takes
+from stewart_drake.studies.options import refuse, takes
 from stewart_drake.studies.study_options import Measurements
 from stewart_drake.tuning.options import DataOptions, EvaluationOptions, TrainingOptions
 
@@ -84,10 +85,17 @@ def identify(
     paths = [logs] if isinstance(logs, str | Path) else list(logs)
     machine = as_mechanism(mechanism)
     typed = command or f"sd.identify({[str(path) for path in paths]!r}, {mechanism!r})"
+    if not paths:
+        raise ConfigError("logs: got none; expected one or more")
+    if delay is not None and not 0 <= delay <= 100:
+        raise ConfigError(f"delay: got {delay!r}; expected 0 to 100 s")
+    if all(is_run(Path(path)) for path in paths):
+        of_csv = {"precision": precision, "gravity": None if gravity else gravity}
+        refuse(of_csv, "with logs of runs, which contain it; expected it with a CSV log only")
     if any(is_servo_log(Path(path)) for path in paths):
         if len(paths) > 1 or delay is not None or tolerances is not None:
             raise ConfigError(
-                f"{paths[0]}: got more than one log of setpoints, --delay or --tolerance; expected "
+                f"{paths[0]}: got more than one log of setpoints, a delay or tolerances; expected "
                 "one log, whose delay is found without any"
             )
         log = read_servo_log(Path(paths[0]), machine)
@@ -133,7 +141,7 @@ def plan_identification(
     if loaded.actuator.kind == "position_servo":
         if poses or tolerances is not None:
             raise ConfigError(
-                "--plan: got --pose-std or --tolerance with position servos; expected neither, "
+                "plan: got measured poses or tolerances with position servos; expected neither, "
                 "their log has setpoints and crank angles"
             )
         rounding = _CODE_12_BITS if precision is None else precision.angle
@@ -232,7 +240,7 @@ def setpoints(
     has the equations.
 
     Args:
-        scenario: or a shipped name or a path; its `actuator.kind` is `position_servo`.
+        scenario: a Scenario, a shipped name or a path; its `actuator.kind` is `position_servo`.
         rate: of the setpoints, Hz.
         out: CSV file to write, if not None.
         plain: whether to send the angles of the reference, without compensation.
@@ -244,10 +252,12 @@ def setpoints(
     Raises:
         ConfigError: bad input, or a motion beyond a limit, with time and motor.
     """
-    if not isinstance(scenario, Scenario):
-        scenario = load_scenario(scenario, controller, settings)
+    if out is None:
+        refuse({"units": units}, "without out; expected both or neither")
     told = None if units is None else load_units(units)
-    made = make_setpoints(scenario, rate, plain=plain, start=start)
+    made = make_setpoints(
+        as_scenario(scenario, controller, settings), rate, plain=plain, start=start
+    )
     if out is not None:
         made.save(out, told)
     return made
@@ -264,7 +274,7 @@ def export_c(
     """Write the controller as a folder of C that builds with its own Makefile.
 
     Args:
-        scenario: or a shipped name or a path.
+        scenario: a Scenario, a shipped name or a path.
         directory: of the files; it is made.
         controller: laid over the scenario's own; for a name or a path.
         settings: as `load_scenario` takes them; for a name or a path.
@@ -276,11 +286,9 @@ def export_c(
     Raises:
         ConfigError: a law that has no C.
     """
-    if not isinstance(scenario, Scenario):
-        scenario = load_scenario(scenario, controller, settings)
-    folder = Path(directory)
+    loaded, folder = as_scenario(scenario, controller, settings), Path(directory)
     folder.mkdir(parents=True, exist_ok=True)
-    return write(exported(scenario, single), folder)
+    return write(exported(loaded, single), folder)
 
 
 @takes(Measurements)
@@ -329,7 +337,7 @@ def run_live(
     """Drive a machine over UDP in real time.
 
     Args:
-        scenario: or a shipped name or a path.
+        scenario: a Scenario, a shipped name or a path.
         machine: HOST:PORT where it listens.
         OPTIONS
 
@@ -346,6 +354,8 @@ def run_live(
 
     options.check_learned()
     if options.learn:
+        of_run = options.model_dump(include={"duration", "log", "mirror"})
+        refuse(of_run, "with --learn; expected none")
         learnt = learn_live(as_scenario(scenario), machine, options, print)
         return SimulationResult.of(learnt)
     ready = prepare_session(as_scenario(scenario), address_of(machine), read_key(options.key))
@@ -361,7 +371,7 @@ def run_machine(scenario: Scenario | str | Path, *, options: MachineOptions) -> 
     Returns what happened.
 
     Args:
-        scenario: or a shipped name or a path; its plant, sensor, delay, link and limits.
+        scenario: a Scenario, a shipped name or a path; its plant, sensor, delay, link and limits.
         OPTIONS
     """
     from stewart_drake.live.reachy import open_chosen
@@ -444,7 +454,7 @@ def train_tuner(
 @takes(EvaluationOptions)
 def evaluate_tuner(
     directory: str | Path,
-    networks: Sequence[str | Path] = (),
+    networks: str | Path | Sequence[str | Path] = (),
     scenario: str | Path = "paper",
     controller: str | Path | None = None,
     settings: Iterable[str] = (),
@@ -457,7 +467,7 @@ def evaluate_tuner(
 
     Args:
         directory: where the runs are kept, so that a second call goes on with them.
-        networks: shipped names or files; none for the shipped one.
+        networks: shipped name or file, or several; none for the shipped one.
         scenario: shipped name or path.
         controller: laid over the scenario's own.
         settings: as `load_scenario` takes them.
@@ -469,6 +479,7 @@ def evaluate_tuner(
     from stewart_drake.tuning.evaluation import evaluate
 
     family, started = options.conditions(scenario, controller, settings), time.perf_counter()
+    networks = [networks] if isinstance(networks, str | Path) else networks
     found = evaluate(family, networks, directory, progress=progress, **options.jobs)
     command = command or f"sd.evaluate_tuner({str(directory)!r}, {list(networks)!r})"
     return _timed(

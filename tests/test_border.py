@@ -118,6 +118,7 @@ def test_simulate_takes_a_name_or_a_path(tmp_path):
 
 
 @pytest.mark.parametrize("given", [None, 3, {"duration": 1.0}])
-def test_simulate_says_what_it_takes(given):
+@pytest.mark.parametrize("function", [sd.simulate, sd.build_closed_loop, sd.analyze_delay])
+def test_a_function_says_which_scenarios_it_takes(function, given):
     with pytest.raises(TypeError, match=r"^scenario: got a .*; expected a Scenario, or the name"):
-        sd.simulate(given)
+        function(given)

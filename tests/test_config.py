@@ -343,6 +343,15 @@ REFUSED = [
         "link.loss: got 0.1, which kind 'wire' does not use; expected link.kind=network",
     ),
     (
+        *("reference.kind=hold", "reference.file=motion.csv"),
+        "which kind 'hold' does not use; expected reference.kind=waypoints or csv or reachy_move",
+    ),
+    (
+        *(NETWORK, "controller.delay_estimator=constant"),
+        "controller.delay_estimator: got 'constant' with link.kind 'network'; expected 'none', as "
+        "of the controller predictor_lqi, or link.kind 'wire'",
+    ),
+    (
         "controller.period=0.1234567",
         "with settings: controller.period: got 0.1234567; expected a whole number of "
         "plant.time_step (0.001 s), nearest 0.123",

@@ -555,6 +555,22 @@ def test_bad_weights_keep_the_last_good_gain(weights):
     assert np.all(np.isfinite(after.torque))
 
 
+@pytest.mark.parametrize("bad", [slice(None), 0])
+def test_a_gain_of_your_own_cost_that_is_not_finite_is_counted(bad):
+    class Broken(cost_module.QuadraticCost):
+        def gain(self, model, weights):
+            K = super().gain(model, weights)
+            K[bad] = np.nan
+            return K
+
+    law = law_of("delay.steps=2", "controller.estimate=[]")
+    good = step(law, sampled(law), HOME[:12], at_home(law))
+    cost = Broken(law.cost.errors, law.cost.integrals, law.cost.torques)
+    after = step(dataclasses.replace(law, cost=cost), good, HOME[:12], at_home(law))
+    assert after.gain is good.gain and after.counts.riccati_failures == 1
+    assert np.all(np.isfinite(after.torque))
+
+
 def test_a_step_changes_nothing_it_was_given():
     law = law_of("delay.steps=2")
     memory, preview = sampled(law), at_home(law)

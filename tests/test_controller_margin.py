@@ -24,6 +24,7 @@ from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import mechanism_yaml
+from stewart_drake.reporting.run import comparison_document
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.compare import CONTROLLERS
@@ -254,6 +255,14 @@ def test_the_first_line_is_about_the_loop(capsys, monkeypatch):
     assert first.startswith("this loop is unstable: linearised along the reference")
     assert (fold(1.2345), fold(1.0004)) == ("1.23 fold", "by 0.04 %")
     assert any("left workspace" in line for line in others)
+    network = ["simulate", "paper", "--set", "plant.kind=exact", "--set", "link.kind=network"]
+    assert main([*network, "--set", "duration=0.2"]) == 0
+    assert capsys.readouterr().out.count("judged") == 1, "a warning repeats nothing"
+    settings = ("plant.kind=exact", "link.kind=network", "duration=0.2")
+    result = sd.simulate(sd.load_scenario("paper", settings=settings))
+    said = result.summary["warnings"]
+    assert "warning: the loop was not judged" in comparison_document({"lqi": result}).plain()
+    assert "warning:" not in comparison_document({"lqi": result}, said=said).plain()
 
 
 def test_an_unstable_loop_that_completes_is_warned_about():

@@ -99,7 +99,17 @@ def test_without_a_start_it_begins_on_the_reference():
     [
         ({"delay": -0.1}, "delay: got -0.1"),
         ({"delay": np.nan}, "delay: got nan"),
+        ({"delay": "late"}, "delay: got 'late'; expected numbers"),
         ({"period": 0.0}, "period: got 0.0"),
+        ({"period": "0.1"}, "period: got '0.1'; expected a finite number above 0"),
+        ({"horizon": np.inf}, "horizon: got inf; expected a finite number above 0"),
+        ({"dynamics": PAPER}, "dynamics: got Mechanism("),
+        ({"reference": "paper"}, "reference: got 'paper'; expected a Trajectory"),
+        ({"reference": PiecewisePolynomial((PAPER.home + 9.0).reshape(6, 1))}, "reference: leg"),
+        ({"options": {}}, "options: got {}; expected a ControllerConfig"),
+        ({"start": np.full(12, np.nan)}, "start: got [nan"),
+        ({"start": np.full(12, 9.0)}, "start: got a pose where leg"),
+        ({"noise_std": "low"}, "noise_std: got 'low'; expected numbers"),
         ({"start": np.zeros(6)}, "start: got shape (6,); expected (12,)"),
         ({"reference": PiecewisePolynomial(np.zeros((3, 1)))}, "got shape (3, 1)"),
         ({"noise_std": [0.0]}, "noise_std"),
@@ -117,6 +127,26 @@ def test_bad_input_is_one_line(changes, message):
     with pytest.raises(ConfigError) as refused:
         sd.design_law(**(given | changes))
     assert message in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_the_margins_of_a_design_are_those_of_its_scenario():
+    """The design's loop is that of the scenario, with the machine that the dynamics describe."""
+    scenario = sd.load_scenario("paper", settings=("plant.kind=exact", "start=on_reference"))
+    design, expected = law_of(scenario, start=None), sd.controller_margin(scenario)
+    found = sd.controller_margin(design)
+    assert found.time == expected.time
+    np.testing.assert_allclose(found.margins, expected.margins, rtol=1e-4)
+    models = sd.linear_models(design, time=1.0), sd.linear_models(scenario, time=1.0)
+    for one, other in zip(*((m.S.A, m.S.B) for m in models), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6)
+
+    loaded = sd.load_scenario("gravity", settings=("plant.payload_mass=0.5", "plant.kind=exact"))
+    payload = np.append(np.zeros(6), [0.5, 0.0])
+    motion = make_reference(loaded.reference, loaded.duration)
+    dynamics = sd.StewartDynamics(PAPER, True, payload)
+    period, eta = loaded.controller.period, loaded.eta
+    found = sd.controller_margin(sd.design_law(dynamics, motion, period, eta))
+    assert found.pole == pytest.approx(sd.controller_margin(loaded).pole, rel=1e-6)
 
 
 def test_the_names_to_estimate_are_those_of_the_options_or_of_the_dynamics():

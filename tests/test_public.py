@@ -63,6 +63,58 @@ def test_the_signature_of_an_analysis_shows_its_options():
     )
 
 
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: sd.analyze_robustness("paper", workers=0), "workers: got 0; expected"),
+        (
+            lambda: sd.layout("paper", keep=["crank"], vary={"crank": (0.1, 0.2)}),
+            "keep: got crank, which vary varies",
+        ),
+        (lambda: sd.layout("paper", limits={"reach": np.nan}), "limits reach: got nan"),
+        (lambda: sd.make_tuner_data("none", draws=10), "draws: got 10 without family"),
+        (lambda: sd.make_tuner_data("none", "gravity", family="T"), "scenario: got gravity with"),
+        (lambda: sd.evaluate_tuner("none", ["a", "b"]), "networks: got 2 without family"),
+        (lambda: sd.evaluate_tuner("none", "nowhere"), "weights: got 'nowhere'"),
+        (lambda: sd.run_live("paper", "nowhere"), "machine: got 'nowhere'; expected HOST:PORT"),
+        (
+            lambda: sd.run_live("paper", "127.0.0.1:9", learn=2, duration=1.0),
+            "duration: got 1.0 with learn; expected none",
+        ),
+        (lambda: sd.simulate("paper", log="run.txt"), "log: got 'run.txt'; expected a file"),
+        (
+            lambda: sd.plan_identification("reachy_mini", poses=True),
+            "plan: got measured poses or tolerances with position servos",
+        ),
+        (lambda: sd.identify([], "paper"), "logs: got none"),
+        (lambda: sd.identify("log.csv", "paper", delay=np.nan), "delay: got nan"),
+        (lambda: sd.identify("run.nc", "paper", gravity=False), "gravity: got False with logs of"),
+        (lambda: sd.setpoints("reachy_mini", units="u.yaml"), "units: got u.yaml without out"),
+        (
+            lambda: sd.setpoints(sd.Scenario(), settings=("duration=1",)),
+            "settings: got ('duration=1',) with a Scenario; expected none",
+        ),
+        (
+            lambda: sd.export_c(sd.Scenario(), "none", "lqi"),
+            "controller: got 'lqi' with a Scenario; expected none",
+        ),
+        (lambda: sd.linear_models("paper", time="1"), "time: got '1'; expected numbers"),
+        (lambda: sd.controller_margin("paper", until=np.nan), "until: got nan; expected"),
+    ],
+)
+def test_an_error_names_the_argument(call, message):
+    """Not the option of the command; an argument that would be ignored is refused."""
+    with pytest.raises(sd.ConfigError) as refused:
+        call()
+    assert str(refused.value).startswith(message) and "--" not in str(refused.value)
+
+
+def test_help_names_arguments_and_not_options_of_the_command():
+    for name in sd.__all__:
+        if inspect.isfunction(function := getattr(sd, name)):
+            assert " --" not in (function.__doc__ or ""), name
+
+
 def test_help_names_arrays_instead_of_the_unions_behind_them():
     assert str(inspect.signature(sd.StewartDynamics.mass_matrix)).startswith(
         "(self, pose: ArrayLike"

@@ -236,14 +236,14 @@ def test_a_wrong_shape_is_an_exception(wrong):
     """It was a counted Riccati failure, or an outlier."""
     law = law_of("delay.steps=2")
     parts = {
-        "errors": {"cost": dataclasses.replace(law.cost, errors=np.ones(5))},
-        "torques": {"cost": dataclasses.replace(law.cost, torques=np.ones(5))},
-        "noise": {"sensing": StateSensing(np.zeros(11), np.ones(6))},
-        "parameters": {"observer": CoreObserver(seven(law.observer))},
+        "errors": lambda: {"cost": dataclasses.replace(law.cost, errors=np.ones(5))},
+        "torques": lambda: {"cost": dataclasses.replace(law.cost, torques=np.ones(5))},
+        "noise": lambda: {"sensing": StateSensing(np.zeros(11), np.ones(6))},
+        "parameters": lambda: {"observer": CoreObserver(seven(law.observer))},
     }
     take_a_sample(law)
     with pytest.raises(ValueError):
-        take_a_sample(dataclasses.replace(law, **parts[wrong]))
+        take_a_sample(dataclasses.replace(law, **parts[wrong]()))
 
 
 def take_a_sample(law):

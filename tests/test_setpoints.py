@@ -112,7 +112,7 @@ def test_a_rate_out_of_range_is_refused(rate):
     "pose", [[0, 0, 0], [np.nan] * 6, [0, 0, 0, 0, 0, 1.0], [0, 0, 0, 0.2, 0, 0.23]]
 )
 def test_a_pose_that_the_head_cannot_have_is_refused(pose):
-    with pytest.raises(ConfigError, match="from: got"):
+    with pytest.raises(ConfigError, match="start: got"):
         made(start=pose)
 
 

@@ -15,22 +15,31 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.resources import resolve
 from stewart_drake.law.core_law import serving
+from stewart_drake.law.cost import PdGain, QuadraticCost
 from stewart_drake.law.motion import Preview
+from stewart_drake.law.nominal import NominalPlant, PaperModel, TorqueLimit
+from stewart_drake.law.observers import DelaySettings
+from stewart_drake.law.planner import Replan
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.law.sensing import Measurement
+from stewart_drake.law.sensing import EncoderSensing, Measurement, StateSensing
+from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import DelayLqiController, Reference
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.law_design import control_law
-from stewart_drake.loop.link import DelayChain
+from stewart_drake.loop.link import DelayChain, LateMeasurements, PlayoutBuffer, VaryingDelay
 from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.loop.preparation import prepare
-from stewart_drake.loop.sensor import Sensor
+from stewart_drake.loop.sensor import Encoders, Sensor
 from stewart_drake.loop.simulation import make_simulator
+from stewart_drake.loop.tuner import AnnTuner, DensityWindow
+from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import evaluate, make_reference
+from stewart_drake.tuner.network import load_network
 from tests.backends import stepped_in_python
 from tests.mechanisms import PAPER
 
@@ -140,10 +149,79 @@ def test_delay_chain_topology_and_initial_state():
         # The oldest acts from the start.
         first = [*queue(steps, fraction), np.zeros(6)][0]
         assert np.array_equal(chain.get_output_port().Eval(context), first)
-    with pytest.raises(ValueError, match="queue: got shape"):
-        DelayChain(0.1, 2, 0.0, queue(2, 0.5))
-    with pytest.raises(ValueError, match="queue: got shape"):
-        DelayChain(0.1, 2, 0.5, queue(2, 0.0))
+    for steps, fraction in ((2, 0.5), (2, 0.0)):
+        with pytest.raises(ValueError, match="queue: got shape"):
+            DelayChain(0.1, steps, fraction, queue(steps, 0.5 - fraction))
+
+
+NAN, SIX, TWELVE = np.nan, np.ones(6), np.zeros(12)
+MACHINE = StewartDynamics(PAPER)
+WITHOUT_DELAY = Delay(0)
+NETWORK = load_network(resolve("weights", "tuner"))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: DelayChain(0.0, 0, 0.0, np.zeros((0, 6))), "period: got 0.0"),
+        (lambda: DelayChain(NAN, 0, 0.0, np.zeros((0, 6))), "period: got nan"),
+        (lambda: DelayChain("0.1", 0, 0.0, np.zeros((0, 6))), "period: got '0.1'"),
+        (lambda: DelayChain(0.1, 1, 0.0, np.full((1, 6), NAN)), "queue: got [nan"),
+        (lambda: DelayChain(0.1, 1.5, 0.0, np.zeros((1, 6))), "delay: got 1.5 steps"),
+        (lambda: DelayChain(0.1, 1, "half", np.zeros((1, 6))), "delay: got 1 steps and a fraction"),
+        (lambda: DelayChain(0.1, 0, 0.0, np.zeros((0, 6)), "force"), "carries: got 'force'"),
+        (lambda: VaryingDelay(0.0, [0.1], WITHOUT_DELAY, np.zeros((0, 6))), "period: got 0.0"),
+        (lambda: VaryingDelay(0.1, [NAN], WITHOUT_DELAY, np.zeros((0, 6))), "delays: got [nan]"),
+        (lambda: PlayoutBuffer(0.1, [-1.0], WITHOUT_DELAY, np.zeros((0, 6))), "times: got [-1.0]"),
+        (
+            lambda: PlayoutBuffer(0.1, [0.0], WITHOUT_DELAY, np.zeros((0, 6)), rows=0),
+            "rows: got 0; expected a whole number, 1 or more",
+        ),
+        (
+            lambda: PlayoutBuffer(0.1, [0.0], WITHOUT_DELAY, np.zeros((0, 6)), dry="drop"),
+            "dry: got 'drop'",
+        ),
+        (lambda: LateMeasurements(0.0, [0.1], 12), "period: got 0.0"),
+        (lambda: LateMeasurements(0.1, [0.1], 0), "size: got 0"),
+        (lambda: Reference("paper", MOTION, [0.0]), "true_motion: got 'paper'"),
+        (lambda: Reference(MOTION, MOTION, [NAN]), "preview_times: got [nan]"),
+        (lambda: Sensor(-np.ones(12), 0, 0.1), "noise_std: got [-1"),
+        (lambda: Sensor(TWELVE, 0.5, 0.1), "seed: got 0.5"),
+        (lambda: Sensor(TWELVE, 0, 0.0), "period: got 0.0"),
+        (lambda: Encoders(PAPER, 12, 0, np.zeros(6), 0, 0.1), "samples: got 0"),
+        (lambda: Encoders(PAPER, 0, 1, np.zeros(6), 0, 0.1), "bits: got 0"),
+        (lambda: Encoders("paper", 12, 1, np.zeros(6), 0, 0.1), "mechanism: got 'paper'"),
+        (lambda: Encoders(PAPER, 12, 1, np.zeros(1), 0, 0.1), "offset: got shape (1,)"),
+        (lambda: DensityWindow(0.1, "square"), "kind: got 'square'"),
+        (lambda: DensityWindow(-0.1), "period: got -0.1"),
+        (lambda: AnnTuner(NETWORK, [1.0, NAN], 0.1), "fixed: got [1, nan]"),
+        (lambda: AnnTuner(NETWORK, [1.0, 1.0], 0.1, 0.0), "factor: got 0.0"),
+        (lambda: ExactPlant(MACHINE, 0.1), "initial_state: got shape ()"),
+        (lambda: Timeline(0.1, 0.8), "delay: got 0.8; expected a Delay"),
+        (lambda: Timeline(0.0, WITHOUT_DELAY), "period: got 0.0"),
+        (lambda: QuadraticCost(SIX, None, NAN * SIX), "torques: got [nan"),
+        (lambda: QuadraticCost(SIX[:5], None, SIX), "errors: got shape (5,)"),
+        (lambda: QuadraticCost(SIX, -SIX, SIX), "integrals: got [-1"),
+        (lambda: PdGain(1.0, NAN, 0.1), "kp, kd: got [1, nan]"),
+        (lambda: TorqueLimit(NAN), "limit: got nan"),
+        (lambda: NominalPlant(MACHINE, 0, 1.0, TorqueLimit()), "substeps: got 0"),
+        (lambda: NominalPlant(PAPER, 1, 1.0, TorqueLimit()), "dynamics: got Mechanism"),
+        (lambda: PaperModel("exact"), "form: got 'exact'"),
+        (lambda: StateSensing(TWELVE[:6], SIX), "noise_std: got shape (6,)"),
+        (
+            lambda: EncoderSensing(PAPER, 1, NAN, TWELVE, SIX, SIX, np.zeros(6)),
+            "quantum: got nan",
+        ),
+        (lambda: DelaySettings(0.1, 0.0, 1.0), "std: got 0.0"),
+        (lambda: DelaySettings(0.1, 0.1, NAN), "longest: got nan"),
+        (lambda: Replan(NAN, SIX), "duration: got nan"),
+    ],
+)
+def test_a_bad_argument_is_one_line_at_construction(make, message):
+    """Of systems and parts of the law, where the damage would show much later."""
+    with pytest.raises(ValueError, match="; expected") as refused:
+        make()
+    assert str(refused.value).startswith(message) and "\n" not in str(refused.value)
 
 
 Update = Callable[[Context, State], None]

@@ -121,7 +121,7 @@ def check_log(path: Path | None) -> None:
         from stewart_drake.scenario.run_log import kind_of_log
 
         check_file(path, "--log")
-        kind_of_log(path)
+        kind_of_log(path, "--log")
 
 
 def release() -> None:

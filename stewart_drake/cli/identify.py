@@ -78,9 +78,11 @@ def identify(
         of_scenario = {"--mechanism": mechanism, "--delay": delay, "--gravity": gravity}
         refuse(of_scenario, "with --plan; expected it in the scenario, or as --set")
     else:
+        from stewart_drake.scenario.run_log import is_run
+
         refuse({"--set": settings}, "without --plan; expected it with --plan")
-        if all(path.suffix == ".nc" for path in logs or ()):
-            refuse(of_csv, "with .nc logs, which contain it; expected it with a CSV log only")
+        if all(map(is_run, logs or ())):
+            refuse(of_csv, "with logs of runs, which contain it; expected it with a CSV log only")
     delivery = Delivery(out, quiet, as_json)
     if plan is None and mechanism is None:
         raise ConfigError("--mechanism: is missing; expected a shipped name or a file, as drawn")

@@ -31,7 +31,7 @@ class Given:
     @property
     def words(self) -> dict[str, Any]:
         """Typed values for the command on a page."""
-        return {_dashed(one): self._typed[_name(one)] for one in _offered(self._kind, True)}
+        return {one.dashed: self._typed[_name(one)] for one in _offered(self._kind, True)}
 
     @property
     def given(self) -> dict[str, Any]:
@@ -57,7 +57,7 @@ class Given:
     @contextlib.contextmanager
     def named(self) -> Iterator[None]:
         """Replace the name of a field in an error by the option that sets it."""
-        flags = {one.name: f"--{_dashed(one)}" for one in _offered(self._kind)}
+        flags = {one.name: f"--{one.dashed}" for one in _offered(self._kind)}
         try:
             yield
         except ConfigError as error:
@@ -106,7 +106,7 @@ def _offered(kind: type[Options], recorded: bool = False) -> list[Option]:
 
 
 def _parameter(one: Option) -> inspect.Parameter:
-    annotation, default, name = one.annotation, one.default, _dashed(one)
+    annotation, default, name = one.annotation, one.default, one.dashed
     if one.read:
         annotation, default = list[str] | None, None
     elif one.unit:
@@ -128,7 +128,3 @@ def _parameter(one: Option) -> inspect.Parameter:
 
 def _name(one: Option) -> str:
     return one.flag or one.name
-
-
-def _dashed(one: Option) -> str:
-    return _name(one).replace("_", "-")

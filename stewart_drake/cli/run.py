@@ -61,6 +61,7 @@ def simulate(
     from stewart_drake.loop.cautions import cautions_before
     from stewart_drake.loop.controller_margin import controller_margin
     from stewart_drake.loop.preparation import prepare
+    from stewart_drake.reporting.run import run_document
     from stewart_drake.studies.verdict import Verdict, loop_verdict
 
     for option, given in (("--csv", csv), ("--replay", replay)):
@@ -74,8 +75,10 @@ def simulate(
     margin = controller_margin(experiment)
     delay = Verdict(margin.eta, margin.pole, margin.pole_time)
     delivery.say_wrapped(loop_verdict(margin), str(delay))
-    for text in cautions_before(experiment, margin):
-        delivery.say(Caution(text).plain())
+    said = cautions_before(experiment, margin)
+    for text in said:
+        if not margin.problem or margin.problem not in text:  # which the verdict has
+            delivery.say(Caution(text).plain())
     if viewer is not None:
         _await_viewer(viewer)
     name = title_of(scenario)
@@ -83,7 +86,7 @@ def simulate(
         result = sd.simulate(
             experiment, progress=progress[name], meshcat=viewer, judge_stability=margin, log=log
         )
-    delivery.say(result.table())
+    delivery.say(run_document(result, said).plain())
 
     def film(folder: Path) -> None:
         result.replay(folder / REPLAY, mechanism=experiment.truth, title=name)

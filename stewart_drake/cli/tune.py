@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-import stewart_drake as sd
 from stewart_drake.cli.common import (
     GO_ON,
     AsJson,
@@ -47,10 +46,12 @@ def dataset(
 
     The grid varies delay, frequency and weights. A family has faults of timing, friction and noise.
     """
-    chosen, delivery = dict(given.options()), Delivery(out, quiet, as_json)
+    from stewart_drake import functions
+
+    options, delivery = given.options(), Delivery(out, quiet, as_json)
     with given.named(), stopping(GO_ON), count_bar("conditions", quiet) as progress:
-        found = sd.make_tuner_data(
-            out, scenario, controller, settings or (), progress=progress, **chosen
+        found = functions.make_tuner_data(
+            out, scenario, controller, settings or (), progress=progress, options=options
         )
     delivery.write(found.summary)
     delivery.say(found.table())
@@ -78,6 +79,8 @@ def train(
     network itself.
     """
 
+    from stewart_drake import functions
+
     def draw() -> "dict[str, Figure]":
         from stewart_drake.reporting.tuner import training_figures
 
@@ -92,7 +95,7 @@ def train(
     name, kept = ("own runs", GO_ON) if options.regret else ("training", "nothing written")
     first = "training" if options.regret else "computing"
     with given.named(), stopping(kept), count_bar(name, delivery.silent, first) as progress:
-        found = sd.train_tuner(data, out, progress=progress, **dict(options))
+        found = functions.train_tuner(data, out, progress=progress, options=options)
     delivery.discard()
     delivery.wrote(out.name, *([f"{out.stem}-runs/"] if options.regret else []))
     delivery.write(found.summary)
@@ -121,6 +124,7 @@ def evaluate(
 
     With --family on fresh conditions of a family, where runs that end early count too.
     """
+    from stewart_drake import functions
     from stewart_drake.reporting.page import command_line, write_page
 
     options, delivery = given.options(), Delivery(out, quiet, as_json)
@@ -134,7 +138,7 @@ def evaluate(
         options={"family": words.pop("family"), **names, **dict(sorted(words.items()))},
     )
     with given.named(), stopping(GO_ON), count_bar("conditions", quiet) as progress:
-        found = sd.evaluate_tuner(
+        found = functions.evaluate_tuner(
             out,
             weights or [],
             scenario,
@@ -142,7 +146,7 @@ def evaluate(
             settings or (),
             progress=progress,
             command=command,
-            **dict(options),
+            options=options,
         )
     delivery.write(found.summary)
     delivery.say(found.table())

@@ -8,9 +8,10 @@ import numpy as np
 from stewart_drake.core.layout import DEAD_CENTRE_SINE, DEFAULT_GRAVITY
 from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.workspace import measures_at
+from stewart_drake.files.arguments import fixed
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.assembly import TorqueMap, torque_map
-from stewart_drake.mechanism.geometry import Mechanism, fixed
+from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, angle_rate_map
 from stewart_drake.scenario.signals import (
     ANGLES,

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from stewart_drake.dynamics.workspace import diagnose
+from stewart_drake.files.arguments import fixed
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.yamlio import load_yaml, one_message, validate
@@ -184,14 +185,9 @@ class _BrokenLimit(ConfigError):
 
 
 def _checked(start: Sequence[float] | Array, experiment: Experiment) -> Array:
-    pose = np.asarray(start, dtype=np.float64)
-    if pose.shape != (6,) or not np.all(np.isfinite(pose)):
-        raise ConfigError(
-            f"from: got {np.asarray(start).tolist()}; expected roll, pitch, yaw in rad and x, y, z "
-            "in m"
-        )
+    pose = fixed("start", start, (6,))
     if failure := diagnose(experiment.mechanism, 0.0, pose):
-        raise ConfigError(f"from: got a pose out of the workspace: {failure.reason}")
+        raise ConfigError(f"start: got a pose where {failure.reason}; expected one within reach")
     return pose
 
 

@@ -268,13 +268,14 @@ def explain(data: Any, error: Any) -> str:
 
 
 def _explain_unknown(type_: type, data: Any, error: Any) -> str:
-    place, known = _place(data, error["loc"]), dict(dotted_names(type_))
+    place, fields = _place(data, error["loc"]), list(dotted_names(type_))
     start = f"{_cut(place, 60)}: "
     plain = re.sub(r"\[\d+\]", "", place)
-    if hasattr(known.get(plain), "kind"):
+    known = dict(fields)
+    if kinds := [owner.kind for name, owner in fields if name == plain and hasattr(owner, "kind")]:
         got = f"got {brief(error['input'])}, which kind {error['loc'][-2]!r} does not use"
         section = place.rpartition(".")[0]
-        return f"{start}{got}; expected {section}.kind={known[plain].kind}"
+        return f"{start}{got}; expected {section}.kind={' or '.join(kinds)}"
     above, dot, name = plain.rpartition(".")
     section = place.rpartition(".")[0] + dot
     siblings = [one.rpartition(".")[2] for one in known if one.rpartition(".")[0] == above]

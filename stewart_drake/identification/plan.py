@@ -145,7 +145,7 @@ def fitted_multisine(
             return time, poses, share
         share *= 0.9
     raise ConfigError(
-        f"--plan: got a motion too large for the workspace even at {100 * _LEAST_SHARE:g} %; "
+        f"plan: got a motion too large for the workspace even at {100 * _LEAST_SHARE:g} %; "
         "expected a smaller one, around a pose with room on all sides"
     )
 
@@ -175,7 +175,7 @@ def plan(experiment: Experiment, std: Array, tolerances: Tolerances | None = Non
     problem, guess = followed(Problem(segments, unknowns), Guess(unknowns.mean, first))
     if not problem.segments:
         raise ConfigError(
-            "--plan: got a motion along which the plate cannot be followed; expected one that "
+            "plan: got a motion along which the plate cannot be followed; expected one that "
             "stays off the edge of the workspace"
         )
     spread = covariance(Evaluator(problem).normal(guess)[1])

@@ -197,7 +197,7 @@ class _Planner:
                 return share, setpoints
             share *= _SMALLER
         raise ConfigError(
-            f"--plan: got a motion beyond the limits of range, torque or reach even at "
+            "plan: got a motion beyond the limits of range, torque or reach even at "
             f"{100 * _LEAST:g} %; expected a pose in the middle of the scenario's motion with room "
             "on all sides"
         )
@@ -225,7 +225,7 @@ class _Planner:
         """Return the states (n, 12) of a motion that stays in the workspace."""
         states = model.states(self.theta)
         if states is None:
-            raise ConfigError("--plan: got motions that leave the workspace one after the other")
+            raise ConfigError("plan: got motions that leave the workspace one after the other")
         return states
 
     def peaks(self, model: ServoModel, states: Array) -> tuple[float, float]:

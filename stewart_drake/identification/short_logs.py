@@ -74,7 +74,7 @@ def fit_short(pairs: Sequence[Pair], unknowns: Unknowns, worst: float) -> Soluti
         f"{longest.name}: got a log of {longest.times[-1] - longest.times[0]:.3g} s, explained by "
         f"{'delays of ' + found if found else 'no delay'}; expected one delay, known to "
         f"{1e3 * _VAGUE:g} ms: a log of at least {length_needed(unknowns):.3g} s (the longest "
-        f"possible delay and {_RESPONSE:g} s of motion), or a narrower --tolerance delay=S"
+        f"possible delay and {_RESPONSE:g} s of motion), or a narrower tolerance of the delay"
     )
 
 

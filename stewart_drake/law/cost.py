@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from stewart_drake.files.arguments import fixed, positive
 from stewart_drake.law.delay_model import ContinuousModel, DelayedModel, delayed_model
 from stewart_drake.law.riccati import prediction_matrix, reduced_gain
 from stewart_drake.law.timeline import Timeline
@@ -75,6 +76,11 @@ class QuadraticCost:
     errors: Array
     integrals: Array | None
     torques: Array
+
+    def __post_init__(self) -> None:
+        for name in ("errors", "integrals", "torques"):
+            if name != "integrals" or self.integrates:
+                fixed(name, getattr(self, name), (NUM_COORDINATES,), 0.0)
 
     @property
     def integrates(self) -> bool:
@@ -156,6 +162,10 @@ class PdGain:
     kp: float
     kd: float
     period: float
+
+    def __post_init__(self) -> None:
+        fixed("kp, kd", (self.kp, self.kd), (2,), 0.0)
+        positive("period", self.period)
 
     integrates = False  # not annotated: no field
 

@@ -3,10 +3,13 @@
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.arguments import of_kind, one_of, whole
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.delay_model import ContinuousModel, double_integrators, linear_model
 from stewart_drake.law.timeline import TorqueSchedule
 from stewart_drake.mechanism.assembly import TorqueMap
@@ -22,6 +25,10 @@ class TorqueLimit:
     """Limit of each motor in N m, infinite for none. The loop applies it after the law."""
 
     limit: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not self.limit > 0:
+            raise ConfigError(f"limit: got {self.limit!r}; expected a number above 0")
 
     def saturate(self, torques: Array) -> Array:
         """Return torques (..., 6) within the limit."""
@@ -47,6 +54,14 @@ class NominalPlant:
     substeps: int
     coarse_torque_limit: float
     motors: TorqueLimit
+
+    def __post_init__(self) -> None:
+        of_kind("dynamics", self.dynamics, StewartDynamics)
+        whole("substeps", self.substeps, 1)
+        if not self.coarse_torque_limit > 0:
+            raise ConfigError(
+                f"coarse_torque_limit: got {self.coarse_torque_limit!r}; expected a number above 0"
+            )
 
     @property
     def mechanism(self) -> Mechanism:
@@ -97,6 +112,9 @@ class PaperModel(DesignModel):
     """
 
     form: TorqueMap = "virtual_work"
+
+    def __post_init__(self) -> None:
+        one_of("form", self.form, get_args(TorqueMap))
 
     def about(
         self, state: Array, torque: Array, parameters: Array, plant: NominalPlant

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from stewart_drake.core.library import core
+from stewart_drake.files.arguments import fixed, positive
 from stewart_drake.law.belief import Belief, Estimate, Innovations
 from stewart_drake.law.compiled import Compiled, Once, machine_of, numbers
 from stewart_drake.law.filter_settings import FilterSettings
@@ -98,6 +99,12 @@ class DelaySettings:
     rate_walk: float = 0.0
     quiet: bool = False
     timing_std: float = TIMING_STD
+
+    def __post_init__(self) -> None:
+        prior = self.mean, self.walk, self.rate_std, self.rate_walk, self.timing_std
+        fixed("mean, walk, rate_std, rate_walk, timing_std", prior, (5,), 0.0)
+        positive("std", self.std)
+        positive("longest", self.longest)
 
     @classmethod
     def of(

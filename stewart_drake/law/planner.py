@@ -14,13 +14,14 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from stewart_drake.core.library import core
+from stewart_drake.files.arguments import fixed, positive
 from stewart_drake.law.belief import Belief
 from stewart_drake.law.catch_up import Model, periods_of
 from stewart_drake.law.compiled import machine_of, numbers
 from stewart_drake.law.motion import KnownMotion, Motion
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.timeline import TorqueSchedule
-from stewart_drake.scenario.signals import NUM_STATE
+from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE
 from stewart_drake.types import Array
 
 EARLY = 0.5
@@ -101,6 +102,12 @@ class Replan:
     longest: float
     size: Array
     sure: float = SURE
+
+    def __post_init__(self) -> None:
+        fixed("duration", self.duration, (), 0.0)
+        fixed("longest", self.longest, (), 0.0)
+        fixed("size", self.size, (NUM_COORDINATES,), 0.0)
+        positive("sure", self.sure)
 
     def lengths(self, period: float) -> tuple[int, int]:
         """Return the usual and the greatest length of a plan in periods, two at least."""

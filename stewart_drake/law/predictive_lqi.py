@@ -379,6 +379,8 @@ class PredictiveLqi:
             error = error - self.feedforward.offset(changes, model.B[RATES], belief.timeline)
             delayed = self.cost.sampled(model, belief.timeline)
             K = self.cost.gain(delayed, weights * [1.0, self.caution(belief)])
+            if not np.all(np.isfinite(K)):
+                raise FloatingPointError("gain: is not finite")
             return error, self.predictor.gain(K, delayed), None
         except UnreachablePoseError:  # nothing to regulate: the feedforward acts alone
             return error, self._no_gain(belief.timeline), "unreachable"

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.core.library import core
+from stewart_drake.files.arguments import fixed, whole
 from stewart_drake.law.compiled import Compiled, Once, geometry, numbers
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_LEGS, NUM_STATE
@@ -138,6 +139,10 @@ class StateSensing:
     noise_std: Array
     motion: Array
     anywhere: bool = False
+
+    def __post_init__(self) -> None:
+        fixed("noise_std", self.noise_std, (NUM_STATE,), 0.0)
+        fixed("motion", self.motion, (NUM_COORDINATES,), 0.0)
 
     @property
     def size(self) -> int:
@@ -271,6 +276,14 @@ class EncoderSensing:
     rates_std: Array
     motion: Array
     offset: Array
+
+    def __post_init__(self) -> None:
+        whole("samples", self.samples, 1)
+        fixed("quantum", self.quantum, (), 0.0)
+        fixed("declared", self.declared, (NUM_STATE,))
+        for name in ("rates_std", "motion"):
+            fixed(name, getattr(self, name), (NUM_COORDINATES,), 0.0)
+        fixed("offset", self.offset, (NUM_LEGS,))
 
     @property
     def size(self) -> int:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stewart_drake.core.library import core
+from stewart_drake.files.arguments import of_kind, positive
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.types import Array
@@ -35,6 +36,10 @@ class Timeline:
     period: float
     delay: Delay
     parts: int = field(default=0, kw_only=True)
+
+    def __post_init__(self) -> None:
+        positive("period", self.period)
+        of_kind("delay", self.delay, Delay)
 
     @property
     def steps(self) -> int:

@@ -9,6 +9,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.files.arguments import fixed, of_kind
 from stewart_drake.law.channel import Packets, Report
 from stewart_drake.law.core_law import AnyMemory, serving
 from stewart_drake.law.memory import Counts
@@ -52,8 +53,10 @@ class Reference(LeafSystem):
         self, true_motion: Trajectory, planned_motion: Trajectory, preview_times: Array
     ) -> None:
         super().__init__()
+        of_kind("true_motion", true_motion, Trajectory)
+        of_kind("planned_motion", planned_motion, Trajectory)
         self._true, self._planned = true_motion, planned_motion
-        self._times = np.array(preview_times)
+        self._times = fixed("preview_times", preview_times, (np.size(preview_times),))
         time_only = {self.time_ticket()}
         self.DeclareVectorOutputPort("reference", NUM_REFERENCE, weak(self._now), time_only)
         size = NUM_REFERENCE * len(self._times)
@@ -167,7 +170,7 @@ class DelayLqiController(SteppedLaw):
         super().__init__()
         self._law, self._motion = law, motion
         self._served = serving(law).law
-        first = self._served.initial_memory(queue)
+        first = self._served.initial_memory(fixed("queue", queue, (law.queue_length, NUM_TORQUES)))
         self._measurement = self.DeclareVectorInputPort("measurement", law.sensing.size)
         self._times = law.preview_times
         preview_size = NUM_REFERENCE * len(self._times)
@@ -255,7 +258,7 @@ class ServoController(SteppedLaw):
         super().__init__()
         self._law = law
         self._served = serving(law).law
-        first = self._served.initial_memory(command)
+        first = self._served.initial_memory(fixed("command", command, (NUM_REFERENCE,)))
         self._measurement = self.DeclareVectorInputPort("measurement", law.sensing.size)
         self._preview = self.DeclareVectorInputPort("preview", NUM_REFERENCE)
         self._report = self.DeclareVectorInputPort("report", law.reports.size)

@@ -34,6 +34,7 @@ import numpy as np
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
+from stewart_drake.files.arguments import fixed
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.cost import law_gain
 from stewart_drake.law.delay_model import ContinuousModel, chain, linear_model
@@ -50,7 +51,7 @@ from stewart_drake.law.stability import (
     spectral_radius,
     worst_margins,
 )
-from stewart_drake.loop.law_design import compose_law, longest_wait
+from stewart_drake.loop.law_design import DesignedLaw, compose_law, longest_wait
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.scenario.config import Scenario
@@ -77,27 +78,44 @@ _LARGEST: Final = 330
 """Rows of a loop above which it is not judged: fifty periods of delay."""
 _FEWEST: Final = 6
 _UNJUDGED: Final = Margins(*[math.nan] * 4)
+Judged = Scenario | str | Path | Experiment | DesignedLaw
+"""A loop of a scenario, or of a designed law with the machine that it assumes."""
 
 
 @dataclass(frozen=True)
 class ControllerMargin:
-    """The loop at its worst along the reference."""
+    """The loop at its worst along the reference.
 
-    period: float  # of the controller, s
-    eta: float  # true total delay, s
-    # largest spectral radius, the factor on an error per period; NaN with a `problem`
+    Attributes:
+        period: of the controller, s.
+        eta: true total delay, s.
+        radius: largest spectral radius, the factor on an error per period; NaN with a `problem`.
+        time: of that radius, s.
+        margins: the least errors of the delay in s, `shorter` and `longer`, and factors of the
+            motors, `gain_down` and `gain_up`, at the edge of stability; NaN with a `problem`.
+        pole: fastest unstable pole of the open loop, 1/s; 0 without one.
+        pole_time: of that pole, s.
+        estimated: whether an estimator is assumed to have found the unknown parameters.
+        delay_found: whether it is assumed to have found the delay too.
+        tuned: whether a tuner changes the weights.
+        problem: why the loop was not judged, or empty.
+        loops: the judged ones in the order of time, evenly over `span`; none with a `problem`.
+        span: s.
+    """
+
+    period: float
+    eta: float
     radius: float = math.nan
-    time: float = math.nan  # of that radius, s
-    margins: Margins = _UNJUDGED  # the least of each kind; NaN with a `problem`
-    pole: float = 0.0  # fastest unstable pole of the open loop, 1/s; 0 without one
-    pole_time: float = 0.0  # of that pole, s
-    estimated: bool = False  # whether an estimator is assumed to have found the unknown parameters
-    delay_found: bool = False  # whether it is assumed to have found the delay too
-    tuned: bool = False  # whether a tuner changes the weights
-    problem: str = ""  # why the loop was not judged, or empty
-    # the judged ones in the order of time, evenly over `span`; none with a `problem`
+    time: float = math.nan
+    margins: Margins = _UNJUDGED
+    pole: float = 0.0
+    pole_time: float = 0.0
+    estimated: bool = False
+    delay_found: bool = False
+    tuned: bool = False
+    problem: str = ""
     loops: tuple[LinearLoop, ...] = field(default=(), repr=False)
-    span: float = 0.0  # s
+    span: float = 0.0
     _growths: dict[float, float] = field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -150,18 +168,27 @@ class ControllerMargin:
         }
 
 
-def controller_margin(experiment: Experiment, until: float | None = None) -> ControllerMargin:
-    """Judge a scenario's loop along its reference, up to `until` in s, by default its duration.
+def controller_margin(loop: Judged, until: float | None = None) -> ControllerMargin:
+    """Judge stability and margins of a loop along its reference.
 
-    Takes 0.2 s for a delay of ten periods.
+    Takes 0.2 s for a delay of ten periods. An estimator, a tuner and torque limits are left out.
+
+    Args:
+        loop: a scenario, prepared or not, a shipped name or a path; or a `DesignedLaw`, with the
+            machine and the delay that it assumes.
+        until: s; None is the duration, or the horizon of the design.
+
+    Raises:
+        ConfigError: bad input, an unreachable reference.
     """
+    experiment = _experiment_of(loop)
     sc = experiment.scenario
-    end = sc.duration if until is None else until
+    end = sc.duration if until is None else float(fixed("until", until, (), 0.0))
     if sc.controller.command != "torque":
         # The loops of servos are checked where the servos are made.
         problem = "servos close theirs at the machine, and nothing is fed back across the delay"
         return ControllerMargin(sc.controller.period, sc.eta, problem=problem, span=end)
-    truth, law = experiment.true_dynamics(), _law_at_last(experiment)
+    truth, law = _parts(loop, experiment)
     times = np.linspace(0.0, end, INSTANTS)
     poses = [evaluate(experiment.reference, t)[POSE] for t in times]
     inside = [margin(truth.mechanism, pose) > 0 for pose in poses]
@@ -228,18 +255,28 @@ def true_model(experiment: Experiment, truth: StewartDynamics, time: float) -> C
     return linear_model(*truth.derivatives(x[POSE], x[RATES], torque)[:2])
 
 
-def loop_at(experiment: Experiment, time: float) -> LinearLoop:
-    """Return the loop of a scenario about its reference at `time` in s."""
-    truth, law = experiment.true_dynamics(), _law_at_last(experiment)
-    return _loops(experiment, truth, law, np.array([time]))[0]
+def loop_at(loop: Judged, time: float) -> LinearLoop:
+    """Return a loop about its reference at `time` in s."""
+    experiment = _experiment_of(loop)
+    return _loops(experiment, *_parts(loop, experiment), np.array([time]))[0]
 
 
-def _law_at_last(experiment: Experiment) -> PredictiveLqi:
-    """Return the law, with the true delay if it estimates the delay."""
-    law = compose_law(experiment)
+def _experiment_of(loop: Judged) -> Experiment:
+    if isinstance(loop, DesignedLaw):
+        return loop.experiment
+    return loop if isinstance(loop, Experiment) else prepare(as_scenario(loop))
+
+
+def _parts(loop: Judged, experiment: Experiment) -> tuple[StewartDynamics, PredictiveLqi]:
+    """Return the true machine, and the law with the true delay if it estimates the delay."""
+    if isinstance(loop, DesignedLaw):
+        truth, law = loop.law.plant.dynamics, loop.law
+    else:
+        truth, law = experiment.true_dynamics(), compose_law(experiment)
     if not law.finds_delay:
-        return law
-    return replace(law, timeline=replace(law.timeline, delay=experiment.scenario.true_delay))
+        return truth, law
+    late = replace(law.timeline, delay=experiment.scenario.true_delay)
+    return truth, replace(law, timeline=late)
 
 
 def _loops(
@@ -313,28 +350,29 @@ class LinearModels(NamedTuple):
         )
 
 
-def linear_models(scenario: Scenario | str | Path, time: float | None = None) -> LinearModels:
-    """Return the loop of a scenario, linearised about its moving reference ("frozen").
+def linear_models(scenario: Judged, time: float | None = None) -> LinearModels:
+    """Return a loop, linearised about its moving reference ("frozen").
 
     An estimator, a tuner and torque limits are left out, see `controller_margin`.
 
     Args:
-        scenario: or a shipped name or a path.
+        scenario: a Scenario, a shipped name or a path; or a `DesignedLaw`.
         time: s; None is that of the largest spectral radius.
 
     Raises:
         ConfigError: bad input, an unreachable reference; no time, and a loop that was not judged.
     """
-    loaded = as_scenario(scenario)
-    experiment = prepare(loaded)
+    loop = scenario if isinstance(scenario, DesignedLaw) else _experiment_of(scenario)
+    duration = _experiment_of(loop).scenario.duration
     if time is None:
-        margin = controller_margin(experiment)
+        margin = controller_margin(loop)
         if margin.problem:
             raise ConfigError(f"time: got None, but {margin.problem}; expected a time in s")
         time = margin.time
-    elif not 0 <= time <= loaded.duration:
-        raise ConfigError(f"time: got {time!r}; expected 0 to {loaded.duration:g} s")
-    return state_spaces(loop_at(experiment, time), time)
+    time = float(fixed("time", time, ()))
+    if not 0 <= time <= duration:
+        raise ConfigError(f"time: got {time!r}; expected 0 to {duration:g} s")
+    return state_spaces(loop_at(loop, time), time)
 
 
 def state_spaces(loop: LinearLoop, time: float = 0.0) -> LinearModels:

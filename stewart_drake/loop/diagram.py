@@ -1,5 +1,6 @@
 """The closed loop of a scenario as a Drake diagram."""
 
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -109,7 +110,7 @@ class ClosedLoop(Diagram):
 
 
 def build_closed_loop(
-    scenario: Scenario | Experiment,
+    scenario: Scenario | str | Path | Experiment,
     *,
     meshcat: Meshcat | None = None,
     **own: Any,
@@ -117,7 +118,7 @@ def build_closed_loop(
     """Build the diagram of a scenario: reference, controller, limit, link, plant, sensor.
 
     Args:
-        scenario: a scenario, or a prepared one.
+        scenario: a scenario, prepared or not, or a shipped name or a path.
         meshcat: shows the multibody plant during the simulation, or None.
         **own: controller, reference, disturbance, modify_law, sensor, link, tuner, true_mechanism,
             as of `simulate`.

@@ -20,11 +20,19 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, Limits, Workspace
+from stewart_drake.files.arguments import fixed
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.sampling import weak
 from stewart_drake.mechanism.geometry import Body, Mechanism
 from stewart_drake.scenario.config import PlantConfig
-from stewart_drake.scenario.signals import CONSTANTS, NUM_TORQUES, PLANT_PARAMETERS, POSE, RATES
+from stewart_drake.scenario.signals import (
+    CONSTANTS,
+    NUM_STATE,
+    NUM_TORQUES,
+    PLANT_PARAMETERS,
+    POSE,
+    RATES,
+)
 from stewart_drake.scenario.timing import METRIC_PERIOD
 from stewart_drake.types import ArrayLike
 
@@ -100,7 +108,7 @@ def ExactPlant_(T):
             self.limits = Workspace(dynamics.mechanism) if limits is None else limits
             self._initial = np.concatenate([dynamics.mechanism.home, np.zeros(6)])
             if initial_state is not None:
-                self._initial[:] = initial_state
+                self._initial = fixed("initial_state", initial_state, (NUM_STATE,))
             default = BasicVector_[T]([T(value) for value in self._initial])
             state = self.DeclareContinuousState(default, 6, 6, 0)
             self._torque = self.DeclareVectorInputPort("torque", NUM_TORQUES)

@@ -12,6 +12,8 @@ from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.dynamics.workspace import diagnose
+from stewart_drake.files.arguments import fixed, of_kind, positive
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import validate
 from stewart_drake.law.catch_up import CatchUp
@@ -61,6 +63,7 @@ from stewart_drake.loop.preparation import (
     Experiment,
     calibration_of,
     check_instants,
+    check_reach,
     estimated_names,
 )
 from stewart_drake.mechanism.geometry import plate_radius
@@ -383,8 +386,9 @@ def tolerated_timing(experiment: Experiment) -> float:
     """Return the standard deviation of single torques' timing that the loop tolerates, s.
 
     It is a share of the time constant of the loop, 1 / bandwidth of theory.md, section 13, that
-    falls with the delay: a longer one carries late torques further. It is infinite for weights that are given or set by a tuner, where the timing is only assumed, and for
-    the paper's laws and baselines: they predict linearly or not at all.
+    falls with the delay: a longer one carries late torques further. It is infinite for weights that
+    are given or set by a tuner, where the timing is only assumed, and for the paper's laws and
+    baselines: they predict linearly or not at all.
     """
     sc, c = experiment.scenario, experiment.scenario.controller
     predicts = c.prediction == "nonlinear" and believed_delay(sc).eta(c.period) > 0
@@ -454,6 +458,7 @@ class DesignedLaw:
         planned: trajectory that the law follows: the reference, or first a way onto it.
         queue: (L, 6) assumed torques in flight at t = 0 in N m, oldest first.
         weights: (2,) w_Q and w_R.
+        experiment: from which `sd.controller_margin` and `sd.linear_models` make the loop.
     """
 
     law: PredictiveLqi
@@ -461,6 +466,7 @@ class DesignedLaw:
     planned: Trajectory
     queue: Array
     weights: Array
+    experiment: Experiment
 
     def __repr__(self) -> str:
         timeline, dynamics = self.law.timeline, self.law.plant.dynamics
@@ -508,6 +514,8 @@ def design_law(
 ) -> DesignedLaw:
     """Design the delayed LQI law for a machine and a motion.
 
+    `sd.controller_margin` computes the stability margins of the result.
+
     Args:
         dynamics: the machine that the law assumes. Its `free` parameters are estimated; those of
             `options.estimate` where they are the default ones.
@@ -521,31 +529,31 @@ def design_law(
             gravity and `equilibrium` with it.
         noise_std: (12,) of the measurement, rad, m and per s.
         torque_limit: of each motor, N m; None is the mechanism's, if it has one.
-        horizon: part of the reference for the choice of weights and steps, s; by default all of it,
-            or 10 s of an endless one.
+        horizon: part of the reference for the choice of weights and steps, and for the check of
+            its reach, s; by default all of it, or 10 s of an endless one.
         options: other options, as a scenario's `controller`; its period and delay are ignored.
 
     Raises:
-        ConfigError: one line.
+        ConfigError: bad input, a reference or a start out of reach.
     """
-    if not (math.isfinite(delay) and delay >= 0):
-        raise ConfigError(f"delay: got {delay!r}; expected a number of seconds, 0 or more")
-    if not (math.isfinite(period) and period > 0):
-        raise ConfigError(f"period: got {period!r}; expected a number of seconds above 0")
-    chosen = dataclasses.asdict(ControllerConfig() if options is None else options)
+    options = ControllerConfig() if options is None else options
+    kinds = {"dynamics": StewartDynamics, "reference": Trajectory, "options": ControllerConfig}
+    for (name, kind), value in zip(kinds.items(), (dynamics, reference, options), strict=True):
+        of_kind(name, value, kind)
+    period, late = positive("period", period), float(fixed("delay", delay, (), 0.0))
     if horizon is None:
         horizon = reference.end_time() if math.isfinite(reference.end_time()) else _HORIZON
-    believed = Delay.of(delay, period)
+    believed = Delay.of(late, period)
     sections = {
-        "duration": horizon,
+        "duration": positive("horizon", horizon),
         "start": "on_reference" if start is None else "rest",
         "queue": ("zero" if dynamics.gravity == 0 else "equilibrium") if queue is None else queue,
         "plant": {"kind": "exact", "gravity": dynamics.gravity != 0},
         "delay": dataclasses.asdict(believed),
-        "controller": chosen
+        "controller": dataclasses.asdict(options)
         | {"period": period, "delay_steps": believed.steps, "delay_fraction": believed.fraction},
         "actuator": {"torque_limit": torque_limit},
-        "sensor": {"noise_std": np.asarray(noise_std, dtype=float).tolist()},
+        "sensor": {"noise_std": fixed("noise_std", noise_std, (NUM_STATE,), 0.0).tolist()},
     }
     scenario = validate(Scenario, sections, "design_law")
     scenario.check("design_law")
@@ -560,10 +568,7 @@ def design_law(
         )
     motion = own_motion(reference, horizon)
     first = evaluate(motion, 0.0)[:NUM_STATE]
-    at = first if start is None else np.array(start, dtype=np.float64)
-    if at.shape != (NUM_STATE,):
-        raise ConfigError(f"start: got shape {at.shape}; expected ({NUM_STATE},), pose and rates")
-    dynamics.equilibrium_torque(at[POSE])  # raises if out of reach
+    at = first if start is None else fixed("start", start, (NUM_STATE,))
     experiment = Experiment(
         scenario=scenario,
         mechanism=dynamics.mechanism,
@@ -576,7 +581,10 @@ def design_law(
         own=Own(reference=reference),
         calibration=calibration_of(scenario, dynamics.mechanism),
     )
+    check_reach(experiment)
+    if outside := diagnose(dynamics.mechanism, 0.0, at[POSE]):
+        raise ConfigError(f"start: got a pose where {outside.reason}; expected one within reach")
     law, planned, _ = control_law(experiment)
     c = scenario.controller
     flying = first_queue(experiment, law)
-    return DesignedLaw(law, motion, planned, flying, np.array(c.weights))
+    return DesignedLaw(law, motion, planned, flying, np.array(c.weights), experiment)

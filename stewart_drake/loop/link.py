@@ -12,6 +12,9 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.core.link import NO_ROOM, Link
+from stewart_drake.files.arguments import fixed, one_of, positive, whole
+from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.yamlio import brief
 from stewart_drake.loop.sampling import declare_constant, update_every, weak
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import SIMULTANEOUS, releases
@@ -28,9 +31,7 @@ class LinkSystem(LeafSystem):
 
     def _begin(self, link: Link, period: float, rows: int, delay: Delay, queue: Array) -> None:
         """Declare input, state and samples; `queue` (L, size) is in flight at t = 0."""
-        queue, shape = np.asarray(queue, np.float64), (delay.queue_length, link.size)
-        if queue.shape != shape:
-            raise ValueError(f"queue: got shape {queue.shape}; expected {shape}")
+        queue = fixed("queue", queue, (delay.queue_length, link.size))
         self._link, self._period = link, period
         self._commanded = self.DeclareVectorInputPort("commanded", rows * link.size)
         self._memory = self.DeclareDiscreteState(begun(link, delay, period, queue))
@@ -70,6 +71,16 @@ class LinkSystem(LeafSystem):
         output.SetFromVector(self._link.acted(self._of(context))[0, columns])
 
 
+def _times(name: str, values: Array, least: int = 0) -> Array:
+    """Return times (n,) in s, infinite where nothing arrives; n is at least `least`."""
+    times = np.asarray(values, np.float64)
+    if times.ndim != 1 or len(times) < least or not np.all(times >= 0):
+        raise ConfigError(
+            f"{name}: got {brief(values)}; expected (n,) of at least 0 s, n of at least {least}"
+        )
+    return times
+
+
 def begun(link: Link, delay: Delay, period: float, queue: Array) -> Array:
     """Return the memory of a link with a queue (L, size) in flight at t = 0, oldest first."""
     memory, first = link.start(), (delay.periods - len(queue)) * period
@@ -83,6 +94,7 @@ class Wire(LinkSystem):
 
     def _lay(self, period: float, kept: int, delay: Delay, queue: Array, carries: Carried) -> None:
         """Declare ports and state, with places for `kept` commands beyond the queue."""
+        one_of("carries", carries, list(CARRIED))
         kept += delay.queue_length
         link = Link(
             CARRIED[carries], kept, period, is_wire=True, time_tolerance=SIMULTANEOUS * period
@@ -133,7 +145,7 @@ class DelayChain(Wire):
         self, period: float, steps: int, fraction: float, queue: Array, carries: Carried = "torque"
     ) -> None:
         super().__init__()
-        self._delay = Delay(steps, fraction)
+        period, self._delay = positive("period", period), Delay(steps, fraction)
         self._lay(period, steps + 2, self._delay, queue, carries)
         if fraction > 0:
             self.DeclarePeriodicUnrestrictedUpdateEvent(
@@ -189,9 +201,7 @@ class VaryingDelay(Wire):
         carries: Carried = "torque",
     ) -> None:
         super().__init__()
-        delays = np.asarray(delays, np.float64)
-        if delays.ndim != 1 or not len(delays) or not np.all(delays >= 0):
-            raise ValueError("delays: got an empty or negative one; expected (n,) of at least 0 s")
+        period, delays = positive("period", period), _times("delays", delays, 1)
         self._delays = np.where(delays > SIMULTANEOUS * period, delays, 0.0)
         longest = self._delays.max(initial=0.0, where=np.isfinite(delays))
         self._lay(period, int(longest / period) + 2, delay, queue, carries)
@@ -262,8 +272,11 @@ class PlayoutBuffer(LinkSystem):
         history: int = 1,
     ) -> None:
         super().__init__()
-        self._delay, self._rows, self._repeats = delay, rows, repeats
-        self._arrivals = period * np.arange(len(times)) + np.asarray(times, dtype=np.float64)
+        period, times = positive("period", period), _times("times", times)
+        self._delay, self._rows = delay, whole("rows", rows, 1)
+        self._repeats, history = whole("repeats", repeats, 0), whole("history", history, 1)
+        one_of("dry", dry, ("hold", "zero"))
+        self._arrivals = period * np.arange(len(times)) + times
         link = Link(
             *(NUM_TORQUES, buffer_places(delay, rows), period),
             is_wire=False,
@@ -351,7 +364,8 @@ class LateMeasurements(LeafSystem):
 
     def __init__(self, period: float, times: Array, size: int) -> None:
         super().__init__()
-        self._times, self._period = np.asarray(times, dtype=np.float64), period
+        self._times, self._period = _times("times", times), positive("period", period)
+        whole("size", size, 1)
         self._link = measurement_link(period, self._times, size)
         self._memory = self.DeclareDiscreteState(self._link.start())
         self._measured = self.DeclareVectorInputPort("measured", size)

@@ -1,6 +1,7 @@
 """A scenario with its machine, plant, reference and start state, checked against each other."""
 
 import math
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from stewart_drake.scenario.calibration import (
 )
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
+from stewart_drake.scenario.loading import as_scenario
 from stewart_drake.scenario.signals import (
     BIAS,
     CONSTANTS,
@@ -172,8 +174,20 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
         ConfigError: one line; also where the reference leaves the workspace, with time and leg.
     """
     experiment = assemble(scenario, truth, own)
+    check_reach(experiment)
+    outside = diagnose(experiment.truth, 0.0, experiment.start[POSE])
+    if outside is not None:
+        raise ConfigError(
+            f"plant.mechanism: got {experiment.truth.name}, which does not reach the first pose "
+            f"({outside.reason}); expected a machine that does"
+        )
+    return experiment
+
+
+def check_reach(experiment: Experiment) -> None:
+    """Check that a reference stays in the workspace, except where the law keeps the limits."""
     failure = experiment.reference_failure()
-    governed = scenario.controller.limits == "qp"
+    governed = experiment.scenario.controller.limits == "qp"
     if failure is not None and not (governed and failure.time > 0):
         first = experiment.reference.value(0.0)[:, 0]
         short = failure.leg is not None and failure.margin < 0
@@ -187,22 +201,17 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
                 else f": {first_pose_text(first, experiment.mechanism)}"
             )
         )
-    outside = diagnose(experiment.truth, 0.0, experiment.start[POSE])
-    if outside is not None:
-        raise ConfigError(
-            f"plant.mechanism: got {experiment.truth.name}, which does not reach the first pose "
-            f"({outside.reason}); expected a machine that does"
-        )
-    return experiment
 
 
 def concrete(
-    scenario: Scenario | Experiment, true_mechanism: Mechanism | None = None, **own: Any
+    scenario: Scenario | str | Path | Experiment,
+    true_mechanism: Mechanism | None = None,
+    **own: Any,
 ) -> Experiment:
     """Prepare a scenario with the user's systems, or return an Experiment as it is.
 
     Args:
-        scenario: either.
+        scenario: a scenario, prepared or not, or a shipped name or a path.
         true_mechanism: the machine to simulate, that of the scenario's plant if None.
         **own: see `loop.simulation.simulate`.
 
@@ -211,7 +220,7 @@ def concrete(
         TypeError: systems of the user with an Experiment, which already has its own.
     """
     if not isinstance(scenario, Experiment):
-        return prepare(scenario, true_mechanism, take(own))
+        return prepare(as_scenario(scenario), true_mechanism, take(own))
     for name, thing in ({"true_mechanism": true_mechanism} | own).items():
         if thing is not None:
             raise TypeError(f"{name}: got one with an Experiment, which has its own; expected None")

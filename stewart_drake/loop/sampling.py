@@ -23,6 +23,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
+from stewart_drake.files.arguments import positive
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
 
@@ -80,7 +81,7 @@ def update_every(
         update: takes a Context and the State to be changed.
         when: the lead, a function in `scenario.timing`.
     """
-    call, early = weak(update), when(period)
+    call, early = weak(update), when(positive("period", period))
 
     def first(context: Context, state: Any) -> EventStatus:
         call(context, state)

@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
+from stewart_drake.files.arguments import fixed, of_kind, positive, whole
 from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.scenario.field_types import SPIKE
-from stewart_drake.scenario.signals import LEGS, NUM_LEGS, NUM_STATE, POSE
+from stewart_drake.scenario.signals import LEGS, NUM_COORDINATES, NUM_LEGS, NUM_STATE, POSE
 from stewart_drake.types import Array, ArrayLike
 
 _EARLY = 1e-9
@@ -126,8 +127,10 @@ class Sensor(LeafSystem):
         motion: ArrayLike = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
     ) -> None:
         super().__init__()
-        self._std, self._seed, self._period = np.array(noise_std), seed, period
-        self._faults, self._scale = list(faults), np.tile(np.asarray(motion, np.float64), 2)
+        self._std = fixed("noise_std", noise_std, (NUM_STATE,), 0.0)
+        self._seed, self._period = whole("seed", seed, 0), positive("period", period)
+        scale = fixed("motion", motion, (NUM_COORDINATES,), 0.0)
+        self._faults, self._scale = list(faults), np.tile(scale, 2)
         self._state = self.DeclareVectorInputPort("state", NUM_STATE)
         if self._faults:
             self.DeclareDiscreteState(np.full(NUM_STATE, np.nan))
@@ -205,11 +208,14 @@ class Encoders(LeafSystem):
         motion: ArrayLike = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
     ) -> None:
         super().__init__()
-        self._mechanism, self._samples, self._seed = mechanism, samples, seed
-        self._quantum = 0.0 if bits is None else 2 * np.pi / 2**bits
-        self._offset, self._motion = np.array(offset), np.asarray(motion, np.float64)
+        of_kind("mechanism", mechanism, Mechanism)
+        self._mechanism, self._seed = mechanism, whole("seed", seed, 0)
+        self._samples = whole("samples", samples, 1)
+        self._quantum = 0.0 if bits is None else 2 * np.pi / 2 ** whole("bits", bits, 1)
+        self._offset = fixed("offset", offset, (NUM_LEGS,))
+        self._motion = fixed("motion", motion, (NUM_LEGS,), 0.0)
         self._phases = draws(seed, _PHASES, 0).uniform(-0.5, 0.5, NUM_LEGS)
-        self._step, self._faults = period / samples, list(faults)
+        self._step, self._faults = positive("period", period) / samples, list(faults)
         size = samples * NUM_LEGS
         self._last = self.DeclareDiscreteState([-1.0])
         self._window = self.DeclareDiscreteState(np.full(size, np.nan))

@@ -20,6 +20,7 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
+from stewart_drake.files.arguments import fixed, positive
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.catch_up import PIECE, shortest
 from stewart_drake.law.feedforward import NoFeedforward
@@ -119,6 +120,7 @@ class Servos(SteppedLaw):
     ) -> None:
         super().__init__()
         self._loop, self._dynamics, self._period, self.reports = loop, dynamics, period, reports
+        command, period = fixed("command", command, (NUM_REFERENCE,)), positive("period", period)
         nothing = np.full((reports.periods * round(period / loop.period), NUM_TORQUES), np.nan)
         setpoint, asked = command[SETPOINT], np.zeros(NUM_TORQUES)
         self._command = self.DeclareVectorInputPort("command", NUM_REFERENCE)
@@ -197,8 +199,10 @@ class PositionServos(LeafSystem):
         reports: ReportLayout,
     ) -> None:
         super().__init__()
-        self._geometry, self._first = geometry_of(dynamics.mechanism), command
-        self._servo, self.reports, self._part = servo, reports, period / reports.parts
+        self._geometry = geometry_of(dynamics.mechanism)
+        self._first = fixed("command", command, (NUM_REFERENCE,))
+        self._servo, self.reports = servo, reports
+        self._part = positive("period", period) / reports.parts
         self._command = self.DeclareVectorInputPort("command", NUM_REFERENCE)
         self._state = self.DeclareVectorInputPort("state", NUM_STATE)
         self.DeclareContinuousState(NUM_TORQUES + 1)

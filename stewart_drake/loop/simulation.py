@@ -25,7 +25,6 @@ from stewart_drake.loop.sampling import dispose
 from stewart_drake.loop.scene import Live
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.run_log import RunLog, open_log
 from stewart_drake.scenario.timing import instants, look_time
 
@@ -80,7 +79,8 @@ def simulate(
             `controller.period`, and of the inputs `density` (18), `measurement` (12) and
             `reference` (18) those that it needs. With encoders `measurement` is the estimate of the
             sample before.
-        progress: called every 20 ms of simulated time; its exceptions reach the caller.
+        progress: called every 20 ms of simulated time, with that time in s and the error in % of
+            peak to peak; its exceptions reach the caller.
         meshcat: shows the machine, its reference and the torques live, at most in real time, or
             None.
         true_mechanism: the machine to simulate; by default that of the scenario's plant.
@@ -93,13 +93,6 @@ def simulate(
         ConfigError: bad input, an unreachable reference.
         TypeError: another type of scenario, or systems of your own with an `Experiment`.
     """
-    if isinstance(scenario, str | Path):
-        scenario = load_scenario(scenario)
-    if not isinstance(scenario, Scenario | Experiment):
-        raise TypeError(
-            f"scenario: got a {type(scenario).__name__}; expected a Scenario, or the name or path "
-            "of one"
-        )
     # Matrices of twenty rows are slower on several threads, up to fifty times on busy cores.
     with one_blas_thread:
         experiment = concrete(

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context
 
+from stewart_drake.files import arguments
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
@@ -59,6 +60,7 @@ class DensityWindow(SteppedLaw):
 
     def __init__(self, period: float, kind: Kind = "magnitude") -> None:
         super().__init__()
+        arguments.one_of("kind", kind, get_args(Kind))
         self._measurement = self.DeclareVectorInputPort("measurement", NUM_STATE)
         self._reference = self.DeclareVectorInputPort("reference", NUM_REFERENCE)
         self._torque = self.DeclareVectorInputPort("torque", NUM_TORQUES)
@@ -111,7 +113,9 @@ class AnnTuner(SteppedLaw):
 
     def __init__(self, network: Network, fixed: Array, period: float) -> None:
         super().__init__()
-        policy = PaperPolicy(network, np.array(fixed))
+        arguments.of_kind("network", network, Network)
+        first = arguments.fixed("fixed", fixed, (len(WEIGHTS),), 0.0)
+        policy = PaperPolicy(network, first)
         self._source = WeightsSource(None, DensityFeatures(network.density), policy)
         self._density = self.DeclareVectorInputPort("density", NUM_INPUTS)
         self._begin((np.full(len(WEIGHTS), np.nan), 0), period)

@@ -20,6 +20,7 @@ from typing import Final
 import numpy as np
 
 from stewart_drake.core.library import core
+from stewart_drake.files.arguments import fixed, listed
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism import kinematics
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS
@@ -46,7 +47,7 @@ class Body:
     def problem(self, field: str, *, massless: bool = False) -> str | None:
         """Return why no rigid body has this mass and inertia, opened by `field`, or None."""
         moments, nothing = self.inertia, massless and self.mass == 0
-        got = f"{field}.inertia: got {_listed(moments)} kg m^2"
+        got = f"{field}.inertia: got {listed(moments)} kg m^2"
         if not (0 < self.mass < np.inf or nothing):
             return f"{field}.mass: got {self.mass:g} kg; expected a positive mass"
         if np.any(moments <= 0) and not nothing:
@@ -153,7 +154,7 @@ class Mechanism(kinematics.Legs):
                 f"name: got {self.name!r}; expected a letter, then letters, digits, _ or -, and "
                 f"none of {', '.join(RESERVED_NAMES)}",
             ),
-            (np.all(u > 0), f"crank.length: got {_listed(u)} m; expected positive lengths"),
+            (np.all(u > 0), f"crank.length: got {listed(u)} m; expected positive lengths"),
             (
                 np.all(rods > u),
                 f"rod.length: got {rods[leg]:g} m for leg {LEGS[leg]}, whose crank is {u[leg]:g} "
@@ -161,7 +162,7 @@ class Mechanism(kinematics.Legs):
             ),
             (
                 np.all(np.abs(self.branches) == 1),
-                f"branches: got {_listed(self.branches)}; expected -1 or 1 six times",
+                f"branches: got {listed(self.branches)}; expected -1 or 1 six times",
             ),
             (
                 skew <= 1e-9 and np.all(np.linalg.det(self.R_WS) > 0),
@@ -192,7 +193,7 @@ class Mechanism(kinematics.Legs):
                 accepted = f"{where} z between {low:.4g} and {high:.4g} m, such as {middle:.4g}"
             raise kinematics.UnreachablePoseError(
                 margins,
-                prefix=f"home: got {_listed(self.home)}, out of reach",
+                prefix=f"home: got {listed(self.home)}, out of reach",
                 suffix=f"; expected a home pose within reach, {accepted}",
             )
 
@@ -335,21 +336,3 @@ def _six(name: str, values: ArrayLike) -> Array:
         what = "crank angles in rad" if angles else "[roll, pitch, yaw, x, y, z] in rad and m"
         raise ValueError(f"{name}: got shape {numbers.shape}; expected (6,), {what}")
     return numbers
-
-
-def fixed(field: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return a read-only copy of finite numbers of this shape."""
-    try:
-        copy = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ConfigError(f"{field}: got {values!r}; expected numbers") from None
-    if copy.shape != shape:
-        raise ConfigError(f"{field}: got shape {copy.shape}; expected {shape or 'one number'}")
-    if not np.all(np.isfinite(copy)):
-        raise ConfigError(f"{field}: got {_listed(copy)}; expected finite numbers")
-    copy.setflags(write=False)
-    return copy
-
-
-def _listed(values: Array) -> str:
-    return "[" + ", ".join(f"{v:g}" for v in np.ravel(values)) + "]"

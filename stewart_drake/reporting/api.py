@@ -15,7 +15,7 @@ from stewart_drake.reporting.results import AnalysisResult, ComparisonResult, Si
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import as_scenario, title_of
 from stewart_drake.studies import compare as comparison
-from stewart_drake.studies.options import argument_lines
+from stewart_drake.studies.options import argument_lines, naming_arguments
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -77,7 +77,7 @@ def analysis_function(name: str) -> Callable[..., AnalysisResult]:
         loaded = as_scenario(scenario)
         if row.exact:
             loaded, given = _exact(loaded), _exact(given)
-        with TemporaryDirectory() as scratch:
+        with TemporaryDirectory() as scratch, naming_arguments(options_of(name), signature):
             return analyze(
                 name,
                 loaded,
@@ -114,7 +114,7 @@ def _signature(name: str) -> inspect.Signature:
 
 def _documentation(name: str) -> str:
     row = ANALYSES[name]
-    meanings = {"scenario": "or a shipped name or a path."}
+    meanings = {"scenario": "a Scenario, a shipped name or a path."}
     meanings |= {one.name: one.help for one in options_of(name).described()}
     if row.keeps:
         meanings["directory"] = f"folder of the {row.keeps}, from which a second call continues."

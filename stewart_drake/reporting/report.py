@@ -197,6 +197,7 @@ def document(found: ReportData, name: str, replay: str = "") -> Document:
     if found.tuned:
         compared["weights"] = weights_figure({LABELS[n]: run for n, run in found.tuned.items()})
     own = found.run and _blocks(run_document(found.run))
+    said = found.run.summary["warnings"] if found.run else ()
     if found.run and own:
         below = _PACKETS_BELOW if has_packets(found.run) else ""
         for what, figure in draw_run(found.run).items():
@@ -212,7 +213,8 @@ def document(found: ReportData, name: str, replay: str = "") -> Document:
         failure=found.failure,
         replay=replay and Frame(replay),
         run=own,
-        comparison=found.comparison and _blocks(comparison_document(found.comparison, found.tuned)),
+        comparison=found.comparison
+        and _blocks(comparison_document(found.comparison, found.tuned, said)),
         papers=is_papers(found.scenario),
         no_weights="weights" not in compared,
         compared=[

@@ -1,7 +1,7 @@
 """Documents of a run, and of a comparison with the paper's Table II."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import fields
 from typing import Any, Final
 
@@ -25,8 +25,11 @@ _STILL: Final = 1e-9
 _Runs = Mapping[str, SimulationResult]
 
 
-def run_document(result: SimulationResult) -> Document:
-    """Return status, errors, torques and computing times of a run."""
+def run_document(result: SimulationResult, said: Collection[str] = ()) -> Document:
+    """Return status, errors, torques and computing times of a run.
+
+    Warnings in `said` were printed before and are left out.
+    """
     s = result.summary
     return from_template(
         "run",
@@ -35,7 +38,7 @@ def run_document(result: SimulationResult) -> Document:
         inf=math.inf,
         peaks=listed(_peaks(result)),
         events=[(n, name) for name, n in s["counts"].items() if n],
-        cautions=s["warnings"],
+        cautions=[text for text in s["warnings"] if text not in said],
     )
 
 
@@ -72,11 +75,13 @@ def worst(run: SimulationResult) -> str:
     return _peaks(run)[int(np.argmax(share))]
 
 
-def comparison_document(results: _Runs, tuned: _Runs | None = None) -> Document:
+def comparison_document(
+    results: _Runs, tuned: _Runs | None = None, said: Collection[str] = ()
+) -> Document:
     """Return a row per controller, the tuner's runs last.
 
     A first section has the paper's Table II, if the scenario is the paper's and adds rows of its
-    controllers.
+    controllers. Warnings in `said` were printed before and are left out.
     """
     paper = {name: run for name, run in results.items() if _base(name, run) in PAPER_ERRORS}
     added = [name for name in paper if name not in PAPER_ERRORS]
@@ -107,7 +112,7 @@ def comparison_document(results: _Runs, tuned: _Runs | None = None) -> Document:
         and any(is_papers(run.scenario, any_size=True) for run in results.values()),
         runs=[_row(title, name, run) for title, name, run in runs],
         loops=[f"{name} ({label(name)}): {text}" for name, text in loops.items()],
-        cautions=_shared_warnings(results),
+        cautions=[text for text in _shared_warnings(results) if text not in said],
         **context,
     )
 

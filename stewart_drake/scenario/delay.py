@@ -1,6 +1,7 @@
 """The delay between a torque and its effect as a value, true or assumed."""
 
 from dataclasses import dataclass
+from numbers import Integral, Real
 
 from stewart_drake.scenario.timing import LEAST_FRACTION
 
@@ -13,10 +14,11 @@ class Delay:
     fraction: float = 0.0  # eta0 / dt, further part of a period, in [0, 1)
 
     def __post_init__(self) -> None:
-        if self.steps < 0 or not 0 <= self.fraction < 1:
+        numbers = isinstance(self.steps, Integral) and isinstance(self.fraction, Real)
+        if not (numbers and self.steps >= 0 and 0 <= self.fraction < 1):
             raise ValueError(
-                f"delay: got {self.steps} steps and a fraction of {self.fraction}; expected "
-                "steps >= 0 and 0 <= fraction < 1"
+                f"delay: got {self.steps!r} steps and a fraction of {self.fraction!r}; expected "
+                "whole steps >= 0 and 0 <= fraction < 1"
             )
 
     @classmethod

@@ -85,6 +85,8 @@ _HINTS: Final[dict[str | tuple[str, str], str]] = {
     "controller.command": ", as of the controllers servo_preview and servo_feedforward",
     ("actuator.kind", "plant.joint_damping"): "; the servos have their own, actuator.crank_damping",
     ("actuator.kind", "plant.coulomb_friction"): "; the servos have their own, actuator.friction",
+    ("link.kind", "controller.delay_estimator"): ", as of the controller predictor_lqi, or "
+    "link.kind 'wire': the play-out bound sets the delay",
     "controller.delay_steps": ": the play-out bound sets the delay, and 0 is a controller without "
     "one",
 }

@@ -40,7 +40,7 @@ def load_scenario(
     Args:
         name_or_path: a shipped name or a YAML file. Paths inside the file start from its folder;
             missing fields keep their defaults.
-        controller: a controller to lay over it, as `load_controller` takes it.
+        controller: a shipped name or a YAML file, laid over the scenario's own.
         settings: `section.field=value` or `field=value`, the value in YAML, e.g.
             `plant.gravity=true`; paths start from the working directory. A setting of a section's
             kind also drops the file's fields of another kind. `overlay=dirty` lays the fields of a
@@ -58,9 +58,31 @@ def load_scenario(
     return read.scenario
 
 
-def as_scenario(given: Scenario | str | Path) -> Scenario:
-    """Return a scenario as it is, or load it by its shipped name or path."""
-    return given if isinstance(given, Scenario) else load_scenario(given)
+def as_scenario(
+    given: Scenario | str | Path,
+    controller: str | Path | None = None,
+    settings: Iterable[str] = (),
+) -> Scenario:
+    """Return a scenario as it is, or load it by its shipped name or path.
+
+    Raises:
+        TypeError: another type.
+        ConfigError: bad input; a controller or settings for a scenario that is loaded already.
+    """
+    if isinstance(given, str | Path):
+        return load_scenario(given, controller, settings)
+    if not isinstance(given, Scenario):
+        raise TypeError(
+            f"scenario: got a {type(given).__name__}; expected a Scenario, or the name or path of "
+            "one"
+        )
+    for name, value in (("controller", controller), ("settings", settings)):
+        if value:
+            raise ConfigError(
+                f"{name}: got {brief(value)} with a Scenario; expected none: give them to "
+                "load_scenario"
+            )
+    return given
 
 
 def title_of(scenario: str | Path) -> str:

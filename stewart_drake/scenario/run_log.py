@@ -102,12 +102,12 @@ class RunLog(Protocol):
         ...
 
 
-def kind_of_log(path: Path) -> Callable[[Path, Scenario], RunLog]:
-    """Return the class of a log, by the suffix of its file."""
+def kind_of_log(path: Path, name: str = "log") -> Callable[[Path, Scenario], RunLog]:
+    """Return the class of a log, by the suffix of its file; `name` opens an error."""
     if path.suffix == ".csv":
         return CsvLog
     if path.suffix != ".mcap":
-        raise ConfigError(f"--log: got {str(path)!r}; expected a file that ends in .mcap or .csv")
+        raise ConfigError(f"{name}: got {str(path)!r}; expected a file that ends in .mcap or .csv")
     _mcap("mcap.writer")
     return McapLog
 
@@ -118,7 +118,7 @@ def open_log(path: Path, scenario: Scenario) -> RunLog:
         return kind_of_log(path)(path, scenario)
     except OSError as error:
         raise ConfigError(
-            f"--log: {path} cannot be written ({error.strerror}); expected a file"
+            f"{path}: cannot be written ({error.strerror}); expected a file"
         ) from None
 
 

@@ -82,14 +82,15 @@ def compare(
     Args:
         scenario_name: a shipped name or a path; its start, plant and tuner stay as they are.
         settings: as `load_scenario` takes them.
-        progress: called for each running simulation, ten times a second.
-        controllers: names or files, for these in this order; or your own systems by name, in
-            addition to the shipped ones, with the ports listed at `simulate`.
+        progress: called for each running simulation, ten times a second, with the controller's
+            name, simulated time in s and error in % of peak to peak.
+        controllers: names or files, to compare these in this order; or a mapping of names to your
+            own systems, with the ports listed at `simulate`, which are added to the shipped ones.
         reference, disturbance: for all runs, as of `simulate`.
 
     Returns:
-        Results by controller, in the order of `shown`, then your own. A file is named by its name
-        without the suffix.
+        Results by controller, the shipped or given ones first, then your own. The name of a file
+        is without its suffix.
     """
     settings, chosen = tuple(settings), None
     makers: dict[str, Callable[[], System]] = {}

@@ -3,6 +3,7 @@
 The command line, the Python signature and the command that a page names follow from them.
 """
 
+import contextlib
 import functools
 import inspect
 import re
@@ -85,6 +86,11 @@ class Option(NamedTuple):
     def required(self) -> bool:
         return self.default is inspect.Parameter.empty
 
+    @property
+    def dashed(self) -> str:
+        """Name on the command line, without the dashes before it."""
+        return (self.flag or self.name).replace("_", "-")
+
 
 class Options(BaseModel):
     """Base class of the options of a study; wrong values raise ConfigError."""
@@ -132,6 +138,24 @@ def argument_lines(meanings: Mapping[str, str]) -> list[str]:
     ]
 
 
+def in_python(text: str, kind: type[Options], function: inspect.Signature) -> str:
+    """Return a text with arguments of a Python function in place of the command's options."""
+    names = {f"--{name}": name for name in function.parameters}
+    names |= {f"--{one.dashed}": one.name for one in kind.described()}
+    names |= {"SCENARIO": "scenario", "WEIGHTS": "networks", "--set": "the setting"}
+    pattern = r"--[a-z]+(?:-[a-z]+)*|[A-Z]{4,}"
+    return re.sub(pattern, lambda found: names.get(found[0], found[0]), text)
+
+
+@contextlib.contextmanager
+def naming_arguments(kind: type[Options], function: inspect.Signature) -> Iterator[None]:
+    """Let errors name arguments of a Python function, see `in_python`."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(in_python(str(error), kind, function)) from None
+
+
 def takes(kind: type[Options]) -> Callable[[Callable[..., _R]], Callable[..., _R]]:
     """Return a decorator that replaces the argument `options` of a function by its options."""
 
@@ -142,12 +166,17 @@ def takes(kind: type[Options]) -> Callable[[Callable[..., _R]], Callable[..., _R
 
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> _R:
+            if "options" in kwargs:  # of a command, whose errors name its options
+                return function(*args, **kwargs)
             given = shown.bind(*args, **kwargs).arguments
             options = kind(**{name: given.pop(name) for name in kind.model_fields if name in given})
-            return function(**given, options=options)
+            with naming_arguments(kind, shown):
+                return function(**given, options=options)
 
         call.__signature__ = shown  # type: ignore[attr-defined]
-        lines = argument_lines({one.name: one.help for one in kind.described()})
+        lines = argument_lines(
+            {one.name: in_python(one.help, kind, shown) for one in kind.described()}
+        )
         call.__doc__ = (function.__doc__ or "").replace("    OPTIONS", "\n".join(lines).lstrip())
         return call
 

@@ -93,7 +93,7 @@ class LearnOptions(Options):
 
 
 class LinkOptions(Options):
-    runs: int = option(5, "Number of seeds for each bound and loss.", "N", ge=1)
+    runs: int = option(5, "Number of seeds for each bound and loss.", "N", ge=1, le=10_000)
 
 
 def _read_also(names: list[str], load: Callable[[str], Scenario]) -> dict[str, Scenario]:
@@ -115,7 +115,7 @@ class RobustnessOptions(JobOptions):
         name="vary",
         read=lambda texts, _: read_ranges(texts),
     )
-    runs: int = option(200, "Number of machines.", "N", ge=1)
+    runs: int = option(200, "Number of machines.", "N", ge=1, le=100_000)
     seed: int = option(0, "Random seed.", ge=0)
     limit: float | None = option(
         None, "E_ac above which a run counts as failed, % s.", "E_AC", gt=0

@@ -55,7 +55,7 @@ LEAST: Final = 1e-3
 
 _NUMBERS: Final = ("accumulated_error", "cost", "rms_torque", "peak_torque", "torque_variation")
 _CONDITION: Final = ("delay_steps", "frequency", "disturbance")
-_EXPECTED: Final = "a data set that `tune dataset --out` has written"
+_EXPECTED: Final = "a data set that `tune dataset` has written"
 _VARIABLES: Final = {
     "samples": ("run", "sample", "input"),
     "density": ("run", "sample", "input"),

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 Labels = Literal["as_run", "best_in_cell", "best_in_cell_torque"]
 Split = Literal["sample", "run", "cell"]
 DRAWS: Final = 384
+MOST: Final = 10_000
+"""Largest number of conditions: each takes 200 kB of memory in the end."""
 
 
 class FamilyOptions(JobOptions):
@@ -57,10 +59,14 @@ class DataOptions(FamilyOptions):
 
     purpose = "training"
     disturbed: int | None = option(
-        None, "N drawn conditions instead of the paper's grid.", "N", ge=0
+        None, "N drawn conditions instead of the paper's grid.", "N", ge=0, le=MOST
     )
     draws: int | None = option(
-        None, f"With --family: how many, each with 13 ratios; {DRAWS} by default.", "N", ge=10
+        None,
+        f"With --family: how many, each with 13 ratios; {DRAWS} by default.",
+        "N",
+        ge=10,
+        le=MOST,
     )
 
     @property
@@ -75,7 +81,7 @@ class DataOptions(FamilyOptions):
 
 class EvaluationOptions(FamilyOptions):
     purpose = "evaluation"
-    scenarios: int = option(40, "Number of scenarios.", "N", ge=2)
+    scenarios: int = option(40, "Number of scenarios.", "N", ge=2, le=MOST)
 
     @property
     def number(self) -> int:
@@ -83,7 +89,7 @@ class EvaluationOptions(FamilyOptions):
 
 
 class TrainingOptions(Options):
-    regret: bool = option(False, "Train by regret, on data of a --family; else as in the paper.")
+    regret: bool = option(False, "Train by regret, on data of a family; else as in the paper.")
     start: float | None = option(
         None, "With --regret: log10 w_Q / w_R at first; else the best.", "RATIO"
     )
