@@ -75,8 +75,10 @@ def live(
     span = math.inf if options.duration is None else options.duration
     name = Path(scenario).stem
     if options.learn:
-        if options.duration is not None or options.log is not None or options.mirror is not None:
-            raise ConfigError("--learn: expected none of --duration, --log and --mirror with it")
+        if options.hold or {options.duration, options.log, options.mirror} != {None}:
+            raise ConfigError(
+                "--learn: expected none of --duration, --log, --mirror and --hold with it"
+            )
         return _learn(scenario, loaded, machine, options, (controller, settings or ()), delivery)
 
     from stewart_drake.live.contact import address_of
@@ -109,7 +111,7 @@ def live(
         if not ready.simulated and sys.stdin.isatty():
             input("Enter begins, Ctrl-C leaves it alone")
         delivery.discard("signals.nc")
-        how: Any = {"armed": options.armed, "viewer": viewer, "max_missing": options.max_missing}
+        how: Any = options.model_dump(include={"armed", "max_missing", "hold"}) | {"viewer": viewer}
         how["log"] = None if out is None else out / LOG
         how["logs"] = session.open_logs(ready, options, delivery.say_wrapped)
         with _Ending() as ending:

@@ -77,6 +77,16 @@ class Design(NamedTuple):
         """Whether plans are sent, to a buffer."""
         return self.rows > 1 if self.cranks else isinstance(self.law.channel, Packets)
 
+    def left_alone(self, machine: MachineMessage) -> str:
+        """Return in words what becomes of the plate without a controller."""
+        if self.cranks:
+            return "the servos hold their last setpoint"
+        if MachineFlags.SAFE_HOLDS in machine.flags:
+            return "the motors keep their last torque, which holds the plate for a while only"
+        if not self.experiment.scenario.plant.gravity:
+            return "the motors have no torque"
+        return "the motors have no torque: the plate falls unless brakes or a support hold it"
+
 
 def check_controller(scenario: Scenario) -> None:
     """Refuse a scenario with a tuner, or with servos that need more than a setpoint."""

@@ -134,14 +134,14 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
     if sc.link.kind == "network":
         c = sc.controller
         packets = f"packets of {c.packet_repeats + c.packet_torques} torques"
-    acts, what = "torques act", "torque"
+    acts = "torques act"
     if made.cranks:
-        acts, what = "setpoints act", "setpoint"
+        acts = "setpoints act"
         packets = (
-            f"plans of {made.rows} setpoints" if made.sends else packets.replace("torque", what)
+            f"plans of {made.rows} setpoints" if made.sends else packets.replace("torque", "setpoint")
         )
+    held = "" if made.cranks else " (--hold controls it at rest until Ctrl-C)"
     until = "until it is stopped" if math.isinf(duration) else f"for {duration:g} s"
-    safe = f"the last {what}" if MachineFlags.SAFE_HOLDS in machine.flags else "no torque"
     return [
         f"machine at {host}:{port}: {kind}{rate}",
         f"link: {1e3 * link.typical:.0f} ms there and back ({1e3 * link.shortest:.0f} to "
@@ -149,8 +149,9 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
         f"{100 * link.loss_back:.0f} % back",
         f"{acts} {eta:g} s after the measurement that they rest on: {packets}, every "
         f"{1e3 * sc.controller.period:g} ms, motors {limit}",
-        f"motion: {scenario}, {until}; after {machine.watchdog / SECOND:g} s without a word the "
-        f"machine goes to {safe}",
+        f"motion: {scenario}, {until}, then rest",
+        f"at the end, and after {machine.watchdog / SECOND:g} s without a word, "
+        f"{made.left_alone(machine)}{held}",
         *_stability(ready),
         *_cautions(made),
     ]
@@ -270,6 +271,7 @@ def drive(
     max_missing: float | None = None,
     log: Path | None = None,
     logs: Sequence[RunLog] = (),
+    hold: bool = False,
     pace: float | None = None,
 ) -> SimulationResult:
     """Run the loop; the machine moves. In the end socket and logs are closed.
@@ -278,7 +280,7 @@ def drive(
         armed: whether a real machine may be driven.
         accept_jitter: whether to start with more jitter than the loop is stable for.
         ending: whether to bring the plate to rest and end.
-        max_missing, log: see `LiveLoop`.
+        max_missing, log, hold: see `LiveLoop`.
         pace: pole of the governor, 1/s; by default it depends on the torque limit.
 
     Raises:
@@ -295,7 +297,7 @@ def drive(
     governor = Governor(made.law.plant.dynamics, made.torque_limit, fastest, slowest)
     steering = Steering(governor, made.experiment.reference, Way.along(made.planned))
     kind = CrankLoop if made.cranks else LiveLoop
-    loop = kind(made, steering, contact, viewer or Viewer(), say, max_missing, log, logs)
+    loop = kind(made, steering, contact, viewer or Viewer(), say, max_missing, log, logs, hold)
     started = clock.perf_counter()
     try:
         with one_blas_thread, before_others() as scheduled:
