@@ -130,25 +130,31 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
     eta = made.law.timeline.eta
     limit = "without a limit" if math.isinf(made.torque_limit) else f"{made.torque_limit:g} N m"
     rate = "" if machine.rate == 1 else f", {machine.rate:g} of its seconds in one"
-    packets = "each torque as it is computed, on a simulated wire"
+    packets, trips = (
+        "each torque as it is computed, on a simulated wire",
+        ", as the machine simulates it",
+    )
     if sc.link.kind == "network":
+        trips = ", which leaves time for the longest round trip, computing and repetitions"
         c = sc.controller
         packets = f"packets of {c.packet_repeats + c.packet_torques} torques"
     acts = "torques act"
     if made.cranks:
         acts = "setpoints act"
         packets = (
-            f"plans of {made.rows} setpoints" if made.sends else packets.replace("torque", "setpoint")
+            f"plans of {made.rows} setpoints"
+            if made.sends
+            else packets.replace("torque", "setpoint")
         )
-    held = "" if made.cranks else " (--hold controls it at rest until Ctrl-C)"
+    held = "" if made.cranks else " (--hold controls the plate at rest until Ctrl-C)"
     until = "until it is stopped" if math.isinf(duration) else f"for {duration:g} s"
     return [
         f"machine at {host}:{port}: {kind}{rate}",
-        f"link: {1e3 * link.typical:.0f} ms there and back ({1e3 * link.shortest:.0f} to "
-        f"{1e3 * link.longest:.0f}), {100 * link.loss_there:.0f} % lost there, "
-        f"{100 * link.loss_back:.0f} % back",
-        f"{acts} {eta:g} s after the measurement that they rest on: {packets}, every "
-        f"{1e3 * sc.controller.period:g} ms, motors {limit}",
+        f"link: a round trip takes {1e3 * link.typical:.0f} ms ({1e3 * link.shortest:.0f} to "
+        f"{1e3 * link.longest:.0f}), {100 * link.loss_there:.0f} % are lost on the way there, "
+        f"{100 * link.loss_back:.0f} % on the way back",
+        f"delay of the loop: {acts} {eta:g} s after the measurement that they rest on{trips}",
+        f"the controller sends {packets}, every {1e3 * sc.controller.period:g} ms; motors {limit}",
         f"motion: {scenario}, {until}, then rest",
         f"at the end, and after {machine.watchdog / SECOND:g} s without a word, "
         f"{made.left_alone(machine)}{held}",

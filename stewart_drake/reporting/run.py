@@ -27,6 +27,7 @@ def run_document(result: SimulationResult) -> Document:
         inf=math.inf,
         names=COORDINATE_NAMES,
         events=[(n, name) for name, n in s["counts"].items() if n],
+        packets=[(n, name) for name, n in s["packets"].items()],
         cautions=s["warnings"],
     )
 
