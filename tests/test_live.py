@@ -487,6 +487,12 @@ def test_a_link_that_takes_longer_than_the_delay_is_refused(offer):
     link = replace(link, trips=deque([0.21, 0.25]))
     with pytest.raises(ConfigError, match=r"^delay\.steps: got 0\.1 s .* delay\.steps=4$"):
         as_seen(scenario_of("delay.steps=1"), link, message)
+    network = ("link.kind=network", "link.burst=3")
+    with pytest.raises(ConfigError, match=r"^link\.playout: got 0\.2 s .* link\.playout=0\.3$"):
+        as_seen(scenario_of(*network, "link.playout=0.1"), link, message)
+    # Where many packets are lost, the default bound leaves out the longest trips.
+    link = replace(link, trips=deque([0.01, 0.38]), sent=100, lost=40)
+    assert as_seen(scenario_of(*network), link, message).eta >= 0.38
 
 
 def test_a_delay_estimator_needs_a_wire(offer):

@@ -3,8 +3,8 @@
 import contextlib
 import ctypes
 import math
-import signal
 import multiprocessing
+import signal
 import sys
 import webbrowser
 from collections.abc import Iterator, Sequence

@@ -174,10 +174,11 @@ class LiveLoop:
             end = self._step(k)
             if end.status != "completed":
                 return end
-            rests, k = not held and self._rests(k), k + 1
-            if rests or k == last and not held:
-                held, found = self._hold, "at rest" if rests else "still in motion"
-                self._watch.report(k, f"{found}; held until {again}" if held else found)
+            rests, k = self._rests(k), k + 1
+            if not held and (rests or k == last):
+                found = "at rest" if rests else "still in motion"
+                self._watch.report(k, f"{found}; held until {again}" if self._hold else found)
+                held = self._hold
                 if not held:
                     break
         return None

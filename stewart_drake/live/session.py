@@ -209,8 +209,8 @@ def _queue_advice(scenario: Scenario) -> str | None:
         return None
     better = "equilibrium" if scenario.plant.gravity else "zero"  # zero lets the plate fall
     return (
-        "queue: reference ends with the machine's own link, and its buffer is dry until this "
-        f"controller's torques act: better --set start=rest --set queue={better}, on both sides"
+        "queue: reference fills only the machine's own link; then it has no torques until those of "
+        f"this controller act: better --set start=rest --set queue={better}, on both sides"
     )
 
 
