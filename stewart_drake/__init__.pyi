@@ -196,6 +196,7 @@ def run_live(
     machine: str,
     *,
     duration: float | None = None,
+    hold: bool = False,
     armed: bool = False,
     key: pathlib.Path | None = None,
     max_missing: float | None = None,

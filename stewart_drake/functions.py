@@ -359,7 +359,7 @@ def run_live(
         learnt = learn_live(as_scenario(scenario), machine, options, print)
         return SimulationResult.of(learnt)
     ready = prepare_session(as_scenario(scenario), address_of(machine), read_key(options.key))
-    how: Any = options.model_dump(include={"armed", "accept_jitter", "max_missing"})
+    how: Any = options.model_dump(include={"armed", "accept_jitter", "max_missing", "hold"})
     span = math.inf if options.duration is None else options.duration
     return SimulationResult.of(drive(ready, span, logs=open_logs(ready, options, print), **how))
 

@@ -233,9 +233,9 @@ def test_the_record_shows_the_delay():
     sent = np.floor(signals.time.values / 0.1 + 1e-9) * 0.1
     assert signals.delay_true.values == pytest.approx(0.8 + 0.01 * sent, abs=1e-12)
     assert signals.delay_true.attrs["units"] == "s"
-    plain = sd.simulate(scenario("duration=0.3"), judge_stability=False).signals
-    assert np.all(plain.delay_true.values == 0.8)
-    assert np.isnan(plain.packets.values).all()
+    plain = sd.simulate(scenario("duration=0.3"), judge_stability=False)
+    assert np.all(plain.signals.delay_true.values == 0.8)
+    assert np.isnan(plain.signals.packets.values).all() and plain.summary["packets"] == {}
 
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -300,10 +300,14 @@ def check_stated(command, out, capsys):
     summary = json.loads((out / "summary.json").read_text())
     for found in summary.get("controllers", {"": summary}).values():
         assert stated.items() <= found["link"].items() and found["link"]["seed"] == 0
+    return printed, summary
 
 
-def test_simulate_states_the_link(tmp_path, capsys):
-    check_stated(["simulate"], tmp_path, capsys)
+def test_simulate_states_the_link_and_counts_packets(tmp_path, capsys):
+    printed, summary = check_stated(["simulate"], tmp_path, capsys)
+    packets = {"sent": 4, "lost": 0, "late": 0, "played": 0, "dry": 0}
+    assert summary["packets"] == packets
+    assert "packets 4 sent, 0 lost, 0 late, 0 played, 0 dry" in printed
 
 
 @pytest.mark.slow

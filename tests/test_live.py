@@ -6,6 +6,7 @@ import json
 import math
 import multiprocessing
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -18,6 +19,7 @@ from collections import deque
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,7 +34,7 @@ from stewart_drake.law.stability import Margins
 from stewart_drake.live import contact as contacts
 from stewart_drake.live.checks import stays_within_reach
 from stewart_drake.live.contact import Contact, Link, address_of, await_free, call, open_endpoint
-from stewart_drake.live.design import as_seen, check_controller, design
+from stewart_drake.live.design import Design, as_seen, check_controller, design
 from stewart_drake.live.endpoint import Endpoint
 from stewart_drake.live.governor import Governor, Request, Steering, Way
 from stewart_drake.live.loop import LiveLoop
@@ -264,6 +266,70 @@ def test_an_error_of_which_half_was_measured_is_none():
     assert share in " ".join(run_document(result).plain().split())
 
 
+# ---------------------------------------------------------------- the end
+
+
+class Holds(Viewer):
+    """Counts samples, and those at which the plate is held; then asks for the end."""
+
+    def __init__(self, machine):
+        self.said, self.seen, self.held, self._machine = [], 0, 0, machine
+
+    def show(self, seen):
+        self.seen += 1
+        held = any("at rest; held until Ctrl-C" in line for line in self.said)
+        self.held += held and self._machine.failure is None
+
+    def stopped(self):
+        return self.held >= 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("duration", "status"), [(0.5, "completed"), (math.inf, "interrupted")])
+@in_real_time
+def test_at_the_end_the_plate_is_held_until_it_is_asked_to_end(duration, status):
+    """Without torques it falls within tenths of a second, as is said before and after."""
+    small = "reference.amplitude=[0, 0, 0, 0, 0, 0.005]"
+    heavy = ("plant.gravity=true", "start=rest", "queue=equilibrium", small)
+    way = "low: 0.01, high: 0.02, loss: 0"
+    link = f"link={{kind: network, {way}, return: {{{way}}}}}"
+    with paper_machine(*heavy, link) as running:
+        viewer = Holds(running.machine)
+        ready = prepare_session(scenario_of(*heavy, link), running.address)
+        told = plans(ready, duration, "paper")
+        how = {"hold": True, "viewer": viewer, "say": viewer.said.append, "accept_jitter": True}
+        result = drive(
+            ready, duration, ending=lambda: math.isinf(duration) and viewer.seen > 6, **how
+        )
+    falls = "the motors have no torque: the plate falls unless brakes or a support hold it"
+    assert any(f"without a word, {falls} (--hold" in line for line in told)
+    assert viewer.said[-1] == f"now {falls}" and viewer.held >= 10
+    assert result.status == status
+
+
+@pytest.mark.slow
+@in_real_time
+def test_a_run_that_is_lost_while_it_comes_to_rest_is_not_completed():
+    with paper_machine(kind=Blind, rate=2.0) as running:
+        result = driven(running, 1.1, max_missing=0.35)
+    assert result.status == "lost_contact" and result.stopped.time > 1.3
+
+
+@pytest.mark.parametrize(
+    ("cranks", "flags", "gravity", "expected"),
+    [
+        (True, MachineFlags.SAFE_HOLDS, True, "the servos hold their last setpoint"),
+        (False, MachineFlags.SAFE_HOLDS, True, "keep their last torque, which holds the plate for"),
+        (False, 0, True, "the plate falls unless brakes or a support hold it"),
+        (False, 0, False, "the motors have no torque"),
+    ],
+)
+def test_what_becomes_of_the_plate_is_said(cranks, flags, gravity, expected):
+    experiment = SimpleNamespace(scenario=scenario_of(f"plant.gravity={gravity}"))
+    made = SimpleNamespace(cranks=cranks, experiment=experiment)
+    assert expected in Design.left_alone(made, SimpleNamespace(flags=MachineFlags(flags)))
+
+
 def test_the_share_that_was_measured_of_a_simulation_leaves_its_error():
     lossy = ("sensor.loss=0.5", "duration=2", "plant.kind=exact")
     result = sd.simulate(scenario_of(*lossy), judge_stability=False)
@@ -421,6 +487,12 @@ def test_a_link_that_takes_longer_than_the_delay_is_refused(offer):
     link = replace(link, trips=deque([0.21, 0.25]))
     with pytest.raises(ConfigError, match=r"^delay\.steps: got 0\.1 s .* delay\.steps=4$"):
         as_seen(scenario_of("delay.steps=1"), link, message)
+    network = ("link.kind=network", "link.burst=3")
+    with pytest.raises(ConfigError, match=r"^link\.playout: got 0\.2 s .* link\.playout=0\.3$"):
+        as_seen(scenario_of(*network, "link.playout=0.1"), link, message)
+    # Where many packets are lost, the default bound leaves out the longest trips.
+    link = replace(link, trips=deque([0.01, 0.38]), sent=100, lost=40)
+    assert as_seen(scenario_of(*network), link, message).eta >= 0.38
 
 
 def test_a_delay_estimator_needs_a_wire(offer):
@@ -554,14 +626,15 @@ def test_what_is_no_number_is_null_on_the_page():
     assert said == {"error": None, "pose": [1.0, None], "limit": None, "missed": 3}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="PR_SET_PDEATHSIG is Linux's")
 def test_the_machine_of_a_demo_ends_with_a_killed_controller():
     parent = """
-import subprocess, sys, time
-from stewart_drake.cli.live import _end_with_parent
-child = subprocess.Popen(["sleep", "60"], start_new_session=True, preexec_fn=_end_with_parent())
-print(child.pid, flush=True)
-time.sleep(60)
+import multiprocessing, time
+from stewart_drake.cli.live import _demo_machine
+with _demo_machine("paper", 0.8, None, ()):
+    print(multiprocessing.active_children()[0].pid, flush=True)
+    time.sleep(60)
 """
     with subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
@@ -577,11 +650,23 @@ time.sleep(60)
 
 
 @pytest.mark.slow
-def test_the_demo_runs_unattended_and_shows_its_jitter(capsys):
-    assert main(["live", "paper", "--demo", "--no-browser", "--duration", "1"]) == 0
+def test_the_demo_runs_unattended_and_shows_its_jitter(capsys, tmp_path):
+    """The name of the scenario's file may be anything."""
+    named = tmp_path / "machine paper at 127.0.0.1:7: x.yaml"
+    named.write_text("mechanism: paper")
+    assert main(["live", str(named), "--demo", "--no-browser", "--duration", "1"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "round trips vary by" in said and "play-out buffer absorbs" in said
-    assert "status completed" in said
+    assert "at 1.0 s: coming to rest, within 8 s; Ctrl-C stops at once" in said
+    assert "now the motors have no torque status completed" in said
+    packets = re.search(r"packets (\d+) sent, \d+ lost, \d+ played, \d+ dry", said)
+    assert packets is not None and int(packets[1]) == 10
+
+
+def test_a_demo_that_cannot_start_says_why(capsys):
+    wrong = ("--set", "sensor={kind: encoders, samples: 20}")
+    assert main(["live", "paper", "--demo", "--no-browser", *wrong]) == 2
+    assert capsys.readouterr().err.startswith("error: sensor.samples: got 20; expected at most 16")
 
 
 @pytest.mark.parametrize("text", ["localhost", "127.0.0.1:", "127.0.0.1:0", ":7000", "a b:7000"])

@@ -96,8 +96,10 @@ def test_counts_are_those_of_the_simulation():
     run = Together(scenario, Settings(watchdog=5))
     run.greet(3 * run.driver.period, 60 * run.driver.period)
     run.drive(31)
-    packets = simulate(scenario, judge_stability=False).signals.packets.values[-1]
-    played, dry = packets[3:]
+    result = simulate(scenario, judge_stability=False)
+    counts = result.signals.packets.values[-1].tolist()
+    assert list(result.summary["packets"].values()) == counts
+    played, dry = counts[3:]
     machine = run.machine.summary()
     assert dry > 0
     assert (machine["played"], machine["dry"]) == (played, dry)
@@ -192,6 +194,12 @@ def test_stop_is_the_safe_torque_and_the_end_of_the_session():
     run.at(time + 20 * driver.period)
     assert not torque_of(run).any()
     assert run.machine.summary()["sessions"] == 1
+    assert any("the controller said stop: the safe torque (zero) acts" in one for one in run.said)
+    run.at(time + 10 * SECOND)  # it drifts out of its workspace
+    number, run.machine.longest_lag = len(run.said), 0
+    run.clock.time += 10 * SECOND  # an idle machine that stands still has nothing to report
+    run.machine.advance(run.machine.time())
+    assert len(run.said) == number and run.machine.longest_lag == 0
 
 
 def test_limits_are_kept_to_here():

@@ -3,11 +3,12 @@
 import contextlib
 import ctypes
 import math
+import multiprocessing
 import signal
-import subprocess
 import sys
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -75,8 +76,10 @@ def live(
     span = math.inf if options.duration is None else options.duration
     name = Path(scenario).stem
     if options.learn:
-        if options.duration is not None or options.log is not None or options.mirror is not None:
-            raise ConfigError("--learn: expected none of --duration, --log and --mirror with it")
+        if options.hold or {options.duration, options.log, options.mirror} != {None}:
+            raise ConfigError(
+                "--learn: expected none of --duration, --log, --mirror and --hold with it"
+            )
         return _learn(scenario, loaded, machine, options, (controller, settings or ()), delivery)
 
     from stewart_drake.live.contact import address_of
@@ -109,7 +112,7 @@ def live(
         if not ready.simulated and sys.stdin.isatty():
             input("Enter begins, Ctrl-C leaves it alone")
         delivery.discard("signals.nc")
-        how: Any = {"armed": options.armed, "viewer": viewer, "max_missing": options.max_missing}
+        how: Any = options.model_dump(include={"armed", "max_missing", "hold"}) | {"viewer": viewer}
         how["log"] = None if out is None else out / LOG
         how["logs"] = session.open_logs(ready, options, delivery.say_wrapped)
         with _Ending() as ending:
@@ -166,19 +169,23 @@ def _page(scenario: "Scenario", name: str) -> Iterator["PageViewer"]:
 
 def _delivered(delivery: Delivery, result: "SimulationResult") -> int:
     """Write and print the result, and return the exit status."""
+    from stewart_drake.live.viewer import End
     from stewart_drake.reporting.run import run_document
 
     summary: Any = result.summary
     s = summary["live"]
     if result.stopped is not None:
-        delivery.say_wrapped(f"{result.status.replace('_', ' ')}: {result.stopped}")
+        end = End(result.status, result.stopped)
+        delivery.say_wrapped(*filter(None, (end.words, end.advice)))
     if result.status == "completed":
         delivery.say(run_document(result).plain())
     late = s["sent_after_due_ms"]
     delivery.say_wrapped(
-        f"{s['samples']} samples, {s['deadlines_missed']} deadlines missed; torques went out "
-        f"{late['median']:.0f} ms after the soonest measurement (99 %: {late['p99']:.0f}, worst "
-        f"{late['worst']:.0f}); {s['periods_played']} periods played, {s['periods_dry']} dry"
+        f"{s['samples']} samples with those of coming to rest, {s['deadlines_missed']} deadlines "
+        f"missed; torques were sent {late['median']:.0f} ms (99 %: {late['p99']:.0f}, worst "
+        f"{late['worst']:.0f}) after the earliest arrival of their measurement",
+        f"the machine had torques for {s['periods_played']} periods, for {s['periods_dry']} it "
+        "had none (dry)",
     )
     if delivery.out is not None:
         result.save(delivery.out)
@@ -187,46 +194,58 @@ def _delivered(delivery: Delivery, result: "SimulationResult") -> int:
     return delivery.end(result.summary, result.status == "interrupted") or int(lost)
 
 
-def _end_with_parent() -> Callable[[], None] | None:
-    """Return a function that ends a child process with its parent, or None without Linux."""
-    if sys.platform != "linux":
-        return None
-    prctl, set_death_signal = ctypes.CDLL(None).prctl, 1
-    return lambda: prctl(set_death_signal, signal.SIGTERM)
+def _serve(address: Connection, *scenario: Any) -> None:
+    """Simulate the machine of a scenario in this process; send its address, or why there is none.
+
+    `scenario` are the arguments of `load_scenario`.
+    """
+    if sys.platform == "linux":
+        set_death_signal = 1
+        ctypes.CDLL(None).prctl(set_death_signal, signal.SIGTERM)  # it ends with its parent
+    from stewart_drake.live.reachy import open_chosen
+
+    try:
+        loaded = load_scenario(*scenario)
+        with open_chosen(loaded, MachineOptions(port=0), lambda _: None) as (running, where):
+            address.send("{}:{}".format(*where))
+            running.run()
+    except ConfigError as error:
+        address.send(error)
 
 
 @contextlib.contextmanager
 def _demo_machine(
     scenario: str, eta: float, controller: str | None, settings: Sequence[str]
 ) -> Iterator[str]:
-    """Run a simulated machine in another process, on a free port, over another link."""
+    """Simulate a machine in another process, over another link; yield its address."""
     low, high = (share * eta for share in _EACH_WAY)
     way = f"low: {low:g}, high: {high:g}, loss: {_LOST}"
-    words = ["machine", scenario, "--port", "0"]
-    words += [] if controller is None else ["--controller", controller]
     link = f"link={{kind: network, {way}, return: {{{way}}}}}"
-    for setting in (*settings, "plant.kind=exact", link):
-        words += ["--set", setting]
-    process = subprocess.Popen(
-        [sys.executable, "-u", "-m", "stewart_drake", *words],
-        stdout=subprocess.PIPE,
-        text=True,
-        start_new_session=True,  # Ctrl-C is for the controller, which stops it
-        preexec_fn=_end_with_parent(),
-    )
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe(duplex=False)
+    args = (there, scenario, controller, [*settings, "plant.kind=exact", link])
+    process = context.Process(target=_serve, args=args, daemon=True)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the controller
+    try:
+        process.start()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    there.close()
     try:
         # Imported while the machine starts, which takes as long.
         from stewart_drake.live import session  # noqa: F401
 
-        assert process.stdout is not None
-        named = (line for line in process.stdout if line.startswith("machine "))
-        _, _, rest = next(named, "").partition(" at ")
-        if not rest:
-            raise ConfigError("--demo: the simulated machine did not start")
-        yield rest.split(": ", 1)[0]
+        found: str | ConfigError
+        try:
+            found = here.recv()
+        except EOFError:
+            found = ConfigError("--demo: the simulated machine did not start")
+        if isinstance(found, ConfigError):
+            raise found
+        yield found
     finally:
         process.terminate()
-        process.communicate()
+        process.join()
 
 
 class _Ending:
@@ -275,12 +294,16 @@ def machine(
         raise KeyboardInterrupt
 
     from stewart_drake.live.reachy import open_chosen
+    from stewart_drake.scenario.link import link_text
 
     options, loaded = given.options(), load_scenario(scenario, controller, settings or ())
     delivery, interrupted = Delivery(None, quiet, as_json), False
     check_log(options.log)
     with given.named(), open_chosen(loaded, options, delivery.say_wrapped) as (running, address):
-        delivery.say_link(loaded)
+        if network := link_text(loaded, bound=False):
+            delivery.say_wrapped(
+                f"simulated link: {network}; the controller chooses the delay of the loop"
+            )
         before = signal.signal(signal.SIGTERM, interrupt)
         try:
             moved = f"simulated by {running.simulated_by}"

@@ -77,6 +77,16 @@ class Design(NamedTuple):
         """Whether plans are sent, to a buffer."""
         return self.rows > 1 if self.cranks else isinstance(self.law.channel, Packets)
 
+    def left_alone(self, machine: MachineMessage) -> str:
+        """Return in words what becomes of the plate without a controller."""
+        if self.cranks:
+            return "the servos hold their last setpoint"
+        if MachineFlags.SAFE_HOLDS in machine.flags:
+            return "the motors keep their last torque, which holds the plate for a while only"
+        if not self.experiment.scenario.plant.gravity:
+            return "the motors have no torque"
+        return "the motors have no torque: the plate falls unless brakes or a support hold it"
+
 
 def check_controller(scenario: Scenario) -> None:
     """Refuse a scenario with a tuner, or with servos that need more than a setpoint."""
@@ -117,27 +127,28 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
     )
     chosen = scenario.link.kind == "wire" or scenario.link.playout is not None
     eta, period = (scenario if chosen else replace(scenario, link=network)).eta, c.period
+    least = math.ceil(longest / period)
+    if not chosen:  # the default bound may be shorter than the longest trip
+        eta = max(eta, least * period)
+    elif eta < longest:
+        field, enough = "link.playout", f"link.playout={least * period:g}"
+        if scenario.link.kind == "wire":
+            repeats = 0 if c.command == "cranks" else c.packet_repeats
+            field, enough = "delay.steps", f"delay.steps={least + repeats}"
+        raise ConfigError(
+            f"{field}: got {eta:g} s from a measurement to its torque; the link takes up to "
+            f"{longest:.3g} s there and back: expected at least --set {enough}"
+        )
     if c.command == "cranks":
-        _check_delay(eta, longest, period, 0)
         delay = DelayConfig(steps=round(eta / period))
         return replace(seen, link=WireConfig(), delay=delay)
     repeats = max(0, min(c.packet_repeats, math.floor((eta - longest) / period + 1e-9)))
-    _check_delay(eta, longest, period, c.packet_repeats)
     network = replace(network, playout=round(eta - repeats * period, 9))
     torques = min(c.packet_torques, MOST_ROWS - repeats)
     controller = replace(
         c, delay_steps=None, delay_fraction=None, packet_repeats=repeats, packet_torques=torques
     )
     return replace(seen, link=network, controller=controller)
-
-
-def _check_delay(eta: float, longest: float, period: float, repeats: int) -> None:
-    if eta < longest:
-        raise ConfigError(
-            f"delay.steps: got {eta:g} s from a measurement to its torque; the link takes up to "
-            f"{longest:.3g} s there and back: expected at least --set delay.steps="
-            f"{math.ceil(longest / period) + repeats}"
-        )
 
 
 def always(signal: LearnedSignal | None) -> Learned:

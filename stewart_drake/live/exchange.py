@@ -200,13 +200,13 @@ class Watch:
         if silent > max(SILENT, 10 * self._period):
             if not self._silent_since:
                 self._silent_since = contact.heard
-                self._report(k, f"the machine is silent since {silent:.1f} s; waiting")
+                self.report(k, f"the machine is silent since {silent:.1f} s; waiting")
             if silent > PATIENCE:
                 return self._end("lost_machine", k, f"the machine was silent for {PATIENCE:g} s")
         elif self._silent_since:
             gone = (contact.heard - self._silent_since) / SECOND
             self._silent_since = 0
-            self._report(k, f"the machine is heard again, after {gone:.1f} s")
+            self.report(k, f"the machine is heard again, after {gone:.1f} s")
         if contact.machine.reason.fault == Fault.ENDED:
             return self._end("lost_machine", k, contact.machine.why)
         if message is None:
@@ -216,9 +216,9 @@ class Watch:
             return self._end("left_workspace", k, message.why, message.reason.leg or None)
         self.safe = message.why if MachineFlags.SAFE in message.flags else None
         if MachineFlags.SAFE in message.flags & ~before:
-            self._report(k, f"the machine is at its safe torque: {self.safe}")
+            self.report(k, f"the machine is at its safe torque: {self.safe}")
         if MachineFlags.SAFE in before & ~message.flags:
-            self._report(k, "torques act again")
+            self.report(k, "torques act again")
         return None
 
     def _report_stall(self, k: int) -> None:
@@ -227,10 +227,11 @@ class Watch:
         stalled = lag > STALL / SECOND
         if stalled and not self._stalled:
             went_on = "the machine went on by its buffer"
-            self._report(k, f"this process did not run for {lag:.1f} s; {went_on}")
+            self.report(k, f"this process did not run for {lag:.1f} s; {went_on}")
         self._stalled = stalled
 
-    def _report(self, k: int, text: str) -> None:
+    def report(self, k: int, text: str) -> None:
+        """Report an event at sample k."""
         self._say(f"at {k * self._period:.1f} s: {text}")
 
     def _end(self, status: str, k: int, reason: str, leg: int | None = None) -> End:

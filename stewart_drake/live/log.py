@@ -135,6 +135,7 @@ class LiveRecord(Record):
             "estimated_s": float(belief.delay[0]),
             "std_s": belief.delay_std,
         }
+        self.packets = packets
         seen = {signal.exported: self._held[signal.name](memory) for signal in _HELD}
         seen["measurement"] = measurement.known(measurement.values.size)
         row = seen | {

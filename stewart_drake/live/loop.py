@@ -67,6 +67,7 @@ class LiveLoop:
         max_missing: longest gap of usable measurements, s. By default as long as the estimator's
             uncertainty allows (`live.checks`).
         log: CSV file of the record, written as the run goes on; a temporary one by default.
+        hold: whether to hold the plate at rest after the run, until Ctrl-C.
 
     Attributes:
         memory: memory of the law after the last sample.
@@ -91,6 +92,7 @@ class LiveLoop:
         max_missing: float | None = None,
         log: Path | None = None,
         logs: Sequence[RunLog] = (),
+        hold: bool = False,
     ) -> None:
         self._design, self._steering, self._viewer, self._say = design, steering, viewer, say
         self._law: Any = serving(design.law).law
@@ -102,7 +104,7 @@ class LiveLoop:
         self.record = LiveRecord(design.experiment, design.torque_limit, log, say, logs)
         self._check = ReportCheck(math.inf if design.cranks else design.torque_limit)
         self._parked = self._leads = False
-        self._recording = True
+        self._recording, self._hold = True, hold
         self._max_missing = max_missing
         self._measured, self._known = -1, self.memory  # last usable measurement: sample, memory
         self._learned: Any = None if design.learned is None else self._learned_part(design)
@@ -127,7 +129,8 @@ class LiveLoop:
     def run(self, duration: float, ending: Callable[[], bool] = lambda: False) -> End:
         """Run for `duration` s, which may be infinite, or until `ending`; then stop the plate.
 
-        A stop of the viewer, Ctrl-C or a failure ends the run at once.
+        A stop of the viewer, Ctrl-C or a failure ends the run at once. After `duration` the first
+        `ending` does, too.
         """
         end, k = End("completed", None), 0
         try:
@@ -139,10 +142,13 @@ class LiveLoop:
             if end.status == "completed":
                 if not self._complete(k, duration):
                     end = self._end("interrupted", k, "ended")
-                self._come_to_rest(k)
+                end = self._come_to_rest(k, ending) or end
         except KeyboardInterrupt:
-            end = self._end("interrupted", k, "stopped")
+            if not self._complete(k, duration):
+                end = self._end("interrupted", k, "stopped")
         self.exchange.stop()
+        if end.status in ("completed", "interrupted"):
+            self._say(f"now {self._design.left_alone(self.exchange.contact.machine)}")
         self._viewer.ended(end)
         return end
 
@@ -158,16 +164,31 @@ class LiveLoop:
         message = self.exchange.wait(k)
         return self._watch.ended(k, message) or self._sample(k, message) or End("completed", None)
 
-    def _come_to_rest(self, k: int) -> None:
-        """Go on, without a record, until the plate is at rest."""
-        self._recording, last = False, k + math.ceil(RESTING / self._period)
-        while k < last and self._step(k).status == "completed":
-            way, t = self._steering.way, k * self._period
-            wanted = np.array([way.at(t)[RATES], way.at(t + self._horizon)[RATES]])
-            rates = np.vstack([wanted, self.memory.belief.state[RATES]])
-            if np.all(np.abs(rates) <= REST_RATE * self._size):
-                return
-            k += 1
+    def _come_to_rest(self, k: int, ending: Callable[[], bool]) -> End | None:
+        """Go on, without a record, until the plate is at rest; return a failure meanwhile."""
+        last, asked, held = k + math.ceil(RESTING / self._period), ending(), False
+        again = "Ctrl-C again" if asked else "Ctrl-C"
+        self._recording = False
+        self._watch.report(k, f"coming to rest, within {RESTING:g} s; {again} stops at once")
+        while asked or not ending():
+            end = self._step(k)
+            if end.status != "completed":
+                return end
+            rests, k = self._rests(k), k + 1
+            if not held and (rests or k == last):
+                found = "at rest" if rests else "still in motion"
+                self._watch.report(k, f"{found}; held until {again}" if self._hold else found)
+                held = self._hold
+                if not held:
+                    break
+        return None
+
+    def _rests(self, k: int) -> bool:
+        """Return whether the plate is at rest at sample k."""
+        way, t = self._steering.way, k * self._period
+        wanted = np.array([way.at(t)[RATES], way.at(t + self._horizon)[RATES]])
+        rates = np.vstack([wanted, self.memory.belief.state[RATES]])
+        return bool(np.all(np.abs(rates) <= REST_RATE * self._size))
 
     def _sample(self, k: int, message: MachineMessage | None) -> End | None:
         """Step the law and send its torques; return the end of the run, or None."""

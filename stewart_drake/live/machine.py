@@ -231,7 +231,7 @@ class Machine:
             if when > time:
                 return when
             lag = time - when
-            if self._running:
+            if self._running and not self._stopped and self.failure is None:
                 self.longest_lag = max(lag, self.longest_lag)
                 if lag > STALL and do != self._silence:
                     self._report_stall(lag, when)
@@ -347,10 +347,11 @@ class Machine:
         self.counts["silences"] += 1
         self._go_safe(time)
         self._fail(Reason(Fault.SILENCE, lasted=self.watchdog), time)
+        self._report_safe(time, str(self.reason))
+
+    def _report_safe(self, time: int, why: str) -> None:
         safe = f"the safe torque ({self._settings.safe}) acts"
-        if self._motors.cranks:
-            safe = "the cranks are held"
-        self._report(time, f"{self.reason}: {safe}")
+        self._report(time, f"{why}: {'the cranks are held' if self._motors.cranks else safe}")
 
     def _go_safe(self, time: int) -> None:
         self._follow(time)
@@ -429,7 +430,7 @@ class Machine:
                 self._go_safe(time)
             if self.failure is None:
                 self._fail(Reason(Fault.STOP), time)
-            self._report(time, FAULTS[Fault.STOP])
+            self._report_safe(time, FAULTS[Fault.STOP])
             return
         if max(message.begin % NEVER, message.playout) > time + FURTHEST:
             self._refuse(Refusal.MALFORMED)

@@ -44,6 +44,7 @@ class LiveOptions(Options):
     duration: float | None = option(
         None, "Duration, s; until it is stopped by default.", "S", ge=0.1
     )
+    hold: bool = option(False, "At the end hold the plate at rest until Ctrl-C.")
     armed: bool = option(False, "Drive a real machine.", name="arm")
     key: Path | None = option(None, "File with the shared key.", "FILE")
     max_missing: float | None = option(

@@ -130,27 +130,34 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
     eta = made.law.timeline.eta
     limit = "without a limit" if math.isinf(made.torque_limit) else f"{made.torque_limit:g} N m"
     rate = "" if machine.rate == 1 else f", {machine.rate:g} of its seconds in one"
-    packets = "each torque as it is computed, on a simulated wire"
+    packets, trips = (
+        "each torque as it is computed, on a simulated wire",
+        ", as the machine simulates it",
+    )
     if sc.link.kind == "network":
+        trips = ", which leaves time for the longest round trip, computing and repetitions"
         c = sc.controller
         packets = f"packets of {c.packet_repeats + c.packet_torques} torques"
-    acts, what = "torques act", "torque"
+    acts = "torques act"
     if made.cranks:
-        acts, what = "setpoints act", "setpoint"
+        acts = "setpoints act"
         packets = (
-            f"plans of {made.rows} setpoints" if made.sends else packets.replace("torque", what)
+            f"plans of {made.rows} setpoints"
+            if made.sends
+            else packets.replace("torque", "setpoint")
         )
+    held = "" if made.cranks else " (--hold controls the plate at rest until Ctrl-C)"
     until = "until it is stopped" if math.isinf(duration) else f"for {duration:g} s"
-    safe = f"the last {what}" if MachineFlags.SAFE_HOLDS in machine.flags else "no torque"
     return [
         f"machine at {host}:{port}: {kind}{rate}",
-        f"link: {1e3 * link.typical:.0f} ms there and back ({1e3 * link.shortest:.0f} to "
-        f"{1e3 * link.longest:.0f}), {100 * link.loss_there:.0f} % lost there, "
-        f"{100 * link.loss_back:.0f} % back",
-        f"{acts} {eta:g} s after the measurement that they rest on: {packets}, every "
-        f"{1e3 * sc.controller.period:g} ms, motors {limit}",
-        f"motion: {scenario}, {until}; after {machine.watchdog / SECOND:g} s without a word the "
-        f"machine goes to {safe}",
+        f"link: a round trip takes {1e3 * link.typical:.0f} ms ({1e3 * link.shortest:.0f} to "
+        f"{1e3 * link.longest:.0f}), {100 * link.loss_there:.0f} % are lost on the way there, "
+        f"{100 * link.loss_back:.0f} % on the way back",
+        f"delay of the loop: {acts} {eta:g} s after the measurement that they rest on{trips}",
+        f"the controller sends {packets}, every {1e3 * sc.controller.period:g} ms; motors {limit}",
+        f"motion: {scenario}, {until}, then rest",
+        f"at the end, and after {machine.watchdog / SECOND:g} s without a word, "
+        f"{made.left_alone(machine)}{held}",
         *_stability(ready),
         *_cautions(made),
     ]
@@ -202,8 +209,8 @@ def _queue_advice(scenario: Scenario) -> str | None:
         return None
     better = "equilibrium" if scenario.plant.gravity else "zero"  # zero lets the plate fall
     return (
-        "queue: reference ends with the machine's own link, and its buffer is dry until this "
-        f"controller's torques act: better --set start=rest --set queue={better}, on both sides"
+        "queue: reference fills only the machine's own link; then it has no torques until those of "
+        f"this controller act: better --set start=rest --set queue={better}, on both sides"
     )
 
 
@@ -270,6 +277,7 @@ def drive(
     max_missing: float | None = None,
     log: Path | None = None,
     logs: Sequence[RunLog] = (),
+    hold: bool = False,
     pace: float | None = None,
 ) -> SimulationResult:
     """Run the loop; the machine moves. In the end socket and logs are closed.
@@ -278,7 +286,7 @@ def drive(
         armed: whether a real machine may be driven.
         accept_jitter: whether to start with more jitter than the loop is stable for.
         ending: whether to bring the plate to rest and end.
-        max_missing, log: see `LiveLoop`.
+        max_missing, log, hold: see `LiveLoop`.
         pace: pole of the governor, 1/s; by default it depends on the torque limit.
 
     Raises:
@@ -295,7 +303,7 @@ def drive(
     governor = Governor(made.law.plant.dynamics, made.torque_limit, fastest, slowest)
     steering = Steering(governor, made.experiment.reference, Way.along(made.planned))
     kind = CrankLoop if made.cranks else LiveLoop
-    loop = kind(made, steering, contact, viewer or Viewer(), say, max_missing, log, logs)
+    loop = kind(made, steering, contact, viewer or Viewer(), say, max_missing, log, logs, hold)
     started = clock.perf_counter()
     try:
         with one_blas_thread, before_others() as scheduled:

@@ -23,6 +23,7 @@ from stewart_drake.scenario.loading import scenario_to_dict, scenario_yaml
 from stewart_drake.scenario.run_log import RunLog, dataset_of
 from stewart_drake.scenario.signals import (
     NUM_STATE,
+    PACKETS,
     POSE,
     exported_ports,
     run_signals,
@@ -81,6 +82,7 @@ class Record:
         innovations: of the estimator, up to the last sample.
         tuner_fallbacks: number of fallbacks of the tuner.
         delay: at the last sample, s: true, assumed or estimated, standard deviation.
+        packets: last counts (5,) of `scenario.signals.PACKETS`.
     """
 
     def __init__(self, experiment: Experiment, logs: Sequence[RunLog] = ()) -> None:
@@ -95,10 +97,12 @@ class Record:
         self.innovations = Innovations()
         nan = float("nan")
         self.delay: DelaySummary = {"true_s": nan, "estimated_s": nan, "std_s": nan}
+        self.packets: Array = np.full(len(PACKETS), nan)
 
     def log(self, time: float, seen: Mapping[str, Array]) -> None:
         """Add a row to the log: a time in s, and the value of each exported port."""
         row = [seen[signal.exported][signal.part] for signal in self._recorded]
+        self.packets = seen["packets"]
         self._log.append(time, *row)
         self.mirror(time, seen)
 
@@ -244,6 +248,11 @@ def summarize(
         "wall_s": wall,
         "counts": recorder.counts.summary() | {"tuner_fallbacks": recorder.tuner_fallbacks},
         "link": plain(sc.assumed_link),
+        "packets": {
+            name: int(number)
+            for name, number in zip(PACKETS, recorder.packets, strict=True)
+            if np.isfinite(number)
+        },
         "own": experiment.own.names,
         "scenario": scenario_to_dict(sc),
         "versions": versions(),

@@ -200,6 +200,9 @@ class RunSummary(TypedDict):
     """Number of survived problems by name (`law.memory.Counts`, `tuner_fallbacks`)."""
     link: dict[str, Any]
     """The assumed link with all its numbers (`Scenario.assumed_link`)."""
+    packets: dict[str, int]
+    """Packets `sent`, `lost` and `late`, and periods `played` (with a torque of one) and `dry`
+    (without); empty over a wire, without `late` in real time."""
     own: dict[str, str]
     """Classes of the user's systems by role."""
     scenario: dict[str, Any]

@@ -38,6 +38,7 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
         inf=math.inf,
         peaks=listed(_peaks(result)),
         events=[(n, name) for name, n in s["counts"].items() if n],
+        packets=[(n, name) for name, n in s["packets"].items()],
         cautions=[text for text in s["warnings"] if text not in said],
     )
 

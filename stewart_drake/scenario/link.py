@@ -104,8 +104,8 @@ def measurement_times(scenario: Scenario) -> Array:
     return sensor_times(scenario, n) + return_times(scenario, n)
 
 
-def link_text(scenario: Scenario) -> str | None:
-    """Return the assumed network in words, None for a wire."""
+def link_text(scenario: Scenario, bound: bool = True) -> str | None:
+    """Return the assumed network in words, with its play-out bound or not; None for a wire."""
     link = scenario.assumed_link
     if link.kind == "wire":
         return None
@@ -122,7 +122,5 @@ def link_text(scenario: Scenario) -> str | None:
         )
     bursts = f" in bursts of {link.burst}" if link.burst > 1 else ""
     back = "measurements at once" if link.back is None else "measurements over a network too"
-    return (
-        f"network, packets take {times}, {100 * link.loss:g} % lost{bursts}, play-out bound "
-        f"{link.playout:g} s; {back}"
-    )
+    playout = f", play-out bound {link.playout:g} s" if bound else ""
+    return f"network, packets take {times}, {100 * link.loss:g} % lost{bursts}{playout}; {back}"
