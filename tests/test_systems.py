@@ -195,7 +195,6 @@ NETWORK = load_network(resolve("weights", "tuner"))
         (lambda: DensityWindow(0.1, "square"), "kind: got 'square'"),
         (lambda: DensityWindow(-0.1), "period: got -0.1"),
         (lambda: AnnTuner(NETWORK, [1.0, NAN], 0.1), "fixed: got [1, nan]"),
-        (lambda: AnnTuner(NETWORK, [1.0, 1.0], 0.1, 0.0), "factor: got 0.0"),
         (lambda: ExactPlant(MACHINE, 0.1), "initial_state: got shape ()"),
         (lambda: Timeline(0.1, 0.8), "delay: got 0.8; expected a Delay"),
         (lambda: Timeline(0.0, WITHOUT_DELAY), "period: got 0.0"),
@@ -214,7 +213,7 @@ NETWORK = load_network(resolve("weights", "tuner"))
         ),
         (lambda: DelaySettings(0.1, 0.0, 1.0), "std: got 0.0"),
         (lambda: DelaySettings(0.1, 0.1, NAN), "longest: got nan"),
-        (lambda: Replan(NAN, SIX), "duration: got nan"),
+        (lambda: Replan(NAN, 1.0, SIX), "duration: got nan"),
     ],
 )
 def test_a_bad_argument_is_one_line_at_construction(make, message):

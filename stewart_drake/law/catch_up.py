@@ -188,7 +188,7 @@ class Model:
     def way(self, schedule: TorqueSchedule, states: Array, begin: float) -> Array:
         """Return the pieces (n, 38) of the motion through states (1 + n, 12) from `begin` s on."""
         c, number = core(), len(schedule.torques)
-        kept = [np.array(a, np.float64) for a in (*schedule, states)]
+        kept = [np.ascontiguousarray(a, np.float64) for a in (*schedule, states)]
         what = c.ffi.new("stewart_schedule *", [number, *map(c.at, kept[:2]), 0])
         pieces = np.empty((number, c.lib.STEWART_PIECE))
         given = self.data, what, c.at(kept[2]), begin, c.at(pieces)
