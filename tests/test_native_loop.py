@@ -54,7 +54,9 @@ def scenario(name="paper", *settings, controller=None):
 LOOPS = {
     "from rest": scenario("paper", "duration=3"),
     "dirty": scenario("paper", "duration=2", *FOLLOWS, *DIRTY),
-    "late": scenario("paper", "duration=2", "delay.fraction=0.37", *FOLLOWS, *DIRTY),
+    "late": scenario(
+        "paper", "duration=2", "delay.fraction=0.37", *FOLLOWS, *DIRTY, "sensor.seed=4"
+    ),
     "limited": scenario("paper", "duration=2", "actuator.torque_limit=0.015", *FOLLOWS, *DIRTY),
     "gravity": scenario("gravity", "duration=0.6", *DIRTY[:2]),
     "off the grid": scenario(
