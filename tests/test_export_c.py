@@ -9,8 +9,11 @@ import pytest
 from stewart_drake.cli import main
 from stewart_drake.core import build
 from stewart_drake.export import controller as export_c
+from stewart_drake.export.recording import EXPORTED, record
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import shipped
 from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.studies.compare import SERVOS
 from tests.building import SANITIZED, c_compiler, make
 
 NOISE = "sensor.noise_std=[1e-5,1e-5,1e-5,1e-6,1e-6,1e-6,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
@@ -274,6 +277,17 @@ def test_what_is_not_exported_is_refused_by_its_field(tmp_path, capsys):
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "controller.prediction: is not exported as it is" in error
     assert not folder.exists()
+
+
+@pytest.mark.parametrize("name", shipped("controller"))
+def test_a_shipped_controller_is_exported_or_refused_by_its_name(name):
+    actuator = f"actuator.kind={'servo' if name in SERVOS else 'torque'}"
+    scenario = load_scenario("paper", name, ("plant.kind=exact", "duration=0.2", actuator))
+    if name in EXPORTED:
+        assert len(record(scenario).steps) == 2
+        return
+    with pytest.raises(ConfigError, match=f"controller: {name} is not .* exported are {EXPORTED[0]}"):
+        record(scenario)
 
 
 def test_a_run_that_does_not_end_is_refused():
