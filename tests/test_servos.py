@@ -13,8 +13,8 @@ from pydrake.trajectories import PiecewisePolynomial
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.core_law import CoreServo
+from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servos import (
     ReportLayout,
