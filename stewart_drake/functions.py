@@ -271,10 +271,10 @@ def export_c(
         single: whether numbers have single precision.
 
     Returns:
-        The paths of the files.
+        The paths of the written files. Those that were changed since the last export are kept.
 
     Raises:
-        ConfigError: a law that has no C.
+        ConfigError: a law that has no C, or a file in the folder that no export has written.
     """
     if not isinstance(scenario, Scenario):
         scenario = load_scenario(scenario, controller, settings)

@@ -304,8 +304,8 @@ def test_the_command_writes_all_files_or_none_and_states_sizes(tmp_path, capsys)
     command = ["export-c", "paper", "--out", str(folder), "--set", "duration=0.5"]
     assert main(command) == 0
     assert "make test" in capsys.readouterr().out
-    names = sorted(path.name for path in folder.iterdir())
-    assert {"law.h", "law.c", "stewart_config.c", "stewart_test.c", "Makefile"} < set(names)
+    names = {path.name for path in folder.iterdir()} - {export_c.DIGESTS}
+    assert {"law.h", "law.c", "stewart_config.c", "stewart_test.c", "Makefile"} < names
     readme = (folder / "README.md").read_text()
     text = int(readme.split("(TOTALS)")[0].splitlines()[-1].split()[0])
     state = int(readme.split("state ")[1].split()[0])
@@ -316,6 +316,21 @@ def test_the_command_writes_all_files_or_none_and_states_sizes(tmp_path, capsys)
     with pytest.raises(FileNotFoundError):
         export_c.write(files, folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    # What its user changed is kept, what no export has written is not replaced.
+    (folder / "stewart_board.c").write_text("mine")
+    assert main([*command, "--set", "sensor.kind=encoders"]) == 0
+    assert "last export: stewart_board.c; delete" in capsys.readouterr().out
+    assert not (folder / "protocol.c").exists()
+    assert main(command) == 0
+    assert "last export: stewart_board.c; delete" in capsys.readouterr().out
+    assert (folder / "stewart_board.c").read_text() == "mine"
+    after = {path.name: path.read_bytes() for path in folder.iterdir()}
+    own = dict.fromkeys(("stewart_board.c", "README.md", export_c.DIGESTS))  # of its times
+    assert after | own == before | own
+    (folder / export_c.DIGESTS).unlink()
+    assert main(command) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "stewart_board.c: no export has written it; exp" in error
 
 
 @pytest.mark.slow

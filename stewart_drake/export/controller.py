@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,6 +52,8 @@ EXAMPLES: Final = (
     *("stewart_board.c", "stewart_board.h"),
 )
 """Sources of the examples over UDP, see `_is_example`."""
+DIGESTS: Final = "exported.sha256"
+"""Digests of the written files, for `sha256sum -c`."""
 TEMPLATES: Final = Path(__file__).with_name("templates")
 TOLERANCES: Final = {"double": 1e-9, "float": 1e-3}
 """Tolerance of the replay, as a share of the peak."""
@@ -293,12 +296,49 @@ def _goal(rows: Array | None) -> str:
 
 
 def write(files: Mapping[str, str], folder: Path) -> list[Path]:
-    """Write all files to an existing folder or, on an error, none."""
-    paths = [folder / name for name in files]
+    """Write files to an existing folder or, on an error, none; return the paths of the written.
+
+    Files that were `changed` since the last export are kept, others that this export has not are
+    removed.
+
+    Raises:
+        ConfigError: another file would be replaced that no export has written.
+    """
+    before, kept = _digests(folder), changed(folder)
+    for name, text in files.items():
+        path = folder / name
+        if name not in before and path.exists() and path.read_bytes() != text.encode():
+            raise ConfigError(
+                f"{path}: no export has written it; expected another folder, or one of an export "
+                "of this version"
+            )
+    after = {name: before[name] for name in kept}
+    after |= {name: sha256(text.encode()).hexdigest() for name, text in files.items()}
+    listed = "".join(f"{digest}  {name}\n" for name, digest in after.items())
+    written = {name: text for name, text in files.items() if name not in kept} | {DIGESTS: listed}
     with ExitStack() as replacements:
-        for path, text in zip(paths, files.values(), strict=True):
-            replacements.enter_context(replacing(path)).write_text(text, "utf-8")
-    return paths
+        for name, text in written.items():
+            replacements.enter_context(replacing(folder / name)).write_text(text, "utf-8")
+    for name in before.keys() - after.keys():
+        (folder / name).unlink(missing_ok=True)
+    return [folder / name for name in written]
+
+
+def changed(folder: Path) -> list[str]:
+    """Return the names of the exported files in a folder that were changed since their export."""
+    return [
+        name
+        for name, digest in _digests(folder).items()
+        if (folder / name).is_file()
+        and sha256((folder / name).read_bytes()).hexdigest() != digest
+    ]
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    """Return the digest of each exported file in a folder, as it was written."""
+    listed = folder / DIGESTS
+    lines = listed.read_text("utf-8").splitlines() if listed.exists() else []
+    return {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
 
 
 def _filled(text: str, values: Mapping[str, str]) -> str:
