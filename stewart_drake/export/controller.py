@@ -171,6 +171,7 @@ def _configuration(
     queue = np.atleast_2d(recorded.first)
     values = {
         "INCLUDES": "\n".join(f'#include "{name}"' for name in headers),
+        "HEADER": "law.h" if torques else "servo.h",
         "OBJECTS": " ".join([*made, "stewart_config.o"]),
         "KIND": "stewart_law" if torques else "stewart_servo",
         "CONFIGURATION": text,
@@ -198,6 +199,7 @@ def _configuration(
             "extern const stewart_tuner stewart_own_tuner;\n#define STEWART_TUNER_MEMORY "
             f"{c.lib.stewart_tuner_memory(tuner.it)} /* numbers that the tuner remembers */\n"
         )
+        values["HEADER"] = "tuner.h"
         values["SCRATCH"] = str(c.lib.stewart_tuned_step_scratch(compiled.data))
     return values | {"CONSTANTS": "\n".join(written.before)}
 
