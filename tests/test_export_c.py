@@ -333,30 +333,84 @@ def test_the_command_writes_all_files_or_none_and_states_sizes(tmp_path, capsys)
     assert error.count("\n") == 1 and "stewart_board.c: no export has written it; exp" in error
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("settings", "step"),
-    [
-        ((), "stewart_step"),
-        (("tuner.kind=ann",), "stewart_tuned_step"),
-        (("actuator.kind=servo",), "stewart_servo_step"),
-    ],
-    ids=["torques", "tuner", "servos"],
-)
-def test_the_wiring_of_the_readme_compiles(settings, step, tmp_path):
-    controller = "servo_feedforward" if step == "stewart_servo_step" else None
-    scenario = load_scenario("paper", controller, (*SHORT, "duration=0.5", *settings))
-    files = export_c.exported(scenario, measured=False)
-    for name, text in files.items():
-        (tmp_path / name).write_text(text, encoding="utf-8")
-    code = files["README.md"].split("```c\n")[1].split("```")[0]
-    assert f"{step}(" in code and "@" not in files["README.md"]
-    declared = "void read_plate(real *);\nvoid read_report(real *);\nvoid send(const real *);\n"
-    declared += "void setup(void);\nvoid every_period(void);\n"
-    body = "{ (void)about, (void)number, (void)times, (void)rows; }"
-    first, _, rest = code.partition("\n\n")
-    wiring = tmp_path / "wiring.c"
-    wiring.write_text(f"{first}\n{declared}{rest}".replace("{ .. }", body), encoding="utf-8")
-    strict = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror"]
-    command = [*c_compiler(), *strict, "-c", "wiring.c", "-o", "wiring.o"]
+BODY = "{ (void)about, (void)number, (void)times, (void)rows; }"
+ENCODERS = ("sensor.kind=encoders", "sensor.samples=20")
+DESCRIBED = {
+    "torques": (
+        *("paper", None, (), ("read_report", "encoder")),
+        (
+            "make udp",
+            "pose and rates",
+            "= 8 periods after",
+            "goal = goal",
+            "(here 9)",
+            "stewart_note_acted",
+        ),
+    ),
+    "late measurements": ("paper", None, ("sensor.delay=0.2",), (), ("up to 2 (`.longest_wait`)",)),
+    "encoders": (
+        *("paper", None, ENCODERS, ("make udp", "12 numbers")),
+        ("20 readings of six", "has 120 numbers: 20 rows", "read_encoders(", "All rows are used"),
+    ),
+    "encoders without estimator": (
+        *("paper", None, (*ENCODERS, "controller.estimate=[]"), ("All rows",)),
+        ("Only the last row is used", "no parameters"),
+    ),
+    "network": (
+        *("paper", None, ("link.kind=network",), ("make udp", "stewart_limit", "goal")),
+        ("packets of 17 rows", "read_report(&report)", "`.arrived[i]`", "holds the last torque"),
+    ),
+    "unknown delay": (
+        *("paper", "adaptive_lqi", (), ("make udp", "periods after its sample")),
+        ("are 0. It is assumed to be 8 periods", "until it is found nothing is fed back"),
+    ),
+    "weights": (
+        *("desktop", None, ("tuner.kind=ann",), ("make udp", ".weights")),
+        ("stewart_tuned_step(", "= 3 periods", "chosen at each sample"),
+    ),
+    "servos": (
+        *("paper", "servo_preview", ("actuator.kind=servo",), ("torque and", "make udp")),
+        ("angles, rates and torques for six", "`report` only is for", "adds the torque"),
+    ),
+    "setpoints": (
+        *("reachy_mini", "servo_feedforward", (), ("make udp", "stewart_limit", "no new gain")),
+        ("`report` has 1216 numbers", "20 rows of mean torques", "compensated for the torque and"),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DESCRIBED)
+def test_the_readme_is_that_of_the_composition(case, tmp_path):
+    """Its words, its files, and its wiring, which compiles as C and as C++."""
+    name, controller, settings, absent, present = DESCRIBED[case]
+    settings = ("plant.kind=exact", "duration=0.2", *settings)
+    files = export_c.exported(load_scenario(name, controller, settings), measured=False)
+    export_c.write(files, tmp_path)
+    readme = files["README.md"]
+    for words in present:
+        assert words in " ".join(readme.split()), words
+    for words in (*absent, "@", "{%", "None"):
+        assert words not in readme, words
+    over_udp = "stewart_udp.c" in files
+    assert over_udp == ("make udp" in readme)
+    make(tmp_path, "--dry-run", "udp", fails=not over_udp)
+    listed = readme.split("```text\n")[-1].split("```")[0].split()
+    assert set(listed) <= files.keys() and "stewart_config.c" in listed
+    code = readme.split("```c\n")[1].split("```")[0].replace("{ .. }", BODY)
+    included, _, rest = code.partition("\n\n")
+    assert included in readme.split("```cpp\n")[1]
+    declared = "extern void read_plate(real *), read_encoders(real *), send(const real *);\n"
+    report = "stewart_report" if "stewart_report" in rest else "real"
+    declared += (
+        f"extern int read_report({report} *);\nvoid setup(void);\nvoid every_period(void);\n"
+    )
+    (tmp_path / "wiring.c").write_text(f"{included}\n{declared}{rest}", encoding="utf-8")
+    other = f'extern "C" {{\n{included}\n{declared}}}\n{rest}'
+    (tmp_path / "wiring.cpp").write_text(other, encoding="utf-8")
+    strict = ["-pedantic", "-Wall", "-Wextra", "-Werror", "-fsyntax-only"]
+    command = [*c_compiler(), "-std=c99", *strict, "wiring.c"]
     subprocess.run(command, cwd=tmp_path, check=True)
+    if shutil.which("g++") is not None:
+        rest = "-Wno-missing-field-initializers", "wiring.cpp"
+        command = ["g++", "-std=c++20", *strict, *rest]
+        subprocess.run(command, cwd=tmp_path, check=True)

@@ -462,8 +462,10 @@ def test_a_measurement_that_is_too_old_or_repeated_is_missing():
     pair = Pair("paper", ("sensor.delay=0.2",))
     law, native = pair.law, pair.native
     y, motion = pair.states[0], KnownMotion(pair.planned, pair.goal, 0.0)
-    # Taken at samples -1, -2, 1 and, again, 1 and 0; the last is newer.
-    for age, missing in ((1, 1), (3, 2), (1, 2), (2, 3), (4, 4), (0, 4)):
+    most, missing = law.longest_wait, 0
+    old = [(most + 1, 1)] * (most + 1)
+    for age, more in (*old, (most, 0), (most + 1, 1), (1, 0), (2, 1), (4, 1), (0, 0)):
+        missing += more
         given = Measurement.of(y, age * law.timeline.period), motion, pair.weights
         pair.one, pair.other = law.step(pair.one, *given), native.step(pair.other, *given)
         for one in (pair.one, pair.other):

@@ -93,8 +93,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "TOLERANCE": f"{TOLERANCES['float' if single else 'double']:g}",
         "REAL": "float" if single else "double",
         "ESTIMATES": _estimates(scenario),
-        "SILENCE": str(getattr(law, "silence", 0)),
-        "WAIT": str(getattr(law, "longest_wait", 0)),
+        "OWN_WEIGHTS": numbers(experiment.scenario.controller.weights, suffix),
         "TESTS": "stewart_test protocol_test" if over_udp else "stewart_test",
         "TEST_OBJECTS": "stewart_motion.o" if recorded.moves else "",
     }
@@ -120,6 +119,8 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "tuned": tuner is not None,
         "over_udp": over_udp,
         "moves": recorded.moves,
+        "law": law,
+        "scenario": scenario,
     }
     return files | {"README.md": readme.render(values | kinds)}
 
@@ -257,14 +258,13 @@ def _reports(reports: list[Any], suffix: str) -> str:
 
 def _example_data(experiment: Experiment, recorded: Recorded, suffix: str) -> dict[str, str]:
     """Return the data of the scenario that the examples need."""
-    scenario, c = experiment.scenario, experiment.scenario.controller
+    scenario = experiment.scenario
     rows = recorded.motion
     if rows is None:
         motion, times = control_law(experiment)[1], recorded.law.preview_times
         rows = knots(motion, scenario.duration + max(0.0, float(times.max())))
     return {
         "DURATION": repr(float(scenario.duration)),
-        "OWN_WEIGHTS": numbers(c.weights, suffix),
         "START": numbers(experiment.start, suffix),
         "LEAST": numbers(LEAST, suffix),
         "HOME_SIGN": numbers(home_sign(experiment.mechanism), suffix),
@@ -331,8 +331,7 @@ def changed(folder: Path) -> list[str]:
     return [
         name
         for name, digest in _digests(folder).items()
-        if (folder / name).is_file()
-        and sha256((folder / name).read_bytes()).hexdigest() != digest
+        if (folder / name).is_file() and sha256((folder / name).read_bytes()).hexdigest() != digest
     ]
 
 
