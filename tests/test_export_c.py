@@ -338,16 +338,9 @@ ENCODERS = ("sensor.kind=encoders", "sensor.samples=20")
 DESCRIBED = {
     "torques": (
         *("paper", None, (), ("read_report", "encoder")),
-        (
-            "make udp",
-            "pose and rates",
-            "= 8 periods after",
-            "goal = goal",
-            "(here 9)",
-            "stewart_note_acted",
-        ),
+        ("make udp", "pose and rates", "= 8 periods after", "goal = goal", "(here 9)"),
     ),
-    "late measurements": ("paper", None, ("sensor.delay=0.2",), (), ("up to 2 (`.longest_wait`)",)),
+    "late measurements": ("paper", None, ("sensor.delay=0.2",), (), ("up to 12 (`.longest_",)),
     "encoders": (
         *("paper", None, ENCODERS, ("make udp", "12 numbers")),
         ("20 readings of six", "has 120 numbers: 20 rows", "read_encoders(", "All rows are used"),
