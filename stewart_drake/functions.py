@@ -281,10 +281,10 @@ def export_c(
         single: whether numbers have single precision.
 
     Returns:
-        The paths of the files.
+        The paths of the written files. Those that were changed since the last export are kept.
 
     Raises:
-        ConfigError: a law that has no C.
+        ConfigError: a law that has no C, or a file in the folder that no export has written.
     """
     loaded, folder = as_scenario(scenario, controller, settings), Path(directory)
     folder.mkdir(parents=True, exist_ok=True)

@@ -9,8 +9,11 @@ import pytest
 from stewart_drake.cli import main
 from stewart_drake.core import build
 from stewart_drake.export import controller as export_c
+from stewart_drake.export.recording import EXPORTED, record
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import shipped
 from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.studies.compare import SERVOS
 from tests.building import SANITIZED, c_compiler, make
 
 NOISE = "sensor.noise_std=[1e-5,1e-5,1e-5,1e-6,1e-6,1e-6,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
@@ -276,6 +279,18 @@ def test_what_is_not_exported_is_refused_by_its_field(tmp_path, capsys):
     assert not folder.exists()
 
 
+@pytest.mark.parametrize("name", shipped("controller"))
+def test_a_shipped_controller_is_exported_or_refused_by_its_name(name):
+    actuator = f"actuator.kind={'servo' if name in SERVOS else 'torque'}"
+    scenario = load_scenario("paper", name, ("plant.kind=exact", "duration=0.2", actuator))
+    if name in EXPORTED:
+        assert record(scenario).steps
+        return
+    said = f"controller: {name} is not exported, because of .*; exported are {EXPORTED[0]}"
+    with pytest.raises(ConfigError, match=said):
+        record(scenario)
+
+
 def test_a_run_that_does_not_end_is_refused():
     scenario = load_scenario("gravity", settings=("plant.kind=exact", "queue=zero"))
     with pytest.raises(ConfigError, match="expected one whose run the test can replay"):
@@ -289,8 +304,8 @@ def test_the_command_writes_all_files_or_none_and_states_sizes(tmp_path, capsys)
     command = ["export-c", "paper", "--out", str(folder), "--set", "duration=0.5"]
     assert main(command) == 0
     assert "make test" in capsys.readouterr().out
-    names = sorted(path.name for path in folder.iterdir())
-    assert {"law.h", "law.c", "stewart_config.c", "stewart_test.c", "Makefile"} < set(names)
+    names = {path.name for path in folder.iterdir()} - {export_c.DIGESTS}
+    assert {"law.h", "law.c", "stewart_config.c", "stewart_test.c", "Makefile"} < names
     readme = (folder / "README.md").read_text()
     text = int(readme.split("(TOTALS)")[0].splitlines()[-1].split()[0])
     state = int(readme.split("state ")[1].split()[0])
@@ -301,32 +316,94 @@ def test_the_command_writes_all_files_or_none_and_states_sizes(tmp_path, capsys)
     with pytest.raises(FileNotFoundError):
         export_c.write(files, folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    # What its user changed is kept, what no export has written is not replaced.
+    (folder / "stewart_board.c").write_text("mine")
+    assert main([*command, "--set", "sensor.kind=encoders"]) == 0
+    assert "last export: stewart_board.c; delete" in capsys.readouterr().out
+    assert not (folder / "protocol.c").exists()
+    assert main(command) == 0
+    assert "last export: stewart_board.c; delete" in capsys.readouterr().out
+    assert (folder / "stewart_board.c").read_text() == "mine"
+    after = {path.name: path.read_bytes() for path in folder.iterdir()}
+    own = dict.fromkeys(("stewart_board.c", "README.md", export_c.DIGESTS))  # of its times
+    assert after | own == before | own
+    (folder / export_c.DIGESTS).unlink()
+    assert main(command) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "stewart_board.c: no export has written it; exp" in error
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("settings", "step"),
-    [
-        ((), "stewart_step"),
-        (("tuner.kind=ann",), "stewart_tuned_step"),
-        (("actuator.kind=servo",), "stewart_servo_step"),
-    ],
-    ids=["torques", "tuner", "servos"],
-)
-def test_the_wiring_of_the_readme_compiles(settings, step, tmp_path):
-    controller = "servo_feedforward" if step == "stewart_servo_step" else None
-    scenario = load_scenario("paper", controller, (*SHORT, "duration=0.5", *settings))
-    files = export_c.exported(scenario, measured=False)
-    for name, text in files.items():
-        (tmp_path / name).write_text(text, encoding="utf-8")
-    code = files["README.md"].split("```c\n")[1].split("```")[0]
-    assert f"{step}(" in code and "@" not in files["README.md"]
-    declared = "void read_plate(real *);\nvoid read_report(real *);\nvoid send(const real *);\n"
-    declared += "void setup(void);\nvoid every_period(void);\n"
-    body = "{ (void)about, (void)number, (void)times, (void)rows; }"
-    first, _, rest = code.partition("\n\n")
-    wiring = tmp_path / "wiring.c"
-    wiring.write_text(f"{first}\n{declared}{rest}".replace("{ .. }", body), encoding="utf-8")
-    strict = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror"]
-    command = [*c_compiler(), *strict, "-c", "wiring.c", "-o", "wiring.o"]
+BODY = "{ (void)about, (void)number, (void)times, (void)rows; }"
+ENCODERS = ("sensor.kind=encoders", "sensor.samples=20")
+DESCRIBED = {
+    "torques": (
+        *("paper", None, (), ("read_report", "encoder")),
+        ("make udp", "pose and rates", "= 8 periods after", "goal = goal", "(here 9)"),
+    ),
+    "late measurements": ("paper", None, ("sensor.delay=0.2",), (), ("up to 12 (`.longest_",)),
+    "encoders": (
+        *("paper", None, ENCODERS, ("make udp", "12 numbers")),
+        ("20 readings of six", "has 120 numbers: 20 rows", "read_encoders(", "All rows are used"),
+    ),
+    "encoders without estimator": (
+        *("paper", None, (*ENCODERS, "controller.estimate=[]"), ("All rows",)),
+        ("Only the last row is used", "no parameters"),
+    ),
+    "network": (
+        *("paper", None, ("link.kind=network",), ("make udp", "stewart_limit", "goal")),
+        ("packets of 17 rows", "read_report(&report)", "`.arrived[i]`", "holds the last torque"),
+    ),
+    "unknown delay": (
+        *("paper", "adaptive_lqi", (), ("make udp", "periods after its sample")),
+        ("are 0. It is assumed to be 8 periods", "until it is found nothing is fed back"),
+    ),
+    "weights": (
+        *("desktop", None, ("tuner.kind=ann",), ("make udp", ".weights")),
+        ("stewart_tuned_step(", "= 3 periods", "chosen at each sample"),
+    ),
+    "servos": (
+        *("paper", "servo_preview", ("actuator.kind=servo",), ("torque and", "make udp")),
+        ("angles, rates and torques for six", "`report` only is for", "adds the torque"),
+    ),
+    "setpoints": (
+        *("reachy_mini", "servo_feedforward", (), ("make udp", "stewart_limit", "no new gain")),
+        ("`report` has 1216 numbers", "20 rows of mean torques", "compensated for the torque and"),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DESCRIBED)
+def test_the_readme_is_that_of_the_composition(case, tmp_path):
+    """Its words, its files, and its wiring, which compiles as C and as C++."""
+    name, controller, settings, absent, present = DESCRIBED[case]
+    settings = ("plant.kind=exact", "duration=0.2", *settings)
+    files = export_c.exported(load_scenario(name, controller, settings), measured=False)
+    export_c.write(files, tmp_path)
+    readme = files["README.md"]
+    for words in present:
+        assert words in " ".join(readme.split()), words
+    for words in (*absent, "@", "{%", "None"):
+        assert words not in readme, words
+    over_udp = "stewart_udp.c" in files
+    assert over_udp == ("make udp" in readme)
+    make(tmp_path, "--dry-run", "udp", fails=not over_udp)
+    listed = readme.split("```text\n")[-1].split("```")[0].split()
+    assert set(listed) <= files.keys() and "stewart_config.c" in listed
+    code = readme.split("```c\n")[1].split("```")[0].replace("{ .. }", BODY)
+    included, _, rest = code.partition("\n\n")
+    assert included in readme.split("```cpp\n")[1]
+    declared = "extern void read_plate(real *), read_encoders(real *), send(const real *);\n"
+    report = "stewart_report" if "stewart_report" in rest else "real"
+    declared += (
+        f"extern int read_report({report} *);\nvoid setup(void);\nvoid every_period(void);\n"
+    )
+    (tmp_path / "wiring.c").write_text(f"{included}\n{declared}{rest}", encoding="utf-8")
+    other = f'extern "C" {{\n{included}\n{declared}}}\n{rest}'
+    (tmp_path / "wiring.cpp").write_text(other, encoding="utf-8")
+    strict = ["-pedantic", "-Wall", "-Wextra", "-Werror", "-fsyntax-only"]
+    command = [*c_compiler(), "-std=c99", *strict, "wiring.c"]
     subprocess.run(command, cwd=tmp_path, check=True)
+    if shutil.which("g++") is not None:
+        rest = "-Wno-missing-field-initializers", "wiring.cpp"
+        command = ["g++", "-std=c++20", *strict, *rest]
+        subprocess.run(command, cwd=tmp_path, check=True)

@@ -402,6 +402,31 @@ def test_the_machine_in_c_is_safe_without_its_controller_and_the_next_one_takes_
     assert sum("a session begins" in line for line in running.lines) == 2
 
 
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("machine", "0"), "PORT: got 0; expected a whole number above 0 and up to 65535"),
+        (("machine", "4700o"), "PORT: got 4700o; expected"),
+        (("machine", "47000", "nan"), "SECONDS: got nan; expected a number above 0"),
+        (("machine", "47000", "", "none"), "none: got 0 bytes"),
+        (("machine", "47000", "1", "key", "more"), "expected: stewart_machine PORT"),
+        (("udp", "127.0.0.1", "65536"), "PORT: got 65536; expected"),
+        (("udp", "127.0.0.1", "80.5"), "PORT: got 80.5; expected"),
+        (("udp", "127.0.0.1", "47000", "seconds=-1"), "seconds: got -1; expected"),
+        (("udp", "127.0.0.1", "47000", "log=no/log"), "log=no/log: No such file"),
+        (("udp", "127.0.0.1", "47000", "key=none"), "none: got 0 bytes"),
+        (("udp", "127.0.0.1", "47000", "armed"), "expected: stewart_udp ADDRESS PORT"),
+        (("udp", "10.0.0.1", "47000"), "expected: stewart_udp ADDRESS PORT"),
+    ],
+)
+def test_wrong_commands_of_the_programs_in_c_are_one_line(arguments, expected, folder, tmp_path):
+    program, *rest = arguments
+    command = [str(folder / f"stewart_{program}"), *rest]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.count("\n") == 1 and done.stderr.startswith(expected)
+
+
 def test_wrong_commands_are_one_line(capfd, tmp_path):
     busy = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     busy.bind(("127.0.0.1", 0))

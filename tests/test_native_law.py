@@ -464,14 +464,18 @@ def test_a_missing_preview_over_a_network_leaves_the_torques_as_they_are():
         assert peak[name, False] < 2 * peak[name, True]
 
 
-def test_a_measurement_that_is_too_old_is_missing():
+def test_a_measurement_that_is_too_old_or_repeated_is_missing():
     pair = Pair("paper", ("sensor.delay=0.2",))
     law, native = pair.law, pair.native
     y, motion = pair.states[0], KnownMotion(pair.planned, pair.goal, 0.0)
-    for age, missing in ((law.longest_wait, 0), (law.longest_wait + 1, 1)):
+    most, missing = law.longest_wait, 0
+    old = [(most + 1, 1)] * (most + 1)
+    for age, more in (*old, (most, 0), (most + 1, 1), (1, 0), (2, 1), (4, 1), (0, 0)):
+        missing += more
         given = Measurement.of(y, age * law.timeline.period), motion, pair.weights
-        for one in (law.step(pair.one, *given), native.step(pair.other, *given)):
-            assert one.counts.measurements_missing == missing
+        pair.one, pair.other = law.step(pair.one, *given), native.step(pair.other, *given)
+        for one in (pair.one, pair.other):
+            assert one.counts.measurements_missing == missing, age
 
 
 def test_shapes_that_do_not_fit_are_refused():

@@ -319,6 +319,12 @@ def test_the_most_probable_content_is_believed():
     nothing = Report(np.zeros(6, dtype=bool), np.full((3, 6), 7.0), 0)
     _, believed = channel.in_flight(sent, flying, timeline, nothing)
     assert believed[-5:, 0].tolist() == [7, 7, 7, 13, 14]
+    # A reported torque that is not finite is none: the assumed one stays.
+    for odd in (np.nan, np.inf):
+        acted = np.array([[7.0] * 6, [odd] + [7.0] * 5, [7.0] * 6])
+        report = replace(nothing, acted=acted)
+        _, believed = channel.in_flight(sent, flying, timeline, report)
+        assert believed[-5:, 0].tolist() == [10, 7, 7, 13, 14]
     # A slower network. T_3: packets 4 and 3 with 0.06 + 0.94 * 0.12 = 0.17, packet 2, which had a
     # plan for it, with 0.83 (0.9 - 0.25) / 0.75 = 0.72, more than twice as much. T_4: packet 4 with
     # 0.17, the plan of packet 3 with 0.83 (0.9 - 0.15) / 0.85 = 0.74.

@@ -13,6 +13,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.core_law import CoreServo
 from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servos import (
@@ -415,17 +416,32 @@ def test_a_command_is_finite_whatever_the_reference_is():
     law, memory = law_and_memory()
     state = Measurement.of(np.concatenate([HOME, np.zeros(6)]))
     report = np.full(law.reports.size, np.nan)
-    for wrong, cause in ((np.nan, "nonfinite_torque"), (5.0, "unreachable")):
+    cases = (-1, np.nan, "references_missing"), (0, np.nan, "references_missing")
+    cases += (-1, 1e308, "nonfinite_torque"), (5, 5.0, "unreachable")
+    for one in (law, CoreServo(law)):
+        before = one.initial_memory(memory.command)
+        for place, wrong, cause in cases:
 
-        def motion(times, wrong=wrong):
-            x = at_home(times)
-            x[:, -1 if np.isnan(wrong) else 5] = wrong
-            return x
+            def motion(times, place=place, wrong=wrong):
+                x = at_home(times)
+                x[:, place] = wrong
+                return x
 
-        after = law.step(memory, state, motion, report)
-        assert getattr(after.counts, cause) == 1
-        assert np.array_equal(after.command[POSE], memory.command[POSE])
-        assert not after.command[RATES].any()
+            after = one.step(before, state, motion, report)
+            assert getattr(after.counts, cause) == sum(after.counts) == 1
+            assert np.array_equal(after.command[POSE], before.command[POSE])
+            assert not after.command[RATES].any()
+
+
+def test_a_measurement_that_servos_repeat_is_missing():
+    law, memory = law_and_memory()
+    state, report = np.concatenate([HOME, np.zeros(6)]), np.zeros(law.reports.size)
+    for one in (law, CoreServo(law)):
+        after = one.initial_memory(memory.command)
+        for age, missing in ((0, 0), (1, 1), (1, 1)):  # of samples 0, 0 and 1
+            given = Measurement.of(state, age * law.timeline.period)
+            after = one.step(after, given, at_home, report)
+            assert after.counts.measurements_missing == missing
 
 
 def test_servos_do_not_follow_what_is_no_number():

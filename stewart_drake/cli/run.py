@@ -171,9 +171,13 @@ def export_c(
 
     A folder that builds with its own Makefile; its test replays a run of the scenario.
     """
+    from stewart_drake.export.controller import changed
+
     check_writable(out)
     files = sd.export_c(scenario, out, controller, settings or (), single=single)
     echo(f"written to {out}: {len(files)} files; make test replays the run")
+    if kept := changed(out):
+        echo(f"kept, as changed since the last export: {', '.join(kept)}; delete to write anew")
 
 
 def setpoints(

@@ -9,7 +9,7 @@
 static int differences_observe(const stewart_law *law, real *memory, int number,
                                const real *torques, const real *values, stewart_scratch scratch)
 {
-    const stewart_sensing sensing = stewart_sensing_of(law), newest = stewart_newest_encoders(law->sensing);
+    const stewart_sensing newest = stewart_newest_encoders(law->sensing);
     const real *now = values + law->measured - LEGS;
     real *state = memory, *last = memory + X, found[X], *root = stewart_take(&scratch, X * X);
     const int had_state = stewart_all_finite(X, state), complete = stewart_all_finite(LEGS, now);
@@ -18,7 +18,7 @@ static int differences_observe(const stewart_law *law, real *memory, int number,
         for (int i = 0; i < 6 && had_state; i++)
             found[6 + i] = (found[i] - state[i]) / law->period;
         stewart_copy(X, found, state);
-        return sensing.fault(&sensing, NULL, law->period, values, last) << STEWART_CAUSES_AT;
+        return 0;
     }
     if (had_state)
         stewart_move_on(law, number, torques, state, scratch);

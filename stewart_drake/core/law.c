@@ -141,7 +141,7 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
         there |= isfinite(y[i]) != 0;
         missing[i] = (real)NAN;
     }
-    there &= sample->age >= 0 && sample->age <= longest;
+    there &= sample->age >= 0 && sample->age <= longest && sample->age < behind; /* and is new */
     const int wanted = there ? sample->age : longest;
     outlook->status = there ? 0 : STEWART_MEASUREMENT_MISSING;
     while (behind > wanted) {

@@ -119,12 +119,14 @@ typedef void (*stewart_preview_function)(void *about, int number, const real *ti
 /* Input of a sample. */
 struct stewart_sample {
     const real *measurement; /* (measured); what is lost is NaN */
-    int age;                 /* of it in periods; negative for a lost one */
+    int age;                 /* of it in periods; negative for a lost one. One that is not newer than
+                                the last one used, or older than `longest_wait`, is missing */
     /* NaN or infinite numbers of the reference are filled in from neighbouring rows and the last
        preview; after a gap the law goes back onto it. Until the first complete row the torque is the
        last one in flight. */
     stewart_preview_function reference;
-    stewart_preview_function goal; /* what a planner leads back to, or NULL for a law without one */
+    stewart_preview_function goal; /* that plans lead back to; from the first plan on it is read in
+                                      the place of `reference`; NULL: `reference` itself */
     void *about;
     const stewart_report *report; /* that came with the measurement, or NULL */
     real weights[2]; /* of errors and of torques; if one is not finite, the last gain is used */

@@ -27,13 +27,12 @@ real stewart_norm(int n, const real *x);
 void stewart_transpose(int n, real *A);
 void stewart_swap_rows(int n, real *a, real *b);
 
-/* C = A B, (n, k) (k, m). */
-void stewart_multiply(int n, int k, int m, const real *A, const real *B, real *restrict C);
+/* C = A B, (n, k) (k, m); C is apart from A and B. */
+void stewart_multiply(int n, int k, int m, const real *A, const real *B, real *C);
 
 /* C = A' B, (k, n)' (k, m), and C = A B', (n, k) (m, k)'. */
-void stewart_multiply_transpose(int n, int k, int m, const real *A, const real *B, real *restrict C);
-void stewart_multiply_by_transpose(int n, int k, int m, const real *A, const real *B,
-                                   real *restrict C);
+void stewart_multiply_transpose(int n, int k, int m, const real *A, const real *B, real *C);
+void stewart_multiply_by_transpose(int n, int k, int m, const real *A, const real *B, real *C);
 
 /* Two rows of a product:
 
@@ -47,7 +46,7 @@ void stewart_two_rows(int how, int k, const real *a0, const real *a1, int next, 
 
 /* B <- A^-1 B, (n, n) (n, m), by elimination with row pivoting; A is overwritten. Returns 0 if A is
    singular. */
-int stewart_solve(int n, int m, real *A, real *restrict B);
+int stewart_solve(int n, int m, real *A, real *B);
 
 /* A <- L, lower triangular, with L L' = A (n, n); only the lower triangle of A is read. Returns 0 if A
    is not positive definite. */

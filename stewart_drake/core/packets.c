@@ -205,7 +205,8 @@ void stewart_packets_update(const stewart_packets *p, real *memory, const stewar
         if (report->arrived[i] > 0)
             arrived[kept - 1 - i - since] = 1;
     for (int i = 0; report && i < report->periods && i + since + steps < number; i++)
-        stewart_copy(U, report->acted + U * i, newest - U * (i + since + steps));
+        if (stewart_all_finite(U, report->acted + U * i))
+            stewart_copy(U, report->acted + U * i, newest - U * (i + since + steps));
     for (int i = 0; i < kept; i++)
         known += !isnan(packets[size * i]);
     int last = since + steps < kept ? since + steps : kept;

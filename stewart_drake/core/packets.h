@@ -24,8 +24,9 @@ typedef struct {
     int packets;         /* in the report, the newest first */
     const real *arrived; /* whether the one sent i + 1 samples before has arrived, 1 or 0 */
     int periods;         /* in the report, the newest first */
-    const real *acted;   /* (periods, 6) torque that acted i + 1 periods before, N m */
-    int age;             /* periods since that sample */
+    const real *acted;   /* (periods, 6) torque that acted i + 1 periods before, N m; a row that is not
+                            finite changes nothing */
+    int age;             /* periods since that sample; negative: no report */
 } stewart_report;
 
 /* Memory: periods since the last report, `kept` where there was none; whether each packet is known to

@@ -116,10 +116,11 @@ static int command_for(const stewart_servo *servo, const real *theta, const real
     const real *geometry = law->machine.geometry;
     real J[36], found[STEWART_COMMAND] = {0};
     stewart_belief belief;
+    if (!stewart_all_finite(ROW, row))
+        return STEWART_REFERENCE_MISSING;
     stewart_crank_angles(geometry, row, found);
-    if (!stewart_all_finite(6, row) || !stewart_all_finite(6, found) ||
-        !stewart_crank_jacobian(geometry, row, J))
-        return stewart_all_finite(6, row) ? STEWART_UNREACHABLE : STEWART_NONFINITE_TORQUE;
+    if (!stewart_all_finite(6, found) || !stewart_crank_jacobian(geometry, row, J))
+        return STEWART_UNREACHABLE;
     stewart_multiply(6, 6, 1, J, row + 6, found + 6);
     stewart_believe(&law->machine, theta, &belief);
     if (law->cost.feedforward != STEWART_NO_FEEDFORWARD)

@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,6 +52,8 @@ EXAMPLES: Final = (
     *("stewart_board.c", "stewart_board.h"),
 )
 """Sources of the examples over UDP, see `_is_example`."""
+DIGESTS: Final = "exported.sha256"
+"""Digests of the written files, for `sha256sum -c`."""
 TEMPLATES: Final = Path(__file__).with_name("templates")
 TOLERANCES: Final = {"double": 1e-9, "float": 1e-3}
 """Tolerance of the replay, as a share of the peak."""
@@ -90,8 +93,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "TOLERANCE": f"{TOLERANCES['float' if single else 'double']:g}",
         "REAL": "float" if single else "double",
         "ESTIMATES": _estimates(scenario),
-        "SILENCE": str(getattr(law, "silence", 0)),
-        "WAIT": str(getattr(law, "longest_wait", 0)),
+        "OWN_WEIGHTS": numbers(experiment.scenario.controller.weights, suffix),
         "TESTS": "stewart_test protocol_test" if over_udp else "stewart_test",
         "TEST_OBJECTS": "stewart_motion.o" if recorded.moves else "",
     }
@@ -117,6 +119,8 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "tuned": tuner is not None,
         "over_udp": over_udp,
         "moves": recorded.moves,
+        "law": law,
+        "scenario": scenario,
     }
     return files | {"README.md": readme.render(values | kinds)}
 
@@ -168,6 +172,7 @@ def _configuration(
     queue = np.atleast_2d(recorded.first)
     values = {
         "INCLUDES": "\n".join(f'#include "{name}"' for name in headers),
+        "HEADER": "law.h" if torques else "servo.h",
         "OBJECTS": " ".join([*made, "stewart_config.o"]),
         "KIND": "stewart_law" if torques else "stewart_servo",
         "CONFIGURATION": text,
@@ -195,6 +200,7 @@ def _configuration(
             "extern const stewart_tuner stewart_own_tuner;\n#define STEWART_TUNER_MEMORY "
             f"{c.lib.stewart_tuner_memory(tuner.it)} /* numbers that the tuner remembers */\n"
         )
+        values["HEADER"] = "tuner.h"
         values["SCRATCH"] = str(c.lib.stewart_tuned_step_scratch(compiled.data))
     return values | {"CONSTANTS": "\n".join(written.before)}
 
@@ -252,14 +258,13 @@ def _reports(reports: list[Any], suffix: str) -> str:
 
 def _example_data(experiment: Experiment, recorded: Recorded, suffix: str) -> dict[str, str]:
     """Return the data of the scenario that the examples need."""
-    scenario, c = experiment.scenario, experiment.scenario.controller
+    scenario = experiment.scenario
     rows = recorded.motion
     if rows is None:
         motion, times = control_law(experiment)[1], recorded.law.preview_times
         rows = knots(motion, scenario.duration + max(0.0, float(times.max())))
     return {
         "DURATION": repr(float(scenario.duration)),
-        "OWN_WEIGHTS": numbers(c.weights, suffix),
         "START": numbers(experiment.start, suffix),
         "LEAST": numbers(LEAST, suffix),
         "HOME_SIGN": numbers(home_sign(experiment.mechanism), suffix),
@@ -293,12 +298,48 @@ def _goal(rows: Array | None) -> str:
 
 
 def write(files: Mapping[str, str], folder: Path) -> list[Path]:
-    """Write all files to an existing folder or, on an error, none."""
-    paths = [folder / name for name in files]
+    """Write files to an existing folder or, on an error, none; return the paths of the written.
+
+    Files that were `changed` since the last export are kept, others that this export has not are
+    removed.
+
+    Raises:
+        ConfigError: another file would be replaced that no export has written.
+    """
+    before, kept = _digests(folder), changed(folder)
+    for name, text in files.items():
+        path = folder / name
+        if name not in before and path.exists() and path.read_bytes() != text.encode():
+            raise ConfigError(
+                f"{path}: no export has written it; expected another folder, or one of an export "
+                "of this version"
+            )
+    after = {name: before[name] for name in kept}
+    after |= {name: sha256(text.encode()).hexdigest() for name, text in files.items()}
+    listed = "".join(f"{digest}  {name}\n" for name, digest in after.items())
+    written = {name: text for name, text in files.items() if name not in kept} | {DIGESTS: listed}
     with ExitStack() as replacements:
-        for path, text in zip(paths, files.values(), strict=True):
-            replacements.enter_context(replacing(path)).write_text(text, "utf-8")
-    return paths
+        for name, text in written.items():
+            replacements.enter_context(replacing(folder / name)).write_text(text, "utf-8")
+    for name in before.keys() - after.keys():
+        (folder / name).unlink(missing_ok=True)
+    return [folder / name for name in written]
+
+
+def changed(folder: Path) -> list[str]:
+    """Return the names of the exported files in a folder that were changed since their export."""
+    return [
+        name
+        for name, digest in _digests(folder).items()
+        if (folder / name).is_file() and sha256((folder / name).read_bytes()).hexdigest() != digest
+    ]
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    """Return the digest of each exported file in a folder, as it was written."""
+    listed = folder / DIGESTS
+    lines = listed.read_text("utf-8").splitlines() if listed.exists() else []
+    return {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
 
 
 def _filled(text: str, values: Mapping[str, str]) -> str:

@@ -9,6 +9,8 @@ import numpy as np
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import shipped
+from stewart_drake.files.schema import plain
 from stewart_drake.law.channel import Report
 from stewart_drake.law.core_law import uncovered
 from stewart_drake.law.memory import Memory
@@ -19,9 +21,14 @@ from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.loading import load_controller
 from stewart_drake.scenario.trajectories import evaluate, through_states
 from stewart_drake.types import Array
 
+EXPORTED: Final = (
+    *("adaptive_lqi", "lqr_gravity", "predictor_lqi", "servo_feedforward", "servo_preview"),
+)
+"""Shipped controllers that are exported."""
 MOST_SAMPLES: Final = 100
 """Largest number of samples that the test replays."""
 TOLERANCE: Final = 1e-7
@@ -197,6 +204,17 @@ class RecordedServo(ServoPreview):
         return after
 
 
+def _refusal(scenario: Scenario, field: str) -> str:
+    """Return why a law is not exported, by the name of its shipped controller if it is one."""
+    given, known = plain(scenario.controller).items(), ", ".join(EXPORTED)
+    fields = {name: load_controller(name) for name in shipped("controller")}
+    names = [name for name in fields if fields[name].items() <= given]
+    name = max(names, key=lambda name: len(fields[name]), default=EXPORTED[0])
+    if name in EXPORTED:
+        return f"{field}: is not exported as it is; expected that of {known}"
+    return f"controller: {name} is not exported, because of {field}; exported are {known}"
+
+
 def record(scenario: Scenario) -> Recorded:
     """Return the law of a scenario with its steps in a run on the exact plant.
 
@@ -208,10 +226,7 @@ def record(scenario: Scenario) -> Recorded:
     def recorded(law: Any) -> Any:
         problem = uncovered(law)
         if problem is not None:
-            raise ConfigError(
-                f"{problem}: is not exported as it is; expected what predictor_lqi, adaptive_lqi "
-                "or the controllers of servos have"
-            )
+            raise ConfigError(_refusal(scenario, problem))
         found.append(Recorded(law, scenario.duration))
         kind = RecordedLqi if isinstance(law, PredictiveLqi) else RecordedServo
         return kind(**{f.name: getattr(law, f.name) for f in fields(law)}, record=found[-1])

@@ -269,7 +269,8 @@ class PredictiveLqi:
         """
         self.require_age(measurement)
         age = round(measurement.age / self.timeline.period)
-        valid = bool(np.any(measurement.valid)) and 0 <= age <= self.longest_wait
+        newest = min(self.longest_wait, memory.lag)  # an older one was used, or overtaken
+        valid = bool(np.any(measurement.valid)) and 0 <= age <= newest
         target = age if valid else self.longest_wait
         delayed = memory.belief if memory.delayed is None else memory.delayed
         lag, flown = memory.lag + 1, memory.in_flight

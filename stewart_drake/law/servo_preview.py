@@ -135,8 +135,8 @@ class ServoPreview:
             The new memory; its command (18,) is finite.
         """
         lag, belief, reported = memory.lag + 1, memory.belief, None
-        if np.any(measurement.valid):
-            age = round(measurement.age / self.timeline.period)
+        age = round(measurement.age / self.timeline.period)
+        if np.any(measurement.valid) and 0 <= age < lag:
             reported = self.reports.read(report, lag - age)
             belief, lag = self._observe(belief, replace(measurement, age=0.0), reported), age
         else:
@@ -175,6 +175,8 @@ class ServoPreview:
         """Return the next command (18,); where there is none, the cranks stop, with the cause."""
         last = memory.command
         stay = np.concatenate([last[POSE], np.zeros(NUM_COORDINATES), last[MODEL_TORQUE]])
+        if not np.all(np.isfinite(wanted)):
+            return stay, "references_missing"
         try:
             command = self.command(wanted, belief.parameters)
         except UnreachablePoseError:

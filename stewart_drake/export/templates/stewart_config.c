@@ -6,6 +6,7 @@
 #include <math.h>
 
 #include "stewart_config.h"
+@INCLUDES@
 
 @CONSTANTS@
 

@@ -3,7 +3,7 @@
 #ifndef STEWART_CONFIG_H
 #define STEWART_CONFIG_H
 
-@INCLUDES@
+#include "@HEADER@"
 
 #define STEWART_MEMORY @MEMORY@   /* numbers that the law remembers */
 #define STEWART_SCRATCH @SCRATCH@ /* numbers that it computes in */

@@ -7,7 +7,6 @@
 
 #include <math.h>
 #include <stdio.h>
-#include <stdlib.h>
 #include <string.h>
 
 #include "link.h"
@@ -362,14 +361,18 @@ static uint64_t advance(machine *m, uint64_t now)
 int main(int argc, char **argv)
 {
     static machine m;
-    double seconds = argc > 2 && *argv[2] ? atof(argv[2]) : INFINITY;
-    m.key = udp_key(argc > 3 ? argv[3] : NULL);
-    if (argc < 2 || (argc > 3 && !m.key.size)) {
+    if (argc < 2 || argc > 4) {
         fprintf(stderr, "expected: stewart_machine PORT [SECONDS [KEYFILE]]\n");
         return 2;
     }
+    double port = udp_number("PORT", argv[1], UDP_LAST_PORT, 0), seconds = INFINITY;
+    if (argc > 2 && *argv[2])
+        seconds = udp_number("SECONDS", argv[2], UDP_LONGEST, 1);
+    m.key = udp_key(argc > 3 ? argv[3] : NULL);
+    if (port == 0 || seconds == 0 || (argc > 3 && !m.key.size))
+        return 2;
     udp_interrupted();
-    m.socket = udp_open((uint16_t)atoi(argv[1]), m.key);
+    m.socket = udp_open((uint16_t)port, m.key);
     if (m.socket < 0 || !udp_draw(m.offers.secret, sizeof m.offers.secret))
         return 2;
     m.offers.tokens = STEWART_AT_ONCE;

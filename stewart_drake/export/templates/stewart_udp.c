@@ -12,7 +12,6 @@
 #include <arpa/inet.h>
 #include <math.h>
 #include <stdio.h>
-#include <stdlib.h>
 #include <string.h>
 
 #include "stewart_config.h"
@@ -331,36 +330,47 @@ static const char *drive(controller *c)
     return NULL;
 }
 
+/* Read the command line; prints an error and returns 0 if it is wrong. */
 static int understood(controller *c, int argc, char **argv)
 {
+    int usable = argc > 2 && inet_pton(AF_INET, argv[1], &c->machine.sin_addr) == 1;
+    double port = usable ? udp_number("PORT", argv[2], UDP_LAST_PORT, 0) : 0;
     c->machine.sin_family = AF_INET;
+    c->machine.sin_port = htons((uint16_t)port);
     c->seconds = stewart_duration;
-    if (argc < 3 || inet_pton(AF_INET, argv[1], &c->machine.sin_addr) != 1)
+    if (usable && port == 0)
         return 0;
-    c->machine.sin_port = htons((uint16_t)atoi(argv[2]));
-    for (int i = 3; i < argc; i++) {
-        if (strncmp(argv[i], "seconds=", 8) == 0)
-            c->seconds = atof(argv[i] + 8);
-        else if (strncmp(argv[i], "key=", 4) == 0 && (c->key = udp_key(argv[i] + 4)).size)
-            continue;
-        else if (strncmp(argv[i], "log=", 4) == 0 && (c->log = fopen(argv[i] + 4, "w")))
-            continue;
-        else if (strcmp(argv[i], "arm") == 0)
+    for (int i = 3; usable && i < argc; i++) {
+        const char *text = argv[i];
+        if (strncmp(text, "seconds=", 8) == 0) {
+            if (!(c->seconds = udp_number("seconds", text + 8, UDP_LONGEST, 1)))
+                return 0;
+        } else if (strncmp(text, "key=", 4) == 0) {
+            if (!(c->key = udp_key(text + 4)).size)
+                return 0;
+        } else if (strncmp(text, "log=", 4) == 0) {
+            if (!(c->log = fopen(text + 4, "w"))) {
+                perror(text);
+                return 0;
+            }
+        } else if (strcmp(text, "arm") == 0) {
             c->flags = STEWART_ARMED;
-        else
-            return 0;
+        } else {
+            usable = 0;
+        }
     }
-    return c->key.size || ntohl(c->machine.sin_addr.s_addr) >> 24 == 127;
+    if (usable && (c->key.size || ntohl(c->machine.sin_addr.s_addr) >> 24 == 127))
+        return 1;
+    fprintf(stderr, "expected: stewart_udp ADDRESS PORT [seconds=S] [key=FILE] [log=FILE] [arm], "
+                    "the address in numbers, beyond 127.0.0.1 with a key\n");
+    return 0;
 }
 
 int main(int argc, char **argv)
 {
     static controller c;
-    if (!understood(&c, argc, argv)) {
-        fprintf(stderr, "expected: stewart_udp ADDRESS PORT [seconds=S] [key=FILE] [log=FILE] [arm], "
-                        "the address in numbers, beyond 127.0.0.1 with a key\n");
+    if (!understood(&c, argc, argv))
         return 2;
-    }
     udp_interrupted();
     c.socket = udp_open(0, c.key);
     if (!udp_draw(&c.session.number, sizeof c.session.number))

@@ -2,9 +2,11 @@
 
 #include <arpa/inet.h>
 #include <fcntl.h>
+#include <math.h>
 #include <poll.h>
 #include <signal.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/socket.h>
 #include <time.h>
@@ -50,6 +52,17 @@ int udp_open(uint16_t port, stewart_key key)
     if (s < 0)
         perror("port");
     return s;
+}
+
+double udp_number(const char *name, const char *text, double most, int parts)
+{
+    char *end;
+    double number = strtod(text, &end);
+    if (end != text && !*end && number > 0 && number <= most && (parts || number == floor(number)))
+        return number;
+    fprintf(stderr, "%s: got %s; expected a%s number above 0 and up to %.0f\n", name, text,
+            parts ? "" : " whole", most);
+    return 0;
 }
 
 void udp_wait(int socket, uint64_t until)

@@ -9,6 +9,8 @@
 #include "protocol.h"
 
 #define SECOND 1000000000u
+#define UDP_LAST_PORT 65535
+#define UDP_LONGEST 1e6 /* s, of a run */
 
 /* Monotonic clock, ns. */
 uint64_t udp_now(void);
@@ -19,6 +21,10 @@ int udp_draw(void *bytes, size_t size);
 /* A socket at a port, 0 for any, of the loopback interface or, with a key, of all; -1 on an error,
    which is printed. */
 int udp_open(uint16_t port, stewart_key key);
+
+/* A number of the command line, above 0 and up to `most`, a whole one unless `parts`. Prints an error and
+   returns 0 for anything else. */
+double udp_number(const char *name, const char *text, double most, int parts);
 
 /* Wait for a datagram, at the longest until an instant of the own clock. */
 void udp_wait(int socket, uint64_t until);
