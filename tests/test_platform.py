@@ -266,6 +266,17 @@ def test_a_platform_begins_at_the_given_state():
         assert "multibody" in repr(platform) or "exact" in repr(platform)
 
 
+def set_state(builder, state, kind="exact"):
+    platform = sd.AddStewartPlatform(builder, PAPER, sd.PlantConfig(kind=kind))
+    platform.SetState(builder.Build().CreateDefaultContext(), state)
+
+
+@pytest.mark.parametrize("kind", ["exact", "multibody"])
+def test_a_state_out_of_reach_is_refused(kind):
+    with pytest.raises(sd.UnreachablePoseError):
+        set_state(DiagramBuilder(), [0, 0, 5, *np.zeros(9)], kind)
+
+
 def own_plant(builder, finalized):
     plant, _ = AddMultibodyPlantSceneGraph(builder, 1e-3)
     if finalized:
@@ -291,7 +302,12 @@ def own_plant(builder, finalized):
         ),
         (lambda b: sd.AddStewartPlatform(b, PAPER).GetInputPort("force"), "expected torque or wre"),
         (lambda b: sd.AddStewartPlatform(b, PAPER, start=[0.0]), "start: got shape (1,)"),
+        (lambda b: sd.AddStewartPlatform(b, PAPER, start=[np.nan] * 6), "start: got [nan"),
+        (lambda b: sd.AddStewartPlatform(b, PAPER, {"kind": "exact"}), "config: got {'kind'"),
         (lambda b: sd.AddStewartPlatform(b, "no_such_machine"), "no_such_machine"),
+        (lambda b: set_state(b, [np.nan] * 12), "state: got [nan"),
+        (lambda b: set_state(b, [0.0] * 6), "state: got shape (6,)"),
+        (lambda b: sd.StewartDynamics("paper"), "mechanism: got 'paper'; expected a Mechanism"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(use, message):

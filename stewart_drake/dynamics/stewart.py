@@ -8,7 +8,7 @@ import numpy as np
 from stewart_drake.core.layout import DEAD_CENTRE_SINE, DEFAULT_GRAVITY
 from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.workspace import measures_at
-from stewart_drake.files.arguments import fixed
+from stewart_drake.files.arguments import fixed, of_kind
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.assembly import TorqueMap, torque_map
 from stewart_drake.mechanism.geometry import Mechanism
@@ -143,6 +143,7 @@ class StewartDynamics:
         parameters: ArrayLike | None = None,
         free: Sequence[str] = PARAMETERS,
     ) -> None:
+        of_kind("mechanism", mechanism, Mechanism)
         self.mechanism = mechanism
         switch = isinstance(gravity, bool | np.bool_)
         scale = DEFAULT_GRAVITY if switch else 1.0

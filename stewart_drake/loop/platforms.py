@@ -41,6 +41,7 @@ from pydrake.systems.primitives import AffineSystem
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose, margin
+from stewart_drake.files.arguments import fixed, of_kind
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.exact import ExactPlant, checked_loads, plate_of_mass
 from stewart_drake.loop.sampling import weak
@@ -375,9 +376,8 @@ class StewartPlatform:
             ConfigError: another shape.
             UnreachablePoseError, SingularPoseError: see `loop.platforms.set_pose`.
         """
-        x = np.asarray(state, dtype=np.float64)
-        if x.shape != (NUM_STATE,):
-            raise ConfigError(f"state: got shape {x.shape}; expected ({NUM_STATE},)")
+        x = fixed("state", state, (NUM_STATE,))
+        self.mechanism.crank_angles(x[POSE])  # raises if out of reach
         own = self.plant.GetMyMutableContextFromRoot(context)
         if self.model is None:
             self.plant.set_state(own, x)
@@ -512,9 +512,8 @@ def AddStewartPlatform(
     """
     machine = as_mechanism(mechanism)
     config = PlantConfig() if config is None else config
-    pose = machine.home if start is None else np.asarray(start, dtype=np.float64)
-    if pose.shape != (6,):
-        raise ConfigError(f"start: got shape {pose.shape}; expected (6,), a pose")
+    of_kind("config", config, PlantConfig)
+    pose = machine.home if start is None else fixed("start", start, (6,))
     machine.crank_angles(pose)  # raises if out of reach
     if config.kind == "paper":
         raise ConfigError(
