@@ -140,7 +140,11 @@ def test_the_mean_error_leaves_out_the_time_in_which_nothing_can_act(summary):
 @pytest.mark.parametrize(
     ("amplitude", "moved", "said"),
     [
-        (0.03, 1, r"on average over what moves \(z\)\. Largest error: z \d+ % of its motion\."),
+        (
+            0.03,
+            1,
+            r"on average over moving coordinates \(z\)\. Largest error: z \d+ % of its motion\.",
+        ),
         (0.0, 6, r"of 1 rad and 1 m on average, as no .* Largest error: \w+ \d\.\d+ (mm|deg)\."),
     ],
 )
