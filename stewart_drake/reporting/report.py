@@ -303,7 +303,7 @@ def verdict(found: ReportData) -> tuple[str, Tone]:
     if bad:
         text = f"Not reliable: {bad}. The run completed {duration}: E_ac is "
     error, floor = number(s["accumulated_error"]), s["delay_floor"]
-    average = f"{number(mean_error(run), 2)} % {_of_what(run)}"
+    average = f"{number(mean_error(run), 2)} % {_averaged(run)}"
     if floor > 0:
         text += (
             f"{error} % s. The time before any torque can act contributes {number(floor)} % s; "
@@ -340,13 +340,15 @@ def _findings(run: SimulationResult) -> list[tuple[Tone, str]]:
     return found
 
 
-def _of_what(run: SimulationResult) -> str:
-    """Return of what, and over which coordinates, `mean_error` is a mean."""
+def _averaged(run: SimulationResult) -> str:
+    """Return the unit and the coordinates of `mean_error`."""
     moved = moving(run)
     if not moved.any():
         return "of 1 rad and 1 m on average, as no coordinate moves"
     names = ", ".join(np.array(COORDINATE_NAMES)[moved])
-    return "of peak to peak on average" + ("" if moved.all() else f" over what moves ({names})")
+    return "of peak to peak on average" + (
+        "" if moved.all() else f" over moving coordinates ({names})"
+    )
 
 
 def mean_error(run: SimulationResult) -> float:

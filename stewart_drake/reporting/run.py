@@ -68,11 +68,12 @@ def _peaks(run: SimulationResult) -> list[str]:
 def worst(run: SimulationResult) -> str:
     """Return the coordinate with the largest error and that error, as in `_peaks`.
 
-    The error of a still coordinate is compared with the largest motion in its unit.
+    The error of a still coordinate is compared with the largest motion in its unit, or with 1 rad
+    or 1 m, as in E_ac, if there is none.
     """
     percent, span = np.array(run.summary["peak_error"]), _span(run)
-    largest = np.repeat([max(span[ANGLES].max(), _STILL), max(span[POSITION].max(), _STILL)], 3)
-    share = np.where(moving(run), percent, percent / largest)
+    largest = np.repeat([span[ANGLES].max(), span[POSITION].max()], 3)
+    share = percent / np.where(moving(run) | (largest <= _STILL), 1.0, largest)
     return _peaks(run)[int(np.argmax(share))]
 
 
