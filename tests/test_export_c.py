@@ -392,13 +392,20 @@ def test_the_readme_is_that_of_the_composition(case, tmp_path):
     code = readme.split("```c\n")[1].split("```")[0].replace("{ .. }", BODY)
     included, _, rest = code.partition("\n\n")
     assert included in readme.split("```cpp\n")[1]
-    declared = "extern void read_plate(real *), read_encoders(real *), send(const real *);\n"
+    declared = "extern void read_plate(real *), read_encoders(real *);\n"
+    declared += "extern void drive(const real *), send_packet(const real *);\n"
     report = "stewart_report" if "stewart_report" in rest else "real"
-    declared += (
-        f"extern int read_report({report} *);\nvoid setup(void);\nvoid every_period(void);\n"
-    )
+    declared += f"extern int read_report({report} *);\nvoid setup(void), every_period(void);\n"
     (tmp_path / "wiring.c").write_text(f"{included}\n{declared}{rest}", encoding="utf-8")
-    other = f'extern "C" {{\n{included}\n{declared}}}\n{rest}'
+    headers = {
+        "stewart_motion.h",
+        "stewart_board.h",
+        "protocol.h",
+        "udp.h",
+        "meter.h",
+    } & files.keys()
+    all_headers = "\n".join([included, *(f'#include "{name}"' for name in sorted(headers))])
+    other = f'extern "C" {{\n{all_headers}\n{declared}}}\n{rest}'
     (tmp_path / "wiring.cpp").write_text(other, encoding="utf-8")
     strict = ["-pedantic", "-Wall", "-Wextra", "-Werror", "-fsyntax-only"]
     command = [*c_compiler(), "-std=c99", *strict, "wiring.c"]
