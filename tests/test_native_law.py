@@ -10,7 +10,7 @@ import stewart_drake as sd
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law import core_law
-from stewart_drake.law.core_law import CompiledLaw, CoreLqi, serving, uncovered
+from stewart_drake.law.core_law import CompiledLaw, CoreLqi, CoreServo, serving, uncovered
 from stewart_drake.law.delay_model import delayed_model, linear_model
 from stewart_drake.law.motion import KnownMotion, Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
@@ -18,6 +18,7 @@ from stewart_drake.law.riccati import RiccatiError, lqr, lqr_by_doubling, reduce
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.law_design import compose_law, control_law
 from stewart_drake.loop.preparation import prepare
+from stewart_drake.loop.servos import compose_servo_law
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
@@ -448,6 +449,25 @@ def test_a_step_takes_no_more_scratch_than_stated(settings, monkeypatch):
     used = [array for array in painted.kept if array.shape == (stated + SPARE,)]
     assert used and all((array[stated:] == UNTOUCHED).all() for array in used)
     assert max(np.count_nonzero(array != UNTOUCHED) for array in used) > stated / 5
+
+
+def test_servos_take_no_more_scratch_than_stated_after_lost_measurements(monkeypatch):
+    """The filter goes over ten periods of 20 torques, and keeps their whole transition only."""
+    experiment = prepare(load_scenario("reachy_mini", "servo_feedforward"))
+    law, painted = compose_servo_law(experiment), Painted()
+    stated, motion = CompiledLaw(law).scratch, Preview(law.preview_times, np.zeros((1, 18)))
+    monkeypatch.setattr(CompiledLaw, "scratch", stated + SPARE)
+    monkeypatch.setattr(core_law, "np", painted)
+    native, report = CoreServo(law), np.zeros(law.reports.size)
+    memory, lost = native.initial_memory(np.zeros(18)), np.full(12, np.nan)
+    for k in range(2 + law.reports.periods):
+        y = lost if 1 < k < 1 + law.reports.periods else experiment.start
+        memory = native.step(memory, Measurement.of(y), motion, report)
+    assert memory.counts.measurements_missing == law.reports.periods - 1
+    used = [array for array in painted.kept if array.shape == (stated + SPARE,)]
+    assert all((array[stated:] == UNTOUCHED).all() for array in used)
+    written = max(np.count_nonzero(array != UNTOUCHED) for array in used)
+    assert stated / 2 < written and stated < 24_000
 
 
 def test_a_missing_preview_over_a_network_leaves_the_torques_as_they_are():

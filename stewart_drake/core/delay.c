@@ -505,7 +505,7 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
         stewart_fill(n, 0, w);
         stewart_copy(X, a->K + X * k, w);
     }
-    stewart_absorb(n, n + a->rows, R, W, scratch);
+    stewart_absorb(n, n + a->rows, R, W);
     stewart_copy(X, a->instant.state, after->numbers);
     stewart_copy(n - X, xi + X, after->numbers + X);
     after->numbers[n - 2] += dt * xi[n - 1];

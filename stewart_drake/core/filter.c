@@ -83,7 +83,7 @@ typedef struct {
     stewart_instant instant;
     const stewart_attempt *attempt;
     int fourth_order;
-    real *states, *H; /* (number, 12), (number, 12, n) of `stewart_transitions` */
+    real *states; /* (number, 12) */
 } Sample;
 
 static int predict(void *about, const real *xi, real *end)
@@ -95,28 +95,25 @@ static int predict(void *about, const real *xi, real *end)
     return 1;
 }
 
-/* H along the states of `predict`. `last` is not written: it is the end of H already. */
-static int linearize(void *about, const real *xi, real *last, stewart_scratch scratch)
+/* H along the states of `predict`. */
+static int linearize(void *about, const real *xi, real *H, stewart_scratch scratch)
 {
     Sample *s = about;
-    (void)last;
-    return stewart_transitions(s->attempt->filter->machine, xi, &s->attempt->period->schedule,
-                               s->fourth_order, s->states, s->H, scratch);
+    return stewart_transition(s->attempt->filter->machine, xi, &s->attempt->period->schedule,
+                              s->fourth_order, s->states, H, scratch);
 }
 
 /* Predict and linearise from the prior's mean. Attempts at the same period often begin with the same. */
 static int begin(Sample *s, const real *xi, real *end, stewart_scratch scratch)
 {
-    const int n = s->attempt->n, pieces = s->attempt->period->schedule.number;
-    real *kept = s->attempt->kept, *mean = kept + 1, *last = mean + n, *states = last + X;
-    real *H = states + X * pieces;
+    const int n = s->attempt->n;
+    real *kept = s->attempt->kept, *mean = kept + 1, *last = mean + n, *H = last + X;
     int same = kept[0] == (real)s->fourth_order;
     for (int i = 0; i < n && same; i++)
         same = mean[i] == xi[i];
     if (same) {
         stewart_copy(X, last, end);
-        stewart_copy(X * pieces, states, s->states);
-        stewart_copy(X * n * pieces, H, s->H);
+        stewart_copy(X * n, H, s->instant.H);
         return 1;
     }
     if (!predict(s, xi, end) || !linearize(s, xi, s->instant.H, scratch))
@@ -124,12 +121,11 @@ static int begin(Sample *s, const real *xi, real *end, stewart_scratch scratch)
     kept[0] = (real)s->fourth_order;
     stewart_copy(n, xi, mean);
     stewart_copy(X, end, last);
-    stewart_copy(X * pieces, s->states, states);
-    stewart_copy(X * n * pieces, s->H, H);
+    stewart_copy(X * n, s->instant.H, H);
     return 1;
 }
 
-static int kept_numbers(int n, int pieces) { return 1 + n + X + X * (n + 1) * pieces; }
+static int kept_numbers(int n) { return 1 + n + X + X * n; }
 
 /* Learn the noise in `after` from whitened innovations (m) with their variances. */
 static void learn(const Sample *s, const real *innovations, const real *variances)
@@ -162,8 +158,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     s.instant.C = stewart_take(&scratch, m * m);
     s.instant.J = stewart_take(&scratch, m * X);
     s.states = stewart_take(&scratch, X * pieces);
-    s.H = stewart_take(&scratch, X * n * pieces);
-    a->last = s.instant.H = s.H + X * n * (pieces - 1);
+    a->last = s.instant.H = stewart_take(&scratch, X * n);
     if (!begin(&s, xi, a->end, scratch))
         return 0;
     stewart_attempt_predicted(a);
@@ -339,7 +334,7 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
     real outliers = 1;
     stewart_attempt a = {.filter = filter, .n = n, .period = period, .prior = &now,
                          .values = values, .history = history, .after = &after};
-    a.kept = stewart_take(&scratch, kept_numbers(n, period->schedule.number));
+    a.kept = stewart_take(&scratch, kept_numbers(n));
     a.kept[0] = (real)NAN;
     a.changes = stewart_changes(period);
     a.kicks = stewart_take(&scratch, X * a.changes);
@@ -391,9 +386,9 @@ int stewart_filter_scratch(const stewart_filter *filter, int torques)
 {
     const stewart_legs *legs = filter->legs;
     const int n = size_of(filter), p = n - X, m = filter->sensing->size;
-    const int sample = m * (m + 3 + X) + m * (torques + 1) + X * (n + 1) * torques + stewart_kalman_scratch(n, m);
+    const int sample = m * (m + 3 + X) + m * (torques + 1) + X * (n + torques) + stewart_kalman_scratch(n, m);
     const int step = legs ? legs->scratch(filter, torques) : sample;
     const int within = step + stewart_transitions_scratch(p) + 2 * n * n + (X + 3 + torques) * n;
     const int start = X * X + m + LEGS * (6 + p) + (legs ? legs->start_scratch(filter) : 0);
-    return 2 * stewart_posterior_size(n, m) + kept_numbers(n, torques) + 2 * X * (torques + 1) + (within > start ? within : start);
+    return 2 * stewart_posterior_size(n, m) + kept_numbers(n) + 2 * X * (torques + 1) + (within > start ? within : start);
 }

@@ -20,7 +20,7 @@ typedef struct {
     real likelihood;            /* log of the density of the values, without a constant; -inf without one */
     const real *last;           /* (12, n) d[end]/d[xi] */
     real *kept; /* of the last prediction from a prior: 1 if F was of fourth order, 0 if not, NaN for none;
-                   the prior's mean, the state at the end, states, H (see filter.c) */
+                   the prior's mean, the state at the end, H */
     real hopeless;              /* as of `stewart_kalman` */
     int left_out;               /* why values were left out, bits as of a `fault` */
     int gated;                  /* number of legs with a value that does not fit */

@@ -67,9 +67,8 @@ static void reflect_six(int n, int m, real v, const real *f, real beta, real *ro
 }
 
 /* Householder reflections of row k of R and all rows of W make column k of W zero. */
-void stewart_absorb(int n, int m, real *R, real *W, stewart_scratch scratch)
+void stewart_absorb(int n, int m, real *R, real *W)
 {
-    (void)scratch;
     for (int k = 0; k < n && m > 0; k++) {
         real *row = R + n * k, square = row[k] * row[k];
         int j = k + 1;
@@ -109,7 +108,7 @@ void stewart_root_of_prediction(int n, const real *H, const real *std, const rea
         stewart_fill(n, 0, W + n * (n + row));
         stewart_copy(X, K + X * row, W + n * (n + row));
     }
-    stewart_absorb(n, n + k, R, W, scratch);
+    stewart_absorb(n, n + k, R, W);
     for (int i = 0; i < n; i++)
         for (int j = 0; j < n; j++)
             L[n * i + j] = j <= i ? R[n * j + i] : 0;
@@ -243,8 +242,7 @@ int stewart_within_bounds(int n, const real *mean, const real *L, const real *lo
 
 int stewart_kalman_scratch(int n, int most)
 {
-    return most + most * n + (most + n + 1) * (n + 1) + n + (n + 1)
-        + n + MAX * MAX;
+    return most + most * n + (most + n + 1) * (n + 1) + n + n + MAX * MAX;
 }
 
 /* With the residuals whitened the mean is the minimum over z, xi = mean + L z, of
@@ -283,7 +281,7 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
         stewart_fill(N * N, 0, R);
         for (int i = 0; i < n; i++)
             R[(N + 1) * i] = 1;
-        stewart_absorb(N, m, R, W, scratch);
+        stewart_absorb(N, m, R, W);
         *spread = 0;
         for (int i = 0; i < n; i++)
             *spread += 2 * REAL(log)(REAL(fabs)(R[(N + 1) * i]));

@@ -39,15 +39,15 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
 int stewart_kalman_scratch(int n, int most);
 
 /* R (n, n), upper triangular, <- R of the QR decomposition of [R; W]; W (m, n) is lost. With covariances
-   R'R and W'W that is the root of their sum. Scratch: n numbers. */
-void stewart_absorb(int n, int m, real *R, real *W, stewart_scratch scratch);
+   R'R and W'W that is the root of their sum. */
+void stewart_absorb(int n, int m, real *R, real *W);
 
 /* L (n, n) <- root of F L L' F' + diag(std, walk)^2 + [K'K, 0; 0, 0], F = [H; 0 1] with H (12, n), std
-   (12), walk (n - 12) and K (k, 12). Scratch: (2 n + k) n + n numbers. */
+   (12), walk (n - 12) and K (k, 12). Scratch: (2 n + k) n numbers. */
 void stewart_root_of_prediction(int n, const real *H, const real *std, const real *walk, int k,
                                 const real *K, real *L, stewart_scratch scratch);
 
-/* L (n, n) <- root of L L' + diag(0, jump)^2 with jump (n - 12). Scratch: 2 n n + 14 n numbers. */
+/* L (n, n) <- root of L L' + diag(0, jump)^2 with jump (n - 12). Scratch: 2 n n + 12 n numbers. */
 void stewart_widen_root(int n, const real *jump, real *L, stewart_scratch scratch);
 
 /* P (n, n) <- L, lower triangular with L L' = P, which is symmetric and may be singular: a component

@@ -205,19 +205,21 @@ static int transition_of_hold(const stewart_machine *machine, const stewart_beli
     return 1;
 }
 
-int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
-                        int fourth_order, const real *states, real *H, stewart_scratch scratch)
+/* See `stewart_transitions`, with the H of each torque `next` numbers after that of the one before. */
+static int transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
+                       int fourth_order, const real *states, int next, real *H, stewart_scratch scratch)
 {
     const int p = machine->estimated, n = X + p;
     real *Phi = stewart_take(&scratch, X * X), *S = stewart_take(&scratch, X * p);
-    const real *start = xi, *before = NULL;
+    real *before = stewart_take(&scratch, X * n);
+    const real *start = xi;
     stewart_belief belief;
     stewart_believe(machine, xi + X, &belief);
-    for (int k = 0; k < schedule->number; k++, before = H, start = states, states += X, H += X * n) {
+    for (int k = 0; k < schedule->number; k++, start = states, states += X, H += next) {
         const real *torque = schedule->torques + U * k, h = schedule->durations[k];
         if (!transition_of_hold(machine, &belief, torque, h, fourth_order, start, states, Phi, S, scratch))
             return 0;
-        if (before) /* [Phi S; 0 1] [H; 0 1] */
+        if (k > 0) /* [Phi S; 0 1] [H; 0 1] */
             stewart_multiply(X, X, n, Phi, before, H);
         else
             for (int i = 0; i < X; i++) {
@@ -227,8 +229,21 @@ int stewart_transitions(const stewart_machine *machine, const real *xi, const st
         for (int i = 0; i < X; i++)
             for (int j = 0; j < p; j++)
                 H[n * i + X + j] += S[p * i + j];
+        stewart_copy(X * n, H, before);
     }
     return 1;
+}
+
+int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
+                        int fourth_order, const real *states, real *H, stewart_scratch scratch)
+{
+    return transitions(machine, xi, schedule, fourth_order, states, X * (X + machine->estimated), H, scratch);
+}
+
+int stewart_transition(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
+                       int fourth_order, const real *states, real *H, stewart_scratch scratch)
+{
+    return transitions(machine, xi, schedule, fourth_order, states, 0, H, scratch);
 }
 
 int stewart_transitions_scratch(int p)
@@ -236,5 +251,5 @@ int stewart_transitions_scratch(int p)
     const int held = X * X + X * p, nodes = 4 * X * X + 4 * X * p;
     const int derivatives = 6 * (X + STEWART_PARAMETERS + X + U + p);
     const int exponential = 4 * X * X + X * (p > X ? p : X);
-    return 2 * held + nodes + X * U + (derivatives > exponential ? derivatives : exponential);
+    return X * (X + p) + 2 * held + nodes + X * U + (derivatives > exponential ? derivatives : exponential);
 }

@@ -80,4 +80,8 @@ int stewart_derivatives(const stewart_machine *machine, const stewart_belief *be
 int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
                         int fourth_order, const real *states, real *H, stewart_scratch scratch);
 
+/* The same to the end of the last torque alone, H (12, 12 + p). */
+int stewart_transition(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
+                       int fourth_order, const real *states, real *H, stewart_scratch scratch);
+
 int stewart_transitions_scratch(int estimated);
