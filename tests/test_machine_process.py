@@ -250,7 +250,7 @@ def test_live_drives_a_board_of_ones_own_once_it_is_armed(folder, tmp_path):
     with process([str(own / "stewart_machine"), str(port)]) as running:
         running.until("a real machine at port")
         where = f"127.0.0.1:{port}"
-        with pytest.raises(ConfigError, match=r"^--arm"):
+        with pytest.raises(ConfigError, match=r"^armed"):
             sd.run_live(scenario, where, duration=5.0, accept_jitter=True)
         run = sd.run_live(scenario, where, duration=5.0, accept_jitter=True, armed=True)
         assert running.end(signal.SIGINT) == 0

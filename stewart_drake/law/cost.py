@@ -164,7 +164,7 @@ class PdGain:
     period: float
 
     def __post_init__(self) -> None:
-        fixed("kp, kd", (self.kp, self.kd), (2,), 0.0)
+        fixed("kp, kd", (self.kp, self.kd), (2,))
         positive("period", self.period)
 
     integrates = False  # not annotated: no field
