@@ -25,7 +25,7 @@ FENCE = re.compile(r"^```(\w+) ?(\S*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 BEFORE, _, _REST = TEXT.partition("\n## 6. ")
 IDENTIFICATION, _, _AFTER = _REST.partition("\n## ")
 SLOW = (
-    "simulate waves.yaml --set delay.fraction=0.1 --set controller.delay_steps=4 "
+    "simulate waves.yaml --set delay.fraction=0.25 --set controller.delay_steps=4 "
     "--set controller.w_R=1000"
 )
 OTHERS = f"{BEFORE}\n## {_AFTER}"
@@ -104,8 +104,9 @@ def test_a_machine_and_a_motion_of_one_s_own(do, monkeypatch):
         "fast": [*given[:-1], "controller.w_R=1", "--set", "controller.replan=0"],
     }.items():
         assert main([*words, "--out", f"out/{name}", "--quiet"]) == 0
-    assert summary("slow")["accumulated_error"] < summary("usual")["accumulated_error"] / 25
-    assert summary("usual")["warnings"] and summary("fast")["status"] == "left_workspace"
+    assert summary("slow")["accumulated_error"] == pytest.approx(0.38, abs=5e-3)
+    assert {summary(name)["status"] for name in ("usual", "fast")} == {"left_workspace"}
+    assert summary("usual")["warnings"]
     sample = next(text for language, _, text in FENCE.findall(TEXT) if language == "text")
     real = told["simulate waves.yaml --out out/waves --csv --replay"]
     assert real.startswith(sample), "the output that the text shows"
