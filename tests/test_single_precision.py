@@ -93,7 +93,7 @@ def single(tmp_path_factory):
 @pytest.mark.parametrize(
     "sensor",
     [
-        ("sensor.loss=0.001", "plant.payload_mass=0.3"),
+        ("sensor.loss=0.001", "plant.payload_mass=0.2"),
         ("sensor.kind=encoders",),
         ("sensor.kind=encoders", "sensor.bits=null"),
         ("sensor.kind=encoders", "sensor.bits=16", "sensor.samples=20"),
