@@ -231,6 +231,7 @@ BAD_FILES = {
     "unclosed": ("delay: {steps: 1\n", ["line"]),
     "nul": ("duration: 1\0\n", ["YAML"]),
     "unknown section": ("contoller: {period: 1}", ["contoller: unknown key", "controller"]),
+    "key that begins with a dot": ("{.o: {}}", [".o: unknown key"]),
     "unknown field": ("controller: {perod: 1}", ["controller.perod", "controller.period"]),
     "nothing near": ("zzz: 1", ["zzz", "mechanism", "tuner"]),
     "empty section": ("delay:\n", ["delay: got None", "an object"]),

@@ -278,9 +278,10 @@ def _explain_unknown(type_: type, data: Any, error: Any) -> str:
         return f"{start}{got}; expected {section}.kind={' or '.join(kinds)}"
     above, dot, name = plain.rpartition(".")
     section = place.rpartition(".")[0] + dot
-    siblings = [one.rpartition(".")[2] for one in known if one.rpartition(".")[0] == above]
-    for owner in (known[f"{above}{dot}{one}"] for one in siblings):
-        if new := getattr(owner, "renamed", {}).get(name):
+    full = [one for one in known if one.rpartition(".")[0] == above]
+    siblings = [one.rpartition(".")[2] for one in full]
+    for one in full:
+        if new := getattr(known[one], "renamed", {}).get(name):
             return f"{start}unknown key; it is called {section}{new} since 0.3"
     meant = [section + one for one in resembling(name, siblings)]
     # A field may have been named without its section.
