@@ -28,10 +28,8 @@
 #define JERKED ((real)0.02)   /* periods, standard deviation of a small step of the delay */
 #define EDGE ((real)0.1)      /* periods before and after one from which a torque may move into it */
 #define BEFORE ((real)1 / 120) /* see stewart_period_late */
-#define ASIDE ((real)0.01) /* share of a kick's variances that is added without correlation */
 #define LARGEST_RATE ((real)0.5) /* s/s */
 #define UNLIKELY ((real)-1e6) /* log-likelihood of a measurement that cannot be explained */
-#define SQRT_HALF ((real)0.70710678118654752)
 
 static int size_of(const stewart_delay *d) { return X + d->machine->estimated + 2; }
 
@@ -275,7 +273,7 @@ static int set_noise(Model *a, const real *xi, real used, stewart_scratch scratc
     for (int i = 0; i < X; i++) {
         real square = d->model_std[i] * d->model_std[i];
         for (int k = 0; k < a->rows; k++)
-            square += ASIDE * a->K[X * k + i] * a->K[X * k + i];
+            square += STEWART_ASIDE * a->K[X * k + i] * a->K[X * k + i];
         a->drift[i] = REAL(sqrt)(square);
     }
     return 1;

@@ -33,7 +33,6 @@
 #define LOOSENED_BY_JUMP ((real)0.01) /* the same at a jump of the delay */
 #define TORQUES 1 /* prior weight of `first_timing`, in torques. Without it the first late torques
                      would be outliers, and the next ones would change payload and bias. */
-#define SQRT_HALF ((real)0.70710678118654752)
 #define SQRT_12 ((real)3.4641016151377546)
 #define SQRT_2_PI ((real)2.5066282746310005)
 

@@ -54,9 +54,8 @@ static stewart_schedule cut(const stewart_schedule *schedule, int n, const real 
        H_j = J(q_j) F_j[pose],   R_j = diag(var_j) + diag(s_j^2 J Q J'),
 
    Q the drift of the pose over a period, which counts as noise here as it does there, and so do late
-   torques. Each leg is
-   judged by itself at each node: one with e^2 > 30 S, S = H P H' + R, is left out, and the step goes on
-   with the rest; if that is less than half, the measurement is an outlier. */
+   torques. Each leg is judged by itself at each node: one with e^2 > 30 S, S = H P H' + R, is left out,
+   and the step goes on with the rest; if that is less than half, the measurement is an outlier. */
 
 typedef struct {
     stewart_attempt *attempt;

@@ -6,8 +6,7 @@
 #define ITERATIONS 4       /* at the most; one is enough when the parameters are roughly known */
 #define KNOWN ((real)0.01) /* a constant is known when its deviation is this share of the usual one */
 #define LEARNT ((real)0.3) /* the same, for a prediction over a few periods */
-#define ASIDE ((real)0.01) /* share of a kick's variances that is added without correlation, */
-#define DIRECTED ((real)0.1) /* if constants are known as above; if not, nor is the kick's direction */
+#define DIRECTED ((real)0.1) /* the same, for the direction in which a late torque moves the plate */
 #define UNTIMELY 70        /* factor t of the timing (noise.h) for a torque far too early or late */
 #define LATEST 700         /* the largest */
 #define ONCE ((real)0.05)  /* after such a torque t grows, from this value at least, */
@@ -47,7 +46,7 @@ void stewart_attempt_predicted(stewart_attempt *a)
 {
     const stewart_filter *f = a->filter;
     const real t = a->prior->noise->timing;
-    const real aside = is_known(f, a->prior->root, DIRECTED) ? ASIDE : 1;
+    const real aside = is_known(f, a->prior->root, DIRECTED) ? STEWART_ASIDE : 1;
     stewart_kicks(f->machine, a->period, a->end, a->after->mean + X, a->kicks);
     for (int i = 0; i < X; i++) {
         real square = f->model_std[i] * f->model_std[i];

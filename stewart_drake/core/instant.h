@@ -15,6 +15,9 @@ void stewart_measurement_jacobian(const stewart_sensing *sensing, const real *st
 void stewart_apply_jacobian(const stewart_sensing *sensing, const real *J, int k, const real *A,
                           real *seen);
 
+/* Share of the variances of late torques, rows of A below, that is added to `std` without correlation. */
+#define STEWART_ASIDE ((real)0.01)
+
 /* C (m, m), lower triangular, with C C' = J (A'A + diag(std)^2) J' + diag(noise)^2 at a state, A (k, 12).
    Returns 0 where it does not exist. Scratch: m (12 + k) numbers. */
 int stewart_innovation_root(const stewart_sensing *sensing, const real *state, int k, const real *A,

@@ -242,7 +242,7 @@ int stewart_within_bounds(int n, const real *mean, const real *L, const real *lo
 
 int stewart_kalman_scratch(int n, int most)
 {
-    return most + most * n + (most + n + 1) * (n + 1) + n + n + MAX * MAX;
+    return most + most * n + (most + n + 1) * (n + 1) + 2 * n + MAX * MAX;
 }
 
 /* With the residuals whitened the mean is the minimum over z, xi = mean + L z, of

@@ -61,9 +61,7 @@ class Link:
 
     def preload(self, memory: Array, first: float, commands: Array) -> None:
         """Queue commands (n, size) for `first`, a period later, and so on."""
-        self._call(
-            "preload", memory, first, len(commands), np.ascontiguousarray(commands, np.float64)
-        )
+        self._call("preload", memory, first, len(commands), np.array(commands, np.float64))
 
     def take(
         self,
@@ -75,14 +73,7 @@ class Link:
         arrival: float = -math.inf,
     ) -> int:
         """Take a plan (n, size), see core/link.h. Return 0, or the reason for its refusal."""
-        given = (
-            now,
-            sequence,
-            arrival,
-            first,
-            len(commands),
-            np.ascontiguousarray(commands, np.float64),
-        )
+        given = now, sequence, arrival, first, len(commands), np.array(commands, np.float64)
         return int(self._call("take", memory, *given))
 
     def next_change(self, memory: Array) -> float:

@@ -8,7 +8,6 @@
 #define WIDER 12
 #define ODD 3       /* largest nu^2 / S - 1 of a value in the slope of w */
 #define LATEST 1000 /* largest t */
-#define SQRT_HALF ((real)0.70710678118654752)
 #define UNTIMELY 4  /* t of torques that are off by twice the assumed standard deviation */
 
 void stewart_noise_start(stewart_noise *noise)

@@ -11,3 +11,4 @@
 
 static const real GAUSS_NODES[2] = {(real)0.21132486540518713, (real)0.7886751345948129};
 static const real SQRT_3 = (real)1.7320508075688772;
+#define SQRT_HALF ((real)0.70710678118654752)

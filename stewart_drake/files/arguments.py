@@ -15,14 +15,14 @@ from stewart_drake.types import Array, ArrayLike
 def fixed(
     field: str, values: ArrayLike | None, shape: tuple[int, ...], least: float = -math.inf
 ) -> Array:
-    """Return a read-only copy of finite numbers of this shape, of at least `least`."""
+    """Return a read-only copy, by rows, of finite numbers of this shape, of at least `least`."""
     try:
         given = np.array(values)
     except (TypeError, ValueError):  # ragged
         given = np.array(None)
     if given.dtype.kind not in "biuf":
         raise ConfigError(f"{field}: got {brief(values)}; expected numbers")
-    copy = given.astype(np.float64)
+    copy = given.astype(np.float64, order="C")
     if copy.shape != shape:
         raise ConfigError(f"{field}: got shape {copy.shape}; expected {shape or 'one number'}")
     if not np.all(np.isfinite(copy)):
@@ -39,10 +39,11 @@ def listed(values: Array) -> str:
     return f"[{text}]" if np.ndim(values) else text
 
 
-def positive(field: str, value: Any) -> float:
-    """Return a finite number above 0."""
-    if not (isinstance(value, Real) and 0 < float(value) < math.inf):
-        raise ConfigError(f"{field}: got {value!r}; expected a finite number above 0")
+def positive(field: str, value: Any, infinite: bool = False) -> float:
+    """Return a number above 0, finite unless it may be `infinite`."""
+    if not (isinstance(value, Real) and float(value) > 0 and (infinite or float(value) < math.inf)):
+        kind = "number" if infinite else "finite number"
+        raise ConfigError(f"{field}: got {value!r}; expected a {kind} above 0")
     return float(value)
 
 

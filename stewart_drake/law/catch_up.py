@@ -12,7 +12,7 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.compiled import machine_of
+from stewart_drake.law.compiled import machine_of, numbers
 from stewart_drake.law.least_error import LeastError
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.timeline import TorqueSchedule
@@ -188,7 +188,7 @@ class Model:
     def way(self, schedule: TorqueSchedule, states: Array, begin: float) -> Array:
         """Return the pieces (n, 38) of the motion through states (1 + n, 12) from `begin` s on."""
         c, number = core(), len(schedule.torques)
-        kept = [np.ascontiguousarray(a, np.float64) for a in (*schedule, states)]
+        kept = [numbers(a) for a in (*schedule, states)]
         what = c.ffi.new("stewart_schedule *", [number, *map(c.at, kept[:2]), 0])
         pieces = np.empty((number, c.lib.STEWART_PIECE))
         given = self.data, what, c.at(kept[2]), begin, c.at(pieces)

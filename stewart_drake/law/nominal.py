@@ -8,8 +8,7 @@ from typing import get_args
 import numpy as np
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.files.arguments import of_kind, one_of, whole
-from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.arguments import of_kind, one_of, positive, whole
 from stewart_drake.law.delay_model import ContinuousModel, double_integrators, linear_model
 from stewart_drake.law.timeline import TorqueSchedule
 from stewart_drake.mechanism.assembly import TorqueMap
@@ -27,8 +26,7 @@ class TorqueLimit:
     limit: float = math.inf
 
     def __post_init__(self) -> None:
-        if not self.limit > 0:
-            raise ConfigError(f"limit: got {self.limit!r}; expected a number above 0")
+        positive("limit", self.limit, infinite=True)
 
     def saturate(self, torques: Array) -> Array:
         """Return torques (..., 6) within the limit."""
@@ -58,10 +56,7 @@ class NominalPlant:
     def __post_init__(self) -> None:
         of_kind("dynamics", self.dynamics, StewartDynamics)
         whole("substeps", self.substeps, 1)
-        if not self.coarse_torque_limit > 0:
-            raise ConfigError(
-                f"coarse_torque_limit: got {self.coarse_torque_limit!r}; expected a number above 0"
-            )
+        positive("coarse_torque_limit", self.coarse_torque_limit, infinite=True)
 
     @property
     def mechanism(self) -> Mechanism:

@@ -537,9 +537,9 @@ def design_law(
         ConfigError: bad input, a reference or a start out of reach.
     """
     options = ControllerConfig() if options is None else options
-    kinds = {"dynamics": StewartDynamics, "reference": Trajectory, "options": ControllerConfig}
-    for (name, kind), value in zip(kinds.items(), (dynamics, reference, options), strict=True):
-        of_kind(name, value, kind)
+    of_kind("dynamics", dynamics, StewartDynamics)
+    of_kind("reference", reference, Trajectory)
+    of_kind("options", options, ControllerConfig)
     period, late = positive("period", period), float(fixed("delay", delay, (), 0.0))
     if horizon is None:
         horizon = reference.end_time() if math.isfinite(reference.end_time()) else _HORIZON
