@@ -385,10 +385,10 @@ def _learns(scenario: Scenario) -> bool:
 def tolerated_timing(experiment: Experiment) -> float:
     """Return the standard deviation of single torques' timing that the loop tolerates, s.
 
-    It is a share of the time constant of the loop, 1 / bandwidth of theory.md, section 13, that
-    falls with the delay: a longer one carries late torques further. It is infinite for weights that
-    are given or set by a tuner, where the timing is only assumed, and for the paper's laws and
-    baselines: they predict linearly or not at all.
+    It is a share of the time constant of the loop that falls with the delay: a longer one carries
+    late torques further. The time constant is 1 / bandwidth of theory.md, section 13, and at least
+    a period. It is infinite for weights that are given or set by a tuner, where the timing is only
+    assumed, and for the paper's laws and baselines: they predict linearly or not at all.
     """
     sc, c = experiment.scenario, experiment.scenario.controller
     predicts = c.prediction == "nonlinear" and believed_delay(sc).eta(c.period) > 0
@@ -401,7 +401,7 @@ def tolerated_timing(experiment: Experiment) -> float:
     accelerations = np.array([evaluate(experiment.reference, t)[ACCELERATIONS] for t in times])
     amplitudes = np.where(experiment.peak_to_peak > 0, experiment.peak_to_peak / 2, np.inf)
     largest = np.abs(accelerations).max(axis=0)
-    bandwidth = math.sqrt(float((largest / amplitudes).max() / TOLERANCE))
+    bandwidth = min(math.sqrt(float((largest / amplitudes).max() / TOLERANCE)), 1 / c.period)
     late = bandwidth * believed_delay(sc).eta(c.period)
     return TOLERATED / (bandwidth * (1 + late)) if bandwidth else math.inf
 
