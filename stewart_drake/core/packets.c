@@ -92,7 +92,7 @@ static Evidence condition(const stewart_packets *p, int known, const real *arriv
         int age = i + 1 - since; /* of the packet at the last report, periods */
         real sum = 0, absent = 1;
         if (age > 0 && !there(&c, i) && since < p->kept) {
-            age = age < p->told ? age : p->told;
+            age = age < p->report_periods ? age : p->report_periods;
             absent = 1 - p->arrived_by[age < p->kept ? age : p->kept - 1];
         }
         c.absent[i] = absent > LEAST ? absent : LEAST;
@@ -226,6 +226,11 @@ void stewart_packets_update(const stewart_packets *p, real *memory, const stewar
         else
             stewart_fill(U, 0, flying);
     }
+}
+
+const real *stewart_newest_packet(const stewart_packets *p, const real *memory)
+{
+    return memory + 1 + p->kept + packet_size(p) * (p->kept - 1);
 }
 
 void stewart_packets_send(const stewart_packets *p, real *memory, const real *plan, int number,

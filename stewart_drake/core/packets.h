@@ -10,7 +10,7 @@ typedef struct {
     int torques; /* N >= 1 */
     int repeats; /* r */
     int kept;    /* packets that are remembered, >= 1 */
-    int told;    /* periods that a report covers */
+    int report_periods; /* periods that a report covers */
     int holds;   /* whether a dry buffer holds the last torque, or puts out zero */
     int burst;   /* packets that are lost together, >= 1 */
     real loss;   /* share of the packets that are lost */
@@ -48,6 +48,9 @@ void stewart_packets_update(const stewart_packets *packets, real *memory,
 /* Add the packet of a plan (torques, 6); `in_flight` (number, 6) are the torques before it. */
 void stewart_packets_send(const stewart_packets *packets, real *memory, const real *plan, int number,
                           const real *in_flight);
+
+/* Rows (repeats + torques, 6) of the packet that was sent last. */
+const real *stewart_newest_packet(const stewart_packets *packets, const real *memory);
 
 /* Probabilities (n + 1) of the sources of T_{k-1-d}: chances[i], i < n, that the packet sent i + 1
    samples ago is in time and no newer one is; chances[n] that no packet is. Returns n <= known.

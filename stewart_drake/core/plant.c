@@ -297,7 +297,7 @@ static void rows_of_goal(void *about, int number, const double *times, double *r
 static int step(void *about, long k, const stewart_sample *measured, double *torque, double *command)
 {
     stewart_law_in_loop *in = about;
-    const stewart_field *sent = &in->law->layout.channel;
+    const double *sent = torque;
     stewart_sample sample = *measured;
     sample.reference = rows_of_plan, sample.goal = rows_of_goal, sample.about = in;
     in->now = in->period * (double)k;
@@ -314,9 +314,9 @@ static int step(void *about, long k, const stewart_sample *measured, double *tor
     } else {
         stewart_step(in->law, in->memory, in->scratch, &sample, torque);
     }
-    if (in->law->channel) /* the newest packet is its last */
-        torque = in->memory + sent->at + sent->rows * sent->columns - U * in->rows;
-    stewart_copy(U * in->rows, torque, command);
+    if (in->law->channel)
+        sent = stewart_newest_packet(in->law->packets, in->memory + in->law->layout.channel.at);
+    stewart_copy(U * in->rows, sent, command);
     return 0;
 }
 

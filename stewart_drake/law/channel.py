@@ -177,7 +177,7 @@ def packets_of(channel: Packets) -> Compiled:
         "torques": channel.torques,
         "repeats": channel.repeats,
         "kept": kept,
-        "told": min(channel.told, kept),
+        "report_periods": min(channel.told, kept),
         "holds": channel.holds,
         "burst": channel.losses.burst,
         "loss": channel.losses.loss,
