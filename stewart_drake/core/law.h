@@ -126,8 +126,8 @@ struct stewart_sample {
        last one in flight. */
     stewart_preview_function reference;
     stewart_preview_function goal; /* that plans lead back to; from the first plan on it is read in
-                                      the place of `reference`; NULL: `reference` itself */
-    void *about;
+                                      the place of `reference`; NULL: no plan is made */
+    void *about;              /* first argument of both */
     const stewart_report *report; /* that came with the measurement, or NULL */
     real weights[2]; /* of errors and of torques; if one is not finite, the last gain is used */
 };
