@@ -97,6 +97,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "TESTS": "stewart_test protocol_test" if over_udp else "stewart_test",
         "TEST_OBJECTS": "stewart_motion.o" if recorded.moves else "",
     }
+    values |= _workspace(experiment)
     values |= _configuration(recorded, compiled, tuner, suffix)
     values |= _replay(recorded, experiment, tuner, suffix)
     kind = "torques" if isinstance(law, PredictiveLqi) else "servos"
@@ -130,6 +131,13 @@ def _estimates(scenario: Scenario) -> str:
     if scenario.controller.delay_estimator != "none":
         names.append("delay")
     return ", ".join(names) or "no parameters"
+
+
+def _workspace(experiment: Experiment) -> dict[str, str]:
+    """Return the limits of `stewart_measures`, to three digits."""
+    names = {"LEAST_SINE": LEAST[0], "LEAST_PARALLEL": LEAST[-2], "LEAST_PITCH": LEAST[-1]}
+    sign = {"SIGN": f"{home_sign(experiment.mechanism):g}"}
+    return {name: f"{value:.3g}" for name, value in names.items()} | sign
 
 
 def _is_example(recorded: Recorded, tuner: Compiled | None) -> bool:

@@ -5,10 +5,10 @@
 
 #include "@HEADER@"
 
-#define STEWART_MEMORY @MEMORY@   /* numbers that the law remembers */
-#define STEWART_SCRATCH @SCRATCH@ /* numbers that it computes in */
+#define STEWART_MEMORY @MEMORY@ /* numbers of the state that the law keeps between samples */
+#define STEWART_SCRATCH @SCRATCH@ /* numbers of the workspace of a step */
 #define STEWART_MEASURED @MEASURED@ /* numbers of a measurement */
-#define STEWART_PREVIEW @ROWS@      /* of a preview, at the most */
+#define STEWART_PREVIEW @ROWS@ /* largest number of instants of a preview */
 
 extern const @KIND@ stewart_configuration;
 extern const real stewart_queue[]; /* @QUEUE_MEANING@ */
