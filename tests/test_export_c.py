@@ -275,7 +275,7 @@ def test_what_is_not_exported_is_refused_by_its_field(tmp_path, capsys):
     options = ["--out", str(folder), "--set", "controller.prediction=linear"]
     assert main(["export-c", "paper", *options]) == 2
     error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "controller.prediction: is not exported as it is" in error
+    assert error.count("\n") == 1 and "controller.prediction: got linear, which is not exp" in error
     assert not folder.exists()
 
 
@@ -364,7 +364,11 @@ DESCRIBED = {
     ),
     "servos": (
         *("paper", "servo_preview", ("actuator.kind=servo",), ("torque and", "make udp")),
-        ("angles, rates and torques for six", "Only the counts of `memory` need `report`", "adds the torque"),
+        (
+            "angles, rates and torques for six",
+            "Only the counts of `memory` need `report`",
+            "adds the torque",
+        ),
     ),
     "setpoints": (
         *("reachy_mini", "servo_feedforward", (), ("make udp", "stewart_limit", "no new gain")),

@@ -379,7 +379,7 @@ def test_a_step_without_time_is_late():
 
 
 def test_it_is_not_exported():
-    with pytest.raises(ConfigError, match=r"controller\.limits: is not exported"):
+    with pytest.raises(ConfigError, match=r"controller\.limits: got qp, which is not exported"):
         exported(limited(0.9))
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from functools import reduce
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
@@ -210,9 +211,10 @@ def _refusal(scenario: Scenario, field: str) -> str:
     fields = {name: load_controller(name) for name in shipped("controller")}
     names = [name for name in fields if fields[name].items() <= given]
     name = max(names, key=lambda name: len(fields[name]), default=EXPORTED[0])
+    value = reduce(lambda part, key: getattr(part, key, None), field.split("."), scenario)
     if name in EXPORTED:
-        return f"{field}: is not exported as it is; expected that of {known}"
-    return f"controller: {name} is not exported, because of {field}; exported are {known}"
+        return f"{field}: got {value}, which is not exported; expected that of {known}"
+    return f"controller: {name} is not exported, because of {field}: {value}; exported are {known}"
 
 
 def record(scenario: Scenario) -> Recorded:
