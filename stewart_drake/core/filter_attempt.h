@@ -21,7 +21,7 @@ typedef struct {
     const real *last;           /* (12, n) d[end]/d[xi] */
     real *kept; /* of the last prediction from a prior: 1 if F was of fourth order, 0 if not, NaN for none;
                    the prior's mean, the state at the end, H */
-    real hopeless;              /* as of `stewart_kalman` */
+    real hopeless;              /* `max_distance` of `stewart_kalman` */
     int left_out;               /* why values were left out, bits as of a `fault` */
     int gated;                  /* number of legs with a value that does not fit */
 } stewart_attempt;

@@ -3,8 +3,8 @@
 #include "kalman.h"
 #include "short.h"
 
-#define MAX STEWART_MAX_BOUNDED
-#define BEYOND ((real)1e-9) /* standard deviations out of bounds that are rounding */
+#define MAX_ACTIVE STEWART_MAX_BOUNDED
+#define BOUND_TOLERANCE ((real)1e-9) /* standard deviations out of bounds that are rounding */
 #ifdef STEWART_FLOAT
 #define ROUNDING ((real)1e-5) /* of a variance, as a share */
 #else
@@ -25,7 +25,7 @@ static void reflect(int n, int m, real v, const real *f, real beta, real *row, r
         W[n * i] -= f[n * i] * s;
 }
 
-/* The same of six columns, with sums that have names: see stewart_two_rows. */
+/* The same for six columns at once. Named sums stay in registers, see stewart_two_rows. */
 static void reflect_six(int n, int m, real v, const real *f, real beta, real *row, real *W)
 {
     const real *last = f + n * (m - 1), *g = f, *w = W;
@@ -153,59 +153,61 @@ static real clipped(real x, real lower, real upper)
     return x < lower ? lower : x > upper ? upper : x;
 }
 
-/* Active set: components at a bound. */
+/* Components that are fixed at a bound, with their Lagrange multipliers. */
 typedef struct {
-    int number, at[MAX], upper[MAX];
-    real value[MAX], push[MAX];
-} Active;
+    int number, index[MAX_ACTIVE], upper[MAX_ACTIVE];
+    real value[MAX_ACTIVE], multiplier[MAX_ACTIVE];
+} ActiveSet;
 
-/* push = P_hh^-1 (mean_h - value_h), after releasing components that are pushed inwards. */
-static int find_pushes(Active *h, int n, const real *mean, const real *L, real *P)
+/* Solve P_aa multiplier = mean_a - value_a for the set a, and release components one by one whose
+   multiplier points into the bounds. Returns 0 if P_aa is singular or none is left. */
+static int find_multipliers(ActiveSet *set, int n, const real *mean, const real *L, real *P)
 {
-    while (h->number) {
-        int least = 0;
-        real inwards = INFINITY;
-        for (int a = 0; a < h->number; a++) {
-            h->push[a] = mean[h->at[a]] - h->value[a];
-            for (int b = 0; b < h->number; b++)
-                P[h->number * a + b] = stewart_dot(n, L + n * h->at[a], L + n * h->at[b]);
+    while (set->number) {
+        int released = 0;
+        real smallest = INFINITY;
+        for (int a = 0; a < set->number; a++) {
+            set->multiplier[a] = mean[set->index[a]] - set->value[a];
+            for (int b = 0; b < set->number; b++)
+                P[set->number * a + b] = stewart_dot(n, L + n * set->index[a], L + n * set->index[b]);
         }
-        if (!stewart_solve(h->number, 1, P, h->push) || !stewart_all_finite(h->number, h->push))
+        if (!stewart_solve(set->number, 1, P, set->multiplier)
+            || !stewart_all_finite(set->number, set->multiplier))
             return 0;
-        for (int a = 0; a < h->number; a++) {
-            const real push = h->upper[a] ? h->push[a] : -h->push[a];
-            if (push < inwards) {
-                inwards = push;
-                least = a;
+        for (int a = 0; a < set->number; a++) {
+            const real multiplier = set->upper[a] ? set->multiplier[a] : -set->multiplier[a];
+            if (multiplier < smallest) {
+                smallest = multiplier;
+                released = a;
             }
         }
-        if (inwards >= 0)
+        if (smallest >= 0)
             return 1;
-        h->number--;
-        for (int a = least; a < h->number; a++) {
-            h->at[a] = h->at[a + 1];
-            h->upper[a] = h->upper[a + 1];
-            h->value[a] = h->value[a + 1];
+        set->number--;
+        for (int a = released; a < set->number; a++) {
+            set->index[a] = set->index[a + 1];
+            set->upper[a] = set->upper[a + 1];
+            set->value[a] = set->value[a + 1];
         }
     }
     return 0;
 }
 
-/* Fixing components at bounds moves all that is correlated with them along their columns of P = L L',
-   so that what the measurements have said about combinations of them is kept. Which ones are fixed is
-   found by adding the one furthest out and freeing those that are held back from inside. The
-   covariance stays: a component at its bound may leave it again. */
+/* Active set method for min (z - mean)' P^-1 (z - mean) within the bounds, P = L L': z = mean - P_:a
+   multiplier. Components that are correlated with a fixed one move with it, so that measured combinations
+   of them are kept. Each round fixes the component that is furthest out, and releases those whose
+   multiplier has the wrong sign. The covariance stays: a component at its bound may leave it again. */
 int stewart_within_bounds(int n, const real *mean, const real *L, const real *lower,
-                          const real *upper, real *moved, stewart_scratch scratch)
+                          const real *upper, real *bounded, stewart_scratch scratch)
 {
-    real *along = stewart_take(&scratch, n), *P = stewart_take(&scratch, MAX * MAX);
-    Active h = {0};
-    stewart_copy(n, mean, moved);
-    for (int round = 0; round < 4 * MAX; round++) {
-        int worst = -1, place = 0;
-        real furthest = BEYOND;
+    real *shift = stewart_take(&scratch, n), *P = stewart_take(&scratch, MAX_ACTIVE * MAX_ACTIVE);
+    ActiveSet set = {0};
+    stewart_copy(n, mean, bounded);
+    for (int round = 0; round < 4 * MAX_ACTIVE; round++) {
+        int worst = -1, slot = 0;
+        real furthest = BOUND_TOLERANCE;
         for (int i = 0; i < n; i++) {
-            const real beyond = moved[i] - clipped(moved[i], lower[i], upper[i]);
+            const real beyond = bounded[i] - clipped(bounded[i], lower[i], upper[i]);
             if (beyond == 0)
                 continue;
             const real excess = REAL(fabs)(beyond) / stewart_norm(n, L + n * i);
@@ -218,38 +220,38 @@ int stewart_within_bounds(int n, const real *mean, const real *L, const real *lo
         }
         if (worst < 0)
             break;
-        while (place < h.number && h.at[place] != worst)
-            place++;
-        if (place == MAX)
+        while (slot < set.number && set.index[slot] != worst)
+            slot++;
+        if (slot == MAX_ACTIVE)
             return 0;
-        h.number += place == h.number;
-        h.at[place] = worst;
-        h.upper[place] = moved[worst] > upper[worst];
-        h.value[place] = h.upper[place] ? upper[worst] : lower[worst];
-        if (!find_pushes(&h, n, mean, L, P))
+        set.number += slot == set.number;
+        set.index[slot] = worst;
+        set.upper[slot] = bounded[worst] > upper[worst];
+        set.value[slot] = set.upper[slot] ? upper[worst] : lower[worst];
+        if (!find_multipliers(&set, n, mean, L, P))
             return 0;
-        stewart_fill(n, 0, along);
-        for (int a = 0; a < h.number; a++)
+        stewart_fill(n, 0, shift);
+        for (int a = 0; a < set.number; a++)
             for (int i = 0; i < n; i++)
-                along[i] += h.push[a] * L[n * h.at[a] + i];
+                shift[i] += set.multiplier[a] * L[n * set.index[a] + i];
         for (int i = 0; i < n; i++)
-            moved[i] = mean[i] - stewart_dot(n, L + n * i, along);
+            bounded[i] = mean[i] - stewart_dot(n, L + n * i, shift);
     }
     for (int i = 0; i < n; i++)
-        moved[i] = clipped(moved[i], lower[i], upper[i]);
+        bounded[i] = clipped(bounded[i], lower[i], upper[i]);
     return 1;
 }
 
 int stewart_kalman_scratch(int n, int most)
 {
-    return most + most * n + (most + n + 1) * (n + 1) + 2 * n + MAX * MAX;
+    return most + most * n + (most + n + 1) * (n + 1) + 2 * n + MAX_ACTIVE * MAX_ACTIVE;
 }
 
-/* With the residuals whitened the mean is the minimum over z, xi = mean + L z, of
+/* With whitened residuals the updated mean is xi = mean + L z, with z the minimum of
 
-       |W z - (e + H (xi_0 - mean))|^2 + |z|^2,   W = H L,
+       |W z - nu|^2 + |z|^2,   W = H L,   nu = e + H (xi_0 - mean),
 
-   about the xi_0 where it was linearised. QR of [W wanted; 1 0] to [R c; 0 d] solves it:
+   linearised at xi_0. QR of [W nu; 1 0] to [R c; 0 d] solves it:
 
        R'R = 1 + W'W,   z = R^-1 c,   P = L (1 + W'W)^-1 L' = L R^-1 (L R^-1)',
 
@@ -260,20 +262,20 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
     const int n = filter->n, N = n + 1;
     real *e = stewart_take(&scratch, filter->most), *H = stewart_take(&scratch, filter->most * n);
     real *R = stewart_take(&scratch, N * N), *W = stewart_take(&scratch, filter->most * N);
-    real *moved = stewart_take(&scratch, n);
+    real *change = stewart_take(&scratch, n), *updated = change; /* in turn */
     for (int round = 0; round < filter->iterations; round++) {
         const int m = filter->rows(filter->model, xi, e, H, scratch);
         if (m < 0)
             return 0;
         for (int k = 0; k < n; k++)
-            moved[k] = xi[k] - filter->mean[k];
+            change[k] = xi[k] - filter->mean[k];
         for (int i = 0; i < m; i += 2) { /* the last of an odd number of rows twice */
             const real *h = H + n * i, *next = i + 1 < m ? h + n : h;
             real *w = W + N * i, *other = i + 1 < m ? w + N : w;
             stewart_two_rows(STEWART_SET, n, h, next, 1, filter->root, n, n, w, other);
         }
         for (int i = 0; i < m; i++)
-            W[N * i + n] = e[i] + stewart_dot(n, H + n * i, moved);
+            W[N * i + n] = e[i] + stewart_dot(n, H + n * i, change);
         for (int i = 0; i < m && filter->innovations; i++) {
             filter->innovations[i] = W[N * i + n];
             filter->variances[i] = 1 + stewart_dot(n, W + N * i, W + N * i);
@@ -286,26 +288,26 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
         for (int i = 0; i < n; i++)
             *spread += 2 * REAL(log)(REAL(fabs)(R[(N + 1) * i]));
         *distance = R[N * n + n] * R[N * n + n];
-        if (round == 0 && filter->hopeless > 0 && !(*distance <= filter->hopeless)) /* or NaN */
+        if (round == 0 && filter->max_distance > 0 && !(*distance <= filter->max_distance)) /* or NaN */
             return 0;
         for (int i = 0; i < n; i++) { /* root R = L, row by row */
             const real *l = filter->root + n * i;
             real *x = root + n * i;
-            real better = filter->mean[i];
+            real mean = filter->mean[i];
             stewart_copy(n, l, x);
             for (int j = 0; j < n; j++) {
                 x[j] /= R[N * j + j];
                 for (int k = j + 1; k < n; k++)
                     x[k] -= x[j] * R[N * j + k];
-                better += x[j] * R[N * j + n];
+                mean += x[j] * R[N * j + n];
             }
-            moved[i] = better;
+            updated[i] = mean;
         }
-        stewart_copy(n, moved, R);
-        if (!stewart_within_bounds(n, R, root, filter->lower, filter->upper, moved, scratch))
+        stewart_copy(n, updated, R);
+        if (!stewart_within_bounds(n, R, root, filter->lower, filter->upper, updated, scratch))
             return 0;
-        const int settled = filter->settle(filter->model, xi, moved, scratch);
-        stewart_copy(n, moved, xi);
+        const int settled = filter->settle(filter->model, xi, updated, scratch);
+        stewart_copy(n, updated, xi);
         if (settled < 0)
             return 0;
         if (settled)

@@ -23,8 +23,8 @@ typedef struct {
     void *model;
     int (*rows)(void *model, const real *xi, real *e, real *H, stewart_scratch scratch);
     int (*settle)(void *model, const real *xi, const real *better, stewart_scratch scratch);
-    real hopeless; /* distance of the first iteration above which the update is given up; 0: none is */
-    real *innovations, *variances; /* (most) results, or NULL: nu and the diagonal of S, whitened by C */
+    real max_distance; /* of the first iteration, above which the update is given up; 0: none */
+    real *innovations, *variances; /* (most) results, NULL: none: nu and the diagonal of S, both whitened */
 } stewart_kalman;
 
 /* Compute the mean xi (n), from a first guess in its place, and the root (n, n) of its covariance, which
@@ -55,8 +55,8 @@ void stewart_widen_root(int n, const real *jump, real *L, stewart_scratch scratc
    than rounding. */
 int stewart_root(int n, real *P);
 
-/* The mean within bounds that is nearest to `mean` in the metric of the covariance L L'. Returns 0 for
-   NaN, or if a component without variance is out of bounds.
+/* Compute the mean within bounds that is nearest to `mean` in the metric of the covariance L L'. Returns 0
+   for NaN, or if a component without variance is out of bounds.
    Scratch: n + STEWART_MAX_BOUNDED^2 numbers. */
 int stewart_within_bounds(int n, const real *mean, const real *L, const real *lower,
-                          const real *upper, real *moved, stewart_scratch scratch);
+                          const real *upper, real *bounded, stewart_scratch scratch);
