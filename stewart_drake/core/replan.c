@@ -5,14 +5,18 @@
 
 #define PIECE STEWART_PIECE
 
-/* Memory: samples since the last plan, or without one since the start; number of pieces; samples since
-   the start; whether a plan was made after a torque had acted; the pieces. Times of pieces are from the
-   sample of the plan. */
-#define HEAD 4
-#define EARLY ((real)0.5)  /* no torque arrives before this share of the assumed delay */
-#define UNPUNCTUAL 2       /* factor on the weight of torques above which no plan is made */
-#define LATEST ((real)1e6) /* largest count of samples since the start */
-#define ROUNDING ((real)1e-3) /* samples; an instant that is nearer to a sample is there */
+/* Places in the memory. */
+enum {
+    SINCE_PLAN,  /* samples since the last plan, or without one since the start */
+    PIECES,      /* number of pieces */
+    SINCE_START, /* samples since the start */
+    PLANNED,     /* whether a plan was made after the first torque had acted for a period */
+    PATH,        /* first number of the pieces; their times are from the sample of the plan */
+};
+#define EARLY ((real)0.5) /* share of the assumed delay before which no torque arrives */
+#define LATE_TORQUES 2 /* factor on the weight of torques (`caution`) above which no plan is made */
+#define MOST_SAMPLES ((real)1e6) /* largest count of samples since the start */
+#define ROUNDING ((real)1e-3) /* samples; an instant nearer to a sample than this is at the sample */
 
 static int most_pieces(const stewart_law *law)
 {
@@ -20,7 +24,7 @@ static int most_pieces(const stewart_law *law)
     return replan->until + stewart_plan_pieces(law->period, replan->most);
 }
 
-static int replan_memory(const stewart_law *law) { return HEAD + PIECE * most_pieces(law); }
+static int replan_memory(const stewart_law *law) { return PATH + PIECE * most_pieces(law); }
 
 static int replan_scratch(const stewart_law *law)
 {
@@ -39,20 +43,20 @@ static void replan_start(const stewart_law *law, real *memory)
 /* Whether the first torque has acted for a period. */
 static int has_acted(const stewart_law *law, const stewart_outlook *outlook, const real *memory)
 {
-    return memory[2] >= outlook->eta / law->period + 2 - ROUNDING;
+    return memory[SINCE_START] >= outlook->eta / law->period + 2 - ROUNDING;
 }
 
-/* Rows of the pieces, and of the goal beyond their end; without pieces, of the caller's reference. */
+/* Fill in rows of the pieces, and of the goal after their end; without pieces, of the caller's reference. */
 static void look(const stewart_law *law, const real *memory, const stewart_sample *sample, int number,
                  const real *times, real *rows)
 {
-    const int pieces = (int)memory[1];
-    const real now = memory[0] * law->period;
+    const int pieces = (int)memory[PIECES];
+    const real now = memory[SINCE_PLAN] * law->period;
     if (pieces == 0)
         sample->reference(sample->about, number, times, rows);
     for (int i = 0; i < number && pieces > 0; i++) {
         real *row = rows + ROW * i;
-        if (!stewart_along(pieces, memory + HEAD, now + times[i], row))
+        if (!stewart_along(pieces, memory + PATH, now + times[i], row))
             (sample->goal ? sample->goal : sample->reference)(sample->about, 1, times + i, row);
     }
 }
@@ -63,7 +67,7 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
                 const real *states, real *memory, stewart_scratch scratch)
 {
     const stewart_replan *replan = law->planning;
-    int periods = replan->periods, further;
+    int periods = replan->periods, added;
     real times[3], rows[3 * ROW], peak, *pieces = stewart_take(&scratch, PIECE * most_pieces(law));
     const real *last = states + X * outlook->until.number;
     stewart_belief belief;
@@ -72,17 +76,17 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
     for (;; periods = 2 * periods < replan->most ? 2 * periods : replan->most) {
         stewart_plan_times(outlook->eta, law->period, periods, times);
         sample->goal(sample->about, 3, times, rows);
-        further = stewart_plan_way(&belief, replan->sign, last, outlook->eta, law->period, periods, rows,
+        added = stewart_plan_way(&belief, replan->sign, last, outlook->eta, law->period, periods, rows,
                                    pieces + PIECE * number, &peak, scratch);
-        if (further == 0)
+        if (added == 0)
             return 0;
         if (peak <= law->machine.torque_limit || periods >= replan->most)
             break;
     }
-    memory[0] = 0;
-    memory[1] = (real)(number + further);
-    memory[3] = (real)has_acted(law, outlook, memory);
-    stewart_copy(PIECE * (number + further), pieces, memory + HEAD);
+    memory[SINCE_PLAN] = 0;
+    memory[PIECES] = (real)(number + added);
+    memory[PLANNED] = (real)has_acted(law, outlook, memory);
+    stewart_copy(PIECE * (number + added), pieces, memory + PATH);
     return 1;
 }
 
@@ -125,31 +129,31 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     real wanted[ROW], *states = outlook->predicted;
     if (!states)
         states = stewart_take(&scratch, X * (outlook->until.number + 1));
-    memory[0] += 1;
-    memory[2] = memory[2] < LATEST ? memory[2] + 1 : LATEST;
+    memory[SINCE_PLAN] += 1;
+    memory[SINCE_START] = memory[SINCE_START] < MOST_SAMPLES ? memory[SINCE_START] + 1 : MOST_SAMPLES;
     /* While the delay is unknown, plan only before the first torque can have acted. */
-    const int early = (memory[2] - ROUNDING) * law->period <= EARLY * outlook->eta;
-    if (!sample->goal || !(outlook->settled || early) || !stewart_all_finite(X, outlook->state))
+    const int before_first = (memory[SINCE_START] - ROUNDING) * law->period <= EARLY * outlook->eta;
+    if (!sample->goal || !(outlook->settled || before_first) || !stewart_all_finite(X, outlook->state))
         return 0;
-    /* Late torques would undo a plan. */
-    if (outlook->settled && outlook->caution > UNPUNCTUAL)
+    /* Torques at uncertain instants do not follow a plan. */
+    if (outlook->settled && outlook->caution > LATE_TORQUES)
         return 0;
     stewart_copy(X, outlook->state, states);
     stewart_predict(&law->machine, outlook->theta, &outlook->until, states, states + X);
     look(law, memory, sample, 1, &outlook->eta, wanted);
     /* A known delay counts as found from the sample at which the first torque has acted for a period
        until the next plan. */
-    const int first = !law->observer->outlook && has_acted(law, outlook, memory) && !(memory[3] > 0);
+    const int first = !law->observer->outlook && has_acted(law, outlook, memory) && !(memory[PLANNED] > 0);
     if (!stewart_is_off(replan->size, states + X * outlook->until.number, wanted,
                         outlook->found || first))
         return 0;
     if (law->observer->uncertainty) {
         const int n = X + law->machine.estimated;
-        stewart_scratch own = scratch;
-        real *L = stewart_take(&own, n * n);
+        stewart_scratch rest = scratch;
+        real *L = stewart_take(&rest, n * n);
         law->observer->uncertainty(law, outlook->observed, L);
         if (!stewart_is_sure(&law->machine, &outlook->until, states, outlook->theta, L, replan->size,
-                             replan->sure, own))
+                             replan->sure, rest))
             return 0;
     }
     return plan(law, outlook, sample, states, memory, scratch);

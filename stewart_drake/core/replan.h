@@ -5,8 +5,9 @@
    reference, from the instant at which the next torque acts. The law follows the predicted motion,
    then the plan, then the reference: the error is zero, and the integral starts again.
 
-   A plan from an uncertain state can make things worse. It is made where the covariance P of state and
-   parameters, carried through the torques in flight, P+ = H P H', leaves the pose known to `sure`. */
+   A plan from an uncertain state can make things worse. It is made only if each coordinate of the pose
+   after the torques in flight has a standard deviation of at most `sure` times its size. This follows from
+   the covariance P of state and parameters, P+ = H P H'. */
 
 #pragma once
 
@@ -16,7 +17,7 @@
 typedef struct {
     int periods;  /* length of a plan, at least two; doubled while the plan exceeds the torque limit, */
     int most;     /* up to this */
-    int until;    /* largest number of torques that act before the next one does */
+    int until;    /* largest number of torques that act before the next one */
     real size[6]; /* of the motion, peak to peak, rad and m */
     real sure;    /* largest standard deviation of the predicted pose for a plan, share of `size` */
     real sign;    /* of the parallel measure at home */
