@@ -9,12 +9,12 @@
 
        tau(w) = (c + f tanh(|w| / s) / |w|) w,     the slope of c |w|^2 / 2 + f s log cosh(|w| / s).
 
-   The rod may spin about itself, and spins such that the sum of these potentials of its joints is least:
-   with one joint that has friction the spin is that joint's own, and costs nothing. Virtual work,
+   The rod may spin about its own axis. It spins such that the sum of these potentials of its two joints is
+   least. If only one of them has friction, there is no spin in that joint. Virtual work,
 
        F' [delta w; delta v] = sum tau_1' delta w_1 + tau_2' delta w_2,
 
-   gives the force F (6), moment and force at the plate's COM, that the plate feels against its motion:
-   it joins h of the equations of motion. */
+   gives F (6), the moment and force at the plate's COM that resist its motion. F is added to h of the
+   equations of motion. */
 
 extern const stewart_joint_friction stewart_ball_joints;

@@ -3,7 +3,7 @@
 #include "instant.h"
 #include "short.h"
 
-#define SMALL ((real)0.1) /* standard deviations; a shorter correction ends the iterations */
+#define SMALL_CORRECTION ((real)0.1) /* standard deviations; a shorter correction ends the iterations */
 
 void stewart_predict_measurement(const stewart_sensing *sensing, const real *state, real *predicted)
 {
@@ -20,15 +20,15 @@ void stewart_measurement_jacobian(const stewart_sensing *sensing, const real *st
 }
 
 void stewart_apply_jacobian(const stewart_sensing *sensing, const real *J, int k, const real *A,
-                          real *seen)
+                          real *JA)
 {
     if (sensing->jacobian) {
-        stewart_multiply_by_transpose(sensing->size, X, k, J, A, seen);
+        stewart_multiply_by_transpose(sensing->size, X, k, J, A, JA);
         return;
     }
     for (int i = 0; i < X; i++)
         for (int j = 0; j < k; j++)
-            seen[k * i + j] = A[X * j + i];
+            JA[k * i + j] = A[X * j + i];
 }
 
 int stewart_innovation_root(const stewart_sensing *sensing, const real *state, int k, const real *A,
@@ -83,17 +83,17 @@ int stewart_instant_rows(void *model, const real *xi, real *e, real *H, stewart_
     return m;
 }
 
-/* Whether a change of the state, as it is seen, is small. */
+/* Whether a change of the state changes each predicted value by less than SMALL_CORRECTION. */
 static int is_small(const stewart_instant *a, const real *change, stewart_scratch scratch)
 {
     const int m = a->sensing->size;
-    real *seen = stewart_take(&scratch, m);
-    stewart_apply_jacobian(a->sensing, a->J, 1, change, seen);
+    real *change_of_values = stewart_take(&scratch, m);
+    stewart_apply_jacobian(a->sensing, a->J, 1, change, change_of_values);
     for (int i = 0; i < m; i++) {
         real variance = 0;
         for (int j = 0; j <= i; j++)
             variance += a->C[m * i + j] * a->C[m * i + j];
-        if (!(REAL(fabs)(seen[i]) <= SMALL * REAL(sqrt)(variance))) /* or NaN */
+        if (!(REAL(fabs)(change_of_values[i]) <= SMALL_CORRECTION * REAL(sqrt)(variance))) /* or NaN */
             return 0;
     }
     return 1;
@@ -102,21 +102,21 @@ static int is_small(const stewart_instant *a, const real *change, stewart_scratc
 int stewart_instant_settle(void *model, const real *xi, const real *better, stewart_scratch scratch)
 {
     const stewart_instant *a = model;
-    real shift[X], linear[X];
+    real shift[X], linearised[X];
     for (int i = 0; i < X; i++) {
         shift[i] = 0;
         for (int j = 0; j < a->n; j++)
             shift[i] += a->H[a->n * i + j] * (better[j] - xi[j]);
-        linear[i] = a->state[i] + shift[i];
+        linearised[i] = a->state[i] + shift[i];
     }
     if (is_small(a, shift, scratch)) {
-        stewart_copy(X, linear, a->state);
+        stewart_copy(X, linearised, a->state);
         return 1;
     }
     if (!a->predict(a->period, better, a->state))
         return -1;
     for (int i = 0; i < X; i++)
-        shift[i] = a->state[i] - linear[i];
+        shift[i] = a->state[i] - linearised[i];
     stewart_measurement_jacobian(a->sensing, a->state, a->J);
     if (is_small(a, shift, scratch))
         return 1;

@@ -11,11 +11,11 @@ void stewart_predict_measurement(const stewart_sensing *sensing, const real *sta
 /* J (m, 12) = dh/dx at a state; not written if the state itself is measured. */
 void stewart_measurement_jacobian(const stewart_sensing *sensing, const real *state, real *J);
 
-/* J A' (m, k) of changes A (k, 12) of the state. */
+/* JA (m, k) = J A': changes of the values for changes A (k, 12) of the state. */
 void stewart_apply_jacobian(const stewart_sensing *sensing, const real *J, int k, const real *A,
-                          real *seen);
+                          real *JA);
 
-/* Share of the variances of late torques, rows of A below, that is added to `std` without correlation. */
+/* Share of the variance of late torques (rows of A below) that is added to `std`, as uncorrelated noise. */
 #define STEWART_ASIDE ((real)0.01)
 
 /* C (m, m), lower triangular, with C C' = J (A'A + diag(std)^2) J' + diag(noise)^2 at a state, A (k, 12).

@@ -1,10 +1,11 @@
 /* See observers.h.
 
-   A torque that comes delta late moves the rates at the next sample by -M^-1 B D delta, D the change of
-   torque. As an impulse of the torques, u = dt (T(x, r / dt) - T(x, 0)) with the prediction's error r of
-   the rates, that is u = -D delta. Unknown bias, payload and friction change u slowly, so that its second
-   difference w = u_k - 2 u_{k-1} + u_{k-2} counts. A delay gives it the variance c |D|^2 sigma^2 along D, and
-   none across D, so that the mean square across, of one direction, is subtracted:
+   A torque that changes by D and comes delta late moves the rates at the next sample by
+   r = -M^-1 B D delta. With T(x, a) the inverse dynamics at accelerations a, the impulse of the motors
+   that corresponds to the observed r is u = dt (T(x, r / dt) - T(x, 0)) = -D delta. Unknown bias, payload
+   and friction change u slowly, so its second difference w = u_k - 2 u_{k-1} + u_{k-2} is used. Timing
+   errors of variance sigma^2 give w the variance c |D|^2 sigma^2 along D, and none across D. The mean square
+   across D, per direction, is other noise and is subtracted:
 
        sigma^2 = sum((D.w)^2 - |D|^2 |w_across|^2 / 5) / sum(c |D|^4).
 
@@ -16,16 +17,17 @@
 #include "observers.h"
 #include "short.h"
 
-#define WITHIN ((real)6) /* c for torques that change within a period, and at the samples */
-#define AT_SAMPLES ((real)2.8169011381620934)
-#define KEEP ((real)0.9)  /* share of the sums that is left after a period */
-#define FADE ((real)0.98) /* the same, of the largest term of the second one */
-#define LEAST ((real)1)   /* of the second sum, in largest terms: small changes of torque tell little */
+#define VARIANCE_WITHIN ((real)6) /* c, for torques that change within a period */
+#define VARIANCE_AT_SAMPLES ((real)2.8169011381620934) /* c, for torques that change at the samples */
+#define FORGETTING ((real)0.9) /* factor on both sums per period */
+#define LARGEST_FORGETTING ((real)0.98) /* the same, on the largest term of `weight` */
+#define LEAST_WEIGHT ((real)1) /* of `weight`, in largest terms: small changes are noisy */
 
 typedef struct {
-    real impulses[2 * U], change[U]; /* u at the last two samples and D at the last; NaN without */
-    real excess, weight;             /* the sums */
-    real largest;                    /* term of the second one, which fades slowly */
+    real impulses[2 * U]; /* u at the last two samples, the newest first; NaN without */
+    real change[U];       /* D at the last sample; NaN without */
+    real excess, weight;  /* numerator and denominator of sigma^2 */
+    real largest;         /* term of `weight`, which decays slowly */
 } Timing;
 
 enum { TIMING_NUMBERS = sizeof(Timing) / sizeof(real) };
@@ -58,20 +60,20 @@ static void timing_restart(const stewart_law *law, real *memory)
     forget(timing_of(law, memory));
 }
 
-/* u (6) of a predicted state and the one found. */
-static void impulse_between(const stewart_law *law, const real *predicted, const real *found, real *u)
+/* Compute the impulse u (6) from the predicted to the measured state. */
+static void impulse_between(const stewart_law *law, const real *predicted, const real *measured, real *u)
 {
     stewart_belief belief;
-    real row[ROW], still[U];
+    real row[ROW], unaccelerated[U];
     stewart_believe(&law->machine, NULL, &belief);
-    stewart_copy(X, found, row);
+    stewart_copy(X, measured, row);
     stewart_fill(6, 0, row + X);
-    stewart_required_torque(&belief, row, still);
+    stewart_required_torque(&belief, row, unaccelerated);
     for (int i = 0; i < 6; i++)
-        row[X + i] = (found[6 + i] - predicted[6 + i]) / law->period;
+        row[X + i] = (measured[6 + i] - predicted[6 + i]) / law->period;
     stewart_required_torque(&belief, row, u);
     for (int i = 0; i < U; i++)
-        u[i] = law->period * (u[i] - still[i]);
+        u[i] = law->period * (u[i] - unaccelerated[i]);
 }
 
 static void learn(Timing *timing, const real *u, const real *D, real c)
@@ -86,9 +88,9 @@ static void learn(Timing *timing, const real *u, const real *D, real c)
     if (!(square > 0) || !isfinite(along)) /* or NaN */
         return;
     const real across = (all - along * along / square) / (U - 1), weight = c * square * square;
-    timing->excess = KEEP * timing->excess + along * along - square * across;
-    timing->weight = KEEP * timing->weight + weight;
-    timing->largest = REAL(fmax)(FADE * timing->largest, weight);
+    timing->excess = FORGETTING * timing->excess + along * along - square * across;
+    timing->weight = FORGETTING * timing->weight + weight;
+    timing->largest = REAL(fmax)(LARGEST_FORGETTING * timing->largest, weight);
 }
 
 static int timing_observe(const stewart_law *law, real *memory, int number, const real *torques,
@@ -114,7 +116,7 @@ static int timing_observe(const stewart_law *law, real *memory, int number, cons
         D[i] = within ? change : (change + timing->change[i]) / 2;
         timing->change[i] = change;
     }
-    learn(timing, u, D, within ? WITHIN : AT_SAMPLES);
+    learn(timing, u, D, within ? VARIANCE_WITHIN : VARIANCE_AT_SAMPLES);
     stewart_copy(U, timing->impulses, timing->impulses + U);
     stewart_copy(U, u, timing->impulses);
     return status;
@@ -131,7 +133,7 @@ static real timing_uncertainty(const stewart_law *law, const real *memory, real 
     const int n = X + law->machine.estimated;
     if (L)
         stewart_fill(n * n, 0, L);
-    const real weight = REAL(fmax)(timing->weight, LEAST * timing->largest);
+    const real weight = REAL(fmax)(timing->weight, LEAST_WEIGHT * timing->largest);
     return timing->excess > 0 ? REAL(sqrt)(timing->excess / weight) : 0;
 }
 
