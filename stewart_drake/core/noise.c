@@ -4,9 +4,9 @@
 #include "short.h"
 
 #define ONE_TORQUE ((real)0.5) /* information of one torque at t = 1: 1 / (2 t^2) */
-#define SURE ((real)2.5)
-#define WIDER 12
-#define ODD 3       /* largest nu^2 / S - 1 of a value in the slope of w */
+#define SURE ((real)2.5) /* standard deviations of w by which it must exceed 0 */
+#define WIDER 12         /* factor on that excess: W is the change in one period, an effect lasts for many */
+#define ODD 3       /* largest nu_i^2 / S_ii - 1 in the slope of w */
 #define LATEST 1000 /* largest t */
 #define UNTIMELY 4  /* t of torques that are off by twice the assumed standard deviation */
 
@@ -15,7 +15,7 @@ void stewart_noise_start(stewart_noise *noise)
     *noise = (stewart_noise){.timing = 1};
 }
 
-/* Fisher scoring of one factor; 0 for NaN. */
+/* Return factor + slope / information, at least 0: one step of Fisher scoring. 0 for NaN. */
 static real scored(real factor, real slope, real information)
 {
     const real found = information > 0 ? factor + slope / information : 0;
@@ -26,13 +26,13 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
                          int changes, const real *kicks, int p, const real *G, const real *wander,
                          real keep, stewart_noise *noise)
 {
-    real wander_slope = 0, all = 0;
+    real wander_slope = 0, total = 0;
     noise->known_timing *= keep;
     noise->known_wander *= keep;
     for (int i = 0; i < m; i++) {
         const real *h = H + X * i;
         real W = 0, S = variances[i];
-        all += innovations[i] * innovations[i] / S;
+        total += innovations[i] * innovations[i] / S;
         for (int k = 0; k < p; k++) {
             real change = 0;
             for (int j = 0; j < X; j++)
@@ -42,25 +42,25 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
         }
         const real S_at_w = S - (noise->used - noise->wander) * W; /* not at the factor in use */
         S = S_at_w > S / 10 ? S_at_w : S / 10;
-        const real off = innovations[i] * innovations[i] / S - 1;
-        wander_slope += W * (off < ODD ? off : ODD) / (2 * S);
+        const real excess_ratio = innovations[i] * innovations[i] / S - 1;
+        wander_slope += W * (excess_ratio < ODD ? excess_ratio : ODD) / (2 * S);
         noise->known_wander += W * W / (2 * S * S);
     }
-    real pulls = 0, squares = 0, along = 0;
+    real sum_a2 = 0, sum_b = 0, along_all = 0; /* a, b, r as in noise.h */
     for (int c = 0; c < changes; c++) {
-        real pull = 0, square = 0;
+        real a = 0, b = 0;
         for (int i = 0; i < m; i++) {
             const real k = stewart_dot(X, H + X * i, kicks + X * c);
-            pull += k * innovations[i] / variances[i];
-            square += k * k / variances[i];
+            a += k * innovations[i] / variances[i];
+            b += k * k / variances[i];
         }
-        pulls += pull * pull;
-        squares += square;
-        along += square > 0 ? pull * pull / square : 0;
-        noise->known_timing += square * square / 2;
+        sum_a2 += a * a;
+        sum_b += b;
+        along_all += b > 0 ? a * a / b : 0;
+        noise->known_timing += b * b / 2;
     }
-    const real across = m > changes ? (all - along) / (real)(m - changes) : 1;
-    const real timing_slope = (pulls - squares * (across > 1 ? across : 1)) / 2;
+    const real r = m > changes ? (total - along_all) / (real)(m - changes) : 1;
+    const real timing_slope = (sum_a2 - sum_b * (r > 1 ? r : 1)) / 2;
     const real t = noise->timing > 1 ? noise->timing : 1;
     const real found = scored(noise->timing, timing_slope, noise->known_timing + ONE_TORQUE / (t * t));
     noise->timing = found < LATEST ? found : LATEST;
@@ -81,10 +81,10 @@ void stewart_kicks(const stewart_machine *machine, const stewart_interval *perio
     const stewart_schedule *schedule = &period->schedule;
     const int number = schedule->number;
     stewart_belief belief;
-    real before[6], after[6], left = 0; /* s from a change of torque to the end */
+    real before[6], after[6], remaining = 0; /* s from the change of torque to the period's end */
     stewart_believe(machine, theta, &belief);
     for (int k = 0; k < number; k++)
-        left += schedule->durations[k];
+        remaining += schedule->durations[k];
     stewart_accelerate(&belief, state, period->preceding, before);
     for (int k = 0; k <= number; k++, kicks += X) {
         const real share = k == 0 || k == number ? SQRT_HALF : 1;
@@ -92,9 +92,9 @@ void stewart_kicks(const stewart_machine *machine, const stewart_interval *perio
         stewart_accelerate(&belief, state, torque, after);
         for (int i = 0; i < 6; i++) {
             kicks[6 + i] = share * (before[i] - after[i]);
-            kicks[i] = left * kicks[6 + i];
+            kicks[i] = remaining * kicks[6 + i];
             before[i] = after[i];
         }
-        left = k + 1 < number ? left - schedule->durations[k] : 0;
+        remaining = k + 1 < number ? remaining - schedule->durations[k] : 0;
     }
 }

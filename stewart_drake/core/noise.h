@@ -5,8 +5,8 @@
        S = S_0 + t sum_c k_c k_c' + w W,
 
    k_c is the effect of a change of torque that comes early or late by the assumed standard deviation of
-   the timing. w W is due to parameters that wander: W holds for their assumed change in a period. S_0 is
-   the rest. The factors t >= 0 and w >= 0 are unknown. With S diagonal the log-density has the slopes and
+   the timing. W is the covariance due to the assumed change of the parameters in one period. S_0 is the
+   rest. The factors t >= 0 and w >= 0 are unknown. With S diagonal the log-density has the slopes and
    the information
 
        g_t = 1/2 sum_c (a_c^2 - b_c r),              I_t = 1/2 sum_c b_c^2,
@@ -31,9 +31,9 @@ enum { STEWART_NOISE = 6 }; /* numbers in a stewart_noise */
 
 typedef struct {
     real timing, wander;              /* t, w */
-    real known_timing, known_wander;  /* J of both */
-    real used;                        /* factor of W in use */
-    real asked;                       /* values at which w exceeded SURE deviations, or t UNTIMELY */
+    real known_timing, known_wander;  /* J of t and w */
+    real used;                        /* factor on W that the filter uses */
+    real asked;                       /* number of values while w exceeded SURE deviations, or t UNTIMELY */
 } stewart_noise;
 
 void stewart_noise_start(stewart_noise *noise);
