@@ -4,19 +4,19 @@
 #include "short.h"
 
 #define ITERATIONS 4       /* at the most; one is enough when the parameters are roughly known */
-#define KNOWN ((real)0.01) /* a constant is known when its deviation is this share of the usual one */
-#define LEARNT ((real)0.3) /* the same, for a prediction over a few periods */
-#define DIRECTED ((real)0.1) /* the same, for the direction in which a late torque moves the plate */
-#define UNTIMELY 70        /* factor t of the timing (noise.h) for a torque far too early or late */
-#define LATEST 700         /* the largest */
-#define ONCE ((real)0.05)  /* after such a torque t grows, from this value at least, */
-#define GROWTH 30          /* by this factor at the most */
+#define KNOWN ((real)0.01) /* share of the usual standard deviation at which a constant is known: for F, */
+#define LEARNT ((real)0.3) /* for a prediction over a few periods, */
+#define DIRECTED ((real)0.1) /* for the direction in which a late torque moves the plate */
+#define UNTIMELY 70        /* factor t of noise.h that is tried for a torque far too early or late, */
+#define LATEST 700         /* up to this */
+#define ONCE ((real)0.05)  /* after such a torque t becomes at most GROWTH times this, or t if that is larger */
+#define GROWTH 30
 /* Shares of `usual_std` by which parameters may have changed. */
 #define CHANGED ((real)1e-3)      /* the least */
 #define MOST_CHANGED ((real)0.01) /* the largest for a single outlier */
 #define MOST_AGREEING ((real)0.3) /* the largest if the last outlier agrees, or the prior is untested */
 #define YOUNG 3                   /* measurements that test the prior */
-#define HOPELESS 100              /* gates beyond which no iteration explains a measurement */
+#define HOPELESS 100              /* gates: after a first iteration beyond this an update is given up */
 
 int stewart_posterior_size(int n, int m)
 {
@@ -77,7 +77,7 @@ int stewart_attempt_ended(stewart_attempt *a, stewart_scratch scratch)
     return stewart_all_finite(n, after->mean) && stewart_all_finite(n * n, after->root);
 }
 
-/* A measurement of the sample alone. */
+/* An attempt with a measurement of the sample alone, not of instants within the period. */
 typedef struct {
     stewart_instant instant;
     const stewart_attempt *attempt;
@@ -102,7 +102,7 @@ static int linearize(void *about, const real *xi, real *H, stewart_scratch scrat
                               s->fourth_order, s->states, H, scratch);
 }
 
-/* Predict and linearise from the prior's mean. Attempts at the same period often begin with the same. */
+/* Predict and linearise from the prior's mean, or copy the last result from `kept` if the mean is the same. */
 static int begin(Sample *s, const real *xi, real *end, stewart_scratch scratch)
 {
     const int n = s->attempt->n;
@@ -207,7 +207,7 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
         known[i] -= theta[offsets + i % LEGS];
     if (!sensing->start(sensing, known, near, state, root, scratch))
         return 0;
-    if (offsets >= 0) { /* the pose is also off by dq = -J^-1 do, with do the error of the offsets */
+    if (offsets >= 0) { /* an error d of the offsets makes an error -J^-1 d of the pose */
         stewart_copy(LEGS * p, filter->prior_root + p * offsets, back);
         if (!filter->legs->moved(filter, state, back, scratch))
             return 0;
@@ -227,8 +227,8 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
     return 1;
 }
 
-/* Compute `after` of a jump of parameters, from `now` with widened variances in `before`. Returns 0 if
-   no jump explains the values. A single leg that does not fit is taken for a fault, not a large jump. */
+/* Compute `after` for a jump of parameters, from `now` with widened variances in `before`. Returns 0 if no
+   jump explains the values. A large jump is not tried if only one leg does not fit: that is a fault. */
 static int jump(stewart_attempt *a, const stewart_posterior *now, const stewart_posterior *before,
                 stewart_scratch scratch)
 {
@@ -272,7 +272,9 @@ static int attempt_changed(stewart_attempt *a, const stewart_posterior *now,
     return attempt(a, scratch);
 }
 
-/* The largest log-density of an outlier, of all factors on its covariance: what a cause has to exceed. */
+/* Return the largest log-density of an outlier over all factors on its covariance S. A cause must exceed it.
+   With S scaled by distance / m, the maximum, distance and ln |S| change by m - distance and
+   m ln(distance / m). */
 static real without_cause(const stewart_attempt *a)
 {
     const real m = (real)a->filter->sensing->size;
@@ -281,9 +283,9 @@ static real without_cause(const stewart_attempt *a)
     return a->likelihood + (a->distance - m - m * REAL(log)(a->distance / m)) / 2;
 }
 
-/* Compute `after` of an outlier that the model explains after all, from `now` with more noise or widened
-   variances in `before`: a torque came far too early or late, or parameters changed by the least share
-   that explains it. Late torques must be likelier than `without`. Returns 0 if neither does. */
+/* Compute `after` for an outlier that has a cause, from `now` with more noise or widened variances in
+   `before`: a torque came far too early or late, or parameters changed by the least share that explains the
+   values. The log-density with a late torque must exceed `without`. Returns 0 without a cause. */
 static int explain(stewart_attempt *a, const stewart_posterior *now, const stewart_posterior *before,
                    real most, real without, stewart_scratch scratch)
 {
