@@ -22,12 +22,12 @@
 #define TRIED 15     /* values of the delay to start the iterations from, while it is hardly known */
 #define DIFFERENCE ((real)1e-3) /* s */
 #define KNOWN ((real)0.01) /* a constant is known at this share of its usual standard deviation */
-#define HEARD 10           /* measurements after which a misfit may be a jump of parameters */
+#define HEARD 10           /* number of measurements from which on a misfit may be a jump of parameters */
 #define MEMORY 5           /* s over which the timing of single torques is estimated */
 #define UNTIMELY ((real)0.1)  /* periods, largest standard deviation of the timing */
-#define JERKED ((real)0.02)   /* periods, standard deviation of a small step of the delay */
-#define EDGE ((real)0.1)      /* periods before and after one from which a torque may move into it */
-#define BEFORE ((real)1 / 120) /* see stewart_period_late */
+#define JERKED ((real)0.02)   /* periods, standard deviation of a step of the delay that explains a misfit */
+#define EDGE ((real)0.1)      /* periods before and after a period from which timing moves a torque into it */
+#define BEFORE ((real)1 / 120) /* mean of (phi (1 - phi) / 2)^2, see stewart_period_late */
 #define LARGEST_RATE ((real)0.5) /* s/s */
 #define UNLIKELY ((real)-1e6) /* log-likelihood of a measurement that cannot be explained */
 
@@ -57,7 +57,8 @@ void stewart_guess_keep_root(int n, const real *L, stewart_guess *guess)
 
 real stewart_guess_std(const stewart_guess *guess, int n)
 {
-    return stewart_norm(n - 1, guess->numbers + n + (n - 2) * (n - 1) / 2);
+    const int row = STEWART_ETA(n); /* of the packed lower triangle */
+    return stewart_norm(row + 1, guess->numbers + n + row * (row + 1) / 2);
 }
 
 /* ---- one period ------------------------------------------------------------------------------- */
@@ -66,8 +67,8 @@ static stewart_arrivals arriving(const stewart_period *t, const real *xi)
 {
     const int n = size_of(t->delay);
     stewart_arrivals view = t->view;
-    view.eta = xi[n - 2];
-    view.rate = xi[n - 1];
+    view.eta = xi[STEWART_ETA(n)];
+    view.rate = xi[STEWART_RATE(n)];
     return view;
 }
 
@@ -142,20 +143,20 @@ static int linearize_along(const stewart_period *t, const real *xi, const Path *
         return 0;
     for (int i = 0; i < X; i++) {
         stewart_copy(known, all + X * known * (path->number - 1) + known * i, H + n * i);
-        H[n * i + n - 2] = H[n * i + n - 1] = 0;
+        H[n * i + STEWART_ETA(n)] = H[n * i + STEWART_RATE(n)] = 0;
     }
-    if (!(xi[n - 2] < STEWART_NEVER))
+    if (!(xi[STEWART_ETA(n)] < STEWART_NEVER))
         return 1;
     stewart_copy(n, xi, moved);
-    moved[n - 2] = xi[n - 2] + DIFFERENCE;
+    moved[STEWART_ETA(n)] = xi[STEWART_ETA(n)] + DIFFERENCE;
     if (!stewart_period_end(t, moved, later, scratch))
         return 0;
-    moved[n - 2] = xi[n - 2] - DIFFERENCE;
+    moved[STEWART_ETA(n)] = xi[STEWART_ETA(n)] - DIFFERENCE;
     if (!stewart_period_end(t, moved, sooner, scratch))
         return 0;
     for (int i = 0; i < X; i++) {
-        H[n * i + n - 2] = (later[i] - sooner[i]) / (2 * DIFFERENCE);
-        H[n * i + n - 1] = t->delay->period / 2 * H[n * i + n - 2];
+        H[n * i + STEWART_ETA(n)] = (later[i] - sooner[i]) / (2 * DIFFERENCE);
+        H[n * i + STEWART_RATE(n)] = t->delay->period / 2 * H[n * i + STEWART_ETA(n)];
     }
     return 1;
 }
@@ -287,7 +288,7 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
 {
     const stewart_delay *d = a->period->delay;
     const int n = a->n, m = a->m, known = n - 2;
-    const real reach = (real)2.5 * std, eta = a->mean[n - 2];
+    const real reach = (real)2.5 * std, eta = a->mean[STEWART_ETA(n)];
     const real low = guess->low > eta - reach ? guess->low : eta - reach;
     const real high = guess->high < eta + reach ? guess->high : eta + reach;
     real *A = stewart_take(&scratch, known * X), *miss = stewart_take(&scratch, m), end[X];
@@ -304,7 +305,7 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
     stewart_copy(n, a->mean, trial);
     for (int k = 0; k < TRIED; k++) {
         real cost = 0;
-        trial[n - 2] = k < TRIED - 1 ? low + (high - low) / (TRIED - 1) * (real)k : high;
+        trial[STEWART_ETA(n)] = k < TRIED - 1 ? low + (high - low) / (TRIED - 1) * (real)k : high;
         if (!stewart_period_end(a->period, trial, end, scratch))
             return 0;
         stewart_predict_measurement(d->sensing, end, miss);
@@ -315,7 +316,7 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
             cost += miss[i] * miss[i];
         if (cost < least) {
             least = cost;
-            xi[n - 2] = trial[n - 2];
+            xi[STEWART_ETA(n)] = trial[STEWART_ETA(n)];
         }
     }
     return 1;
@@ -382,7 +383,7 @@ static int judge_timing(Model *a, const real *L, real used, stewart_guess *after
 /* Whether the effect of a single torque can be separated from that of the delay. */
 static int is_precise(const stewart_delay *d, const stewart_guess *guess, int n, real std)
 {
-    return std < d->period / 50 && guess->numbers[n - 2] < STEWART_NEVER;
+    return std < d->period / 50 && guess->numbers[STEWART_ETA(n)] < STEWART_NEVER;
 }
 
 /* Correct xi and the root of its covariance by a measurement; 0 where it does not fit. */
@@ -391,8 +392,8 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
 {
     const stewart_delay *d = a->period->delay;
     const int n = a->n, m = a->m, p = d->machine->estimated;
-    const int free_eta = stewart_norm(n, L + n * (n - 2)) > 0;
-    const int free_rate = stewart_norm(n, L + n * (n - 1)) > 0;
+    const int free_eta = stewart_norm(n, L + n * STEWART_ETA(n)) > 0;
+    const int free_rate = stewart_norm(n, L + n * STEWART_RATE(n)) > 0;
     real *lower = stewart_take(&scratch, n), *upper = stewart_take(&scratch, n);
     real *C = a->instant.C, distance, spread;
     if (std > d->period / 10) {
@@ -413,12 +414,12 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
     stewart_copy(p, d->lower, lower + X);
     stewart_copy(p, d->upper, upper + X);
     if (free_eta) {
-        lower[n - 2] = guess->low;
-        upper[n - 2] = guess->high;
+        lower[STEWART_ETA(n)] = guess->low;
+        upper[STEWART_ETA(n)] = guess->high;
     }
     if (free_rate) {
-        lower[n - 1] = -LARGEST_RATE;
-        upper[n - 1] = LARGEST_RATE;
+        lower[STEWART_RATE(n)] = -LARGEST_RATE;
+        upper[STEWART_RATE(n)] = LARGEST_RATE;
     }
     const stewart_kalman filter = {
         n, m, std > d->period / 100 ? ITERATIONS : FEW, a->mean, L, lower, upper, a,
@@ -433,7 +434,7 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
     after->outliers = 0;
     after->squares += distance;
     after->values += (real)m;
-    after->heard += guess->numbers[n - 2] < STEWART_NEVER;
+    after->heard += guess->numbers[STEWART_ETA(n)] < STEWART_NEVER;
     if (is_precise(d, guess, n, std)) {
         const int judged = judge_timing(a, L, used, after, scratch);
         if (!judged)
@@ -450,7 +451,7 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
 {
     const stewart_delay *d = a->period->delay;
     const int n = a->n;
-    const real dt = d->period, std = stewart_norm(n, L + n * (n - 2)), timing = timing_of(d, guess);
+    const real dt = d->period, std = stewart_norm(n, L + n * STEWART_ETA(n)), timing = timing_of(d, guess);
     const real used = timing > least ? timing : least;
     real *xi = stewart_take(&scratch, n), *posterior = stewart_take(&scratch, n * n);
     real *R = stewart_take(&scratch, n * n), *W = stewart_take(&scratch, n * (n + MOST));
@@ -482,15 +483,15 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
         R[(n + 1) * i] = a->drift[i];
     for (int i = X; i < n - 2; i++)
         R[(n + 1) * i] = d->walk_std[i - X];
-    if (guess->numbers[n - 2] < STEWART_NEVER) {
-        R[n * n - n - 2] = REAL(sqrt)(less_sure + d->walk * d->walk * dt);
-        R[n * n - 1] = d->rate_walk * REAL(sqrt)(dt);
+    if (guess->numbers[STEWART_ETA(n)] < STEWART_NEVER) {
+        R[(n + 1) * STEWART_ETA(n)] = REAL(sqrt)(less_sure + d->walk * d->walk * dt);
+        R[(n + 1) * STEWART_RATE(n)] = d->rate_walk * REAL(sqrt)(dt);
     }
     for (int j = 0; j < n; j++) {
         real *w = W + n * j;
         for (int k = 0; k < n; k++)
             w[k] = L[n * k + j];
-        w[n - 2] += dt * w[n - 1];
+        w[STEWART_ETA(n)] += dt * w[STEWART_RATE(n)];
         for (int i = 0; i < X; i++) {
             real sum = 0;
             for (int k = 0; k < n; k++)
@@ -506,7 +507,7 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
     stewart_absorb(n, n + a->rows, R, W);
     stewart_copy(X, a->instant.state, after->numbers);
     stewart_copy(n - X, xi + X, after->numbers + X);
-    after->numbers[n - 2] += dt * xi[n - 1];
+    after->numbers[STEWART_ETA(n)] += dt * xi[STEWART_RATE(n)];
     real *packed = after->numbers + n;
     for (int i = 0; i < n; i++)
         for (int j = 0; j <= i; j++)
@@ -514,10 +515,11 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
     return stewart_all_finite(n + n * (n + 1) / 2, after->numbers);
 }
 
-/* L <- root of the covariance with std^2 added to the variance of eta. Only its last two rows change. */
+/* L <- root of the covariance with std^2 added to the variance of eta, which may have stepped. Only the
+   last two rows change. */
 static void jerk(int n, real std, real *L)
 {
-    real *eta = L + n * (n - 2) + n - 2, *rate = L + n * (n - 1) + n - 2;
+    real *eta = L + n * STEWART_ETA(n) + STEWART_ETA(n), *rate = L + n * STEWART_RATE(n) + STEWART_ETA(n);
     const real before = *eta, along = rate[0];
     *eta = REAL(sqrt)(before * before + std * std);
     if (!(*eta > 0))

@@ -13,6 +13,10 @@ enum {
     STEWART_MAX_SCHEDULE = 8,  /* torques that act in a period, at a rate of the delay within bounds */
 };
 
+/* Places of eta and eta_dot in xi = [x; theta; eta; eta_dot] (n). */
+#define STEWART_ETA(n) ((n) - 2)
+#define STEWART_RATE(n) ((n) - 1)
+
 /* Assumptions about the state, the parameters theta (p) and the delay. */
 typedef struct {
     const stewart_machine *machine;
@@ -24,7 +28,7 @@ typedef struct {
     const real *walk_std;            /* (p) change of theta in a period; 0 for a constant */
     const real *jump_std;            /* (p) sudden change of theta, as of a filter, or NULL */
     const real *lower, *upper;       /* (p) bounds of theta */
-    real gate;                       /* squared innovation that makes an outlier */
+    real gate;                       /* largest nu' S^-1 nu that is not an outlier */
     real first_timing;               /* s, first standard deviation of the timing of torques */
     real believed, delay_std;        /* s, mean and standard deviation of the delay's prior */
     real longest;                    /* s */
@@ -43,7 +47,7 @@ typedef struct {
     real timing;         /* s^2, variance of the timing of single torques */
     real torques;        /* number of torques in that estimate */
     real heard;          /* number of measurements since an own torque has arrived */
-    real weight;         /* log of the odds */
+    real weight;         /* log of the probability, relative to the best hypothesis */
     real squares;        /* sum of nu' S^-1 nu of the measurements that were used */
     real values;         /* number of values in them */
     real numbers[];      /* mean of xi = [x; theta; eta; eta_dot] (n), then the lower triangle of the
@@ -101,7 +105,7 @@ typedef struct {
     real found;                  /* whether the delay has just been found, or is another than before */
     real fresh;                  /* whether that was at this sample, and took so long that planning waits
                                     for the next one */
-    real silent;                 /* whether nothing is fed back until then */
+    real silent;                 /* whether nothing is fed back until the delay is found */
     real feeds_back;             /* whether the estimate is good enough for feedback */
     real caution;                /* factor on the weight of torques */
     real settled;                /* whether the delay is known */

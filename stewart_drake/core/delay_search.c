@@ -82,7 +82,7 @@ static void copy_guess(int n, const stewart_guess *from, stewart_guess *to)
 
 static real distance_of(int n, const stewart_guess *a, const stewart_guess *b)
 {
-    return REAL(fabs)(a->numbers[n - 2] - b->numbers[n - 2]);
+    return REAL(fabs)(a->numbers[STEWART_ETA(n)] - b->numbers[STEWART_ETA(n)]);
 }
 
 /* ---- the prior of the delay ------------------------------------------------------------------- */
@@ -146,11 +146,11 @@ static void spawn(Search *s, int k, stewart_scratch scratch)
     cell->high = high;
     cell->weight += REAL(log)(share);
     master->weight += REAL(log1p)(-share);
-    cell->numbers[n - 2] = (low + high) / 2;
-    cell->numbers[n - 1] = 0;
+    cell->numbers[STEWART_ETA(n)] = (low + high) / 2;
+    cell->numbers[STEWART_RATE(n)] = 0;
     stewart_guess_root(cell, n, L); /* its last two rows are 0 */
-    L[n * n - n - 2] = d->period / SQRT_12;
-    L[n * n - 1] = d->rate_std;
+    L[(n + 1) * STEWART_ETA(n)] = d->period / SQRT_12;
+    L[(n + 1) * STEWART_RATE(n)] = d->rate_std;
     stewart_guess_keep_root(n, L, cell);
 }
 
@@ -184,8 +184,8 @@ static void begin(Search *s, const real *y, const real *near, stewart_scratch sc
     master->torques = TORQUES;
     stewart_copy(X, state, master->numbers);
     stewart_copy(p, d->prior, master->numbers + X);
-    master->numbers[n - 2] = STEWART_NEVER;
-    master->numbers[n - 1] = 0;
+    master->numbers[STEWART_ETA(n)] = STEWART_NEVER;
+    master->numbers[STEWART_RATE(n)] = 0;
     stewart_fill(n * n, 0, L);
     for (int i = 0; i < X; i++)
         stewart_copy(X, root + X * i, L + n * i);
@@ -284,16 +284,16 @@ static void begin_at(const Search *s, const stewart_guess *from, real eta, real 
     stewart_absorb(p, X + p, R, W);
     copy_guess(n, from, guess);
     stewart_copy(X, state, guess->numbers);
-    guess->numbers[n - 2] = eta;
-    guess->numbers[n - 1] = 0;
+    guess->numbers[STEWART_ETA(n)] = eta;
+    guess->numbers[STEWART_RATE(n)] = 0;
     stewart_fill(n * n, 0, L);
     for (int i = 0; i < X; i++)
         stewart_copy(X, root + X * i, L + n * i);
     for (int i = 0; i < p; i++)
         for (int j = 0; j <= i; j++)
             L[n * (X + i) + X + j] = R[p * j + i];
-    L[n * n - n - 2] = std;
-    L[n * n - 1] = d->rate_std;
+    L[(n + 1) * STEWART_ETA(n)] = std;
+    L[(n + 1) * STEWART_RATE(n)] = d->rate_std;
     stewart_guess_keep_root(n, L, guess);
     guess->outliers = 0;
 }
@@ -312,7 +312,7 @@ static int compare(const Search *s, const stewart_period *t, const stewart_guess
     real *C = stewart_take(&scratch, m * m), *miss = stewart_take(&scratch, m), end[X];
     stewart_copy(n, guess->numbers, xi);
     stewart_copy(X, state, xi);
-    xi[n - 1] = 0;
+    xi[STEWART_RATE(n)] = 0;
     if (!stewart_period_at(t, xi, 0, end, H, scratch))
         return 0;
     stewart_guess_root(guess, n, L);
@@ -329,7 +329,7 @@ static int compare(const Search *s, const stewart_period *t, const stewart_guess
     if (!stewart_innovation_root(sensing, state, known + X, A, d->model_std, C, scratch))
         return 0;
     for (int k = 0; k < number; k++) {
-        xi[n - 2] = (real)(k + 1) * GRID * d->period;
+        xi[STEWART_ETA(n)] = (real)(k + 1) * GRID * d->period;
         if (!stewart_period_end(t, xi, end, scratch))
             return 0;
         stewart_predict_measurement(sensing, end, miss);
@@ -435,9 +435,9 @@ static void restart(Search *s, const real *y, const real *near, stewart_scratch 
     if (!start_of(d->sensing, y, guess->numbers, state, root, scratch))
         return;
     const real std = stewart_guess_std(guess, n), least = d->period / 10;
-    begin_at(s, guess, guess->numbers[n - 2], std > least ? std : least, LOOSENED, state, root, anew,
+    begin_at(s, guess, guess->numbers[STEWART_ETA(n)], std > least ? std : least, LOOSENED, state, root, anew,
              scratch);
-    anew->numbers[n - 1] = guess->numbers[n - 1];
+    anew->numbers[STEWART_RATE(n)] = guess->numbers[STEWART_RATE(n)];
     copy_guess(n, anew, guess);
 }
 
@@ -456,7 +456,7 @@ static void mix(Search *s)
         for (int i = 0; i <= cells; i++) {
             const stewart_guess *cell = guess_at(s, i);
             const real share = REAL(exp)(cell->weight - top);
-            const real eta = i > 0 ? cell->numbers[n - 2] : rest;
+            const real eta = i > 0 ? cell->numbers[STEWART_ETA(n)] : rest;
             const real std = i > 0 ? stewart_guess_std(cell, n) : spread;
             if (pass == 0) {
                 total += share;
@@ -476,7 +476,7 @@ static void report(Search *s, int measured)
     const stewart_delay *d = s->delay;
     stewart_delay_memory *memory = s->memory;
     const stewart_guess *guess = guess_at(s, (int)memory->best);
-    const real eta = guess->numbers[s->n - 2];
+    const real eta = guess->numbers[STEWART_ETA(s->n)];
     const int settled = !(memory->searching > 0) && !(memory->fresh > 0);
     const int silent = memory->silent > 0 && !settled, waiting = !(eta < STEWART_NEVER);
     memory->rejected = measured && !(guess->fits > 0);
@@ -484,7 +484,7 @@ static void report(Search *s, int measured)
     memory->silent = (real)silent;
     memory->caution = settled ? 1 : CAUTION;
     memory->eta = eta > 0 ? eta : 0;
-    memory->rate = guess->numbers[s->n - 1];
+    memory->rate = guess->numbers[STEWART_RATE(s->n)];
     memory->feeds_back = 1;
     if (!settled && (waiting || silent)) {
         const int late = memory->sent * d->period >= d->believed;
