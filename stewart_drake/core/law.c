@@ -56,7 +56,7 @@ void stewart_prepare(stewart_law *law)
     l->counts = place(law, 1, STEWART_CAUSES);
 }
 
-/* A torque in flight, if it is finite. */
+/* Copy a torque into those in flight if it is finite. */
 static void keep(const real *torque, real *in_flight)
 {
     if (stewart_all_finite(U, torque))
@@ -102,7 +102,7 @@ void stewart_note_acted(const stewart_law *law, real *memory, int ago, int numbe
 
 /* ---- estimation ------------------------------------------------------------------------------- */
 
-/* What of `outlook` follows from the delay alone. */
+/* Fill in what of `outlook` follows from a known delay. */
 static void fixed_delay_outlook(const stewart_law *law, const real *in_flight, stewart_outlook *outlook,
                              stewart_scratch *scratch)
 {
@@ -126,8 +126,8 @@ static void fixed_delay_outlook(const stewart_law *law, const real *in_flight, s
     outlook->limited = stewart_at_limit(&law->machine, last.number, last.torques);
 }
 
-/* Moves the observer on to the last measurement there is and predicts the state of now from there:
-   a measurement may be `age` periods old. */
+/* Advance the observer to the newest measurement, which may be `age` periods old, and predict the present
+   state from there. Without a usable measurement it stays up to `longest_wait` periods behind. */
 static void estimate(const stewart_law *law, real *memory, const stewart_sample *sample,
                      stewart_outlook *outlook, stewart_scratch *scratch)
 {
@@ -198,8 +198,8 @@ static int preview_times(const stewart_law *law, const stewart_outlook *outlook,
     return n;
 }
 
-/* Whether nothing is fed back yet. A limit spoils the plan: what it takes away is known without a
-   measurement. */
+/* Whether the open-loop start lasts. It does not while a torque in flight is at the limit: what the limit
+   takes away is known without a measurement. */
 static int is_quiet(const stewart_law *law, const real *memory)
 {
     const stewart_field *in_flight = &law->layout.in_flight;
@@ -207,7 +207,7 @@ static int is_quiet(const stewart_law *law, const real *memory)
            !stewart_at_limit(&law->machine, in_flight->rows, memory + in_flight->at);
 }
 
-/* The course of the last sample in the memory. */
+/* Read the course of the last sample from the memory. */
 static stewart_course last_course(const stewart_law *law, real *memory)
 {
     const stewart_layout *l = &law->layout;
@@ -224,7 +224,7 @@ static stewart_course last_course(const stewart_law *law, real *memory)
     return last;
 }
 
-/* Asks for the reference and finds the course to follow. */
+/* Ask for the reference, and compute the course to follow. */
 static void follow(const stewart_law *law, real *memory, const stewart_sample *sample,
                    const stewart_outlook *outlook, stewart_course *c, stewart_scratch *scratch)
 {
@@ -245,7 +245,7 @@ static void follow(const stewart_law *law, real *memory, const stewart_sample *s
     stewart_follow(&motion, &last, given, c, *scratch);
 }
 
-/* Keeps the course for the next sample. */
+/* Store the course for the next sample. */
 static void remember_course(const stewart_law *law, real *memory, const stewart_course *c)
 {
     const stewart_layout *l = &law->layout;
@@ -261,7 +261,8 @@ static void remember_course(const stewart_law *law, real *memory, const stewart_
 
 /* ---- feedback --------------------------------------------------------------------------------- */
 
-/* The exact equations until then. The integral waits in every part in which a motor is at its limit. */
+/* Predict state, error and integral at the instant from which the next torque acts, by the equations of
+   motion. Anti-windup: the integral is held in periods in which a motor is at its limit. */
 static void predict(const stewart_law *law, const stewart_outlook *outlook, const real *followed,
                     const real *integral, stewart_ahead *a, stewart_scratch scratch)
 {
@@ -294,7 +295,7 @@ static void predict(const stewart_law *law, const stewart_outlook *outlook, cons
         a->error[i] = a->state[i] - followed[ROW * outlook->samples + i];
 }
 
-/* A torque that regulates the error where it acts, and what went wrong. */
+/* Compute the torque by feedback of the predicted error. Returns bits of `stewart_status`. */
 static int feed_back(const stewart_law *law, real *memory, const stewart_outlook *outlook,
                      const real *followed, const real *weights, stewart_ahead *a, real *torque,
                      stewart_scratch scratch)
@@ -336,7 +337,7 @@ static int feed_back(const stewart_law *law, real *memory, const stewart_outlook
 
 /* ---- a sample --------------------------------------------------------------------------------- */
 
-/* A torque for what is followed, and what went wrong. */
+/* Compute the torque of a sample, with feedback or without. Returns bits of `stewart_status`. */
 static int respond(const stewart_law *law, real *memory, const stewart_outlook *outlook, const stewart_course *c,
                    int waiting, const real *weights, stewart_ahead *a, real *torque,
                    stewart_scratch scratch)
@@ -419,9 +420,9 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
     int status = outlook.status | (c.missing ? STEWART_REFERENCE_MISSING : 0);
     const real *nodes = c.followed + ROW * (1 + outlook.samples);
     const int waiting = !stewart_all_finite(ROW * 2 * (3 + outlook.pending), nodes);
-    if (c.missing && !c.gap && !waiting) /* which spoils the plan as a limit does */
+    if (c.missing && !c.gap && !waiting) /* the planned start had other numbers: end it */
         memory[l->silence.at] = 0;
-    if (!stewart_all_finite(X, outlook.state)) { /* nothing else to go on with */
+    if (!stewart_all_finite(X, outlook.state)) { /* no measurement yet: assume the reference */
         stewart_copy(X, c.followed, outlook.state);
         if (law->longest_wait == 0)
             stewart_copy(X, outlook.state, memory + l->observer.at);
