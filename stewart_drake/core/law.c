@@ -261,8 +261,7 @@ static void remember_course(const stewart_law *law, real *memory, const stewart_
 
 /* ---- feedback --------------------------------------------------------------------------------- */
 
-/* Predict state, error and integral at the instant from which the next torque acts, by the equations of
-   motion. Anti-windup: the integral is held in periods in which a motor is at its limit. */
+/* The exact equations until then. The integral waits in every part in which a motor is at its limit. */
 static void predict(const stewart_law *law, const stewart_outlook *outlook, const real *followed,
                     const real *integral, stewart_ahead *a, stewart_scratch scratch)
 {

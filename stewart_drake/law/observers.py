@@ -87,7 +87,7 @@ class DelaySettings:
         walk: s per root s, of the delay itself.
         rate_std: s/s, of its rate; 0 for none.
         rate_walk: s/s per root s.
-        quiet: whether nothing is fed back before the delay is found.
+        quiet: whether there is no feedback before the delay is found.
         timing_std: s, least standard deviation of the instant of a single torque.
     """
 
@@ -127,7 +127,7 @@ class CoreObserver:
     Attributes:
         settings: of the filter; None: only the state is estimated.
         delay: prior of an unknown delay; None: the delay is known.
-        gaps: whether the filter corrects the estimate before a gap between measurements.
+        gaps: whether measurements can be missing for periods, for the filter over gaps.
         timing: whether the standard deviation of the torques' instants is learnt without a filter.
     """
 
@@ -277,7 +277,7 @@ def _gate(size: int) -> float:
 
 
 def _assumed(settings: FilterSettings) -> dict[str, Array]:
-    """Return what all filters assume of parameters: prior and changes."""
+    """Return the prior of the parameters and their assumed changes, for all filters."""
     known, p = settings.parameters, len(settings.parameters.names)
     walk = np.zeros(p) if settings.walk_std is None else settings.walk_std
     arrays = {
