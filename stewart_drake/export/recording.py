@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from functools import reduce
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
@@ -211,7 +210,9 @@ def _refusal(scenario: Scenario, field: str) -> str:
     fields = {name: load_controller(name) for name in shipped("controller")}
     names = [name for name in fields if fields[name].items() <= given]
     name = max(names, key=lambda name: len(fields[name]), default=EXPORTED[0])
-    value = reduce(lambda part, key: getattr(part, key, None), field.split("."), scenario)
+    value: Any = scenario
+    for key in field.split("."):
+        value = getattr(value, key, None)
     if name in EXPORTED:
         return f"{field}: got {value}, which is not exported; expected that of {known}"
     return f"controller: {name} is not exported, because of {field}: {value}; exported are {known}"
