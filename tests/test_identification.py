@@ -12,13 +12,13 @@ from benchmarks.identification import calm_torque, excitation, find
 from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.fit import (
-    ENOUGH,
+    CONVERGED,
     Evaluator,
     Guess,
     Problem,
     chi2_per_value,
-    finer,
     solve,
+    with_half_step,
 )
 from stewart_drake.identification.identify import identify
 from stewart_drake.identification.judgement import (
@@ -286,7 +286,7 @@ def test_the_fit_is_that_of_a_general_solver():
     np.testing.assert_allclose(
         found.covariance / np.outer(std, std), spread / np.outer(std, std), atol=2e-3
     )
-    assert found.residuals.chi2 == pytest.approx(2 * other.cost, abs=2 * ENOUGH)
+    assert found.residuals.chi2 == pytest.approx(2 * other.cost, abs=2 * CONVERGED)
     true = problem.unknowns.mean.copy()
     away = (found.guess.values - true)[free] / np.sqrt(np.diag(found.covariance))
     assert np.abs(away).max() < 4
@@ -567,9 +567,9 @@ def test_steps_are_halved_until_they_do_not_matter():
     values = guess.values.copy()
     values[8], guess = 2e-3, Guess(guess.values, guess.first)
     guess = Guess(values, guess.first)
-    halved = finer(problem, guess)
+    halved = with_half_step(problem, guess)
     assert halved is not None and halved.longest_step == problem.longest_step / 2
-    while (more := finer(halved, guess)) is not None:
+    while (more := with_half_step(halved, guess)) is not None:
         halved = more
     one, exact = (
         Evaluator(dataclasses.replace(problem, longest_step=h)).residuals(guess).measured
@@ -578,7 +578,7 @@ def test_steps_are_halved_until_they_do_not_matter():
     assert np.sqrt(np.mean((one - exact) ** 2)) < 0.05
     values = guess.values.copy()
     values[8] = 0.0
-    assert finer(problem, Guess(values, guess.first)) is None
+    assert with_half_step(problem, Guess(values, guess.first)) is None
 
 
 # ---------------------------------------------------------------- many machines

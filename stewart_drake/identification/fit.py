@@ -34,12 +34,12 @@ from stewart_drake.identification.unknowns import DELAY, GEOMETRY, NUM_UNKNOWNS,
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array
 
-MOST_DELAY: Final = 0.1  # largest change of the delay in one iteration, s
-ENOUGH: Final = 0.01  # gain of chi^2 below which an iteration is the last
+MAX_DELAY_CHANGE: Final = 0.1  # in one iteration, s
+CONVERGED: Final = 0.01  # gain of chi^2 below which an iteration is the last
 MOST_ITERATIONS: Final = 60
-# chi^2 per value of a segment that no similar machine explains; an error of a millimetre in the
-# drawing causes some fifty
-ASTRAY: Final = 1e3
+# chi^2 per value above which no similar machine explains a segment; a drawing that is a millimetre
+# off causes some fifty
+UNEXPLAINED: Final = 1e3
 _SENSITIVITY_STEP: Final = 0.02  # step of the integration of sensitivities, s
 _STEP_ERROR: Final = 0.05  # RMS error of the integration in standard deviations of a measurement
 _SHORTEST_STEP: Final = 1e-3  # s
@@ -154,9 +154,11 @@ class Evaluator:
         _, n, _, columns = J.shape
         rows = J.transpose(1, 0, 2, 3).reshape(n, -1, columns)
         r = residuals.measured.transpose(1, 0, 2).reshape(n, -1, 1)
-        turned = rows.transpose(0, 2, 1)
+        transposed = rows.transpose(0, 2, 1)
         weight = 1 / self.problem.unknowns.std[self.free]
-        normal = Normal(turned @ rows, (turned @ r)[:, :, 0], weight**2, weight * residuals.prior)
+        normal = Normal(
+            transposed @ rows, (transposed @ r)[:, :, 0], weight**2, weight * residuals.prior
+        )
         return residuals, normal
 
     def _evaluate(
@@ -193,7 +195,7 @@ class Evaluator:
         return Residuals(residual, prior), J
 
     def _columns(self, sensitivities: Array, offsets: Array) -> Array:
-        """Return the columns of S as those of free unknowns and first state."""
+        """Return derivatives by free unknowns and first state from those of the integration."""
         whole = np.empty((*sensitivities.shape[:-1], NUM_UNKNOWNS))
         whole[..., : OFFSETS.start] = sensitivities[..., PARAMETER_COLUMNS]
         whole[..., OFFSETS] = offsets
@@ -201,7 +203,7 @@ class Evaluator:
         return np.concatenate([whole[..., self.free], sensitivities[..., FIRST_COLUMNS]], axis=-1)
 
 
-def followed(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
+def without_diverged(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
     """Return a problem without the segments whose first trajectory leaves the workspace."""
     measured = Evaluator(problem).residuals(start).measured
     with np.errstate(over="ignore"):
@@ -209,7 +211,7 @@ def followed(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
     return problem.kept(start, np.flatnonzero(finite))
 
 
-def nearest(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
+def nearest_half(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
     """Return the half of the segments whose first trajectories are nearest to the measurements.
 
     The others, such as the last one before a plate was lost, would pull all unknowns towards
@@ -226,12 +228,12 @@ def misfit(residuals: Residuals, problem: Problem) -> Array:
 
 
 def solve(problem: Problem, start: Guess, most: int = MOST_ITERATIONS) -> Fit:
-    """Return the most probable guess after at most `most` iterations from a `followed` start."""
+    """Return the most probable guess after up to `most` iterations from a finite start."""
     evaluator = Evaluator(problem)
     guess, damping, iterations = start, _DAMPING[0], 0
     residuals, normal = evaluator.normal(guess)
     gained = np.inf
-    while iterations < most and gained >= ENOUGH:
+    while iterations < most and gained >= CONVERGED:
         iterations += 1
         progress.iteration(iterations, most)
         before, gained = residuals.chi2, 0.0
@@ -296,7 +298,7 @@ class Solution(NamedTuple):
         return self._replace(problem=problem, fit=solve(problem, self.fit.guess))
 
 
-def finer(problem: Problem, guess: Guess, residual: float = 1.0) -> Problem | None:
+def with_half_step(problem: Problem, guess: Guess, residual: float = 1.0) -> Problem | None:
     """Return the problem with half the step, or None if that hardly changes its residuals.
 
     The change is compared with `residual` standard deviations. The necessary step depends on the
@@ -312,7 +314,9 @@ def finer(problem: Problem, guess: Guess, residual: float = 1.0) -> Problem | No
 def _moved(guess: Guess, unknown: Array, first: Array, free: NDArray[np.intp]) -> Guess:
     values, before = guess.values.copy(), guess.values[DELAY]
     values[free] += unknown
-    values[DELAY] = np.clip(values[DELAY], max(0.0, before - MOST_DELAY), before + MOST_DELAY)
+    values[DELAY] = np.clip(
+        values[DELAY], max(0.0, before - MAX_DELAY_CHANGE), before + MAX_DELAY_CHANGE
+    )
     return Guess(values, guess.first + first)
 
 
@@ -322,9 +326,9 @@ def _step(normal: Normal, damping: float) -> tuple[Array, Array]:
     N_ip, N_ii = normal.of_first
     damped = N_ii + damping * np.einsum("nij,ij->nij", N_ii, np.eye(NUM_STATE))
     eliminated = np.linalg.solve(damped, np.dstack([N_ip, normal.gradients[:, k:, None]]))
-    turned = N_ip.transpose(0, 2, 1)
-    reduced = N_pp + damping * np.diag(np.diag(N_pp)) - (turned @ eliminated[:, :, :k]).sum(0)
-    right = g - (turned @ eliminated[:, :, k:]).sum(0)[:, 0]
+    N_pi = N_ip.transpose(0, 2, 1)
+    reduced = N_pp + damping * np.diag(np.diag(N_pp)) - (N_pi @ eliminated[:, :, :k]).sum(0)
+    right = g - (N_pi @ eliminated[:, :, k:]).sum(0)[:, 0]
     unknown = -np.linalg.solve(reduced, right)
     first = -(eliminated[:, :, k] + eliminated[:, :, :k] @ unknown)
     return unknown, first

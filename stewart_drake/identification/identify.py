@@ -10,16 +10,16 @@ import numpy as np
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification import progress, short_logs, start
 from stewart_drake.identification.fit import (
-    ASTRAY,
+    UNEXPLAINED,
     Fit,
     Guess,
     Problem,
     Solution,
     chi2_per_value,
-    finer,
-    followed,
-    nearest,
+    nearest_half,
     solve,
+    with_half_step,
+    without_diverged,
 )
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
 from stewart_drake.identification.logs import ANGLES, Log
@@ -189,7 +189,7 @@ def identify(
     else:
         found = _grown(min(tried, key=lambda one: one.chi2))
     progress.phase("shorter steps")
-    while (halved := finer(found.problem, found.fit.guess)) is not None:
+    while (halved := with_half_step(found.problem, found.fit.guess)) is not None:
         found = found.refitted(halved)
     return Identification(logs, unknowns, found, middle)
 
@@ -204,10 +204,10 @@ def _begin(values: Array, share: float, pairs: Sequence[start.Pair], unknowns: U
     """Fit the nearest segments, from values of the unknowns, with a share of the usual length."""
     late = _COARSE if unknowns.std[DELAY] > 0 else 0.0
     whole, first = start.problem_of(pairs, unknowns, values, late, share=share)
-    problem, guess = followed(whole, first)
+    problem, guess = without_diverged(whole, first)
     if not problem.segments:
         return _Begun(np.inf, whole, first)
-    near, guess = nearest(problem, guess)
+    near, guess = nearest_half(problem, guess)
     fit = solve(near, guess, _FEW)
     chi2 = chi2_per_value(fit.residuals, near)["all"]
     return _Begun(chi2, whole, Guess(fit.guess.values, first.first))
@@ -221,7 +221,7 @@ def _grown(begun: _Begun) -> Solution:
     nearest remain.
     """
     progress.phase("whole log")
-    problem, guess = followed(begun.whole, begun.guess)
+    problem, guess = without_diverged(begun.whole, begun.guess)
     if not problem.segments:
         raise ConfigError(
             "LOG: got no stretch that the mechanism could have moved through under these torques; "
@@ -232,7 +232,7 @@ def _grown(begun: _Begun) -> Solution:
     fewest = len(problem.segments) // 2 + 1
     found = Solution(begun.whole, problem, guess, solve(problem, guess, _FEW))
     while found.chi2 > WRONG and len(found.problem.segments) > fewest:
-        if found.misfit.max() < ASTRAY:
+        if found.misfit.max() < UNEXPLAINED:
             break
         found = found.without_worst(_FEW)
     return found if found.fit.iterations < _FEW else found.refitted(found.problem)

@@ -23,7 +23,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin, margins
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.identification.fit import Evaluator, Guess, Problem, covariance, followed
+from stewart_drake.identification.fit import Evaluator, Guess, Problem, covariance, without_diverged
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
 from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
 from stewart_drake.identification.start import segment_length, segments_of
@@ -172,7 +172,7 @@ def plan(experiment: Experiment, std: Array, tolerances: Tolerances | None = Non
     length = segment_length(log, log.values[:, POSE], mechanism, sc.eta)
     segments = segments_of(log, sc.eta, length)
     first = np.array([states[segment.rows[0]] for segment in segments])
-    problem, guess = followed(Problem(segments, unknowns), Guess(unknowns.mean, first))
+    problem, guess = without_diverged(Problem(segments, unknowns), Guess(unknowns.mean, first))
     if not problem.segments:
         raise ConfigError(
             "plan: got a motion along which the plate cannot be followed; expected one that "

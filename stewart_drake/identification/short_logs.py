@@ -15,12 +15,12 @@ from stewart_drake.dynamics.workspace import margin, margins
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification import progress
 from stewart_drake.identification.fit import (
-    ASTRAY,
     MOST_ITERATIONS,
+    UNEXPLAINED,
     Solution,
-    finer,
-    followed,
     solve,
+    with_half_step,
+    without_diverged,
 )
 from stewart_drake.identification.logs import Log
 from stewart_drake.identification.start import Pair, problem_of
@@ -138,7 +138,7 @@ def _fitted(
     whole, guess = problem_of(
         pairs, unknowns, values, _LATE, longest=longest, step=_STEP, skip_short=True
     )
-    problem, begun = followed(whole, guess) if whole.segments else (whole, guess)
+    problem, begun = without_diverged(whole, guess) if whole.segments else (whole, guess)
     if not problem.segments:
         return None
     return Solution(whole, problem, begun, solve(problem, begun, most))
@@ -153,12 +153,12 @@ def _grown(pairs: Sequence[Pair], unknowns: Unknowns, values: Array) -> Solution
     if one is None:
         return None
     for _ in pairs:
-        if one.chi2 <= ASTRAY or len(one.problem.segments) == 1:
+        if one.chi2 <= UNEXPLAINED or len(one.problem.segments) == 1:
             break
         one = one.without_worst()
-    while one.chi2 <= ASTRAY:
+    while one.chi2 <= UNEXPLAINED:
         away = max(1.0, float(np.sqrt(np.mean(one.fit.residuals.measured**2))))
-        halved = finer(one.problem, one.fit.guess, away)
+        halved = with_half_step(one.problem, one.fit.guess, away)
         if halved is None:
             break
         one = one.refitted(halved)

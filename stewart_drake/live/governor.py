@@ -73,11 +73,11 @@ _PHASES: Final = np.concatenate(
     [np.arange(_FINE, _UNTIL, _FINE), np.arange(_UNTIL, _SETTLED, _COARSE)]
 )
 """w t at which the future is checked."""
-_STILL: Final = 1e-9
-"""Rate without a sign, rad/s and m/s."""
+_ZERO_RATE: Final = 1e-9
+"""Largest rate that counts as zero, rad/s and m/s."""
 _RESOLUTION: Final = 2e-4
 """Accuracy of the applied target, rad and shares of the reach."""
-_FARTHEST: Final = 4.0
+_TARGET_CLIP: Final = 4.0
 """Distance from home to which a target is clipped, in the same units; no machine goes that far."""
 _REACHED: Final = 1e-6
 """Distance within which a target is reached, in the same units."""
@@ -85,9 +85,9 @@ _BLENDS: Final = (1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
 """Durations of a blend onto a motion, s, tried in this order."""
 _BLEND_STEP: Final = 0.02
 """Time between the checked instants of a blend, s."""
-_KEPT: Final = 3.0
+_HISTORY: Final = 3.0
 """Time for which past segments are kept, s."""
-_LEAST: Final = 0.05
+_UPDATE_INTERVAL: Final = 0.05
 """Shortest time between two updates of the target, s."""
 _SHORTEST: Final = 1e-6
 """Shortest piece of a trajectory, s."""
@@ -127,8 +127,8 @@ def stop_pose(state: Array, pace: float) -> Array:
 
 
 def _turns(states: Array) -> Array:
-    """Return how often each rate of successive states (n, 18) changes its sign, (6,)."""
-    signs = [np.sign(v[np.abs(v) > _STILL]) for v in states[:, RATES].T]
+    """Return the number of sign changes (6,) of each rate along states (n, 18)."""
+    signs = [np.sign(v[np.abs(v) > _ZERO_RATE]) for v in states[:, RATES].T]
     return np.array([np.count_nonzero(np.diff(sign)) for sign in signs])
 
 
@@ -144,7 +144,7 @@ class GovernorState(NamedTuple):
 
 @dataclass(frozen=True)
 class Governor:
-    """Keeps a reference set by hand within the workspace and the torque limits."""
+    """Reference governor: keeps a reference set by hand within workspace and torque limits."""
 
     dynamics: StewartDynamics
     torque_limit: float = np.inf  # limit of each motor, N m; TORQUE_SHARE of it is used
@@ -204,7 +204,7 @@ class Governor:
         Pose, rates and accelerations stay.
         """
         # Unclipped, a huge target would take a bisection per factor of two, and overflow.
-        reach, home = _FARTHEST * self._size, self.dynamics.mechanism.home
+        reach, home = _TARGET_CLIP * self._size, self.dynamics.mechanism.home
         target = np.clip(target, home - reach, home + reach)
         step = target - governed.applied
         if np.abs(step / self._size).max() <= _REACHED:
@@ -307,7 +307,7 @@ class Segment(NamedTuple):
 
 @dataclass(frozen=True)
 class Way:
-    """The reference in segments, the earliest first, which also holds before its begin.
+    """The reference in segments, the earliest first. Before its begin the first one holds too.
 
     A law reads the same instants again at each sample. They are therefore cached, to 1 ns.
     """
@@ -334,7 +334,7 @@ class Way:
     def then(self, begin: float, at: Callable[[float], Array]) -> "Way":
         """Replace the reference from `begin` on, and drop segments that are long past."""
         before = [s for s in self.segments if s.begin < begin]
-        while len(before) > 1 and before[1].begin < begin - _KEPT:
+        while len(before) > 1 and before[1].begin < begin - _HISTORY:
             del before[0]
         return Way((*before, Segment(begin, at)))
 
@@ -353,7 +353,7 @@ class Steering:
 
     def on(self, time: float, request: Request) -> "Steering":
         """Fix the reference up to `time` in s, and follow a request from there on."""
-        if time - self.until < _LEAST - 1e-9:
+        if time - self.until < _UPDATE_INTERVAL - 1e-9:
             return self
         governed = self._governed_at(time)
         if request.target is None and not request.rest:
