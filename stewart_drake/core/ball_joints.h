@@ -10,7 +10,7 @@
        tau(w) = (c + f tanh(|w| / s) / |w|) w,     the slope of c |w|^2 / 2 + f s log cosh(|w| / s).
 
    The rod may spin about its own axis. It spins such that the sum of these potentials of its two joints is
-   least. If only one of them has friction, there is no spin in that joint. Virtual work,
+   least. If only one of them has friction, the spin in that joint is 0. Virtual work,
 
        F' [delta w; delta v] = sum tau_1' delta w_1 + tau_2' delta w_2,
 

@@ -87,7 +87,7 @@ class DelaySettings:
         walk: s per root s, of the delay itself.
         rate_std: s/s, of its rate; 0 for none.
         rate_walk: s/s per root s.
-        quiet: whether there is no feedback before the delay is found.
+        quiet: whether feedback waits until the delay is found.
         timing_std: s, least standard deviation of the instant of a single torque.
     """
 
@@ -127,7 +127,7 @@ class CoreObserver:
     Attributes:
         settings: of the filter; None: only the state is estimated.
         delay: prior of an unknown delay; None: the delay is known.
-        gaps: whether measurements can be missing for periods, for the filter over gaps.
+        gaps: whether the filter corrects the estimate before a gap between measurements.
         timing: whether the standard deviation of the torques' instants is learnt without a filter.
     """
 
