@@ -30,7 +30,7 @@ def text():
         functions.append(shown)
     lines += [f"from stewart_drake import {name} as {name}" for name in sd._MODULES]
     imports = [f"import {module}" for module in sorted(modules)]
-    shown = f"__version__: str\n__all__ = {sd.__all__!r}\n"
+    shown = "__version__: str\n"
     head = "# Written by .ci/public_names.py.\n"
     return head + "\n".join([*imports, *lines, shown, *functions])
 
