@@ -18,7 +18,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.servos import rise
@@ -31,18 +30,16 @@ from stewart_drake.live.loop import REST_RATE, START_ERROR
 from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.session import Ready, drive, plans, prepare_session
 from stewart_drake.live.viewer import End, Snapshot, Viewer
-from stewart_drake.loop.learned import HARMONICS, harmonics_below, motion_period, save_learned
+from stewart_drake.loop.learned import HARMONICS, save_learned
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import SimulationResult, accumulated_error
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.signals import NUM_PARAMETERS, POSE, RATES
+from stewart_drake.scenario.signals import POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.learn import (
-    PATIENCE,
-    Anderson,
+    Lessons,
     check_learning,
-    corrected_setpoints,
-    fit,
+    estimated,
     lacking_angles,
     lacking_torque,
 )
@@ -138,8 +135,8 @@ def _learn_torques(asked: _Asked) -> SimulationResult:
     result = asked.drive(ready, viewer=lessons, logs=[lessons], pace=lessons.pace)
     if result.status != "completed":
         asked.say(f"{End(result.status, result.stopped).words}; learning ends")
-    if lessons.errors:
-        best = lessons.best
+    if lessons.learning.errors:
+        best = lessons.learning.best
         if best:
             save_learned(asked.file, lessons.tried[best], lessons.experiment)
         asked.end(best)
@@ -154,7 +151,7 @@ class TorqueLessons(Viewer):
 
     Attributes:
         tried: added torques of the repetitions so far; those of the first one are zero.
-        errors: E of the last period of each complete repetition, % s.
+        learning: its errors are E of the last period of each complete repetition, % s.
         done: whether learning has ended.
         pace: pole of the governor, 1/s.
     """
@@ -162,11 +159,10 @@ class TorqueLessons(Viewer):
     def __init__(self, experiment: Experiment, number: int, say: Callable[[str], None]) -> None:
         self.experiment, self._number, self._say = experiment, number, say
         sc = experiment.scenario
-        self._dt, self._period = sc.controller.period, motion_period(sc)
-        self._harmonics = harmonics_below(self._period, self._dt)
+        self.learning = Lessons(sc)
+        self._dt, self._period = sc.controller.period, self.learning.period
         none = LearnedSignal(self._period, np.zeros((1 + 2 * HARMONICS, 6)))
-        self.tried, self.errors, self.done = [none], list[float](), False
-        self._anderson = Anderson()
+        self.tried, self.done = [none], False
         self._span = _SETTLING + _DELAYS * sc.eta + self._period
         self._size = 2 * experiment.motion_scale
         times = np.linspace(0.0, self._period, _INSTANTS, endpoint=False)
@@ -182,11 +178,6 @@ class TorqueLessons(Viewer):
         self._whole = False
         self._lacking: Iterator[tuple[float, Array]] | None = None
         self._found: list[tuple[float, Array]] = []
-
-    @property
-    def best(self) -> int:
-        """Number of the repetition with the least error, from 0."""
-        return int(np.argmin(self.errors))
 
     def __call__(self) -> LearnedSignal:
         before, present = self._before.coefficients, self.tried[-1].coefficients
@@ -244,18 +235,18 @@ class TorqueLessons(Viewer):
         """Compute the error of the repetition; end after the last one."""
         times = np.array([time for time, _ in self._rows])
         errors = np.array([row["pose"] - row["reference"] for _, row in self._rows])
-        self.errors.append(accumulated_error(times, errors, self.experiment.scale))
-        k = len(self.errors)
-        self._say(f"repetition {k}: E of one period is {self.errors[-1]:.3g} % s")
-        self.done = k == self._number or k - 1 - self.best >= PATIENCE
+        error = accumulated_error(times, errors, self.experiment.scale)
+        self.learning.errors.append(error)
+        k = len(self.learning.errors)
+        self._say(f"repetition {k}: E of one period is {error:.3g} % s")
+        self.done = k == self._number or self.learning.ended
         self._lacking = self._lacking_torques()
 
     def _lacking_torques(self) -> Iterator[tuple[float, Array]]:
         """Yield the middles of periods, s, and the torques (6,) that the model lacks there."""
         sc, rows = self.experiment.scenario, list(self._rows)
-        parameters = self.experiment.nominal.plant_parameters.copy()
-        parameters[:NUM_PARAMETERS] = np.mean([row["parameters"] for _, row in rows], axis=0)
-        dynamics = StewartDynamics(self.experiment.mechanism, sc.plant.gravity, parameters)
+        parameters = np.array([row["parameters"] for _, row in rows])
+        dynamics = estimated(self.experiment, parameters)
         timeline = Timeline(self._dt, sc.true_delay)
         state = "measurement" if sc.sensor.measures_state else "state_estimate"
         for (time, row), (_, after) in pairwise(rows):
@@ -274,21 +265,20 @@ class TorqueLessons(Viewer):
 
     def _begin(self, t: float) -> None:
         """Begin the next repetition, with torques fitted to those that the last one lacked."""
-        least = 2 * (1 + 2 * self._harmonics)  # twice the number of coefficients
+        least = self.learning.least
         if len(self._found) < least:
             self._end(f"{len(self._found)} measurements of a period; expected at least {least}")
             return
         times, lacking = (np.array(column) for column in zip(*self._found, strict=True))
-        fitted = fit(times, -lacking, self._period, self._harmonics)
         self._before = self.tried[-1]
-        self.tried.append(LearnedSignal(self._period, self._anderson.after(fitted)))
+        self.tried.append(self.learning.learned(times, lacking))
         self._until, self._asked, self._returns = self._end_of_motion(t), t, False
         self._share = 0.0
         self._whole, self._lacking, self._found = False, None, []
         self._rows.clear()
 
     def _end(self, reason: str) -> None:
-        self._say(f"repetition {len(self.errors) + 1}: {reason}; learning ends")
+        self._say(f"repetition {len(self.learning.errors) + 1}: {reason}; learning ends")
         self.done = True
 
 
@@ -298,15 +288,10 @@ class TorqueLessons(Viewer):
 def _learn_setpoints(asked: _Asked) -> SimulationResult:
     scenario, say = asked.scenario, asked.say
     learned: LearnedSignal | None = None
-    period, dt = motion_period(scenario), scenario.controller.period
-    number, servo = harmonics_below(period, dt), scenario.actuator
-    assert servo.kind == "position_servo"
-    lag = (servo.velocity_gain + servo.crank_damping) / servo.stiffness
-    last = period * math.ceil(_LEARNED_FROM / period)
+    lessons, dt = Lessons(scenario), scenario.controller.period
+    last = lessons.period * math.ceil(_LEARNED_FROM / lessons.period)
     duration = dt * math.ceil((_SETTLING + last) / dt + 1)
-    least = 2 * (1 + 2 * number)  # twice the number of coefficients
-    errors, runs = list[float](), list[SimulationResult]()
-    steps, own = Anderson(), prepare(scenario)
+    runs, own = list[SimulationResult](), prepare(scenario)
     for k in range(1, asked.options.learn + 1):
         ready = asked.call(always(learned), duration, plan=k == 1)
         result = asked.drive(ready, duration)
@@ -314,22 +299,21 @@ def _learn_setpoints(asked: _Asked) -> SimulationResult:
             say(f"repetition {k}: {End(result.status, result.stopped).words}; learning ends")
             break
         times, missed = lacking_angles(ready.design.experiment, result, last)
-        if len(times) < least:
+        if len(times) < lessons.least:
             say(
                 f"repetition {k}: {len(times)} measurements in the last {last:.3g} s; expected at "
-                f"least {least}; learning ends"
+                f"least {lessons.least}; learning ends"
             )
             break
-        errors.append(float(np.sqrt(np.mean(missed**2))))  # rad
+        lessons.errors.append(float(np.sqrt(np.mean(missed**2))))  # rad
         runs.append(result)
-        say(f"repetition {k}: the cranks lack {np.degrees(errors[-1]):.3f} degrees rms")
-        best = int(np.argmin(errors))
+        say(f"repetition {k}: the cranks lack {np.degrees(lessons.errors[-1]):.3f} degrees rms")
+        best = lessons.best
         if best == k - 1 and learned is not None:  # at once, so that Ctrl-C loses nothing
             save_learned(asked.file, learned, own)
-        if k - 1 - best >= PATIENCE:
+        if lessons.ended:
             break
-        fitted = corrected_setpoints(steps.used, fit(times, missed, period, number), period, lag)
-        learned = LearnedSignal(period, steps.after(fitted))
+        learned = lessons.learned(times, missed)
     if not runs:
         return result
     asked.end(best)

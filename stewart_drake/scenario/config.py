@@ -423,6 +423,11 @@ class PositionServoConfig:
     speed_limit: Positive | None = None
 
     @property
+    def lag(self) -> float:
+        """Time by which the servo follows its setpoint late, s."""
+        return (self.velocity_gain + self.crank_damping) / self.stiffness
+
+    @property
     def reflected_inertia(self) -> float:
         """Inertia of the rotor at its crank, kg m^2."""
         return self.armature

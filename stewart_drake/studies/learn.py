@@ -52,7 +52,7 @@ _DEPTH: Final = 3
 """Largest number of differences of repetitions in a step of Anderson's method."""
 _POINTS: Final = 100
 """Instants of a period at which a learned torque or angle is looked at."""
-PATIENCE: Final = 2
+_PATIENCE: Final = 2
 """Repetitions without a smaller error, one after the other, that end learning."""
 
 
@@ -129,18 +129,16 @@ def study_learn(
     other noise. The motion is periodic, the link a wire of known delay.
     """
     check_learning(scenario)
-    period = motion_period(scenario)
-    dt = scenario.controller.period
+    lessons = Lessons(scenario)
+    period, dt = lessons.period, scenario.controller.period
     eta = believed_delay(scenario).eta(dt)
     periods = 1 + math.ceil(max(1.0, _SETTLING * eta / period))
     run = replace(scenario, duration=dt * math.ceil(periods * period / dt - 1e-9), log_period=None)
     experiment = prepare(run)
-    number = harmonics_below(period, dt)
     done: list[Repetition] = []
     learned: LearnedSignal | None = None
-    steps, interrupted = Anderson(), False
-    servos = scenario.actuator if scenario.actuator.kind == "position_servo" else None
-    lacking = lacking_torques if servos is None else lacking_angles
+    interrupted = False
+    lacking = lacking_torques if lessons.lag is None else lacking_angles
     for k in range(options.repetitions):
         sensor = replace(run.sensor, seed=run.sensor.seed + k)
         result = simulate(
@@ -150,20 +148,14 @@ def study_learn(
         )
         if interrupted := result.status == "interrupted":
             break
-        done.append(Repetition(learned, result, last_error(result, experiment.scale, period)))
+        lessons.errors.append(last_error(result, experiment.scale, period))
+        done.append(Repetition(learned, result, lessons.errors[-1]))
         if progress is not None:
             progress(k + 1, options.repetitions)
         times, values = lacking(experiment, result, period)
-        errors = [one.error for one in done]
-        if len(done) - 1 - np.argmin(errors) >= PATIENCE or len(times) < 2 * (1 + 2 * number):
+        if lessons.ended or len(times) < lessons.least:
             break
-        if servos is None:
-            fitted = fit(times, -values, period, number)
-        else:
-            lag = (servos.velocity_gain + servos.crank_damping) / servos.stiffness
-            missed = fit(times, values, period, number)
-            fitted = corrected_setpoints(steps.used, missed, period, lag)
-        learned = LearnedSignal(period, steps.after(fitted))
+        learned = lessons.learned(times, values)
     if not done:
         raise KeyboardInterrupt
     return LearnStudy(experiment, period, done, options.repetitions, interrupted)
@@ -258,9 +250,7 @@ def lacking_torques(
     sc = experiment.scenario
     dt, delay = sc.controller.period, believed_delay(sc)
     signals, (first, rows, states) = result.signals, _last_samples(experiment, result, period)
-    parameters = experiment.nominal.plant_parameters.copy()
-    parameters[:NUM_PARAMETERS] = signals.parameters.values[rows[first:]].mean(axis=0)
-    dynamics = StewartDynamics(experiment.mechanism, sc.plant.gravity, parameters)
+    dynamics = estimated(experiment, signals.parameters.values[rows[first:]])
     limit = experiment.torque_limit
     sent = np.clip(signals.torque_commanded.values[rows], -limit, limit)
     in_flight = np.vstack([experiment.torques_in_flight(delay), sent])
@@ -274,6 +264,13 @@ def lacking_torques(
             times.append(dt * (k + 0.5))
             found.append(lacking_torque(dynamics, begin, end, schedule))
     return np.array(times), np.reshape(found, (-1, 6))
+
+
+def estimated(experiment: Experiment, parameters: Array) -> StewartDynamics:
+    """Return the controller's model with the mean of estimated parameters (n, p)."""
+    known = experiment.nominal.plant_parameters.copy()
+    known[:NUM_PARAMETERS] = np.mean(parameters, axis=0)
+    return StewartDynamics(experiment.mechanism, experiment.scenario.plant.gravity, known)
 
 
 def lacking_torque(
@@ -315,3 +312,41 @@ class Anderson:
         y = np.linalg.lstsq(dF.T @ dF + noise, dF.T @ f.ravel(), rcond=None)[0]
         self.used = g - (dG @ y).reshape(g.shape)
         return self.used
+
+
+class Lessons:
+    """What the repetitions of a scenario's motion teach.
+
+    Attributes:
+        period: of the motion, s.
+        least: number of samples that a repetition is learned from, at least.
+        lag: time of position servos behind their setpoints, s; None with torques.
+        errors: of the repetitions so far.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.period, servo = motion_period(scenario), scenario.actuator
+        self._harmonics = harmonics_below(self.period, scenario.controller.period)
+        self.least = 2 * (1 + 2 * self._harmonics)  # twice the number of coefficients
+        self.lag = servo.lag if servo.kind == "position_servo" else None
+        self.errors: list[float] = []
+        self._steps = Anderson()
+
+    @property
+    def best(self) -> int:
+        """Number of the repetition with the least error, from 0."""
+        return int(np.argmin(self.errors))
+
+    @property
+    def ended(self) -> bool:
+        """Whether the error no longer falls."""
+        return len(self.errors) - 1 - self.best >= _PATIENCE
+
+    def learned(self, times: Array, lacking: Array) -> LearnedSignal:
+        """Return the signal of the next repetition, from what the last one lacked at times (n,)."""
+        if self.lag is None:
+            fitted = fit(times, -lacking, self.period, self._harmonics)
+        else:
+            missed = fit(times, lacking, self.period, self._harmonics)
+            fitted = corrected_setpoints(self._steps.used, missed, self.period, self.lag)
+        return LearnedSignal(self.period, self._steps.after(fitted))
