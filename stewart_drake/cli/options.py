@@ -25,7 +25,6 @@ class Given:
 
     @property
     def missing(self) -> list[Option]:
-        """Required options that were not given."""
         return [one for one in _offered(self._kind) if one.required and one.name not in self.given]
 
     @property

@@ -404,7 +404,6 @@ class Constants:
         self.before: list[str] = []
 
     def struct(self, data: Any, about: str) -> str:
-        """Return the initialiser of a structure."""
         fields = core().ffi.typeof(data).fields
         parts = (
             f".{name} = {self._value(getattr(data, name), field.type, f'{about}_{name}')}"

@@ -96,8 +96,6 @@ class Step(NamedTuple):
 
 @dataclass
 class Recorded:
-    """A recorded run."""
-
     law: PredictiveLqi | ServoPreview  # the law itself, not the one that records
     duration: float  # of the run, s
     steps: list[Step] = field(default_factory=list)  # at most MOST_SAMPLES

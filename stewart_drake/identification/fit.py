@@ -54,8 +54,6 @@ class Guess(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Residuals of a guess."""
-
     measured: Array  # (m, n, 18) of n segments in standard deviations, 0 for missing measurements
     prior: Array  # (free unknowns,)
 

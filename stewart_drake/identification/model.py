@@ -65,8 +65,6 @@ def compiled(function: ca.Function) -> Compiled:
 
 
 class Numbers(NamedTuple):
-    """Numbers of a machine."""
-
     parameters: Array  # (NUM_DYNAMIC,) of the dynamics
     legs: Array  # (6, LEG_NUMBERS), see `core.layout`
 

@@ -152,7 +152,6 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
 
 
 def always(signal: LearnedSignal | None) -> Learned:
-    """Return a function that returns this signal, or None for None."""
     return None if signal is None else lambda: signal
 
 

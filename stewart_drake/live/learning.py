@@ -74,7 +74,6 @@ class _Asked(NamedTuple):
 
     @property
     def file(self) -> Path:
-        """File for what is learned."""
         return self.options.learned or Path("learned.npz")
 
     def call(self, learned: Learned, duration: float = math.inf, plan: bool = True) -> Ready:
@@ -86,7 +85,6 @@ class _Asked(NamedTuple):
         return ready
 
     def drive(self, ready: Ready, duration: float = math.inf, **how: Any) -> SimulationResult:
-        """Drive the machine."""
         how |= self.options.model_dump(include={"armed", "accept_jitter", "max_missing"})
         return drive(ready, duration, ending=self.ending, say=self.say, **how)
 
@@ -188,7 +186,6 @@ class TorqueLessons(Viewer):
         return Request(target=self._target) if self._returns else Request()
 
     def finished(self) -> bool:
-        """Return whether learning has ended."""
         return self.done
 
     def write(self, time: float, values: Mapping[str, Array]) -> None:

@@ -154,7 +154,6 @@ class LiveRecord(Record):
             self._write(first)
 
     def ran(self, scenario: Scenario) -> None:
-        """Set the scenario that was run."""
         self._scenario = scenario
 
     def finish(self) -> Array:

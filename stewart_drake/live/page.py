@@ -41,8 +41,6 @@ _AHEAD: Final = 0.2
 
 
 class PageRequest(NamedTuple):
-    """A request made on the page."""
-
     target: Array | None
     stop: bool
 

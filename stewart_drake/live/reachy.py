@@ -115,7 +115,6 @@ class Daemon:
             self._loop.call_soon_threadsafe(replace)
 
     def close(self) -> None:
-        """Close the connection."""
         self._closed = True
         with suppress(RuntimeError):
             self._loop.call_soon_threadsafe(lambda: [one.cancel() for one in asyncio.all_tasks()])

@@ -61,7 +61,6 @@ class Viewer:
         """Show the loop at a sample, without waiting."""
 
     def request(self) -> Request:
-        """Return the present request."""
         return Request()
 
     def stopped(self) -> bool:

@@ -140,8 +140,6 @@ def uncovered(scenario: Scenario) -> str | None:
 
 
 class Ending(NamedTuple):
-    """End of a run."""
-
     status: str  # as of `loop.results.RunSummary`
     stopped: Failure | None  # when and why it did not complete, or None
     figures: Figures
@@ -193,7 +191,6 @@ class Preparation:
         self.references = np.array([evaluate(reference, t)[:NUM_STATE] for t in self.when.looks])
 
     def experiment(self, scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
-        """Return the result of `prepare` for a scenario."""
         scenario.check()
         true = self._base.truth if truth is None else truth
         return self._base._replace(scenario=scenario, truth=true, network=network_of(scenario))

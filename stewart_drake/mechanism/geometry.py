@@ -34,8 +34,6 @@ _BRANCHES: Final = slice(2 * NUM_LEGS, 3 * NUM_LEGS)  # place of the crank branc
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body."""
-
     mass: float  # kg
     inertia: Array  # principal moments (3,) about its COM, kg m^2
     _: KW_ONLY

@@ -19,8 +19,6 @@ RENAMED: Final = {"beside": "also"}
 
 
 class Analysis(NamedTuple):
-    """One analysis of a scenario."""
-
     help: str  # of the command
     examples: tuple[str, ...]  # of the command, without the program's name
     counts: str = ""  # pieces that its progress counts; empty without progress
@@ -102,7 +100,6 @@ def words_of(name: str) -> tuple[str, ...]:
 
 
 def options_of(name: str) -> "type[Options]":
-    """Return the class of an analysis' options."""
     from stewart_drake.studies import study_options
     from stewart_drake.studies.options import Options
 

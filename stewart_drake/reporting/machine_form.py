@@ -108,7 +108,6 @@ class MachineForm:
         return json.dumps(found)
 
     def wait(self) -> Measurements:
-        """Wait for complete measurements."""
         while not self._asked.wait(0.2):  # short, so that Ctrl-C ends it
             pass
         return measurements_of(self._entries)

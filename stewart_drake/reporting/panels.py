@@ -43,8 +43,6 @@ _CROSS: Final = Line2D([], [], ls="", marker="x", color="#666666", ms=7, mew=2)
 
 @dataclass(frozen=True)
 class Curve:
-    """A line in a panel."""
-
     x: ArrayLike
     y: ArrayLike
     label: str = ""  # for the legend, or empty

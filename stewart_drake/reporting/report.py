@@ -100,8 +100,6 @@ _PACKETS_BELOW: Final = (
 
 @dataclass(frozen=True)
 class ReportData:
-    """Content of a report."""
-
     scenario: Scenario
     failure: Failure | None  # where the reference leaves the workspace; None with runs
     run: SimulationResult | None = None  # of the scenario; None with a `failure`
@@ -246,7 +244,6 @@ def _blocks(document: Document) -> list[Block]:
 
 
 def _caption(figure: str, of_paper: bool) -> str:
-    """Return the caption of a figure of the comparison."""
     what, _, controller = figure.partition("_")
     caption = _CAPTIONS.get(figure)
     if caption is None and what == "delay":

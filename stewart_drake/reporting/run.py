@@ -144,7 +144,6 @@ def _shared_warnings(results: _Runs) -> list[str]:
 
 
 def _base(row: str, run: SimulationResult) -> str:
-    """Return the controller of a row."""
     return str(run.scenario.compare.get(row, {}).get("controller", row))
 
 

@@ -109,8 +109,6 @@ def load_compatible(
 
 
 class Read(NamedTuple):
-    """A scenario that was read."""
-
     scenario: Scenario  # its fields are checked one by one only
     where: str  # opening of a message
     places: dict[str, str]  # the file, or "settings", that set a field last, by its dotted name

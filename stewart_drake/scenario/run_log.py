@@ -53,8 +53,6 @@ _ENCODER: Final = re.compile(r"measurement_A\d")
 
 
 class Channel(NamedTuple):
-    """A signal in a log."""
-
     name: str  # of the signal
     fields: tuple[str, ...]  # names of its components in JSON
     heads: tuple[str, ...]  # of its columns in CSV, with units

@@ -104,7 +104,6 @@ class Hautus:
 
     @property
     def deficient(self) -> tuple[Mode, ...]:
-        """Modes that fail."""
         return tuple(mode for mode in self.modes if mode.margin < self.tolerance)
 
 

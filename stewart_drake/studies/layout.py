@@ -191,8 +191,6 @@ class Problem:
 
 @dataclass(frozen=True)
 class LayoutStudy:
-    """Result of `layout`."""
-
     problem: Problem  # of the searches
     options: LayoutOptions
     searches: dict[str, Found]  # result of each, by its key

@@ -58,8 +58,6 @@ _PATIENCE: Final = 2
 
 @dataclass(frozen=True, eq=False)
 class Repetition:
-    """One repetition of a motion."""
-
     learned: LearnedSignal | None  # torque or angles that were used, or None in the first one
     result: SimulationResult
     error: float  # E of its last period, % s; infinite if it did not complete
@@ -75,8 +73,6 @@ class Repetition:
 
 @dataclass(frozen=True)
 class LearnStudy:
-    """Result of learning."""
-
     experiment: Experiment  # of the scenario
     period: float  # of the motion, s
     repetitions: Sequence[Repetition]  # in order

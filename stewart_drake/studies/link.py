@@ -76,8 +76,6 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class LinkStudy:
-    """Result of the study."""
-
     scenario: Scenario  # with the network
     runs: int  # seeds per bound and loss
     bounds: Sequence[Cell]  # over the bound, the shortest first, at the scenario's loss

@@ -67,8 +67,6 @@ def quantity(name: str, text: str, unit: str) -> float:
 
 
 class Option(NamedTuple):
-    """One option of a study."""
-
     name: str  # of the field and of the Python argument
     annotation: Any  # of the Python argument
     default: Any  # in both; `inspect.Parameter.empty` for none

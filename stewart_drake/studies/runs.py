@@ -32,8 +32,6 @@ _Number = Annotated[float, Field(ge=0), WrapValidator(_or_nan)]
 
 @dataclass(config=STRICT)
 class Outcome:
-    """End of a run."""
-
     # as of a simulation; `not_assembled` if drawn parts do not fit together, `refused` if the
     # scenario with the drawn values cannot be prepared
     status: Literal["completed", "left_workspace", "solver_failed", "not_assembled", "refused"]

@@ -55,8 +55,6 @@ class Variant:
 
 
 class Quantity(NamedTuple):
-    """Unknown quantity."""
-
     # function of random numbers and the context of its model. It takes the same number of random
     # numbers for any range, so that a narrower range leaves other draws unchanged.
     draw: Callable[[Generator, Any], Any]
@@ -93,7 +91,6 @@ def draw_from(model: Model, rng: Generator, about: Any) -> Draw:
 
 
 def apply_draw(model: Model, scenario: Scenario, mechanism: Mechanism, one: Draw) -> Variant:
-    """Return a scenario and its mechanism with a draw."""
     variant = Variant(scenario, mechanism, dataclasses.asdict(scenario))
     for name, value in one.items():
         model[name].apply(variant, value)

@@ -69,8 +69,6 @@ class HealthFeatures:
 
 @dataclass(frozen=True)
 class FixedPolicy:
-    """Fixed weights."""
-
     first: Array  # (2,) w_Q and w_R
 
 

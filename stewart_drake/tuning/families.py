@@ -340,7 +340,6 @@ def faulty_family(
 def _drawn(
     name: str, model: Model, base: Scenario, about: About, number: int, seed: list[int]
 ) -> tuple[list[Draw], dict[str, Condition]]:
-    """Return draws of a model, and the conditions that they make of a scenario."""
     draws = [draw_from(model, np.random.default_rng([*seed, i]), about) for i in range(number)]
     return draws, {
         name.format(i): Condition(vary(model, base, one), one["delay_steps"], one["frequency"], i)

@@ -358,7 +358,6 @@ class FeatureRows(NamedTuple):
 
 
 def curves_of(data: xr.Dataset, features: FeatureName) -> Curves:
-    """Return the cost curves of a data set."""
     values = {"densities": "density", "health": "health"}[features]
     ratios = np.log10(data.weights.values[:, 0] / data.weights.values[:, 1])
     whole = not len(ratios) % len(RATIOS)
