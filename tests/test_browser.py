@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import stewart_drake as sd
-from stewart_drake.reporting.replay import write_replay
+from stewart_drake.reporting.replay import replay_html
 from tests.browser import needs_chromium
 
 pytestmark = [needs_chromium, pytest.mark.slow]
@@ -22,7 +22,8 @@ def run():
 @pytest.fixture(scope="module")
 def page(run, tmp_path_factory):
     path = tmp_path_factory.mktemp("replay") / "replay.html"
-    return write_replay(run, sd.load_mechanism("paper"), path, "paper, from rest")
+    path.write_text(replay_html(run, sd.load_mechanism("paper"), "paper, from rest"))
+    return path
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.preparation import prepare
-from stewart_drake.reporting.csv_file import signals_csv, write_csv
+from stewart_drake.reporting.csv_file import signals_csv
 from stewart_drake.scenario.reference_files import read_csv
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -60,7 +60,8 @@ def test_every_number_of_every_signal_is_there(run):
 
 def test_a_run_comes_back_as_a_motion(run, tmp_path):
     """An exported run is the reference of the next run."""
-    path = write_csv(run.signals, tmp_path / "run.csv")
+    path = tmp_path / "run.csv"
+    path.write_text(signals_csv(run.signals))
     settings = ("plant.kind=exact", "duration=0.3", "reference.kind=csv", f"reference.file={path}")
     reference = prepare(sd.load_scenario("paper", settings=settings)).reference
     poses = np.array([reference.value(t)[:, 0] for t in run.signals.time.values])
@@ -75,7 +76,8 @@ def test_a_run_comes_back_as_a_motion(run, tmp_path):
 
 
 def test_an_exported_file_must_be_whole_in_its_motion_only(run, tmp_path):
-    path = write_csv(run.signals, tmp_path / "run.csv")
+    path = tmp_path / "run.csv"
+    path.write_text(signals_csv(run.signals))
     lines = path.read_text().splitlines()
     header = lines[0].split(",")
     place = header.index("pose_yaw[rad]")

@@ -25,6 +25,7 @@ from stewart_drake.cli.common import (
     open_meshcat,
 )
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.fileio import write_whole
 from stewart_drake.reporting.document import Caution
 from stewart_drake.reporting.terminal import count_bar, echo, progress_bars
 from stewart_drake.scenario.loading import load_compatible, load_scenario, title_of
@@ -95,9 +96,9 @@ def simulate(
     delivery.discard(CSV, REPLAY, *_pictures(RUN_FIGURES))
     if out is not None:
         if csv:
-            from stewart_drake.reporting.csv_file import write_csv
+            from stewart_drake.reporting.csv_file import signals_csv
 
-            write_csv(result.signals, out / CSV)
+            write_whole(out / CSV, signals_csv(result.signals))
         result.save(out)
         delivery.wrote("summary.json", "signals.nc", *[CSV] * csv)
     delivery.figures(result.plot)
@@ -304,11 +305,12 @@ def report(
 
     def film(folder: Path) -> None:
         nonlocal replay
-        from stewart_drake.reporting.replay import write_replay
+        from stewart_drake.reporting.replay import replay_html
 
         assert found.run is not None
         mechanism = simulated_machine(found.scenario)
-        replay = write_replay(found.run, mechanism, folder / REPLAY, name).read_text("utf-8")
+        replay = replay_html(found.run, mechanism, name)
+        write_whole(folder / REPLAY, replay)
 
     def page(folder: Path) -> None:
         document = report_document.document(found, name, replay)

@@ -13,7 +13,6 @@ from pydrake.systems.framework import (
     System,
 )
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Saturation
-from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
@@ -42,14 +41,11 @@ from stewart_drake.loop.servos import (
     servo_loop,
 )
 from stewart_drake.loop.tuner import AnnTuner, DensityWindow, LawTuner, weights_source
-from stewart_drake.scenario.config import (
-    Scenario,
-)
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.link import measurement_times
 from stewart_drake.scenario.signals import NUM_TORQUES, RATES, SIGNALS, exported_ports
 from stewart_drake.tuner.source import DensityFeatures, PaperPolicy
-from stewart_drake.types import Array
 
 _TUNER_INPUTS: Final = {
     "density": "density.density",
@@ -184,12 +180,6 @@ def _connect(builder: DiagramBuilder, source: OutputPort | str, target: str) -> 
     builder.Connect(source, builder.GetSubsystemByName(system).GetInputPort(port))
 
 
-def _add_reference(
-    builder: DiagramBuilder, experiment: Experiment, planned: Trajectory, times: Array
-) -> None:
-    builder.AddNamedSystem("reference", Reference(experiment.reference, planned, times))
-
-
 def _add_torques(builder: DiagramBuilder, experiment: Experiment) -> float:
     """Add a controller of torques, their limit and link; return its catch-up, s."""
     channel: Channel = Wire()
@@ -222,7 +212,8 @@ def _add_servos(builder: DiagramBuilder, experiment: Experiment) -> float:
     first, believed = commands_in_flight(experiment, law, law.timeline.delay)
     last = believed[-1] if len(believed) else first
     builder.AddNamedSystem("controller", ServoController(law, last))
-    _add_reference(builder, experiment, planned, law.preview_times)
+    reference = Reference(experiment.reference, planned, law.preview_times)
+    builder.AddNamedSystem("reference", reference)
     _, in_flight = commands_in_flight(experiment, law, sc.true_delay)
     builder.AddNamedSystem("delay_chain", wire(experiment, in_flight, "command"))
     rest = machine, first, sc.controller.period, law.reports
@@ -324,7 +315,8 @@ def _measured(builder: DiagramBuilder, experiment: Experiment, motors: str) -> O
 def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[PredictiveLqi, float]:
     """Add the shipped controller, its reference and weights; return law and catch-up, s."""
     law, planned, catch_up = control_law(experiment)
-    _add_reference(builder, experiment, planned, law.preview_times)
+    reference = Reference(experiment.reference, planned, law.preview_times)
+    builder.AddNamedSystem("reference", reference)
     queue = first_queue(experiment, law)
     motion = followed_motion(law, planned, experiment.reference)
     builder.AddNamedSystem("controller", DelayLqiController(law, queue, motion))
@@ -345,7 +337,8 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[Predictiv
 def _add_own_controller(builder: DiagramBuilder, experiment: Experiment) -> None:
     """Add the user's controller, its reference, and the system that samples it."""
     sc, system = experiment.scenario, experiment.own.systems["controller"]
-    _add_reference(builder, experiment, experiment.reference, np.zeros(1))
+    reference = Reference(experiment.reference, experiment.reference, np.zeros(1))
+    builder.AddNamedSystem("reference", reference)
     builder.AddNamedSystem("own_controller", system)
     sampled = SampledController(sc.controller.period, experiment.torque_limit)
     builder.AddNamedSystem("controller", sampled)

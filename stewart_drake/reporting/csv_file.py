@@ -6,7 +6,6 @@ import numpy as np
 import xarray as xr
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import write_whole
 from stewart_drake.scenario.run_log import EXPECTED, headings, read_log
 from stewart_drake.scenario.signals import SIGNALS
 from stewart_drake.types import Array
@@ -38,11 +37,6 @@ def columns_of(signals: xr.Dataset) -> tuple[list[str], Array]:
         header += headings(str(name), labels, units)
         columns.append(signal.transpose("time", *others).values.reshape(len(signal.time), -1))
     return header, np.hstack(columns)
-
-
-def write_csv(signals: xr.Dataset, path: Path) -> Path:
-    write_whole(path, signals_csv(signals))
-    return path
 
 
 def read_signals(path: Path) -> xr.Dataset:

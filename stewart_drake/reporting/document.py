@@ -349,7 +349,7 @@ def _table(part: _Part, caption: str, items: Any, context: Mapping[str, Any]) ->
 @cache
 def _template(name: str) -> "list[tuple[Template, bool, list[_Part]]]":
     """Return the headings of a template, whether they are folded, and their parts."""
-    environment = _environment()
+    environment = templates()
     assert environment.loader is not None
     found: list[tuple[Template, bool, list[_Part]]] = []
     columns: dict[str, list[list[Template]]] = {}
@@ -375,7 +375,8 @@ def _template(name: str) -> "list[tuple[Template, bool, list[_Part]]]":
 
 
 @cache
-def _environment() -> "Environment":
+def templates() -> "Environment":
+    """Return the templates of all documents and pages."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     def shown(value: object) -> object:

@@ -13,12 +13,12 @@ from functools import cache
 from pathlib import Path
 from urllib.parse import quote
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment
 from matplotlib.figure import Figure
 
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.versions import versions
-from stewart_drake.reporting.document import Document, sentence
+from stewart_drake.reporting.document import Document, sentence, templates
 from stewart_drake.reporting.style import figure_style, for_dark_too
 
 
@@ -82,13 +82,9 @@ def command_line(
 
 @cache
 def environment() -> Environment:
-    """Return the templates of all pages."""
-    found = Environment(
-        loader=PackageLoader("stewart_drake.reporting"),
-        autoescape=True,  # names come from files
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+    # Names come from files, and are escaped. Numbers in styles and scripts keep all digits.
+    found = templates().overlay(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, finalize=None
     )
     found.filters |= {"source": source, "size": size}
     found.filters |= {"sentence": sentence, "kind": lambda block: type(block).__name__}

@@ -10,7 +10,6 @@ from pydrake.geometry import Meshcat, MeshcatParams, Rgba
 from pydrake.math import RotationMatrix
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.versions import versions
 from stewart_drake.loop.preparation import simulated_machine
 from stewart_drake.loop.results import SimulationResult
@@ -115,11 +114,6 @@ def _html(signals: xr.Dataset, mechanism: Mechanism, title: str, outcome: str) -
     assert end, "Meshcat's page has no body"
     whole = f"{before}{overlay}{end}{after}".replace("Drake MeshCat", "Replay", 1)
     return whole.replace("<head>", f"<head>{_VIEWPORT}", 1)
-
-
-def write_replay(result: SimulationResult, mechanism: Mechanism, path: Path, title: str) -> Path:
-    write_whole(path, replay_html(result, mechanism, title))
-    return path
 
 
 def _quiet_meshcat() -> Meshcat:

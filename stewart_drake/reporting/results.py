@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pandas
 import xarray
 
+from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.jsonio import write_json
 from stewart_drake.loop import results as loop_results
 from stewart_drake.loop.preparation import simulated_machine
@@ -109,15 +110,17 @@ class SimulationResult(loop_results.SimulationResult):
         Returns:
             The path, the Meshcat, or without either an object that a notebook shows.
         """
-        from stewart_drake.reporting.replay import replay, replay_html, write_replay
+        from stewart_drake.reporting.replay import replay, replay_html
 
         machine = simulated_machine(self.scenario) if mechanism is None else mechanism
         if meshcat is not None:
             return replay(self.signals, machine, meshcat)
+        text = replay_html(self, machine, title)
         if path is None:
-            return Replay(replay_html(self, machine, title))
+            return Replay(text)
         Path(path).parent.mkdir(parents=True, exist_ok=True)
-        return write_replay(self, machine, Path(path), title)
+        write_whole(Path(path), text)
+        return Path(path)
 
 
 class ComparisonResult(dict[str, SimulationResult]):
