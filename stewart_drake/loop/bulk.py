@@ -323,10 +323,7 @@ class CompiledController:
         self._compiled = CompiledLaw(prepared.law)
         self._memory = self._compiled.start(first_queue(prepared.experiment, prepared.law))
         samples = len(prepared.previews)
-        self.weights, self.rows = (
-            np.tile(config.weights, (samples, 1)),
-            np.empty((samples, 0)),
-        )
+        self.weights, self.rows = np.tile(config.weights, (samples, 1)), np.empty((samples, 0))
         self._tuned, scratch = np.empty(0), self._compiled.scratch
         if tuner is not None:
             self._tuned = np.empty(c.lib.stewart_tuner_memory(tuner.it))

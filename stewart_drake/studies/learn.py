@@ -311,7 +311,7 @@ class Anderson:
 
 
 class Lessons:
-    """What the repetitions of a scenario's motion teach.
+    """State of learning from the repetitions of a scenario's motion.
 
     Attributes:
         period: of the motion, s.
