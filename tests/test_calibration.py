@@ -74,7 +74,7 @@ def test_a_file_is_read_back_to_the_last_digit(tmp_path_factory, names, seed):
         ({"covariance": [[0.0, 0.1], [0.1, 1.0]]}, "an eigenvalue of"),
         ({"covariance": "none"}, "covariance: got 'none'; expected a valid array"),
         ({"means": [1.0]}, "means: unknown key; did you mean mean"),
-        ({"mechanism": 3}, "mechanism: got 3; expected a valid string"),
+        ({"mechanism": 3}, "mechanism: got 3; expected text"),
     ],
 )
 def test_a_wrong_file_is_refused_in_one_line(tmp_path, wrong, message):

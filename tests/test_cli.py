@@ -167,7 +167,7 @@ def test_a_process_says_the_same(tmp_path):
     path.write_text("duration: 2021-05-30")
     done = subprocess.run(command("simulate", str(path)), capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"error: {path}: duration: got '2021-05-30'; expected a valid number\n"
+    assert done.stderr == f"error: {path}: duration: got '2021-05-30'; expected a number\n"
 
 
 def test_help_comes_without_drake():

@@ -198,7 +198,7 @@ def test_a_rows_own_controller_starts_from_the_files_folder(tmp_path, monkeypatc
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ("{actuator: 5}", "actuator: got 5; expected an object"),
+        ("{actuator: 5}", "actuator: got 5; expected a mapping of fields"),
         ("{actuator: {torque_limit: -1}}", "actuator.torque_limit: got -1; expected a number"),
         ("{controller: [./a.yaml]}", "controller: got ['./a.yaml']; expected text"),
     ],

@@ -64,6 +64,10 @@ def test_robustness_tells_the_unit_of_everything_that_it_varies(capsys):
         assert main(["analyze", "robustness", "--vary", f"{name}=-1"]) == 2
         error = capsys.readouterr().err
         assert f"{name}: {unit}" in " ".join(error.split()) and len(error.splitlines()) == 1
+    assert main(["analyze", "robustness", "--vary", "zzz=1"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: --vary: zzz: unknown key; expected one of payload, ")
+    assert "share of" not in error  # units are for a wrong value
 
 
 # ---------------------------------------------------------------- completion

@@ -112,7 +112,7 @@ INVALID = [
     ({"name": "my robot"}, "name: got 'my robot'", "letters, digits"),
     ({"name": "ab\n"}, r"name: got 'ab\n'", "letters, digits"),
     ({"name": ""}, "name: got ''", "letters, digits"),
-    ({"name": 3}, "name: got 3", "valid string"),
+    ({"name": 3}, "name: got 3", "text"),
 ]
 
 
@@ -147,7 +147,7 @@ def test_invalid_fields_are_refused_in_one_line(edits, got, allowed, load):
         ),
         (
             {"plate.mass": "heavy", "rod.mass": ABSENT},
-            "plate.mass: got 'heavy'; expected a valid number; rod.mass: is missing",
+            "plate.mass: got 'heavy'; expected a number; rod.mass: is missing",
         ),
     ],
 )

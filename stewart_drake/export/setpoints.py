@@ -134,7 +134,7 @@ def make_setpoints(
     if not plain and scenario.actuator.kind != "position_servo":
         raise ConfigError(
             f"actuator.kind: got {scenario.actuator.kind!r}; expected 'position_servo', whose "
-            "stiffness the setpoints compensate, or plain setpoints"
+            "stiffness the setpoints compensate, or plain setpoints (`--plain`, plain=True)"
         )
     experiment = prepare(scenario)
     learned = learned_signal(experiment)

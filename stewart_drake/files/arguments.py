@@ -34,8 +34,8 @@ def fixed(
 
 
 def listed(values: Array) -> str:
-    """Return numbers as text, an array in brackets."""
-    text = ", ".join(f"{v:g}" for v in np.ravel(values))
+    """Return numbers as text, an array in brackets and cut after 18."""
+    text = ", ".join(f"{v:g}" for v in np.ravel(values)[:18]) + ", ..." * (np.size(values) > 18)
     return f"[{text}]" if np.ndim(values) else text
 
 

@@ -206,7 +206,7 @@ def validate_pairs(
             given[name.strip()] = parse_yaml(text, f"{option}: {name.strip()}")
         return validate(type_, given, option)
     except ConfigError as error:
-        named = set(re.findall(r"\w+", str(error)))
+        named = set(re.findall(r"\w+", str(error).partition("; expected one of ")[0]))
         shown = [f"{name}: {unit}" for name, unit in units.items() if name in named]
         raise ConfigError(f"{error} ({'; '.join(shown)})" if shown else str(error)) from None
 
@@ -256,10 +256,22 @@ def _cut(text: str, length: int) -> str:
     return text if len(text) <= length else f"{text[: length - 3]}..."
 
 
+_PLAIN: Final = {
+    "a valid integer": "a whole number",
+    "a valid boolean": "true or false",
+    "a valid number": "a number",
+    "a valid string": "text",
+    "an object": "a mapping of fields",
+}
+"""Words of pydantic, and those of a message."""
+
+
 def explain(data: Any, error: Any) -> str:
     """Return an error of pydantic as `place: got value; expected what is accepted`."""
     place, value = _place(data, error["loc"]), error["input"]
     expected = re.sub(r"^(\w+ should (be|have) |Value error, )| after validation", "", error["msg"])
+    for theirs, plain in _PLAIN.items():
+        expected = expected.replace(theirs, plain)
     if error["type"].startswith("missing"):
         return f"{place}.{error['loc'][-1]}: is missing".removeprefix(".")
     if error["type"] == "union_tag_invalid":
