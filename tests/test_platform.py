@@ -288,6 +288,7 @@ def own_plant(builder, finalized):
     ("use", "message"),
     [
         (lambda b: sd.AddStewartPlatform(b, PAPER, plant=own_plant(b, True)), "is finalized; exp"),
+        (lambda b: sd.AddStewartPlatform(b, PAPER, plant=3), "plant: got 3; expected a Multibody"),
         (
             lambda b: sd.AddStewartPlatform(
                 b, PAPER, sd.PlantConfig(kind="exact"), plant=own_plant(b, False)

@@ -536,8 +536,12 @@ def AddStewartPlatform(
         exact.set_name(machine.name)
         return StewartPlatform(builder, machine, builder.AddSystem(exact))
     scene_graph = None
-    if plant is not None and plant.is_finalized():
-        raise ConfigError("plant: got one that is finalized; expected one before plant.Finalize()")
+    if plant is not None:
+        of_kind("plant", plant, MultibodyPlant)
+        if plant.is_finalized():
+            raise ConfigError(
+                "plant: got one that is finalized; expected one before plant.Finalize()"
+            )
     own = plant is None
     if plant is None:
         plant, scene_graph = AddMultibodyPlant(
