@@ -77,13 +77,16 @@ def _deficiencies(systems: Sequence[System]) -> list[Paragraph]:
     found = []
     for family, group in groupby(systems, key=lambda system: system.family):
         some = list(group)
-        for test, opening in (("reach", "no torque"), ("view", "no output")):
+        for test, opening, property_ in (
+                ("reach", "no torque", "controllable"),
+                ("view", "no output", "observable"),
+            ):
             failing = [system for system in some if getattr(system, test).deficient]
             if failing:
                 words = [word for word in failing[-1].words if word.startswith(opening)]
                 text = (
-                    f"{capital(family)}: {len(failing)} of {len(some)} models fail "
-                    f"here, such as {failing[-1].name}: {'; '.join(words)}."
+                    f"{capital(family)}: {len(failing)} of {len(some)} models are not "
+                    f"{property_}, such as {failing[-1].name}: {'; '.join(words)}."
                 )
                 found.append(Paragraph(text, brief=True))
     return found
