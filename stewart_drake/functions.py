@@ -366,7 +366,7 @@ def run_live(
 
 @takes(MachineOptions)
 def run_machine(scenario: Scenario | str | Path, *, options: MachineOptions) -> dict[str, Any]:
-    """Simulate a machine in real time, or drive a robot, for a controller over UDP.
+    """Simulate a machine, or drive a robot, over UDP in real time.
 
     Returns what happened.
 

@@ -285,7 +285,7 @@ def machine(
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> int:
-    """Simulate a machine in real time, or drive a robot, for a controller over UDP.
+    """Simulate a machine, or drive a robot, over UDP in real time.
 
     Plant, sensor, delay, link and limits are those of the scenario. Ctrl-C ends it.
     """
