@@ -74,6 +74,7 @@ def test_hautus_of_the_paper(tmp_path, capsys):
     told = capsys.readouterr().out
     assert not too_long(told)
     assert "All 30 models are stabilisable and detectable" in told
+    assert "Paper's chain: 3 of 3 models are not observable, such as" in " ".join(told.split())
     assert "stewart-drake analyze hautus paper --out" in page
     assert page.count("<img") == 2
 

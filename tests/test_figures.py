@@ -93,7 +93,7 @@ def test_axes_name_their_units(run):
         "states": ["deg"] * 3 + ["mm"] * 3,
         "errors": ["deg"] * 3 + ["mm"] * 3,
         "torques": ["N m"] * 6,
-        "parameters": ["mN m"] * 6 + ["kg", "mN m s/rad"],
+        "parameters": ["µN m"] * 6 + ["kg", "µN m s/rad"],
     }.items():
         labels = sorted(ax.get_ylabel() for ax in drawn[name].axes)
         assert sorted(label.partition("[")[2].rstrip("]") for label in labels) == sorted(units)

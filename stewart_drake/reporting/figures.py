@@ -33,8 +33,12 @@ TORQUE_CONTROLLERS: Final = ("delay_lqr", "delay_lqi", "predictor_lqi")
 """Delay-aware controllers, with figures of their torques in a comparison."""
 
 _SYMBOLS: Final = dict(zip(COORDINATES, ("roll φ", "pitch θ", "yaw ψ", "x", "y", "z"), strict=True))
-_PARAMETER_UNITS: Final = ("mN m",) * 6 + ("kg", "mN m s/rad")
-_PARAMETER_FACTORS: Final = np.array([1e3] * 6 + [1.0, 1e3])
+_PARAMETER_GROUPS: Final = (
+    (slice(0, 6), {"mN m": 1e3, "µN m": 1e6}),
+    (slice(6, 7), {"kg": 1.0, "g": 1e3}),
+    (slice(7, 8), {"mN m s/rad": 1e3, "µN m s/rad": 1e6}),
+)
+"""Components of the parameters that share a unit, with the units to choose from."""
 _STATE_REACH: Final = 0.3
 _ERROR_REACH: Final = 0.5
 """Largest widening of an axis by a diverging run, as a share of the reference's peak to peak."""
@@ -176,21 +180,23 @@ def _packet_strip(ax: Axes, run: SimulationResult) -> None:
 
 def _parameters(run: SimulationResult) -> Figure:
     time, xlim = run.signals.time.values, (0.0, shown_until(run))
-    true, values, widths = (
-        _PARAMETER_FACTORS * data
-        for data in (
-            np.array(run.scenario.plant_parameters[:NUM_PARAMETERS]),
-            run.signals.parameters.values,
-            2 * run.signals.parameter_std.values,
-        )
-    )
+    true = np.array(run.scenario.plant_parameters[:NUM_PARAMETERS])
+    values, widths = run.signals.parameters.values, 2 * run.signals.parameter_std.values
+    units, factors = [""] * NUM_PARAMETERS, np.ones(NUM_PARAMETERS)
+    shown = np.nanmax(np.abs(np.vstack([true, values, _LEAST_SIGMAS * widths / 2])), axis=0)
+    for some, choice in _PARAMETER_GROUPS:
+        # The first unit in which the axis reaches 0.1, else the last.
+        unit = next((u for u, f in choice.items() if f * shown[some].max() > 0.1), [*choice][-1])
+        units[some] = [unit] * len(units[some])
+        factors[some] = choice[unit]
+    true, values, widths = factors * true, factors * values, factors * widths
     panels = []
     for k, name in enumerate(PARAMETERS):
         value, width = values[:, k], widths[:, k]
         least = _LEAST_SIGMAS * np.nanmax(width) / 2
         panels.append(
             Panel(
-                f"{name.replace('_', ' ')}  [{_PARAMETER_UNITS[k]}]",
+                f"{name.replace('_', ' ')}  [{units[k]}]",
                 [
                     Curve(time, np.full(len(time), true[k]), "true value", style.TRUTH),
                     Curve(time, value, "estimate", band=(value - width, value + width, "± 2 σ")),
