@@ -78,9 +78,9 @@ def _deficiencies(systems: Sequence[System]) -> list[Paragraph]:
     for family, group in groupby(systems, key=lambda system: system.family):
         some = list(group)
         for test, opening, property_ in (
-                ("reach", "no torque", "controllable"),
-                ("view", "no output", "observable"),
-            ):
+            ("reach", "no torque", "controllable"),
+            ("view", "no output", "observable"),
+        ):
             failing = [system for system in some if getattr(system, test).deficient]
             if failing:
                 words = [word for word in failing[-1].words if word.startswith(opening)]
