@@ -287,6 +287,7 @@ def test_steps_longer_than_the_period_are_reported(kind, median, worst, told):
     summary = {
         "controller_step_ms": {"median": median, "worst": worst},
         "controller_margin": None,
+        "counts": {"nonfinite_torque": 0},
         "estimator_consistency": {"nis_ratio": 1.0, "verdict": "consistent"},
         "status": "completed",
     }

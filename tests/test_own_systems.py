@@ -150,6 +150,7 @@ def test_what_is_no_number_is_sent_as_before_and_counted():
     result = sd.simulate(scenario("duration=0.1", faults), controller=broken)
     counts = result.summary["counts"]
     assert counts["nonfinite_torque"] == 3 and counts["measurements_missing"] == 2
+    assert any("not finite at 3 samples" in said for said in result.summary["warnings"])
     assert (result.signals.torque_commanded == 1e-3).all()
     for name in ("integral", "weights", "parameters", "state_estimate"):
         assert np.isnan(result.signals[name]).all()

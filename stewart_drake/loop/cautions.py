@@ -126,6 +126,11 @@ def cautions_after(experiment: Experiment, summary: RunSummary) -> list[str]:
             f"{period:.3g} ms: the search for the delay takes as long as it has hypotheses, "
             "and a real machine would get the torques of such samples late"
         )
+    if broken := summary["counts"]["nonfinite_torque"]:
+        found.append(
+            f"the controller's torque was not finite at {broken} samples, which sent the one "
+            "before again"
+        )
     found += overconfidence(summary)
     margin = summary["controller_margin"]
     if summary["status"] == "completed" and margin is not None and margin["stable"] is False:
