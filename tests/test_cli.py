@@ -89,7 +89,8 @@ def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys):
     assert not too_long(out)
     rows = [next(line for line in lines if line.startswith(f"{n} ")) for n in CONTROLLERS]
     assert all(f"{n} ({LABELS[n]})" in " ".join(out.split()) for n in CONTROLLERS)
-    assert "left workspace" in rows[0] and "at 1.36 s, leg 2" in lines[lines.index(rows[0]) + 1]
+    second, third = lines[lines.index(rows[0]) + 1 :][:2]
+    assert "left workspace" in rows[0] and "at 1.36 s," in second and "leg 2" in third
     assert [row.split()[1] for row in rows] == ["NaN", "NaN", "225", "80", "-"]
     assert rows[-1].split()[3:7] == ["15.2", "roll", "36", "%"], "floor and worst beside E_ac"
     heads = next(line for line in lines if "asked" in line)
@@ -253,6 +254,11 @@ def test_a_pipe_gets_a_line_now_and_then(capsys):
     # Twenty in 0.2 to 0.4 s leaves 1.4 to 2.8 s for 140; the forty of an earlier start took none.
     assert re.fullmatch(r"runs: 60 of 200, about [1-9] s left, after \d s", lines[-1]), said
     assert "\r" not in said and "\x1b" not in said
+
+
+def test_lines_of_progress_differ_for_ten_minutes():
+    said = [terminal._duration(time) for time in (9.6, 61, 599, 601, 5400)]
+    assert said == ["10 s", "1 min 1 s", "9 min 59 s", "10 min", "1.5 h"]
 
 
 @pytest.mark.usefixtures("often")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
@@ -237,3 +238,12 @@ def test_a_plan_can_be_run(tmp_path):
     assert main(["simulate", str(tmp_path / "scenario.yaml"), *words, "--quiet"]) == 0
     run = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert run["status"] == "completed"
+
+
+@pytest.mark.slow
+def test_the_steps_of_the_multibody_plant_are_no_wrong_machine(tmp_path):
+    scenario = sd.load_scenario("paper", settings=("duration=4",))
+    sd.simulate(scenario, judge_stability=False).save(tmp_path)
+    found = sd.identify(tmp_path, "paper").summary
+    assert found["chi2"]["all"] < 1.5
+    assert found["delay_s"] == pytest.approx(0.8, abs=0.001), (found["delay_std_s"], found["chi2"])

@@ -80,7 +80,7 @@ def test_a_file_gives_the_same_as_the_signal(tmp_path, name, settings):
     ("words", "message"),
     [
         (["paper", "--set", "controller.limits=qp"], "controller.learned: got 'learned.npz' with"),
-        (["paper", "--set", "link.kind=network"], "controller.learned: got 'learned.npz' with"),
+        (["paper", "--set", "link.kind=network"], "link.kind: got 'network' for learning"),
         (["reachy_mini", "--set", "reference.kind=hold"], "only a motion that repeats is learned"),
         (["reachy_mini", "--learned", "no/such/l.npz"], "--learned: got no/such/l.npz; expected"),
         (["reachy_mini", "--duration", "5"], "--learn: expected none of --duration, --log"),

@@ -508,6 +508,10 @@ def test_bounds_are_alike_where_the_seeds_do_not_tell_them_apart(known_outcomes)
     assert document(replace(study, bounds=cells[:2])).tone == "good"
     assert "--runs 16 would about halve this. As good, within 1 %: 0.4 s. Default" in text
     assert "Every other bound is worse (t-test, 95 % confidence). Default" in verdict(cells[:2])
+    few = verdict([cells[0], cells[4]])  # one lost run of four is no proof
+    assert "0.5 s lost more runs, which so few do not confirm" in few and "Every" not in few
+    many = [cells[0]._replace(runs=8, errors=(*common, *common)), cells[4]._replace(runs=8)]
+    assert replace(study, bounds=many).hardly_lost == []  # 3 of 8 against 8 of 8
     alone = [cell._replace(runs=1, errors=cell.errors[:1]) for cell in cells[:2]]
     assert "One seed is not enough to compare bounds" in verdict(alone)
 

@@ -257,5 +257,8 @@ def test_machine_and_controller_log_a_live_run(tmp_path):
     # The controller measures without noise what the machine's log has as true.
     there = np.isfinite(read.measurement.values).all(axis=1)
     seen = read.measurement.values[there]
-    distance = np.abs(seen[:, None, :6] - true.pose.values).max(axis=2).min(axis=1)
-    assert np.median(distance) < 1e-9
+    distance = np.abs(seen[:, None, :6] - true.pose.values).max(axis=2)
+    assert np.median(distance.min(axis=1)) < 1e-9
+    rows = distance.argmin(axis=1)  # both logs have the torque that acts from there on
+    off = true.torque_applied.values[rows] - read.torque_applied.values[there]
+    assert np.median(np.abs(off).max(axis=1)) < 1e-9

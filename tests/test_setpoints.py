@@ -155,7 +155,11 @@ def test_the_command_writes_the_file(tmp_path, capsys):
     header, *rows = out.read_text().splitlines()
     assert "setpoint_6[deg]" in header and len(rows) == 100
     kept = out.read_text()
-    for wrong in (["--from", "1,2"], ["--rate", "0"], ["--units", str(tmp_path / "none.yaml")]):
+    missing, far = str(tmp_path / "none.yaml"), "0,0,0,0,0,1"
+    for wrong in (["--from", "1,2"], ["--from", far], ["--rate", "0"], ["--units", missing]):
         assert main([*common, *wrong]) == 2
-        assert capsys.readouterr().err.count("\n") == 1
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and (
+            wrong[0] == "--units" or f"error: {wrong[0]}: got" in said
+        )
     assert out.read_text() == kept

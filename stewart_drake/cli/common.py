@@ -105,6 +105,16 @@ def check_writable(directory: Path | None, *, alone: bool = True) -> None:
         ) from None
 
 
+@contextlib.contextmanager
+def named(**options: str) -> Iterator[None]:
+    """Replace the name of a parameter in an error by the option that sets it."""
+    try:
+        yield
+    except ConfigError as error:
+        name, colon, rest = str(error).partition(":")
+        raise ConfigError(f"{options.get(name, name)}{colon}{rest}") from None
+
+
 def check_file(path: Path | None, option: str = "--out") -> None:
     """Check that a file can be written, and make its directory; `option` names it in errors."""
     if path is None:

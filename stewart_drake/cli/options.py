@@ -2,12 +2,12 @@
 
 import contextlib
 import inspect
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Annotated, Any
 
 import typer
 
-from stewart_drake.files.errors import ConfigError
+from stewart_drake.cli.common import named
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.options import Option, Options
 
@@ -53,15 +53,9 @@ class Given:
             values = {one.name: self._value(one, load) for one in _offered(self._kind)}
             return self._kind(**(values | dict(more or {})))
 
-    @contextlib.contextmanager
-    def named(self) -> Iterator[None]:
+    def named(self) -> contextlib.AbstractContextManager[None]:
         """Replace the name of a field in an error by the option that sets it."""
-        flags = {one.name: f"--{one.dashed}" for one in _offered(self._kind)}
-        try:
-            yield
-        except ConfigError as error:
-            name, colon, rest = str(error).partition(":")
-            raise ConfigError(f"{flags.get(name, name)}{colon}{rest}") from None
+        return named(**{one.name: f"--{one.dashed}" for one in _offered(self._kind)})
 
     def _value(self, one: Option, load: Any) -> Any:
         typed = self._typed[_name(one)]

@@ -22,6 +22,7 @@ from stewart_drake.cli.common import (
     check_file,
     check_log,
     check_writable,
+    named,
     open_meshcat,
 )
 from stewart_drake.files.errors import ConfigError
@@ -206,14 +207,15 @@ def setpoints(
     and torque of each motor.
     """
     check_file(out)
-    made = sd.setpoints(
-        *(scenario, rate, out),
-        plain=plain,
-        start=None if start is None else _pose(start),
-        units=units,
-        controller=controller,
-        settings=settings or (),
-    )
+    with named(start="--from", rate="--rate"):
+        made = sd.setpoints(
+            *(scenario, rate, out),
+            plain=plain,
+            start=None if start is None else _pose(start),
+            units=units,
+            controller=controller,
+            settings=settings or (),
+        )
     kind = "plain" if plain else "compensated"
     echo(f"written to {out}: {len(made.times)} {kind} setpoints at {rate:g} Hz")
     torque, speed = abs(made.torques).max(), abs(made.crank_rates).max()

@@ -46,6 +46,11 @@ _HEADER: Final = (
 # Least standard deviations: the error of the integration
 LEAST_STD: Final = np.repeat([1e-6, 1e-7, 1e-5, 1e-6], 3)  # state: rad, m and per s
 LEAST_ANGLE: Final = 1e-6  # crank angle, rad
+_STEPS: Final = 1e5
+"""Factor on them for the multibody plant, per s of its step: its errors are of first order.
+
+They look like a delay that is up to a step shorter.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,11 +187,12 @@ def _measured(measured: Array, scenario: Scenario, samples: Array) -> tuple[Arra
 
     They are measured at each sample of the controller.
     """
-    sensor = scenario.sensor
+    sensor, plant = scenario.sensor, scenario.plant
+    least = max(1.0, _STEPS * plant.time_step) if plant.kind == "multibody" else 1.0
     if sensor.kind == "state":
         values = np.full((len(samples), NUM_MEASURED), np.nan)
         values[:, POSE.start :] = measured
-        noise = np.hypot(sensor.noise_std, LEAST_STD)
+        noise = np.hypot(sensor.noise_std, least * LEAST_STD)
         return samples, values, np.concatenate([np.full(6, np.inf), noise])
     # Readings of the period before a sample, the oldest first; the first sample has none.
     ago = np.arange(sensor.samples - 1, -1, -1) * scenario.controller.period / sensor.samples
@@ -194,7 +200,7 @@ def _measured(measured: Array, scenario: Scenario, samples: Array) -> tuple[Arra
     kept = times > -1e-9
     values = np.full((kept.sum(), NUM_MEASURED), np.nan)
     values[:, ANGLES] = measured.reshape(-1, NUM_LEGS)[kept]
-    error = LEAST_ANGLE if sensor.bits is None else angle_std(sensor.bits)
+    error = least * LEAST_ANGLE if sensor.bits is None else angle_std(sensor.bits)
     return times[kept], values, np.concatenate([np.full(6, error), np.full(NUM_STATE, np.inf)])
 
 

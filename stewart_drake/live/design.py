@@ -37,7 +37,7 @@ from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
-_ROOM: Final = 0.25
+ROOM: Final = 0.25
 """Allowance for a longer round trip, as a share of the measured jitter."""
 _COMPUTING: Final = 0.01
 """Time for a step of the law and for waking up, s."""
@@ -117,7 +117,7 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
             f"controller.delay_estimator: got {c.delay_estimator!r}; expected 'none' for a machine "
             "that keeps to the play-out times of torques"
         )
-    longest = link.longest + _ROOM * link.jitter + _COMPUTING * machine.rate
+    longest = link.longest + ROOM * link.jitter + _COMPUTING * machine.rate
     network = NetworkConfig(
         low=link.shortest,
         high=longest,

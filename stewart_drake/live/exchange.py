@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.live.contact import Contact, await_free
+from stewart_drake.live.design import ROOM
 from stewart_drake.live.endpoint import STALL, now
 from stewart_drake.live.protocol import (
     NEVER,
@@ -62,7 +63,7 @@ class Exchange:
 
     def __init__(self, contact: Contact, period: float, size: int) -> None:
         self.contact, self._period, self._size = contact, period, size
-        self._began, self._flags = 0, NOTHING
+        self._began, self._flags, self._longest = 0, NOTHING, 0.0
         self._came, self._sequences = dict[int, MachineMessage](), dict[int, int]()
         self.sent = self.overtaken = 0
 
@@ -78,6 +79,8 @@ class Exchange:
         contact, self._flags = self.contact, flags
         await_free(contact)
         last = contact.machine
+        if MachineFlags.WIRE not in last.flags:  # the design has time for such round trips
+            self._longest = (1 + ROOM) * contact.link.jitter / last.rate
         contact.join()
         # The machine's clock, or earlier by the way back.
         here = (clock.monotonic() - contact.due(0, last.rate)) * last.rate
@@ -109,8 +112,11 @@ class Exchange:
 
     @property
     def jitter(self) -> float:
-        """Largest delay of the last measurements after the earliest arrival, s."""
-        return self.contact.lateness(self.real_period)
+        """Largest delay of the last measurements after the earliest arrival, s.
+
+        Delays above a period, or above the jitter that the design has room for, do not count.
+        """
+        return self.contact.lateness(max(self.real_period, self._longest))
 
     def late(self, k: int) -> float:
         """Return the time since the earliest arrival of the measurement of a sample, s."""

@@ -317,16 +317,21 @@ class Machine:
         values = self._body.measurement()
         number = 0
         if self._running and self._log is not None:
-            state, torque = np.array(self._body.state), self._motors.torque
-            torque = torque * math.nan if self._motors.cranks else torque  # servos know theirs
-            row = {"pose": state[POSE], "rates": state[RATES], "torque_applied": torque}
-            self._log.write(time / SECOND, row | {"measurement": np.array(values)})
+            state = np.array(self._body.state)
+            row = {"pose": state[POSE], "rates": state[RATES], "measurement": np.array(values)}
+            self._at(time, 3, lambda _: self._write_row(time, row))  # after the torque's change
         if self._running:
             number = max(0, round((time - self._origin) / self.period))
         waits = self._times.sensor(number)
         fields = {} if waits is None else self._fields.of(values)
         self._at(time + (waits or 0), 1, lambda _: self._answer(time, fields, number))
         self._at(time + self.period, 1, self._take_sample)
+
+    def _write_row(self, time: int, row: dict[str, Array]) -> None:
+        assert self._log is not None
+        torque = self._motors.torque
+        torque = torque * math.nan if self._motors.cranks else torque  # servos know theirs
+        self._log.write(time / SECOND, row | {"torque_applied": torque})
 
     # -------------------------------------------------------------- session
 

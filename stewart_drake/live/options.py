@@ -58,7 +58,7 @@ class LiveOptions(Options):
     )
     log: Path | None = option(None, "Log to write during the run, .mcap or .csv.", "FILE")
     learn: int = option(
-        0, "Repetitions of the motion from which torques or setpoints are learned.", ge=0, le=100
+        0, "Repetitions from which torques or setpoints are learned, without a page.", ge=0, le=100
     )
     learned: Path | None = option(
         None, "File for what was learned; learned.npz by default.", "FILE"

@@ -39,15 +39,13 @@ from stewart_drake.loop.controller_margin import ControllerMargin, controller_ma
 from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.recording import summarize
-from stewart_drake.loop.results import LiveSummary, SimulationResult
+from stewart_drake.loop.results import LEAST_MEASURED, LiveSummary, SimulationResult
 from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.link_config import WireConfig
 from stewart_drake.scenario.run_log import Background, RunLog, UdpMirror, open_log
 from stewart_drake.studies.verdict import milliseconds
 from stewart_drake.types import Array
 
-LEAST_MEASURED: Final = 0.9
-"""Smallest share of measured samples for which E_ac and the cost are given."""
 _MOST: Final = 0.5
 """Share of a period above which a step counts as slow."""
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, Final, NamedTuple, TypedDict
 
 import numpy as np
 import xarray as xr
@@ -159,6 +159,10 @@ class ConsistencySummary(TypedDict):
     """Mean of nu' S^-1 nu per measured value; 1 is right; NaN without an estimator."""
     verdict: str | None
     """`consistent`, `cautious` or `overconfident`; None with too few measurements."""
+
+
+LEAST_MEASURED: Final = 0.9
+"""Smallest share of measured samples for which a run in real time has E_ac and a cost."""
 
 
 class RunSummary(TypedDict):

@@ -26,14 +26,16 @@ def document(study: LinkStudy) -> Document:
     best, checked = study.best, study.checked
     own = best is not None and all(one is None or one.completed == 1 for one in (best, checked))
     undecided = {bound: excess for bound, excess in study.alike.items() if not excess < SAME}
+    unsure = ", ".join(f"{bound:g}" for bound in study.hardly_lost)
     return from_template(
         "link",
-        "bad" if not own else "fair" if undecided else "good",
+        "bad" if not own else "fair" if undecided or unsure else "good",
         study=study,
         mean=_mean,
         spread=lambda cell: float(np.std(cell.errors, ddof=1)),
         same=", ".join(f"{bound:g}" for bound, excess in study.alike.items() if excess < SAME),
         undecided=undecided,
+        unsure=unsure,
         most=lambda cell: max(cell.errors, default=math.nan),
         assured=_ASSURED,
         wanted=math.ceil(math.log(1 - CONFIDENCE) / math.log(_ASSURED)),

@@ -373,7 +373,10 @@ def first_report(made: NewMachine, result: SimulationResult, findings: Iterable[
     figures = [
         Picture(figure, f"{name.capitalize()}.") for name, figure in draw_run(result).items()
     ]
-    motion = "Up and down by a quarter of the travel, once in two seconds."
+    motion = (
+        "Up and down, once in two seconds. A log of this motion shows friction and payload, but "
+        "hardly the lengths: stewart-drake identify --plan finds a better one."
+    )
     return Document(
         f"First report on {check.mechanism.name}",
         " ".join(sentence(text) for text in (check.verdict, *made.crossings, *findings)),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.loop.preparation import assemble, check_instants
-from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.results import LEAST_MEASURED, SimulationResult
 from stewart_drake.reporting.document import Document, from_template, listed, number
 from stewart_drake.reporting.style import FACTORS, UNITS
 from stewart_drake.scenario.config import Scenario
@@ -37,7 +37,9 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
         s=s,
         inf=math.inf,
         peaks=listed(_peaks(result)),
-        events=[(n, name) for name, n in s["counts"].items() if n],
+        least=LEAST_MEASURED,
+        # the sum of others is left out
+        events=[(n, name) for name, n in s["counts"].items() if n and name != "bad_measurements"],
         packets=[(n, name) for name, n in s["packets"].items()],
         cautions=[text for text in s["warnings"] if text not in said],
     )
@@ -126,7 +128,7 @@ def _row(title: str, name: str, run: SimulationResult) -> dict[str, Any]:
     if stopped is None:
         numbers = {"error": s["accumulated_error"], "floor": s["delay_floor"], "cost": s["cost"]}
         return row | numbers | {"worst": worst(run)}
-    leg = "" if stopped.leg is None else f", leg {stopped.leg}"
+    leg = "" if stopped.leg is None else f",\nleg {stopped.leg}"
     ended = f"{run.status.replace('_', ' ')}\nat {stopped.time:.2f} s{leg}"
     return row | {"error": ended, "worst": "-", "floor": "-", "cost": "-"}
 

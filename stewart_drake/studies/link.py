@@ -95,8 +95,9 @@ class LinkStudy:
 
         Excess: how much larger than the best's the mean E_ac may be, with 95 % confidence, as a
         share; NaN for one seed. The interval is that of a t-test: of the differences, as the runs
-        have the same seeds, or of two samples where some runs were lost. A bound is worse if it
-        lost more runs, or if its mean is larger by 1 % and the one-sided test says so.
+        have the same seeds, or of two samples where some runs were lost. A bound is worse if its
+        mean is larger by 1 % and the one-sided test says so. `hardly_lost` has bounds that lost
+        more runs.
         """
         best, found = self.best, dict[float, float]()
         for cell in self.bounds:
@@ -111,6 +112,18 @@ class LinkStudy:
                 ends = test(cell.errors, best.errors).confidence_interval(2 * CONFIDENCE - 1)
             if np.mean(cell.errors) / mean - 1 < SAME or not ends.low > 0:
                 found[cell.bound] = float(ends.high / mean)
+        return found
+
+    @property
+    def hardly_lost(self) -> list[float]:
+        """Bounds in s that lost more runs than the best, but by Fisher's exact test not surely."""
+        best, found = self.best, list[float]()
+        for cell in self.bounds:
+            if best is None or len(cell.errors) >= len(best.errors):
+                continue
+            table = np.array([[len(c.errors), c.runs - len(c.errors)] for c in (best, cell)])
+            if stats.fisher_exact(table, "greater").pvalue > 1 - CONFIDENCE:
+                found.append(cell.bound)
         return found
 
     @property

@@ -231,7 +231,9 @@ duration: 10.0          # s
 start: on_reference
 queue: reference        # the motors hold the plate already
 
-reference:              # up and down
+# Up and down: a log of it shows friction and payload, but hardly the lengths.
+# For a log to identify the machine from: stewart-drake identify --plan
+reference:
   kind: sine
   amplitude: [0, 0, 0, 0, 0, {amplitude}]
   offset: {home}
