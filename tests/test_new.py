@@ -273,6 +273,8 @@ def test_the_form_in_a_browser_by_keyboard(tab, tmp_path):
             assert tab.evaluate("document.getElementById('drawing').naturalWidth") > 100
             tab.press("Enter")
             tab.wait("document.title.startsWith('First report')")
+            # Without one the browser asks the server for an icon, without the token: 403.
+            assert tab.evaluate("document.querySelector('link[rel=icon]') !== null")
             assert tab.errors == []
             assert process.wait(timeout=120) == 0
         finally:
