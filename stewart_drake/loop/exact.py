@@ -145,7 +145,7 @@ def ExactPlant_(T):
                 wrench = self._wrench.Eval(context)
             if T is float:
                 # The integrator would shorten its steps for ever.
-                if not np.all(np.isfinite(torque)):
+                if not np.isfinite(torque).all():
                     raise ValueError(f"torque: got {torque.tolist()}; expected finite numbers, N m")
                 change = dynamics.change(x, torque)
                 if wrench is not None:

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
+from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.files.arguments import fixed, of_kind, positive, whole
 from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.scenario.field_types import SPIKE
 from stewart_drake.scenario.signals import LEGS, NUM_COORDINATES, NUM_LEGS, NUM_STATE, POSE
 from stewart_drake.types import Array, ArrayLike
@@ -209,7 +209,7 @@ class Encoders(LeafSystem):
     ) -> None:
         super().__init__()
         of_kind("mechanism", mechanism, Mechanism)
-        self._mechanism, self._seed = mechanism, whole("seed", seed, 0)
+        self._functions, self._seed = functions_of(mechanism), whole("seed", seed, 0)
         self._samples = whole("samples", samples, 1)
         self._quantum = 0.0 if bits is None else 2 * np.pi / 2 ** whole("bits", bits, 1)
         self._offset = fixed("offset", offset, (NUM_LEGS,))
@@ -241,7 +241,7 @@ class Encoders(LeafSystem):
         if last == number:
             return number, window
         state = np.asarray(self._state.Eval(context))
-        angles = legs_along(self._mechanism, state[POSE]).crank_angles + self._offset
+        angles = self._functions.cranks(state)[POSE] + self._offset
         if self._quantum > 0:
             q, p = self._quantum, self._phases
             angles = q * (np.round(angles / q + p) - p)

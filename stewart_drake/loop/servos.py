@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
@@ -18,6 +17,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.trajectories import Trajectory
 
+from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.arguments import fixed, positive
@@ -47,7 +47,6 @@ from stewart_drake.loop.own import NOTHING
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sampling import SteppedLaw, update_every, weak
 from stewart_drake.mechanism.geometry import geometry_of
-from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.scenario.config import Scenario, compatible_actuator
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
@@ -92,7 +91,7 @@ class Servos(SteppedLaw):
 
     Updates come after the other events of an instant and before a discrete plant's step
     (`servo_time`), so that the torque follows from the present state. A command that is not finite
-    is ignored. At the edge of the workspace, where a pose has no crank angles, the torque is held.
+    is ignored. At the edge of the workspace, where a pose has no crank angles or rates, the torque is held.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |
@@ -119,7 +118,8 @@ class Servos(SteppedLaw):
         reports: ReportLayout,
     ) -> None:
         super().__init__()
-        self._loop, self._dynamics, self._period, self.reports = loop, dynamics, period, reports
+        self._loop, self._period, self.reports = loop, period, reports
+        self._functions = functions_of(dynamics.mechanism)
         command, period = fixed("command", command, (NUM_REFERENCE,)), positive("period", period)
         nothing = np.full((reports.periods * round(period / loop.period), NUM_TORQUES), np.nan)
         setpoint, asked = command[SETPOINT], np.zeros(NUM_TORQUES)
@@ -141,8 +141,9 @@ class Servos(SteppedLaw):
         def step() -> ServoState:
             wanted, asked = segment.at(now, self._period), before.asked
             setpoint = self._loop.limited(wanted[SETPOINT], before.setpoint[POSE])
-            with suppress(UnreachablePoseError):
-                asked = self._loop.torque(setpoint, wanted[MODEL_TORQUE], self._cranks(state))
+            cranks = self._functions.cranks(state)
+            if np.isfinite(cranks).all():
+                asked = self._loop.torque(setpoint, wanted[MODEL_TORQUE], cranks)
             put_out = np.vstack([before.put_out[1:], self._loop.motors.saturate(asked)])
             return ServoState(segment, arrived, setpoint, asked, put_out)
 
@@ -155,12 +156,6 @@ class Servos(SteppedLaw):
             return before.segment, before.arrived
         begin = max(arrived, before.segment.begin)
         return before.segment.then(command, begin, arrived + self._period, self._period), arrived
-
-    def _cranks(self, state: Array) -> Array:
-        """Return crank angles and rates (12,) of pose and rates (12,)."""
-        angles = self._dynamics.mechanism.crank_angles(state[POSE])
-        rates = self._dynamics.actuation_map(state[POSE]).T @ state[RATES]
-        return np.concatenate([angles, rates])
 
 
 class PositionServos(LeafSystem):
