@@ -48,7 +48,8 @@ def test_robustness_from_either_start(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_table_two_on_three_plants_and_what_its_law_lacks(tmp_path, capsys):
+def test_table_two_on_three_plants_and_what_its_law_lacks(tmp_path, capsys, monkeypatch):
+    judge_few_delays(monkeypatch)
     tables, rows = script("table2").main("duration=0.3", out=str(tmp_path))
     assert list(tables) == ["exact", "multibody", "paper"]
     for table in tables.values():

@@ -111,17 +111,24 @@ def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys):
 # ---------------------------------------------------------------- Ctrl-C
 
 
+WITHOUT_FIGURES = (
+    "import sys, pytest; from tests.shorter import leave_blank; from stewart_drake.cli import main;"
+    "leave_blank(pytest.MonkeyPatch()); sys.exit(main(sys.argv[1:]))"
+)
+
+
 def interrupted(arguments, wait, group):
     """Exit status and stderr of a command that gets Ctrl-C some time after its first line.
 
     Without the lines of progress that a busy machine gives it time for.
     """
     process = subprocess.Popen(
-        command(*arguments),
+        [sys.executable, "-c", WITHOUT_FIGURES, *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        cwd=ROOT,
     )
     assert process.stdout is not None
     assert process.stdout.readline()  # the verdict: it has begun

@@ -140,8 +140,9 @@ def test_g_is_the_geometric_mean_and_hindsight_has_the_best_of_each():
 
 
 @pytest.mark.slow
-def test_intervals_cover_what_they_should():
+def test_intervals_cover_what_they_should(monkeypatch):
     """200 samples of 60 conditions, log J off by -0.1 +- 0.3: 95 % of intervals hold the truth."""
+    monkeypatch.setattr("stewart_drake.tuning.evaluation.RESAMPLES", 2000)
     rng, held = np.random.default_rng(5), 0
     fixed = np.full((len(FIXED), 60), 1e6)
     for _ in range(200):

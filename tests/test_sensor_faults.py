@@ -74,7 +74,8 @@ def test_spikes_of_all_sizes_are_distinguished_from_motion(size):
 @pytest.mark.parametrize("controller", CONTROLLERS[:4])
 def test_the_papers_controllers_count_them_too(controller):
     """They keep the plate without a delay."""
-    slow = ("delay.steps=0", "reference.amplitude=[0.02, 0.02, 0.02, 0.002, 0.002, 0.008]")
+    amplitude = "reference.amplitude=[0.02, 0.02, 0.02, 0.002, 0.002, 0.008]"
+    slow = ("delay.steps=0", "duration=3", amplitude)
     for kind in COUNT:
         far = {"size": 1e3} if kind == "spike" else {}  # without a filter, out of reach only
         run = simulate(
