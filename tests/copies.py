@@ -7,7 +7,8 @@ held in the copy for ever. The one that is copied here has a single thread.
 import contextlib
 import os
 import signal
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -25,7 +26,9 @@ _server.set_forkserver_preload(
         "pytest",
         "h5netcdf",
         "matplotlib.pyplot",
-        "stewart_drake.cli",
+        "stewart_drake.cli.live",
+        "stewart_drake.live.session",
+        "stewart_drake.live.simulated",
         "stewart_drake.reporting.csv_file",
         "stewart_drake.studies.robustness",
         "stewart_drake.tuning.data",
@@ -66,6 +69,48 @@ def _carry_out(work: bytes, begun: Connection) -> None:
         status = result if isinstance(result, int) else 0
     finally:
         os._exit(status)
+
+
+class Command:
+    """`stewart-drake` in a copy, at once; with what is needed of `subprocess.Popen`.
+
+    `stdout` has both of its streams.
+    """
+
+    def __init__(self, *arguments: str) -> None:
+        here, there = _server.Pipe(duplex=False)
+        self._copy = _server.Process(target=_run_command, args=(there, arguments))
+        self._copy.start()
+        there.close()
+        self.stdout = os.fdopen(os.dup(here.fileno()), encoding="utf-8")
+        here.close()
+
+    def send_signal(self, number: int) -> None:
+        assert self._copy.pid is not None
+        os.kill(self._copy.pid, number)
+
+    def kill(self) -> None:
+        kill(self._copy)
+
+    def poll(self) -> int | None:
+        return self._copy.exitcode
+
+    def wait(self, timeout: float = PATIENCE) -> int | None:
+        self._copy.join(timeout)
+        return self._copy.exitcode
+
+
+def _run_command(out: Connection, arguments: Sequence[str]) -> None:
+    from stewart_drake.cli import main
+
+    os.setpgid(0, 0)
+    for stream in (1, 2):
+        os.dup2(out.fileno(), stream)
+    out.close()
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+    status = main(list(arguments))
+    sys.stdout.flush()
+    os._exit(status)
 
 
 def kill(copy: BaseProcess) -> None:

@@ -18,12 +18,12 @@ from tests.building import SANITIZED, c_compiler, make
 
 NOISE = "sensor.noise_std=[1e-5,1e-5,1e-5,1e-6,1e-6,1e-6,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
 FAULTS = (
-    "sensor.faults=[{kind: missing, from: 0.2, to: 0.3}, {kind: frozen, from: 0.4, to: 0.5}, "
-    "{kind: spike, from: 0.6, to: 0.7}, {kind: spike, size: 0.3, from: 0.8, to: 0.85}]"
+    "sensor.faults=[{kind: missing, from: 0.5, to: 0.6}, {kind: frozen, from: 0.9, to: 1.0}, "
+    "{kind: spike, from: 1.2, to: 1.3}, {kind: spike, size: 0.3, from: 1.5, to: 1.55}]"
 )
 SHORT = ("plant.kind=exact", "duration=5.0")
-FASTER = "duration=1.1"
-"""Of a machine with a period of 20 ms: every step costs the sanitizers a tenth of a second."""
+FASTER = "duration=2.0"
+"""Of a machine with a period of 20 ms."""
 RUNS = {
     "paper": ("paper", ()),
     "bad measurements and outliers": ("desktop", (NOISE, FAULTS, FASTER)),

@@ -5,8 +5,6 @@ import math
 import os
 import resource
 import signal
-import subprocess
-import sys
 import threading
 import time
 import tracemalloc
@@ -26,7 +24,7 @@ from stewart_drake.loop.recording import Table
 from stewart_drake.reporting.csv_file import signals_csv
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
-from tests.copies import status_of
+from tests.copies import Command, status_of
 from tests.test_live import FROM_REST, OVER_A_NETWORK, SETTINGS, paper_machine, scenario_of
 
 
@@ -177,9 +175,7 @@ def test_a_killed_run_leaves_all_but_its_last_second(tmp_path):
     with paper_machine(OVER_A_NETWORK, *FROM_REST) as running:
         where = f"127.0.0.1:{running.address[1]}"
         command = ["live", "paper", "--machine", where, "--no-browser", "--out", str(tmp_path)]
-        live = subprocess.Popen(
-            [sys.executable, "-m", "stewart_drake", *command, *words], stdout=subprocess.DEVNULL
-        )
+        live = Command(*command, *words)
         try:
             while not running.machine.counts["runs"]:
                 assert live.poll() is None

@@ -23,6 +23,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_scenario
 from tests.building import SANITIZED, c_compiler, make
+from tests.copies import Command
 from tests.live_driver import Driver, drive_in_real_time, in_real_time
 
 SETTINGS = ("plant.kind=exact", "duration=2.5")
@@ -31,7 +32,8 @@ SAMPLES = 25
 LONG = ("plant.kind=exact", "duration=4.0", "delay.steps=2")
 SLOW = 0.4
 """Rate of the machine's clock at which a busy computer still delivers measurements in time."""
-COMMAND = [sys.executable, "-m", "stewart_drake"]
+DRAKE = "stewart-drake"
+"""Runs in a copy of a process."""
 PATIENCE = 120.0
 """s in which a process must say what is waited for, on a busy computer."""
 
@@ -46,10 +48,12 @@ class Process:
     """A process whose lines are read one by one."""
 
     def __init__(self, command):
-        surroundings = os.environ | {"PYTHONUNBUFFERED": "1"}
-        self.popen = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=surroundings
-        )
+        if command[0] == DRAKE:
+            self.popen = Command(*command[1:])
+        else:
+            streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+            surroundings = os.environ | {"PYTHONUNBUFFERED": "1"}
+            self.popen = subprocess.Popen(command, text=True, env=surroundings, **streams)
         self.lines: list[str] = []
 
     @property
@@ -97,14 +101,15 @@ def process(command):
     finally:
         if made.popen.poll() is None:
             made.popen.kill()
-            made.popen.communicate()
+            made.popen.wait()
+        made.popen.stdout.close()
 
 
 @contextmanager
-def machine(*options, settings=SETTINGS):
+def machine(*options, settings=SETTINGS, command=(DRAKE,)):
     """`stewart-drake machine`, once it listens, and its port."""
     said = [word for setting in settings for word in ("--set", setting)]
-    with process([*COMMAND, "machine", "paper", "--port", "0", *said, *options]) as made:
+    with process([*command, "machine", "paper", "--port", "0", *said, *options]) as made:
         first = made.until("^machine paper at")
         made.until("waits for a controller")
         yield made, int(first.split("127.0.0.1:")[1].split(":")[0])
@@ -283,7 +288,7 @@ def test_both_ends_in_c(folder, tmp_path):
 
 @pytest.mark.slow
 def test_ctrl_c_ends_it_with_one_summary(capfd):
-    with machine() as (running, _):
+    with machine(command=(sys.executable, "-m", "stewart_drake")) as (running, _):
         assert running.end(signal.SIGINT) == 130
     begun = [line.split()[0] for line in running.lines if not line.startswith(" ")]
     assert begun == ["machine", "waits", "ended", "datagrams:", "torques:"]
@@ -300,7 +305,7 @@ def test_either_side_of_a_network_may_stand_still_for_a_second(side):
     that it promises, and the controller leads the plate back, or says why not."""
     way = "low: 0.1, high: 0.12"
     link = f"link={{kind: network, {way}, return: {{{way}}}}}"
-    live = [*COMMAND, "live", "paper", "--no-browser", "--duration", "6", "--machine"]
+    live = [DRAKE, "live", "paper", "--no-browser", "--duration", "6", "--machine"]
     with (
         machine("--watchdog", "0.7", settings=("plant.kind=exact", link)) as (running, port),
         process([*live, f"127.0.0.1:{port}"]) as driving,

@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from http.client import HTTPConnection
@@ -19,6 +17,7 @@ from stewart_drake.cli import main, model
 from stewart_drake.mechanism.kinematics import leg_geometry
 from stewart_drake.reporting.machine_form import MachineForm
 from tests.browser import needs_chromium
+from tests.copies import Command
 from tests.screen import too_long
 
 MEASURED = {
@@ -248,15 +247,8 @@ def test_the_form_gives_the_measurements_and_shows_the_report(form):
 @needs_chromium
 def test_the_form_in_a_browser_by_keyboard(tab, tmp_path):
     """Type every measurement with Tab between them, press Enter, and read the report."""
-    command = [
-        sys.executable,
-        "-c",
-        "import sys; from stewart_drake.cli import main; sys.exit(main(sys.argv[1:]))",
-        "new",
-        str(tmp_path / "mine"),
-        "--form",
-    ]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    process = Command("new", str(tmp_path / "mine"), "--form")
+    with process.stdout:
         try:
             url = re.search(r"http://\S+", process.stdout.readline())[0].rstrip(",")
             for width in (1280, 400):
@@ -276,7 +268,7 @@ def test_the_form_in_a_browser_by_keyboard(tab, tmp_path):
             # Without one the browser asks the server for an icon, without the token: 403.
             assert tab.evaluate("document.querySelector('link[rel=icon]') !== null")
             assert tab.errors == []
-            assert process.wait(timeout=120) == 0
+            assert process.wait() == 0
         finally:
             process.kill()
     assert (tmp_path / "mine" / "report.html").exists()

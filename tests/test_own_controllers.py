@@ -62,18 +62,17 @@ def run(workers, *arguments, folder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("place", "workers"), [("script", 2), ("module", 1), ("notebook", 2)])
-def test_own_controllers_are_compared(place, workers, tmp_path):
-    """Those of a script ended in "a worker process was killed, perhaps for want of memory"."""
-    script, code = tmp_path / "mine.py", CLASS + COMPARE
-    if place == "module":
-        (tmp_path / "parts.py").write_text(CLASS)
-        code = "import stewart_drake as sd\nfrom parts import Broken, Steady\n" + COMPARE
-    if place == "notebook":  # whose cells are executed in __main__, with no file
-        script.write_text(f"for cell in ({CLASS!r}, {COMPARE!r}):\n    exec(cell, globals())\n")
-    else:
-        script.write_text(code)
-    assert run(workers, str(script), folder=tmp_path) == "told\n"
+def test_own_controllers_are_compared(tmp_path):
+    """Those of a script, of a notebook and of a module.
+
+    The first ended in "a worker process was killed, perhaps for want of memory". Cells of a
+    notebook are executed in __main__, with no file.
+    """
+    (tmp_path / "parts.py").write_text(CLASS)
+    cells = f"for cell in ({CLASS!r}, {COMPARE!r}):\n    exec(cell, globals())\n"
+    module = "from parts import Broken, Steady\n" + COMPARE
+    (tmp_path / "mine.py").write_text(CLASS + COMPARE + cells + module)
+    assert run(2, "mine.py", folder=tmp_path) == 3 * "told\n"
 
 
 # ---------------------------------------------------------------- jobs that cannot be sent

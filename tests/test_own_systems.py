@@ -68,6 +68,7 @@ def disturbance(name="torque", size=6, value=0.0):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
 def test_own_computed_torque_controller_with_table_figures_and_replay(tmp_path, capsys, plant):
     result = example("own_controller").main(str(tmp_path), "duration=2", f"plant.kind={plant}")

@@ -17,7 +17,7 @@ from stewart_drake.scenario.loading import load_scenario
 from tests.building import SANITIZED, c_compiler
 from tests.live_driver import Driver
 from tests.test_machine_process import (
-    COMMAND,
+    DRAKE,
     SETTINGS,
     c_controller,
     folder,
@@ -127,7 +127,7 @@ def test_a_controller_in_c_of_another_machine_is_refused_by_both(folder):
 @pytest.mark.slow
 def test_a_machine_in_c_refuses_a_controller_of_another_mechanism(folder):
     port = free_port()
-    live = [*COMMAND, "live", "paper", "--no-browser", "--set", "mechanism=paper_clear"]
+    live = [DRAKE, "live", "paper", "--no-browser", "--set", "mechanism=paper_clear"]
     with process([str(folder / "stewart_machine"), str(port)]) as running:
         running.until("a simulated machine at port")
         with process([*live, "--machine", f"127.0.0.1:{port}"]) as driving:

@@ -91,7 +91,8 @@ class Servos(SteppedLaw):
 
     Updates come after the other events of an instant and before a discrete plant's step
     (`servo_time`), so that the torque follows from the present state. A command that is not finite
-    is ignored. At the edge of the workspace, where a pose has no crank angles or rates, the torque is held.
+    is ignored. The torque is held at the edge of the workspace, where a pose has no crank angles or
+    rates.
 
     | port | direction | size | unit | rate |
     | --- | --- | --- | --- | --- |

@@ -8,7 +8,11 @@
 
 #define STEPS @STEPS@
 #ifndef REPEATS
+#ifdef __SANITIZE_ADDRESS__ /* steps are slow, and their time means nothing */
+#define REPEATS 2
+#else
 #define REPEATS 20
+#endif
 #endif
 #define TOLERANCE @TOLERANCE@
 
