@@ -25,7 +25,7 @@ from stewart_drake.scenario.loading import load_scenario, title_of
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 from tests.browser import needs_chromium
 from tests.screen import too_long
-from tests.shorter import judge_few_delays, map_few_poses
+from tests.shorter import judge_few_delays, leave_blank, map_few_poses
 
 EXACT = ("plant.kind=exact",)
 SETTINGS = ("--set", "plant.kind=exact", "--set", "duration=2.0")
@@ -44,6 +44,7 @@ def report(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         map_few_poses(patch)
         judge_few_delays(patch)
+        leave_blank(patch)
         assert main(["report", "paper", *SETTINGS, "--out", str(folder), "--quiet"]) == 0
     return folder
 
