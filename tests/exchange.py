@@ -3,7 +3,6 @@
 A machine of the scenario `paper` with a fixed secret answers a controller at 127.0.0.1:50000.
 """
 
-from collections import Counter
 from dataclasses import replace
 from typing import Any, Final
 
@@ -17,36 +16,23 @@ from stewart_drake.live.protocol import (
     SECOND,
     ControllerMessage,
     Head,
-    MachineMessage,
     Message,
     encode,
 )
 from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.loading import load_scenario
-from tests.live_driver import Clock
+from tests.live_driver import Clock, Wire
 
 SESSION: Final = 0x1122334455667788
 MILLISECOND: Final = 10**6
 NAMES: Final = ("request", "offer", "confirmation", "measurement", "torques")
 
 
-class _Wire:
-    """Keeps what a machine sends."""
-
-    def __init__(self) -> None:
-        self.said: list[MachineMessage] = []
-        self.refused, self.unsent = Counter[Any](), 0
-
-    def send(self, message: MachineMessage, to: tuple[str, int]) -> bool:
-        self.said.append(message)
-        return True
-
-
 def exchange() -> list[Message]:
     """Return the datagrams from a request for a session to the first torques."""
     scenario = load_scenario("paper", settings=("plant.kind=exact",))
-    wire, clock = _Wire(), Clock()
+    wire, clock = Wire(), Clock()
     machine: Any = Machine(prepare(scenario), wire, say=lambda line: None, clock=clock)  # type: ignore[arg-type]
     machine.offers = Offers(bytes(range(32)))
     zero, found = clock.time, list[Message]()

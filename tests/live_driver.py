@@ -3,6 +3,7 @@
 import functools
 import select
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ from stewart_drake.live.protocol import (
     ControllerMessage,
     Head,
     MachineMessage,
+    Refusal,
 )
 from stewart_drake.loop.law_design import control_law, first_queue
 from stewart_drake.loop.peer import identity_of
@@ -98,6 +100,21 @@ class Clock:
 
     def __call__(self) -> int:
         return self.time
+
+
+class Wire:
+    """An endpoint that keeps what a machine sends and refuses."""
+
+    def __init__(self) -> None:
+        self.said: list[MachineMessage] = []
+        self.refused, self.unsent = Counter[Refusal](), 0
+
+    def send(self, message: MachineMessage, to: Address) -> bool:
+        self.said.append(message)
+        return True
+
+    def refuse(self, cause: Refusal, detail: str = "") -> None:
+        self.refused[cause] += 1
 
 
 class Driver:

@@ -1,6 +1,5 @@
 """Servos over a network: plans of setpoints between `live` and a machine."""
 
-from collections import Counter
 from contextlib import closing
 from types import SimpleNamespace
 
@@ -25,25 +24,12 @@ from stewart_drake.loop.servos import servo_law
 from stewart_drake.scenario.run_log import open_log, read_log
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
-from tests.live_driver import Clock, in_real_time, running_machine
+from tests.live_driver import Clock, Wire, in_real_time, running_machine
 
 NETWORK = "link={kind: network, low: 0, high: 0, loss: 0, playout: 0.1}"
 SESSION, NONCE, ADDRESS = 7, 9, ("127.0.0.1", 50000)
 STEPS = 5  # of delay
 SETTINGS = (f"delay.steps={STEPS}", "plant.accuracy=1e-9")
-
-
-class Wire:
-    """Keeps what a machine sends."""
-
-    def __init__(self):
-        self.said, self.refused, self.unsent = [], Counter(), 0
-
-    def send(self, message, to):
-        self.said.append(message)
-
-    def refuse(self, cause, detail=""):
-        self.refused[cause] += 1
 
 
 class Fed:

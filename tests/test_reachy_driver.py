@@ -26,8 +26,7 @@ from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import servo_law
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
-from tests.live_driver import Clock, in_a_thread, in_real_time
-from tests.test_live_servos import Wire
+from tests.live_driver import Clock, Wire, in_a_thread, in_real_time
 
 server = pytest.importorskip("websockets.sync.server")
 
