@@ -18,6 +18,7 @@ from stewart_drake.files.resources import KINDS, shipped
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
 from stewart_drake.reporting import terminal
+from stewart_drake.reporting.document import number
 from stewart_drake.studies.compare import CONTROLLERS, LABELS
 from tests.screen import too_long
 
@@ -261,6 +262,10 @@ def test_a_pipe_gets_a_line_now_and_then(capsys):
     # Twenty in 0.2 to 0.4 s leaves 1.4 to 2.8 s for 140; the forty of an earlier start took none.
     assert re.fullmatch(r"runs: 60 of 200, about [1-9] s left, after \d s", lines[-1]), said
     assert "\r" not in said and "\x1b" not in said
+
+
+def test_a_number_that_is_rounded_up_keeps_its_digits():
+    assert [number(x) for x in (9.996, 99.96, -9.994, 0.0)] == ["10.0", "100", "-9.99", "0"]
 
 
 def test_lines_of_progress_differ_for_ten_minutes():

@@ -67,7 +67,9 @@ def load_yaml(path: str | Path) -> dict[str, Any]:
             the file, and the line where there is one.
     """
     try:
-        text = read_bytes(Path(path), _MAX_BYTES, "a small YAML file").decode("utf-8-sig")
+        text = read_bytes(Path(path), _MAX_BYTES, "a YAML file of at most 100 kB").decode(
+            "utf-8-sig"
+        )
     except UnicodeDecodeError as error:
         line = error.object.count(b"\n", 0, error.start) + 1
         raise ConfigError(f"{path}: line {line}: is not UTF-8 text; expected YAML") from None

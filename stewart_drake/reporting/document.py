@@ -70,8 +70,8 @@ def number(value: float, digits: int = 3) -> str:
         return "-"
     if value != 0 and not 1e-4 <= abs(value) < 1e5:
         return f"{value:.0e}"
-    decimals = digits - 1 - math.floor(math.log10(abs(value))) if value else 0
-    return f"{value:.{max(0, decimals)}f}"
+    exponent = int(f"{value:.{digits - 1}e}".partition("e")[2])  # of the rounded value
+    return f"{value:.{max(0, digits - 1 - exponent if value else 0)}f}"
 
 
 def listed(items: Iterable[object], form: str = "%s", between: str = ", ") -> str:
