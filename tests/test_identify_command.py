@@ -244,6 +244,8 @@ def test_a_plan_can_be_run(tmp_path):
 def test_the_steps_of_the_multibody_plant_are_no_wrong_machine(tmp_path):
     scenario = sd.load_scenario("paper", settings=("duration=4",))
     sd.simulate(scenario, judge_stability=False).save(tmp_path)
-    found = sd.identify(tmp_path, "paper").summary
+    result = sd.identify(tmp_path, "paper")
+    found, said = result.summary, " ".join(str(result).split())
+    assert "its steps shift the delay by about 1 ms, which no interval contains" in said
     assert found["chi2"]["all"] < 1.5
-    assert found["delay_s"] == pytest.approx(0.8, abs=0.001), (found["delay_std_s"], found["chi2"])
+    assert found["delay_s"] == pytest.approx(0.8, abs=0.001)

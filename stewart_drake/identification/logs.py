@@ -65,6 +65,7 @@ class Log:
     delay: float | None = None  # believed delay in s, or None
     # torques (6,) that act before the first of these does, or None if unknown
     before: Array | None = None
+    step: float = 0.0  # of a simulated multibody plant, s; 0 for another one
 
     def applied_torque(self, times: Array, delay: float) -> Array:
         """Return the torques (k, 6) at instants (k,) in s; before any arrived, the first one."""
@@ -168,6 +169,7 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
         gravity=DEFAULT_GRAVITY if scenario.plant.gravity else 0.0,
         delay=believed if math.isfinite(believed) else None,
         before=None if changing else applied[0],
+        step=scenario.plant.time_step if scenario.plant.kind == "multibody" else 0.0,
     )
 
 

@@ -110,6 +110,11 @@ def file_names(logs: Sequence[Log]) -> list[str]:
 
 def _cautions(found: Identification) -> list[str]:
     cautions = []
+    if step := max(log.step for log in found.logs):
+        cautions.append(
+            f"a log of the multibody plant: its steps shift the delay by about {1e3 * step:g} ms, "
+            "which no interval contains; plant.kind=exact has no such error"
+        )
     if left_out := found.solution.left_out:
         stretches = "1 stretch" if left_out == 1 else f"{left_out} stretches"
         cautions.append(f"{stretches} of the logs left out: no trajectory fits there")
