@@ -1,4 +1,4 @@
-"""Write stewart_drake/__init__.pyi, which tells type checkers the public names.
+"""Write stewart_drake/__init__.pyi, the public names for type checkers.
 
 The names come from the table in stewart_drake/__init__.py. Functions whose arguments are made of
 options at run time are written with their signatures.

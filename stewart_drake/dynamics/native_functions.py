@@ -19,6 +19,7 @@ from stewart_drake.scenario.signals import (
     NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
+    POSE,
     RATES,
 )
 from stewart_drake.types import Array, ArrayLike
@@ -146,17 +147,20 @@ class NativeFunctions:
         N[ANGLES, ANGLES] = angle_rate_map(np.asarray(pose)[ANGLES])
         return N.T @ MN.T, N.T @ B
 
+    def crank_angles(self, pose: ArrayLike) -> Array:
+        """Return crank angles (6,), NaN where a leg does not reach."""
+        c, pose, angles = core(), np.array(pose, np.float64), np.empty(NUM_TORQUES)
+        c.lib.stewart_crank_angles(self._first, c.at(pose), c.at(angles))
+        return angles
+
     def cranks(self, state: ArrayLike) -> Array:
         """Return crank angles and rates (12,) at [pose; rates] (12,).
 
         NaN where a leg does not reach; rates also where a leg is at its dead centre.
         """
-        c, state = core(), np.array(state, np.float64)
-        found, J = np.empty(NUM_STATE), np.empty((NUM_TORQUES, NUM_TORQUES))
-        c.lib.stewart_crank_angles(self._first, c.at(state), c.at(found))
+        c, state, J = core(), np.array(state, np.float64), np.empty((NUM_TORQUES, NUM_TORQUES))
         c.lib.stewart_crank_jacobian(self._first, c.at(state), c.at(J))
-        found[RATES] = J @ state[RATES]
-        return found
+        return np.concatenate([self.crank_angles(state[POSE]), J @ state[RATES]])
 
     def margins(self, poses: Array, sign: float, least: Array) -> Array:
         """Return the least distances (n,) of the measures of poses (n, 6) above `least` (8,).

@@ -157,7 +157,9 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
         then = np.searchsorted(time, samples + believed - 1e-9)
         torques = applied[np.minimum(then, len(time) - 1)]
     limit = scenario.actuator.torque_limit
-    times, values, std = _measured(measured[rows], scenario, samples)
+    step = scenario.plant.time_step if scenario.plant.kind == "multibody" else 0.0
+    least = max(1.0, _STEPS * step)  # factor on the least standard deviations
+    times, values, std = _measured(measured[rows], scenario, samples, least)
     changing = scenario.queue == "reference" or scenario.link.kind == "network"
     return Log(
         name=str(path),
@@ -169,7 +171,7 @@ def _of_run(path: Path, mechanism: Mechanism) -> Log:
         gravity=DEFAULT_GRAVITY if scenario.plant.gravity else 0.0,
         delay=believed if math.isfinite(believed) else None,
         before=None if changing else applied[0],
-        step=scenario.plant.time_step if scenario.plant.kind == "multibody" else 0.0,
+        step=step,
     )
 
 
@@ -184,13 +186,14 @@ def _run_problem(scenario: Scenario) -> str | None:
     return None
 
 
-def _measured(measured: Array, scenario: Scenario, samples: Array) -> tuple[Array, Array, Array]:
+def _measured(
+    measured: Array, scenario: Scenario, samples: Array, least: float
+) -> tuple[Array, Array, Array]:
     """Return instants (n,), values (n, 18) and their std (18,) of a run's measurements.
 
-    They are measured at each sample of the controller.
+    They are measured at each sample of the controller. `least` is a factor on the least std.
     """
-    sensor, plant = scenario.sensor, scenario.plant
-    least = max(1.0, _STEPS * plant.time_step) if plant.kind == "multibody" else 1.0
+    sensor = scenario.sensor
     if sensor.kind == "state":
         values = np.full((len(samples), NUM_MEASURED), np.nan)
         values[:, POSE.start :] = measured

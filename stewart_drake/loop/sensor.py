@@ -241,7 +241,7 @@ class Encoders(LeafSystem):
         if last == number:
             return number, window
         state = np.asarray(self._state.Eval(context))
-        angles = self._functions.cranks(state)[POSE] + self._offset
+        angles = self._functions.crank_angles(state[POSE]) + self._offset
         if self._quantum > 0:
             q, p = self._quantum, self._phases
             angles = q * (np.round(angles / q + p) - p)
