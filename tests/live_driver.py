@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stewart_drake.law.channel import Packets, Report
-from stewart_drake.law.core_law import serving
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.live.endpoint import Address, Endpoint, Session, now
@@ -123,8 +122,7 @@ class Driver:
     def __init__(self, scenario: Scenario, machine: Address, key: bytes | None = None) -> None:
         self.experiment = prepare(scenario)
         self.law, self.planned, _ = control_law(self.experiment)
-        self.served, _ = serving(self.law)
-        self.memory = self.served.initial_memory(first_queue(self.experiment, self.law))
+        self.memory = self.law.initial_memory(first_queue(self.experiment, self.law))
         self.endpoint = Endpoint(MachineMessage, key=key)
         self.session = Session.drawn(machine)
         self.identity = identity_of(scenario)
@@ -182,7 +180,7 @@ class Driver:
         c = self.experiment.scenario.controller
         weights = np.array(c.weights)
         measured = Measurement.of(values, age)
-        self.memory = self.served.step(self.memory, measured, motion, weights, report)
+        self.memory = self.law.step(self.memory, measured, motion, weights, report)
         self.torques.append(np.array(self.memory.torque))
         playout = time + round(self.law.timeline.eta * SECOND)
         rows = np.array(self.memory.torque)[None]

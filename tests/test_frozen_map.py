@@ -7,7 +7,7 @@ from pydrake.systems.framework import DiagramBuilder
 import stewart_drake as sd
 from stewart_drake.dynamics.frozen_map import Band, FrozenDynamics
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.core_law import uncovered
+from stewart_drake.law.coverage import uncovered
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.assembly import torque_map

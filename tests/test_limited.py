@@ -11,7 +11,7 @@ from stewart_drake.export.controller import exported
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.catch_up import LEAST_ERROR_SHARE
 from stewart_drake.law.clear_space import ClearSpace
-from stewart_drake.law.core_law import serving
+from stewart_drake.law.coverage import uncovered
 from stewart_drake.law.feedforward import GAUSS_NODES, InverseDynamicsFeedforward, mean_torques
 from stewart_drake.law.horizon import HoldModel, HorizonCost, condense, riccati
 from stewart_drake.law.horizon_qp import NEAR, QpError, problem_of, solve_by_daqp
@@ -251,7 +251,7 @@ def test_a_reference_that_leaves_the_workspace_is_refused_without_plans_and_gove
 def test_drakes_loop_and_the_loop_in_c_agree():
     scenario = limited(0.9, "duration=1.5")
     drake, bulk = simulate(scenario, judge_stability=False), run_in_bulk(scenario)
-    assert bulk.loop == "native, law in Python (controller.limits)"
+    assert bulk.loop == "native, controller.limits in Python"
     assert drake.accumulated_error == pytest.approx(bulk.error_so_far, rel=1e-3)
 
 
@@ -302,7 +302,7 @@ def test_it_works_next_to_a_part_in_python():
         simulate(scenario, judge_stability=False, modify_law=change)
         for change in (lambda law: law, with_part)
     )
-    assert serving(with_part(compose_law(prepare(scenario))).free).backend.startswith("python")
+    assert uncovered(with_part(compose_law(prepare(scenario))).free) == "controller.feedforward"
     np.testing.assert_allclose(
         compiled.signals.torque_commanded, python.signals.torque_commanded, atol=1e-7
     )

@@ -5,7 +5,6 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.law.core_law import serving
 from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servos import rise
@@ -102,7 +101,7 @@ def test_a_packet_has_the_sum_and_the_law_the_rest(limit):
     signal, on_hand = some_signal(2e-3, 2 * np.pi), [False]
     scenario = sd.load_scenario("paper", settings=settings)
     made = designing.design(scenario, Message(), designing.always(signal))
-    law, reference = serving(made.law).law, made.experiment.reference
+    law, reference = made.law, made.experiment.reference
 
     class Alone(LiveLoop):
         _by_hand = property(lambda self: on_hand[0])

@@ -1,4 +1,4 @@
-"""The law in C against the law in Python, step by step, and the Riccati equation behind it."""
+"""The law with parts of the core against that with parts in Python, and the Riccati equation."""
 
 from dataclasses import replace
 from typing import Any
@@ -10,7 +10,8 @@ import stewart_drake as sd
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law import core_law
-from stewart_drake.law.core_law import CompiledLaw, CoreLqi, CoreServo, serving, uncovered
+from stewart_drake.law.core_law import CompiledLaw
+from stewart_drake.law.coverage import backend, uncovered
 from stewart_drake.law.delay_model import delayed_model, linear_model
 from stewart_drake.law.motion import KnownMotion, Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
@@ -22,6 +23,7 @@ from stewart_drake.loop.servos import compose_servo_law
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
+from tests.backends import Predicted, with_own
 from tests.mechanisms import PAPER, random_mechanism
 from tests.test_riccati import riccati_gain
 
@@ -211,17 +213,19 @@ RECORDED = (
 
 
 class Pair:
-    """Both laws in one loop with the plant as it is: what the one in Python says acts."""
+    """Both laws in one loop with the plant: what the one with parts in Python says acts."""
 
     def __init__(self, name, settings):
         self.scenario = load_scenario(name, settings=("plant.kind=exact", *settings))
         experiment = prepare(self.scenario)
         self.law, self.planned, _ = control_law(experiment)
         self.goal = experiment.reference
-        self.native = CoreLqi(self.law)
+        self.own = with_own(self.law, "observer", "feedforward", "model", "cost")
+        if not self.law.finds_delay:
+            self.own = replace(self.own, predictor=Predicted())
         queue = experiment.torques_in_flight(self.law.timeline.delay)
-        self.one: Any = self.law.initial_memory(queue)
-        self.other: Any = self.native.initial_memory(queue)
+        self.one: Any = self.own.initial_memory(queue)
+        self.other: Any = self.law.initial_memory(queue)
         sc = self.scenario
         self.truth = StewartDynamics(
             experiment.truth, gravity=sc.plant.gravity, parameters=sc.plant.parameters
@@ -244,8 +248,8 @@ class Pair:
         if law.moves:
             motion = KnownMotion(self.planned, self.goal, k * period)
         given = Measurement.of(y, age * period), motion, weights
-        self.one = law.step(self.one, *given)
-        self.other = self.native.step(self.other, *given)
+        self.one = self.own.step(self.one, *given)
+        self.other = law.step(self.other, *given)
         gap = float(np.abs(self.one.torque - self.other.torque).max())
         self.other.in_flight[:] = self.one.in_flight
         (torques, durations), _ = law.timeline.last_period(self.one.in_flight)
@@ -254,7 +258,7 @@ class Pair:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_step_by_step_the_torques_are_those_of_python(case):
+def test_step_by_step_the_torques_are_those_of_parts_in_python(case):
     """1e-9 of the peak torque; and all that is recorded."""
     name, settings, spoil = CASES[case]
     pair, rng = Pair(name, settings), np.random.default_rng(7)
@@ -273,7 +277,7 @@ def test_step_by_step_the_torques_are_those_of_python(case):
             assert np.nanmax(np.abs(a - b), initial=0.0) <= bound, k
     assert max(gaps) <= 1e-9 * peak
     if "plan" in case:
-        assert pair.one.path is not None
+        assert pair.one.planner[1] > 0  # pieces
         assert peak < 0.03 or case == "planned again"  # the usual length takes 0.053 N m
     for count in HAPPENED.get(case, ()):
         assert getattr(pair.one.counts, count) > 0
@@ -295,42 +299,9 @@ def lost(k, reference):
     return reference
 
 
-def lost_in_a_row(first, number):
-    """Whole previews, and later one without its last row."""
-
-    def lose(k, reference):
-        reference = reference.copy()
-        if first <= k < first + number:
-            reference[:] = np.nan
-        if k == 20:
-            reference[-1] = np.nan
-        return reference
-
-    return lose
-
-
-@pytest.mark.parametrize("case", ["paper", "a fraction of a period", "no delay", "gravity"])
-@pytest.mark.parametrize(("first", "number"), [(0, 1), (0, 3), (1, 5), (2, 5), (0, 10), (8, 10)])
-def test_after_a_gap_the_way_back_is_that_of_python(case, first, number):
-    """Torques, counts and memory are the same, from rest."""
-    name, settings, _ = CASES[case]
-    pair, gaps, peak = Pair(name, (*settings, "controller.replan=0")), [], 0.0
-    for k in range(32):
-        gaps.append(pair.step(k, np.zeros(12), None, lost_in_a_row(first, number)))
-        one, other = pair.one, pair.other
-        peak = max(peak, float(np.abs(one.torque).max()))
-        assert one.counts == other.counts, k
-        back = one.course
-        assert [back.gap, back.holds, back.samples] == [*other.gap, *other.way_back], k
-        if back.holds:
-            assert np.allclose(back.offset, other.offset, rtol=1e-6, atol=1e-8), k
-    assert max(gaps) <= 1e-8 * peak
-    assert pair.one.counts.references_missing == number + 1
-
-
 @pytest.mark.parametrize("case", ["paper", "a fraction of a period", "no delay", "gravity"])
 @pytest.mark.parametrize("start", ["measured", "unmeasured"])
-def test_a_reference_that_is_missing_is_continued_as_in_python(case, start):
+def test_a_reference_that_is_missing_is_continued_with_parts_in_python(case, start):
     """Torques, counts and memory are the same, with weights that are NaN, too."""
     name, settings, _ = CASES[case]
     reads = "start=on_reference", "queue=reference", "controller.replan=0"
@@ -393,18 +364,28 @@ def test_what_the_law_in_c_has_not_is_named(settings, field):
     assert uncovered(law_of(*settings)) == field
 
 
-def test_a_part_of_ones_own_is_stepped_in_python():
+def test_a_part_of_ones_own_is_named():
     class Mine(PredictiveLqi):
         pass
 
     law = law_of()
     mine = replace(law, planner=type("Planner", (), {})())
     assert uncovered(mine) == "controller.replan"
-    assert uncovered(Mine(**{name: getattr(law, name) for name in law.__dataclass_fields__})) == (
-        "law"
-    )
-    assert serving(law).backend == "native"
-    assert serving(mine) == (mine, "python (controller.replan)")
+    assert uncovered(Mine(**law.parts)) == "law"
+    assert backend(law) == "native"
+    assert backend(mine) == "native, controller.replan in Python"
+
+
+def test_an_error_of_a_part_is_raised():
+    class Broken(type(law_of().feedforward)):
+        def held(self, *_):
+            raise KeyError("by the test")
+
+    law = replace(law_of(), feedforward=Broken())
+    memory, home = law.initial_memory(np.zeros((8, 6))), np.append(PAPER.home, np.zeros(12))
+    preview = Preview(law.preview_times, np.tile(home, (len(law.preview_times), 1)))
+    with pytest.raises(KeyError, match="by the test"):
+        law.step(memory, Measurement.of(home[:12]), preview, np.ones(2))
 
 
 SPARE, UNTOUCHED = 500, 12345.678
@@ -458,11 +439,11 @@ def test_servos_take_no_more_scratch_than_stated_after_lost_measurements(monkeyp
     stated, motion = CompiledLaw(law).scratch, Preview(law.preview_times, np.zeros((1, 18)))
     monkeypatch.setattr(CompiledLaw, "scratch", stated + SPARE)
     monkeypatch.setattr(core_law, "np", painted)
-    native, report = CoreServo(law), np.zeros(law.reports.size)
-    memory, lost = native.initial_memory(np.zeros(18)), np.full(12, np.nan)
+    report = np.zeros(law.reports.size)
+    memory, lost = law.initial_memory(np.zeros(18)), np.full(12, np.nan)
     for k in range(2 + law.reports.periods):
         y = lost if 1 < k < 1 + law.reports.periods else experiment.start
-        memory = native.step(memory, Measurement.of(y), motion, report)
+        memory = law.step(memory, Measurement.of(y), motion, report)
     assert memory.counts.measurements_missing == law.reports.periods - 1
     used = [array for array in painted.kept if array.shape == (stated + SPARE,)]
     assert all((array[stated:] == UNTOUCHED).all() for array in used)
@@ -486,24 +467,23 @@ def test_a_missing_preview_over_a_network_leaves_the_torques_as_they_are():
 
 def test_a_measurement_that_is_too_old_or_repeated_is_missing():
     pair = Pair("paper", ("sensor.delay=0.2",))
-    law, native = pair.law, pair.native
+    law = pair.law
     y, motion = pair.states[0], KnownMotion(pair.planned, pair.goal, 0.0)
     most, missing = law.longest_wait, 0
     old = [(most + 1, 1)] * (most + 1)
     for age, more in (*old, (most, 0), (most + 1, 1), (1, 0), (2, 1), (4, 1), (0, 0)):
         missing += more
         given = Measurement.of(y, age * law.timeline.period), motion, pair.weights
-        pair.one, pair.other = law.step(pair.one, *given), native.step(pair.other, *given)
+        pair.one, pair.other = pair.own.step(pair.one, *given), law.step(pair.other, *given)
         for one in (pair.one, pair.other):
             assert one.counts.measurements_missing == missing, age
 
 
 def test_shapes_that_do_not_fit_are_refused():
     law = law_of()
-    native = CoreLqi(law)
     with pytest.raises(ValueError, match=r"queue: got shape \(2, 6\); expected \(8, 6\)"):
-        native.initial_memory(np.zeros((2, 6)))
-    memory = native.initial_memory(np.zeros((8, 6)))
+        law.initial_memory(np.zeros((2, 6)))
+    memory = law.initial_memory(np.zeros((8, 6)))
     preview = np.tile(np.concatenate([PAPER.home, np.zeros(12)]), (len(law.preview_times), 1))
     motion = Preview(law.preview_times, preview)
     y, weights = np.concatenate([PAPER.home, np.zeros(6)]), np.ones(2)
@@ -514,7 +494,7 @@ def test_shapes_that_do_not_fit_are_refused():
         ((Measurement.of(y, 0.1), motion, weights), "measurement: got an age of 0.1 s"),
     ):
         with pytest.raises(ValueError, match=field):
-            native.step(memory, *arguments)
-    after = native.step(memory, Measurement.of(y), motion, weights)
+            law.step(memory, *arguments)
+    after = law.step(memory, Measurement.of(y), motion, weights)
     assert not np.array_equal(after.data, memory.data)  # which stays as it was
     assert np.isnan(memory.weights).all()

@@ -108,10 +108,10 @@ LOOPS = {
 
 
 IN_PYTHON = {
-    "blind": "native, law in Python (controller.prediction)",
-    "packets, blind": "native, law in Python (controller.prediction)",
-    "linear": "native, law in Python (controller.prediction)",
-    "printed": "native, law in Python (controller.model)",
+    "blind": "native, controller.prediction in Python",
+    "packets, blind": "native, controller.prediction in Python",
+    "linear": "native, controller.prediction in Python",
+    "printed": "native, controller.model in Python",
 }
 """What the core has not."""
 

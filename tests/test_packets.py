@@ -12,8 +12,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 import stewart_drake as sd
+from stewart_drake.core.library import core
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.channel import Packets, Report, Wire
+from stewart_drake.law.channel import Packets, Report, Sent, Wire, packets_of, report_of
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.diagram import build_closed_loop
@@ -298,66 +299,97 @@ def test_the_law_knows_what_has_acted():
     assert not np.array_equal(applied[steps:], decided[: len(applied) - steps])
 
 
+class Buffer:
+    """Packets that were sent, as core/packets.h remembers them."""
+
+    def __init__(self, channel, memory=None):
+        self._it = packets_of(channel).it
+        self._rows, self._memory = len(channel.in_time), memory
+        if memory is None:
+            self._memory = np.empty(core().lib.stewart_packets_memory(self._it))
+            core().lib.stewart_packets_start(self._it, core().at(self._memory))
+
+    @property
+    def packets(self):
+        return Sent(self._memory, self._rows).packets
+
+    def of(self, channel):
+        """Return the same packets over another channel."""
+        return Buffer(channel, self._memory)
+
+    def believed(self, flying, timeline, report):
+        c, memory, flying = core(), self._memory.copy(), flying.copy()
+        given = c.at(memory), report_of(report).it, timeline.steps, len(flying), c.at(flying)
+        scratch = c.scratch(c.lib.stewart_packets_scratch(self._it))
+        c.lib.stewart_packets_update(self._it, *given, scratch)
+        return flying
+
+    def send(self, plan, flying):
+        c = core()
+        given = c.at(self._memory), c.at(plan), len(flying), c.at(flying)
+        c.lib.stewart_packets_send(self._it, *given)
+
+
 def test_the_most_probable_content_is_believed():
     """One packet a period, r = 1, by hand: packet k has T_{k-1}, T_k and a plan for k + 1."""
     # mu = 3: the rows are due 0.2, 0.3 and 0.4 s after they are sent.
     channel = Packets(2, 1, in_time=(0.3, 0.6, 0.9), arrived_by=(0.0, 0.1, 0.3, 0.6, 0.9, 0.9))
     timeline = Timeline(PERIOD, Delay(3))
-    sent, flying = channel.start(), np.zeros((6, 6))
+    sent, flying = Buffer(channel), np.zeros((6, 6))
     for k in range(5):
-        sent, flying = channel.in_flight(sent, flying, timeline, None)
+        flying = sent.believed(flying, timeline, None)
         plan = np.array([np.full(6, 10.0 + k), np.full(6, 20.0 + k)])  # T_k, and for T_{k+1}
-        sent = channel.send(sent, plan, flying)
+        sent.send(plan, flying)
         flying = np.vstack([flying[1:], plan[:1]])
     assert sent.packets[-1, :, 0].tolist() == [13, 14, 24]
     # Without any report T_k comes with packet k or its repetition: 0.3 + 0.7 * 0.6 > 1/2.
-    _, believed = channel.in_flight(sent, flying, timeline, None)
+    believed = sent.believed(flying, timeline, None)
     assert believed[-5:, 0].tolist() == [10, 11, 12, 13, 14]
     # Nothing has come. T_4: packet 4 is there in time with (0.6 - 0.1) / (1 - 0.1) > 1/2. T_3:
     # packet 4 with (0.3 - 0.1) / 0.9 = 0.22, else packet 3 with (0.6 - 0.3) / 0.7 = 0.43, which
     # make 0.56. T_2: no packet will be there; the buffer holds what acted last.
     nothing = Report(np.zeros(6, dtype=bool), np.full((3, 6), 7.0), 0)
-    _, believed = channel.in_flight(sent, flying, timeline, nothing)
+    believed = sent.believed(flying, timeline, nothing)
     assert believed[-5:, 0].tolist() == [7, 7, 7, 13, 14]
     # A reported torque that is not finite is none: the assumed one stays.
     for odd in (np.nan, np.inf):
         acted = np.array([[7.0] * 6, [odd] + [7.0] * 5, [7.0] * 6])
         report = replace(nothing, acted=acted)
-        _, believed = channel.in_flight(sent, flying, timeline, report)
+        believed = sent.believed(flying, timeline, report)
         assert believed[-5:, 0].tolist() == [10, 7, 7, 13, 14]
     # A slower network. T_3: packets 4 and 3 with 0.06 + 0.94 * 0.12 = 0.17, packet 2, which had a
     # plan for it, with 0.83 (0.9 - 0.25) / 0.75 = 0.72, more than twice as much. T_4: packet 4 with
     # 0.17, the plan of packet 3 with 0.83 (0.9 - 0.15) / 0.85 = 0.74.
     chances = (0.0, 0.1, 0.15, 0.25, 0.9, 0.9)
     slow = dataclasses.replace(channel, in_time=(0.15, 0.25, 0.9), arrived_by=chances)
-    _, believed = slow.in_flight(sent, flying, timeline, nothing)
+    believed = sent.of(slow).believed(flying, timeline, nothing)
     assert believed[-5:, 0].tolist() == [7, 7, 7, 22, 23]
     # 0.33 and 0.56 are not enough to change one's mind.
     chances = (0.0, 0.1, 0.15, 0.4, 0.9, 0.9)
     slow = dataclasses.replace(channel, in_time=(0.15, 0.4, 0.9), arrived_by=chances)
-    _, believed = slow.in_flight(sent, flying, timeline, nothing)
+    believed = sent.of(slow).believed(flying, timeline, nothing)
     assert believed[-5:, 0].tolist() == [7, 7, 7, 13, 14]
     # What a packet that has come says is certain.
     came = Report(np.array([False, True, False, False, False]), np.full((3, 6), 7.0), 0)
-    _, believed = channel.in_flight(sent, flying, timeline, came)
+    believed = sent.believed(flying, timeline, came)
     assert believed[-5:, 0].tolist() == [7, 7, 12, 13, 14]
 
 
 def test_packets_that_come_later_than_reports_tell_of_are_borne():
     """The state of a packet that was missing in the last report is unknown."""
     channel = Packets(1, 0, (0.5,), (0.0, 0.2, 0.4, 1.0, 1.0, 1.0), told=2)
-    sent = channel.start()
+    sent = Buffer(channel)
     for k in range(6):
-        sent = channel.send(sent, np.full((1, 6), 10.0 + k), np.zeros((6, 6)))
+        sent.send(np.full((1, 6), 10.0 + k), np.zeros((6, 6)))
     none = np.zeros(6, dtype=bool)
     late = dataclasses.replace(channel, in_time=(1.0,))
     nothing, timeline = Report(none, np.empty((0, 6))), Timeline(PERIOD, Delay(4))
     # (1 - 0.4) / (1 - 0.4): it takes four periods, and is there by then.
-    _, believed = late.in_flight(sent, np.zeros((6, 6)), timeline, nothing)
+    believed = sent.of(late).believed(np.zeros((6, 6)), timeline, nothing)
     assert believed[-4, 0] == 12
     # All were told of after four periods, by when every packet is there: this one is lost.
     longer = dataclasses.replace(late, told=4)
-    _, believed = longer.in_flight(sent, np.zeros((6, 6)), timeline, nothing)
+    believed = sent.of(longer).believed(np.zeros((6, 6)), timeline, nothing)
     assert believed[-4, 0] == 0
     law = compose_law(prepare(scenario(*NETWORK)))
     assert isinstance(law.channel, Packets) and law.channel.told == reported(law.kept)

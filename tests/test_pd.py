@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.core_law import uncovered
 from stewart_drake.law.cost import pd_gains
+from stewart_drake.law.coverage import uncovered
 from stewart_drake.law.delay_model import chain, delayed_model, linear_model
 from stewart_drake.law.stability import closed_loop, fastest_pole, spectral_radius
 from stewart_drake.loop.law_design import compose_law, pd_gain

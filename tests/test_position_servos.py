@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.core_law import CoreServo, uncovered
+from stewart_drake.law.coverage import uncovered
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.bulk import ending_of, run_in_bulk
@@ -29,6 +29,7 @@ from stewart_drake.scenario.signals import (
 )
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.compare import shown
+from tests.backends import with_own
 
 PAPER = sd.load_mechanism("paper")
 SERVO = (
@@ -225,22 +226,22 @@ def test_estimates_need_the_reports_of_drakes_loop():
 
 
 @pytest.mark.parametrize("feedforward", ["none", "equilibrium", "inverse_dynamics"])
-def test_the_law_in_c_is_that_in_python(feedforward):
+def test_commands_are_the_same_with_a_feedforward_in_python(feedforward):
     home = PAPER.crank_angles(PAPER.home)
     ranges = np.column_stack([home - 0.1, home + 0.05])
     limits = ("actuator.speed_limit=3", f"actuator.angle_range={ranges.tolist()}")
     experiment = prepare(scenario(f"controller.feedforward={feedforward}", *limits))
     law = compose_servo_law(experiment)
     assert uncovered(law) is None
-    rng, compiled = np.random.default_rng(6), CoreServo(law)
+    rng, mine = np.random.default_rng(6), with_own(law, "feedforward")
     first, _ = commands_in_flight(experiment, law, law.timeline.delay)
-    memories = [law.initial_memory(first), compiled.initial_memory(first)]
+    memories = [law.initial_memory(first), mine.initial_memory(first)]
     nothing = np.full(law.reports.size, np.nan)
     for k in range(8):
         row = evaluate(experiment.reference, 0.1 * k)
         row[POSE] += 0.01 * rng.standard_normal(6)
         motion = Preview(law.preview_times, row[None])
-        for i, one in enumerate((law, compiled)):
+        for i, one in enumerate((law, mine)):
             measured = Measurement.of(experiment.start)
             memories[i] = one.step(memories[i], measured, motion, nothing)
         angles = memories[0].command[POSE]

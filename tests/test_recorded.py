@@ -1,14 +1,8 @@
-"""Torques stay what they are: step by step, and around the loop.
-
-The record is of the law in Python, on the compiled core. The law in C rounds differently, and the
-law alone amplifies that with every sample, so it is compared around the loop.
-"""
+"""Torques stay what they are: step by step, and around the loop."""
 
 import numpy as np
 import pytest
 
-from stewart_drake.files.resources import shipped
-from tests.backends import stepped_in_python
 from tests.recorded import runs
 
 RECORDED = runs.load()
@@ -27,12 +21,11 @@ QUICK = [row for row in runs.ROWS if row.startswith("paper/") and row.endswith("
 @pytest.mark.parametrize(
     "row", [pytest.param(r, marks=() if r in QUICK else pytest.mark.slow) for r in runs.ROWS]
 )
-def test_torques_are_what_they_were(row, monkeypatch):
+def test_torques_are_what_they_were(row):
     """The law's first answers and the loop with its plant, to 1e-9 of the peak torque.
 
     With other releases or another processor the law's first answers, to 1e-7.
     """
-    stepped_in_python(monkeypatch)
     measurements, torques = RECORDED[row]
     peak = np.abs(torques).max()
     loop = runs.closed_loop(row)
@@ -43,15 +36,3 @@ def test_torques_are_what_they_were(row, monkeypatch):
         _, found = runs.run(loop)
         assert found.shape == torques.shape
         assert np.abs(found - torques).max() <= 1e-9 * peak
-
-
-@pytest.mark.parametrize("scenario", shipped("scenario"))
-def test_in_c_the_loop_does_the_same(scenario):
-    """1e-9 of the peak torque, with the law that asks most of the dynamics; found are 4e-13."""
-    if not runs.same_rounding():
-        pytest.skip("recorded with other releases or another processor")
-    row = f"{scenario}/predictor_lqi/exact"
-    _, torques = RECORDED[row]
-    _, found = runs.run(runs.closed_loop(row))
-    assert found.shape == torques.shape
-    assert np.abs(found - torques).max() <= 1e-9 * np.abs(torques).max()

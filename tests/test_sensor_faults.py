@@ -7,7 +7,7 @@ import pytest
 
 import stewart_drake.loop.kinds as kinds_module
 from stewart_drake.core.library import core
-from stewart_drake.law.memory import Counts
+from stewart_drake.law.counts import Counts
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.sensing import Measurement, StateSensing
 from stewart_drake.loop.sensor import Sensor

@@ -13,7 +13,6 @@ from pydrake.trajectories import PiecewisePolynomial
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.core_law import CoreServo
 from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servos import (
@@ -37,6 +36,7 @@ from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
 from stewart_drake.scenario.timing import look_time, servo_ticks
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.compare import CONTROLLERS, SERVOS, shown
+from tests.backends import with_own
 
 ON = ("start=on_reference", "queue=reference")
 UNKNOWN = (
@@ -409,7 +409,7 @@ def test_where_too_many_reports_are_lost_the_observer_begins_anew():
     memory = law.step(memory, Measurement.of(state), at_home, quiet)
     prior = law.observer.settings.parameters.std
     assert np.all(memory.belief.estimate.parameter_std == prior) and np.any(known < prior)
-    assert np.allclose(memory.belief.state, state) and memory.lag == 0
+    assert np.allclose(memory.belief.state, state) and memory.behind == 0
 
 
 def test_a_command_is_finite_whatever_the_reference_is():
@@ -418,7 +418,7 @@ def test_a_command_is_finite_whatever_the_reference_is():
     report = np.full(law.reports.size, np.nan)
     cases = (-1, np.nan, "references_missing"), (0, np.nan, "references_missing")
     cases += (-1, 1e308, "nonfinite_torque"), (5, 5.0, "unreachable")
-    for one in (law, CoreServo(law)):
+    for one in (law, with_own(law, "observer", "feedforward")):
         before = one.initial_memory(memory.command)
         for place, wrong, cause in cases:
 
@@ -436,7 +436,7 @@ def test_a_command_is_finite_whatever_the_reference_is():
 def test_a_measurement_that_servos_repeat_is_missing():
     law, memory = law_and_memory()
     state, report = np.concatenate([HOME, np.zeros(6)]), np.zeros(law.reports.size)
-    for one in (law, CoreServo(law)):
+    for one in (law, with_own(law, "observer", "feedforward")):
         after = one.initial_memory(memory.command)
         for age, missing in ((0, 0), (1, 1), (1, 1)):  # of samples 0, 0 and 1
             given = Measurement.of(state, age * law.timeline.period)

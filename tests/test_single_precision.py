@@ -12,7 +12,7 @@ import stewart_drake as sd
 from stewart_drake.core import build, library
 from stewart_drake.law.compiled import address_of
 from stewart_drake.law.observers import CoreObserver, part_of
-from tests.backends import stepped_in_python
+from tests.backends import with_own
 
 HOST = ("dop853", "plant")
 """Sources for the host alone, in double precision."""
@@ -121,9 +121,9 @@ def observed(controller, settings, monkeypatch):
         calls.append((one, *given, observe(one, *given)))
         return calls[-1][-1]
 
-    stepped_in_python(monkeypatch)  # which calls the observer by itself
     monkeypatch.setattr(CoreObserver, "observe", recorded)
-    sd.simulate(sd.load_scenario("paper", controller, settings), judge_stability=False)
+    scenario = sd.load_scenario("paper", controller, settings)
+    sd.simulate(scenario, judge_stability=False, modify_law=lambda law: with_own(law, "observer"))
     return calls
 
 

@@ -16,7 +16,6 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.resources import resolve
-from stewart_drake.law.core_law import serving
 from stewart_drake.law.cost import PdGain, QuadraticCost
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.nominal import NominalPlant, PaperModel, TorqueLimit
@@ -40,7 +39,7 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.scenario.trajectories import evaluate, make_reference
 from stewart_drake.tuner.network import load_network
-from tests.backends import stepped_in_python
+from tests.backends import with_own
 from tests.mechanisms import PAPER
 
 DELAYS = [(steps, fraction) for steps in (0, 1, 8) for fraction in (0.0, 0.3)]
@@ -420,14 +419,12 @@ def fixed(controller, context):
     return values
 
 
-@pytest.mark.parametrize("in_python", [False, True])
-def test_controller_output_and_forced_update_are_steps_of_the_law(in_python, monkeypatch):
-    if in_python:
-        stepped_in_python(monkeypatch)
-    controller = DelayLqiController(law(), np.zeros((2, 6)))
+@pytest.mark.parametrize("own", [(), ("observer", "feedforward")])
+def test_controller_output_and_forced_update_are_steps_of_the_law(own):
+    steps = with_own(law(), *own)
+    controller = DelayLqiController(steps, np.zeros((2, 6)))
     context = controller.CreateDefaultContext()
     inputs = fixed(controller, context)
-    steps = law() if in_python else serving(law()).law
     expected = steps.initial_memory(np.zeros((2, 6)))
     for _ in range(3):
         preview = Preview(law().preview_times, inputs["preview"].reshape(-1, 18))
@@ -456,7 +453,6 @@ def short_loop(plant, *settings):
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
 @pytest.mark.parametrize("fraction", [0.0, 0.3])
 def test_the_law_is_evaluated_once_per_sample(fraction, plant, monkeypatch):
-    stepped_in_python(monkeypatch)
     step, calls = PredictiveLqi.step, []
 
     def counted(self, memory, *inputs):

@@ -20,15 +20,15 @@ int stewart_order(const stewart_cost *cost, int pending)
 void stewart_hold(const stewart_machine *machine, const stewart_cost *cost, const real *theta,
                   int pending, const real *nodes, stewart_held *held)
 {
-    static const real still[12] = {0};
     const int holds = 3 + pending, moves = cost->feedforward == STEWART_INVERSE_DYNAMICS;
     real mean[4][U], at[2][U] = {{0}};
     stewart_belief belief;
     stewart_believe(machine, theta, &belief);
     for (int k = 0; k < holds; k++) {
         for (int node = 0; node < 2 && cost->feedforward != STEWART_NO_FEEDFORWARD; node++) {
-            const real *r = nodes + ROW * (2 * k + node), *motion = moves ? r + 6 : still;
-            stewart_inverse_dynamics(&belief.plant, r, motion, motion + 6, at[node]);
+            real row[ROW] = {0};
+            stewart_copy(moves ? ROW : 6, nodes + ROW * (2 * k + node), row);
+            stewart_required_torque(&belief, row, at[node]);
         }
         for (int i = 0; i < U; i++) {
             mean[k][i] = (at[0][i] + at[1][i]) / 2;
@@ -175,7 +175,7 @@ int stewart_linearize(const stewart_machine *machine, const real *theta, real pe
                       stewart_scratch scratch)
 {
     stewart_belief belief;
-    if (!stewart_is_workable(machine->geometry, state))
+    if (!machine->acceleration_per_torque && !stewart_is_workable(machine->geometry, state))
         return STEWART_UNREACHABLE;
     stewart_believe(machine, theta, &belief);
     if (!stewart_derivatives(machine, &belief, state, held->torque[fraction > 0], A, B, NULL, scratch))
@@ -205,17 +205,15 @@ int stewart_gain(const stewart_cost *cost, real period, real fraction, const rea
 }
 
 void stewart_feed_back(const stewart_cost *cost, const real *K, const real *error,
-                       const real *integral, const real *late, const stewart_held *held,
+                       const real *integral, int pending, const real *late, const real *feedforward,
                        real *torque)
 {
-    real seen[STEWART_MAX_ORDER];
-    int n = X;
-    stewart_copy(X, error, seen);
-    for (int i = 0; cost->integrates && i < 6; i++)
-        seen[n++] = integral[i];
-    for (int i = 0; late && i < U; i++)
-        seen[n++] = late[i] - held->torque[0][i];
-    for (int i = 0; i < U; i++)
-        for (int j = 0; j < n; j++)
-            torque[i] -= K[n * i + j] * seen[j];
+    for (int i = 0; i < U; i++) {
+        for (int j = 0; j < X; j++)
+            torque[i] -= *K++ * error[j];
+        for (int j = 0; cost->integrates && j < 6; j++)
+            torque[i] -= *K++ * integral[j];
+        for (int j = 0; j < U * pending; j++)
+            torque[i] -= *K++ * (late[j] - feedforward[j]);
+    }
 }

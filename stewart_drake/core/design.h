@@ -46,10 +46,10 @@ int stewart_linearize(const stewart_machine *machine, const real *theta, real pe
 int stewart_gain(const stewart_cost *cost, real period, real fraction, const real *A, const real *B,
                  const real *weights, real *K, stewart_scratch scratch);
 
-/* T = T_ff - K [error; integral; torque that is still to act], in the place of T (6), which is T_ff;
-   `late` (6) is that torque, NULL for none. */
+/* T = T_ff - K [error; integral; late - its feedforward], in the place of T (6), which is T_ff. `late`
+   (pending, 6) are the torques that are still to act, `feedforward` (pending, 6) theirs. */
 void stewart_feed_back(const stewart_cost *cost, const real *K, const real *error,
-                       const real *integral, const real *late, const stewart_held *held,
+                       const real *integral, int pending, const real *late, const real *feedforward,
                        real *torque);
 
 int stewart_linearize_scratch(void);

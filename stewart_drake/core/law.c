@@ -40,7 +40,7 @@ void stewart_prepare(stewart_law *law)
     l->measurement = place(law, 1, law->measured);
     l->error = place(law, 1, 6);
     l->integral = place(law, 1, 6);
-    l->gain = place(law, U, stewart_order(&law->cost, law->fraction > 0));
+    l->gain = place(law, U, law->design ? law->design->columns : stewart_order(&law->cost, law->fraction > 0));
     l->torque = place(law, 1, U);
     l->feedforward = place(law, 1, U);
     l->weights = place(law, 1, 2);
@@ -118,7 +118,8 @@ static void fixed_delay_outlook(const stewart_law *law, const real *in_flight, s
     outlook->eta = ((real)law->steps + law->fraction) * law->period;
     outlook->fraction = law->fraction;
     outlook->until = (stewart_schedule){queue, torques, durations, 0};
-    outlook->horizon = stewart_schedule_of(law, law->steps, torques, scratch);
+    outlook->horizon = stewart_schedule_of(law->period, law->fraction, law->steps, torques, scratch);
+    outlook->assumed = 1;
     outlook->samples = law->steps;
     outlook->times = times;
     outlook->pending = pending;
@@ -154,7 +155,7 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
     }
     memory[l->behind.at] = (real)behind;
     outlook->feeds_back = outlook->settled = 1;
-    outlook->found = 0;
+    outlook->found = outlook->assumed = 0;
     outlook->caution = 1;
     outlook->observed = observed;
     if (observer->outlook)
@@ -175,6 +176,8 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
         stewart_predict(&law->machine, outlook->theta, &schedule, outlook->state, states);
         stewart_copy(X, states + X * (schedule.number - 1), outlook->state);
     }
+    if (law->design && law->design->outlook)
+        law->design->outlook(law, behind, outlook);
 }
 
 /* ---- the reference to follow ------------------------------------------------------------------ */
@@ -266,13 +269,17 @@ static void predict(const stewart_law *law, const stewart_outlook *outlook, cons
                     const real *integral, stewart_ahead *a, stewart_scratch scratch)
 {
     const stewart_schedule *schedule = &outlook->horizon;
+    if (law->design && law->design->predict) {
+        law->design->predict(law, outlook, followed, integral, a);
+        return;
+    }
     real *states = stewart_take(&scratch, X * (schedule->number + 1)), before[6];
     const int each = outlook->samples > 0 ? schedule->number / outlook->samples : 1;
     stewart_copy(X, outlook->state, states);
     stewart_copy(6, integral, a->integral);
     for (int i = 0; i < 6; i++)
         before[i] = outlook->state[i] - followed[i];
-    if (law->fraction == 0 && outlook->predicted && !isnan(outlook->predicted[0]))
+    if (outlook->fraction == 0 && outlook->predicted && !isnan(outlook->predicted[0]))
         stewart_copy(X * (schedule->number + 1), outlook->predicted, states);
     else
         stewart_predict(&law->machine, outlook->theta, schedule, states, states + X);
@@ -294,6 +301,33 @@ static void predict(const stewart_law *law, const stewart_outlook *outlook, cons
         a->error[i] = a->state[i] - followed[ROW * outlook->samples + i];
 }
 
+int stewart_design_feedback(const stewart_law *law, const stewart_outlook *outlook, const real *theta,
+                            const real *nodes, const real *state, const real *weights, real *torques,
+                            real *error, real *K, stewart_scratch scratch)
+{
+    if (law->design && law->design->design)
+        return law->design->design(law, outlook, theta, nodes, state, weights, torques, error, K);
+    const real h = law->period, fraction = outlook->fraction;
+    stewart_held held;
+    stewart_hold(&law->machine, &law->cost, theta, outlook->pending, nodes, &held);
+    stewart_copy(U * (1 + outlook->pending), held.torque[0], torques);
+    if (!error)
+        return 0;
+    real *A = stewart_take(&scratch, X * X), *B = stewart_take(&scratch, X * U);
+    const int trouble =
+        stewart_linearize(&law->machine, theta, h, fraction, state, &held, A, B, error, scratch);
+    if (trouble || !weights || stewart_gain(&law->cost, h, fraction, A, B, weights, K, scratch))
+        return trouble;
+    return STEWART_RICCATI_FAILURE;
+}
+
+/* Whether the last good gain has n numbers; under another delay it may have more or fewer. */
+static int fits(const stewart_field *field, const real *gain, int n)
+{
+    const int size = field->rows * field->columns;
+    return !isnan(gain[0]) && !isnan(gain[n - 1]) && (n == size || isnan(gain[n]));
+}
+
 /* Compute the torque by feedback of the predicted error. Returns bits of `stewart_status`. */
 static int feed_back(const stewart_law *law, real *memory, const stewart_outlook *outlook,
                      const real *followed, const real *weights, stewart_ahead *a, real *torque,
@@ -302,13 +336,12 @@ static int feed_back(const stewart_law *law, real *memory, const stewart_outlook
     const stewart_layout *l = &law->layout;
     const int pending = outlook->pending, n = U * stewart_order(&law->cost, pending);
     const real *nodes = followed + ROW * (1 + outlook->samples), h = law->period;
-    const real *newest = memory + l->in_flight.at + U * (in_flight_length(law) - 1);
+    const real *late = memory + l->in_flight.at + U * (in_flight_length(law) - pending);
     real *error = memory + l->error.at, *integral = memory + l->integral.at;
     real *gain = memory + l->gain.at, *K = stewart_take(&scratch, n);
-    real *A = stewart_take(&scratch, X * X), *B = stewart_take(&scratch, X * U);
+    real *torques = stewart_take(&scratch, U * (1 + pending));
     const real cautious[2] = {weights[0], weights[1] * outlook->caution};
     const int had_state = stewart_all_finite(X, memory + l->state.at);
-    stewart_held held;
     for (int i = 0; i < 6; i++) {
         real now = outlook->state[i] - followed[i];
         if (law->cost.integrates && had_state && !outlook->limited)
@@ -316,21 +349,20 @@ static int feed_back(const stewart_law *law, real *memory, const stewart_outlook
         error[i] = now;
     }
     predict(law, outlook, followed, integral, a, scratch);
-    stewart_hold(&law->machine, &law->cost, outlook->theta, pending, nodes, &held);
-    stewart_copy(U, held.torque[pending], torque);
+    const int trouble = stewart_design_feedback(law, outlook, outlook->theta, nodes, a->state, cautious,
+                                                torques, a->error, K, scratch);
+    stewart_copy(U, torques + U * pending, torque);
     stewart_copy(U, torque, memory + l->feedforward.at);
-    int trouble = stewart_linearize(&law->machine, outlook->theta, h, outlook->fraction, a->state, &held, A, B,
-                                    a->error, scratch);
     if (trouble == STEWART_UNREACHABLE) /* nothing to regulate: the feedforward goes on alone */
         return trouble;
-    if (!trouble && stewart_gain(&law->cost, h, outlook->fraction, A, B, cautious, K, scratch))
+    if (!trouble) {
+        stewart_fill(U * l->gain.columns, (real)NAN, gain);
         stewart_copy(n, K, gain);
-    else
-        trouble = STEWART_RICCATI_FAILURE;
-    if (isnan(gain[0])) /* nothing to go on with */
+    }
+    if (!fits(&l->gain, gain, n)) /* nothing to go on with */
         return trouble;
     a->gain = gain;
-    stewart_feed_back(&law->cost, gain, a->error, a->integral, pending ? newest : NULL, &held, torque);
+    stewart_feed_back(&law->cost, gain, a->error, a->integral, pending, late, torques, torque);
     return trouble;
 }
 
@@ -353,9 +385,9 @@ static int respond(const stewart_law *law, real *memory, const stewart_outlook *
         a->theta = outlook->theta;
         stewart_copy(U, memory + l->torque.at, torque);
     } else { /* by what is known beforehand */
-        stewart_held held;
-        stewart_hold(&law->machine, &law->cost, NULL, outlook->pending, nodes, &held);
-        stewart_copy(U, held.torque[outlook->pending], torque);
+        real *torques = stewart_take(&scratch, U * (1 + outlook->pending));
+        stewart_design_feedback(law, outlook, NULL, nodes, NULL, NULL, torques, NULL, NULL, scratch);
+        stewart_copy(U, torques + U * outlook->pending, torque);
     }
     stewart_copy(X, nodes - ROW, a->state);
     stewart_fill(X, 0, a->error);
@@ -371,14 +403,16 @@ static int shares_prediction(const stewart_law *law) { return law->planner && !l
 int stewart_step_scratch(const stewart_law *law)
 {
     const stewart_channel *channel = law->channel;
-    const int rows = ROW * law->rows, queue = stewart_queue_length(law), parts = 2 * law->steps + 2;
-    const int telling = law->steps + queue + 2 + (U + 1) * (parts + 2);
+    /* Parts of one's own may estimate any delay for which there are torques and rows. */
+    const int queue = law->design ? in_flight_length(law) + law->rows : stewart_queue_length(law);
+    const int rows = ROW * law->rows, parts = 2 * queue + 2, late = law->design ? queue : 1;
+    const int telling = 2 * queue + 2 + (U + 1) * (parts + 2);
     const int behind = (X + U + 1) * 2 * (law->longest_wait + 1);
     const int following = 2 * rows + X * (queue + 2);
     int channelled = channel ? channel->scratch(law) : 0;
     const int gaining = stewart_gain_scratch(&law->cost, law->fraction > 0);
     const int designing = stewart_linearize_scratch() + gaining;
-    const int feeding = U * STEWART_MAX_ORDER + X * (X + U) + X * (parts + 1) + designing;
+    const int feeding = U * (X + 7 + U * late) + U * (1 + late) + X * (X + U) + X * (parts + 1) + designing;
     const int used = feeding > following ? feeding : following;
     const int planned = law->planner ? law->planner->scratch(law) : 0;
     if (planned > channelled)

@@ -57,6 +57,21 @@ typedef struct {
     const real *rows;             /* of the reference, at further instants of the preview */
 } stewart_ahead;
 
+/* Parts of a law that are not of the core; a function is NULL where the core's is used. */
+typedef struct {
+    int columns; /* of the gain, at the most */
+    /* Change the outlook, which is that of the core under the assumed delay; the state is `behind` periods
+       after the one that was observed. */
+    void (*outlook)(const stewart_law *law, int behind, stewart_outlook *outlook);
+    /* Fill in state, error and integral, for the rows to follow and the integral (6) now. */
+    void (*predict)(const stewart_law *law, const stewart_outlook *outlook, const real *followed,
+                    const real *integral, stewart_ahead *ahead);
+    /* As `stewart_design_feedback`. */
+    int (*design)(const stewart_law *law, const stewart_outlook *outlook, const real *theta,
+                  const real *nodes, const real *state, const real *weights, real *torques,
+                  real *error, real *K);
+} stewart_design;
+
 /* A kind of channel to the motors, with which more than one torque is sent at a sample. */
 typedef struct {
     int (*memory)(const stewart_law *law);
@@ -105,6 +120,7 @@ struct stewart_law {
     int memory;        /* numbers of the memory, and the place of each field: `stewart_prepare` */
     stewart_layout layout;
     const stewart_observer *observer;
+    const stewart_design *design;     /* NULL: prediction and gain of the core */
     const void *sensing, *estimation; /* assumptions of the observer */
     const stewart_sensing *described; /* a sensor given by its functions, in the place of `sensing`; or NULL */
     const stewart_channel *channel;   /* NULL: every torque arrives, after the delay */
@@ -158,12 +174,28 @@ void stewart_note_acted(const stewart_law *law, real *memory, int ago, int numbe
 /* A `stewart_preview_function`: `about` points to all rows that are asked for. */
 void stewart_given_rows(void *about, int number, const real *times, real *rows);
 
+/* Compute the feedforward `torques` (1 + pending, 6), of those that are still to act and of the next, from
+   the reference at two `nodes` of each of 3 + pending holds. Unless `error` (12) is NULL, subtract from it
+   the offset that held torques cause in a state (12). Unless `weights` are NULL, compute the gain K
+   (6, `stewart_order`). Returns 0, or the cause of failure, of `stewart_status`. */
+int stewart_design_feedback(const stewart_law *law, const stewart_outlook *outlook, const real *theta,
+                            const real *nodes, const real *state, const real *weights, real *torques,
+                            real *error, real *K, stewart_scratch scratch);
+
+/* Plan the torques (`channel->torques`, 6) of this sample and of further ones: the model continues from the
+   end of the prediction, under feedback with the same gain. `late` (pending, 6) are still to act. */
+void stewart_plan_torques(const stewart_law *law, const stewart_outlook *outlook,
+                          const stewart_ahead *ahead, const real *late, real *plan,
+                          stewart_scratch scratch);
+int stewart_planning_scratch(const stewart_law *law);
+
 /* Limit a torque. Returns whether that changed it. */
 int stewart_limit(const stewart_machine *machine, const real *torque, real *limited);
 
-/* What acts in whole periods that begin with the oldest of `periods` + 1 torques. */
-stewart_schedule stewart_schedule_of(const stewart_law *law, int periods, const real *torques,
-                                 stewart_scratch *scratch);
+/* What acts in whole periods that begin with the oldest of `periods` + 1 torques, the first of which acts for
+   another `fraction` of a period. */
+stewart_schedule stewart_schedule_of(real period, real fraction, int periods, const real *torques,
+                                     stewart_scratch *scratch);
 
 /* For observers of a fixed delay: what acted in the last `periods` of torques (number, 6). */
 stewart_interval stewart_last_periods(const stewart_law *law, int number, const real *torques, int periods,

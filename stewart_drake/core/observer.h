@@ -26,6 +26,7 @@ typedef struct {
     int status;         /* problems of the measurement, bits of `stewart_status` */
     int feeds_back;     /* whether the estimate is good enough for feedback */
     int settled, found; /* whether the delay is known; whether it was found at this sample */
+    int assumed;        /* whether the delay is the assumed one */
     real caution;       /* factor on the weight of torques */
     real state[STEWART_STATES]; /* now; NaN before there is any */
     real theta[STEWART_MAX_ESTIMATED];
@@ -36,7 +37,7 @@ typedef struct {
     stewart_schedule horizon; /* torques until the last of `times`, the same number of pieces each */
     int samples;            /* instants of the prediction */
     const real *times;      /* (samples) s from now */
-    int pending;            /* 1 if the newest torque still acts then */
+    int pending;            /* number of the newest torques that still act then, left to the gain */
     int limited;            /* whether a torque since the last sample was at the limit */
     real *predicted; /* (until.number + 1, 12) states that a planner fills in, NULL without; first NaN */
 } stewart_outlook;

@@ -143,7 +143,7 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     look(law, memory, sample, 1, &outlook->eta, wanted);
     /* A known delay counts as found from the sample at which the first torque has acted for a period
        until the next plan. */
-    const int first = !law->observer->outlook && has_acted(law, outlook, memory) && !(memory[PLANNED] > 0);
+    const int first = outlook->assumed && has_acted(law, outlook, memory) && !(memory[PLANNED] > 0);
     if (!stewart_is_off(replan->size, states + X * outlook->until.number, wanted,
                         outlook->found || first))
         return 0;

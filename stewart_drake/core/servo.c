@@ -107,17 +107,16 @@ static real limited(const stewart_stiffness *stiff, int i, real setpoint, real l
     return last + REAL(fmax)(-stiff->most, REAL(fmin)(stiff->most, within - last));
 }
 
-/* [crank angles; their rates; torque] for a row of the reference; what went wrong. */
-static int command_for(const stewart_servo *servo, const real *theta, const real *row, real *command)
+/* [crank angles; their rates; torque] for a row of the reference, without limits; what went wrong. */
+static int unlimited(const stewart_servo *servo, const real *theta, const real *row, real *found)
 {
     const stewart_law *law = &servo->law;
     static const real still[12] = {0};
     const int moves = law->cost.feedforward == STEWART_INVERSE_DYNAMICS;
     const real *geometry = law->machine.geometry;
-    real J[36], found[STEWART_COMMAND] = {0};
+    real J[36];
     stewart_belief belief;
-    if (!stewart_all_finite(ROW, row))
-        return STEWART_REFERENCE_MISSING;
+    stewart_fill(STEWART_COMMAND, 0, found);
     stewart_crank_angles(geometry, row, found);
     if (!stewart_all_finite(6, found) || !stewart_crank_jacobian(geometry, row, J))
         return STEWART_UNREACHABLE;
@@ -130,6 +129,19 @@ static int command_for(const stewart_servo *servo, const real *theta, const real
     if (stiff->stiffness > 0) /* before the check, so that NaN stops here */
         for (int i = 0; i < U; i++)
             found[i] += (found[12 + i] + (moves ? stiff->velocity_gain * found[6 + i] : 0)) / stiff->stiffness;
+    return 0;
+}
+
+/* The command for a row of the reference, in the place of the last one; what went wrong. */
+static int command_for(const stewart_servo *servo, const real *theta, const real *row, real *command)
+{
+    const stewart_stiffness *stiff = &servo->stiff;
+    real found[STEWART_COMMAND];
+    if (!stewart_all_finite(ROW, row))
+        return STEWART_REFERENCE_MISSING;
+    const int trouble = (servo->command ? servo->command : unlimited)(servo, theta, row, found);
+    if (trouble)
+        return trouble;
     if (!stewart_all_finite(STEWART_COMMAND, found))
         return STEWART_NONFINITE_TORQUE;
     if (stiff->stiffness > 0)

@@ -43,9 +43,12 @@ typedef struct {
 
 /* `law` has `parts` torques in a report of each period; its cost but the feedforward, channel and what
    a law for torques remembers do not count. */
-typedef struct {
+typedef struct stewart_servo {
     stewart_law law;
     stewart_stiffness stiff;
+    /* Commands of one's own: write the command (18) for a row, without limits, and return 0 or the cause of
+       failure; NULL for those of the core. */
+    int (*command)(const struct stewart_servo *servo, const real *theta, const real *row, real *command);
     int periods; /* rows of a report; `periods` - 1 reports in a row may be lost without loss of data */
     int memory;  /* numbers of the memory, and the place of each field: `stewart_servo_prepare` */
     stewart_servo_layout layout;

@@ -22,14 +22,14 @@ int stewart_limit(const stewart_machine *machine, const real *torque, real *limi
 }
 
 /* With a fraction each torque acts for the end of one period and the beginning of the next. */
-stewart_schedule stewart_schedule_of(const stewart_law *law, int periods, const real *torques,
-                                 stewart_scratch *scratch)
+stewart_schedule stewart_schedule_of(real period, real fraction, int periods, const real *torques,
+                                     stewart_scratch *scratch)
 {
-    const int parts = 1 + (law->fraction > 0), number = parts * periods;
+    const int parts = 1 + (fraction > 0), number = parts * periods;
     real *durations = stewart_take(scratch, number), *each = stewart_take(scratch, U * number);
     for (int i = 0; i < number; i++) {
-        const real split = i % 2 ? 1 - law->fraction : law->fraction;
-        durations[i] = (parts == 1 ? 1 : split) * law->period;
+        const real split = i % 2 ? 1 - fraction : fraction;
+        durations[i] = (parts == 1 ? 1 : split) * period;
         stewart_copy(U, torques + U * (parts == 1 ? i : (i + 1) / 2), each + U * i);
     }
     stewart_schedule schedule = {number, each, durations, 0};
@@ -49,7 +49,8 @@ stewart_interval stewart_last_periods(const stewart_law *law, int number, const 
     /* Without a delay the next torque is not computed yet; the one before may not be remembered. */
     const real *before = first > torques ? first - U : first;
     const real *after = first + U * (queue > 0 ? periods : periods - 1);
-    return (stewart_interval){stewart_schedule_of(law, periods, first, scratch), before, after};
+    return (stewart_interval){stewart_schedule_of(law->period, law->fraction, periods, first, scratch),
+                              before, after};
 }
 
 void stewart_given_rows(void *about, int number, const real *times, real *rows)

@@ -12,13 +12,13 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
 from stewart_drake.files.schema import plain
 from stewart_drake.law.channel import Report
-from stewart_drake.law.core_law import uncovered
+from stewart_drake.law.coverage import uncovered
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import KnownMotion, Motion, between
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
+from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_controller
@@ -189,13 +189,13 @@ class RecordedServo(ServoPreview):
 
     record: Recorded = field(kw_only=True)
 
-    def initial_memory(self, command: Array) -> ServoMemory:
+    def initial_memory(self, command: Array) -> Memory:
         self.record.begin(command)
         return super().initial_memory(command)
 
     def step(
-        self, memory: ServoMemory, measurement: Measurement, motion: Motion, report: Array
-    ) -> ServoMemory:
+        self, memory: Memory, measurement: Measurement, motion: Motion, report: Array
+    ) -> Memory:
         after = super().step(memory, measurement, motion, report)
         rest = np.full(2, np.nan), np.full(6, np.nan), np.array(report)
         self.record.note(measurement, memory, after, motion(self.preview_times), *rest)

@@ -12,10 +12,9 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.compiled import machine_of, numbers
+from stewart_drake.law.compiled import machine_of
 from stewart_drake.law.least_error import LeastError
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
-from stewart_drake.law.timeline import TorqueSchedule
 from stewart_drake.scenario.signals import NUM_REFERENCE
 from stewart_drake.scenario.trajectories import evaluate, through_states
 from stewart_drake.types import Array
@@ -184,12 +183,3 @@ class Model:
         results = c.at(pieces), c.at(peak), scratch
         number = c.lib.stewart_plan_way(self.data, self._sign, *given, *results)
         return Plan(pieces, float(peak[0])) if number else None
-
-    def way(self, schedule: TorqueSchedule, states: Array, begin: float) -> Array:
-        """Return the pieces (n, 38) of the motion through states (1 + n, 12) from `begin` s on."""
-        c, number = core(), len(schedule.torques)
-        kept = [numbers(a) for a in (*schedule, states)]
-        what = c.ffi.new("stewart_schedule *", [number, *map(c.at, kept[:2]), 0])
-        pieces = np.empty((number, c.lib.STEWART_PIECE))
-        given = self.data, what, c.at(kept[2]), begin, c.at(pieces)
-        return pieces[: c.lib.stewart_predicted_pieces(*given)]

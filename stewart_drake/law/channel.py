@@ -89,20 +89,7 @@ class Channel(Protocol):
 class Wire:
     """Every torque arrives, after the delay."""
 
-    @property
-    def torques(self) -> int:
-        return 1
-
-    def start(self) -> Sent:
-        return Sent(np.zeros(1))
-
-    def in_flight(
-        self, sent: Sent, in_flight: Array, timeline: Timeline, report: Report | None
-    ) -> tuple[Sent, Array]:
-        return sent, in_flight
-
-    def send(self, sent: Sent, plan: Array, in_flight: Array) -> Sent:
-        return sent
+    torques = 1  # not annotated: no field
 
 
 @dataclass(frozen=True)
@@ -134,29 +121,6 @@ class Packets:
                 f"in_time: got {len(self.in_time)} values; expected {self.repeats + self.torques}, "
                 "one per row of a packet"
             )
-
-    def start(self) -> Sent:
-        c, channel = core(), packets_of(self).it
-        memory = np.empty(c.lib.stewart_packets_memory(channel))
-        c.lib.stewart_packets_start(channel, c.at(memory))
-        return Sent(memory, len(self.in_time))
-
-    def in_flight(
-        self, sent: Sent, in_flight: Array, timeline: Timeline, report: Report | None
-    ) -> tuple[Sent, Array]:
-        c, channel, compiled = core(), packets_of(self).it, report_of(report)
-        memory, flying = sent.memory.copy(), in_flight.copy()
-        c.lib.stewart_packets_update(
-            *(channel, c.at(memory), compiled.it, timeline.steps, len(flying), c.at(flying)),
-            c.scratch(c.lib.stewart_packets_scratch(channel)),
-        )
-        return Sent(memory, sent.rows), flying
-
-    def send(self, sent: Sent, plan: Array, in_flight: Array) -> Sent:
-        c, memory, rows, before = core(), sent.memory.copy(), numbers(plan), numbers(in_flight)
-        given = c.at(memory), c.at(rows), len(before), c.at(before)
-        c.lib.stewart_packets_send(packets_of(self).it, *given)
-        return Sent(memory, sent.rows)
 
 
 def report_of(report: Report | None) -> Compiled:

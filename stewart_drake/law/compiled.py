@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -67,6 +68,51 @@ class Once(Generic[Made]):
             if len(self._made) > 64:
                 self._made.popitem(last=False)
         return found[1]
+
+
+@dataclass(frozen=True)
+class Out:
+    """Argument of a callback that takes `size` numbers, as a writable array."""
+
+    size: Any  # a number, or a function of all arguments
+
+
+def call_back(it: Any, raised: list[BaseException], **functions: tuple[Any, ...]) -> list[Any]:
+    """Set functions of a table of the core to Python ones; return what must outlive the table.
+
+    Args:
+        it: pointer to the table.
+        raised: gets the errors of the functions, which C does not see.
+        functions: (function, argument, ...) by name. An argument is the size of an array, which is
+            copied, None for NULL; or `Out`; or None for a value that is passed as it is. A size is
+            a number, or a function of all arguments.
+    """
+    ffi = core().ffi
+
+    def failed(_: Any, error: BaseException, __: Any) -> None:
+        raised.append(error)
+
+    def array(pointer: Any, size: Any, given: tuple[Any, ...]) -> Any:
+        if size is None:
+            return pointer
+        if pointer == ffi.NULL:
+            return None
+        wanted = size.size if isinstance(size, Out) else size
+        number = wanted(*given) if callable(wanted) else wanted
+        view = np.ndarray(number, buffer=ffi.buffer(pointer, 8 * number)) if number else np.empty(0)
+        return view if isinstance(size, Out) else view.copy()
+
+    def called(function: Callable[..., Any], *sizes: Any) -> Callable[..., Any]:
+        return lambda *given: function(
+            *(array(*one, given) for one in zip(given, sizes, strict=True))
+        )
+
+    kept = []
+    for name, (function, *sizes) in functions.items():
+        kind = ffi.typeof(getattr(it, name))
+        kept.append(ffi.callback(kind, called(function, *sizes), onerror=failed))
+        setattr(it, name, kept[-1])
+    return kept
 
 
 def numbers(values: Any, *shape: int) -> Array:

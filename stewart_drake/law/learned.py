@@ -18,10 +18,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from stewart_drake.law.channel import Report
-from stewart_drake.law.core_law import OuterLqi, OuterMemory
-from stewart_drake.law.memory import Counts
+from stewart_drake.law.counts import Counts
 from stewart_drake.law.motion import Motion
-from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.predictive_lqi import OuterLqi, OuterMemory, PredictiveLqi
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.types import Array
@@ -84,9 +83,9 @@ class LearnedLqi(OuterLqi):
     learned: LearnedSignal = field(kw_only=True)
 
     def initial_memory(self, queue: Array) -> Any:
-        begun = self._served.initial_memory(queue)
+        begun = self.free.initial_memory(queue)
         ago = np.arange(-len(queue), 0)
-        free = self._served.initial_memory(np.subtract(queue, self._acting(ago)))
+        free = self.free.initial_memory(np.subtract(queue, self._acting(ago)))
         return LearnedMemory(free, np.array(begun.in_flight), np.array(begun.torque))
 
     def _acting(self, samples: Array) -> Array:
@@ -101,7 +100,7 @@ class LearnedLqi(OuterLqi):
         weights: Array,
         report: Report | None = None,
     ) -> Any:
-        free = self._served.step(memory.free, measurement, motion, weights, report)
+        free = self.free.step(memory.free, measurement, motion, weights, report)
         (learned,) = self._acting(np.array([memory.samples]))
         torque = free.torque + learned
         sent = self.plant.motors.saturate(torque)

@@ -25,16 +25,17 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from stewart_drake.law.belief import Belief
-from stewart_drake.law.channel import Report, Sent
+from stewart_drake.law.channel import Report
 from stewart_drake.law.clear_space import RESERVE, ClearSpace
-from stewart_drake.law.core_law import AnyMemory, CoreMemory, OuterLqi, OuterMemory
 from stewart_drake.law.cost import QuadraticCost
+from stewart_drake.law.counts import Counts
 from stewart_drake.law.feedforward import GAUSS_NODES
 from stewart_drake.law.horizon import NODES, HoldModel, HorizonCost, Plan, condense, riccati
 from stewart_drake.law.horizon_qp import QpError, Solver, problem_of, solve_by_daqp
-from stewart_drake.law.memory import Counts
+from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import Motion, Preview
 from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.predictive_lqi import OuterLqi, OuterMemory
 from stewart_drake.law.riccati import lqr_by_doubling
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.timeline import Timeline
@@ -210,7 +211,7 @@ class LimitedLqi(OuterLqi):
         return np.concatenate([self.free.times_for(timeline), ends, nodes.ravel()])
 
     def initial_memory(self, queue: Array) -> Any:
-        return LimitedMemory(self._served.initial_memory(queue))
+        return LimitedMemory(self.free.initial_memory(queue))
 
     def step(
         self,
@@ -228,7 +229,7 @@ class LimitedLqi(OuterLqi):
         begun, before = time.perf_counter(), memory.free
         rows, own = np.asarray(motion(self.preview_times)), len(self.free.preview_times)
         given = Preview(self.free.preview_times, rows[:own])
-        after = self._served.step(before, measurement, given, weights, report)
+        after = self.free.step(before, measurement, given, weights, report)
         quiet, further = before.silence > 0 and after.silence > 0, rows[own:]
         if quiet or not after.belief.feeds_back or not np.isfinite(further).all():
             return memory.following(after)
@@ -330,17 +331,12 @@ def _shrunk(rows: Array, share: float, mechanism: Mechanism) -> Array:
     return shrunk
 
 
-def _sending(memory: AnyMemory, torques: Array, integral: Array) -> AnyMemory:
+def _sending(memory: Memory, torques: Array, integral: Array) -> Memory:
     """Return the memory of the free law with other torques (n, 6) sent, and its last integral."""
-    if isinstance(memory, CoreMemory):
-        after: Any = CoreMemory(memory.data.copy(), memory.compiled)
-        after.field("torque")[:], after.in_flight[-1] = torques[0], torques[0]
-        after.field("integral")[:] = integral
-    else:
-        sent = Sent(memory.sent.memory.copy(), memory.sent.rows)
-        in_flight = np.vstack([memory.in_flight[:-1], torques[:1]])
-        new = {"in_flight": in_flight, "integral": integral, "plan": torques, "sent": sent}
-        after = replace(memory, torque=torques[0], **new)
+    after = memory.copy()
+    after.field("torque")[:], after.in_flight[-1] = torques[0], torques[0]
+    after.field("integral")[:] = integral
+    after.plan[:] = torques
     packets = after.sent.packets
     if len(packets):
         packets[-1, -len(torques) :] = torques

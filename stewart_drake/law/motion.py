@@ -1,18 +1,13 @@
 """The motion that a law follows, as a function of the time from now."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.core.library import core
-from stewart_drake.law.belief import Belief
-from stewart_drake.law.compiled import machine_of, numbers
-from stewart_drake.law.nominal import NominalPlant
-from stewart_drake.law.timeline import TorqueSchedule
-from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE
+from stewart_drake.scenario.signals import NUM_REFERENCE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
@@ -76,69 +71,6 @@ class KnownMotion:
         if c.lib.stewart_along(len(self.pieces), c.at(self.pieces), time, c.at(row)):
             return row
         return evaluate(self.reference, time)
-
-
-@dataclass(frozen=True)
-class Course:
-    """Preview of a sample, and the rows that the law followed, see core/reference.h."""
-
-    times: Array  # (p,) s from the sample
-    reference: Array  # (p, 18), with numbers for what was missing; NaN before the first preview
-    followed: Array  # (p, 18) the same with the way back after a gap
-    missing: bool = False  # whether anything was missing in the preview
-    gap: bool = False  # whether its last row was
-    # (12,) from the reference where the next torque acts, after a gap
-    offset: Array = field(default_factory=lambda: np.zeros(NUM_STATE))
-    holds: int = 0  # number of holds until the offset is zero
-    samples: int = 0  # number of samples after that until no torque of the way back is in flight
-
-    @classmethod
-    def unknown(cls, times: Array) -> "Course":
-        """Return the course before the first preview."""
-        nothing = np.full((len(times), NUM_REFERENCE), np.nan)
-        return cls(times, nothing, nothing)
-
-    def following(
-        self,
-        times: Array,
-        given: Array,
-        belief: Belief,
-        schedule: TorqueSchedule,
-        plant: NominalPlant,
-        quiet: bool,
-    ) -> "Course":
-        """Return the course of the next sample.
-
-        Args:
-            times: (p,) of its preview, s.
-            given: (p, 18) its preview, NaN or infinite where it is missing.
-            belief: now.
-            schedule: torques until the next one acts.
-            plant: model of the plant.
-            quiet: whether nothing is fed back yet.
-        """
-        c, rows, timeline = core(), (len(times), NUM_REFERENCE), belief.timeline
-        course, asked = Course(times, np.empty(rows), np.empty(rows)), numbers(given, *rows)
-        state, theta, *torques = map(numbers, (belief.state, belief.parameters, *schedule))
-        delay = timeline.period, timeline.queue_length, timeline.eta
-        until = [len(torques[0]), *map(c.at, torques), 0]
-        motion = c.ffi.new(
-            "stewart_course_input *",
-            [machine_of(plant).it, *delay, c.at(state), c.at(theta), until, quiet],
-        )
-        last, found = self._compiled(), course._compiled()
-        scratch = c.scratch(2 * NUM_REFERENCE * len(times) + NUM_STATE * (len(torques[0]) + 1))
-        c.lib.stewart_follow(motion, last, c.at(asked), found, scratch)
-        back = found.back
-        way = {"offset": np.array(list(back.offset)), "holds": back.holds, "samples": back.samples}
-        return replace(course, missing=bool(found.missing), gap=bool(found.gap), **way)
-
-    def _compiled(self) -> Any:
-        c = core()
-        arrays = map(c.at, (self.times, self.reference, self.followed))
-        back = [self.offset.tolist(), self.holds, self.samples]
-        given = [len(self.times), *arrays, self.missing, self.gap, back]
-        return c.ffi.new("stewart_course *", given)
 
 
 def between(a: Array, b: Array, h: float, s: float) -> Array:

@@ -22,8 +22,8 @@ from stewart_drake.core.library import core
 from stewart_drake.files.arguments import fixed, positive
 from stewart_drake.law.belief import Belief, Estimate, Innovations
 from stewart_drake.law.compiled import Compiled, Once, machine_of, numbers
+from stewart_drake.law.counts import Counts
 from stewart_drake.law.filter_settings import FilterSettings
-from stewart_drake.law.memory import Counts
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.sensing import (
     EncoderSensing,

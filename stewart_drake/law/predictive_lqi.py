@@ -12,50 +12,27 @@ dynamics through the queue. Torques enter the linear parts as deviations from th
 """
 
 import math
-from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from stewart_drake.law.belief import Belief
-from stewart_drake.law.channel import Channel, Report, Wire
+from stewart_drake.law.channel import Channel, Packets, Report, Wire
+from stewart_drake.law.core_law import CompiledLaw
 from stewart_drake.law.cost import Cost
 from stewart_drake.law.feedforward import Feedforward
-from stewart_drake.law.memory import Counts, Memory
-from stewart_drake.law.motion import Course, Motion
+from stewart_drake.law.memory import Memory
+from stewart_drake.law.motion import Motion
 from stewart_drake.law.nominal import DesignModel, NominalPlant
 from stewart_drake.law.observers import CoreObserver, Observer
 from stewart_drake.law.planner import NoPlanner, Planner, Replan
-from stewart_drake.law.predictors import PredictedState, Predictor
+from stewart_drake.law.predictors import NonlinearPredictor, Predictor
 from stewart_drake.law.sensing import Measurement, Sensing
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.mechanism.kinematics import UnreachablePoseError
-from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE, NUM_TORQUES, POSE, RATES
+from stewart_drake.scenario.signals import NUM_TORQUES
 from stewart_drake.types import Array
-
-
-class StepResult(NamedTuple):
-    """Torque of one sample and its origin.
-
-    Attributes:
-        torque: (6,) N m.
-        error: (6,) of the pose, for the integral.
-        integral: (6,) of the pose error.
-        predicted: where the torque acts.
-        gain: (6, g), NaN without feedback.
-        cause: of a missing model or gain, as the name of a count, or None.
-        feedforward: (6,) N m, share of the torque without feedback.
-    """
-
-    torque: Array
-    error: Array
-    integral: Array
-    predicted: PredictedState
-    gain: Array
-    cause: str | None
-    feedforward: Array
 
 
 @dataclass(frozen=True)
@@ -87,14 +64,14 @@ class PredictiveLqi:
     plant: NominalPlant
     sensing: Sensing
     observer: Observer
-    predictor: Predictor
+    predictor: Predictor | NonlinearPredictor
     feedforward: Feedforward
     model: DesignModel
     cost: Cost
-    channel: Channel = field(default_factory=Wire)
+    channel: Channel | Wire | Packets = field(default_factory=Wire)
     kept: int = 0
     longest_wait: int = 0
-    planner: Planner = field(default_factory=NoPlanner)
+    planner: Planner | NoPlanner | Replan = field(default_factory=NoPlanner)
     silence: int = 0
     tolerated_timing: float = math.inf
 
@@ -155,32 +132,23 @@ class PredictiveLqi:
             return self.observer.kept(self.timeline.period)
         return self.timeline.queue_length
 
+    @cached_property
+    def _compiled(self) -> CompiledLaw:
+        return CompiledLaw(self)
+
     def initial_memory(self, queue: Array) -> Memory:
         """Return the memory before the first sample.
 
         Args:
             queue: (n >= L, 6) torques in flight, oldest first, L by the delay at the start; more
-                for an observer whose estimate of the delay may grow.
+                for an observer of one's own whose estimate of the delay may grow.
         """
-        nothing = np.zeros(NUM_TORQUES)
-        before = queue[0] if len(queue) else nothing  # the oldest has acted before, too
-        return Memory(
-            in_flight=np.vstack([np.tile(before, (1 + self.kept, 1)), queue]),
-            belief=self.observer.start(self.timeline, self.sensing, self.plant),
-            measurement=np.full(self.sensing.size, np.nan),
-            error=np.zeros(NUM_COORDINATES),
-            integral=np.zeros(NUM_COORDINATES),
-            gain=self._no_gain(self.timeline),
-            torque=queue[-1] if len(queue) else nothing,
-            weights=np.full(2, np.nan),
-            counts=Counts(),
-            plan=np.tile(nothing, (self.channel.torques, 1)),
-            sent=self.channel.start(),
-            course=Course.unknown(self.preview_times),
-            silence=self.silence,
-        )
+        more = len(queue) - self.queue_length
+        if more < 0 or np.shape(queue)[1:] != (NUM_TORQUES,):
+            expected = self.queue_length, NUM_TORQUES
+            raise ValueError(f"queue: got shape {queue.shape}; expected {expected}, or more rows")
+        return (CompiledLaw(self, more) if more else self._compiled).start(queue)
 
-    @np.errstate(over="ignore", invalid="ignore")  # the result is checked instead
     def step(
         self,
         memory: Memory,
@@ -204,211 +172,32 @@ class PredictiveLqi:
         Raises:
             ValueError: a shape that does not fit. Bad numbers are survived and counted.
         """
-        sent, in_flight = self.channel.in_flight(
-            memory.sent, memory.in_flight, memory.belief.timeline, report
-        )
-        memory = replace(memory, in_flight=in_flight)
-        belief, delayed, lag = self._observe(memory, measurement)
-        careful = replace(belief, caution=self.caution(belief))
-        followed = self.planner.follow(memory.path, careful, in_flight, motion, self.plant)
-        if followed.replanned:
-            memory = memory.without_error()
-        timeline = belief.timeline
-        queue = timeline.queue(in_flight)
-        times = self.preview_times if timeline == self.timeline else self.times_for(timeline)
-        course = memory.course.following(
-            *(times, followed.motion(times), belief, timeline.until_next(queue), self.plant),
-            self._is_quiet(memory),
-        )
-        samples = 1 + len(self.predictor.samples(timeline))
-        nodes_end = samples + 2 * (self.predictor.pending(timeline) + 3)
-        wanted, nodes = course.followed[:samples, :NUM_STATE], course.followed[samples:nodes_end]
-        waiting = not np.all(np.isfinite(nodes))
-        if course.missing and not (course.gap or waiting):  # the open-loop plan is spoilt
-            memory = replace(memory, silence=0)
-        if not belief.has_state:
-            belief = belief.at(wanted[0])
-        guide, result = self._respond(memory, belief, queue, wanted, nodes, weights)
-        finite = bool(np.all(np.isfinite(result.torque)))
-        torque = result.torque if finite else memory.torque
-        limited = self.plant.motors.saturate(torque)
-        plan = self._plan(limited, guide, result, queue, course.followed[nodes_end:])
-        return Memory(
-            in_flight=np.vstack([in_flight[1:], limited]),
-            belief=belief,
-            delayed=delayed if self.longest_wait else None,
-            lag=lag,
-            measurement=measurement.values,
-            error=result.error,
-            integral=result.integral,
-            gain=result.gain if _is_there(result.gain) else memory.gain,
-            torque=torque,
-            weights=np.array(weights),
-            counts=memory.counts.plus(
-                *belief.faults,
-                result.cause,
-                None if finite else "nonfinite_torque",
-                "saturated_steps" if np.any(limited != torque) else None,
-                "references_missing" if course.missing else None,
-            ),
-            path=followed.path,
-            silence=memory.silence if waiting else max(memory.silence - 1, 0),
-            feedforward=result.feedforward,
-            course=course,
-            plan=plan,
-            sent=self.channel.send(sent, plan, in_flight),
-        )
-
-    def _observe(self, memory: Memory, measurement: Measurement) -> tuple[Belief, Belief, int]:
-        """Return the belief now, the belief at the last measurement, and its age in periods.
-
-        A measurement that is m periods old describes the state m periods ago. The observer runs
-        that many periods behind, and its estimate is predicted with the torques that acted since:
-
-            x(t_k) = f(x(t_k - m dt), torques of the last m periods, theta).
-        """
         self.require_age(measurement)
-        age = round(measurement.age / self.timeline.period)
-        newest = min(self.longest_wait, memory.lag)  # an older one was used, or overtaken
-        valid = bool(np.any(measurement.valid)) and 0 <= age <= newest
-        target = age if valid else self.longest_wait
-        delayed = memory.belief if memory.delayed is None else memory.delayed
-        lag, flown = memory.lag + 1, memory.in_flight
-        faults: tuple[str, ...] = () if valid else ("measurements_missing",)
-        partial = 0
-        while lag > target:
-            lag -= 1
-            fresh = valid and lag == age
-            given = replace(measurement, age=0.0) if fresh else measurement.missing()
-            before = flown[: len(flown) - lag]
-            delayed = self.observer.observe(delayed, given, before, self.sensing, self.plant)
-            if fresh:
-                faults, partial = delayed.faults, delayed.partial
-        belief = replace(delayed, faults=faults, partial=partial)
-        if lag and delayed.has_state:
-            schedule = delayed.timeline.last_periods(flown, lag)
-            belief = belief.at(self.plant.predict(delayed.state, schedule, delayed.parameters)[-1])
-        return belief, delayed, lag
-
-    def _respond(
-        self,
-        memory: Memory,
-        belief: Belief,
-        queue: Array,
-        wanted: Array,
-        nodes: Array,
-        weights: Array,
-    ) -> tuple[Belief, StepResult]:
-        """Compute the response; return it with the belief used."""
-        dynamics = self.plant.dynamics
-        if not np.all(np.isfinite(nodes)):  # nothing to follow yet: hold the torque
-            return belief, self._unregulated(memory.torque, memory, belief, wanted)
-        if not belief.feeds_back or self._is_quiet(memory):  # feedforward of the known plant
-            guide = belief.assuming(dynamics.parameters)
-            held = self.feedforward.held(nodes, dynamics, guide.parameters)
-            return guide, self._unregulated(held.torques[-1], memory, guide, wanted)
-        error = belief.state[POSE] - wanted[0, POSE]
-        integral = self._integrate(memory, error, belief.timeline)
-        ahead = self.predictor.predict(belief, integral, queue, wanted, self.plant)
-        held = self.feedforward.held(nodes, dynamics, belief.parameters)
-        torque = feedforward = held.torques[-1]
-        error_ahead, gain, cause = self._design(
-            memory, belief, ahead, torque, held.changes, weights
-        )
-        if _is_there(gain):  # (42)
-            pending = (queue[len(queue) - len(held.torques) + 1 :] - held.torques[:-1]).ravel()
-            regulated = self.cost.regulated(ahead.integral)
-            torque = torque - gain @ np.concatenate([error_ahead, regulated, pending])
-        return belief, StepResult(torque, error, integral, ahead, gain, cause, feedforward)
-
-    def _is_quiet(self, memory: Memory) -> bool:
-        """Return whether nothing is fed back yet. A torque at the limit ends that."""
-        return memory.silence > 0 and not self.plant.motors.reached(memory.in_flight)
-
-    def _unregulated(
-        self, torque: Array, memory: Memory, belief: Belief, wanted: Array
-    ) -> StepResult:
-        nothing = np.zeros(NUM_COORDINATES)
-        ahead = PredictedState(wanted[-1], np.zeros(NUM_STATE), nothing)
-        none = self._no_gain(belief.timeline)
-        return StepResult(torque, nothing, memory.integral, ahead, none, None, torque)
-
-    def _plan(
-        self, first: Array, belief: Belief, result: StepResult, queue: Array, preview: Array
-    ) -> Array:
-        """Return this sample's torque and further ones (N, 6), if all goes as predicted.
-
-        The nominal plant continues from the end of the prediction, period by period, under the
-        same gain. `preview` ((N - 1) (1 + s), 18) is the reference there.
-        """
-        plan, timeline, plant = [first], belief.timeline, self.plant
-        state, error, integral = result.predicted
-        pending = queue[len(queue) - self.predictor.pending(timeline) :]
-        for rows in np.split(preview, self.channel.torques - 1) if len(preview) else ():
-            flying = np.vstack([pending, plan[-1:]])
-            schedule = timeline.next_period(flying)
-            state, pending = plant.predict(state, schedule, belief.parameters)[-1], flying[1:]
-            before, error = error, state - rows[0, :NUM_STATE]
-            if not plant.motors.reached(schedule.torques):
-                integral = integral + timeline.period / 2 * (before[POSE] + error[POSE])
-            held, changes = self.feedforward.held(rows[1:], plant.dynamics, belief.parameters)
-            torque = held[-1]
-            with suppress(UnreachablePoseError, ArithmeticError, np.linalg.LinAlgError):
-                model = self.model.at(state, torque, belief.parameters, plant)
-                offset = self.feedforward.offset(changes, model.B[RATES], timeline)
-                late = (pending - held[:-1]).ravel()
-                z = self.cost.regulated(integral)
-                regulated = np.concatenate([error - offset, z, late])
-                torque = torque - result.gain @ regulated if _is_there(result.gain) else torque
-            usable = bool(np.all(np.isfinite(torque)))
-            plan.append(plant.motors.saturate(torque) if usable else plan[-1])
-        return np.array(plan)
-
-    def _design(
-        self,
-        memory: Memory,
-        belief: Belief,
-        ahead: PredictedState,
-        torque: Array,
-        changes: Array,
-        weights: Array,
-    ) -> tuple[Array, Array, str | None]:
-        """Return the error (12,) to feed back, the gain, NaN for none, and the cause, or None."""
-        error = ahead.error
-        try:
-            model = self.model.at(ahead.state, torque, belief.parameters, self.plant)
-            error = error - self.feedforward.offset(changes, model.B[RATES], belief.timeline)
-            delayed = self.cost.sampled(model, belief.timeline)
-            K = self.cost.gain(delayed, weights * [1.0, self.caution(belief)])
-            if not np.all(np.isfinite(K)):
-                raise FloatingPointError("gain: is not finite")
-            return error, self.predictor.gain(K, delayed), None
-        except UnreachablePoseError:  # nothing to regulate: the feedforward acts alone
-            return error, self._no_gain(belief.timeline), "unreachable"
-        except (ArithmeticError, np.linalg.LinAlgError):  # such as RiccatiError
-            none = self._no_gain(belief.timeline)
-            last = memory.gain if memory.gain.shape == none.shape else none  # of another delay
-            return error, last, "riccati_failures"
+        compiled = memory.compiled if memory.law is self else self._compiled
+        return compiled.step(memory, measurement, motion, report, weights)
 
     def caution(self, belief: Belief) -> float:
         """Return the factor on w_R for an uncertain delay and uncertain timing."""
         return belief.caution * max(1.0, belief.timing / self.tolerated_timing) ** 2
 
-    def _no_gain(self, timeline: Timeline) -> Array:
-        """Return NaN in the shape of a gain: on error, integral and pending torques."""
-        integral = self.cost.regulated(np.zeros(NUM_COORDINATES))
-        pending = NUM_TORQUES * self.predictor.pending(timeline)
-        return np.full((NUM_TORQUES, NUM_STATE + len(integral) + pending), np.nan)
 
-    def _integrate(self, memory: Memory, error: Array, timeline: Timeline) -> Array:
-        """Return z_k = z_{k-1} + dt/2 (e_{k-1} + e_k), or z_{k-1} while a motor is at its limit."""
-        if not self.cost.integrates or not memory.belief.has_state:
-            return memory.integral
-        schedule, _ = timeline.last_period(memory.in_flight)
-        if self.plant.motors.reached(schedule.torques):
-            return memory.integral
-        return memory.integral + timeline.period / 2 * (memory.error + error)
+@dataclass(frozen=True)
+class OuterLqi(PredictiveLqi):
+    """`PredictiveLqi` around the free law of the same parts."""
+
+    @cached_property
+    def free(self) -> PredictiveLqi:
+        """The law without what this one adds."""
+        return PredictiveLqi(**self.parts)
 
 
-def _is_there(gain: Array) -> bool:
-    return not np.all(np.isnan(gain))
+@dataclass(frozen=True)
+class OuterMemory:
+    """Memory of an `OuterLqi`; other names are those of the free law's memory."""
+
+    free: Any  # memory of the free law
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name == "free":
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return getattr(self.free, name)

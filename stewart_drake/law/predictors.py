@@ -9,8 +9,7 @@ from stewart_drake.law.belief import Belief
 from stewart_drake.law.delay_model import ContinuousModel, DelayedModel
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.riccati import prediction_matrix
-from stewart_drake.law.timeline import Timeline, TorqueSchedule
-from stewart_drake.scenario.signals import POSE
+from stewart_drake.law.timeline import Timeline
 from stewart_drake.types import Array
 
 
@@ -81,9 +80,10 @@ class LinearPredictor:
 
 @dataclass(frozen=True)
 class NonlinearPredictor:
-    """Integration of the exact equations over mu periods, with the torques in flight.
+    """Integration of the exact equations over mu periods, with the torques in flight (core/law.c).
 
-    A torque that still acts for eta0 by then is left to the gain.
+    A torque that still acts for eta0 by then is left to the gain. The integral waits in every part
+    in which a motor is at its limit.
     """
 
     def samples(self, timeline: Timeline) -> Array:
@@ -91,20 +91,6 @@ class NonlinearPredictor:
 
     def pending(self, timeline: Timeline) -> int:
         return timeline.queue_length - timeline.steps
-
-    def predict(
-        self, belief: Belief, integral: Array, queue: Array, wanted: Array, plant: NominalPlant
-    ) -> PredictedState:
-        """Predict; the integral waits in every period with a motor at its limit."""
-        x, timeline = belief.state, belief.timeline
-        if timeline.steps == 0:
-            return PredictedState(x, x - wanted[0], integral)
-        schedule, each = timeline.schedule(queue), timeline.per_period
-        ends = plant.predict(x, schedule, belief.parameters)[each - 1 :: each]
-        periods = TorqueSchedule(
-            schedule.torques.reshape(timeline.steps, -1), np.full(timeline.steps, timeline.period)
-        )
-        return _compared(np.vstack([x, ends]), wanted, periods, integral, plant)
 
     def gain(self, K: Array, model: DelayedModel) -> Array:
         return K
@@ -119,21 +105,3 @@ class ArrivalPredictor(NonlinearPredictor):
 
     def pending(self, timeline: Timeline) -> int:
         return 0
-
-    def predict(
-        self, belief: Belief, integral: Array, queue: Array, wanted: Array, plant: NominalPlant
-    ) -> PredictedState:
-        """Predict; the integral continues from one change of torque to the next."""
-        schedule = belief.timeline.until_next(queue)
-        states = np.vstack([belief.state, plant.predict(belief.state, schedule, belief.parameters)])
-        return _compared(states, wanted, schedule, integral, plant)
-
-
-def _compared(
-    states: Array, wanted: Array, schedule: TorqueSchedule, integral: Array, plant: NominalPlant
-) -> PredictedState:
-    """Return the last of states (1 + n, 12), with the integral over n intervals with torques."""
-    errors = states - wanted
-    added = schedule.durations[:, None] / 2 * (errors[:-1, POSE] + errors[1:, POSE])
-    free = np.array([not plant.motors.reached(torque) for torque in schedule.torques], bool)
-    return PredictedState(states[-1], errors[-1], integral + added[free].sum(axis=0))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.core.library import core
 from stewart_drake.files.arguments import fixed, whole
-from stewart_drake.law.compiled import Compiled, Once, geometry, numbers
+from stewart_drake.law.compiled import Compiled, Once, Out, call_back, geometry, numbers
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_LEGS, NUM_STATE
 from stewart_drake.types import Array
@@ -182,44 +182,35 @@ def described(sensing: Sensing, mechanism: Mechanism) -> Compiled:
     c, m, raised = core(), sensing.size, list[BaseException]()
     noise = numbers(sensing.noise_std, m)
 
-    def read(pointer: Any, number: int) -> Array:
-        return np.frombuffer(c.ffi.buffer(pointer, 8 * number)).copy()
+    def seen(_: Any, state: Array, values: Array) -> None:
+        values[:] = np.nan
+        values[:] = sensing.seen(state)
 
-    def write(pointer: Any, values: Array | float, *shape: int) -> None:
-        there = np.frombuffer(c.ffi.buffer(pointer, 8 * int(np.prod(shape)))).reshape(shape)
-        there[...] = values
+    def jacobian(_: Any, state: Array, J: Array) -> None:
+        J[:] = np.nan
+        J[:] = np.ravel(sensing.through(state, np.eye(NUM_STATE)))
 
-    def failed(_: Any, error: BaseException, __: Any) -> None:
-        raised.append(error)
-
-    def seen(_: Any, state: Any, values: Any) -> None:
-        write(values, np.nan, m)
-        write(values, sensing.seen(read(state, NUM_STATE)), m)
-
-    def jacobian(_: Any, state: Any, J: Any) -> None:
-        write(J, np.nan, m, NUM_STATE)
-        write(J, sensing.through(read(state, NUM_STATE), np.eye(NUM_STATE)), m, NUM_STATE)
-
-    def start(_: Any, values: Any, near: Any, state: Any, root: Any, __: Any) -> int:
-        expected = None if near == c.ffi.NULL else read(near, NUM_STATE)
-        first = sensing.start(Measurement.of(read(values, m)), expected)
+    def start(_: Any, values: Array, near: Array | None, state: Array, root: Array, __: Any) -> int:
+        first = sensing.start(Measurement.of(values), near)
         if first is None:
             return 0
-        write(state, first.state, NUM_STATE)
-        write(root, first.covariance, NUM_STATE, NUM_STATE)
-        return int(c.lib.stewart_root(NUM_STATE, root))
+        state[:], root[:] = first.state, np.ravel(first.covariance)
+        return int(c.lib.stewart_root(NUM_STATE, c.at(root)))
 
-    def fault(_: Any, __: Any, period: float, values: Any, last: Any) -> int:
-        found = sensing.fault(Measurement.of(read(values, m)), read(last, m), period, mechanism)
+    def fault(_: Any, __: Any, period: float, values: Array, last: Array) -> int:
+        found = sensing.fault(Measurement.of(values), last, period, mechanism)
         return 0 if found is None else 1 << FAULTS.index(found)
 
-    it = c.ffi.new("stewart_sensing *", [m, c.at(noise)])
-    functions = []
-    for function in (seen, jacobian, start, fault):
-        kind = c.ffi.typeof(getattr(it, function.__name__))
-        functions.append(c.ffi.callback(kind, function, onerror=failed))
-        setattr(it, function.__name__, functions[-1])
-    return Compiled(it, (noise, *functions), (raised,))
+    it, n = c.ffi.new("stewart_sensing *", [m, c.at(noise)]), NUM_STATE
+    kept = call_back(
+        it,
+        raised,
+        seen=(seen, None, n, Out(m)),
+        jacobian=(jacobian, None, n, Out(m * n)),
+        start=(start, None, m, n, Out(n), Out(n * n), None),
+        fault=(fault, None, None, None, m, m),
+    )
+    return Compiled(it, (noise, *kept), (raised,))
 
 
 NODES = 3

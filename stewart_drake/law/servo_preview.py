@@ -16,47 +16,22 @@ compensated for torque and velocity gain, without it they are the angles of the 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from stewart_drake.law.belief import Belief
+from stewart_drake.law.core_law import CompiledLaw
 from stewart_drake.law.feedforward import Feedforward, InverseDynamicsFeedforward
-from stewart_drake.law.memory import Counts
+from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import Motion
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.observers import Observer
 from stewart_drake.law.sensing import Measurement, Sensing
-from stewart_drake.law.servos import Reported, ReportLayout, Stiffness
+from stewart_drake.law.servos import ReportLayout, Stiffness
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.mechanism.kinematics import UnreachablePoseError
-from stewart_drake.scenario.signals import (
-    MODEL_TORQUE,
-    NUM_COORDINATES,
-    NUM_TORQUES,
-    POSE,
-    RATES,
-    WEIGHTS,
-)
+from stewart_drake.scenario.signals import POSE, RATES
 from stewart_drake.types import Array
-
-
-@dataclass(frozen=True)
-class ServoMemory:
-    """Memory of the law, with the names of `law.memory.Memory`."""
-
-    command: Array  # (18,) sent last
-    belief: Belief  # of the observer, at the last measurement
-    measurement: Array  # (m,) at the last sample, as it came; NaN before the first
-    torque: Array  # (6,) of the servos before their limit, in the last report
-    in_flight: Array  # (1, 6) the same within the limit
-    counts: Counts  # see `law.memory.Counts`
-    lag: int  # age of that measurement, periods
-    # integral, weights: NaN
-    integral: Array
-    weights: Array
-    samples: int = 0  # number of samples so far
 
 
 @dataclass(frozen=True)
@@ -104,25 +79,17 @@ class ServoPreview:
             angles = self.servo.setpoint(angles, rates * moves, torque)
         return np.concatenate([angles, rates, torque])
 
-    def initial_memory(self, command: Array) -> ServoMemory:
-        """Return the memory before the first sample, with the command (18,) that was sent last."""
-        nothing = np.zeros(NUM_TORQUES)
-        return ServoMemory(
-            command=command,
-            belief=self.observer.start(self.timeline, self.sensing, self.plant),
-            measurement=np.full(self.sensing.size, np.nan),
-            torque=nothing,
-            in_flight=nothing[None],
-            counts=Counts(),
-            lag=0,
-            integral=np.full(NUM_COORDINATES, np.nan),
-            weights=np.full(len(WEIGHTS), np.nan),
-        )
+    @cached_property
+    def _compiled(self) -> CompiledLaw:
+        return CompiledLaw(self)
 
-    @np.errstate(over="ignore", invalid="ignore")  # the result is checked instead
+    def initial_memory(self, command: Array) -> Memory:
+        """Return the memory before the first sample, with the command (18,) that was sent last."""
+        return self._compiled.start(command)
+
     def step(
-        self, memory: ServoMemory, measurement: Measurement, motion: Motion, report: Array
-    ) -> ServoMemory:
+        self, memory: Memory, measurement: Measurement, motion: Motion, report: Array
+    ) -> Memory:
         """Compute the command of one sample.
 
         Args:
@@ -134,58 +101,4 @@ class ServoPreview:
         Returns:
             The new memory; its command (18,) is finite.
         """
-        lag, belief, reported = memory.lag + 1, memory.belief, None
-        age = round(measurement.age / self.timeline.period)
-        if np.any(measurement.valid) and 0 <= age < lag:
-            reported = self.reports.read(report, lag - age)
-            belief, lag = self._observe(belief, replace(measurement, age=0.0), reported), age
-        else:
-            belief = replace(belief, faults=("measurements_missing",))
-        command, cause = self._next(memory, motion(self.preview_times)[0], belief)
-        saturated = 0 if reported is None else reported.saturated
-        torque = memory.torque if reported is None else reported.asked
-        return replace(
-            memory,
-            command=command,
-            belief=belief,
-            lag=lag,
-            measurement=measurement.values,
-            torque=torque,
-            in_flight=self.plant.motors.saturate(torque)[None],
-            counts=memory.counts.plus(*belief.faults, cause, *["saturated_steps"] * saturated),
-            samples=memory.samples + 1,
-        )
-
-    def _observe(
-        self, belief: Belief, measurement: Measurement, reported: Reported | None
-    ) -> Belief:
-        """Take a measurement, with the reported torques since the one before.
-
-        Without a report the observer begins anew, from the estimated parameters.
-        """
-        torques = np.zeros((1, NUM_TORQUES))
-        if reported is not None:
-            torques = reported.torques
-        elif belief.has_state:
-            fresh = self.observer.start(self.timeline, self.sensing, self.plant)
-            belief = replace(fresh.assuming(belief.parameters), measured=belief.measured)
-        return self.observer.observe(belief, measurement, torques, self.sensing, self.plant)
-
-    def _next(self, memory: ServoMemory, wanted: Array, belief: Belief) -> tuple[Array, str | None]:
-        """Return the next command (18,); where there is none, the cranks stop, with the cause."""
-        last = memory.command
-        stay = np.concatenate([last[POSE], np.zeros(NUM_COORDINATES), last[MODEL_TORQUE]])
-        if not np.all(np.isfinite(wanted)):
-            return stay, "references_missing"
-        try:
-            command = self.command(wanted, belief.parameters)
-        except UnreachablePoseError:
-            return stay, "unreachable"
-        if not np.all(np.isfinite(command)):
-            return stay, "nonfinite_torque"
-        if self.learned is not None:
-            time = self.timeline.period * memory.samples
-            command[POSE] += self.learned(time + self.preview_times)[0]
-        if self.servo is not None:
-            command[POSE] = self.servo.limited(command[POSE], last[POSE])
-        return command, None
+        return self._compiled.step(memory, measurement, motion, report)

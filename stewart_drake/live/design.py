@@ -17,7 +17,7 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.channel import Packets
-from stewart_drake.law.core_law import serving
+from stewart_drake.law.coverage import backend
 from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.limited import LimitedLqi
 from stewart_drake.law.motion import KnownMotion
@@ -176,8 +176,8 @@ def design(scenario: Scenario, machine: MachineMessage, learned: Learned = None)
     repeats = scenario.controller.packet_repeats if scenario.link.kind == "network" else 0
     queue = first_queue(experiment, law)
     assert law.kept < MOST_HISTORY
-    took, backend = _step_times(replace(law, silence=0), planned, queue, _TRIED, np.ones(2))
-    step = min(took), backend
+    took = _step_times(replace(law, silence=0), planned, queue, _TRIED, np.ones(2))
+    step = min(took), backend(law)
     return Design(experiment, law, planned, queue, repeats, limit, step, learned=learned)
 
 
@@ -192,24 +192,22 @@ def _of_cranks(experiment: Experiment, machine: MachineMessage, learned: Learned
     limit = min(experiment.torque_limit, machine.torque_limit)
     first, _ = commands_in_flight(experiment, law, experiment.scenario.true_delay)
     rows = 1 if MachineFlags.WIRE in machine.flags else _PLAN
-    took, backend = _step_times(law, planned, first, rows, np.full(law.reports.size, np.nan))
-    step = sum(took), backend
+    took = _step_times(law, planned, first, rows, np.full(law.reports.size, np.nan))
+    step = sum(took), backend(law)
     return Design(experiment, law, planned, first, 0, limit, step, rows, learned)
 
 
 def _step_times(
     law: Any, motion: Trajectory, first: Array, number: int, given: Array
-) -> tuple[list[float], str]:
-    """Return the times of steps, s of this thread, and the name of their implementation.
+) -> list[float]:
+    """Return the times of steps, s of this thread.
 
     `first` is the queue or command before the first sample; weights or report are `given`.
     """
-    served: Any
-    served, backend = serving(law)
-    memory, took = served.initial_memory(first), list[float]()
+    memory, took = law.initial_memory(first), list[float]()
     measured = Measurement.of(law.sensing.seen(evaluate(motion, 0.0)[:NUM_STATE]))
     for _ in range(number):
         started = clock.thread_time()
-        memory = served.step(memory, measured, KnownMotion(motion, motion, 0.0), given)
+        memory = law.step(memory, measured, KnownMotion(motion, motion, 0.0), given)
         took.append(clock.thread_time() - started)
-    return took, backend
+    return took

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.core_law import AnyMemory
+from stewart_drake.law.memory import Memory
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.controller import held_by
 from stewart_drake.loop.preparation import Experiment
@@ -114,7 +114,7 @@ class LiveRecord(Record):
     def sample(
         self,
         number: int,
-        memory: AnyMemory,
+        memory: Memory,
         measurement: Measurement,
         wanted: Array,
         seconds: float,

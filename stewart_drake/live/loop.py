@@ -15,7 +15,6 @@ import numpy as np
 
 from stewart_drake.dynamics.workspace import Failure, margins
 from stewart_drake.law.channel import Report
-from stewart_drake.law.core_law import serving
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.live.checks import (
     LONGEST_GAP,
@@ -95,7 +94,7 @@ class LiveLoop:
         hold: bool = False,
     ) -> None:
         self._design, self._steering, self._viewer, self._say = design, steering, viewer, say
-        self._law: Any = serving(design.law).law
+        self._law: Any = design.law
         self.memory: Any = self._law.initial_memory(design.queue)
         self._period = design.experiment.scenario.controller.period
         self._horizon, self._size = self._ahead(), 2 * design.experiment.motion_scale
@@ -357,7 +356,7 @@ class LiveLoop:
         if message is not None and len(message.acted):
             acts = message.acted[0]
         queue = np.tile(acts, (len(design.queue), 1))
-        self._law = serving(replace(design.law, silence=0)).law
+        self._law = replace(design.law, silence=0)
         self.memory = self._law.initial_memory(queue)
         schedule = until_next(design.law.timeline, queue)
         steering = replanned(self._steering, design.law.plant, t, state, schedule)

@@ -21,11 +21,10 @@ from stewart_drake.dynamics.open_loop import Ended, IntegrationError, NativePlan
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
-from stewart_drake.law import core_law
 from stewart_drake.law.catch_up import CatchUp
 from stewart_drake.law.channel import Packets, Report
-from stewart_drake.law.core_law import CompiledLaw, CoreMemory
-from stewart_drake.law.memory import Counts
+from stewart_drake.law.counts import Counts
+from stewart_drake.law.coverage import uncovered as uncovered_part
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
@@ -309,7 +308,7 @@ class CompiledController:
     """Law and tuner in C.
 
     Args:
-        prepared: a run with a law that `law.core_law.uncovered` accepts.
+        prepared: a run with a law that `law.coverage.uncovered` accepts.
         tuner: `stewart_tuner`, or None.
         wanted: (k, 12) reference at each sample, for a tuner.
 
@@ -320,18 +319,18 @@ class CompiledController:
 
     def __init__(self, prepared: Prepared, tuner: Any, wanted: Array) -> None:
         c, config = core(), prepared.experiment.scenario.controller
-        self._compiled = CompiledLaw(prepared.law)
-        self._memory = self._compiled.start(first_queue(prepared.experiment, prepared.law))
+        self._memory = prepared.law.initial_memory(first_queue(prepared.experiment, prepared.law))
+        compiled = self._memory.compiled
         samples = len(prepared.previews)
         self.weights, self.rows = np.tile(config.weights, (samples, 1)), np.empty((samples, 0))
-        self._tuned, scratch = np.empty(0), self._compiled.scratch
+        self._tuned, scratch = np.empty(0), compiled.scratch
         if tuner is not None:
             self._tuned = np.empty(c.lib.stewart_tuner_memory(tuner.it))
             c.lib.stewart_tuner_start(tuner.it, c.at(self._tuned))
             row = self._tuned.copy()
             columns = c.lib.stewart_newest_row(tuner.it, c.at(self._tuned), c.at(row))
             self.rows = np.empty((samples, columns))
-            scratch = c.lib.stewart_tuned_step_scratch(self._compiled.data)
+            scratch = c.lib.stewart_tuned_step_scratch(compiled.data)
         previews = np.ascontiguousarray(prepared.previews)
         self._kept = prepared, tuner, previews, np.ascontiguousarray(wanted), np.empty(scratch)
         motions = [(len(rows), c.at(times), c.at(rows)) for times, rows in prepared.motions]
@@ -339,9 +338,9 @@ class CompiledController:
         self.data = c.ffi.new(
             "stewart_law_in_loop *",
             {
-                "law": self._compiled.data,
+                "law": compiled.data,
                 "tuner": c.ffi.NULL if tuner is None else tuner.it,
-                "memory": c.at(self._memory),
+                "memory": c.at(self._memory.data),
                 "tuner_memory": c.at(self._tuned),
                 "scratch": c.at(self._kept[4]),
                 "previews": c.ffi.NULL if prepared.motions else c.at(previews),
@@ -359,7 +358,7 @@ class CompiledController:
     @property
     def counts(self) -> dict[str, int]:
         fallbacks = int(self._tuned[2]) if len(self._tuned) else 0  # after two weights
-        counts = CoreMemory(self._memory, self._compiled).counts
+        counts = self._memory.counts
         return counts.summary() | {"tuner_fallbacks": fallbacks}
 
 
@@ -374,19 +373,19 @@ class CompiledServo:
         c, law, experiment = core(), prepared.law, prepared.experiment
         assert isinstance(law, ServoPreview)
         first, believed = commands_in_flight(experiment, law, law.timeline.delay)
-        self._compiled = CompiledLaw(law)
-        self._memory = self._compiled.start(believed[-1] if len(believed) else first)
+        self._memory = law.initial_memory(believed[-1] if len(believed) else first)
+        compiled = self._memory.compiled
         samples = len(prepared.previews)
         self.weights, self.rows = np.full((samples, len(WEIGHTS)), np.nan), np.empty((samples, 0))
         previews = np.ascontiguousarray(prepared.previews)
-        scratch = np.empty(self._compiled.scratch)
+        scratch = np.empty(compiled.scratch)
         self._servo, self._saturated = position_servo(experiment).compiled, 0
         self._kept = previews, scratch, np.full(law.reports.size, np.nan)
         self.data = c.ffi.new(
             "stewart_servo_in_loop *",
             {
-                "law": self._compiled.data,
-                "memory": c.at(self._memory),
+                "law": compiled.data,
+                "memory": c.at(self._memory.data),
                 "scratch": c.at(scratch),
                 "previews": c.at(previews),
                 "report": c.at(self._kept[2]),
@@ -395,7 +394,7 @@ class CompiledServo:
 
     @property
     def counts(self) -> dict[str, int]:
-        counts = CoreMemory(self._memory, self._compiled).counts
+        counts = self._memory.counts
         survived = counts.plus(*["saturated_steps"] * self._saturated)
         return survived.summary() | {"tuner_fallbacks": 0}
 
@@ -424,8 +423,7 @@ class PythonController:
         c = experiment.scenario.controller
         self._prepared, self._law, self._when, self._wanted = prepared, law, when, wanted
         self._followed = followed_motion(law, prepared.planned, experiment.reference)
-        self._served = core_law.serving(law).law
-        self._memory: Any = self._served.initial_memory(first_queue(experiment, law))
+        self._memory: Any = law.initial_memory(first_queue(experiment, law))
         self._fixed = Decision(np.array(c.weights), False)
         source = prepared.tuner
         self._tuned: Any = None if source is None else source.start(self._memory)
@@ -440,7 +438,7 @@ class PythonController:
         if self._followed is not None:
             motion = KnownMotion(*self._followed, self._when.samples[sample])
         decision = self._fixed if source is None else source.decide(self._tuned)
-        after = self._served.step(self._memory, measured, motion, decision.weights, report)
+        after = law.step(self._memory, measured, motion, decision.weights, report)
         if source is not None:
             self._tuned = source.observe(self._tuned, decision, after, self._wanted[sample])
             self.rows.append(source.row(self._tuned))
@@ -665,7 +663,7 @@ def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
     """Run a prepared run in C, with law and tuner in C if the core has all their parts."""
     law, when, source = prepared.law, preparation.when, prepared.tuner
     wanted = preparation.references[when.sampled]
-    field, tuner = core_law.uncovered(law), None if source is None else source.compiled
+    field, tuner = uncovered_part(law), None if source is None else source.compiled
     experiment = prepared.experiment
     controller: CompiledController | CompiledServo | PythonController
     if isinstance(law, ServoPreview):
@@ -675,7 +673,7 @@ def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
         loop, controller = "native", CompiledController(prepared, tuner, wanted)
         course = run_loop(experiment, when, controller, law)
     else:
-        loop = f"native, law in Python ({field})"
+        loop = f"native, {field} in Python"
         controller = PythonController(prepared, when, wanted)
         with one_blas_thread:
             course = run_loop(experiment, when, controller, law)

@@ -11,12 +11,12 @@ from pydrake.trajectories import Trajectory
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.arguments import fixed, of_kind
 from stewart_drake.law.channel import Packets, Report
-from stewart_drake.law.core_law import AnyMemory, serving
-from stewart_drake.law.memory import Counts
+from stewart_drake.law.counts import Counts
+from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.law.servo_preview import ServoMemory, ServoPreview
+from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.sampling import Sample, SteppedLaw, declare_constant, weak
 from stewart_drake.scenario.signals import (
     NUM_PARAMETERS,
@@ -71,7 +71,7 @@ class Reference(LeafSystem):
         output.SetFromVector(np.concatenate(values))
 
 
-HELD: Final[dict[str, Callable[[AnyMemory], Array]]] = {
+HELD: Final[dict[str, Callable[[Memory], Array]]] = {
     "torque_commanded": lambda memory: memory.torque,
     "integral": lambda memory: memory.integral,
     "weights": lambda memory: memory.weights,
@@ -87,7 +87,7 @@ HELD: Final[dict[str, Callable[[AnyMemory], Array]]] = {
 """Signal of the table `scenario.signals.SIGNALS` -> its value in the controller's memory."""
 
 
-def held_by(dynamics: StewartDynamics) -> dict[str, Callable[[AnyMemory], Array]]:
+def held_by(dynamics: StewartDynamics) -> dict[str, Callable[[Memory], Array]]:
     """Return HELD for the law of a plant, with its parameters at their places in the record.
 
     A parameter that is not estimated is recorded with its assumed value, without a deviation; a
@@ -96,9 +96,7 @@ def held_by(dynamics: StewartDynamics) -> dict[str, Callable[[AnyMemory], Array]
     known = dynamics.plant_parameters[:NUM_PARAMETERS]
     unknown, nothing = np.full(NUM_PARAMETERS, np.nan), np.full(len(WRENCHES), np.nan)
 
-    def recorded(
-        signal: str, names: Sequence[str], otherwise: Array
-    ) -> Callable[[AnyMemory], Array]:
+    def recorded(signal: str, names: Sequence[str], otherwise: Array) -> Callable[[Memory], Array]:
         place = np.array([_place(name, dynamics.free) for name in names])
         return lambda memory: np.where(place < 0, otherwise, HELD[signal](memory)[place])
 
@@ -169,8 +167,7 @@ class DelayLqiController(SteppedLaw):
     ) -> None:
         super().__init__()
         self._law, self._motion = law, motion
-        self._served = serving(law).law
-        first = self._served.initial_memory(fixed("queue", queue, (law.queue_length, NUM_TORQUES)))
+        first = law.initial_memory(fixed("queue", queue, (law.queue_length, NUM_TORQUES)))
         self._measurement = self.DeclareVectorInputPort("measurement", law.sensing.size)
         self._times = law.preview_times
         preview_size = NUM_REFERENCE * len(self._times)
@@ -194,10 +191,10 @@ class DelayLqiController(SteppedLaw):
             part = held[signal.name]
             self._put_out(port, len(part(first)), part)
 
-    def memory(self, context: Context) -> AnyMemory:
+    def memory(self, context: Context) -> Memory:
         return self.sample(context).memory
 
-    def _prepared(self, context: Context) -> Callable[[], AnyMemory]:
+    def _prepared(self, context: Context) -> Callable[[], Memory]:
         age = 0.0
         if self._age is not None:
             age = float(np.asarray(self._age.Eval(context))[0])
@@ -205,7 +202,7 @@ class DelayLqiController(SteppedLaw):
         weights = np.asarray(self._weights.Eval(context))
         memory, motion = self.memory(context), self._followed(context)
         report = self._reported(context, age)
-        return lambda: self._served.step(memory, measurement, motion, weights, report)
+        return lambda: self._law.step(memory, measurement, motion, weights, report)
 
     def _reported(self, context: Context, age: float) -> Report | None:
         if self._report is None or not self._report.HasValue(context):
@@ -257,8 +254,7 @@ class ServoController(SteppedLaw):
     def __init__(self, law: ServoPreview, command: Array) -> None:
         super().__init__()
         self._law = law
-        self._served = serving(law).law
-        first = self._served.initial_memory(fixed("command", command, (NUM_REFERENCE,)))
+        first = law.initial_memory(fixed("command", command, (NUM_REFERENCE,)))
         self._measurement = self.DeclareVectorInputPort("measurement", law.sensing.size)
         self._preview = self.DeclareVectorInputPort("preview", NUM_REFERENCE)
         self._report = self.DeclareVectorInputPort("report", law.reports.size)
@@ -272,13 +268,13 @@ class ServoController(SteppedLaw):
             part = held[signal.name]
             self._put_out(port, len(part(first)), part)
 
-    def _prepared(self, context: Context) -> Callable[[], ServoMemory]:
+    def _prepared(self, context: Context) -> Callable[[], Memory]:
         age = float(np.asarray(self._age.Eval(context))[0]) if self._age.HasValue(context) else 0.0
         measurement = Measurement.of(np.asarray(self._measurement.Eval(context)), age)
         reference = np.reshape(np.asarray(self._preview.Eval(context)), (-1, NUM_REFERENCE))
         motion, report = Preview(self._law.preview_times, reference), self._report.Eval(context)
         memory = self.sample(context).memory
-        return lambda: self._served.step(memory, measurement, motion, np.asarray(report))
+        return lambda: self._law.step(memory, measurement, motion, np.asarray(report))
 
 
 _KNOWN: Final = ("torque_commanded", "measurement")

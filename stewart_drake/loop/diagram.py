@@ -16,7 +16,7 @@ from pydrake.systems.primitives import Adder, ConstantVectorSource, Saturation
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.channel import Channel, Wire
+from stewart_drake.law.channel import Channel, Packets, Wire
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop.controller import (
     DelayLqiController,
@@ -182,7 +182,7 @@ def _connect(builder: DiagramBuilder, source: OutputPort | str, target: str) -> 
 
 def _add_torques(builder: DiagramBuilder, experiment: Experiment) -> float:
     """Add a controller of torques, their limit and link; return its catch-up, s."""
-    channel: Channel = Wire()
+    channel: Channel | Wire | Packets = Wire()
     reports, catch_up = 1, 0.0
     if "controller" in experiment.own.systems:
         _add_own_controller(builder, experiment)

@@ -163,7 +163,7 @@ def sizing_of(experiment: Experiment) -> Sizing:
     )
 
 
-_PREDICTORS: Final[Mapping[str, Predictor]] = {
+_PREDICTORS: Final[Mapping[str, Predictor | NonlinearPredictor]] = {
     "linear": LinearPredictor(),
     "nonlinear": NonlinearPredictor(),
 }

@@ -12,7 +12,7 @@ from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.schema import plain
 from stewart_drake.files.versions import versions
 from stewart_drake.law.belief import Innovations
-from stewart_drake.law.memory import Counts
+from stewart_drake.law.counts import Counts
 from stewart_drake.loop import results as metrics
 from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.loop.diagram import ClosedLoop

@@ -18,7 +18,7 @@ import numpy as np
 
 from stewart_drake.core.library import core
 from stewart_drake.law.compiled import Compiled, machine_of, numbers
-from stewart_drake.law.core_law import AnyMemory
+from stewart_drake.law.memory import Memory
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Kind, Network
@@ -126,7 +126,7 @@ class TunerMemory(NamedTuple):
     """Memory of a tuner: numbers of the core, and the memory of the law."""
 
     data: Array
-    law: AnyMemory
+    law: Memory
 
     @property
     def fallbacks(self) -> int:
@@ -172,7 +172,7 @@ class WeightsSource:
             setattr(it, name, c.at(array))
         return Compiled(it, kept)
 
-    def start(self, law: AnyMemory) -> TunerMemory:
+    def start(self, law: Memory) -> TunerMemory:
         """Return the memory before the first sample of a law."""
         it, c = self.compiled.it, core()
         memory = np.empty(c.lib.stewart_tuner_memory(it))
@@ -203,7 +203,7 @@ class WeightsSource:
         return row[: c.lib.stewart_newest_row(self.compiled.it, c.at(memory.data), c.at(row))]
 
     def observe(
-        self, memory: TunerMemory, decision: Decision, after: AnyMemory, wanted: Array
+        self, memory: TunerMemory, decision: Decision, after: Memory, wanted: Array
     ) -> TunerMemory:
         """Take a sample into the memory.
 

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 from pydrake.systems.analysis import Simulator
 from scipy.linalg import expm
@@ -30,7 +29,6 @@ from stewart_drake.scenario.loading import load_compatible
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES
 from stewart_drake.scenario.timing import event_time, look_time
 from stewart_drake.types import Array
-from tests.backends import stepped_in_python
 
 FILE = Path(__file__).with_name("torques.npz")
 SAMPLES = 60
@@ -194,6 +192,4 @@ def main(rows: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    with pytest.MonkeyPatch.context() as patch:
-        stepped_in_python(patch)
-        main(sys.argv[1:])
+    main(sys.argv[1:])

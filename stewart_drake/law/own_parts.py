@@ -1,0 +1,347 @@
+"""Parts of a law in Python, as tables of functions that the step in C calls back."""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from stewart_drake.core.library import core
+from stewart_drake.law.belief import Belief
+from stewart_drake.law.compiled import Out, call_back, numbers
+from stewart_drake.law.counts import Counts
+from stewart_drake.law.memory import Memory
+from stewart_drake.law.motion import Motion
+from stewart_drake.law.observers import belief_of
+from stewart_drake.law.sensing import Measurement
+from stewart_drake.law.timeline import Arrivals, Timeline, TorqueSchedule
+from stewart_drake.mechanism.kinematics import UnreachablePoseError
+from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES, POSE, RATES
+from stewart_drake.types import Array
+
+
+@dataclass
+class Step:
+    """Data of the step that is being taken.
+
+    Attributes:
+        memory: of the law; C and the parts change it in place.
+        motion: to follow, as the caller gives it.
+        report: of the machine, or None.
+        followed: motion that the planner chose.
+        kept: arrays that C reads until the step is over.
+    """
+
+    memory: Memory
+    motion: Motion | None = None
+    report: Any = None
+    followed: Motion | None = None
+    kept: list[Any] = field(default_factory=list)
+
+
+class OwnParts:
+    """Tables of the parts of a law that Python has.
+
+    Args:
+        law: the law.
+        data: `stewart_law *` of it.
+
+    Attributes:
+        raised: errors in the parts.
+        kept: C structures that must outlive `data`.
+        now: the step that is being taken.
+    """
+
+    now: Step
+
+    def __init__(self, law: Any, data: Any) -> None:
+        self.law, self._data, self._has_observer = law, data, False
+        self.raised: list[BaseException] = []
+        self.kept: list[Any] = []
+
+    def _table(self, kind: str, **functions: tuple[Any, ...]) -> Any:
+        it = core().ffi.new(f"stewart_{kind} *")
+        self.kept += [it, *call_back(it, self.raised, **functions)]
+        return it
+
+    def rows_of(self, times: Array, motion: Motion | None) -> Array:
+        """Return rows of a motion as one vector.
+
+        Raises:
+            ValueError: their shape does not fit.
+        """
+        assert motion is not None
+        law = self.law
+        if motion is self.now.motion and (self._has_observer or not law.finds_delay):
+            timeline = self.timeline()
+            own = law.preview_times if timeline == law.timeline else law.times_for(timeline)
+            times = own if len(own) == len(times) else times  # to the last digit
+        return preview_rows(motion(times), len(times)).ravel()
+
+    # -------------------------------------------------------------- observer
+
+    def observer(self) -> None:
+        """Set the observer."""
+        p, m = len(self.law.plant.dynamics.free), self.law.sensing.size
+        self._has_observer, state = True, Out(NUM_STATE)
+        self._data.observer = self._table(
+            "observer",
+            memory=(lambda _: NUM_STATE, None),
+            scratch=(lambda _: 0, None),
+            start=(self._start, None, state),
+            observe=(self._observe, None, state, None, _torques, m, None),
+            restart=(self._restart, None, state),
+            parameters=(self._parameters, None, None, Out(p), Out(p)),
+            uncertainty=(self._uncertainty, None, None, Out((NUM_STATE + p) ** 2)),
+        )
+
+    def _start(self, _: Any, state: Array) -> None:
+        law, state[:] = self.law, np.nan
+        belief = law.observer.start(law.timeline, law.sensing, law.plant)
+        self.now.memory.own["observer"], state[:] = belief, belief.state
+
+    def _observe(
+        self, _: Any, state: Array, __: int, torques: Array, values: Array, ___: Any
+    ) -> int:
+        law, belief = self.law, self.now.memory.own["observer"]
+        if not np.array_equal(state, belief.state, equal_nan=True):
+            belief = belief.at(state.copy())
+        given = Measurement.of(values), torques.reshape(-1, NUM_TORQUES), law.sensing, law.plant
+        after = law.observer.observe(belief, *given)
+        self.now.memory.own["observer"], state[:] = after, after.state
+        return sum(1 << Counts._fields.index(cause) for cause in set(after.faults))
+
+    def _restart(self, _: Any, state: Array) -> None:
+        belief = self.now.memory.own["observer"]
+        self._start(_, state)
+        fresh = self.now.memory.own["observer"].assuming(belief.parameters)
+        self.now.memory.own["observer"] = replace(fresh, measured=belief.measured)
+
+    def _parameters(self, _: Any, __: Any, theta: Array, std: Array) -> None:
+        estimate = self.now.memory.own["observer"].estimate
+        theta[:], std[:] = estimate.parameters, estimate.parameter_std
+
+    def _uncertainty(self, _: Any, __: Any, root: Array | None) -> float:
+        belief = self.now.memory.own["observer"]
+        if root is not None:
+            root[:] = 0.0
+        if root is not None and belief.estimate.uncertain:
+            w, V = np.linalg.eigh(belief.estimate.covariance)
+            root[:] = np.ravel(V * np.sqrt(np.maximum(w, 0.0)))
+        return float(belief.timing)
+
+    # -------------------------------------------------------------- prediction and gain
+
+    def design(self, columns: int, *, predicts: bool, designs: bool) -> None:
+        """Set the outlook and, where wanted, prediction and gain of `columns` at the most."""
+        functions: dict[str, tuple[Any, ...]] = {"outlook": (self._outlook, None, None, None)}
+        if predicts:
+            functions["predict"] = (self._predict, None, None, _followed, 6, None)
+        if designs:
+            p, torques = len(self.law.plant.dynamics.free), Out(lambda _, o, *__: 6 + 6 * o.pending)
+            nodes = lambda _, o, *__: 2 * NUM_REFERENCE * (3 + o.pending)  # noqa: E731
+            gain = Out(lambda law, o, *_: 6 * core().lib.stewart_order([law.cost], o.pending))
+            given = p, nodes, NUM_STATE, 2, torques, Out(NUM_STATE), gain
+            functions["design"] = (self._design, None, None, *given)
+        self._data.design = self._table("design", **functions)
+        self._data.design.columns = columns
+
+    def timeline(self) -> Timeline:
+        """Return the clock with the estimated delay."""
+        if self._has_observer:
+            found: Timeline = self.now.memory.own["observer"].timeline
+            return found
+        if not self.law.finds_delay:
+            return self.law.timeline
+        return self._observed().timeline
+
+    def _observed(self) -> Belief:
+        if self._has_observer:
+            found: Belief = self.now.memory.own["observer"]
+            return found
+        memory = np.array(self.now.memory.field("observer"))
+        return belief_of(self.law.observer, self._data, memory, self.law.timeline)
+
+    def _belief(self, outlook: Any) -> Belief:
+        return self._observed().at(np.array(list(outlook.state)))
+
+    def _outlook(self, _: Any, lag: int, outlook: Any) -> None:
+        law, c, belief = self.law, core(), self._observed()
+        timeline, in_flight = belief.timeline, self.now.memory.in_flight.copy()
+        if self._has_observer:
+            outlook.feeds_back, outlook.caution = belief.feeds_back, law.caution(belief)
+            outlook.settled, outlook.found = belief.settled, belief.found
+            outlook.assumed = math.isnan(belief.delay_mean)
+        if self._has_observer and timeline != law.timeline:
+            queue = timeline.queue(in_flight)
+            until = timeline.until_next(queue)
+            exact = isinstance(timeline, Arrivals)
+            outlook.eta, outlook.fraction = timeline.eta, 0.0 if exact else timeline.fraction
+            outlook.until = self._schedule(until)
+            outlook.horizon = self._schedule(until if exact else timeline.schedule(queue))
+            acted = timeline.last_period(in_flight)[0].torques
+            outlook.limited = law.plant.motors.reached(acted)
+            if lag and belief.has_state:
+                late = timeline.last_periods(in_flight, lag)
+                state = law.plant.predict(belief.state, late, belief.parameters)[-1]
+                outlook.state = state.tolist()
+        times, pending = numbers(law.predictor.samples(timeline)), law.predictor.pending(timeline)
+        if 1 + len(times) + 2 * (3 + pending) > self._data.rows:
+            raise ValueError(f"predictor: got {len(times)} samples and {pending} pending torques")
+        self.now.kept.append(times)
+        outlook.samples, outlook.times, outlook.pending = len(times), c.at(times), pending
+
+    def _schedule(self, schedule: TorqueSchedule) -> Any:
+        arrays = [numbers(part) for part in schedule]
+        self.now.kept += arrays
+        return [len(arrays[0]), *map(core().at, arrays), 0]
+
+    def _predict(self, _: Any, outlook: Any, followed: Array, integral: Array, it: Any) -> None:
+        belief, wanted = self._belief(outlook), followed.reshape(-1, NUM_REFERENCE)[:, :NUM_STATE]
+        queue = belief.timeline.queue(self.now.memory.in_flight.copy())
+        found = self.law.predictor.predict(belief, integral, queue, wanted, self.law.plant)
+        it.state, it.error, it.integral = (np.ravel(part).tolist() for part in found)
+
+    def _design(
+        self,
+        _: Any,
+        outlook: Any,
+        theta: Array | None,
+        nodes: Array,
+        state: Array,
+        weights: Array | None,
+        torques: Array,
+        error: Array | None,
+        gain: Array,
+    ) -> int:
+        law, plant, timeline = self.law, self.law.plant, self.timeline()
+        known = plant.dynamics.parameters if theta is None else theta
+        rows = nodes.reshape(-1, NUM_REFERENCE)
+        held = law.feedforward.held(rows, plant.dynamics, known)
+        torques[:] = np.ravel(held.torques)
+        if error is None:
+            return 0
+        try:
+            model = law.model.at(state, held.torques[-1], known, plant)
+            error -= law.feedforward.offset(held.changes, model.B[RATES], timeline)
+            if weights is None:
+                return 0
+            delayed = law.cost.sampled(model, timeline)
+            K = law.cost.gain(delayed, weights)
+            if not np.all(np.isfinite(K)):
+                raise FloatingPointError("gain: is not finite")
+            gain[:] = np.ravel(law.predictor.gain(K, delayed))
+        except UnreachablePoseError:  # nothing to regulate: the feedforward acts alone
+            return int(core().lib.STEWART_UNREACHABLE)
+        except (ArithmeticError, np.linalg.LinAlgError):  # such as RiccatiError
+            return int(core().lib.STEWART_RICCATI_FAILURE)
+        return 0
+
+    def command(self, servo: Any) -> None:
+        """Set the commands of a `stewart_servo`."""
+        p, row = len(self.law.plant.dynamics.free), NUM_REFERENCE
+        given = self._command, None, p, row, Out(row)
+        self.kept += call_back(servo, self.raised, command=given)
+
+    def _command(self, _: Any, theta: Array, row: Array, command: Array) -> int:
+        law, state = self.law, self.now.memory.own
+        try:
+            command[:] = law.command(row, theta)
+        except UnreachablePoseError:
+            return int(core().lib.STEWART_UNREACHABLE)
+        if law.learned is not None:
+            time = law.timeline.period * state["samples"]
+            command[POSE] += law.learned(time + law.preview_times)[0]
+        return 0
+
+    # -------------------------------------------------------------- planner and channel
+
+    def planner(self) -> None:
+        """Set the planner."""
+        self._data.planner = self._table(
+            "planner",
+            memory=(lambda _: 0, None),
+            scratch=(lambda _: 0, None),
+            start=(self._start_planner, None, None),
+            follow=(self._follow, None, None, None, None, None),
+            look=(self._look, None, None, None, None, _times, Out(_rows)),
+        )
+
+    def _start_planner(self, _: Any, __: Any) -> None:
+        self.now.memory.own["planner"] = None
+
+    def _follow(self, _: Any, __: Any, outlook: Any, ___: Any, ____: Any) -> int:
+        belief = replace(self._belief(outlook), caution=outlook.caution)
+        given = belief, self.now.memory.in_flight.copy(), self.now.motion, self.law.plant
+        followed = self.law.planner.follow(self.now.memory.own["planner"], *given)
+        self.now.memory.own["planner"], self.now.followed = followed.path, followed.motion
+        return int(followed.replanned)
+
+    def _look(self, _: Any, __: Any, ___: Any, ____: int, times: Array, rows: Array) -> None:
+        rows[:] = np.nan
+        rows[:] = self.rows_of(times, self.now.followed)
+
+    def channel(self) -> None:
+        """Set the channel."""
+        lib = core().lib
+        self._data.channel = self._table(
+            "channel",
+            memory=(lambda _: 0, None),
+            scratch=(lib.stewart_planning_scratch, None),
+            torques=(lambda _: self.law.channel.torques, None),
+            start=(self._start_channel, None, None),
+            update=(self._update, None, None, None, Out(_flying), None),
+            send=(self._send, None, None, None, None, _flying, None),
+        )
+
+    def _start_channel(self, _: Any, __: Any) -> None:
+        self.now.memory.own["channel"] = self.law.channel.start()
+        self.now.memory.own["plan"] = np.zeros((self.law.channel.torques, NUM_TORQUES))
+
+    def _update(self, _: Any, __: Any, ___: Any, in_flight: Array, ____: Any) -> None:
+        given = in_flight.reshape(-1, NUM_TORQUES).copy(), self.timeline(), self.now.report
+        sent, flying = self.law.channel.in_flight(self.now.memory.own["channel"], *given)
+        self.now.memory.own["channel"], in_flight[:] = sent, np.ravel(flying)
+
+    def _send(
+        self, law: Any, _: Any, outlook: Any, ahead: Any, in_flight: Array, scratch: Any
+    ) -> None:
+        c, plan = core(), np.empty((self.law.channel.torques, NUM_TORQUES))
+        late = in_flight[len(in_flight) - NUM_TORQUES * outlook.pending :].copy()
+        c.lib.stewart_plan_torques(law, outlook, ahead, c.at(late), c.at(plan), scratch)
+        sent = self.law.channel.send(
+            self.now.memory.own["channel"], plan, in_flight.reshape(-1, NUM_TORQUES)
+        )
+        self.now.memory.own["channel"], self.now.memory.own["plan"] = sent, plan
+
+
+def preview_rows(rows: Any, number: int) -> Array:
+    """Return rows of a reference (number, 18) for C.
+
+    Raises:
+        ValueError: their shape does not fit.
+    """
+    found = np.ascontiguousarray(rows, np.float64)
+    if found.shape != (number, NUM_REFERENCE):
+        raise ValueError(f"preview: got shape {found.shape}; expected {(number, NUM_REFERENCE)}")
+    return found
+
+
+def _torques(_: Any, __: Any, number: int, *___: Any) -> int:
+    return NUM_TORQUES * number
+
+
+def _followed(_: Any, outlook: Any, *__: Any) -> int:
+    return NUM_REFERENCE * (1 + int(outlook.samples))
+
+
+def _times(*given: Any) -> int:
+    return int(given[3])
+
+
+def _rows(*given: Any) -> int:
+    return NUM_REFERENCE * int(given[3])
+
+
+def _flying(law: Any, *_: Any) -> int:
+    return NUM_TORQUES * int(law.layout.in_flight.rows)
