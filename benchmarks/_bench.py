@@ -7,6 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,16 @@ PAYLOAD = "plant.payload_mass=0.4"
 NARROW = "controller.prior={torque_bias: 0.003, payload: 0.5, damping: 0.003}"
 AMPLITUDE = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
 """Of the reference of `paper`, rad and m."""
+
+
+def with_own(law: Any, *names: str) -> Any:
+    """Return a law with some parts as those of a user, which the step in C calls back."""
+
+    def own(part: Any) -> Any:
+        given = {one.name: getattr(part, one.name) for one in fields(part)}
+        return type("Own", (type(part),), {})(**given)
+
+    return replace(law, **{name: own(getattr(law, name)) for name in names})
 
 
 def size(name: str, usual: int, least: int = 1) -> int:

@@ -1,6 +1,6 @@
 """Computing time of a closed loop: one controller step, one run, one process.
 
-The parts of a step are those of the law in Python, which the law in C does not call.
+The parts of a step are those in Python, in the place of those of the core.
 Times of steps are medians over a run and its worst step, each the least of several runs.
 """
 
@@ -15,17 +15,14 @@ from timeit import timeit
 from typing import Any
 
 import numpy as np
-from _bench import table, write
+from _bench import table, with_own, write
 
 import stewart_drake as sd
 from stewart_drake.dynamics.stewart import plant_parameters
-from stewart_drake.law.core_law import Serving
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.feedforward import InverseDynamicsFeedforward
 from stewart_drake.law.nominal import DesignModel
 from stewart_drake.law.observers import CoreObserver
-from stewart_drake.law.predictors import NonlinearPredictor
-from stewart_drake.loop import controller
 
 RUNS = 6
 REPEATS = 300
@@ -34,13 +31,17 @@ SCENARIOS = {"paper": ["duration=10.0"], "gravity": ["duration=2.0"]}
 ESTIMATORS = {"parameters": "[torque_bias,payload,damping]", "none": "[]"}
 PARTS = {
     "observe": (CoreObserver, "observe"),
-    "predict": (NonlinearPredictor, "predict"),
     "feedforward": (InverseDynamicsFeedforward, "held"),
     "linear model": (DesignModel, "at"),
     "sample": (QuadraticCost, "sampled"),
     "Riccati gain": (QuadraticCost, "gain"),
 }
 """Calls of a step of `predictor_lqi`, in order; the rest is arithmetic on short vectors."""
+
+
+def in_python(law: Any) -> Any:
+    """Return a law with parts in Python."""
+    return with_own(law, "observer", "feedforward", "model", "cost")
 
 
 @contextmanager
@@ -61,12 +62,9 @@ def timed_parts() -> Iterator[dict[str, list[float]]]:
 
     for name, place in PARTS.items():
         setattr(*place, timed(name, originals[name]))
-    served = controller.serving
-    controller.serving = lambda law: Serving(law, "python (its parts are timed)")
     try:
         yield spent
     finally:
-        controller.serving = served
         for name, place in PARTS.items():
             setattr(*place, originals[name])
 
@@ -84,8 +82,9 @@ def steps() -> tuple[list[list[str]], list[list[str]]]:
             for _ in range(RUNS):
                 step_ms = sd.simulate(scenario).summary["controller_step_ms"]
                 with timed_parts() as spent:
-                    in_python = sd.simulate(scenario).summary["controller_step_ms"]["median"]
-                told = {"in Python": [in_python]} | {k: [v] for k, v in step_ms.items()}
+                    result = sd.simulate(scenario, modify_law=in_python)
+                    own = result.summary["controller_step_ms"]["median"]
+                told = {"in Python": [own]} | {k: [v] for k, v in step_ms.items()}
                 for part, milliseconds in (spent | told).items():
                     medians[part].append(float(np.median(milliseconds)))
             least = {part: f"{min(values):.3g}" for part, values in medians.items()}

@@ -5,14 +5,12 @@ with the paper's motion and delay. Times are the CPU's, of laws in Python.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-from _bench import EXACT, NARROW, ON, CpuTime, in_parallel, run_sections, section, size
+from _bench import EXACT, NARROW, ON, CpuTime, in_parallel, run_sections, section, size, with_own
 
 import stewart_drake as sd
-from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.loop import sampling
 from stewart_drake.loop.diagram import build_closed_loop
@@ -26,13 +24,9 @@ MOUNTED = float(np.deg2rad(0.1))
 INSTANTS = (2.0, 5.0, 10.0)
 
 
-class InPython(CoreObserver):
-    """The same observer, but unknown to the law in C."""
-
-
-def in_python(law: PredictiveLqi) -> PredictiveLqi:
-    """Return the law of a measured state in the language of that of encoders."""
-    return replace(law, observer=InPython(cast(CoreObserver, law.observer).settings))
+def in_python(law: PredictiveLqi) -> Any:
+    """Return the law of a measured state with its observer as that of a user."""
+    return with_own(law, "observer")
 
 
 def median_step(settings: Sequence[str], seed: int) -> float:

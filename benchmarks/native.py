@@ -1,6 +1,6 @@
-"""The law's step in C and in Python, and the Riccati equation by doubling and by Drake, in turns.
+"""The law's step with parts in C and in Python, and the Riccati equation by doubling and by Drake.
 
-A time is the least of its repeats.
+Both are timed in turns. A time is the least of its repeats.
 """
 
 import time
@@ -8,12 +8,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from _bench import table, write
+from _bench import table, with_own, write
 from pydrake.math import DiscreteAlgebraicRiccatiEquation
 
 import stewart_drake as sd
 from stewart_drake.export.recording import record
-from stewart_drake.law.core_law import CoreLqi
 from stewart_drake.law.delay_model import delayed_model, linear_model
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
@@ -32,7 +31,7 @@ def repeated(call: Callable[[], object], number: int) -> float:
 
 
 def replayed_steps(name: str, samples: int = 60, repeats: int = 8) -> dict[str, list[float]]:
-    """Return the time in s of each step of a law in Python and in C, least of the repeats.
+    """Return the time in s of each step with parts in Python and in C, least of the repeats.
 
     Both repeat the steps of one run, in turns, and use the compiled dynamics.
     """
@@ -40,7 +39,8 @@ def replayed_steps(name: str, samples: int = 60, repeats: int = 8) -> dict[str, 
     recorded = record(scenario)
     law = recorded.law
     assert isinstance(law, PredictiveLqi)
-    steppers: dict[str, Any] = {"python": law, "c": CoreLqi(law)}
+    own = with_own(law, "observer", "feedforward", "model", "cost")
+    steppers: dict[str, Any] = {"python": own, "c": law}
     least = {which: [np.inf] * len(recorded.steps) for which in steppers}
     for which, stepper in [*steppers.items()] * repeats:
         memory = stepper.initial_memory(recorded.first)
@@ -84,7 +84,13 @@ def steps() -> str:
         worst = max(c[k] for k in fed) / mid[1]
         medians = [f"{1e6 * one:.4g}" for one in mid]
         rows.append([f"`{name}`", *medians, f"{mid[0] / mid[1]:.1f}", f"{worst:.2f}"])
-    heads = ["step of the law", "Python, median us", "C, median us", "ratio", "C, worst / median"]
+    heads = [
+        "step of the law",
+        "parts in Python, median us",
+        "in C, median us",
+        "ratio",
+        "in C, worst / median",
+    ]
     return table(heads, rows)
 
 

@@ -327,22 +327,17 @@ def test_a_speed_limit_that_the_motion_exceeds_makes_it_late():
 # Reports, and what is made of them.
 
 
-def test_a_report_is_read_as_it_was_written():
+def test_a_report_has_means_and_limits_of_each_period():
     rng, layout = np.random.default_rng(3), ReportLayout(parts=4, periods=3)
     torques = rng.standard_normal((3 * 4 * 5, 6))
     torques[25, 2] = 7.0  # in the second period
     report = layout.written(torques, np.arange(6.0), TorqueLimit(6.5))
     assert report.shape == (layout.size,)
     means = np.array([torques[5 * i : 5 * i + 5].mean(axis=0) for i in range(12)])
-    for periods in (1, 2, 3):
-        said = layout.read(report, periods)
-        assert said is not None
-        assert np.allclose(said.torques, means[12 - 4 * periods :])
-        assert np.array_equal(said.asked, np.arange(6.0))
-        assert said.saturated == (periods > 1)
-    assert layout.read(report, 4) is None
-    report[3] = np.nan  # before the start
-    assert layout.read(report, 3) is None and layout.read(report, 2) is not None
+    rows = report[:-6].reshape(3, layout.width)
+    assert np.allclose(rows[:, :-1].reshape(-1, 6), means)
+    assert rows[:, -1].tolist() == [0, 1, 0]
+    assert np.array_equal(report[-6:], np.arange(6.0))
 
 
 @pytest.mark.parametrize("kind", ["exact", "multibody"])
@@ -357,10 +352,11 @@ def test_the_machine_reports_what_has_acted(kind):
         simulator.AdvanceTo(look_time((k + 1) * 1e-3) if k < 399 else 0.4 * (1 - 9e-15))
     own = servos.GetMyContextFromRoot(context)
     layout = servos.reports
-    said = layout.read(servos.GetOutputPort("report").Eval(own), 2)
-    means = np.array(acted[200:]).reshape(len(said.torques), -1, 6).mean(axis=1)
-    assert np.abs(means).max() == 0 or np.allclose(said.torques, means, rtol=1e-12, atol=1e-15)
-    assert len(said.torques) == 2 * layout.parts
+    report = servos.GetOutputPort("report").Eval(own)
+    said = report[:-6].reshape(layout.periods, layout.width)[-2:, :-1].reshape(-1, 6)
+    means = np.array(acted[200:]).reshape(len(said), -1, 6).mean(axis=1)
+    assert np.abs(means).max() == 0 or np.allclose(said, means, rtol=1e-12, atol=1e-15)
+    assert len(said) == 2 * layout.parts
 
 
 @pytest.mark.slow

@@ -139,7 +139,9 @@ static int command_for(const stewart_servo *servo, const real *theta, const real
     real found[STEWART_COMMAND];
     if (!stewart_all_finite(ROW, row))
         return STEWART_REFERENCE_MISSING;
-    const int trouble = (servo->command ? servo->command : unlimited)(servo, theta, row, found);
+    int trouble = unlimited(servo, theta, row, found);
+    if (!trouble && servo->command)
+        trouble = servo->command(servo, theta, row, found);
     if (trouble)
         return trouble;
     if (!stewart_all_finite(STEWART_COMMAND, found))

@@ -46,8 +46,8 @@ typedef struct {
 typedef struct stewart_servo {
     stewart_law law;
     stewart_stiffness stiff;
-    /* Commands of one's own: write the command (18) for a row, without limits, and return 0 or the cause of
-       failure; NULL for those of the core. */
+    /* Change the command (18) for a row of the reference, before its limits, or NULL. Returns 0 or the cause of
+       failure. */
     int (*command)(const struct stewart_servo *servo, const real *theta, const real *row, real *command);
     int periods; /* rows of a report; `periods` - 1 reports in a row may be lost without loss of data */
     int memory;  /* numbers of the memory, and the place of each field: `stewart_servo_prepare` */

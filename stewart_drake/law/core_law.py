@@ -130,8 +130,9 @@ class CompiledLaw:
     def _of_servos(self) -> None:
         law, d = self.law, self.data
         d.law.parts, d.periods = law.reports.parts, law.reports.periods
-        if law.learned is not None or self._python & set(_DESIGN):
-            self._own.command(d)
+        computes = bool(self._python & set(_DESIGN))
+        if computes or law.learned is not None:
+            self._own.command(d, computes=computes)
         if (servo := law.servo) is not None:
             limits = servo.low.tolist(), servo.high.tolist(), servo.most
             d.stiff = (servo.stiffness, servo.velocity_gain, *limits)

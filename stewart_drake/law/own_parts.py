@@ -237,20 +237,22 @@ class OwnParts:
             return int(core().lib.STEWART_RICCATI_FAILURE)
         return 0
 
-    def command(self, servo: Any) -> None:
-        """Set the commands of a `stewart_servo`."""
+    def command(self, servo: Any, *, computes: bool) -> None:
+        """Set the change of commands of a `stewart_servo`."""
         p, row = len(self.law.plant.dynamics.free), NUM_REFERENCE
         given = self._command, None, p, row, Out(row)
         self.kept += call_back(servo, self.raised, command=given)
+        self._computes = computes
 
     def _command(self, _: Any, theta: Array, row: Array, command: Array) -> int:
-        law, state = self.law, self.now.memory.own
-        try:
-            command[:] = law.command(row, theta)
-        except UnreachablePoseError:
-            return int(core().lib.STEWART_UNREACHABLE)
+        law, samples = self.law, self.now.memory.own["samples"]
+        if self._computes:
+            try:
+                command[:] = law.command(row, theta)
+            except UnreachablePoseError:
+                return int(core().lib.STEWART_UNREACHABLE)
         if law.learned is not None:
-            time = law.timeline.period * state["samples"]
+            time = law.timeline.period * samples
             command[POSE] += law.learned(time + law.preview_times)[0]
         return 0
 

@@ -215,14 +215,6 @@ def still(command: Array, time: float) -> Segment:
     return Segment(time, time, command, command)
 
 
-class Reported(NamedTuple):
-    """Torques of the servos between two measurements."""
-
-    torques: Array  # (n, 6) N m, means over equal parts of the time
-    asked: Array  # (6,) N m, before the limit, when it ended
-    saturated: int  # periods of the controller in which a torque was at its limit
-
-
 @dataclass(frozen=True)
 class ReportLayout:
     """Layout of the report that a machine with servos sends with each measurement.
@@ -257,13 +249,3 @@ class ReportLayout:
         ever = at_limit.reshape(self.periods, self.parts).any(axis=1)
         rows = np.column_stack([means.reshape(self.periods, -1), ever])
         return np.concatenate([rows.ravel(), asked])
-
-    def read(self, report: Array, periods: int) -> Reported | None:
-        """Return the last periods of a report (size,), or None where it does not cover them."""
-        if periods > self.periods:
-            return None
-        rows = report[:-NUM_TORQUES].reshape(self.periods, self.width)[self.periods - periods :]
-        if not np.all(np.isfinite(rows)):
-            return None
-        torques = rows[:, :-1].reshape(-1, NUM_TORQUES)
-        return Reported(torques, report[-NUM_TORQUES:], int(rows[:, -1].sum()))
