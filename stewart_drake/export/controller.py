@@ -416,7 +416,7 @@ class Constants:
             return self.struct(value, about)
         if kind.kind == "array":
             return "{" + ", ".join(self._value(v, kind.item, about) for v in value) + "}"
-        if kind.kind == "pointer":
+        if kind.kind in ("pointer", "function"):
             return self._pointed(value, about)
         return number(value, self._suffix) if kind.cname == "double" else str(int(value))
 

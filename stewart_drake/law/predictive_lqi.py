@@ -141,7 +141,7 @@ class PredictiveLqi:
 
         Args:
             queue: (n >= L, 6) torques in flight, oldest first, L by the delay at the start; more
-                for an observer of one's own whose estimate of the delay may grow.
+                for an observer of your own whose estimate of the delay may grow.
         """
         more = len(queue) - self.queue_length
         if more < 0 or np.shape(queue)[1:] != (NUM_TORQUES,):
