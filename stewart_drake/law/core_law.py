@@ -15,7 +15,7 @@ from stewart_drake.dynamics.frozen_map import FrozenDynamics
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.law.channel import Packets, Wire, packets_of, report_of
-from stewart_drake.law.compiled import Out, address_of, call_back, machine_of, numbers, resists
+from stewart_drake.law.compiled import address_of, machine_of, numbers, resists
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
@@ -235,7 +235,12 @@ class CompiledLaw:
         sample.age = round(measurement.age / law.timeline.period)
         after.own["samples"] = after.own.get("samples", -1) + 1
         self._own.now = Step(after, motion, report)
-        asked = self._asked(sample, motion)
+        if self._servos or not (law.moves or "observer" in self._python):  # known instants
+            rows = preview_rows(motion(law.preview_times), len(law.preview_times))
+            sample.reference, sample.about = c.lib.stewart_given_rows, c.at(rows)
+        else:
+            sample.reference, goal = self._own.motion
+            sample.goal = goal if isinstance(motion, KnownMotion) else c.ffi.NULL
         given = self.data, c.at(after.data), c.at(scratch), sample
         if weights is None:
             said, command = numbers(report), np.empty(NUM_REFERENCE)
@@ -246,7 +251,6 @@ class CompiledLaw:
             compiled, torque = report_of(report), np.empty(NUM_TORQUES)
             sample.report, sample.weights = compiled.it, list(weights)
             c.lib.stewart_step(*given, c.at(torque))
-        del asked
         self._raise_errors()
         return after
 
@@ -257,28 +261,3 @@ class CompiledLaw:
                 first = errors[0]
                 errors.clear()
                 raise first
-
-    def _asked(self, sample: Any, motion: Motion) -> list[Any]:
-        """Set the reference of a sample; return the objects that it points to.
-
-        With a known delay the instants are known, too, and all rows are given beforehand.
-        """
-        law, c = self.law, core()
-        if self._servos or not (law.moves or "observer" in self._python):
-            rows = preview_rows(motion(law.preview_times), len(law.preview_times))
-            sample.reference, sample.about = c.lib.stewart_given_rows, c.at(rows)
-            return [rows]
-        size = None, None, lambda _, number, *__: number, Out(lambda _, n, *__: NUM_REFERENCE * n)
-
-        def reference(_: Any, __: int, times: Array, rows: Array) -> None:
-            rows[:] = np.nan
-            rows[:] = self._own.rows_of(times, motion)
-
-        def goal(_: Any, __: int, times: Array, rows: Array) -> None:
-            rows[:] = np.nan
-            rows[:] = np.ravel(motion.goal(times))  # type: ignore[attr-defined]
-
-        functions = {"reference": (reference, *size)}
-        if isinstance(motion, KnownMotion):
-            functions["goal"] = (goal, *size)
-        return call_back(sample, self._own.raised, **functions)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from stewart_drake.law.belief import Belief
 from stewart_drake.law.compiled import Out, call_back, numbers
 from stewart_drake.law.counts import Counts
 from stewart_drake.law.memory import Memory
-from stewart_drake.law.motion import Motion
+from stewart_drake.law.motion import KnownMotion, Motion
 from stewart_drake.law.observers import belief_of
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.timeline import Arrivals, Timeline, TorqueSchedule
@@ -59,6 +60,24 @@ class OwnParts:
         self.raised: list[BaseException] = []
         self.kept: list[Any] = []
 
+    @cached_property
+    def motion(self) -> tuple[Any, Any]:
+        """Functions `reference` and `goal` of a `stewart_sample`."""
+        sample = core().ffi.new("stewart_sample *")
+        given = None, None, lambda _, number, *__: number, Out(lambda _, n, *__: NUM_REFERENCE * n)
+        functions = {"reference": (self._reference, *given), "goal": (self._goal, *given)}
+        reference, goal = call_back(sample, self.raised, **functions)
+        return reference, goal
+
+    def _reference(self, _: Any, __: int, times: Array, rows: Array) -> None:
+        rows[:] = np.nan
+        rows[:] = self.rows_of(times, self.now.motion)
+
+    def _goal(self, _: Any, __: int, times: Array, rows: Array) -> None:
+        assert isinstance(self.now.motion, KnownMotion)
+        rows[:] = np.nan
+        rows[:] = np.ravel(self.now.motion.goal(times))
+
     def _table(self, kind: str, **functions: tuple[Any, ...]) -> Any:
         it = core().ffi.new(f"stewart_{kind} *")
         self.kept += [it, *call_back(it, self.raised, **functions)]
@@ -72,7 +91,8 @@ class OwnParts:
         """
         assert motion is not None
         law = self.law
-        if motion is self.now.motion and (self._has_observer or not law.finds_delay):
+        anywhere = isinstance(motion, KnownMotion) or motion is not self.now.motion
+        if not anywhere and (self._has_observer or not law.finds_delay):
             timeline = self.timeline()
             own = law.preview_times if timeline == law.timeline else law.times_for(timeline)
             times = own if len(own) == len(times) else times  # to the last digit
