@@ -472,3 +472,42 @@ def test_the_rest_of_a_path_is_the_same_path():
     back, h = path(0.1), 0.1
     for time in (0.0, 0.03, 0.1, 0.17):
         assert np.allclose(back.after(h).at(time, h)[:12], back.at(time + h, h)[:12], atol=1e-12)
+
+
+class Weak(TorqueLimit):
+    """Motors of which the last has half of the limit."""
+
+    def saturate(self, torques):
+        limit = self.limit * np.array([1, 1, 1, 1, 1, 0.5])
+        return np.clip(torques, -limit, limit)
+
+    def reached(self, torques):
+        return bool(np.any(self.saturate(torques) != torques))
+
+
+class Watched(NominalPlant):
+    """A plant that keeps the numbers of torques that it predicts with."""
+
+    calls: list[int] = []
+
+    def predict(self, state, schedule, parameters=None):
+        self.calls.append(len(schedule.torques))
+        return super().predict(state, schedule, parameters)
+
+
+def test_motors_and_a_plant_of_your_own_are_those_of_the_law():
+    law = law_of("delay.steps=2", "controller.estimate=[]", limit=0.003)
+    reference = sine(0.5)
+    plant = Watched(
+        law.plant.dynamics, law.plant.substeps, law.plant.coarse_torque_limit, Weak(0.003)
+    )
+    loop = Loop(replace(law, plant=plant), reference, queue=np.zeros((2, 6))).run(8)
+    asked = np.array([memory.torque for memory in loop.memories])
+    sent = np.array([memory.in_flight[-1] for memory in loop.memories])
+    assert np.array_equal(sent, plant.motors.saturate(asked)) and np.abs(sent[:, 5]).max() == 0.0015
+    assert 2 in plant.calls
+    same = replace(
+        law, plant=Watched(*(getattr(law.plant, n) for n in law.plant.__dataclass_fields__))
+    )
+    loops = [Loop(one, reference, queue=np.zeros((2, 6))).run(8) for one in (law, same)]
+    assert loops[0].memory.torque == pytest.approx(loops[1].memory.torque, abs=1e-12)

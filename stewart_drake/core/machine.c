@@ -43,6 +43,8 @@ int stewart_substeps(const stewart_machine *machine, int number, const real *tor
 
 int stewart_at_limit(const stewart_machine *machine, int number, const real *torques)
 {
+    if (machine->own)
+        return machine->own->at_limit(machine, number, torques);
     for (int i = 0; i < U * number; i++)
         if (REAL(fabs)(torques[i]) >= machine->torque_limit)
             return 1;
@@ -83,6 +85,10 @@ void stewart_advance(const stewart_belief *belief, const real *torque, real dura
 void stewart_predict(const stewart_machine *machine, const real *theta, const stewart_schedule *schedule,
                      const real *state, real *states)
 {
+    if (machine->own) {
+        machine->own->predict(machine, theta, schedule, state, states);
+        return;
+    }
     const int substeps = schedule->substeps
                              ? schedule->substeps
                              : stewart_substeps(machine, schedule->number, schedule->torques);

@@ -11,7 +11,7 @@
 
 /* Estimated parameters theta (p) are some of the plant's; what else xi = [state; theta] has, such as
    offsets of encoders, changes nothing in the motion. */
-typedef struct {
+typedef struct stewart_machine {
     real geometry[STEWART_GEOMETRY];
     real parameters[STEWART_PARAMETERS]; /* as they are known beforehand */
     real gravity;                        /* m/s^2 */
@@ -22,6 +22,7 @@ typedef struct {
     int estimated;                       /* p */
     int place[STEWART_MAX_ESTIMATED];    /* of each in `parameters`, or -1 */
     const real *acceleration_per_torque; /* (6, 6) at any pose, times torque + bias; NULL: the equations */
+    const struct stewart_own_machine *own; /* NULL: motion and limit of the core */
 } stewart_machine;
 
 /* Torque schedule: torques that act one after the other, each for its duration. */
@@ -31,6 +32,14 @@ typedef struct {
     const real *durations; /* (number) s */
     int substeps;          /* for each of them; 0: by the largest torque */
 } stewart_schedule;
+
+/* Functions for `stewart_predict`, `stewart_limit` and `stewart_at_limit`. */
+typedef struct stewart_own_machine {
+    void (*predict)(const stewart_machine *machine, const real *theta, const stewart_schedule *schedule,
+                    const real *state, real *states);
+    int (*limit)(const stewart_machine *machine, const real *torque, real *limited);
+    int (*at_limit)(const stewart_machine *machine, int number, const real *torques);
+} stewart_own_machine;
 
 /* What acts between two samples, under the assumed delay. */
 typedef struct {

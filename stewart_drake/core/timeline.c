@@ -14,6 +14,8 @@ int stewart_limit(const stewart_machine *machine, const real *torque, real *limi
 {
     const real most = machine->torque_limit;
     int saturated = 0;
+    if (machine->own)
+        return machine->own->limit(machine, torque, limited);
     for (int i = 0; i < U; i++) {
         limited[i] = torque[i] > most ? most : torque[i] < -most ? -most : torque[i];
         saturated |= limited[i] != torque[i];

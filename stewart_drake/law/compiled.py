@@ -10,12 +10,15 @@ import numpy as np
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.frozen_map import FrozenDynamics
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.nominal import NominalPlant, TorqueLimit
+from stewart_drake.law.timeline import TorqueSchedule
 from stewart_drake.mechanism.geometry import Mechanism, geometry_of
 from stewart_drake.scenario.signals import BALL_JOINTS, PLANT_PARAMETERS
 from stewart_drake.types import Array
 
 Made = TypeVar("Made")
+DYNAMICS = StewartDynamics, FrozenDynamics
+"""Dynamics that the core has."""
 
 
 class Compiled(NamedTuple):
@@ -157,8 +160,43 @@ def machine_of(plant: NominalPlant) -> Compiled:
         machine.joints = core().ffi.addressof(core().lib, "stewart_ball_joints")
     for i, name in enumerate(dynamics.free):
         machine.place[i] = PLANT_PARAMETERS.index(name) if name in PLANT_PARAMETERS else -1
-    if not isinstance(dynamics, FrozenDynamics):
-        return Compiled(machine)
-    frozen = numbers(dynamics.map)
-    machine.acceleration_per_torque = core().at(frozen)
-    return Compiled(machine, (frozen,))
+    keeps, raised = list[Any](), list[BaseException]()
+    if isinstance(dynamics, FrozenDynamics):
+        keeps = [numbers(dynamics.map)]
+        machine.acceleration_per_torque = core().at(keeps[0])
+    shipped = NominalPlant, TorqueLimit, *DYNAMICS
+    if not all(type(part) in shipped for part in (plant, plant.motors, dynamics)):
+        keeps += _own_machine(plant, machine, raised)
+    return Compiled(machine, tuple(keeps), (raised,))
+
+
+def _own_machine(plant: NominalPlant, machine: Any, raised: list[BaseException]) -> list[Any]:
+    """Set the motion and the limit of a machine to those of a plant in Python."""
+
+    def predict(_: Any, theta: Array | None, it: Any, state: Array, states: Array) -> None:
+        torques, durations = (
+            np.reshape(core().ffi.unpack(values, it.number * n), (it.number, n))
+            for values, n in ((it.torques, 6), (it.durations, 1))
+        )
+        states[:] = np.ravel(
+            plant.predict(state, TorqueSchedule(torques, durations.ravel()), theta)
+        )
+
+    def limit(_: Any, torque: Array, limited: Array) -> int:
+        limited[:] = plant.motors.saturate(torque)
+        return int(np.any(limited != torque))
+
+    def at_limit(_: Any, number: int, torques: Array) -> int:
+        return int(plant.motors.reached(torques.reshape(number, 6)))
+
+    own, p = core().ffi.new("stewart_own_machine *"), len(plant.dynamics.free)
+    given = p, None, 12, Out(lambda _, __, it, *___: 12 * it.number)
+    kept = call_back(
+        own,
+        raised,
+        predict=(predict, None, *given),
+        limit=(limit, None, 6, Out(6)),
+        at_limit=(at_limit, None, None, lambda _, number, __: 6 * number),
+    )
+    machine.own = own
+    return [own, *kept]

@@ -11,11 +11,9 @@ from typing import Any, Final
 import numpy as np
 
 from stewart_drake.core.library import core
-from stewart_drake.dynamics.frozen_map import FrozenDynamics
-from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.law.channel import Packets, Wire, packets_of, report_of
-from stewart_drake.law.compiled import address_of, machine_of, numbers, resists
+from stewart_drake.law.compiled import DYNAMICS, address_of, machine_of, numbers, resists
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
@@ -40,7 +38,7 @@ _FEEDFORWARDS: Final = {
 }
 _DESIGN: Final = ("plant", "feedforward", "predictor", "model", "cost")
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
-    "plant": (StewartDynamics, FrozenDynamics),
+    "plant": DYNAMICS,
     "observer": (CoreObserver,),
     "feedforward": tuple(_FEEDFORWARDS),
     "planner": (NoPlanner, Replan),
@@ -112,6 +110,7 @@ class CompiledLaw:
             self.tables[address_of(machine.it.joints)] = "stewart_ball_joints"
             self.sources += ("ball_joints",)
         data.machine = machine.it[0]
+        self._raised += machine.raised
         self.keep += machine.pointed()
         data.period, data.steps, data.fraction = timeline.period, timeline.steps, timeline.fraction
         data.measured, data.rows = law.sensing.size, len(law.preview_times)
@@ -124,7 +123,7 @@ class CompiledLaw:
         part.fill(data)
         self.tables[address_of(data.observer)] = part.table
         self.sources += part.sources
-        self._raised = [self._own.raised, *part.sensor.raised]
+        self._raised += part.sensor.raised
         self.keep += [one for it in (part.sensor, part.estimation) if it for one in it.pointed()]
 
     def _of_servos(self) -> None:

@@ -267,7 +267,8 @@ def _law_of(
     law.measured, law.kept = sensing.size, observer.kept(period)
     if observer.delay is None:
         law.steps, law.fraction = steps, fraction
-    return Compiled(law, (machine, part.sensor, part.estimation), part.sensor.raised)
+    raised = *machine.raised, *part.sensor.raised
+    return Compiled(law, (machine, part.sensor, part.estimation), raised)
 
 
 @cache
