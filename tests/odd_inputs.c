@@ -71,7 +71,7 @@ static void run(oddity o)
     for (int k = 0; k < SAMPLES; k++) {
         real torque[STEWART_MOTORS], measurement[STEWART_REFERENCE];
         stewart_sample sample = {.measurement = measurement, .reference = stewart_given_rows};
-        sample.about = preview;
+        sample.context = preview;
         sample.weights[0] = sample.weights[1] = 1;
         look_ahead(k);
         stewart_reference((double)((real)k * law->period), measurement);

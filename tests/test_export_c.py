@@ -339,7 +339,7 @@ def test_the_command_writes_all_files_or_none_and_states_sizes(tmp_path, capsys,
     assert error.count("\n") == 1 and "stewart_board.c: no export has written it; exp" in error
 
 
-BODY = "{ (void)about, (void)number, (void)times, (void)rows; }"
+BODY = "{ (void)context, (void)number, (void)times, (void)rows; }"
 ENCODERS = ("sensor.kind=encoders", "sensor.samples=20")
 DESCRIBED = {
     "torques": (

@@ -405,7 +405,7 @@ def test_where_too_many_reports_are_lost_the_observer_begins_anew():
     memory = law.step(memory, Measurement.of(state), at_home, quiet)
     prior = law.observer.settings.parameters.std
     assert np.all(memory.belief.estimate.parameter_std == prior) and np.any(known < prior)
-    assert np.allclose(memory.belief.state, state) and memory.behind == 0
+    assert np.allclose(memory.belief.state, state) and memory.lag == 0
 
 
 def test_a_command_is_finite_whatever_the_reference_is():

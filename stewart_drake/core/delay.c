@@ -231,21 +231,21 @@ typedef struct {
     real *white, *nu;    /* (m, n) C^-1 J H, and (m) C^-1 nu, nu the innovation about the prior */
 } Model;
 
-static int predict_model(void *about, const real *xi, real *state)
+static int predict_model(void *context, const real *xi, real *state)
 {
-    Model *a = about;
+    Model *a = context;
     return predict(a->period, xi, &a->path, state);
 }
 
-static int linearize_model(void *about, const real *xi, real *H, stewart_scratch scratch)
+static int linearize_model(void *context, const real *xi, real *H, stewart_scratch scratch)
 {
-    Model *a = about;
+    Model *a = context;
     return linearize_along(a->period, xi, &a->path, a->fourth_order, H, scratch);
 }
 
-static int whitened_rows(void *about, const real *xi, real *e, real *H, stewart_scratch scratch)
+static int whitened_rows(void *context, const real *xi, real *e, real *H, stewart_scratch scratch)
 {
-    Model *a = about;
+    Model *a = context;
     stewart_instant_rows(&a->instant, xi, e, H, scratch);
     stewart_copy(a->m * a->n, H, a->white);
     for (int i = 0; i < a->m; i++) {

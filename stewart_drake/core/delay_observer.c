@@ -132,7 +132,7 @@ void stewart_delayed_outlook(const stewart_law *law, const real *memory, int num
     outlook->pending = 0;
     const int pieces = stewart_torque_schedule(&arrivals, number, torques, 0, outlook->eta, -1, each,
                                                durations);
-    outlook->until = outlook->horizon = (stewart_schedule){pieces, each, durations, 0};
+    outlook->until_next = outlook->horizon = (stewart_schedule){pieces, each, durations, 0};
     outlook->samples = stewart_switch_times(&arrivals, 0, outlook->eta, -1, times);
     times[outlook->samples++] = outlook->eta;
     outlook->times = times;

@@ -85,9 +85,9 @@ typedef struct {
     real *states; /* (number, 12) */
 } Sample;
 
-static int predict(void *about, const real *xi, real *end)
+static int predict(void *context, const real *xi, real *end)
 {
-    Sample *s = about;
+    Sample *s = context;
     const stewart_schedule *schedule = &s->attempt->period->schedule;
     stewart_predict(s->attempt->filter->machine, xi + X, schedule, xi, s->states);
     stewart_copy(X, s->states + X * (schedule->number - 1), end);
@@ -95,9 +95,9 @@ static int predict(void *about, const real *xi, real *end)
 }
 
 /* H along the states of `predict`. */
-static int linearize(void *about, const real *xi, real *H, stewart_scratch scratch)
+static int linearize(void *context, const real *xi, real *H, stewart_scratch scratch)
 {
-    Sample *s = about;
+    Sample *s = context;
     return stewart_transition(s->attempt->filter->machine, xi, &s->attempt->period->schedule,
                               s->fourth_order, s->states, H, scratch);
 }

@@ -34,7 +34,7 @@ void stewart_prepare(stewart_law *law)
     law->memory = 0;
     l->in_flight = place(law, 1 + law->kept + stewart_queue_length(law), U);
     l->observer = place(law, 1, observed);
-    l->behind = place(law, 1, 1);
+    l->lag = place(law, 1, 1);
     l->state = place(law, 1, X);
     l->parameters = place(law, 1, estimated);
     l->measurement = place(law, 1, law->measured);
@@ -81,7 +81,7 @@ void stewart_start(const stewart_law *law, real *memory, int number, const real 
         law->planner->start(law, memory + l->planner.at);
     real std[STEWART_MAX_ESTIMATED];
     law->observer->parameters(law, memory + l->observer.at, memory + l->parameters.at, std);
-    memory[l->behind.at] = 0;
+    memory[l->lag.at] = 0;
     stewart_fill(6, 0, memory + l->error.at);
     stewart_fill(6, 0, memory + l->integral.at);
     memory[l->silence.at] = (real)law->silence;
@@ -117,7 +117,7 @@ static void fixed_delay_outlook(const stewart_law *law, const real *in_flight, s
         durations[k] = (k == 0 && pending ? law->fraction : 1) * law->period;
     outlook->eta = ((real)law->steps + law->fraction) * law->period;
     outlook->fraction = law->fraction;
-    outlook->until = (stewart_schedule){queue, torques, durations, 0};
+    outlook->until_next = (stewart_schedule){queue, torques, durations, 0};
     outlook->horizon = stewart_schedule_of(law->period, law->fraction, law->steps, torques, scratch);
     outlook->assumed = 1;
     outlook->samples = law->steps;
@@ -137,23 +137,23 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
     const int length = in_flight_length(law), longest = law->longest_wait;
     const real *in_flight = memory + l->in_flight.at, *y = sample->measurement;
     real *missing = stewart_take(scratch, law->measured), *observed = memory + l->observer.at;
-    int behind = (int)memory[l->behind.at] + 1, there = 0;
+    int lag = (int)memory[l->lag.at] + 1, there = 0;
     for (int i = 0; i < law->measured; i++) {
         there |= isfinite(y[i]) != 0;
         missing[i] = (real)NAN;
     }
-    there &= sample->age >= 0 && sample->age <= longest && sample->age < behind; /* and is new */
+    there &= sample->age >= 0 && sample->age <= longest && sample->age < lag; /* and is new */
     const int wanted = there ? sample->age : longest;
     outlook->status = there ? 0 : STEWART_MEASUREMENT_MISSING;
-    while (behind > wanted) {
-        behind--;
-        const int fresh = there && behind == sample->age;
-        int status = observer->observe(law, observed, length - behind, in_flight,
+    while (lag > wanted) {
+        lag--;
+        const int fresh = there && lag == sample->age;
+        int status = observer->observe(law, observed, length - lag, in_flight,
                                        fresh ? y : missing, *scratch);
         if (fresh)
             outlook->status = status;
     }
-    memory[l->behind.at] = (real)behind;
+    memory[l->lag.at] = (real)lag;
     outlook->feeds_back = outlook->settled = 1;
     outlook->found = outlook->assumed = 0;
     outlook->caution = 1;
@@ -169,15 +169,15 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
     }
     stewart_copy(X, observed, outlook->state);
     observer->parameters(law, observed, outlook->theta, std);
-    if (behind > 0 && stewart_all_finite(X, outlook->state)) {
+    if (lag > 0 && stewart_all_finite(X, outlook->state)) {
         const stewart_schedule schedule =
-            stewart_last_periods(law, length, in_flight, behind, scratch).schedule;
+            stewart_last_periods(law, length, in_flight, lag, scratch).schedule;
         real *states = stewart_take(scratch, X * schedule.number);
         stewart_predict(&law->machine, outlook->theta, &schedule, outlook->state, states);
         stewart_copy(X, states + X * (schedule.number - 1), outlook->state);
     }
     if (law->design && law->design->outlook)
-        law->design->outlook(law, behind, outlook);
+        law->design->outlook(law, lag, outlook);
 }
 
 /* ---- the reference to follow ------------------------------------------------------------------ */
@@ -235,16 +235,16 @@ static void follow(const stewart_law *law, real *memory, const stewart_sample *s
     const stewart_course last = last_course(law, memory);
     const stewart_course_input motion = {&law->machine,  law->period,    stewart_queue_length(law),
                                    outlook->eta,   outlook->state, outlook->theta,
-                                   outlook->until, is_quiet(law, memory)};
+                                   outlook->until_next, is_quiet(law, memory)};
     real *given = stewart_take(scratch, ROW * law->rows);
     c->times = stewart_take(scratch, law->rows);
     c->reference = stewart_take(scratch, ROW * law->rows);
     c->followed = stewart_take(scratch, ROW * law->rows);
     c->number = preview_times(law, outlook, c->times);
     if (law->planner)
-        law->planner->look(law, memory + l->planner.at, sample, c->number, c->times, given);
+        law->planner->rows(law, memory + l->planner.at, sample, c->number, c->times, given);
     else
-        sample->reference(sample->about, c->number, c->times, given);
+        sample->reference(sample->context, c->number, c->times, given);
     stewart_follow(&motion, &last, given, c, *scratch);
 }
 
@@ -266,7 +266,7 @@ static void remember_course(const stewart_law *law, real *memory, const stewart_
 
 /* The exact equations until then. The integral waits in every part in which a motor is at its limit. */
 static void predict(const stewart_law *law, const stewart_outlook *outlook, const real *followed,
-                    const real *integral, stewart_ahead *a, stewart_scratch scratch)
+                    const real *integral, stewart_predicted *a, stewart_scratch scratch)
 {
     const stewart_schedule *schedule = &outlook->horizon;
     if (law->design && law->design->predict) {
@@ -330,7 +330,7 @@ static int fits(const stewart_field *field, const real *gain, int n)
 
 /* Compute the torque by feedback of the predicted error. Returns bits of `stewart_status`. */
 static int feed_back(const stewart_law *law, real *memory, const stewart_outlook *outlook,
-                     const real *followed, const real *weights, stewart_ahead *a, real *torque,
+                     const real *followed, const real *weights, stewart_predicted *a, real *torque,
                      stewart_scratch scratch)
 {
     const stewart_layout *l = &law->layout;
@@ -370,7 +370,7 @@ static int feed_back(const stewart_law *law, real *memory, const stewart_outlook
 
 /* Compute the torque of a sample, with feedback or without. Returns bits of `stewart_status`. */
 static int respond(const stewart_law *law, real *memory, const stewart_outlook *outlook, const stewart_course *c,
-                   int waiting, const real *weights, stewart_ahead *a, real *torque,
+                   int waiting, const real *weights, stewart_predicted *a, real *torque,
                    stewart_scratch scratch)
 {
     const stewart_layout *l = &law->layout;
@@ -407,7 +407,7 @@ int stewart_step_scratch(const stewart_law *law)
     const int queue = law->design ? in_flight_length(law) + law->rows : stewart_queue_length(law);
     const int rows = ROW * law->rows, parts = 2 * queue + 2, late = law->design ? queue : 1;
     const int telling = 2 * queue + 2 + (U + 1) * (parts + 2);
-    const int behind = (X + U + 1) * 2 * (law->longest_wait + 1);
+    const int lag = (X + U + 1) * 2 * (law->longest_wait + 1);
     const int following = 2 * rows + X * (queue + 2);
     int channelled = channel ? channel->scratch(law) : 0;
     const int gaining = stewart_gain_scratch(&law->cost, law->fraction > 0);
@@ -422,7 +422,7 @@ int stewart_step_scratch(const stewart_law *law)
     const int observing = law->observer->scratch(law);
     /* An estimated delay has its own instants and torques, of the preview and of the last period. */
     const int outlook = law->observer->outlook ? (U + 2) * law->rows + 2 * (U + 1) * 8 : telling;
-    return law->measured + outlook + behind + predicted +
+    return law->measured + outlook + lag + predicted +
            (holding > observing ? holding : observing);
 }
 
@@ -434,14 +434,14 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
     stewart_scratch scratch = {scratch_memory};
     real *in_flight = memory + l->in_flight.at, *sent = memory + l->channel.at;
     stewart_outlook outlook;
-    stewart_ahead ahead;
+    stewart_predicted ahead;
     stewart_course c;
     if (law->channel)
         law->channel->update(law, sent, sample->report, in_flight, scratch);
     estimate(law, memory, sample, &outlook, &scratch);
     outlook.predicted = NULL;
     if (shares_prediction(law)) {
-        outlook.predicted = stewart_take(&scratch, X * (outlook.until.number + 1));
+        outlook.predicted = stewart_take(&scratch, X * (outlook.until_next.number + 1));
         outlook.predicted[0] = (real)NAN;
     }
     if (law->planner &&

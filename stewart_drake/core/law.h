@@ -26,7 +26,7 @@ typedef struct {
 typedef struct {
     stewart_field in_flight;   /* limited torques, the oldest first */
     stewart_field observer;    /* of the observer, at its last measurement */
-    stewart_field behind;      /* periods since that was taken */
+    stewart_field lag;      /* periods since that was taken */
     stewart_field state;       /* now */
     stewart_field parameters;  /* estimated, or as they are known beforehand */
     stewart_field measurement; /* the last, as it came */
@@ -55,17 +55,17 @@ typedef struct {
     const real *theta;            /* parameters that it is computed with, NULL: as known beforehand */
     const real *gain;             /* or NULL without feedback */
     const real *rows;             /* of the reference, at further instants of the preview */
-} stewart_ahead;
+} stewart_predicted;
 
 /* Parts of a law that are not of the core; a function is NULL where the core's is used. */
 typedef struct {
     int columns; /* of the gain, at the most */
-    /* Change the outlook, which is that of the core under the assumed delay; the state is `behind` periods
+    /* Change the outlook, which is that of the core under the assumed delay; the state is `lag` periods
        after the one that was observed. */
-    void (*outlook)(const stewart_law *law, int behind, stewart_outlook *outlook);
+    void (*outlook)(const stewart_law *law, int lag, stewart_outlook *outlook);
     /* Fill in state, error and integral, for the rows to follow and the integral (6) now. */
     void (*predict)(const stewart_law *law, const stewart_outlook *outlook, const real *followed,
-                    const real *integral, stewart_ahead *ahead);
+                    const real *integral, stewart_predicted *ahead);
     /* As `stewart_design_feedback`. */
     int (*design)(const stewart_law *law, const stewart_outlook *outlook, const real *theta,
                   const real *nodes, const real *state, const real *weights, real *torques,
@@ -83,7 +83,7 @@ typedef struct {
                    real *in_flight, stewart_scratch scratch);
     /* Keep the packet: this torque and planned ones; `in_flight` are those before. */
     void (*send)(const stewart_law *law, real *memory, const stewart_outlook *outlook,
-                 const stewart_ahead *ahead, const real *in_flight, stewart_scratch scratch);
+                 const stewart_predicted *ahead, const real *in_flight, stewart_scratch scratch);
 } stewart_channel;
 
 extern const stewart_channel stewart_network;
@@ -99,7 +99,7 @@ typedef struct {
     int (*follow)(const stewart_law *law, real *memory, const stewart_outlook *outlook,
                   const stewart_sample *sample, stewart_scratch scratch);
     /* Rows (number, 18) of that motion, at instants in s from now. */
-    void (*look)(const stewart_law *law, const real *memory, const stewart_sample *sample, int number,
+    void (*rows)(const stewart_law *law, const real *memory, const stewart_sample *sample, int number,
                  const real *times, real *rows);
 } stewart_planner;
 
@@ -130,7 +130,7 @@ struct stewart_law {
 };
 
 /* Rows (number, 18) of the reference at instants in s from now, some of them negative. */
-typedef void (*stewart_preview_function)(void *about, int number, const real *times, real *rows);
+typedef void (*stewart_preview_function)(void *context, int number, const real *times, real *rows);
 
 /* Input of a sample. */
 struct stewart_sample {
@@ -143,7 +143,7 @@ struct stewart_sample {
     stewart_preview_function reference;
     stewart_preview_function goal; /* that plans lead back to; from the first plan on it is read in
                                       the place of `reference`; NULL: no plan is made */
-    void *about;              /* first argument of both */
+    void *context;              /* first argument of both */
     const stewart_report *report; /* that came with the measurement, or NULL */
     real weights[2]; /* of errors and of torques; if one is not finite, the last gain is used */
 };
@@ -171,8 +171,8 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch, const stew
    last step). Torques that are older than the memory, or not finite, change nothing. */
 void stewart_note_acted(const stewart_law *law, real *memory, int ago, int number, const real *torques);
 
-/* A `stewart_preview_function`: `about` points to all rows that are asked for. */
-void stewart_given_rows(void *about, int number, const real *times, real *rows);
+/* A `stewart_preview_function`: `context` points to all rows that are asked for. */
+void stewart_given_rows(void *context, int number, const real *times, real *rows);
 
 /* Compute the feedforward `torques` (1 + pending, 6), of those that are still to act and of the next, from
    the reference at two `nodes` of each of 3 + pending holds. Unless `error` (12) is NULL, subtract from it
@@ -185,7 +185,7 @@ int stewart_design_feedback(const stewart_law *law, const stewart_outlook *outlo
 /* Plan the torques (`channel->torques`, 6) of this sample and of further ones: the model continues from the
    end of the prediction, under feedback with the same gain. `late` (pending, 6) are still to act. */
 void stewart_plan_torques(const stewart_law *law, const stewart_outlook *outlook,
-                          const stewart_ahead *ahead, const real *late, real *plan,
+                          const stewart_predicted *ahead, const real *late, real *plan,
                           stewart_scratch scratch);
 int stewart_planning_scratch(const stewart_law *law);
 

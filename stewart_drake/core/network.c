@@ -12,7 +12,7 @@ int stewart_planning_scratch(const stewart_law *law)
 }
 
 void stewart_plan_torques(const stewart_law *law, const stewart_outlook *outlook,
-                          const stewart_ahead *ahead, const real *late, real *plan,
+                          const stewart_predicted *ahead, const real *late, real *plan,
                           stewart_scratch scratch)
 {
     const int pending = outlook->pending, nodes = 2 * (3 + pending);
@@ -80,7 +80,7 @@ static void network_update(const stewart_law *law, real *memory, const stewart_r
 }
 
 static void network_send(const stewart_law *law, real *memory, const stewart_outlook *outlook,
-                         const stewart_ahead *ahead, const real *in_flight, stewart_scratch scratch)
+                         const stewart_predicted *ahead, const real *in_flight, stewart_scratch scratch)
 {
     const int number = law->layout.in_flight.rows;
     real *plan = stewart_take(&scratch, U * law->packets->torques);

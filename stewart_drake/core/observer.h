@@ -33,13 +33,13 @@ typedef struct {
     const real *observed;   /* memory of the observer */
     real eta;               /* s until the torque that is computed now begins to act */
     real fraction;          /* of a period, of `eta` beyond the last of `times` */
-    stewart_schedule until;   /* torques until then */
+    stewart_schedule until_next; /* torques until then */
     stewart_schedule horizon; /* torques until the last of `times`, the same number of pieces each */
     int samples;            /* instants of the prediction */
     const real *times;      /* (samples) s from now */
     int pending;            /* number of the newest torques that still act then, left to the gain */
     int limited;            /* whether a torque since the last sample was at the limit */
-    real *predicted; /* (until.number + 1, 12) states that a planner fills in, NULL without; first NaN */
+    real *predicted; /* (until_next.number + 1, 12) states that a planner fills in, NULL without; first NaN */
 } stewart_outlook;
 
 /* A kind of observer. Its memory, a part of the law's, begins with the state (12), which may be set. */

@@ -191,7 +191,7 @@ static int pass_back(const stewart_loop *o, long k, double *values)
     return arrived ? (int)((double)(k + 1) - o->back_memory[STEWART_LINK_NEWEST]) : 0;
 }
 
-static int sample(const dop853 *s, stewart_loop *o, long k, stewart_controller law, void *about)
+static int sample(const dop853 *s, stewart_loop *o, long k, stewart_controller law, void *context)
 {
     double *y = o->measured + X * k, *torque = o->asked + U * k, now = o->period * (double)k;
     double *values = o->scratch, *arrived = values + X, *acted = arrived + o->reported;
@@ -206,7 +206,7 @@ static int sample(const dop853 *s, stewart_loop *o, long k, stewart_controller l
     stewart_copy(X, values, y);
     if (o->reported && !isnan(arrived[0]))
         measured.report = &report;
-    if (law(about, k, &measured, torque, command))
+    if (law(context, k, &measured, torque, command))
         return STEWART_CONTROLLER_FAILED;
     if (o->servo && k > 0) { /* before, no setpoint has acted */
         double limited[U];
@@ -240,7 +240,7 @@ static int advance_pushed(dop853 *s, stewart_run *r, const stewart_loop *o, doub
 
 /* Take samples and release torques until the run's end. A change of the torque that coincides with a
    sample takes place at the sample's instant. */
-int stewart_closed_loop(stewart_run *r, stewart_loop *o, stewart_controller law, void *about)
+int stewart_closed_loop(stewart_run *r, stewart_loop *o, stewart_controller law, void *context)
 {
     driven d = {.run = r, .servo = o->servo};
     dop853 s = integrator(&d);
@@ -258,7 +258,7 @@ int stewart_closed_loop(stewart_run *r, stewart_loop *o, stewart_controller law,
         if (next > s.time + o->link->time_tolerance)
             how = advance_pushed(&s, r, o, next);
         if (how == STEWART_INSIDE && samples)
-            how = sample(&s, o, k++, law, about);
+            how = sample(&s, o, k++, law, context);
         else if (how == STEWART_INSIDE)
             stewart_link_change(o->link, o->memory, fmax(released, s.time));
         if (how != STEWART_INSIDE)
@@ -280,30 +280,30 @@ static void row_at(const stewart_motion *motion, double time, double *row)
     stewart_between(rows, rows + STEWART_REFERENCE, h, fmin(fmax(share, 0.), 1.), row);
 }
 
-static void rows_of_plan(void *about, int number, const double *times, double *rows)
+static void rows_of_plan(void *context, int number, const double *times, double *rows)
 {
-    const stewart_law_in_loop *in = about;
+    const stewart_law_in_loop *in = context;
     for (int i = 0; i < number; i++)
         row_at(&in->planned, in->now + times[i], rows + STEWART_REFERENCE * i);
 }
 
-static void rows_of_goal(void *about, int number, const double *times, double *rows)
+static void rows_of_goal(void *context, int number, const double *times, double *rows)
 {
-    const stewart_law_in_loop *in = about;
+    const stewart_law_in_loop *in = context;
     for (int i = 0; i < number; i++)
         row_at(&in->goal, in->now + times[i], rows + STEWART_REFERENCE * i);
 }
 
-static int step(void *about, long k, const stewart_sample *measured, double *torque, double *command)
+static int step(void *context, long k, const stewart_sample *measured, double *torque, double *command)
 {
-    stewart_law_in_loop *in = about;
+    stewart_law_in_loop *in = context;
     const double *sent = torque;
     stewart_sample sample = *measured;
-    sample.reference = rows_of_plan, sample.goal = rows_of_goal, sample.about = in;
+    sample.reference = rows_of_plan, sample.goal = rows_of_goal, sample.context = in;
     in->now = in->period * (double)k;
     if (in->previews) {
         sample.reference = stewart_given_rows;
-        sample.about = (void *)(in->previews + STEWART_REFERENCE * in->preview_rows * k);
+        sample.context = (void *)(in->previews + STEWART_REFERENCE * in->preview_rows * k);
     }
     stewart_copy(2, in->weights + 2 * k, sample.weights);
     if (in->tuner) {
@@ -320,13 +320,13 @@ static int step(void *about, long k, const stewart_sample *measured, double *tor
     return 0;
 }
 
-static int servo_step(void *about, long k, const stewart_sample *measured, double *torque,
+static int servo_step(void *context, long k, const stewart_sample *measured, double *torque,
                       double *command)
 {
-    const stewart_servo_in_loop *in = about;
+    const stewart_servo_in_loop *in = context;
     stewart_sample sample = *measured;
     sample.reference = stewart_given_rows;
-    sample.about = (void *)(in->previews + STEWART_REFERENCE * k);
+    sample.context = (void *)(in->previews + STEWART_REFERENCE * k);
     stewart_fill(U, 0, torque); /* replaced by that of the servos */
     stewart_servo_step(in->law, in->memory, in->scratch, &sample, in->report, command);
     return 0;

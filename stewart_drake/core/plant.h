@@ -45,7 +45,7 @@ int stewart_open_loop(stewart_run *run, const stewart_drive *drives, long number
 
 /* Controller at a sample: writes its torque (6) without limit, and the command (rows, 6) that it sends.
    The sample has measurement, age and report only. Returns 0, or 1 to end the run. */
-typedef int (*stewart_controller)(void *about, long number, const stewart_sample *sample,
+typedef int (*stewart_controller)(void *context, long number, const stewart_sample *sample,
                                   double *torque, double *command);
 
 /* Connection of a controller and the plant. */
@@ -75,7 +75,7 @@ typedef struct {
     long saturated;           /* result: periods in which a servo reached its limit */
 } stewart_loop;
 
-int stewart_closed_loop(stewart_run *run, stewart_loop *loop, stewart_controller law, void *about);
+int stewart_closed_loop(stewart_run *run, stewart_loop *loop, stewart_controller law, void *context);
 
 /* A motion in pieces: quintics between rows of 18 numbers. */
 typedef struct {

@@ -47,17 +47,17 @@ static int has_acted(const stewart_law *law, const stewart_outlook *outlook, con
 }
 
 /* Fill in rows of the pieces, and of the goal after their end; without pieces, of the caller's reference. */
-static void look(const stewart_law *law, const real *memory, const stewart_sample *sample, int number,
+static void rows_of(const stewart_law *law, const real *memory, const stewart_sample *sample, int number,
                  const real *times, real *rows)
 {
     const int pieces = (int)memory[PIECES];
     const real now = memory[SINCE_PLAN] * law->period;
     if (pieces == 0)
-        sample->reference(sample->about, number, times, rows);
+        sample->reference(sample->context, number, times, rows);
     for (int i = 0; i < number && pieces > 0; i++) {
         real *row = rows + ROW * i;
         if (!stewart_along(pieces, memory + PATH, now + times[i], row))
-            (sample->goal ? sample->goal : sample->reference)(sample->about, 1, times + i, row);
+            (sample->goal ? sample->goal : sample->reference)(sample->context, 1, times + i, row);
     }
 }
 
@@ -69,13 +69,13 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
     const stewart_replan *replan = law->planning;
     int periods = replan->periods, added;
     real times[3], rows[3 * ROW], peak, *pieces = stewart_take(&scratch, PIECE * most_pieces(law));
-    const real *last = states + X * outlook->until.number;
+    const real *last = states + X * outlook->until_next.number;
     stewart_belief belief;
     stewart_believe(&law->machine, outlook->theta, &belief);
-    const int number = stewart_predicted_pieces(&belief, &outlook->until, states, 0, pieces);
+    const int number = stewart_predicted_pieces(&belief, &outlook->until_next, states, 0, pieces);
     for (;; periods = 2 * periods < replan->most ? 2 * periods : replan->most) {
         stewart_plan_times(outlook->eta, law->period, periods, times);
-        sample->goal(sample->about, 3, times, rows);
+        sample->goal(sample->context, 3, times, rows);
         added = stewart_plan_way(&belief, replan->sign, last, outlook->eta, law->period, periods, rows,
                                    pieces + PIECE * number, &peak, scratch);
         if (added == 0)
@@ -128,7 +128,7 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     const stewart_replan *replan = law->planning;
     real wanted[ROW], *states = outlook->predicted;
     if (!states)
-        states = stewart_take(&scratch, X * (outlook->until.number + 1));
+        states = stewart_take(&scratch, X * (outlook->until_next.number + 1));
     memory[SINCE_PLAN] += 1;
     memory[SINCE_START] = memory[SINCE_START] < MOST_SAMPLES ? memory[SINCE_START] + 1 : MOST_SAMPLES;
     /* While the delay is unknown, plan only before the first torque can have acted. */
@@ -139,12 +139,12 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     if (outlook->settled && outlook->caution > LATE_TORQUES)
         return 0;
     stewart_copy(X, outlook->state, states);
-    stewart_predict(&law->machine, outlook->theta, &outlook->until, states, states + X);
-    look(law, memory, sample, 1, &outlook->eta, wanted);
+    stewart_predict(&law->machine, outlook->theta, &outlook->until_next, states, states + X);
+    rows_of(law, memory, sample, 1, &outlook->eta, wanted);
     /* A known delay counts as found from the sample at which the first torque has acted for a period
        until the next plan. */
     const int first = outlook->assumed && has_acted(law, outlook, memory) && !(memory[PLANNED] > 0);
-    if (!stewart_is_off(replan->size, states + X * outlook->until.number, wanted,
+    if (!stewart_is_off(replan->size, states + X * outlook->until_next.number, wanted,
                         outlook->found || first))
         return 0;
     if (law->observer->uncertainty) {
@@ -152,7 +152,7 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
         stewart_scratch rest = scratch;
         real *L = stewart_take(&rest, n * n);
         law->observer->uncertainty(law, outlook->observed, L);
-        if (!stewart_is_sure(&law->machine, &outlook->until, states, outlook->theta, L, replan->size,
+        if (!stewart_is_sure(&law->machine, &outlook->until_next, states, outlook->theta, L, replan->size,
                              replan->sure, rest))
             return 0;
     }
@@ -160,4 +160,4 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
 }
 
 const stewart_planner stewart_replanner = {replan_memory, replan_scratch, replan_start, replan_follow,
-                                           look};
+                                           rows_of};

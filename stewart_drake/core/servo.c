@@ -23,7 +23,7 @@ void stewart_servo_prepare(stewart_servo *servo)
     servo->memory = 0;
     l->command = place(servo, STEWART_COMMAND);
     l->observer = place(servo, law->observer->memory(law));
-    l->behind = place(servo, 1);
+    l->lag = place(servo, 1);
     l->state = place(servo, X);
     l->parameters = place(servo, law->machine.estimated);
     l->measurement = place(servo, law->measured);
@@ -161,17 +161,17 @@ int stewart_servo_step(const stewart_servo *servo, real *memory, real *scratch_m
     const stewart_scratch scratch = {scratch_memory};
     const real ahead = servo->stiff.stiffness > 0 ? (real)0.5 : 1;
     const real time = ((real)law->steps + law->fraction + ahead) * law->period;
-    const int behind = (int)memory[l->behind.at] + 1;
+    const int lag = (int)memory[l->lag.at] + 1;
     real row[ROW], *last = memory + l->command.at;
     int there = 0, status = STEWART_MEASUREMENT_MISSING;
     for (int i = 0; i < law->measured; i++)
         there |= isfinite(sample->measurement[i]) != 0;
-    if (there && sample->age >= 0 && sample->age < behind)
-        status = observe(servo, memory, sample, report, behind - sample->age, scratch);
+    if (there && sample->age >= 0 && sample->age < lag)
+        status = observe(servo, memory, sample, report, lag - sample->age, scratch);
     else
         there = 0;
-    memory[l->behind.at] = (real)(there ? sample->age : behind);
-    sample->reference(sample->about, 1, &time, row);
+    memory[l->lag.at] = (real)(there ? sample->age : lag);
+    sample->reference(sample->context, 1, &time, row);
     int trouble = command_for(servo, memory + l->parameters.at, row, last);
     if (trouble) /* the cranks stop where they are */
         stewart_fill(6, 0, last + 6);

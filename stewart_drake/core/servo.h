@@ -24,7 +24,7 @@
 typedef struct {
     stewart_field command;     /* sent last */
     stewart_field observer;    /* at the last measurement */
-    stewart_field behind;      /* periods since that was taken */
+    stewart_field lag;      /* periods since that was taken */
     stewart_field state;       /* at the last measurement */
     stewart_field parameters;
     stewart_field measurement; /* the last, as it came */

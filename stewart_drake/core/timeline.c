@@ -55,8 +55,8 @@ stewart_interval stewart_last_periods(const stewart_law *law, int number, const 
                               before, after};
 }
 
-void stewart_given_rows(void *about, int number, const real *times, real *rows)
+void stewart_given_rows(void *context, int number, const real *times, real *rows)
 {
     (void)times;
-    stewart_copy(STEWART_REFERENCE * number, about, rows);
+    stewart_copy(STEWART_REFERENCE * number, context, rows);
 }

@@ -236,7 +236,7 @@ class CompiledLaw:
         self._own.now = Step(after, motion, report)
         if self._servos or not (law.moves or "observer" in self._python):  # known instants
             rows = preview_rows(motion(law.preview_times), len(law.preview_times))
-            sample.reference, sample.about = c.lib.stewart_given_rows, c.at(rows)
+            sample.reference, sample.context = c.lib.stewart_given_rows, c.at(rows)
         else:
             sample.reference, goal = self._own.motion
             sample.goal = goal if isinstance(motion, KnownMotion) else c.ffi.NULL

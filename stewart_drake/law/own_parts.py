@@ -197,7 +197,7 @@ class OwnParts:
             until = timeline.until_next(queue)
             exact = isinstance(timeline, Arrivals)
             outlook.eta, outlook.fraction = timeline.eta, 0.0 if exact else timeline.fraction
-            outlook.until = self._schedule(until)
+            outlook.until_next = self._schedule(until)
             outlook.horizon = self._schedule(until if exact else timeline.schedule(queue))
             acted = timeline.last_period(in_flight)[0].torques
             outlook.limited = law.plant.motors.reached(acted)
@@ -286,7 +286,7 @@ class OwnParts:
             scratch=(lambda _: 0, None),
             start=(self._start_planner, None, None),
             follow=(self._follow, None, None, None, None, None),
-            look=(self._look, None, None, None, None, _times, Out(_rows)),
+            rows=(self._rows, None, None, None, None, _times, Out(_row_numbers)),
         )
 
     def _start_planner(self, _: Any, __: Any) -> None:
@@ -299,7 +299,7 @@ class OwnParts:
         self.now.memory.own["planner"], self.now.followed = followed.path, followed.motion
         return int(followed.replanned)
 
-    def _look(self, _: Any, __: Any, ___: Any, ____: int, times: Array, rows: Array) -> None:
+    def _rows(self, _: Any, __: Any, ___: Any, ____: int, times: Array, rows: Array) -> None:
         rows[:] = np.nan
         rows[:] = self.rows_of(times, self.now.followed)
 
@@ -361,7 +361,7 @@ def _times(*given: Any) -> int:
     return int(given[3])
 
 
-def _rows(*given: Any) -> int:
+def _row_numbers(*given: Any) -> int:
     return NUM_REFERENCE * int(given[3])
 
 

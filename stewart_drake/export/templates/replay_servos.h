@@ -17,7 +17,7 @@ static int answer(int k, real *command)
 {
     stewart_sample sample = {.measurement = measurement[k], .age = age[k]};
     sample.reference = stewart_given_rows;
-    sample.about = preview[k];
+    sample.context = preview[k];
     return stewart_servo_step(&stewart_configuration, memory, scratch, &sample, report[k], command);
 }
 

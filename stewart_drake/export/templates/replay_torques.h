@@ -41,10 +41,10 @@ static int answer(int k, real *torque)
     double now = k * (double)stewart_configuration.period;
     sample.reference = stewart_look_ahead;
     sample.goal = stewart_look_back;
-    sample.about = &now;
+    sample.context = &now;
 #else
     sample.reference = stewart_given_rows;
-    sample.about = preview[k];
+    sample.context = preview[k];
 #endif
 #if @TUNED@
     return stewart_tuned_step(&stewart_configuration, &stewart_own_tuner, memory, tuner_memory, scratch,

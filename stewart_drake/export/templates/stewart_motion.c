@@ -34,14 +34,14 @@ static void along(int number, const double (*knots)[1 + STEWART_REFERENCE], doub
 
 void stewart_reference(double t, real *reference) { along(KNOTS, motion, t, reference); }
 @GOAL@
-void stewart_look_ahead(void *about, int number, const real *times, real *rows)
+void stewart_look_ahead(void *context, int number, const real *times, real *rows)
 {
     for (int i = 0; i < number; i++)
-        stewart_reference(*(const double *)about + (double)times[i], rows + STEWART_REFERENCE * i);
+        stewart_reference(*(const double *)context + (double)times[i], rows + STEWART_REFERENCE * i);
 }
 
-void stewart_look_back(void *about, int number, const real *times, real *rows)
+void stewart_look_back(void *context, int number, const real *times, real *rows)
 {
     for (int i = 0; i < number; i++)
-        stewart_goal(*(const double *)about + (double)times[i], rows + STEWART_REFERENCE * i);
+        stewart_goal(*(const double *)context + (double)times[i], rows + STEWART_REFERENCE * i);
 }

@@ -13,8 +13,8 @@ void stewart_reference(double t, real *reference);
 /* The motion that a law with a planner returns to. */
 void stewart_goal(double t, real *reference);
 
-/* `reference` and `goal` of a sample: rows at instants in s from the time, s, that `about` points to. */
-void stewart_look_ahead(void *about, int number, const real *times, real *rows);
-void stewart_look_back(void *about, int number, const real *times, real *rows);
+/* `reference` and `goal` of a sample: rows at instants in s from the time, s, that `context` points to. */
+void stewart_look_ahead(void *context, int number, const real *times, real *rows);
+void stewart_look_back(void *context, int number, const real *times, real *rows);
 
 #endif

@@ -184,7 +184,7 @@ static void compute(controller *c, real *memory, unsigned k, const real *measure
     real limit = (real)fmin(c->last.torque_limit, (double)law->machine.torque_limit);
     stewart_sample sample = {.measurement = measurement, .age = age, .reference = stewart_look_ahead};
     sample.goal = stewart_look_back;
-    sample.about = &now;
+    sample.context = &now;
     sample.weights[0] = stewart_weights[0];
     sample.weights[1] = stewart_weights[1];
     stewart_step(law, memory, c->scratch, &sample, torque);
