@@ -403,7 +403,6 @@ static int shares_prediction(const stewart_law *law) { return law->planner && !l
 int stewart_step_scratch(const stewart_law *law)
 {
     const stewart_channel *channel = law->channel;
-    /* Your own parts may estimate any delay for which there are torques and rows. */
     const int queue = law->design ? in_flight_length(law) + law->rows : stewart_queue_length(law);
     const int rows = ROW * law->rows, parts = 2 * queue + 2, late = law->design ? queue : 1;
     const int telling = 2 * queue + 2 + (U + 1) * (parts + 2);

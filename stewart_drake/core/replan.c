@@ -26,11 +26,17 @@ static int most_pieces(const stewart_law *law)
 
 static int replan_memory(const stewart_law *law) { return PATH + PIECE * most_pieces(law); }
 
+static int sure_scratch(int estimated, int torques)
+{
+    const int n = X + estimated;
+    return X * n * torques + n + stewart_transitions_scratch(estimated);
+}
+
 static int replan_scratch(const stewart_law *law)
 {
     const stewart_replan *replan = law->planning;
     const int p = law->machine.estimated;
-    const int judged = (X + p) * (X + p) + stewart_sure_scratch(p, replan->until);
+    const int judged = (X + p) * (X + p) + sure_scratch(p, replan->until);
     const int planned = PIECE * most_pieces(law) + stewart_plan_scratch(law->period, replan->most);
     return X * (replan->until + 1) + (judged > planned ? judged : planned);
 }
@@ -90,15 +96,10 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
     return 1;
 }
 
-int stewart_sure_scratch(int estimated, int torques)
-{
-    const int n = X + estimated;
-    return X * n * torques + n + stewart_transitions_scratch(estimated);
-}
-
-int stewart_is_sure(const stewart_machine *machine, const stewart_schedule *schedule,
-                    const real *states, const real *theta, const real *L, const real *size, real sure,
-                    stewart_scratch scratch)
+/* Whether every standard deviation of the pose after a schedule is at most `sure` times `size` (6), for the
+   root L of the covariance of [state; theta] before it, along `states` (1 + number, 12). */
+static int is_sure(const stewart_machine *machine, const stewart_schedule *schedule, const real *states,
+                   const real *theta, const real *L, const real *size, real sure, stewart_scratch scratch)
 {
     const int p = machine->estimated, n = X + p, last = schedule->number - 1;
     real *H = stewart_take(&scratch, X * n * schedule->number), *xi = stewart_take(&scratch, n);
@@ -152,8 +153,8 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
         stewart_scratch rest = scratch;
         real *L = stewart_take(&rest, n * n);
         law->observer->uncertainty(law, outlook->observed, L);
-        if (!stewart_is_sure(&law->machine, &outlook->until_next, states, outlook->theta, L, replan->size,
-                             replan->sure, rest))
+        if (!is_sure(&law->machine, &outlook->until_next, states, outlook->theta, L, replan->size,
+                     replan->sure, rest))
             return 0;
     }
     return plan(law, outlook, sample, states, memory, scratch);

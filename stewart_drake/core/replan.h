@@ -23,12 +23,4 @@ typedef struct {
     real sign;    /* of the parallel measure at home */
 } stewart_replan;
 
-/* Whether every standard deviation of the pose at the end of a schedule is at most `sure` times `size`
-   (6). It follows from the root L of the covariance of [state; theta] at the beginning, along `states`
-   (1 + number, 12). */
-int stewart_is_sure(const stewart_machine *machine, const stewart_schedule *schedule,
-                    const real *states, const real *theta, const real *L, const real *size, real sure,
-                    stewart_scratch scratch);
-int stewart_sure_scratch(int estimated, int torques);
-
 extern const stewart_planner stewart_replanner;
