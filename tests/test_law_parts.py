@@ -475,7 +475,7 @@ def test_the_rest_of_a_path_is_the_same_path():
 
 
 class Weak(TorqueLimit):
-    """Motors of which the last has half of the limit."""
+    """Motors with half of the limit at the last one."""
 
     def saturate(self, torques):
         limit = self.limit * np.array([1, 1, 1, 1, 1, 0.5])
@@ -485,7 +485,7 @@ class Weak(TorqueLimit):
         return bool(np.any(self.saturate(torques) != torques))
 
 
-class Watched(NominalPlant):
+class CountingPlant(NominalPlant):
     """A plant that keeps the numbers of torques that it predicts with."""
 
     calls: list[int] = []
@@ -498,7 +498,7 @@ class Watched(NominalPlant):
 def test_motors_and_a_plant_of_your_own_are_those_of_the_law():
     law = law_of("delay.steps=2", "controller.estimate=[]", limit=0.003)
     reference = sine(0.5)
-    plant = Watched(
+    plant = CountingPlant(
         law.plant.dynamics, law.plant.substeps, law.plant.coarse_torque_limit, Weak(0.003)
     )
     loop = Loop(replace(law, plant=plant), reference, queue=np.zeros((2, 6))).run(8)
@@ -507,7 +507,7 @@ def test_motors_and_a_plant_of_your_own_are_those_of_the_law():
     assert np.array_equal(sent, plant.motors.saturate(asked)) and np.abs(sent[:, 5]).max() == 0.0015
     assert 2 in plant.calls
     same = replace(
-        law, plant=Watched(*(getattr(law.plant, n) for n in law.plant.__dataclass_fields__))
+        law, plant=CountingPlant(*(getattr(law.plant, n) for n in law.plant.__dataclass_fields__))
     )
     loops = [Loop(one, reference, queue=np.zeros((2, 6))).run(8) for one in (law, same)]
     assert loops[0].memory.torque == pytest.approx(loops[1].memory.torque, abs=1e-12)

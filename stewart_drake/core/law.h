@@ -192,8 +192,8 @@ int stewart_planning_scratch(const stewart_law *law);
 /* Limit a torque. Returns whether that changed it. */
 int stewart_limit(const stewart_machine *machine, const real *torque, real *limited);
 
-/* What acts in whole periods that begin with the oldest of `periods` + 1 torques, the first of which acts for
-   another `fraction` of a period. */
+/* What acts in whole periods that begin with the oldest of `periods` + 1 torques; that one acts for another
+   `fraction` of a period. */
 stewart_schedule stewart_schedule_of(real period, real fraction, int periods, const real *torques,
                                      stewart_scratch *scratch);
 

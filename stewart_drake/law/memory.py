@@ -97,7 +97,7 @@ class Memory:
         return belief.at(self.field("state"))
 
     def copy(self) -> "Memory":
-        """Return a memory with numbers of its own."""
+        """Return an independent copy."""
         return replace(self, data=self.data.copy(), own=deepcopy(self.own))
 
     def without_error(self) -> "Memory":
