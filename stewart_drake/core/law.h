@@ -26,7 +26,7 @@ typedef struct {
 typedef struct {
     stewart_field in_flight;   /* limited torques, the oldest first */
     stewart_field observer;    /* of the observer, at its last measurement */
-    stewart_field lag;      /* periods since that was taken */
+    stewart_field lag;         /* periods since that was taken */
     stewart_field state;       /* now */
     stewart_field parameters;  /* estimated, or as they are known beforehand */
     stewart_field measurement; /* the last, as it came */
@@ -143,7 +143,7 @@ struct stewart_sample {
     stewart_preview_function reference;
     stewart_preview_function goal; /* that plans lead back to; from the first plan on it is read in
                                       the place of `reference`; NULL: no plan is made */
-    void *context;              /* first argument of both */
+    void *context;                 /* first argument of both */
     const stewart_report *report; /* that came with the measurement, or NULL */
     real weights[2]; /* of errors and of torques; if one is not finite, the last gain is used */
 };
