@@ -50,10 +50,10 @@ BAD_ARGUMENTS = [
     (["tune", "evaluate", "nope"], "weights"),
     (["tune", "evaluate", "--scenarios", "1"], "--scenarios"),
     (["tune", "evaluate", "--family", "T", "--scenarios", "1"], "--scenarios"),
-    (["tune", "evaluate", "--scenarios", "2000000"], "--scenarios: got 2000000; expected less"),
-    (["tune", "dataset", "--disturbed", "2000000"], "--disturbed: got 2000000; expected less"),
-    (["analyze", "robustness", "--runs", "2000000"], "--runs: got 2000000; expected less"),
-    (["analyze", "link", "--runs", "2000000"], "--runs: got 2000000; expected less"),
+    (["tune", "evaluate", "--scenarios", "2000000"], "--scenarios: got 2000000; expected at most"),
+    (["tune", "dataset", "--disturbed", "2000000"], "--disturbed: got 2000000; expected at most"),
+    (["analyze", "robustness", "--runs", "2000000"], "--runs: got 2000000; expected at most"),
+    (["analyze", "link", "--runs", "2000000"], "--runs: got 2000000; expected at most"),
     (["tune", "evaluate", "tuner", "tuner"], "WEIGHTS"),
     (["tune", "evaluate", "--family", "T", "--controller", "lqi"], "--controller"),
     (["tune", "dataset", "--family", "T", "--draws", "9"], "--draws"),
@@ -78,6 +78,8 @@ BAD_ARGUMENTS = [
     (["live", "--demo", "--learned", "a.npz"], "--learned: got a.npz without --learn; expected"),
     (["live", "--demo", "--mirror", "x"], "--mirror: got 'x'; expected HOST:PORT"),
     (["export"], "FILE"),
+    (["export-c", "paper", "--out", ""], "--out: got ''; expected a value"),
+    (["simulate", "--out="], "--out: got ''; expected a value"),
 ]
 
 

@@ -292,5 +292,7 @@ def test_the_command_names_the_links_that_cross(tmp_path, capsys):
     assert found["least"]["distance"] == min(one["distance"] for one in found["touching"])
     assert len(found["pairs"]) == len(ClearanceScene(PAPER).pairs)
     assert found["base"]["distance"] < 0
-    assert " base," not in told and "would enter the base's disc, as it is drawn" in told
-    assert told.count("crosses the disc as drawn") == 1  # the rows of the table are on the page
+    assert " base," not in told and "into a base that is a full disc; cutouts" in told
+    assert (
+        told.count("crosses a base that is a full disc") == 1
+    )  # the rows of the table are on the page

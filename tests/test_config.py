@@ -244,7 +244,7 @@ BAD_FILES = {
     "text in a list": ("reference: {offset: [0, 0, 0, a, 0, 0]}", ["reference.offset[3]", "'a'"]),
     "negative noise": (
         "sensor: {noise_std: [0, 0, 0, 0, 0, -1, 0, 0, 0, 0, 0, 0]}",
-        ["sensor.noise_std[5]: got -1", "greater than or equal to 0"],
+        ["sensor.noise_std[5]: got -1", "at least 0"],
     ),
     "unknown kind": (
         "reference: {kind: square}",

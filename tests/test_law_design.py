@@ -113,7 +113,8 @@ def test_without_a_start_it_begins_on_the_reference():
         ({"start": np.zeros(6)}, "start: got shape (6,); expected (12,)"),
         ({"reference": PiecewisePolynomial(np.zeros((3, 1)))}, "got shape (3, 1)"),
         ({"noise_std": [0.0]}, "noise_std"),
-        ({"options": sd.ControllerConfig(torque_map="printed")}, "controller.torque_map"),
+        ({"options": sd.ControllerConfig(torque_map="printed")}, "options.torque_map: got"),
+        ({"torque_limit": -1.0}, "torque_limit: got -1.0"),
     ],
 )
 def test_bad_input_is_one_line(changes, message):

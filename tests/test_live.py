@@ -262,7 +262,7 @@ def test_an_error_of_which_half_was_measured_is_none():
         result = driven(running, 3.0)
     assert result.status == "completed" and math.isnan(result.accumulated_error)
     assert result.summary["measured_share"] == pytest.approx(0.5, abs=0.1)
-    share = f"measured at {100 * result.summary['measured_share']:.1f} %"
+    share = f"a new measurement at {100 * result.summary['measured_share']:.1f} %"
     said = " ".join(run_document(result).plain().split())
     assert f"{share} of the samples; E_ac needs 90 %" in said and "bad measurements" not in said
 

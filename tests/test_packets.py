@@ -594,7 +594,7 @@ def test_statements_on_the_worst_run_are_wrong_in_five_percent_at_most(completes
 def test_the_study_asks_for_a_network_and_for_runs():
     with pytest.raises(ConfigError, match="got 'wire'; expected 'network'"):
         study_link(scenario(), LinkOptions())
-    with pytest.raises(ConfigError, match="runs: got 0; expected greater than or equal to 1"):
+    with pytest.raises(ConfigError, match="runs: got 0; expected at least 1"):
         LinkOptions(runs=0)
 
 

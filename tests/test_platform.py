@@ -308,7 +308,7 @@ def own_plant(builder, finalized):
         (lambda b: sd.AddStewartPlatform(b, "no_such_machine"), "no_such_machine"),
         (lambda b: set_state(b, [np.nan] * 12), "state: got [nan"),
         (lambda b: set_state(b, [0.0] * 6), "state: got shape (6,)"),
-        (lambda b: sd.StewartDynamics("paper"), "mechanism: got 'paper'; expected a Mechanism"),
+        (lambda b: sd.StewartDynamics("no_such_machine"), "no_such_machine"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(use, message):

@@ -197,8 +197,16 @@ def test_a_run_that_ends_early_is_reported_at_once():
     [
         ((), "good", "The plate follows its reference"),
         (("controller.delay_steps=7",), "bad", "Not reliable: the loop is unstable, errors grow"),
-        (("sensor.loss=0.2",), "fair", r"Caution: \d+ bad measurements in 31 samples"),
-        (("sensor.loss=0.7",), "bad", r"Not reliable: \d+ bad measurements in 31 samples"),
+        (
+            ("sensor.loss=0.2",),
+            "fair",
+            r"Caution: \d+ of 31 samples without a new and usable measurement",
+        ),
+        (
+            ("sensor.loss=0.7",),
+            "bad",
+            r"Not reliable: \d+ of 31 samples without a new and usable measurement",
+        ),
         (("actuator.torque_limit=0.008",), "fair", "Caution: a mean error of"),
     ],
 )

@@ -5,6 +5,7 @@ import functools
 import os
 import sys
 import tempfile
+from itertools import pairwise
 from typing import Any, Final
 
 import typer
@@ -51,9 +52,12 @@ def main(arguments: list[str] | None = None) -> int:
         The exit status: 0; 2 for bad input, with one line on stderr; 130 for Ctrl-C.
     """
     _prepare_surroundings()
-    for argument in sys.argv[1:] if arguments is None else arguments:
+    words = sys.argv[1:] if arguments is None else arguments
+    for argument in words:
         if any("\ud800" <= letter <= "\udfff" for letter in argument):  # an undecodable byte
             return _complain(f"{argument!r}: is not UTF-8 text; expected names in UTF-8")
+    if option := _without_value(words):
+        return _complain(f"{option}: got ''; expected a value")
     try:
         return _command().main(arguments, "stewart-drake", standalone_mode=False) or 0
     except _UsageError as error:
@@ -76,6 +80,15 @@ def main(arguments: list[str] | None = None) -> int:
         return _complain(f"{error}{where}")
     finally:
         release()
+
+
+def _without_value(words: list[str]) -> str | None:
+    """Return the first option that is given an empty text, or None."""
+    for before, word in pairwise(["", *words]):
+        option = word.removesuffix("=") if word else before
+        if option != word and option.startswith("--") and "=" not in option:
+            return option
+    return None
 
 
 @functools.cache

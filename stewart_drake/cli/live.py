@@ -40,6 +40,16 @@ _EACH_WAY: Final = (0.35, 0.4)
 """Transit time of the demo's link each way, as a share of the scenario's delay."""
 _LOST: Final = 0.02
 """Loss of the demo's link each way."""
+_REFUSED: Final = {
+    "malformed": "malformed",
+    "version": "of another version",
+    "key": "with another key",
+    "foreign": "of another session",
+    "replayed": "repeated",
+    "late": "too old for use",
+    "rate": "above the rate of requests",
+}
+"""Words for the causes of `live.protocol.Refusal`."""
 _REQUESTS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -322,7 +332,7 @@ def machine(
     if options.log is not None:
         delivery.say(f"log written to {options.log}")
     s: Any = running.summary()
-    refused = ", ".join(f"{number} {cause}" for cause, number in s["refused"].items() if number)
+    refused = ", ".join(f"{n} {_REFUSED[cause]}" for cause, n in s["refused"].items() if n)
     delivery.say_wrapped(
         f"ended after {s['time_s']:.1f} s: {s['sessions']} sessions, {s['runs']} runs, "
         f"{s['silences']} silences, at most {1e3 * s['longest_lag_s']:.0f} ms behind",

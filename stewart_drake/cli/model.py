@@ -22,7 +22,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.reporting.terminal import echo
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.studies.options import Option, quantity
+from stewart_drake.studies.options import MissingOption, Option, quantity
 from stewart_drake.studies.study_options import LARGEST, Measurements
 
 app = typer.Typer(rich_markup_mode=None, help="Check and view a mechanism.")
@@ -174,17 +174,18 @@ def _new(
 
 def _measured(given: Given, asking: bool) -> Measurements:
     """Return the measurements; ask for missing ones, and again for those that do not fit."""
-    missing = {one.name: one for one in given.missing}
-    if missing and not asking:
-        flags = ", ".join("--" + name.replace("_", "-") for name in missing)
-        raise ConfigError(
-            f"new: got no {flags}; expected the measurements as options, a terminal to ask at, or "
-            "--form"
-        )
-    asked = {name: _ask(one) for name, one in missing.items()}
+    missing, asked = {one.name: one for one in given.missing}, dict[str, float]()
     while True:
         try:
             measurements: Measurements = given.options(more=asked)
+        except MissingOption:
+            if not asking:
+                flags = ", ".join(f"--{one.dashed}" for one in given.missing)
+                raise ConfigError(
+                    f"new: got no {flags}; expected the measurements as options, a terminal to ask "
+                    "at, or --form"
+                ) from None
+            asked = {name: _ask(one) for name, one in missing.items()}
         except ConfigError as error:
             flag = str(error).partition(":")[0]
             name = flag.removeprefix("--").replace("-", "_")

@@ -51,6 +51,7 @@ class Given:
         """
         with self.named():
             values = {one.name: self._value(one, load) for one in _offered(self._kind)}
+            values = {name: value for name, value in values.items() if value is not None}
             return self._kind(**(values | dict(more or {})))
 
     def named(self) -> contextlib.AbstractContextManager[None]:

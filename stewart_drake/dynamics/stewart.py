@@ -8,9 +8,10 @@ import numpy as np
 from stewart_drake.core.layout import DEAD_CENTRE_SINE, DEFAULT_GRAVITY
 from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.workspace import measures_at
-from stewart_drake.files.arguments import fixed, of_kind
+from stewart_drake.files.arguments import fixed
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.assembly import TorqueMap, torque_map
+from stewart_drake.mechanism.files import as_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError, angle_rate_map
 from stewart_drake.scenario.signals import (
@@ -117,7 +118,7 @@ class StewartDynamics:
     such as a constant of a sensor, has no effect.
 
     Args:
-        mechanism: the machine.
+        mechanism: the machine, or a name or path for `load_mechanism`.
         gravity: True for 9.81 m/s^2 along -z, which is Drake's default, False for none, or m/s^2.
         parameters: (22,) or fewer, see `plant_parameters`.
         free: names (p,) out of `scenario.signals.PLANT_PARAMETERS`, and others.
@@ -138,13 +139,12 @@ class StewartDynamics:
 
     def __init__(
         self,
-        mechanism: Mechanism,
+        mechanism: Mechanism | str,
         gravity: bool | float = True,
         parameters: ArrayLike | None = None,
         free: Sequence[str] = PARAMETERS,
     ) -> None:
-        of_kind("mechanism", mechanism, Mechanism)
-        self.mechanism = mechanism
+        self.mechanism = as_mechanism(mechanism)
         switch = isinstance(gravity, bool | np.bool_)
         scale = DEFAULT_GRAVITY if switch else 1.0
         self.gravity = float(scale * fixed("gravity", gravity, ()))
@@ -155,7 +155,7 @@ class StewartDynamics:
         place = [PLANT_PARAMETERS.index(free[i]) for i in own]
         self._own, self._place = _slice(own), _slice(place)
         self.parameters = self.free_of(self.plant_parameters)
-        self._functions: Any = functions_of(mechanism)
+        self._functions: Any = functions_of(self.mechanism)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.mechanism, self.gravity, self.plant_parameters, self.free)

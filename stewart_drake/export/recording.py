@@ -210,7 +210,7 @@ def _refusal(scenario: Scenario, field: str) -> str:
     name = max(names, key=lambda name: len(fields[name]), default=EXPORTED[0])
     value: Any = scenario
     for key in field.split("."):
-        value = getattr(value, key, None)
+        value = getattr(value, key, "a law of your own")
     if name in EXPORTED:
         return f"{field}: got {value}, which is not exported; expected that of {known}"
     return f"controller: {name} is not exported, because of {field}: {value}; exported are {known}"

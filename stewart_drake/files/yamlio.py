@@ -264,6 +264,9 @@ _PLAIN: Final = {
     "a valid number": "a number",
     "a valid string": "text",
     "an object": "a mapping of fields",
+    "greater than or equal to": "at least",
+    "less than or equal to": "at most",
+    "greater than": "more than",
 }
 """Words of pydantic, and those of a message."""
 

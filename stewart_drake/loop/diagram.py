@@ -13,6 +13,7 @@ from pydrake.systems.framework import (
     System,
 )
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Saturation
+from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
@@ -46,6 +47,7 @@ from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.link import measurement_times
 from stewart_drake.scenario.signals import NUM_TORQUES, RATES, SIGNALS, exported_ports
 from stewart_drake.tuner.source import DensityFeatures, PaperPolicy
+from stewart_drake.types import Array
 
 _TUNER_INPUTS: Final = {
     "density": "density.density",
@@ -212,8 +214,7 @@ def _add_servos(builder: DiagramBuilder, experiment: Experiment) -> float:
     first, believed = commands_in_flight(experiment, law, law.timeline.delay)
     last = believed[-1] if len(believed) else first
     builder.AddNamedSystem("controller", ServoController(law, last))
-    reference = Reference(experiment.reference, planned, law.preview_times)
-    builder.AddNamedSystem("reference", reference)
+    _add_reference(builder, experiment, planned, law.preview_times)
     _, in_flight = commands_in_flight(experiment, law, sc.true_delay)
     builder.AddNamedSystem("delay_chain", wire(experiment, in_flight, "command"))
     rest = machine, first, sc.controller.period, law.reports
@@ -315,8 +316,7 @@ def _measured(builder: DiagramBuilder, experiment: Experiment, motors: str) -> O
 def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[PredictiveLqi, float]:
     """Add the shipped controller, its reference and weights; return law and catch-up, s."""
     law, planned, catch_up = control_law(experiment)
-    reference = Reference(experiment.reference, planned, law.preview_times)
-    builder.AddNamedSystem("reference", reference)
+    _add_reference(builder, experiment, planned, law.preview_times)
     queue = first_queue(experiment, law)
     motion = followed_motion(law, planned, experiment.reference)
     builder.AddNamedSystem("controller", DelayLqiController(law, queue, motion))
@@ -337,14 +337,20 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[Predictiv
 def _add_own_controller(builder: DiagramBuilder, experiment: Experiment) -> None:
     """Add the user's controller, its reference, and the system that samples it."""
     sc, system = experiment.scenario, experiment.own.systems["controller"]
-    reference = Reference(experiment.reference, experiment.reference, np.zeros(1))
-    builder.AddNamedSystem("reference", reference)
+    _add_reference(builder, experiment, experiment.reference, np.zeros(1))
     builder.AddNamedSystem("own_controller", system)
     sampled = SampledController(sc.controller.period, experiment.torque_limit)
     builder.AddNamedSystem("controller", sampled)
     _connect(builder, "own_controller.torque", "controller.own_torque")
     if system.HasInputPort("reference"):
         _connect(builder, "reference.reference", "own_controller.reference")
+
+
+def _add_reference(
+    builder: DiagramBuilder, experiment: Experiment, planned: Trajectory, ahead: Array
+) -> None:
+    """Add the reference, with previews of the planned motion at times (n,) ahead, s."""
+    builder.AddNamedSystem("reference", Reference(experiment.reference, planned, ahead))
 
 
 def _disturb(builder: DiagramBuilder, disturbance: System | None, torque: OutputPort) -> None:

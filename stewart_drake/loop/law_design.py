@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, NamedTuple
@@ -499,6 +500,14 @@ class DesignedLaw:
         return controller
 
 
+def _of_argument(message: str) -> str:
+    """Return an error about a scenario's field with the argument of `design_law` that sets it."""
+    fields = {"actuator.torque_limit": "torque_limit", "controller": "options"}
+    for field, argument in fields.items():
+        message = re.sub(rf"^design_law: {field}\b", argument, message)
+    return message
+
+
 def design_law(
     dynamics: StewartDynamics,
     reference: Trajectory,
@@ -555,8 +564,11 @@ def design_law(
         "actuator": {"torque_limit": torque_limit},
         "sensor": {"noise_std": fixed("noise_std", noise_std, (NUM_STATE,), 0.0).tolist()},
     }
-    scenario = validate(Scenario, sections, "design_law")
-    scenario.check("design_law")
+    try:
+        scenario = validate(Scenario, sections, "design_law")
+        scenario.check("design_law")
+    except ConfigError as error:
+        raise ConfigError(_of_argument(str(error))) from None
     names = estimated_names(scenario)
     if dynamics.free == PARAMETERS:
         parts = dynamics.mechanism, dynamics.gravity, dynamics.plant_parameters

@@ -43,6 +43,7 @@ def document(study: DelayStudy) -> Document:
         gains=_gains,
         milliseconds=milliseconds,
         spoken=own and loop_verdict(own),
+        least=_is_fragile(study) and FRAGILE,
         growth=verdict and verdict.amplification,
         bandwidth=_BANDWIDTH,
         gives_way=1.0 / stiffness,
@@ -65,8 +66,13 @@ def _tone(study: DelayStudy) -> Tone:
     if study.verdict is None or study.assessment.obstacles or (loop and loop.stable is False):
         return "bad"
     tone = _TONES[study.verdict.beatable]
-    fragile = loop and (loop.problem or loop.delay_margin < FRAGILE * study.eta)
-    return "fair" if tone == "good" and fragile else tone
+    return "fair" if tone == "good" and loop and (loop.problem or _is_fragile(study)) else tone
+
+
+def _is_fragile(study: DelayStudy) -> bool:
+    """Return whether a small error of the delay makes the loop unstable."""
+    loop = study.controller
+    return loop is not None and bool(loop.delay_margin < FRAGILE * study.eta)
 
 
 def _eta(study: DelayStudy, steps: int) -> float:

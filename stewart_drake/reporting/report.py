@@ -324,7 +324,7 @@ def _findings(run: SimulationResult) -> list[tuple[Tone, str]]:
     samples = number_sent(run.scenario.duration, run.scenario.controller.period)
     wrong = counts["bad_measurements"]
     if wrong > FEW_BAD * samples:
-        text = f"{wrong} bad measurements in {samples} samples"
+        text = f"{wrong} of {samples} samples without a new and usable measurement"
         found.append(("bad" if wrong > MANY_BAD * samples else "fair", text))
     failed = sum(counts[name] for name in ("riccati_failures", "unreachable", "nonfinite_torque"))
     if failed:

@@ -22,6 +22,11 @@ from stewart_drake.types import Array
 _STILL: Final = 1e-9
 """Motion below which a coordinate counts as still, rad or m."""
 
+_EVENTS: Final = {"measurements_missing": "samples without a new measurement"}
+_MAY_BE_LATE: Final = (
+    "a late measurement is used at the sample at which it comes, unless a newer one has come"
+)
+
 _Runs = Mapping[str, SimulationResult]
 
 
@@ -39,7 +44,12 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
         peaks=listed(_peaks(result)),
         least=LEAST_MEASURED,
         # the sum of others is left out
-        events=[(n, name) for name, n in s["counts"].items() if n and name != "bad_measurements"],
+        events=[
+            (n, _EVENTS.get(name, name))
+            for name, n in s["counts"].items()
+            if n and name != "bad_measurements"
+        ],
+        late=_MAY_BE_LATE if result.scenario.link.back and "live" not in s else "",
         packets=[(n, name) for name, n in s["packets"].items()],
         cautions=[text for text in s["warnings"] if text not in said],
     )

@@ -86,7 +86,7 @@ def _crossing(nearest: Nearest) -> str:
     """Return a remark on parts that cross."""
     if nearest.distance >= 0:
         return ""
-    return "crosses the disc as drawn" if "base" in nearest.pair else "they cross"
+    return "crosses a base that is a full disc" if "base" in nearest.pair else "they cross"
 
 
 def margins_figure(study: WorkspaceStudy) -> Figure:

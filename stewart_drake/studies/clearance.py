@@ -77,7 +77,8 @@ class ClearanceAlong(NamedTuple):
         if disc is not None and disc.distance < 0:
             deep = f"{-1e3 * disc.distance:.3g} mm"
             found.append(
-                f"{disc.pair.second} would enter the base's disc, as it is drawn, by {deep}"
+                f"{disc.pair.second} would reach {deep} into a base that is a full disc; "
+                "cutouts may clear it"
             )
         return found
 

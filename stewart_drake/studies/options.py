@@ -66,6 +66,10 @@ def quantity(name: str, text: str, unit: str) -> float:
     return float(f"{value * factor:.15g}")
 
 
+class MissingOption(ConfigError):
+    """An option is missing, and all given ones are right."""
+
+
 class Option(NamedTuple):
     name: str  # of the field and of the Python argument
     annotation: Any  # of the Python argument
@@ -102,7 +106,10 @@ class Options(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as caught:
-            raise ConfigError(explain(values, caught.errors(include_url=False)[0])) from None
+            errors = caught.errors(include_url=False)
+            wrong = [error for error in errors if error["type"] != "missing"]
+            kind = ConfigError if wrong else MissingOption
+            raise kind(explain(values, (wrong or errors)[0])) from None
 
     @classmethod
     def described(cls) -> Iterator[Option]:
