@@ -356,7 +356,7 @@ def run_live(
     if options.learn:
         of_run = options.model_dump(include={"duration", "log", "mirror"})
         refuse(of_run, "with --learn; expected none")
-        learnt = learn_live(as_scenario(scenario), machine, options, print)
+        learnt = learn_live(as_scenario(scenario), machine, options, print).run
         return SimulationResult.of(learnt)
     ready = prepare_session(as_scenario(scenario), address_of(machine), read_key(options.key))
     how: Any = options.model_dump(include={"armed", "accept_jitter", "max_missing", "hold"})

@@ -19,6 +19,8 @@ from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.protocol import MachineFlags
 from stewart_drake.loop.learned import HARMONICS, motion_period, save_learned
 from stewart_drake.loop.preparation import prepare
+from stewart_drake.reporting.learn import document
+from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.scenario.trajectories import evaluate
 from tests.live_driver import in_real_time, running_machine
 
@@ -172,7 +174,7 @@ OVER_A_NETWORK = ("start=rest", "queue=zero", f"link={{kind: network, {WAY}, ret
 
 
 def learn(wanted, running, file, say):
-    """Return the run of three repetitions on a machine."""
+    """Return the run and the study of three repetitions on a machine."""
     host, port = running.address
     options = LiveOptions(learn=3, learned=file, accept_jitter=True)
     return learn_live(wanted, f"{host}:{port}", options, say)
@@ -190,8 +192,17 @@ def test_torques_of_a_machine_with_friction_and_payload_are_learned(tmp_path, wa
     wanted = sd.load_scenario("paper", settings=(*LAW, *way[:2]))
     machine = sd.load_scenario("paper", settings=(*LAW, *UNKNOWN, *way))
     with running_machine(machine, rate=5.0) as running:
-        result = learn(wanted, running, file, said.append)
+        result, study = learn(wanted, running, file, said.append)
     assert result.status == "completed"
+    # Each repetition is a run of its own, to the same instant of the motion but for a sample.
+    assert [one.error for one in study.repetitions] == study.summary["errors"]
+    assert len(study.repetitions) == 3 and study.best is study.repetitions[2]
+    last = [one.result.signals.isel(time=slice(-60, None)) for one in study.repetitions]
+    np.testing.assert_allclose(last[0].reference, last[2].reference, atol=0.1 * AMPLITUDE.max())
+    means = [np.abs(one.error.values / AMPLITUDE).mean() for one in last]
+    assert means[2] < 0.1 * means[0]
+    page = html(document(study), Provenance("live"))
+    assert page.count("<iframe") == 2 and "Learning lowers E of one period" in page
     errors = [float(line.split()[-3]) for line in said if "E of one period" in line]
     assert len(errors) == 3
     assert 13 < errors[0] < 16 and errors[2] < 0.5
@@ -217,8 +228,10 @@ def test_setpoints_of_a_machine_with_other_servos_are_learned(monkeypatch, tmp_p
     other = ("actuator.friction=0.2", "actuator.stiffness=8", network)
     wanted = sd.load_scenario("reachy_mini", settings=(STEPS,))
     with running_machine(sd.load_scenario("reachy_mini", settings=other)) as running:
-        result = learn(wanted, running, file, said.append)
+        result, study = learn(wanted, running, file, said.append)
     assert result.status == "completed"
+    assert study.best.result is result and study.measure.unit == "deg"
+    assert "Learning lowers the rms error of the cranks" in document(study).plain()
     lacking = [float(line.split()[5]) for line in said if "degrees rms" in line]
     assert len(lacking) == 3
     assert 0.5 < lacking[0] < 1.5

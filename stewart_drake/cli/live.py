@@ -33,6 +33,7 @@ from stewart_drake.scenario.loading import load_scenario
 if TYPE_CHECKING:
     from stewart_drake.live.page import PageViewer
     from stewart_drake.loop.results import SimulationResult
+    from stewart_drake.reporting.results import AnalysisResult
     from stewart_drake.scenario.config import Scenario
 
 LOG: Final = "log.csv"
@@ -90,7 +91,13 @@ def live(
             raise ConfigError(
                 "--learn: expected none of --duration, --log, --mirror and --hold with it"
             )
-        return _learn(scenario, loaded, machine, options, (controller, settings or ()), delivery)
+        typed = {"controller": controller, "machine": machine, "demo": demo, **given.words}
+        shown = {name: value for name, value in typed.items() if value} | {"out": out}
+        from stewart_drake.reporting.page import command_line
+
+        command = command_line("live", scenario, settings=settings or (), options=shown)
+        more = controller, settings or ()
+        return _learn(scenario, loaded, machine, options, more, delivery, command)
 
     from stewart_drake.live.contact import address_of
     from stewart_drake.live.endpoint import read_key
@@ -131,7 +138,7 @@ def live(
             )
     if options.log is not None:
         delivery.say(f"log written to {options.log}")
-    return _delivered(delivery, result)
+    return _delivered(delivery, result, LOG)
 
 
 def _learn(
@@ -141,9 +148,13 @@ def _learn(
     options: LiveOptions,
     more: tuple[str | None, Sequence[str]],
     delivery: Delivery,
+    command: str,
 ) -> int:
-    """Learn torques or setpoints, and deliver the run."""
+    """Learn torques or setpoints, and deliver the run, with the page of `learn`."""
     from stewart_drake.live.learning import learn_live
+    from stewart_drake.reporting.learn import document
+    from stewart_drake.reporting.page import Provenance
+    from stewart_drake.reporting.results import AnalysisResult
     from stewart_drake.studies.learn import check_learning
 
     check_learning(loaded)
@@ -152,8 +163,11 @@ def _learn(
         delivery.say(f"calling {where}")
         consent = options if machine else options.model_copy(update={"accept_jitter": True})
         with _Ending() as ending:
-            result = learn_live(loaded, where, consent, delivery.say_wrapped, ending)
-    return _delivered(delivery, result)
+            run, study = learn_live(loaded, where, consent, delivery.say_wrapped, ending)
+    found = None
+    if study is not None:
+        found = AnalysisResult(study, study.summary, document(study), Provenance(command))
+    return _delivered(delivery, run, found=found)
 
 
 def _agreed(problem: str) -> bool:
@@ -177,9 +191,18 @@ def _page(scenario: "Scenario", name: str) -> Iterator["PageViewer"]:
         viewer.close()
 
 
-def _delivered(delivery: Delivery, result: "SimulationResult") -> int:
-    """Write and print the result, and return the exit status."""
+def _delivered(
+    delivery: Delivery,
+    result: "SimulationResult",
+    *logs: str,
+    found: "AnalysisResult | None" = None,
+) -> int:
+    """Write and print the result, and the page of what was learned; return the exit status.
+
+    `logs` are the names of files that were written during the run.
+    """
     from stewart_drake.live.viewer import End
+    from stewart_drake.reporting.results import PAGE
     from stewart_drake.reporting.run import run_document
 
     summary: Any = result.summary
@@ -198,8 +221,11 @@ def _delivered(delivery: Delivery, result: "SimulationResult") -> int:
         "had none (dry)",
     )
     if delivery.out is not None:
+        delivery.discard(PAGE)  # of an earlier run
         result.save(delivery.out)
-        delivery.wrote("summary.json", "signals.nc", LOG)
+        delivery.wrote("summary.json", "signals.nc", *logs)
+    if found is not None:
+        delivery.draw(PAGE, found.write_page)
     lost = result.status in ("lost_machine", "lost_contact", "refused", "left_workspace")
     return delivery.end(result.summary, result.status == "interrupted") or int(lost)
 

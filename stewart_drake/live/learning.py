@@ -12,6 +12,7 @@ that the cranks lack in the last periods correct the setpoints of the next one.
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -37,7 +38,11 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import POSE, RATES
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.learn import (
+    PERIOD_ERROR,
+    LearnStudy,
     Lessons,
+    Measure,
+    Repetition,
     check_learning,
     estimated,
     lacking_angles,
@@ -88,13 +93,26 @@ class _Asked(NamedTuple):
         how |= self.options.model_dump(include={"armed", "accept_jitter", "max_missing"})
         return drive(ready, duration, ending=self.ending, say=self.say, **how)
 
-    def end(self, best: int) -> None:
-        """Print the number of the best repetition, from 0."""
+    def end(self, lessons: Lessons, own: Experiment, done: list[Repetition]) -> LearnStudy:
+        """Print the number of the best repetition; return all."""
+        best = lessons.best
         self.say(
             f"repetition {1 + best} is the best; {self.file} is for controller.learned"
             if best
             else "nothing was learned: no repetition was better than the first one"
         )
+        asked, file = self.options.learn, str(self.file)
+        early = len(done) < asked and not lessons.ended
+        cranks = self.scenario.controller.command == "cranks"
+        measure = Measure("the rms error of the cranks", "deg") if cranks else PERIOD_ERROR
+        return LearnStudy(own, lessons.period, done, asked, early, measure, file)
+
+
+class LiveLessons(NamedTuple):
+    """Results of learning from a machine."""
+
+    run: SimulationResult  # of all repetitions; of setpoints the best one, or the last one
+    study: LearnStudy | None  # None if no repetition completed
 
 
 def learn_live(
@@ -103,15 +121,11 @@ def learn_live(
     options: LiveOptions,
     say: Callable[[str], None],
     ending: Callable[[], bool] = lambda: False,
-) -> SimulationResult:
+) -> LiveLessons:
     """Repeat a motion on a machine, learn from each repetition, and write what was learned.
 
     Learning ends early after two repetitions without a smaller error, or if one does not complete,
     or once `ending` returns True.
-
-    Returns:
-        The run of all repetitions. With setpoints the best repetition, or the last one if none
-        completed.
 
     Raises:
         ConfigError: see `studies.learn.check_learning` and `live.session`.
@@ -127,18 +141,18 @@ def learn_live(
 # ---------------------------------------------------------------- torques
 
 
-def _learn_torques(asked: _Asked) -> SimulationResult:
+def _learn_torques(asked: _Asked) -> LiveLessons:
     lessons = TorqueLessons(prepare(asked.scenario), asked.options.learn, asked.say)
     ready = asked.call(lessons)
     result = asked.drive(ready, viewer=lessons, logs=[lessons], pace=lessons.pace)
     if result.status != "completed":
         asked.say(f"{End(result.status, result.stopped).words}; learning ends")
-    if lessons.learning.errors:
-        best = lessons.learning.best
-        if best:
-            save_learned(asked.file, lessons.tried[best], lessons.experiment)
-        asked.end(best)
-    return result
+    if not lessons.learning.errors:
+        return LiveLessons(result, None)
+    if best := lessons.learning.best:
+        save_learned(asked.file, lessons.tried[best], lessons.experiment)
+    done = lessons.repetitions(result)
+    return LiveLessons(result, asked.end(lessons.learning, lessons.experiment, done))
 
 
 class TorqueLessons(Viewer):
@@ -168,6 +182,7 @@ class TorqueLessons(Viewer):
         self.pace = min(PACE, _PACE * 2 * np.pi / self._period)
         self._slowest = float(times[np.argmin(np.abs(rates).max(axis=1))])
         self._until, self._asked, self._returns = self._end_of_motion(0.0), 0.0, False
+        self._ends = list[float]()  # of the motions that were judged, s
         self._before, self._share = none, 0.0
         self._left: Array = self.experiment.start[POSE]  # pose at which the motion ended
         self._target = self._left
@@ -223,6 +238,27 @@ class TorqueLessons(Viewer):
         if not more and self._rests(snapshot):
             self._begin(t)
 
+    def repetitions(self, run: SimulationResult) -> list[Repetition]:
+        """Return the end of each repetition's motion as a run of its own."""
+        found = list[Repetition]()
+        for tried, end, error in zip(self.tried, self._ends, self.learning.errors, strict=False):
+            begin = end - self._span
+            part = run.signals.sel(time=slice(begin - self._dt / 2, end + self._dt / 2))
+            signals = part.assign_coords(time=part.time - part.time[0])
+            E_ac = accumulated_error(
+                signals.time.values, signals.error.values, self.experiment.scale
+            )
+            result = replace(
+                run,
+                scenario=replace(run.scenario, duration=self._span),
+                status="completed",
+                stopped=None,
+                signals=signals,
+                summary=run.summary | {"accumulated_error": E_ac},
+            )
+            found.append(Repetition(tried if found else None, result, error))
+        return found
+
     def _end_of_motion(self, t: float) -> float:
         """Return the end, in s, of a motion from t s on: where it is slowest, for a gentle stop."""
         least = t + self._span
@@ -234,6 +270,7 @@ class TorqueLessons(Viewer):
         errors = np.array([row["pose"] - row["reference"] for _, row in self._rows])
         error = accumulated_error(times, errors, self.experiment.scale)
         self.learning.errors.append(error)
+        self._ends.append(self._until)
         k = len(self.learning.errors)
         self._say(f"repetition {k}: E of one period is {error:.3g} % s")
         self.done = k == self._number or self.learning.ended
@@ -282,13 +319,13 @@ class TorqueLessons(Viewer):
 # ---------------------------------------------------------------- setpoints
 
 
-def _learn_setpoints(asked: _Asked) -> SimulationResult:
+def _learn_setpoints(asked: _Asked) -> LiveLessons:
     scenario, say = asked.scenario, asked.say
     learned: LearnedSignal | None = None
     lessons, dt = Lessons(scenario), scenario.controller.period
     last = lessons.period * math.ceil(_LEARNED_FROM / lessons.period)
     duration = dt * math.ceil((_SETTLING + last) / dt + 1)
-    runs, own = list[SimulationResult](), prepare(scenario)
+    done, own = list[Repetition](), prepare(scenario)
     for k in range(1, asked.options.learn + 1):
         ready = asked.call(always(learned), duration, plan=k == 1)
         result = asked.drive(ready, duration)
@@ -303,7 +340,7 @@ def _learn_setpoints(asked: _Asked) -> SimulationResult:
             )
             break
         lessons.errors.append(float(np.sqrt(np.mean(missed**2))))  # rad
-        runs.append(result)
+        done.append(Repetition(learned, result, float(np.degrees(lessons.errors[-1]))))
         say(f"repetition {k}: the cranks lack {np.degrees(lessons.errors[-1]):.3f} degrees rms")
         best = lessons.best
         if best == k - 1 and learned is not None:  # at once, so that Ctrl-C loses nothing
@@ -311,7 +348,6 @@ def _learn_setpoints(asked: _Asked) -> SimulationResult:
         if lessons.ended:
             break
         learned = lessons.learned(times, missed)
-    if not runs:
-        return result
-    asked.end(best)
-    return runs[best]
+    if not done:
+        return LiveLessons(result, None)
+    return LiveLessons(done[lessons.best].result, asked.end(lessons, own, done))

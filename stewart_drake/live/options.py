@@ -57,9 +57,7 @@ class LiveOptions(Options):
         False, "Start without the question that a large jitter raises.", name="yes"
     )
     log: Path | None = option(None, "Log to write during the run, .mcap or .csv.", "FILE")
-    learn: int = option(
-        0, "Repetitions from which torques or setpoints are learned, without a page.", ge=0, le=100
-    )
+    learn: int = option(0, "Repetitions from which torques or setpoints are learned.", ge=0, le=100)
     learned: Path | None = option(
         None, "File for what was learned; learned.npz by default.", "FILE"
     )

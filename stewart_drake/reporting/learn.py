@@ -2,7 +2,6 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -13,8 +12,6 @@ from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.replay import replay_html
 from stewart_drake.reporting.style import line
 from stewart_drake.studies.learn import LearnStudy, Repetition
-
-LEARNED: Final = "learned.npz"
 
 
 def document(study: LearnStudy) -> Document:
@@ -42,18 +39,19 @@ def document(study: LearnStudy) -> Document:
 
 def write(study: LearnStudy, folder: Path) -> list[str]:
     """Write the learned torque of the best repetition, if any; return the name of its file."""
-    (folder / LEARNED).unlink(missing_ok=True)  # of an earlier command
+    (folder / study.file).unlink(missing_ok=True)  # of an earlier command
     learned = study.best.learned
     if learned is None:
         return []
-    save_learned(folder / LEARNED, learned, study.experiment)
-    return [LEARNED]
+    save_learned(folder / study.file, learned, study.experiment)
+    return [study.file]
 
 
 def error_figure(study: LearnStudy) -> Figure:
     errors = [one.error for one in study.repetitions]
     curve = Curve(np.arange(1, len(errors) + 1), errors, "", line(0))
-    return draw([Panel("E of a period  [% s]", [curve], "repetition", yscale="log", height=2.5)])
+    name = "{}  [{}]".format(*study.measure)
+    return draw([Panel(name, [curve], "repetition", yscale="log", height=2.5)])
 
 
 def time_figure(study: LearnStudy) -> Figure:

@@ -61,7 +61,7 @@ _PATIENCE: Final = 2
 class Repetition:
     learned: LearnedSignal | None  # torque or angles that were used, or None in the first one
     result: SimulationResult
-    error: float  # E of its last period, % s; infinite if it did not complete
+    error: float  # see `Measure`; infinite if it did not complete
 
     @property
     def largest(self) -> float:
@@ -72,13 +72,25 @@ class Repetition:
         return float(np.abs(self.learned(times)).max())
 
 
+class Measure(NamedTuple):
+    """Error of a repetition by which the best one is chosen."""
+
+    name: str
+    unit: str
+
+
+PERIOD_ERROR: Final = Measure("E of one period", "% s")
+
+
 @dataclass(frozen=True)
 class LearnStudy:
     experiment: Experiment  # of the scenario
     period: float  # of the motion, s
     repetitions: Sequence[Repetition]  # in order
     asked: int  # number of repetitions that were asked for
-    interrupted: bool  # whether Ctrl-C ended it early
+    interrupted: bool  # whether it ended early for another reason than its errors
+    measure: Measure = PERIOD_ERROR
+    file: str = "learned.npz"  # of what was learned
 
     @property
     def best(self) -> Repetition:
