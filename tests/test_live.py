@@ -255,6 +255,29 @@ def test_a_run_ends_where_measurements_stay_away(kind, missing):
     assert 0.4 < result.summary["measured_share"] < 0.8
 
 
+class Hesitates(Machine):
+    """Says nothing of the plate from the second sample until 0.3 s."""
+
+    def _message(self, time, sampled, said, *others, **more):
+        since = sampled - self._origin
+        quiet = self._running and 0 < since < 0.3 * SECOND
+        return super()._message(time, sampled, {} if quiet else said, *others, **more)
+
+
+@pytest.mark.slow
+@in_real_time
+def test_a_gap_after_the_first_measurement_of_encoders_does_not_end_a_run():
+    """One set of angles shows no rates, but the plate of a parked machine rests."""
+    way = "low: 0.01, high: 0.02, loss: 0"
+    link = f"link={{kind: network, {way}, return: {{{way}}}}}"
+    heavy = ("plant.gravity=true", "start=rest", "queue=equilibrium", "controller.period=0.02")
+    settings = (*heavy, "sensor.kind=encoders", "reference.amplitude=[0, 0, 0, 0, 0, 0.005]", link)
+    with paper_machine(*settings, kind=Hesitates) as running:
+        ready = prepare_session(scenario_of(*settings), running.address)
+        result = drive(ready, 0.6, accept_jitter=True, say=lambda _: None)
+    assert result.status == "completed" or result.stopped.time > 0.6, result.failure
+
+
 @pytest.mark.slow
 @in_real_time
 def test_an_error_of_which_half_was_measured_is_none():

@@ -106,6 +106,7 @@ class LiveLoop:
         self._recording, self._hold = True, hold
         self._max_missing = max_missing
         self._measured, self._known = -1, self.memory  # last usable measurement: sample, memory
+        self._late = 0  # number of overtaken measurements before it
         self._learned: Any = None if design.learned is None else self._learned_part(design)
         self.recoveries, self.taken_over = 0, False
         self.missed, self.resting = 0, list[float]()
@@ -230,7 +231,7 @@ class LiveLoop:
         self._recover(t)
         self._viewer.show(self._snapshot(k, wanted))
         if has_measured(self.memory, counts):
-            self._measured, self._known = k, self.memory
+            self._measured, self._known, self._late = k, self.memory, self.exchange.overtaken
         return self._lost(k)
 
     def _lost(self, k: int) -> End | None:
@@ -248,6 +249,8 @@ class LiveLoop:
             for name in after
             if name.startswith("measurements_") and after[name] > before[name]
         ]
+        if late := self.exchange.overtaken - self._late:
+            causes.append(f"{late} came too late")
         reason = f"no usable measurement for {gap:.3g} s ({', '.join(causes) or 'none came'})"
         return self._end("lost_contact", k, reason)
 
@@ -258,7 +261,9 @@ class LiveLoop:
         if self._max_missing is not None:
             return gap <= self._max_missing + 1e-9
         eta = self._design.law.timeline.eta
-        if gap > LONGEST_GAP + 1e-9 or self._measured < 0:
+        # The start of a parked plate is known, though the first angles of encoders show no rates.
+        starts = self._parked and self._measured * self._period < eta
+        if gap > LONGEST_GAP + 1e-9 or starts or self._measured < 0:
             return gap <= LONGEST_GAP + 1e-9
         plant, estimate = self._design.law.plant, self._known.belief.estimate
         return gap <= eta or stays_within_reach(plant, estimate, self.record.latest, gap + eta)

@@ -9,10 +9,10 @@ from stewart_drake.types import Array
 _ADVICE: Final = {
     "left_workspace": "Bring the plate back to its start and start live again. With --out the log "
     "shows the loss: stewart-drake replay LOG, stewart-drake identify LOG.",
-    "lost_contact": "Check the sensor and its connection: datagrams arrive, usable measurements do "
-    "not. --max-missing allows longer gaps.",
-    "lost_machine": "Check the machine's process and the network, then start live again. The "
-    "machine goes to its safe torque by itself.",
+    "lost_contact": "Datagrams arrive, usable measurements do not. If these are late, relieve both "
+    "computers or the network; else check the sensor. --max-missing 1 allows gaps of 1 s.",
+    "lost_machine": "Check the machine's process and the network, and the load of its computer. "
+    "--max-missing 1 allows gaps of 1 s. The machine goes to its safe torque by itself.",
     "refused": "Correct what is named, then start live again.",
 }
 """What to do after a run, by its status."""
