@@ -15,9 +15,11 @@ from stewart_drake.loop.simulation import simulate
 from stewart_drake.reporting.figures import draw_comparison, draw_run
 from stewart_drake.reporting.run import run_document
 from stewart_drake.reporting.style import (
+    TORQUES,
     controller_lines,
     figure_style,
     plain_log_ticks,
+    unit_for,
     write_figures,
 )
 from stewart_drake.scenario.loading import load_scenario
@@ -150,7 +152,10 @@ def test_any_number_of_controllers_has_distinct_lines_named_on_the_figure(run, n
     assert 0 <= box.x0 < box.x1 <= drawn["states"].bbox.x1
 
 
-@pytest.mark.parametrize(("low", "high"), [(19.5, 37), (0.4, 300), (8, 12), (20, 55), (1e-3, 2e-3)])
+RANGES = [(19.5, 37), (0.4, 300), (8, 12), (20, 55), (1e-3, 2e-3), (0.59, 1.95)]
+
+
+@pytest.mark.parametrize(("low", "high"), RANGES)
 def test_ticks_of_a_logarithmic_axis_are_plain_numbers(low, high):
     with figure_style():
         figure = Figure()
@@ -165,3 +170,10 @@ def test_ticks_of_a_logarithmic_axis_are_plain_numbers(low, high):
     for text, place in zip(texts, places, strict=True):
         assert re.fullmatch(r"[\d.]+(e-0\d)?", text)
         assert float(text) == pytest.approx(place), "not what stands there"
+
+
+@pytest.mark.parametrize(("largest", "unit"), [(2.0, "N m"), (0.02, "mN m"), (2e-9, "µN m")])
+def test_a_unit_fits_the_values(largest, unit):
+    found, factor = unit_for([0.0, -largest, np.nan], TORQUES)
+    assert found == unit and factor == TORQUES[unit]
+    assert unit_for([], TORQUES)[0] == "µN m"

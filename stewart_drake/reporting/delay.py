@@ -1,6 +1,7 @@
 """Document and figures of an analysis of the delay."""
 
 import math
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
@@ -194,13 +195,14 @@ def map_figure(study: DelayStudy) -> Figure:
 
     xlim, ylim = (-0.5, len(steps) - 0.5), (-0.5, len(factors) - 0.5)
     height = 0.8 * len(factors)
-    return draw([Panel("amplitude", x="delay", xlim=xlim, ylim=ylim, height=height, paint=paint)])
+    panel = Panel("amplitude", x="delay", title="E_ac  [% s]", xlim=xlim, ylim=ylim, height=height)
+    return draw([replace(panel, paint=paint)])
 
 
 def _draw_cell(ax: Axes, cell: Cell, x: int, y: int, floor: float) -> None:
     done = cell.status == "completed"
     if done:
-        text = f"{cell.error:.3g}" + (f"\nfloor {floor:.3g}" if floor else "")
+        text = number(cell.error) + (f"\nfloor {number(floor)}" if floor else "")
     elif cell.status == "not_run":
         text = "not run"
     else:

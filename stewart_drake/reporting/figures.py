@@ -71,7 +71,8 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
     aware = {name: results[name] for name in shown if name in results}
     figures = {"states": _states(runs), "errors": _errors(runs)}
     for name, result in aware.items():
-        figures[f"torques_{name}"] = _torques(result, spoken(name), lines[name])
+        alone = lines[name]._replace(linestyle="-", marker="")
+        figures[f"torques_{name}"] = _torques(result, spoken(name), alone)
     for name, result in aware.items():
         if _finds_delay(result):
             figures[f"delay_{name}"] = _delay(result)
@@ -149,11 +150,13 @@ def _coordinates(
 
 def _torques(run: SimulationResult, label: str, line: Line, commanded: bool = False) -> Figure:
     signals, panels, xlim = run.signals, [], (0.0, shown_until(run))
+    asked, acted = signals.torque_commanded.values, signals.torque_applied.values
+    unit, factor = style.unit_for([acted, asked] if commanded else acted, style.TORQUES)
     for k, leg in enumerate(LEGS):
-        asked = signals.torque_commanded.values[:, k]
-        curves = [Curve(signals.time.values, asked, "commanded", style.COMMANDED, steps=True)]
-        applied = _curve(run, signals.torque_applied.values[:, k], label, line, steps=True)
-        name = f"motor {leg}{'' if commanded else ' applied'}  [N m]"
+        wanted = factor * asked[:, k]
+        curves = [Curve(signals.time.values, wanted, "commanded", style.COMMANDED, steps=True)]
+        applied = _curve(run, factor * acted[:, k], label, line, steps=True)
+        name = f"motor {leg}{'' if commanded else ' applied'}  [{unit}]"
         panels.append(Panel(name, [*curves * commanded, applied], xlim=xlim))
     if has_packets(run):
         strip = partial(_packet_strip, run=run)
@@ -185,10 +188,8 @@ def _parameters(run: SimulationResult) -> Figure:
     units, factors = [""] * NUM_PARAMETERS, np.ones(NUM_PARAMETERS)
     shown = np.nanmax(np.abs(np.vstack([true, values, _LEAST_SIGMAS * widths / 2])), axis=0)
     for some, choice in _PARAMETER_GROUPS:
-        # The first unit in which the axis reaches 0.1, else the last.
-        unit = next((u for u, f in choice.items() if f * shown[some].max() > 0.1), [*choice][-1])
+        unit, factors[some] = style.unit_for(shown[some], choice)
         units[some] = [unit] * len(units[some])
-        factors[some] = choice[unit]
     true, values, widths = factors * true, factors * values, factors * widths
     panels = []
     for k, name in enumerate(PARAMETERS):

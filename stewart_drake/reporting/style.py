@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from stewart_drake.files.fileio import replacing
+from stewart_drake.types import ArrayLike
 
 
 class Line(NamedTuple):
@@ -101,6 +102,11 @@ _RC: Final[dict[Any, Any]] = {
 }
 
 
+TORQUES: Final = {"N m": 1.0, "mN m": 1e3, "µN m": 1e6}
+POWERS: Final = {"W": 1.0, "mW": 1e3, "µW": 1e6}
+"""Units to choose from, with their factors; see `unit_for`."""
+
+
 def line(k: int, *, marked: bool = True, width: float = 1.5) -> Line:
     """Return the style of curve k, distinct by dash or marker in grey print.
 
@@ -135,11 +141,17 @@ def figure_style() -> Iterator[None]:
 
 
 class _RoundTicks(LogLocator):
-    """Ticks at 1, 2 and 5; evenly spaced on an axis of less than half a decade."""
+    """Ticks at 1, 2 and 5; evenly spaced on an axis of less than a decade."""
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
-        narrow = max(vmin, vmax) < 3 * min(vmin, vmax)
+        narrow = max(vmin, vmax) < 10 * min(vmin, vmax)
         return MaxNLocator(5).tick_values(vmin, vmax) if narrow else super().tick_values(vmin, vmax)
+
+
+def unit_for(values: ArrayLike, choice: Mapping[str, float]) -> tuple[str, float]:
+    """Return the first unit in which the values reach 0.1, else the last, and its factor."""
+    largest = np.nanmax(np.abs(values), initial=0.0)
+    return next((one for one in choice.items() if one[1] * largest > 0.1), [*choice.items()][-1])
 
 
 def plain_log_ticks(axis: Axis) -> None:

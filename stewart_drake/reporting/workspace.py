@@ -15,7 +15,7 @@ from stewart_drake.core.layout import DEAD_CENTRE_SINE
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT
 from stewart_drake.reporting.document import Document, from_template, number
 from stewart_drake.reporting.panels import Curve, Panel, draw, leg_curves
-from stewart_drake.reporting.style import FACTORS, LIMIT, UNITS, line
+from stewart_drake.reporting.style import FACTORS, LIMIT, POWERS, TORQUES, UNITS, line, unit_for
 from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.studies.clearance import Nearest
 from stewart_drake.studies.workspace import Sizing, WorkspaceStudy
@@ -129,11 +129,13 @@ def margins_figure(study: WorkspaceStudy) -> Figure:
 def motors_figure(sizing: Sizing, torque_limit: float | None) -> Figure:
     """Draw torque, speed and power of the six cranks along the reference."""
     limited = torque_limit is not None and torque_limit < 3 * np.abs(sizing.torque).max()
-    limits = {sign * torque_limit: "" for sign in (-1, 1)} if torque_limit and limited else {}
+    of_torque, torque = unit_for(sizing.torque, TORQUES)
+    of_power, power = unit_for(sizing.power, POWERS)
+    limits = {s * torque * torque_limit: "" for s in (-1, 1)} if torque_limit and limited else {}
     values = {
-        "torque  [N m]": (sizing.torque, limits),
+        f"torque  [{of_torque}]": (torque * sizing.torque, limits),
         "crank speed  [rad/s]": (sizing.speed, {}),
-        "power  [W]": (sizing.power, {}),
+        f"power  [{of_power}]": (power * sizing.power, {}),
     }
     ends = (0, sizing.time[-1])
     return draw(
@@ -159,14 +161,15 @@ def clearance_figure(study: WorkspaceStudy) -> Figure:
     x, y = FACTORS[pair.first] * section.x, FACTORS[pair.second] * section.y
     distance = 1e3 * section.distance
     ends = Normalize(np.nanmin(distance), np.nanmax(distance))
+    colors = _CMAP.reversed()
 
     def paint(ax: Axes) -> None:
-        ax.pcolormesh(x, y, distance, cmap=_CMAP, norm=ends, shading="nearest")
+        ax.pcolormesh(x, y, distance, cmap=colors, norm=ends, shading="nearest")
         _home(ax, pair, study.experiment.mechanism.home)
         ax.set_facecolor(_OUTSIDE)
 
     right = Panel(_axis(pair.second), x=_axis(pair.first), height=3.2, paint=paint)
-    scale = ScalarMappable(ends, _CMAP), "nearest links  [mm]"
+    scale = ScalarMappable(ends, colors), "nearest links  [mm], light is good"
     return draw([left, right], 2, colors=scale)
 
 
@@ -209,6 +212,7 @@ def _section(ax: Axes, section: Section, study: WorkspaceStudy, norm: BoundaryNo
     edges = [0.0, *(1 / np.square(_LEVELS[::-1]))]
     shades = [_CMAP(norm(1.01 * level)) for level in _LEVELS[::-1]]
     border = np.sign(section.margin) * np.square(section.margin)
+    ax.set_facecolor(_OUTSIDE)
     ax.contourf(x, y, quality, levels=edges, colors=shades)
     ax.contourf(x, y, border, levels=[-1e9, 0.0], colors=_OUTSIDE)
     if (border > 0).any():
