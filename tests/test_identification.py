@@ -50,6 +50,7 @@ from stewart_drake.identification.unknowns import (
     unknowns_of,
 )
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
+from stewart_drake.reporting.identification import document
 from stewart_drake.scenario.signals import BALL_JOINTS
 from tests.mechanisms import PAPER, random_mechanism
 
@@ -457,6 +458,11 @@ def test_a_machine_is_found_from_encoders_of_14_bit(log_and_truth):
     # The joint test: the error weighs as much as its covariance says.
     assert 0.5 < away @ np.linalg.solve(found.fit.covariance, away) / len(free) < 1.6
     assert {f"where the base stands along {axis}" for axis in "xyz"} <= set(found.unseen[1])
+    told = document(found).plain()
+    assert "Weak" not in told and "Enter mechanism.yaml" in told
+    less = dataclasses.replace(found.unknowns, std=np.minimum(found.unknowns.std, 1.5 * found.std))
+    told = document(dataclasses.replace(found, unknowns=less)).plain()
+    assert "Weak, hardly better known than before: torque bias 1, torque" in " ".join(told.split())
     for name, size in {"torque_bias_1": 1e-4, "payload_mass": 0.02, "joint_damping": 1e-4}.items():
         assert abs(found.values[NAMES.index(name)] - true[NAMES.index(name)]) < size
 
@@ -468,6 +474,8 @@ def test_a_drawing_that_is_trusted_too_much_is_refused(log_and_truth):
     summary = found.summary
     assert not found.right and found.chi2["all"] > 1.5
     assert np.isnan(summary["delay_std_s"]) and summary["pose_uncertainty"] is None
+    told = " ".join(document(found).plain().split())
+    assert "Do not use the values" in told and "Next Check units, zeros and signs" in told
     assert all(np.isnan(one["std"]) for one in summary["parameters"].values())
     assert abs(summary["delay_s"] - 0.93) < 1e-3  # the delay stands all the same
 

@@ -202,7 +202,8 @@ def test_a_lost_log_lets_the_next_run_be_held(lost, tmp_path, capsys):
     machine = load_mechanism(tmp_path / "mechanism.yaml")
     assert np.abs(machine.rod_lengths - PAPER.rod_lengths).max() < 1e-3
     page = (tmp_path / "report.html").read_text()
-    assert "log does not determine" in page and "<svg" not in page.split("<body")[0]
+    assert "Enter mechanism.yaml as mechanism" in " ".join(out.split())
+    assert "What the log does not show" in page and "<svg" not in page.split("<body")[0]
     settings = (
         "plant.kind=exact", "plant.mechanism=paper", "delay.steps=9", "delay.fraction=0.3",
         "plant.payload_mass=0.4", "reference.amplitude=[0.13,0.13,0.13,0.01,0.01,0.04]",

@@ -24,6 +24,7 @@ from stewart_drake.identification.servo_logs import ServoLog, read_servo_log, se
 from stewart_drake.identification.servo_plan import mixed_motion, plan_servos
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import servo_law
+from stewart_drake.reporting.servo_identification import document
 from stewart_drake.scenario.trajectories import evaluate
 from tests.screen import too_long
 
@@ -277,4 +278,6 @@ def test_a_log_that_no_servo_explains_has_no_intervals():
     fit, _ = with_known_statistics(rng, 600, 4)
     wrong = dataclasses.replace(fit, residuals=10 + fit.residuals)
     assert not wrong.right and np.isnan(wrong.intervals).all()
+    told = " ".join(document(wrong).plain().split())
+    assert "Do not use the values" in told and "Next Check units" in told
     assert yaml.safe_dump(wrong.overlay)

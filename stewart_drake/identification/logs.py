@@ -180,7 +180,10 @@ def _run_problem(scenario: Scenario) -> str | None:
     if scenario.link.kind == "network" and scenario.link.back is not None:
         return "measurements over its network have different ages (link.return)"
     if scenario.actuator.kind != "torque":
-        return f"its motors got no torques (actuator.kind {scenario.actuator.kind!r})"
+        return (
+            f"its motors got no torques (actuator.kind {scenario.actuator.kind!r}), and position "
+            "servos are found from a CSV log of setpoint_1[rad] to crank_6[rad]"
+        )
     if scenario.sensor.delay > 0:
         return f"its measurements are {scenario.sensor.delay:g} s old (sensor.delay)"
     return None

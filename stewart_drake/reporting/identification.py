@@ -28,6 +28,7 @@ _UNITS: Final = {
     "s": ("ms", 1e3),
 }
 """Unit in which an unknown is shown, and the factor, by its SI unit."""
+_WEAK: Final = 0.5
 _OF_KIND: Final = {
     "angles": [f"leg {leg}" for leg in LEGS],
     "pose": list(COORDINATE_NAMES),
@@ -38,16 +39,14 @@ _OF_KIND: Final = {
 
 def document(found: Identification) -> Document:
     """Return the identified values, their accuracy, and the fit."""
-    interval = number(1e3 * found.std[DELAY], 2)
-    digits = len(interval.partition(".")[2])
-    exact = f"{1e3 * found.values[DELAY]:.6g}"
+    interval, delay = _measured(1e3 * found.std[DELAY], 1e3 * found.values[DELAY])
     cautions, names = _cautions(found), file_names(found.logs)
     right = found.right
     return from_template(
         "identification",
         "bad" if not right else "fair" if cautions else "good",
         right=right,
-        delay=f"{1e3 * found.values[DELAY]:.{digits}f}" if right and "e" not in interval else exact,
+        delay=delay if right else f"{1e3 * found.values[DELAY]:.6g}",
         interval=interval,
         wrong=WRONG,
         logs=names,
@@ -64,6 +63,7 @@ def document(found: Identification) -> Document:
             )
             for i, name in enumerate(names)
         ],
+        weak=_weak(found) if right else [],
         poses=found.pose_uncertainty if right else None,
         outside=right and found.pose_uncertainty is None,
         **_shared(found, plan=None, reduced=False, motion=None),
@@ -84,7 +84,7 @@ def plan_document(plan: Plan) -> Document:
         reduced=plan.share < 1,
         logs=(),
         segments="",
-        **dict.fromkeys(("cautions", "outside", "fits", "residuals", "geometry")),
+        **dict.fromkeys(("cautions", "weak", "outside", "fits", "residuals", "geometry")),
         **_shared(plan, plan=plan),
     )
 
@@ -125,6 +125,21 @@ def _cautions(found: Identification) -> list[str]:
     return cautions
 
 
+def _measured(std: float, value: float) -> tuple[str, str]:
+    """Return a standard deviation in two digits, and a value with as many decimals."""
+    interval = number(std, 2)
+    if "e" in interval:
+        return interval, f"{value:.6g}"
+    return interval, f"{value:.{len(interval.partition('.')[2])}f}"
+
+
+def _weak(found: Identification) -> list[str]:
+    """Return the unknowns beside the geometry whose deviation is above _WEAK of that before."""
+    before = found.unknowns.std
+    rest = (k for k in found.unknowns.free if not _of_geometry(k))
+    return [NAMES[k].replace("_", " ") for k in rest if found.std[k] > _WEAK * before[k]]
+
+
 def _of_geometry(k: int) -> bool:
     return GEOMETRY.start <= k < DELAY
 
@@ -139,12 +154,18 @@ def _table(found: Identification, geometry: bool) -> Table:
 
 
 def _unknowns(free: Sequence[int], columns: dict[str, Array], brief: bool) -> Table:
-    """Return name and unit of each unknown, and columns of its numbers."""
+    """Return name and unit of each unknown, and columns of its numbers.
+
+    A value has the digits of its deviation, the column `±`.
+    """
     rows = []
     for k in free:
         unit, factor = _UNITS[SI_UNITS[k]]
-        numbers = [number(factor * values[k], 4) for values in columns.values()]
-        rows.append((NAMES[k].replace("_", " "), unit, *numbers))
+        numbers = {head: number(factor * values[k]) for head, values in columns.items()}
+        if "±" in columns and np.isfinite(columns["±"][k]):
+            (head, values), *_ = columns.items()
+            numbers["±"], numbers[head] = _measured(factor * columns["±"][k], factor * values[k])
+        rows.append((NAMES[k].replace("_", " "), unit, *numbers.values()))
     return Table(("unknown", "unit", *columns), rows, brief=brief)
 
 

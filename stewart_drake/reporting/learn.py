@@ -4,7 +4,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from stewart_drake.loop.learned import save_learned
 from stewart_drake.reporting.document import Document, Frame, from_template
@@ -51,7 +53,12 @@ def error_figure(study: LearnStudy) -> Figure:
     errors = [one.error for one in study.repetitions]
     curve = Curve(np.arange(1, len(errors) + 1), errors, "", line(0))
     name = "{}  [{}]".format(*study.measure)
-    return draw([Panel(name, [curve], "repetition", yscale="log", height=2.5)])
+    panel = Panel(name, [curve], "repetition", yscale="log", height=2.5, paint=_count)
+    return draw([panel])
+
+
+def _count(ax: Axes) -> None:
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def time_figure(study: LearnStudy) -> Figure:

@@ -71,6 +71,7 @@ def _document(identified: ServoIdentification, tone: Tone, **more: object) -> Do
         "servo_identification",
         tone,
         right=identified.right,
+        weak=identified.weak,
         mechanism=identified.model.mechanism.name,
         limit="none" if np.isinf(limit) else f"{limit:g} N m",
         mass=number(identified.model.mechanism.plate.mass),
