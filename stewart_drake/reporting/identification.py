@@ -55,7 +55,7 @@ def document(found: Identification) -> Document:
         found=_table(found, geometry=False),
         geometry=_table(found, geometry=True),
         chi2=found.chi2,
-        fits=found.chi2.items(),
+        fits=[("tolerances" if of == "prior" else of, chi2) for of, chi2 in found.chi2.items()],
         residuals=[
             Picture(
                 partial(residual_figure, found, i),

@@ -17,6 +17,7 @@ from stewart_drake.identification.servo_fit import (
 from stewart_drake.identification.servo_plan import SETPOINTS_FILE, ServoPlan
 from stewart_drake.reporting.document import Document, Table, Tone, from_template, number
 from stewart_drake.reporting.panels import Panel, draw, leg_curves
+from stewart_drake.reporting.style import unit_for
 from stewart_drake.types import Array
 
 _UNITS: Final = {"s": ("ms", 1e3), "rad": ("mrad", 1e3), "kg m^2": ("g m^2", 1e3)}
@@ -111,6 +112,7 @@ def _table(found: ServoIdentification, weak: bool) -> Table:
 
 
 def _figure(name: str, times: Array, angles: Array) -> Figure:
-    """Draw crank angles (n, 6), rad, in degrees."""
-    curves = leg_curves(times, np.degrees(angles), "crank")
-    return draw([Panel(f"{name}  [deg]", curves, legend="panel", height=2.5)])
+    """Draw crank angles (n, 6), rad, in degrees or thousandths."""
+    unit, factor = unit_for(np.degrees(angles), {"deg": 1.0, "mdeg": 1e3})
+    curves = leg_curves(times, factor * np.degrees(angles), "crank")
+    return draw([Panel(f"{name}  [{unit}]", curves, legend="panel", height=2.5)])
