@@ -9,7 +9,7 @@ import pytest
 from stewart_drake.cli import main
 from stewart_drake.core import build
 from stewart_drake.export import controller as export_c
-from stewart_drake.export.recording import EXPORTED, record
+from stewart_drake.export.recording import EXPORTED, _refusal, record
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
 from stewart_drake.scenario.loading import load_scenario
@@ -292,6 +292,11 @@ def test_a_shipped_controller_is_exported_or_refused_by_its_name(name):
     said = f"controller: {name} is not exported, because of .*; exported are {EXPORTED[0]}"
     with pytest.raises(ConfigError, match=said):
         record(scenario)
+
+
+def test_a_law_of_the_user_is_refused_by_what_it_is():
+    said = _refusal(load_scenario("paper"), "law")
+    assert said.startswith("law: got a law of your own, which is not exported")
 
 
 def test_a_run_that_does_not_end_is_refused():

@@ -345,10 +345,10 @@ def machine(
             moved = f"simulated by {running.simulated_by}"
             if options.reachy is not None:
                 moved = f"drives the robot behind {options.reachy}"
-            delivery.say(
+            delivery.say_wrapped(
                 f"machine {scenario} at {address[0]}:{address[1]}: {moved}, "
-                f"every {1e-6 * running.period:g} ms\n"
-                "waits for a controller; Ctrl-C ends it"
+                f"every {1e-6 * running.period:g} ms",
+                "waits for a controller; Ctrl-C ends it",
             )
             running.run(options.duration or math.inf)
         except KeyboardInterrupt:

@@ -120,16 +120,28 @@ def _states(runs: _Runs) -> Figure:
     least = np.maximum(_LEAST_SPAN * motion, _ROUNDING)
     time = wanted.time.values
     curves = [Curve(time, column, "reference", style.REFERENCE) for column in reference.T]
-    return _coordinates(runs, "pose", _STATE_REACH * spans, least, curves)
+    title = "Pose of the plate and its reference"
+    if lost := sum(run.stopped is not None for run, _ in runs.values()):
+        title += f": {lost} of {len(runs)} runs ended early"
+    return _coordinates(title, runs, "pose", _STATE_REACH * spans, least, curves)
 
 
 def _errors(runs: _Runs) -> Figure:
     spans = np.max([_spans(FACTORS * run.signals.reference.values) for run, _ in runs.values()], 0)
-    return _coordinates(runs, "error", _ERROR_REACH * spans, np.full(6, _ROUNDING))
+    title, errors = "Errors of the pose", {one: r.accumulated_error for one, (r, _) in runs.items()}
+    completed = {one: error for one, error in errors.items() if np.isfinite(error)}
+    if completed and len(runs) > 1:
+        title += f": least with {min(completed, key=completed.__getitem__)}"
+    return _coordinates(title, runs, "error", _ERROR_REACH * spans, np.full(6, _ROUNDING))
 
 
 def _coordinates(
-    runs: _Runs, signal: str, reach: Array, least: Array, wanted: Sequence[Curve] = ()
+    title: str,
+    runs: _Runs,
+    signal: str,
+    reach: Array,
+    least: Array,
+    wanted: Sequence[Curve] = (),
 ) -> Figure:
     """Draw the six coordinates of a signal, over the wanted ones; `reach`, `least`: `_limits`."""
     panels, word = [], "" if signal == "pose" else f" {signal}"
@@ -145,7 +157,7 @@ def _coordinates(
                 ylim=_limits(core, data, reach[k], least[k]),
             )
         )
-    return draw(panels, 2, down=True)
+    return draw(panels, 2, down=True, title=title)
 
 
 def _torques(run: SimulationResult, label: str, line: Line, commanded: bool = False) -> Figure:
@@ -161,7 +173,8 @@ def _torques(run: SimulationResult, label: str, line: Line, commanded: bool = Fa
     if has_packets(run):
         strip = partial(_packet_strip, run=run)
         panels.append(Panel("", xlim=xlim, height=1.15, wide=True, paint=strip))
-    return draw(panels, 2, down=True, sharey=True)
+    title = "Torques of the motors" if commanded else "Torques that acted"
+    return draw(panels, 2, down=True, sharey=True, title=title)
 
 
 def _packet_strip(ax: Axes, run: SimulationResult) -> None:
@@ -206,7 +219,7 @@ def _parameters(run: SimulationResult) -> Figure:
                 ylim=_limits([value, true[k] + np.array([-least, least])], [], 0.0),
             )
         )
-    return draw(panels, 2, down=True)
+    return draw(panels, 2, down=True, title="Parameters as the controller estimates them")
 
 
 def _delay(run: SimulationResult) -> Figure:
@@ -225,7 +238,7 @@ def _delay(run: SimulationResult) -> Figure:
         found = Curve(time, value, "estimate", steps=True, band=(low, high, "± 2 σ"))
         xlim = (0.0, shown_until(run))
         panels.append(Panel(name, [truth, found], xlim=xlim, ylim=ylim))
-    return draw(panels, 2)
+    return draw(panels, 2, title="Delay as the controller estimates it")
 
 
 def weights_figure(runs: Mapping[str, SimulationResult]) -> Figure:
@@ -241,7 +254,8 @@ def weights_figure(runs: Mapping[str, SimulationResult]) -> Figure:
         how: dict[str, Any] = {"xlim": (0, end), "yscale": "log" if len(weights) else "linear"}
         above.append(Panel("weight", [first, second], title=title, **how))
         below.append(Panel("w_Q / w_R", [other, constant], **how))
-    return draw([*above, *below], len(runs), sharey="row")
+    title = "Weights of the cost as the tuner sets them"
+    return draw([*above, *below], len(runs), sharey="row", title=title)
 
 
 def shown_until(run: SimulationResult) -> float:

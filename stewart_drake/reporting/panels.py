@@ -90,6 +90,7 @@ def draw(
     down: bool = False,
     sharey: bool | Literal["row"] = False,
     colors: tuple[ScalarMappable, str] | None = None,
+    title: str = "",
 ) -> Figure:
     """Draw panels in rows, or column by column with `down`, below a legend of all their curves.
 
@@ -100,6 +101,7 @@ def draw(
         sharey: whether all panels share a vertical axis; with "row" those of a row, while each has
             its own horizontal axis.
         colors: a scale of colours on the right, and its name.
+        title: of the legend.
     """
     grid = [one for one in panels if not one.wide]
     placed = [*grid, *(one for one in panels if one.wide)]
@@ -128,7 +130,7 @@ def draw(
         _fill(ax, one, last=last, named=column == 0 or not alike)
     figure.align_ylabels()
     titled = sum(any(one.title or one.legend == "panel" for one in row) for row in in_row)
-    lines = _legend(figure, panels) + titled
+    lines = _legend(figure, panels, title) + titled
     figure.set_figheight(sum(heights) + _LABELS * len(named) + _LEGEND_LINE * (lines + 0.5))
     if colors is not None:
         figure.colorbar(colors[0], ax=figure.axes, aspect=30).set_label(colors[1])
@@ -196,8 +198,8 @@ def limit(ax: Axes, level: float, text: str, *, below: bool = False) -> None:
     )
 
 
-def _legend(figure: Figure, panels: Sequence[Panel]) -> int:
-    """Name all curves above the figure, and return the number of lines."""
+def _legend(figure: Figure, panels: Sequence[Panel], title: str) -> int:
+    """Name all curves above the figure, below a title; return the number of lines."""
     handles: dict[str, Artist] = {}
     for ax, panel in zip(figure.axes, panels, strict=False):
         if panel.legend == "figure":
@@ -213,5 +215,6 @@ def _legend(figure: Figure, panels: Sequence[Panel]) -> int:
             break
     else:
         return 0
-    figure.legend(handles.values(), labels, loc="outside upper center", ncols=columns)
-    return lines
+    how: Any = {"loc": "outside upper center", "ncols": columns}
+    figure.legend(handles.values(), labels, title=title or None, **how)
+    return lines + bool(title)
