@@ -1,5 +1,7 @@
 """`live --learn`: torques, or setpoints of servos, learned from a machine, in real time."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from stewart_drake.live import design as designing
 from stewart_drake.live import learning
 from stewart_drake.live.exchange import Exchange
 from stewart_drake.live.learned import LearnedSetpoints, LearnedTorques
-from stewart_drake.live.learning import learn_live
+from stewart_drake.live.learning import LiveLessons, learn_live
 from stewart_drake.live.log import LiveRecord
 from stewart_drake.live.loop import LiveLoop
 from stewart_drake.live.options import LiveOptions
@@ -22,6 +24,7 @@ from stewart_drake.loop.preparation import prepare
 from stewart_drake.reporting.learn import document
 from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.studies.learn import LearnStudy, Repetition
 from tests.live_driver import in_real_time, running_machine
 
 STEPS = "delay.steps=13"
@@ -152,6 +155,27 @@ def test_a_packet_has_the_sum_and_the_law_the_rest(limit):
     assert loop._as_sent(39).counts.saturated_steps == loop._learned.saturated
     assert (loop._learned.saturated > 0) == (limit < 1)
     np.testing.assert_allclose(loop._as_sent(39).torque, asked + learned, atol=1e-12)
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_the_command_writes_the_page_of_learn(tmp_path, monkeypatch, capsys):
+    """The repetitions are canned."""
+    scenario = sd.load_scenario("paper", settings=("plant.kind=exact", "duration=1"))
+    run = sd.simulate(scenario, judge_stability=False)
+    late = {"median": 1.0, "p99": 2.0, "worst": 3.0}
+    counts = {"samples": 11, "deadlines_missed": 0, "periods_played": 10, "periods_dry": 0}
+    summary = run.summary | {"live": counts | {"sent_after_due_ms": late}}
+    run = dataclasses.replace(run, summary=summary)
+    done = [Repetition(None, run, 2.0), Repetition(some_signal(), run, 1.0)]
+    found = LearnStudy(prepare(scenario), 0.5, done, 2, interrupted=False, file="mine.npz")
+    monkeypatch.setattr(learning, "learn_live", lambda *_: LiveLessons(run, found))
+    command = ["live", "paper", "--machine", "127.0.0.1:9", "--learn", "2", "--out", str(tmp_path)]
+    assert main(command) == 0
+    assert "signals.nc, report.html" in " ".join(capsys.readouterr().out.split())
+    page = (tmp_path / "report.html").read_text()
+    assert "from 2.00 to 1.00 % s" in " ".join(page.split()) and page.count("<iframe") == 2
+    assert f"stewart-drake {' '.join(command)}" in " ".join(page.split())
+    assert "controller.learned=mine.npz" in page
 
 
 AMPLITUDE = 0.7 * np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
