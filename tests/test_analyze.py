@@ -95,7 +95,8 @@ def test_delay_of_the_paper(tmp_path, capsys):
         assert growth == pytest.approx(limit["amplification"])
     told = capsys.readouterr().out
     assert not too_long(told)
-    assert "can be compensated" in " ".join(told.split())
+    told = " ".join(told.split())
+    assert "can be compensated" in told and "%: a margin below 5 % is small." in told
     for part in ("1.64 ms longer", "21.0", "left 1.00", "no reach 1.00"):
         assert part in told
     assert page.count("<img") == 3
