@@ -218,7 +218,7 @@ def test_torques_of_a_machine_with_friction_and_payload_are_learned(tmp_path, wa
     with running_machine(machine, rate=5.0) as running:
         result, study = learn(wanted, running, file, said.append)
     assert result.status == "completed"
-    # Each repetition is a run of its own, to the same instant of the motion but for a sample.
+    # Each repetition is a separate run, to the same instant of the motion but for a sample.
     assert [one.error for one in study.repetitions] == study.summary["errors"]
     assert len(study.repetitions) == 3 and study.best is study.repetitions[2]
     last = [one.result.signals.isel(time=slice(-60, None)) for one in study.repetitions]

@@ -197,7 +197,7 @@ def _delivered(
     *logs: str,
     found: "AnalysisResult | None" = None,
 ) -> int:
-    """Write and print the result, and the page of what was learned; return the exit status.
+    """Write and print the result, and the page of `learn`; return the exit status.
 
     `logs` are the names of files that were written during the run.
     """

@@ -239,7 +239,7 @@ class TorqueLessons(Viewer):
             self._begin(t)
 
     def repetitions(self, run: SimulationResult) -> list[Repetition]:
-        """Return the end of each repetition's motion as a run of its own."""
+        """Return the end of each repetition's motion as a separate run."""
         found = list[Repetition]()
         for tried, end, error in zip(self.tried, self._ends, self.learning.errors, strict=False):
             begin = end - self._span

@@ -29,6 +29,7 @@ _UNITS: Final = {
 }
 """Unit in which an unknown is shown, and the factor, by its SI unit."""
 _WEAK: Final = 0.5
+"""Share of its deviation before the log above which an unknown is weak."""
 _OF_KIND: Final = {
     "angles": [f"leg {leg}" for leg in LEGS],
     "pose": list(COORDINATE_NAMES),
@@ -134,7 +135,7 @@ def _measured(std: float, value: float) -> tuple[str, str]:
 
 
 def _weak(found: Identification) -> list[str]:
-    """Return the unknowns beside the geometry whose deviation is above _WEAK of that before."""
+    """Return the names of the unknowns, without the geometry, that are hardly better known."""
     before = found.unknowns.std
     rest = (k for k in found.unknowns.free if not _of_geometry(k))
     return [NAMES[k].replace("_", " ") for k in rest if found.std[k] > _WEAK * before[k]]

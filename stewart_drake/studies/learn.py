@@ -90,7 +90,7 @@ class LearnStudy:
     asked: int  # number of repetitions that were asked for
     interrupted: bool  # whether it ended early for another reason than its errors
     measure: Measure = PERIOD_ERROR
-    file: str = "learned.npz"  # of what was learned
+    file: str = "learned.npz"  # with the learned torque or angles
 
     @property
     def best(self) -> Repetition:
