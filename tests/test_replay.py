@@ -61,6 +61,15 @@ def test_the_page_holds_what_the_run_was_like(run):
     assert np.abs(shares).max() == 1 and (np.sign(shares) == np.sign(torque))[shares != 0].all()
 
 
+def test_a_page_of_servos_shows_no_torques(run):
+    """The torque of position servos is unknown: NaN in a log in real time."""
+    assert "<div hidden>" not in replay_html(run, PAPER, "torques")
+    signals = run.signals.copy(deep=True)
+    signals.torque_applied.values[:] = np.nan
+    page = replay_html(dataclasses.replace(run, signals=signals), PAPER, "servos")
+    assert "<div hidden>" in page and np.all(np.array(data_of(page)["share"]) == 0)
+
+
 def test_the_angle_of_the_page_is_that_of_one_turn(run):
     """Calibration by construction: the plate is turned about z against its reference."""
     signals = run.signals.copy(deep=True)

@@ -52,7 +52,7 @@ def write(study: LearnStudy, folder: Path) -> list[str]:
 def error_figure(study: LearnStudy) -> Figure:
     errors = [one.error for one in study.repetitions]
     curve = Curve(np.arange(1, len(errors) + 1), errors, "", line(0))
-    name = "{}  [{}]".format(*study.measure)
+    name = "{}  [{}]".format(*study.measure).removeprefix("the ")
     panel = Panel(name, [curve], "repetition", yscale="log", height=2.5, paint=_count)
     return draw([panel])
 

@@ -83,7 +83,8 @@ def log_html(path: Path) -> str:
 def _html(signals: xr.Dataset, mechanism: Mechanism, title: str, outcome: str) -> str:
     meshcat = replay(signals, mechanism)
     shown = _thinned(signals)
-    torque = shown.torque_applied.values
+    known = bool(np.isfinite(shown.torque_applied.values).any())  # not that of servos
+    torque = np.nan_to_num(shown.torque_applied.values)
     largest = np.abs(torque).max(axis=1, initial=0.0)
     full = full_color(largest)
     data = {
@@ -101,6 +102,7 @@ def _html(signals: xr.Dataset, mechanism: Mechanism, title: str, outcome: str) -
         .render(
             title=title,
             outcome=outcome,
+            known=known,
             full=number(full, 2),
             peak=number(float(largest.max(initial=0.0)), 2),
             data=data,
