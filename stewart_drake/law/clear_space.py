@@ -10,7 +10,7 @@ from stewart_drake.dynamics.workspace import border
 from stewart_drake.mechanism.clearance import APART, clearances
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import legs_along, reach_margins
-from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_LEGS
+from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_LEGS, POSE
 from stewart_drake.types import Array
 
 RESERVE = 0.06
@@ -102,3 +102,15 @@ class ClearSpace:
         if fits(1.0):
             return 1.0
         return border(fits, 0.0, 1.0, 1e-3)[0]
+
+    def within(self, rows: Array) -> Array:
+        """Return the rows (n, 18) of a motion, shrunk towards home until they keep the reach."""
+        return self.moved(rows, self.shrunk(rows[:, POSE]))
+
+    def moved(self, rows: Array, share: float) -> Array:
+        """Return the rows (n, 18) of a motion, with its distance from home times a share."""
+        if share == 1.0:
+            return rows
+        moved = share * rows
+        moved[:, POSE] += (1 - share) * self.mechanism.home
+        return moved

@@ -39,7 +39,6 @@ from stewart_drake.law.predictive_lqi import OuterLqi, OuterMemory
 from stewart_drake.law.riccati import lqr_by_doubling
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import reach_margins
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE, POSE
 from stewart_drake.types import Array
@@ -112,9 +111,9 @@ class _Ahead(NamedTuple):
     share: float  # factor on its distance from home that keeps the reach, at most 1
     torques: Array  # (N, 6) feedforward of the shrunk reference, N m
 
-    def states(self, mechanism: Mechanism) -> Array:
+    def states(self, space: ClearSpace) -> Array:
         """Return the states (N + 1, 12) of the shrunk reference."""
-        return _shrunk(self.rows, self.share, mechanism)[:, :NUM_STATE]
+        return space.moved(self.rows, self.share)[:, :NUM_STATE]
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +265,7 @@ class LimitedLqi(OuterLqi):
         n, space, dynamics = self.limits.horizon, self.limits.space, self.plant.dynamics
         rows, nodes = further[: n + 1], further[n + 1 :]
         share = space.shrunk(further[:, POSE])
-        within = _shrunk(nodes, share, space.mechanism)
+        within = space.moved(nodes, share)
         held = self.feedforward.held(within, dynamics, belief.parameters)
         return _Ahead(rows, nodes, share, held.torques)
 
@@ -304,7 +303,7 @@ class LimitedLqi(OuterLqi):
         Q, R = self.cost.matrices(weights)
         errors = np.zeros(NUM_STATE)
         errors[POSE] = np.diag(Q)[:NUM_COORDINATES]
-        ends = np.tile(ahead.states(self.plant.mechanism)[-1], (2, 1))
+        ends = np.tile(ahead.states(self.limits.space)[-1], (2, 1))
         last = holds.linearised(ends, ahead.torques[-1:])
         _, P = lqr_by_doubling(last.Phi[0], last.Gamma[0], np.diag(errors), TERMINAL_R * R)
         torques = ahead.torques
@@ -319,16 +318,7 @@ class LimitedLqi(OuterLqi):
         """Return the shrunk reference, with its torques within the limit."""
         torques = self.plant.motors.saturate(ahead.torques)
         gains = np.zeros((len(torques), 6, NUM_STATE))
-        return Plan(ahead.states(self.plant.mechanism), torques, gains)
-
-
-def _shrunk(rows: Array, share: float, mechanism: Mechanism) -> Array:
-    """Return rows (n, 18) of a motion with its distance from home, and its rates, times a share."""
-    if share == 1.0:
-        return rows
-    shrunk = share * rows
-    shrunk[:, POSE] += (1 - share) * mechanism.home
-    return shrunk
+        return Plan(ahead.states(self.limits.space), torques, gains)
 
 
 def _sending(memory: Memory, torques: Array, integral: Array) -> Memory:

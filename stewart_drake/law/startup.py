@@ -12,6 +12,7 @@ import numpy as np
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
+from stewart_drake.law.clear_space import ClearSpace
 from stewart_drake.law.feedforward import mean_torques
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.delay import Delay
@@ -110,15 +111,28 @@ def weight_scales(
     return 1 / tolerable**2, 1 / tolerable**2, np.full(NUM_TORQUES, 1 / peak**2)
 
 
-def reference_torques(dynamics: StewartDynamics, reference: Trajectory, duration: float) -> Array:
-    """Return the largest of the six motor torques (INSTANTS,) along the reference, N m."""
+def reference_torques(
+    dynamics: StewartDynamics,
+    reference: Trajectory,
+    duration: float,
+    space: ClearSpace | None = None,
+) -> Array:
+    """Return the largest of the six motor torques (INSTANTS,) along the reference, N m.
+
+    With a space it is that along the reference shrunk into reach.
+    """
     rows = np.array([evaluate(reference, t) for t in spread_instants(duration, INSTANTS)])
-    return np.abs(dynamics.torques_along(rows)).max(axis=1)
+    return np.abs(dynamics.torques_along(space.within(rows) if space else rows)).max(axis=1)
 
 
-def reference_torque(dynamics: StewartDynamics, reference: Trajectory, duration: float) -> float:
-    """Return the largest motor torque that the reference takes, N m."""
-    return float(reference_torques(dynamics, reference, duration).max())
+def reference_torque(
+    dynamics: StewartDynamics,
+    reference: Trajectory,
+    duration: float,
+    space: ClearSpace | None = None,
+) -> float:
+    """Return the largest motor torque that the reference takes, N m; see `reference_torques`."""
+    return float(reference_torques(dynamics, reference, duration, space).max())
 
 
 def choose_substeps(

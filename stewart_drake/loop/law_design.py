@@ -148,7 +148,9 @@ class Sizing(NamedTuple):
     """Step size and torque scales of a law, computed from its machine and motion."""
 
     substeps: int  # of the prediction, per period
-    reference_torque: float  # largest along the reference, N m
+    reference_torque: float  # largest along the reference, N m; it sets the weights
+    # the same where the plate can follow it: at the end of a leg's reach torques have no bound
+    reachable_torque: float
     machine_torque: float  # see `law.startup.machine_torque`, N m
 
 
@@ -157,9 +159,14 @@ def sizing_of(experiment: Experiment) -> Sizing:
     sc, nominal, reference = experiment.scenario, experiment.nominal, experiment.reference
     period, steps = sc.controller.period, believed_delay(sc).steps
     substeps = choose_substeps(nominal, reference, period, steps, sc.duration)
+    largest = reachable = reference_torque(nominal, reference, sc.duration)
+    if sc.controller.limits == "qp":
+        space = clear_space(experiment)
+        reachable = reference_torque(nominal, reference, sc.duration, space)
     return Sizing(
         max(substeps, turning_substeps(nominal, reference, period, sc.duration)),
-        reference_torque(nominal, reference, sc.duration),
+        largest,
+        reachable,
         machine_torque(nominal),
     )
 
@@ -191,9 +198,9 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     c, motion = sc.controller, experiment.motion_scale
     sensor, link = SENSORS[type(sc.sensor)], LINKS[type(sc.link)]
     timeline = Timeline(c.period, believed_delay(sc))
-    substeps, peak_torque, machine_scale = sizing or sizing_of(experiment)
-    torque_scale = max(machine_scale, peak_torque)
-    motion_torque = max(STILL * machine_scale, peak_torque)
+    substeps, peak_torque, reachable, machine_scale = sizing or sizing_of(experiment)
+    torque_scale = max(machine_scale, reachable)
+    motion_torque = max(STILL * machine_scale, reachable)
     parameters = estimated_parameters(experiment, torque_scale, motion_torque)
     noise = sc.sensor.noise_std if isinstance(sc.sensor, StateSensorConfig) else None
     exact, tolerated = _learns(sc), tolerated_timing(experiment)
