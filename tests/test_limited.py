@@ -9,14 +9,16 @@ from pydrake.solvers import ClarabelSolver, MathematicalProgram
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.export.controller import exported
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.law.belief import Belief, Estimate
 from stewart_drake.law.catch_up import LEAST_ERROR_SHARE
 from stewart_drake.law.clear_space import ClearSpace
 from stewart_drake.law.coverage import uncovered
 from stewart_drake.law.feedforward import GAUSS_NODES, InverseDynamicsFeedforward, mean_torques
-from stewart_drake.law.horizon import HoldModel, HorizonCost, condense, riccati
+from stewart_drake.law.horizon import HoldModel, HorizonCost, condense, pose_root, riccati
 from stewart_drake.law.horizon_qp import NEAR, QpError, problem_of, solve_by_daqp
 from stewart_drake.law.limited import LimitedLqi
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
+from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.law_design import clear_space, compose_law, way_onto
 from stewart_drake.loop.preparation import prepare
@@ -24,6 +26,7 @@ from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.clearance import APART
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.reporting.run import run_document
+from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.trajectories import evaluate
 from tests.oracles import central_difference
@@ -180,6 +183,40 @@ def test_without_limits_the_problem_has_no_rows_far_from_the_edge(paper, plan):
     assert problem_of(found, far, torques, np.inf, unguarded).A.size == 0
 
 
+def test_the_root_of_the_pose_is_that_of_sampled_predictions(paper):
+    """States and parameters drawn from the belief, integrated through the torques in flight."""
+    rng, size = np.random.default_rng(5), 400
+    dynamics = StewartDynamics(paper, gravity=True)
+    plant = NominalPlant(dynamics, 4, 1.0, TorqueLimit())
+    n = 12 + len(dynamics.free)
+    spread = np.concatenate([np.full(6, 1e-4), np.full(6, 1e-3), np.full(n - 12, 1e-4)])
+    C = np.diag(spread**2)
+    mean = np.concatenate([paper.home, np.zeros(6), dynamics.parameters])
+    timeline = Timeline(0.1, Delay(4))
+    belief = replace(Belief.nothing(timeline, 12, dynamics.parameters), estimate=Estimate(mean, C))
+    schedule = timeline.until_next(np.tile(dynamics.equilibrium_torque(paper.home), (4, 1)))
+    W = pose_root(plant, belief, schedule)
+    drawn = mean + spread * rng.standard_normal((size, n))
+    ends = [plant.predict(xi[:12], schedule, xi[12:])[-1, :6] for xi in drawn]
+    stated = np.linalg.cholesky(W @ W.T)
+    whitened = np.linalg.solve(stated, (ends - np.mean(ends, axis=0)).T)
+    eigenvalues = np.linalg.eigvalsh(whitened @ whitened.T / (size - 1))
+    low, high = ((1 + sign * np.sqrt(6 / size)) ** 2 for sign in (-1, 1))  # Marchenko-Pastur
+    assert 0.9 * low < eigenvalues[0] and eigenvalues[-1] < 1.1 * high
+
+
+def test_a_plan_keeps_a_standard_deviation_of_each_distance(paper, plan):
+    _, states, torques, model, cost = plan
+    found = condense(model, riccati(model, cost, states, torques), np.zeros(12))
+    space, root = ClearSpace.along(paper, paper.home[None]), 1e-3 * np.eye(6)
+    poses = states[1:, :6]
+    known, unsure = (problem_of(found, poses, torques, np.inf, space, w) for w in (0 * root, root))
+    slopes = space.near(poses, NEAR).slopes
+    np.testing.assert_allclose(
+        unsure.lower - known.lower, 1e-3 * np.linalg.norm(slopes, axis=1), rtol=1e-9, atol=1e-12
+    )
+
+
 def test_slopes_of_the_distances_are_their_derivatives(paper):
     space = clear_space(prepare(load_scenario("desktop")))
     poses = space.mechanism.home + 1e-3 * np.random.default_rng(2).standard_normal((3, 6))
@@ -246,6 +283,24 @@ def test_a_reference_that_leaves_the_workspace_is_refused_without_plans_and_gove
     out = "reference.offset=[0, 0, 0, 0, 0, 0.9]"
     with pytest.raises(ConfigError, match=r"reference: .* at t = 0\.00 s"):
         prepare(load_scenario("paper", "predictor_mpc", (*ON, NONE, out)))
+
+
+@pytest.mark.parametrize("seed", [7001, 7002, 7006])
+def test_a_reference_that_leaves_the_workspace_is_governed_with_an_unknown_bias(seed):
+    """The prior is that of a motion within reach: beyond it torques have no bound."""
+    signs = np.random.default_rng(seed).choice([-1.0, 1.0], 6)
+    amplitude = np.array([np.deg2rad(15)] * 3 + [0.02, 0.02, 0.08])
+    noise = (1e-3 * np.tile(amplitude, 2)).tolist()
+    settings = (
+        f"reference.amplitude={(1.2 * amplitude).tolist()}",
+        f"sensor.noise_std={noise}",
+        f"sensor.seed={seed}",
+        f"plant.torque_bias={(3e-4 * signs).tolist()}",
+        "plant.payload_mass=0.02",
+        "duration=2",
+    )
+    found = run_in_bulk(load_scenario("paper", "predictor_mpc", (*ON, *settings)))
+    assert found.status == "completed"
 
 
 def test_drakes_loop_and_the_loop_in_c_agree():

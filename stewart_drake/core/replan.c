@@ -86,8 +86,10 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
                                    pieces + PIECE * number, &peak, scratch);
         if (added == 0)
             return 0;
-        if (peak <= law->machine.torque_limit || periods >= replan->most)
+        if (peak <= law->machine.torque_limit)
             break;
+        if (periods >= replan->most)
+            return 0;
     }
     memory[SINCE_PLAN] = 0;
     memory[PIECES] = (real)(number + added);

@@ -16,7 +16,7 @@
 
 typedef struct {
     int periods;  /* length of a plan, at least two; doubled while the plan exceeds the torque limit, */
-    int most;     /* up to this */
+    int most;     /* up to this; no plan exceeds the limit */
     int until;    /* largest number of torques that act before the next one */
     real size[6]; /* of the motion, peak to peak, rad and m */
     real sure;    /* largest standard deviation of the predicted pose for a plan, share of `size` */

@@ -15,9 +15,11 @@ import numpy as np
 
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.compiled import Once, machine_of
+from stewart_drake.law.belief import Belief
+from stewart_drake.law.compiled import Once, machine_of, numbers
 from stewart_drake.law.feedforward import GAUSS_NODES
 from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.timeline import TorqueSchedule
 from stewart_drake.scenario.signals import (
     BIAS,
     NUM_COORDINATES,
@@ -141,6 +143,31 @@ def _by_bias(plant: NominalPlant) -> NominalPlant:
     d = plant.dynamics
     own = StewartDynamics(d.mechanism, d.gravity, d.plant_parameters, PARAMETERS[BIAS])
     return NominalPlant(own, plant.substeps, plant.coarse_torque_limit, plant.motors)
+
+
+def pose_root(plant: NominalPlant, belief: Belief, schedule: TorqueSchedule) -> Array:
+    """Return a root W (6, n) of the covariance W W' of the pose at the end of a prediction.
+
+    With C the covariance of [state; parameters] now, and H the derivative of the predicted pose by
+    both, W W' = H C H'. Without a covariance W is zero.
+    """
+    C, number = belief.estimate.covariance, len(schedule.torques)
+    if not belief.estimate.uncertain:
+        return np.zeros((NUM_COORDINATES, 1))
+    w, U = np.linalg.eigh(C)
+    H = np.eye(len(C))[:NUM_STATE]
+    if number:
+        c, maps = core(), np.empty((number, NUM_STATE, len(C)))
+        states = numbers(plant.predict(belief.state, schedule, belief.parameters))
+        given = [numbers(a) for a in (belief.estimate.mean, *schedule)]
+        mean, torques, durations = map(c.at, given)
+        until = c.ffi.new("stewart_schedule *", [number, torques, durations, 0])
+        scratch = c.scratch(c.lib.stewart_transitions_scratch(len(belief.parameters)))
+        arrays = until, 0, c.at(states), c.at(maps), scratch
+        if not c.lib.stewart_transitions(machine_of(plant).it, mean, *arrays):
+            raise ArithmeticError("prediction: no derivatives at a state of it")
+        H = maps[-1]
+    return H[POSE] @ (U * np.sqrt(np.maximum(w, 0.0)))
 
 
 class HorizonCost(NamedTuple):

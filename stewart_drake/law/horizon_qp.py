@@ -5,8 +5,11 @@ without limits. Limits are affine in v, so that the plan within them is
 
     minimise   |v|^2 / 2 + sum_j (w s_j + q s_j^2 / 2)   over v and s >= 0
     subject to |T_j| <= limit,                                                          (qp)
-               room_i(x_j) + s_j >= 0    for each leg and pair of links i that is near.
+               room_i(x_j) - sigma_i + s_j >= 0    for each leg and pair of links i that is near.
 
+sigma_i is the standard deviation of the room where the plan begins: parameters that are not yet
+known may lead the plate nearer to the edge than the plan does. It is not propagated along the plan,
+since each later sample plans again and knows more.
 The room has one slack s_j per sample, with the linear penalty w. It is exact: s = 0 wherever a plan
 within the workspace exists, since w exceeds the multipliers. The identity as Hessian needs no
 factorisation, and a dual active-set method starts at v = 0.
@@ -19,12 +22,14 @@ import numpy as np
 
 from stewart_drake.law.clear_space import ClearSpace
 from stewart_drake.law.horizon import Condensed
-from stewart_drake.scenario.signals import POSE
+from stewart_drake.scenario.signals import NUM_COORDINATES, POSE
 from stewart_drake.types import Array
 
 SLACK_WEIGHT = 1e3
 """Cost w of the slack per shortest crank; a pose error of the whole motion costs 1/2."""
 _SLACK_CURVATURE = 0.1
+KNOWN: Final = np.zeros((NUM_COORDINATES, 1))
+"""Root of the covariance of a pose that is known exactly."""
 NEAR = 0.25
 """Room, in shortest cranks, below which a distance is a constraint."""
 MOST_ITERATIONS = 1000
@@ -73,7 +78,12 @@ class Solver(Protocol):
 
 
 def problem_of(
-    found: Condensed, poses: Array, torques: Array, limit: float, space: ClearSpace
+    found: Condensed,
+    poses: Array,
+    torques: Array,
+    limit: float,
+    space: ClearSpace,
+    root: Array = KNOWN,
 ) -> LeastDistance:
     """Return (qp) of a plan.
 
@@ -83,14 +93,16 @@ def problem_of(
         torques: (N, 6) of the plan, N m.
         limit: of each motor, N m, infinite for none.
         space: distances to keep.
+        root: (6, n) of the covariance of the pose where the plan begins, see `horizon.pose_root`.
     """
     n = torques.size
     near = space.near(poses, NEAR)
+    uncertainty = np.linalg.norm(near.slopes @ root, axis=1)  # one standard deviation of the room
     samples, column = np.unique(near.pose, return_inverse=True)
     moved = np.einsum("ri,ri->r", near.slopes, found.states[1:][near.pose, POSE])
     by_v = np.einsum("ri,riv->rv", near.slopes, found.state_map[1:][near.pose, POSE])
     slack, number = np.eye(len(samples))[column], len(samples)
-    A, lower = [np.hstack([slack, by_v])], [-near.room - moved]
+    A, lower = [np.hstack([slack, by_v])], [uncertainty - near.room - moved]
     upper = [np.full(len(column), np.inf)]
     if np.isfinite(limit):
         by_torque = found.torque_map.reshape(n, n) / limit

@@ -30,7 +30,15 @@ from stewart_drake.law.clear_space import RESERVE, ClearSpace
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.counts import Counts
 from stewart_drake.law.feedforward import GAUSS_NODES
-from stewart_drake.law.horizon import NODES, HoldModel, HorizonCost, Plan, condense, riccati
+from stewart_drake.law.horizon import (
+    NODES,
+    HoldModel,
+    HorizonCost,
+    Plan,
+    condense,
+    pose_root,
+    riccati,
+)
 from stewart_drake.law.horizon_qp import QpError, Solver, problem_of, solve_by_daqp
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import Motion, Preview
@@ -131,8 +139,14 @@ class _Search:
         later = last.later(self.reference.states[-1], self.reference.torques[-1])
         return self._along(later, 0) or later
 
-    def within(self, plan: Plan, cost: HorizonCost, until: float) -> Plan:
+    def within(self, plan: Plan, cost: HorizonCost, root: Array, until: float) -> Plan:
         """Return the plan after LINEARISATIONS quadratic programs, fewer if time is short.
+
+        Args:
+            plan: to begin with.
+            cost: of a plan.
+            root: (6, n) of the covariance of the pose at the start, see `law.horizon.pose_root`.
+            until: end of the time, s, as of `time.perf_counter`.
 
         Raises:
             QpError: the first one has no solution.
@@ -150,7 +164,7 @@ class _Search:
                 policy = riccati(model, cost, plan.states, plan.torques)
                 m = condense(model, policy, self.start - plan.states[0])
                 poses = plan.states[1:, POSE]
-                problem = problem_of(m, poses, plan.torques, motors.limit, limits.space)
+                problem = problem_of(m, poses, plan.torques, motors.limit, limits.space, root)
                 v = limits.solver(problem, left)[problem.slacks :]
             except (ArithmeticError, np.linalg.LinAlgError):
                 if number > 0:
@@ -235,8 +249,8 @@ class LimitedLqi(OuterLqi):
         belief, timeline = after.belief, after.belief.timeline
         start, flying = belief.state, after.in_flight[:-1]
         queue = flying[len(flying) - timeline.queue_length :]
+        schedule = timeline.until_next(queue)
         if len(queue):
-            schedule = timeline.until_next(queue)
             start = self.plant.predict(start, schedule, belief.parameters)[-1]
         holds = HoldModel(self.plant, belief.parameters, timeline.period)
         ahead = self._ahead(further, belief)
@@ -248,12 +262,13 @@ class LimitedLqi(OuterLqi):
         cause = None
         try:
             cost = self._cost(after, ahead, holds, weights * [1.0, self.caution(belief)])
+            root = pose_root(self.plant, belief, schedule)
             try:
-                plan = search.within(last or search.reference, cost, until)
+                plan = search.within(last or search.reference, cost, root, until)
             except (ArithmeticError, np.linalg.LinAlgError):
                 if last is None:
                     raise
-                plan = search.within(search.reference, cost, until)
+                plan = search.within(search.reference, cost, root, until)
         except (ArithmeticError, np.linalg.LinAlgError) as error:  # the last plan goes on
             cause = "qp_late" if isinstance(error, QpError) and error.late else "qp_failures"
         torques = after.plan

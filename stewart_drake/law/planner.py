@@ -70,7 +70,7 @@ class Replan:
 
     Attributes:
         duration: of the plan, s. It is doubled while the plan exceeds the motors' limit.
-        longest: s, up to which; a plan of this length may exceed the limit.
+        longest: s, up to which. No plan is made that exceeds the limit.
         size: (6,) of the motion, peak to peak, rad and m.
         sure: largest standard deviation of the predicted pose at which a plan is made, as a share
             of the size. A plan from an uncertain state can make things worse.

@@ -91,6 +91,9 @@ LONGEST_REPLAN = 0.4
 """Longest plan back onto the reference where `controller.replan` is null, s."""
 REPLAN_SHARE = 0.2
 """The same as a share of the assumed delay: the error is still small."""
+LIMITED_REPLAN = 0.5
+"""Longest plan under a torque limit, over the catch-up from rest. Longer ones start the way anew
+where feedback alone would arrive earlier."""
 SURE_ON_REFERENCE = 0.01
 """`law.planner.SURE` with a known delay, after a start on the reference. Feedback answers a noisy
 prediction that is off now and then: plans would add to the noise of long delays with gravity."""
@@ -366,8 +369,8 @@ def on_its_way(
 def _replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> PredictiveLqi:
     """Return the law that plans a way back onto the reference, or `law` where it does not.
 
-    After a start from rest with a catch-up of `length` s it plans again for as long: payload and
-    bias were unknown before. After a start on the reference it takes back what they moved the plate
+    After a start from rest with a catch-up of `length` s it plans again for as long, under a torque
+    limit for half as long at the most: payload and bias were unknown before. After a start on the reference it takes back what they moved the plate
     by before they were known. It does not plan without estimated parameters, with a linear
     prediction, with a quadratic program, or with `replan: 0`. With a known delay it also does not
     plan over packets, with late measurements, or after a start from rest without a catch-up (0 s).
@@ -379,8 +382,12 @@ def _replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> Pr
     prompt = isinstance(law.channel, Wire) and law.longest_wait == 0
     if not law.finds_delay and not (prompt and (length or sc.start != "rest")):
         return law
-    usual = replan or length or min(LONGEST_REPLAN, REPLAN_SHARE * law.timeline.eta)
-    longest = replan or length or LONGEST_REPLAN
+    short = min(LONGEST_REPLAN, REPLAN_SHARE * law.timeline.eta)
+    usual, longest = (length, length) if length else (short, LONGEST_REPLAN)
+    if length and experiment.planned_limit is not None:
+        usual, longest = short, LIMITED_REPLAN * length
+    if replan:
+        usual = longest = replan
     sure = SURE if length or law.finds_delay else SURE_ON_REFERENCE
     return replace(law, planner=Replan(usual, longest, experiment.scale, sure))
 
