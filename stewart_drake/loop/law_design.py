@@ -370,10 +370,11 @@ def _replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> Pr
     """Return the law that plans a way back onto the reference, or `law` where it does not.
 
     After a start from rest with a catch-up of `length` s it plans again for as long, under a torque
-    limit for half as long at the most: payload and bias were unknown before. After a start on the reference it takes back what they moved the plate
-    by before they were known. It does not plan without estimated parameters, with a linear
-    prediction, with a quadratic program, or with `replan: 0`. With a known delay it also does not
-    plan over packets, with late measurements, or after a start from rest without a catch-up (0 s).
+    limit for half as long at the most: payload and bias were unknown before. After a start on the
+    reference it takes back what they moved the plate by before they were known. It does not plan
+    without estimated parameters, with a linear prediction, with a quadratic program, or with
+    `replan: 0`. With a known delay it also does not plan over packets, with late measurements, or
+    after a start from rest without a catch-up (0 s).
     """
     sc, replan = experiment.scenario, experiment.scenario.controller.replan
     nonlinear = isinstance(law.predictor, NonlinearPredictor) and not isinstance(law, LimitedLqi)
