@@ -87,7 +87,7 @@ INVALID = [
         "pattern.plate_order: got [0, 0, 1, 2, 3, 4]",
         "each of 0 to 5 once",
     ),
-    ({"pattern.plate_order": [6, 0, 1, 2, 3, 4]}, "pattern.plate_order[0]: got 6", "equal to 5"),
+    ({"pattern.plate_order": [6, 0, 1, 2, 3, 4]}, "pattern.plate_order[0]: got 6", "at most 5"),
     (
         {"home": [0, 0, 0, 0, 0, 0.6]},
         "home: got [0, 0, 0, 0, 0, 0.6], out of reach: all legs short by ",
