@@ -245,8 +245,8 @@ def test_where_nothing_binds_it_is_predictor_lqi():
     unknown = "plant.torque_bias=[1e-4, -1e-4, 1e-4, 1e-4, -1e-4, 1e-4]", "plant.payload_mass=0.1"
     settings = (*ON, half, *unknown, "duration=2", "delay.fraction=0.25")
     free, plans = (
-        simulate(load_scenario("paper", name, (*settings, *way)), judge_stability=False)
-        for name, way in (("predictor_lqi", ("controller.replan=0",)), ("predictor_mpc", ()))
+        simulate(load_scenario("paper", name, settings), judge_stability=False)
+        for name in ("predictor_lqi", "predictor_mpc")
     )
     assert plans.summary["counts"]["limited_steps"] == 0
     for signal in ("torque_commanded", "pose", "state_estimate"):

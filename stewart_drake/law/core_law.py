@@ -253,6 +253,19 @@ class CompiledLaw:
         self._raise_errors()
         return after
 
+    def followed(self, memory: Memory, motion: Motion, times: Array) -> Array:
+        """Return the rows (n, 18) that the law follows at instants (n,) in s from the last step."""
+        c, planner = core(), self.data.planner
+        if planner == c.ffi.NULL:
+            return motion(times)
+        sample, rows = c.ffi.new("stewart_sample *"), np.empty((len(times), NUM_REFERENCE))
+        sample.reference, goal = self._own.motion
+        sample.goal = goal if isinstance(motion, KnownMotion) else c.ffi.NULL
+        given = c.at(memory.field("planner")), sample, len(times), c.at(times), c.at(rows)
+        planner.rows(self.data, *given)
+        self._raise_errors()
+        return rows
+
     def _raise_errors(self) -> None:
         """Raise the first error of a part in Python since the last call."""
         for errors in self._raised:

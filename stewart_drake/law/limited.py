@@ -240,10 +240,14 @@ class LimitedLqi(OuterLqi):
             The new memory. Its torque is that of the free law where its plan meets the limits.
         """
         begun, before = time.perf_counter(), memory.free
-        rows, own = np.asarray(motion(self.preview_times)), len(self.free.preview_times)
-        given = Preview(self.free.preview_times, rows[:own])
+        own = self.free.preview_times
+        times, given = self.preview_times[len(own) :], motion
+        if not self.free.moves:
+            rows = np.asarray(motion(self.preview_times))
+            given, motion = Preview(own, rows[: len(own)]), Preview(times, rows[len(own) :])
         after = self.free.step(before, measurement, given, weights, report)
-        quiet, further = before.silence > 0 and after.silence > 0, rows[own:]
+        further = after.compiled.followed(after, motion, times)
+        quiet = before.silence > 0 and after.silence > 0
         if quiet or not after.belief.feeds_back or not np.isfinite(further).all():
             return memory.following(after)
         belief, timeline = after.belief, after.belief.timeline

@@ -372,12 +372,12 @@ def _replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> Pr
     After a start from rest with a catch-up of `length` s it plans again for as long, under a torque
     limit for half as long at the most: payload and bias were unknown before. After a start on the
     reference it takes back what they moved the plate by before they were known. It does not plan
-    without estimated parameters, with a linear prediction, with a quadratic program, or with
-    `replan: 0`. With a known delay it also does not plan over packets, with late measurements, or
-    after a start from rest without a catch-up (0 s).
+    without estimated parameters, with a linear prediction, or with `replan: 0`. With a known delay
+    it also does not plan over packets, with late measurements, or after a start from rest without a
+    catch-up (0 s).
     """
     sc, replan = experiment.scenario, experiment.scenario.controller.replan
-    nonlinear = isinstance(law.predictor, NonlinearPredictor) and not isinstance(law, LimitedLqi)
+    nonlinear = isinstance(law.predictor, NonlinearPredictor)
     if replan == 0 or not (law.estimates and nonlinear):
         return law
     prompt = isinstance(law.channel, Wire) and law.longest_wait == 0
