@@ -215,8 +215,8 @@ def test_late_torques_are_told_from_a_wrong_model_by_the_direction(times, wide, 
     for _ in range(600):
         drawn = wide * rng.standard_normal(12) * np.sqrt(1 + times * kick**2)
         stated = 1 + noise.timing * kick**2
-        given = 12, c.at(drawn), c.at(stated), c.at(np.eye(12)), 1, c.at(kick)
-        c.lib.stewart_noise_learn(*given, 1, *map(c.at, nothing), 0.98, noise)
+        given = 12, c.at(drawn), c.at(stated)
+        c.lib.stewart_noise_learn(*given, 1, *map(c.at, nothing), 1, c.at(kick), 0.98, noise)
         found.append(noise.timing)
     assert low <= np.mean(found[100:]) <= high
 

@@ -244,32 +244,32 @@ def test_a_step_is_what_batch_least_squares_finds(samples, free):
     early = assumed.timing_std
 
     def noise(xi):
-        """(M, 6) variances: of the projected samples, and of the model's drift, seen by a leg."""
+        """Covariance (6 M, 6 M): projected samples, drift of the model and late torques at nodes."""
         end = DYNAMICS.predict(xi[:12], PERIOD.torques, PERIOD.durations, 20, xi[12:20])[-1]
         pushes = np.array([*PERIOD.torques, PERIOD.following])
         a = [DYNAMICS.accelerations(end[POSE], end[RATES], T, xi[12:20]) for T in pushes]
-        left = DT - np.cumsum(PERIOD.durations)
-        late = early * left[:, None] * np.diff(a, axis=0)
+        changed = np.cumsum(PERIOD.durations)
+        late = early * (DT - changed)[:, None] * np.diff(a, axis=0)
         drift = model + 0.01 * np.sum(late**2, axis=0)
-        rows = []
+        variances, kicks = [], []
         for share, g in zip(shares, G, strict=True):
             held = np.maximum([min(share * DT, 0.03), share * DT - min(share * DT, 0.03)], 1e-12)
             pose = DYNAMICS.predict(xi[:12], PERIOD.torques, held, 20, xi[12:20])[-1, POSE]
             J = PAPER.jacobian(pose)
-            rows.append(
-                encoders.std**2 * g @ g + share**2 * (J**2 @ drift + np.sum((J @ late.T) ** 2, 1))
-            )
-        return np.array(rows)
+            variances.append(encoders.std**2 * g @ g + share**2 * J**2 @ drift)
+            passed = early * np.maximum(share * DT - changed, 0)
+            kicks.append(J @ (passed[:, None] * np.diff(a, axis=0)).T)
+        return np.diag(np.ravel(variances)) + 0.99 * (K := np.vstack(kicks)) @ K.T
 
-    # The filter takes the variances where it linearises; they hardly change.
-    deviation = np.sqrt(noise(mean))
+    # The filter takes the covariance where it linearises; it hardly changes.
+    C = np.linalg.cholesky(noise(mean))
 
     def misfit(xi):
         shown = angles_of(xi[:12], xi[12:20], samples)
         if len(free) > len(PARAMETERS):
             shown = shown + xi[20:]
-        beside = G @ (read - shown)
-        return np.concatenate([np.linalg.solve(L, xi - mean), (beside / deviation).ravel()])
+        beside = (G @ (read - shown)).ravel()
+        return np.concatenate([np.linalg.solve(L, xi - mean), np.linalg.solve(C, beside)])
 
     scale = np.sqrt(np.diag(P))
     batch = least_squares(

@@ -53,8 +53,10 @@ static stewart_schedule cut(const stewart_schedule *schedule, int n, const real 
 
        H_j = J(q_j) F_j[pose],   R_j = diag(var_j) + diag(s_j^2 J Q J'),
 
-   Q the drift of the pose over a period, which counts as noise here as it does there, and so do late
-   torques. Each leg is judged by itself at each node: one with e^2 > 30 S, S = H P H' + R, is left out,
+   Q the drift of the pose over a period, which counts as noise here as it does there. A torque that
+   changes at t_c by that of an acceleration a_c, late by sigma, adds k_c k_c' to the covariance,
+
+       k_c = sigma (s_j - t_c) J(q_j) a_c   at nodes after it.   Each leg is judged by itself at each node: one with e^2 > 30 S, S = H P H' + R, is left out,
    and the step goes on with the rest; if that is less than half, the measurement is an outlier. */
 
 typedef struct {
@@ -68,6 +70,9 @@ typedef struct {
     real *seen;       /* (number, 12) states of `fine` */
     stewart_reading reading;
     int round, number, kept[MAX_ROWS];
+    real *since;      /* (M, changes) s from a change of torque to a node, 0 before it */
+    real *kicks;      /* (number, changes) effects of the torques' timing, whitened, of the rows kept */
+    real *C;          /* (number, number) Cholesky factor of their covariance */
     const real *rows; /* (number, n) whitened, of those kept */
 } Legs;
 
@@ -137,17 +142,17 @@ static int rows_of_legs(void *model, const real *xi, real *e, real *H, stewart_s
                 const real moved = share * J[6 * leg + i] * a->drift[i];
                 variance[row] += moved * moved;
             }
-            for (int k = 0; k < a->changes; k++) {
-                const real moved = share * stewart_dot(6, J + 6 * leg, a->late + X * k);
-                variance[row] += moved * moved;
-            }
+            for (int c = 0; c < a->changes; c++)
+                s->kicks[a->changes * row + c] = s->since[a->changes * node + c]
+                                                 * stewart_dot(6, J + 6 * leg, a->kicks + X * c + 6);
             if (offsets >= 0)
                 H[n * row + X + offsets + leg] += 1;
         }
     }
     if (s->round++ == 0) {
         for (int row = 0; row < rows; row++) {
-            real S = variance[row];
+            const real *kicks = s->kicks + a->changes * row;
+            real S = variance[row] + a->along * stewart_dot(a->changes, kicks, kicks);
             for (int j = 0; j < n; j++) {
                 real seen = 0;
                 for (int i = 0; i < n; i++)
@@ -166,12 +171,23 @@ static int rows_of_legs(void *model, const real *xi, real *e, real *H, stewart_s
     for (int row = 0; row < rows; row++) {
         if (!s->kept[row])
             continue;
-        const real std = REAL(sqrt)(variance[row]);
-        e[number] = residual[row] / std;
-        for (int j = 0; j < n; j++)
-            H[n * number + j] = H[n * row + j] / std;
+        e[number] = residual[row];
+        variance[number] = variance[row];
+        stewart_copy(n, H + n * row, H + n * number);
+        stewart_copy(a->changes, s->kicks + a->changes * row, s->kicks + a->changes * number);
         number++;
     }
+    stewart_multiply_by_transpose(number, a->changes, number, s->kicks, s->kicks, s->C);
+    for (int i = 0; i < number; i++) {
+        for (int j = 0; j <= i; j++)
+            s->C[number * i + j] *= a->along;
+        s->C[(number + 1) * i] += variance[i];
+    }
+    if (!stewart_cholesky(number, s->C))
+        return -1;
+    stewart_whiten(number, 1, s->C, e);
+    stewart_whiten(number, n, s->C, H);
+    stewart_whiten(number, a->changes, s->C, s->kicks);
     s->rows = H;
     return s->number = number;
 }
@@ -198,7 +214,7 @@ static stewart_scratch prepare(Legs *s, stewart_scratch scratch)
     const stewart_schedule *schedule = &s->attempt->period->schedule;
     const stewart_encoders *encoders = s->encoders;
     const int n = s->attempt->n, N = encoders->samples, M = encoders->nodes;
-    const int fine = schedule->number + N;
+    const int fine = schedule->number + N, changes = s->attempt->changes;
     real total = 0, *instants = stewart_take(&scratch, N);
     real *torques = stewart_take(&scratch, U * (schedule->number + M));
     real *durations = stewart_take(&scratch, schedule->number + M);
@@ -218,6 +234,16 @@ static stewart_scratch prepare(Legs *s, stewart_scratch scratch)
     s->reading.angles = stewart_take(&scratch, LEGS * N);
     s->reading.onto = stewart_take(&scratch, LEGS * M * M);
     s->reading.variance = stewart_take(&scratch, LEGS * M);
+    s->since = stewart_take(&scratch, M * changes);
+    for (int j = 0; j < M; j++) {
+        real since = total * encoders->shares[j];
+        for (int c = 0; c < changes; c++) {
+            s->since[changes * j + c] = since > 0 ? since : 0;
+            since -= c + 1 < changes ? schedule->durations[c] : 0;
+        }
+    }
+    s->kicks = stewart_take(&scratch, LEGS * M * changes);
+    s->C = stewart_take(&scratch, LEGS * M * LEGS * M);
     s->states = stewart_take(&scratch, X * s->coarse.number);
     s->H = stewart_take(&scratch, X * n * s->coarse.number);
     return scratch;
@@ -230,6 +256,7 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
     const stewart_history *history = a->history;
     Legs s = {.attempt = a, .encoders = f->sensing->kind};
     real *xi = a->after->mean, distance = 0, spread;
+    real innovations[MAX_ROWS], variances[MAX_ROWS];
     scratch = prepare(&s, scratch);
     if (!along(&s, xi, scratch))
         return 0;
@@ -239,11 +266,12 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
     stewart_read(s.encoders, a->values, s.shown, history->last, history->still, &s.reading, scratch);
     const stewart_kalman update = {a->n,     LEGS * s.encoders->nodes, ITERATIONS, a->prior->mean,
                                    a->prior->root, f->lower, f->upper, &s, rows_of_legs, settle_legs,
-                                   0, NULL, NULL};
+                                   0, innovations, variances};
     if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &spread, scratch))
         return 0;
     *a->after->squares += distance;
     *a->after->values += (real)s.number;
+    stewart_attempt_learn(a, s.number, innovations, variances, s.rows, s.kicks);
     stewart_predict(f->machine, xi + X, schedule, xi, s.seen);
     stewart_copy(X, s.seen + X * (schedule->number - 1), a->end);
     return stewart_attempt_ended(a, scratch);
@@ -254,7 +282,8 @@ static int attempt_scratch(const stewart_filter *filter, int torques)
     const stewart_encoders *encoders = filter->sensing->kind;
     const int N = encoders->samples, M = encoders->nodes, n = X + filter->machine->estimated;
     const int coarse = torques + M, fine = torques + N;
-    const int legs = (U + 1) * (coarse + fine) + 14 * N + X * fine + LEGS * M * (M + 1);
+    const int timing = M * (LEGS + 1) * (torques + 1) + LEGS * M * LEGS * M;
+    const int legs = timing + (U + 1) * (coarse + fine) + 14 * N + X * fine + LEGS * M * (M + 1);
     return legs + X * (n + 1) * coarse + stewart_kalman_scratch(n, LEGS * M) + N;
 }
 

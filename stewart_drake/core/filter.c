@@ -47,6 +47,7 @@ void stewart_attempt_predicted(stewart_attempt *a)
     const stewart_filter *f = a->filter;
     const real t = a->prior->noise->timing;
     const real aside = is_known(f, a->prior->root, DIRECTED) ? STEWART_ASIDE : 1;
+    a->along = (1 - aside) * t;
     stewart_kicks(f->machine, a->period, a->end, a->after->mean + X, a->kicks);
     for (int i = 0; i < X; i++) {
         real square = f->model_std[i] * f->model_std[i];
@@ -54,7 +55,7 @@ void stewart_attempt_predicted(stewart_attempt *a)
             real *kick = a->kicks + X * k + i;
             *kick *= f->timing_std;
             square += aside * t * *kick * *kick;
-            a->late[X * k + i] = REAL(sqrt)((1 - aside) * t) * *kick;
+            a->late[X * k + i] = REAL(sqrt)(a->along) * *kick;
         }
         a->drift[i] = REAL(sqrt)(square);
     }
@@ -82,7 +83,9 @@ typedef struct {
     stewart_instant instant;
     const stewart_attempt *attempt;
     int fourth_order;
-    real *states; /* (number, 12) */
+    real *states;     /* (number, 12) */
+    real *kicks;      /* (m, changes) effects of the torques' timing on the values */
+    const real *rows; /* (m, n) whitened, of the last iteration */
 } Sample;
 
 static int predict(void *context, const real *xi, real *end)
@@ -126,21 +129,19 @@ static int begin(Sample *s, const real *xi, real *end, stewart_scratch scratch)
 
 static int kept_numbers(int n) { return 1 + n + X + X * n; }
 
-/* Learn the noise in `after` from whitened innovations (m) with their variances. */
-static void learn(const Sample *s, const real *innovations, const real *variances)
+static int rows_of_sample(void *about, const real *xi, real *e, real *H, stewart_scratch scratch)
 {
-    const stewart_attempt *a = s->attempt;
+    Sample *s = about;
+    s->rows = H;
+    return stewart_instant_rows(&s->instant, xi, e, H, scratch);
+}
+
+void stewart_attempt_learn(const stewart_attempt *a, int m, const real *innovations,
+                           const real *variances, const real *H, const real *kicks)
+{
     const stewart_filter *f = a->filter;
-    const int m = f->sensing->size;
-    real *K = s->instant.J; /* C^-1 dh/dx */
-    if (!f->sensing->jacobian) {
-        stewart_fill(m * X, 0, K);
-        for (int i = 0; i < m; i++)
-            K[(X + 1) * i] = 1;
-    }
-    stewart_whiten(m, X, s->instant.C, K);
-    stewart_noise_learn(m, innovations, variances, K, f->learns_timing ? a->changes : 0, a->kicks,
-                        a->n - X, a->last, f->wander_std, f->keep, a->after->noise);
+    stewart_noise_learn(m, innovations, variances, a->n - X, H, f->wander_std,
+                        f->learns_timing ? a->changes : 0, kicks, f->keep, a->after->noise);
 }
 
 static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
@@ -156,6 +157,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
                                   NULL,       NULL,      &s, predict, linearize};
     s.instant.C = stewart_take(&scratch, m * m);
     s.instant.J = stewart_take(&scratch, m * X);
+    s.kicks = stewart_take(&scratch, m * a->changes);
     s.states = stewart_take(&scratch, X * pieces);
     a->last = s.instant.H = stewart_take(&scratch, X * n);
     if (!begin(&s, xi, a->end, scratch))
@@ -166,7 +168,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     if (!stewart_innovation_root(f->sensing, a->end, a->changes, a->late, a->drift, s.instant.C, scratch))
         return 0;
     const stewart_kalman update = {n, m, ITERATIONS, prior->mean, prior->root, f->lower, f->upper, &s,
-                                   stewart_instant_rows, stewart_instant_settle, a->hopeless,
+                                   rows_of_sample, stewart_instant_settle, a->hopeless,
                                    innovations, variances};
     if (!stewart_kalman_update(&update, xi, a->after->root, &a->distance, &spread, scratch))
         return 0;
@@ -177,7 +179,9 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
         return 0;
     *a->after->squares += a->distance;
     *a->after->values += (real)m;
-    learn(&s, innovations, variances);
+    stewart_apply_jacobian(f->sensing, s.instant.J, a->changes, a->kicks, s.kicks);
+    stewart_whiten(m, a->changes, s.instant.C, s.kicks);
+    stewart_attempt_learn(a, m, innovations, variances, s.rows, s.kicks);
     return stewart_attempt_ended(a, scratch);
 }
 
@@ -387,7 +391,7 @@ int stewart_filter_scratch(const stewart_filter *filter, int torques)
 {
     const stewart_legs *legs = filter->legs;
     const int n = size_of(filter), p = n - X, m = filter->sensing->size;
-    const int sample = m * (m + 3 + X) + m * (torques + 1) + X * (n + torques) + stewart_kalman_scratch(n, m);
+    const int sample = m * (m + 3 + X) + 2 * m * (torques + 1) + X * (n + torques) + stewart_kalman_scratch(n, m);
     const int step = legs ? legs->scratch(filter, torques) : sample;
     const int within = step + stewart_transitions_scratch(p) + 2 * n * n + (X + 3 + torques) * n;
     const int start = X * X + m + LEGS * (6 + p) + (legs ? legs->start_scratch(filter) : 0);

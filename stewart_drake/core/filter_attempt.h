@@ -15,7 +15,8 @@ typedef struct {
     real end[STEWART_STATES];   /* state at the end of the period */
     real drift[STEWART_STATES]; /* standard deviation of the model's other errors there */
     int changes;        /* of torque, see noise.h */
-    real *kicks, *late; /* (changes, 12) effect on `end` of the torques' timing at t = 1, and now */
+    real *kicks, *late; /* (changes, 12) effect on `end` of the torques' timing at t = 1, and now: */
+    real along;         /* variance of the latter over the former, but for that in `drift` */
     real distance;              /* of the last innovation, as of `stewart_kalman` */
     real likelihood;            /* log of the density of the values, without a constant; -inf without one */
     const real *last;           /* (12, n) d[end]/d[xi] */
@@ -26,8 +27,13 @@ typedef struct {
     int gated;                  /* number of legs with a value that does not fit */
 } stewart_attempt;
 
-/* Fill in `kicks`, `late` and `drift` from `end` of the prior. */
+/* Fill in `kicks`, `late`, `along` and `drift` from `end` of the prior. */
 void stewart_attempt_predicted(stewart_attempt *attempt);
+
+/* Learn the noise in `after` from whitened innovations (m) with their variances, H (m, n) and the effects
+   of torques on the values, `kicks` (m, changes). */
+void stewart_attempt_learn(const stewart_attempt *attempt, int m, const real *innovations,
+                           const real *variances, const real *H, const real *kicks);
 
 /* Predict mean and root in `after` over the period, with `end` and `last` of that mean; without values
    the root is that of the prior. Returns 0 if a result is not finite. Scratch: (2 n + changes) n + n numbers. */

@@ -22,22 +22,18 @@ static real scored(real factor, real slope, real information)
     return found > 0 ? found : 0;
 }
 
-void stewart_noise_learn(int m, const real *innovations, const real *variances, const real *H,
-                         int changes, const real *kicks, int p, const real *G, const real *wander,
-                         real keep, stewart_noise *noise)
+void stewart_noise_learn(int m, const real *innovations, const real *variances, int p, const real *H,
+                         const real *wander, int changes, const real *kicks, real keep,
+                         stewart_noise *noise)
 {
     real wander_slope = 0, total = 0;
     noise->known_timing *= keep;
     noise->known_wander *= keep;
     for (int i = 0; i < m; i++) {
-        const real *h = H + X * i;
         real W = 0, S = variances[i];
         total += innovations[i] * innovations[i] / S;
         for (int k = 0; k < p; k++) {
-            real change = 0;
-            for (int j = 0; j < X; j++)
-                change += h[j] * G[(X + p) * j + X + k];
-            change *= wander[k];
+            const real change = H[(X + p) * i + X + k] * wander[k];
             W += change * change;
         }
         const real S_at_w = S - (noise->used - noise->wander) * W; /* not at the factor in use */
@@ -50,7 +46,7 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
     for (int c = 0; c < changes; c++) {
         real a = 0, b = 0;
         for (int i = 0; i < m; i++) {
-            const real k = stewart_dot(X, H + X * i, kicks + X * c);
+            const real k = kicks[changes * i + c];
             a += k * innovations[i] / variances[i];
             b += k * k / variances[i];
         }

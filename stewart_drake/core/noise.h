@@ -38,13 +38,13 @@ typedef struct {
 
 void stewart_noise_start(stewart_noise *noise);
 
-/* Update the factors by values (m) with innovations nu and variances S. H (m, 12) is the derivative of
-   the values by the state, and G (12, 12 + p) that of the state by state and parameters a period before.
-   `kicks` (changes, 12) are the effects on the state at t = 1, `wander` (p) the standard deviations of
-   the parameters at w = 1; both may be 0. `keep` is the share of J that is kept in a period. */
-void stewart_noise_learn(int m, const real *innovations, const real *variances, const real *H,
-                         int changes, const real *kicks, int p, const real *G, const real *wander,
-                         real keep, stewart_noise *noise);
+/* Update the factors by values (m) with innovations nu and variances S. H (m, 12 + p) is the derivative of
+   the values by state and parameters a period before, `kicks` (m, changes) the effects of torques on them
+   at t = 1, and `wander` (p) the standard deviations of the parameters at w = 1; both may be 0. `keep` is
+   the share of J that is kept in a period. */
+void stewart_noise_learn(int m, const real *innovations, const real *variances, int p, const real *H,
+                         const real *wander, int changes, const real *kicks, real keep,
+                         stewart_noise *noise);
 
 /* Changes of torque in a period, those at both of its samples included. */
 int stewart_changes(const stewart_interval *period);
