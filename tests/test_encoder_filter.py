@@ -244,7 +244,7 @@ def test_a_step_is_what_batch_least_squares_finds(samples, free):
     early = assumed.timing_std
 
     def noise(xi):
-        """Covariance (6 M, 6 M): projected samples, drift of the model and late torques at nodes."""
+        """Covariance (6 M, 6 M): projected samples, the model's drift, late torques at nodes."""
         end = DYNAMICS.predict(xi[:12], PERIOD.torques, PERIOD.durations, 20, xi[12:20])[-1]
         pushes = np.array([*PERIOD.torques, PERIOD.following])
         a = [DYNAMICS.accelerations(end[POSE], end[RATES], T, xi[12:20]) for T in pushes]

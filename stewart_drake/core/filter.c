@@ -83,9 +83,7 @@ typedef struct {
     stewart_instant instant;
     const stewart_attempt *attempt;
     int fourth_order;
-    real *states;     /* (number, 12) */
-    real *kicks;      /* (m, changes) effects of the torques' timing on the values */
-    const real *rows; /* (m, n) whitened, of the last iteration */
+    real *states; /* (number, 12) */
 } Sample;
 
 static int predict(void *context, const real *xi, real *end)
@@ -129,19 +127,23 @@ static int begin(Sample *s, const real *xi, real *end, stewart_scratch scratch)
 
 static int kept_numbers(int n) { return 1 + n + X + X * n; }
 
-static int rows_of_sample(void *about, const real *xi, real *e, real *H, stewart_scratch scratch)
-{
-    Sample *s = about;
-    s->rows = H;
-    return stewart_instant_rows(&s->instant, xi, e, H, scratch);
-}
-
 void stewart_attempt_learn(const stewart_attempt *a, int m, const real *innovations,
                            const real *variances, const real *H, const real *kicks)
 {
     const stewart_filter *f = a->filter;
     stewart_noise_learn(m, innovations, variances, a->n - X, H, f->wander_std,
                         f->learns_timing ? a->changes : 0, kicks, f->keep, a->after->noise);
+}
+
+static void learn(const Sample *s, const real *innovations, const real *variances, stewart_scratch scratch)
+{
+    const stewart_instant *at = &s->instant;
+    const int m = at->sensing->size, changes = s->attempt->changes;
+    real *H = stewart_take(&scratch, m * at->n), *kicks = stewart_take(&scratch, m * changes);
+    stewart_instant_derivative(at, H);
+    stewart_apply_jacobian(at->sensing, at->J, changes, s->attempt->kicks, kicks);
+    stewart_whiten(m, changes, at->C, kicks);
+    stewart_attempt_learn(s->attempt, m, innovations, variances, H, kicks);
 }
 
 static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
@@ -157,7 +159,6 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
                                   NULL,       NULL,      &s, predict, linearize};
     s.instant.C = stewart_take(&scratch, m * m);
     s.instant.J = stewart_take(&scratch, m * X);
-    s.kicks = stewart_take(&scratch, m * a->changes);
     s.states = stewart_take(&scratch, X * pieces);
     a->last = s.instant.H = stewart_take(&scratch, X * n);
     if (!begin(&s, xi, a->end, scratch))
@@ -168,7 +169,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     if (!stewart_innovation_root(f->sensing, a->end, a->changes, a->late, a->drift, s.instant.C, scratch))
         return 0;
     const stewart_kalman update = {n, m, ITERATIONS, prior->mean, prior->root, f->lower, f->upper, &s,
-                                   rows_of_sample, stewart_instant_settle, a->hopeless,
+                                   stewart_instant_rows, stewart_instant_settle, a->hopeless,
                                    innovations, variances};
     if (!stewart_kalman_update(&update, xi, a->after->root, &a->distance, &spread, scratch))
         return 0;
@@ -179,9 +180,7 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
         return 0;
     *a->after->squares += a->distance;
     *a->after->values += (real)m;
-    stewart_apply_jacobian(f->sensing, s.instant.J, a->changes, a->kicks, s.kicks);
-    stewart_whiten(m, a->changes, s.instant.C, s.kicks);
-    stewart_attempt_learn(a, m, innovations, variances, s.rows, s.kicks);
+    learn(&s, innovations, variances, scratch);
     return stewart_attempt_ended(a, scratch);
 }
 
@@ -391,7 +390,7 @@ int stewart_filter_scratch(const stewart_filter *filter, int torques)
 {
     const stewart_legs *legs = filter->legs;
     const int n = size_of(filter), p = n - X, m = filter->sensing->size;
-    const int sample = m * (m + 3 + X) + 2 * m * (torques + 1) + X * (n + torques) + stewart_kalman_scratch(n, m);
+    const int sample = m * (m + 3 + X) + m * (torques + 1) + X * (n + torques) + stewart_kalman_scratch(n, m);
     const int step = legs ? legs->scratch(filter, torques) : sample;
     const int within = step + stewart_transitions_scratch(p) + 2 * n * n + (X + 3 + torques) * n;
     const int start = X * X + m + LEGS * (6 + p) + (legs ? legs->start_scratch(filter) : 0);

@@ -64,6 +64,16 @@ void stewart_whiten(int m, int n, const real *C, real *B)
     }
 }
 
+void stewart_instant_derivative(const stewart_instant *a, real *H)
+{
+    const int m = a->sensing->size;
+    if (a->sensing->jacobian)
+        stewart_multiply(m, X, a->n, a->J, a->H, H);
+    else
+        stewart_copy(X * a->n, a->H, H);
+    stewart_whiten(m, a->n, a->C, H);
+}
+
 int stewart_instant_rows(void *model, const real *xi, real *e, real *H, stewart_scratch scratch)
 {
     const stewart_instant *a = model;
@@ -72,13 +82,9 @@ int stewart_instant_rows(void *model, const real *xi, real *e, real *H, stewart_
     (void)scratch;
     stewart_predict_measurement(a->sensing, a->state, e);
     stewart_measurement_jacobian(a->sensing, a->state, a->J);
-    if (a->sensing->jacobian)
-        stewart_multiply(m, X, a->n, a->J, a->H, H);
-    else
-        stewart_copy(X * a->n, a->H, H);
+    stewart_instant_derivative(a, H);
     for (int i = 0; i < m; i++)
         e[i] = a->values[i] - e[i];
-    stewart_whiten(m, a->n, a->C, H);
     stewart_whiten(m, 1, a->C, e);
     return m;
 }

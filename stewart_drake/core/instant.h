@@ -41,6 +41,9 @@ typedef struct {
     int (*linearize)(void *period, const real *xi, real *H, stewart_scratch scratch);
 } stewart_instant;
 
+/* H (m, n) <- C^-1 d[values]/d[xi] of the last linearisation. */
+void stewart_instant_derivative(const stewart_instant *a, real *H);
+
 /* Callbacks of a `stewart_kalman` whose `model` has a `stewart_instant` as its first member. Iteration
    ends at a correction below 0.1 standard deviations: the linearisation error, of second order, is then
    negligible. */

@@ -206,19 +206,20 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     motion_torque = max(STILL * machine_scale, reachable)
     parameters = estimated_parameters(experiment, torque_scale, motion_torque)
     noise = sc.sensor.noise_std if isinstance(sc.sensor, StateSensorConfig) else None
-    exact, tolerated = _learns(sc), tolerated_timing(experiment)
+    learns, tolerated = _learns(sc), tolerated_timing(experiment)
+    white = learns and noise is not None
     settings = filter_settings(
         motion,
         c.period,
         parameters,
         model_error=c.model_error,
         timing_std=c.timing_std,
-        white=exact,
-        noisy=noise is not None and all(noise),
-        learns=exact,
+        white=white,
+        noisy=white and all(noise or ()),
+        learns=learns,
     )
     gaps = sc.sensor.kind == "state" and sc.sensor.loss > 0
-    timing = exact and not any(noise or ()) and math.isfinite(tolerated)
+    timing = white and not any(noise or ()) and math.isfinite(tolerated)
     observer = CoreObserver(settings if c.estimate else None, gaps=gaps, timing=timing)
     quiet = c.open_loop_start and sc.start == "rest"
     before = int(bool(c.estimate) and c.delay_estimator == "none")  # torques, as the filter asks
@@ -394,8 +395,8 @@ def _replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> Pr
 
 
 def _learns(scenario: Scenario) -> bool:
-    """Return whether the estimator learns its noise: the errors of plant and sensor are white."""
-    return scenario.plant.kind == "exact" and isinstance(scenario.sensor, StateSensorConfig)
+    """Return whether the estimator learns its noise: the plant has no errors of fixed steps."""
+    return scenario.plant.kind == "exact"
 
 
 def tolerated_timing(experiment: Experiment) -> float:
