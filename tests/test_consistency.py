@@ -242,6 +242,17 @@ def test_a_jitter_far_above_the_assumed_one_does_not_move_the_parameters(control
     assert np.median([run.error_so_far for run in runs]) < 3
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_late_torque_by_mistake_is_soon_corrected(seed):
+    """Coulomb friction, first taken for a late torque; E_ac exceeds 10 if it stays so."""
+    half = np.array([np.pi / 24] * 3 + [0.01, 0.01, 0.04]).tolist()
+    motion = f"reference.amplitude={half}", "controller.period=0.02", "delay.steps=5"
+    sensor = f"sensor.noise_std={(NOISE / 10).tolist()}", f"sensor.seed={seed}"
+    settings = *ON, *motion, *sensor, "plant.coulomb_friction=0.01", "duration=4"
+    found = run_in_bulk(load_scenario("gravity", "predictor_lqi", settings))
+    assert found.status == "completed" and found.error_so_far < 6
+
+
 # The timing of torques without an estimator.
 
 

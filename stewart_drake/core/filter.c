@@ -319,6 +319,7 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
         *a->after->noise = *now->noise; /* one late torque does not make all of them late */
         const real once = now->noise->timing > ONCE ? now->noise->timing : ONCE;
         a->after->noise->timing = REAL(fmin)(GROWTH * once, untimely);
+        a->after->noise->known_timing = 0; /* what is known of it holds near its former value only */
     }
     a->prior = now;
     a->hopeless = 0;
