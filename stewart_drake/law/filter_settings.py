@@ -252,6 +252,16 @@ def usual_model_error(motion_scale: Array, period: float) -> Array:
     return np.concatenate([poses, poses / share])
 
 
+def assumed_model_error(
+    motion_scale: Array, period: float, model_error: float | None, white: bool, noisy: bool
+) -> Array:
+    """Return the model's error (12,) over a period, for arguments of `filter_settings`."""
+    if model_error is not None:
+        return acceleration_noise(model_error, motion_scale, period)
+    share = INTEGRATION_ERROR / MODEL_ERROR if white and noisy else 1.0
+    return share * usual_model_error(motion_scale, period if white else USUAL_PERIOD)
+
+
 def filter_settings(
     motion_scale: Array,
     period: float,
@@ -278,16 +288,10 @@ def filter_settings(
             filter of a sensor without noise would otherwise follow each digit of that error.
         learns: whether innovations correct the noise, see core/noise.h.
     """
-    if model_error is None:
-        model_std = usual_model_error(motion_scale, period if white else USUAL_PERIOD)
-        if white and noisy:
-            model_std *= INTEGRATION_ERROR / MODEL_ERROR
-    else:
-        model_std = acceleration_noise(model_error, motion_scale, period)
     usual_timing = period * (FIRST_TIMING_ERROR if learns else TIMING_ERROR)
     return FilterSettings(
         parameters,
-        model_std,
+        assumed_model_error(motion_scale, period, model_error, white, noisy),
         usual_timing if timing_std is None else timing_std,
         None if parameters.walk is None else math.sqrt(period) * parameters.walk,
         parameters.jump,

@@ -180,6 +180,41 @@ def choose_substeps(
     return substeps
 
 
+def filter_substeps(
+    dynamics: StewartDynamics,
+    reference: Trajectory,
+    period: float,
+    duration: float,
+    model_std: Array,
+) -> int:
+    """Return the fewest Runge-Kutta steps, a power of 2, that keep to the filter's model error.
+
+    A larger integration error over a period is not the assumed noise: it repeats, and the filter
+    attributes it to parameters. With n steps it is compared with 2 n steps along the reference.
+
+    Args:
+        dynamics: nominal plant.
+        reference: of the pose.
+        period: s.
+        duration: of the reference, s.
+        model_std: (12,) assumed error of the state over a period.
+    """
+
+    def error(t: float, substeps: int) -> float:
+        torque = mean_torques(dynamics, reference, np.array([t]), np.array([t + period]))
+        x = evaluate(reference, t)[:NUM_STATE]
+        coarse, fine = (
+            dynamics.predict(x, torque, period, n)[-1] for n in (substeps, 2 * substeps)
+        )
+        return float(np.max(np.abs(coarse - fine) / model_std))
+
+    substeps = 1
+    for t in spread_instants(duration, 8):
+        while substeps < MOST_SUBSTEPS and error(t, substeps) > 1:
+            substeps *= 2
+    return substeps
+
+
 def turning_substeps(
     dynamics: StewartDynamics, reference: Trajectory, period: float, duration: float
 ) -> int:

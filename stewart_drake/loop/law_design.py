@@ -29,6 +29,7 @@ from stewart_drake.law.feedforward import (
 )
 from stewart_drake.law.filter_settings import (
     ParameterSet,
+    assumed_model_error,
     filter_settings,
     usual_parameters,
 )
@@ -50,6 +51,7 @@ from stewart_drake.law.startup import (
     STILL,
     TOLERANCE,
     choose_substeps,
+    filter_substeps,
     machine_torque,
     reference_torque,
     turning_substeps,
@@ -162,6 +164,11 @@ def sizing_of(experiment: Experiment) -> Sizing:
     sc, nominal, reference = experiment.scenario, experiment.nominal, experiment.reference
     period, steps = sc.controller.period, believed_delay(sc).steps
     substeps = choose_substeps(nominal, reference, period, steps, sc.duration)
+    if sc.controller.estimate:
+        given = period, sc.controller.model_error, *_white(sc)
+        model_std = assumed_model_error(experiment.motion_scale, *given)
+        assumed = filter_substeps(nominal, reference, period, sc.duration, model_std)
+        substeps = max(substeps, assumed)
     largest = reachable = reference_torque(nominal, reference, sc.duration)
     if sc.controller.limits == "qp":
         space = clear_space(experiment)
@@ -206,8 +213,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     motion_torque = max(STILL * machine_scale, reachable)
     parameters = estimated_parameters(experiment, torque_scale, motion_torque)
     noise = sc.sensor.noise_std if isinstance(sc.sensor, StateSensorConfig) else None
-    learns, tolerated = _learns(sc), tolerated_timing(experiment)
-    white = learns and noise is not None
+    tolerated, (white, noisy) = tolerated_timing(experiment), _white(sc)
     settings = filter_settings(
         motion,
         c.period,
@@ -215,8 +221,8 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         model_error=c.model_error,
         timing_std=c.timing_std,
         white=white,
-        noisy=white and all(noise or ()),
-        learns=learns,
+        noisy=noisy,
+        learns=_learns(sc),
     )
     gaps = sc.sensor.kind == "state" and sc.sensor.loss > 0
     timing = white and not any(noise or ()) and math.isfinite(tolerated)
@@ -397,6 +403,13 @@ def _replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> Pr
 def _learns(scenario: Scenario) -> bool:
     """Return whether the estimator learns its noise: the plant has no errors of fixed steps."""
     return scenario.plant.kind == "exact"
+
+
+def _white(scenario: Scenario) -> tuple[bool, bool]:
+    """Return whether plant and sensor have white errors, and whether such a sensor has noise."""
+    sensor = scenario.sensor
+    white = _learns(scenario) and isinstance(sensor, StateSensorConfig)
+    return white, isinstance(sensor, StateSensorConfig) and white and all(sensor.noise_std)
 
 
 def tolerated_timing(experiment: Experiment) -> float:
