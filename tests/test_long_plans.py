@@ -102,7 +102,7 @@ def test_a_long_delay_is_compared_no_further_than_the_prediction_is_of_use(work)
 
 @pytest.mark.parametrize("share", [1.0, 0.1])
 def test_a_filter_steps_as_finely_as_its_model_error_asks(share):
-    """Against 64 steps a period. The error is of fourth order: half the steps, 16 times the error."""
+    """Against 64 steps a period. Half the steps have 16 times the error, of fourth order."""
     experiment = prepare(load_scenario("motion_base", "predictor_lqi", ["controller.period=0.2"]))
     dynamics, reference, dt = experiment.nominal, experiment.reference, 0.2
     std = 2e-4 * share * np.tile(experiment.motion_scale, 2)
