@@ -56,8 +56,10 @@ static stewart_schedule cut(const stewart_schedule *schedule, int n, const real 
    Q the drift of the pose over a period, which counts as noise here as it does there. A torque that
    changes at t_c by that of an acceleration a_c, late by sigma, adds k_c k_c' to the covariance,
 
-       k_c = sigma (s_j - t_c) J(q_j) a_c   at nodes after it.   Each leg is judged by itself at each node: one with e^2 > 30 S, S = H P H' + R, is left out,
-   and the step goes on with the rest; if that is less than half, the measurement is an outlier. */
+       k_c = sigma (s_j - t_c) J(q_j) a_c   at nodes after it.
+
+   Each leg is judged by itself at each node: one with e^2 > 30 S, S = H P H' + R, is left out, and the
+   step goes on with the rest; if that is less than half, the measurement is an outlier. */
 
 typedef struct {
     stewart_attempt *attempt;
