@@ -7,11 +7,12 @@
 #define BALL_FRICTION 14
 #define BALL_SPEED 15
 #define ROUNDS 60
+/* Of Newton's last step; the error is of its square. */
 #ifdef STEWART_FLOAT
-#define SPIN_TOLERANCE ((real)1e-6)
+#define SPIN_TOLERANCE ((real)1e-4)
 #define DIFFERENCE ((real)5e-3) /* of the central differences: rad, m over the crank's length, per s */
 #else
-#define SPIN_TOLERANCE 1e-15
+#define SPIN_TOLERANCE 1e-9
 #define DIFFERENCE 1e-5
 #endif
 
@@ -25,39 +26,44 @@ static Joint joint_of_plant(const real *parameters)
     return (Joint){parameters[BALL_DAMPING], parameters[BALL_FRICTION], parameters[BALL_SPEED]};
 }
 
-/* |tau| / |w|, from |w|^2. */
-static real resistance(const Joint *joint, real square)
+/* q(|w|) = |tau| / |w|, and its slope over |w|. */
+typedef struct {
+    real value, slope;
+} Resistance;
+
+static Resistance resistance(const Joint *joint, real square)
 {
-    const real w = REAL(sqrt)(square);
-    if (joint->friction == 0)
-        return joint->damping;
-    const real slip = w / joint->speed;
-    const real share = slip < (real)1e-4 ? 1 - slip * slip / 3 : REAL(tanh)(slip) / slip;
-    return joint->damping + joint->friction / joint->speed * share;
+    const real f = joint->friction / joint->speed, w = REAL(sqrt)(square), slip = w / joint->speed;
+    if (f == 0)
+        return (Resistance){joint->damping, 0};
+    if (slip < (real)1e-4)
+        return (Resistance){joint->damping + f * (1 - slip * slip / 3),
+                            -2 * f / (3 * joint->speed * joint->speed)};
+    const real t = REAL(tanh)(slip), share = t / slip;
+    return (Resistance){joint->damping + f * share, f * (1 - t * t - share) / square};
 }
 
-/* Spin z that minimises the potentials of both joints, whose angular velocities have the parts a + z and
-   b - z along the rod and the squares m, n across it. The slope
+/* Spin z that minimises the potentials of both joints, whose angular velocities have the parts p = a + z
+   and b - z along the rod and the squares m, n across it. The slope
 
-       (c + ..) (a + z) - (c + ..) (b - z)
+       q_1 (a + z) - q_2 (b - z),    with the derivative of q p by p: q + (q' / |w|) p^2,
 
-   rises with z and vanishes between -a and b: secants, kept within that interval. */
+   rises with z and vanishes between -a and b: Newton's steps, halving that interval where one leaves it. */
 static real spin_of(const Joint *joint, real a, real m, real b, real n)
 {
-    real low = -a, high = b, at_low = resistance(joint, n + (a + b) * (a + b)) * -(a + b);
-    real at_high = resistance(joint, m + (a + b) * (a + b)) * (a + b), z = (low + high) / 2;
-    const real tolerance = SPIN_TOLERANCE * (REAL(fabs)(a) + REAL(fabs)(b));
-    for (int round = 0; round < ROUNDS && REAL(fabs)(high - low) > tolerance; round++) {
-        z = high - at_high * (high - low) / (at_high - at_low);
+    real low = REAL(fmin)(-a, b), high = REAL(fmax)(-a, b), z = (low + high) / 2, step = high - low;
+    const real tolerance = SPIN_TOLERANCE * step;
+    for (int round = 0; round < ROUNDS && REAL(fabs)(step) > tolerance; round++) {
         const real p = a + z, q = b - z;
-        const real slope = resistance(joint, m + p * p) * p - resistance(joint, n + q * q) * q;
+        const Resistance one = resistance(joint, m + p * p), two = resistance(joint, n + q * q);
+        const real slope = one.value * p - two.value * q;
         if (slope == 0)
             break;
-        if ((slope > 0) == (at_high > 0)) { /* the Illinois rule: the end that stays counts half */
-            high = z, at_high = slope, at_low /= 2;
-        } else {
-            low = z, at_low = slope, at_high /= 2;
-        }
+        *(slope > 0 ? &high : &low) = z;
+        step = slope / (one.value + one.slope * p * p + two.value + two.slope * q * q);
+        if (!(low <= z - step && z - step <= high))
+            step = z - (low + high) / 2;
+        z -= step;
     }
     return z;
 }
@@ -87,8 +93,8 @@ static void add_leg(const Joint *joint, const Leg *leg, const LegMotion *m, cons
     real z = at_crank ? -a : b;
     if (at_crank && at_plate)
         z = spin_of(joint, a, across_1, b, across_2);
-    const real q_1 = at_crank ? resistance(joint, across_1 + (a + z) * (a + z)) : 0;
-    const real q_2 = at_plate ? resistance(joint, across_2 + (b - z) * (b - z)) : 0;
+    const real q_1 = at_crank ? resistance(joint, across_1 + (a + z) * (a + z)).value : 0;
+    const real q_2 = at_plate ? resistance(joint, across_2 + (b - z) * (b - z)).value : 0;
     for (int i = 0; i < 3; i++) {
         tau_1[i] = q_1 * (w_1[i] + z * m->rod[i]);
         tau_2[i] = q_2 * (w_2[i] - z * m->rod[i]);

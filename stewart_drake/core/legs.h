@@ -101,11 +101,12 @@ static inline LegMotion leg_motion_of(const Leg *leg, const Turn *turn, const re
     LegMotion m;
     real q[3], length = 0;
     joint_of(leg, turn, pose, m.arm, q);
-    const real a = 2 * leg->crank * q[0], b = 2 * leg->crank * q[1];
+    const real a = 2 * leg->crank * q[0], b = 2 * leg->crank * q[1], far = REAL(hypot)(a, b);
     const real c = dot(q, q) + leg->crank * leg->crank - leg->rod * leg->rod;
-    const real cosine = REAL(fmax)(-1, REAL(fmin)(1, c / REAL(hypot)(a, b)));
+    const real cosine = REAL(fmax)(-1, REAL(fmin)(1, c / far));
+    const real sine = leg->branch * REAL(sqrt)((1 - cosine) * (1 + cosine));
     m.angle = REAL(atan2)(b, a) + leg->branch * REAL(acos)(cosine);
-    const real ca = REAL(cos)(m.angle), sa = REAL(sin)(m.angle);
+    const real ca = (a * cosine - b * sine) / far, sa = (b * cosine + a * sine) / far;
     cross(w, m.arm, m.velocity);
     for (int i = 0; i < 3; i++) {
         const real *axes = leg->R[i];
