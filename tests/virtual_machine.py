@@ -4,20 +4,47 @@ Derivatives are CasADi's own, of the residual as a whole; the core has them by t
 by leg.
 """
 
+from collections.abc import Callable
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from stewart_drake.dynamics import equations
 from stewart_drake.dynamics.equations import leg_measures, numbers_of, workspace_measures
-from stewart_drake.identification.model import Compiled, compiled
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_PLANT_PARAMETERS, NUM_STATE, POSE, RATES
 from stewart_drake.types import Array
 
 _UNROLLED = 64
 """Steps in one piece of a prediction; a piece of n steps takes memory like n^2, 10 GB for 4000."""
+
+
+Compiled = Callable[..., list[Array]]
+
+
+def compiled(function: ca.Function) -> Compiled:
+    """Return a dense CasADi function of arrays; CasADi's columns are numpy's rows.
+
+    It keeps places for arguments and results, so one thread at a time may call it.
+    """
+    buffer: Any  # its stubs are those of the C interface
+    buffer, evaluate = function.buffer()
+    given = [np.zeros(function.size_in(k)[::-1]) for k in range(function.n_in())]
+    results = [np.zeros(function.size_out(k)[::-1]) for k in range(function.n_out())]
+    for put, places in ((buffer.set_arg, given), (buffer.set_res, results)):
+        for k, place in enumerate(places):
+            put(k, place.reshape(-1).data)
+
+    def call(*arguments: Array) -> list[Array]:
+        for place, argument in zip(given, arguments, strict=True):
+            place.squeeze()[...] = argument
+        evaluate()
+        return [result.squeeze().copy() for result in results]
+
+    call.owners = function, buffer  # type: ignore[attr-defined]  # `evaluate` keeps neither alive
+    return call
 
 
 class VirtualMachine:

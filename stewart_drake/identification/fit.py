@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.identification import progress
 from stewart_drake.identification.logs import ANGLES, KINDS, NUM_MEASURED, POSE
-from stewart_drake.identification.model import NUM_DYNAMIC, DrawnModel, MachineModel
+from stewart_drake.identification.model import NUM_DYNAMIC, MachineModel
 from stewart_drake.identification.shooting import (
     DELAY_COLUMN,
     FIRST_COLUMNS,
@@ -109,10 +109,9 @@ class Problem:
         return sum(int(np.isfinite(s.log.values[s.rows]).sum()) for s in self.segments)
 
     def model(self) -> MachineModel:
-        """Return the model that evaluates all segments at once."""
-        gravity = self.segments[0].log.gravity
-        kind = MachineModel if self.unknowns.std[GEOMETRY].any() else DrawnModel
-        return kind(self.unknowns.mechanism, gravity, len(self.segments))
+        """Return the machine of all segments."""
+        gravity, free_legs = self.segments[0].log.gravity, bool(self.unknowns.std[GEOMETRY].any())
+        return MachineModel(self.unknowns.mechanism, gravity, free_legs)
 
     def measured(self) -> tuple[Array, Array]:
         """Return values (m, n, 18) of the segments, NaN for missing ones, and their std (n, 18)."""
@@ -173,14 +172,14 @@ class Evaluator:
         predicted[:, :, POSE.start :] = states
         any_angle = bool(np.isfinite(self.values[:, :, ANGLES]).any())
         with np.errstate(all="ignore"):
-            for k in range(m) if any_angle else ():
-                alpha, by_pose, by_geometry = self.model.crank_angles(states[k, :, :6], numbers)
-                predicted[k, :, ANGLES] = alpha + guess.values[OFFSETS]
+            if any_angle:
+                alpha, by_pose, by_geometry = self.model.crank_angles(states[:, :, :6], numbers)
+                predicted[:, :, ANGLES] = alpha + guess.values[OFFSETS]
                 if sensitive:
                     legs = slice(NUM_STATE + NUM_DYNAMIC, PARAMETER_COLUMNS.stop)
-                    sensitivities = by_pose @ state_sensitivities[k][:, :6]
-                    sensitivities[:, :, legs] += by_geometry
-                    J[k, :, ANGLES] = self._columns(sensitivities, np.eye(6))
+                    sensitivities = by_pose @ state_sensitivities[:, :, :6]
+                    sensitivities[..., legs] += by_geometry
+                    J[:, :, ANGLES] = self._columns(sensitivities, np.eye(6))
             residual = self.values - predicted
             residual[:, :, ANGLES] = np.remainder(residual[:, :, ANGLES] + np.pi, 2 * np.pi) - np.pi
             residual /= self.std

@@ -165,7 +165,7 @@ def pose_uncertainty(
 
 def pose_slopes(unknowns: Unknowns, numbers: Numbers, poses: Array) -> Array:
     """Return d pose / d[geometry; offsets] (n, 6, 54) at poses (n, 6) for fixed crank angles."""
-    model = MachineModel(unknowns.mechanism, 0.0, len(poses))
+    model = MachineModel(unknowns.mechanism, 0.0)
     _, J, by_geometry = model.crank_angles(poses, numbers)
     offsets = np.broadcast_to(np.eye(len(LEGS)), (len(poses), NUM_LEGS, NUM_LEGS))
     found: Array = -np.linalg.solve(J, np.concatenate([by_geometry, offsets], axis=2))

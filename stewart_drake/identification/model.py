@@ -1,33 +1,28 @@
-"""The machine with its numbers as unknowns: accelerations, crank angles and their derivatives.
+"""The machine with its numbers as unknowns: slopes of accelerations and crank angles.
 
 With the residual F = M nu_dot + h - B tau of the equations of motion, zero for the accelerations a
 that a torque gives, every derivative at constant a is that of a itself by
 
     da/dz = -(M N)^-1 dF/dz,   nu_dot = N a + ...,
 
-for z the state, parameters of the dynamics, or numbers of a leg. The expressions are those of
-`dynamics.equations`; only the legs' numbers are symbols.
+for z the state, parameters of the dynamics, or numbers of a leg (core/shooting.h).
 """
 
-from collections.abc import Callable
-from functools import cached_property
 from typing import Any, Final, NamedTuple
 
-import casadi as ca
 import numpy as np
 
 from stewart_drake.core.layout import LEG_NUMBERS
-from stewart_drake.dynamics import equations
-from stewart_drake.dynamics.equations import leg_numbers, numbers_of
-from stewart_drake.dynamics.native_functions import NativeFunction
+from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.mechanism.geometry import Mechanism, geometry_of
+from stewart_drake.mechanism.kinematics import Legs, angle_rate_map, dot, legs_along, rotation
 from stewart_drake.scenario.signals import (
+    ANGLES,
     NUM_CONSTANTS,
     NUM_COORDINATES,
     NUM_LEGS,
     NUM_STATE,
-    WRENCHES,
 )
 from stewart_drake.types import Array
 
@@ -38,187 +33,76 @@ NUM_GEOMETRY: Final = NUM_LEGS * PER_LEG
 NUM_DYNAMIC: Final = NUM_CONSTANTS  # parameters of the dynamics; a log has no wrench
 
 
-Compiled = Callable[..., list[Array]]
-
-
-def compiled(function: ca.Function) -> Compiled:
-    """Return a dense CasADi function of arrays; CasADi's columns are numpy's rows.
-
-    It keeps places for arguments and results, so one thread at a time may call it.
-    """
-    buffer: Any  # its stubs are those of the C interface
-    buffer, evaluate = function.buffer()
-    given = [np.zeros(function.size_in(k)[::-1]) for k in range(function.n_in())]
-    results = [np.zeros(function.size_out(k)[::-1]) for k in range(function.n_out())]
-    for put, places in ((buffer.set_arg, given), (buffer.set_res, results)):
-        for k, place in enumerate(places):
-            put(k, place.reshape(-1).data)
-
-    def call(*arguments: Array) -> list[Array]:
-        for place, argument in zip(given, arguments, strict=True):
-            place.squeeze()[...] = argument
-        evaluate()
-        return [result.squeeze().copy() for result in results]
-
-    call.owners = function, buffer  # type: ignore[attr-defined]  # `evaluate` keeps neither alive
-    return call
-
-
 class Numbers(NamedTuple):
     parameters: Array  # (NUM_DYNAMIC,) of the dynamics
     legs: Array  # (6, LEG_NUMBERS), see `core.layout`
 
 
 class Slopes(NamedTuple):
-    """Accelerations at n points, and their derivatives."""
+    """Accelerations at a point, and their derivatives."""
 
-    accelerations: Array  # (n, 6)
-    state: Array  # (n, 6, 12)
-    numbers: Array  # (n, 6, NUM_DYNAMIC + NUM_GEOMETRY)
-
-
-class SymbolicLegs(NamedTuple):
-    """Symbols of the equations, of a machine's legs (18, 6), and of its constants (13,)."""
-
-    s: dict[str, ca.SX]
-    legs: ca.SX
-    constants: ca.SX
-
-    @property
-    def geometry(self) -> ca.SX:
-        """Free numbers of the legs (NUM_GEOMETRY,), leg by leg."""
-        return ca.vec(self.legs[list(LEG_PLACES), :])
+    accelerations: Array  # (6,)
+    state: Array  # (6, 12)
+    numbers: Array  # (6, NUM_DYNAMIC + NUM_GEOMETRY)
 
 
 class MachineModel:
     """Accelerations and crank angles of a machine with any numbers, and their derivatives.
 
-    Bodies, motor frames and branches stay. Each call evaluates a number of points. Gravity is along
-    -z.
+    Bodies, motor frames and branches stay. Gravity is along -z. `free_legs` is whether derivatives
+    by the numbers of the legs are wanted, which take most of the time.
     """
 
-    def __init__(self, mechanism: Mechanism, gravity: float, points: int) -> None:
-        self.mechanism, self.gravity, self.points = mechanism, gravity, points
+    def __init__(self, mechanism: Mechanism, gravity: float, free_legs: bool = True) -> None:
+        self.mechanism, self.gravity, self.free_legs = mechanism, gravity, free_legs
 
-    @cached_property
-    def _symbols(self) -> SymbolicLegs:
-        constants = ca.SX.sym("constants", NUM_CONSTANTS)
-        whole = ca.vertcat(constants, ca.SX.zeros(len(WRENCHES)))
-        legs = ca.SX.sym("legs", LEG_NUMBERS, NUM_LEGS)
-        return SymbolicLegs(equations.symbols() | {"parameters": whole}, legs, constants)
+    def plant(self, numbers: Numbers) -> tuple[Any, object]:
+        """Return a `stewart_plant` with these numbers, and the memory that it uses."""
+        geometry, parameters = geometry_of(self.mechanism).copy(), plant_parameters()
+        geometry[: LEG_NUMBERS * NUM_LEGS] = numbers.legs.T.ravel()
+        parameters[:NUM_DYNAMIC] = numbers.parameters
+        kept = [core().at(one) for one in (geometry, parameters, np.array([self.gravity]))]
+        return core().plant(*kept), kept
 
-    @cached_property
-    def _motion(self) -> equations.Motion:
-        (s, legs, _), common = self._symbols, numbers_of(self.mechanism)[1]
-        plate = equations.plate_motion(s["pose"], s["rates"], ca.SX(self.gravity))
-        sums = equations.plate_alone(common, plate, s["parameters"])
-        numbers, arms, crank_rates = ca.SX.sym("leg", LEG_NUMBERS), [], []
-        one, *others = equations.leg_on_plate(leg_numbers(numbers), common, plate)
-        leg = ca.Function("leg", [s["pose"], s["rates"], numbers], [*one, *others])
-        for number in range(NUM_LEGS):
-            *added, arm, crank_rate = leg(s["pose"], s["rates"], legs[:, number])
-            sums = sums.plus(equations.Sums(*added))
-            arms.append(arm)
-            crank_rates.append(crank_rate)
-        rows = ca.vertcat(*arms), ca.vertcat(*crank_rates)
-        return equations.assembled(sums, *rows, s["pose"], s["rates"])
-
-    def _many(self, name: str, inputs: list[ca.SX], results: list[ca.SX], shared: int) -> Compiled:
-        """Return a function of all points; the last `shared` inputs are the same for all."""
-        one = ca.Function(name, inputs, [ca.densify(one) for one in results], {"cse": True})
-        same = list(range(len(inputs) - shared, len(inputs)))
-        return compiled(one.map(name, "serial", self.points, same, []))
-
-    @cached_property
-    def _accelerations(self) -> Compiled:
-        s, legs, constants = self._symbols
-        p = s["parameters"]
-        slip = equations.slip(self._motion.crank_rates, p)
-        found = equations.accelerations(self._motion, s["torque"], p, slip)
-        inputs = [s["pose"], s["rates"], s["torque"], constants, legs]
-        return self._many("forward", inputs, [found], 2)
-
-    @cached_property
-    def _residual(self) -> Compiled:
-        (s, legs, constants), motion = self._symbols, self._motion
-        p = s["parameters"]
-        nu_dot = ca.mtimes(motion.rates_map, s["accelerations"]) + motion.nu_dot_bias
-        force = equations.force(motion, s["torque"], p, equations.slip(motion.crank_rates, p))
-        F = ca.mtimes(motion.mass, nu_dot) - force
-        by_legs = ca.jacobian(F, ca.vec(legs))
-        places = [LEG_NUMBERS * leg + k for leg in range(NUM_LEGS) for k in LEG_PLACES]
-        state = ca.vertcat(s["pose"], s["rates"])
-        slopes = ca.horzcat(ca.jacobian(F, state), ca.jacobian(F, constants), by_legs[:, places])
-        inputs = [s["pose"], s["rates"], s["accelerations"], s["torque"], constants, legs]
-        return self._many("residual", inputs, [slopes, ca.mtimes(motion.mass, motion.rates_map)], 2)
-
-    @cached_property
-    def _angles(self) -> Compiled:
-        (s, legs, _), geometry = self._symbols, self._symbols.geometry
-        R_WP, angles = equations.rotation(s["pose"][:3]), []
-        for number in range(NUM_LEGS):
-            leg = leg_numbers(legs[:, number])
-            p_SQ_W = s["pose"][3:] + ca.mtimes(R_WP, leg.p_PQ) - leg.p_WS
-            q = ca.mtimes(leg.R_WS.T, p_SQ_W)
-            cosine = equations.swing_cosine(q, leg.crank_length, leg.rod_length)
-            angles.append(ca.atan2(q[1], q[0]) + leg.branch * ca.acos(cosine))
-        alpha = ca.vertcat(*angles)
-        slopes = ca.jacobian(alpha, s["pose"]), ca.jacobian(alpha, geometry)
-        return self._many("angles", [s["pose"], legs], [alpha, *slopes], 1)
-
-    def accelerations(self, states: Array, torques: Array, numbers: Numbers) -> Array:
-        """Return the pose's accelerations (n, 6) at states (n, 12) under torques (n, 6)."""
-        found: Array = self._accelerations(states[:, :6], states[:, 6:], torques, *numbers)[0]
-        return found.reshape(self.points, NUM_COORDINATES)
-
-    def slopes(self, states: Array, torques: Array, numbers: Numbers) -> Slopes:
-        a = self.accelerations(states, torques, numbers)
-        dF, MN = self._residual(states[:, :6], states[:, 6:], a, torques, *numbers)
-        n = self.points
-        dF, MN = dF.reshape(n, -1, NUM_COORDINATES), MN.reshape(n, 6, 6)
-        da = np.negative(np.linalg.solve(MN.transpose(0, 2, 1), dF.transpose(0, 2, 1)), dtype=float)
-        return Slopes(a, da[:, :, :NUM_STATE], da[:, :, NUM_STATE:])
+    def slopes(self, state: Array, torque: Array, numbers: Numbers) -> Slopes:
+        """Return accelerations and derivatives at a state (12,) under a torque (6,)."""
+        plant, _kept = self.plant(numbers)
+        columns = NUM_DYNAMIC + NUM_GEOMETRY * self.free_legs
+        found = Slopes(*(np.empty(6 * n) for n in (1, NUM_STATE, columns)))
+        core().call("slopes", plant, self.free_legs, np.array(state), np.array(torque), *found)
+        return Slopes(found[0], found[1].reshape(6, -1), found[2].reshape(6, -1))
 
     def crank_angles(self, poses: Array, numbers: Numbers) -> tuple[Array, Array, Array]:
-        """Return angles (n, 6), d/dpose (n, 6, 6) and d/dgeometry (n, 6, NUM_GEOMETRY).
+        """Return angles (..., 6), d/dpose (..., 6, 6) and d/dgeometry (..., 6, NUM_GEOMETRY).
 
-        They are NaN out of reach.
+        They are NaN out of reach. With r the rod's direction, t that of the crank's tip, e the
+        crank's, u and l the lengths, and Q, W the plate joint and the shaft,
+
+            u r.t d alpha = r.(dQ - dW) - r.e du - dl.
         """
-        n = self.points
-        alpha, by_pose, by_geometry = self._angles(poses, numbers.legs)
-        return (
-            alpha.reshape(n, NUM_LEGS),
-            by_pose.reshape(n, 6, 6).transpose(0, 2, 1),
-            by_geometry.reshape(n, NUM_GEOMETRY, 6).transpose(0, 2, 1),
+        legs = Legs(
+            p_WS=numbers.legs[:, 15:18],
+            R_WS=numbers.legs[:, 3:12].reshape(-1, 3, 3).swapaxes(1, 2),
+            p_PQ=numbers.legs[:, 12:15],
+            crank_lengths=numbers.legs[:, 0],
+            rod_lengths=numbers.legs[:, 1],
+            branches=numbers.legs[:, 2],
         )
-
-
-class DrawnModel(MachineModel):
-    """Machine with its legs as drawn: fifty times as fast, zero derivatives by the geometry."""
-
-    def _compiled(self, name: str) -> Compiled:
-        """Return a function of the core at all points; its last argument, the legs, is unused."""
-        function = NativeFunction(name, geometry_of(self.mechanism), self.points)
-        parameters = plant_parameters()
-
-        def call(*arguments: Array) -> list[Array]:
-            *at, parameters[:NUM_DYNAMIC], _ = arguments
-            return [*function(*at, parameters, self.gravity)]
-
-        return call
-
-    @cached_property
-    def _accelerations(self) -> Compiled:
-        return self._compiled("accelerations")
-
-    @cached_property
-    def _residual(self) -> Compiled:
-        derivatives = self._compiled("residual_derivatives")
-        by_geometry = np.zeros((self.points, NUM_GEOMETRY, NUM_COORDINATES))
-
-        def slopes(*arguments: Array) -> list[Array]:
-            by_state, by_parameters, MN, _ = derivatives(*arguments)
-            by_constants = by_parameters[:, :NUM_DYNAMIC]
-            return [np.concatenate([by_state, by_constants, by_geometry], axis=1), MN]
-
-        return slopes
+        flat = poses.reshape(-1, NUM_COORDINATES)
+        turns = flat[:, ANGLES]
+        E = np.array([angle_rate_map(one) for one in turns])
+        with np.errstate(all="ignore"):
+            at = legs_along(legs, flat)
+            lever = (legs.crank_lengths * at.transmission)[..., None]
+            by_pose = np.concatenate([np.cross(at.p_PQ_W, at.rod) @ E, at.rod], axis=2) / lever
+            stretch = -dot(at.rod, at.crank)[..., None]
+            lengths = np.concatenate([stretch, -np.ones_like(stretch)], axis=2)
+            of_leg = np.concatenate([lengths, at.rod @ rotation(turns), -at.rod], axis=2) / lever
+        by_geometry = np.zeros((len(flat), NUM_LEGS, NUM_LEGS, PER_LEG))
+        by_geometry[:, range(NUM_LEGS), range(NUM_LEGS)] = of_leg
+        shape = poses.shape[:-1]
+        return (
+            at.crank_angles.reshape(*shape, NUM_LEGS),
+            by_pose.reshape(*shape, NUM_LEGS, NUM_COORDINATES),
+            by_geometry.reshape(*shape, NUM_LEGS, NUM_GEOMETRY),
+        )
