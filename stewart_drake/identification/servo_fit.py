@@ -161,9 +161,12 @@ class ServoModel:
         angles = legs_along(self.mechanism, states[self.counted][:, POSE]).crank_angles
         return turned(angles, measured) - measured
 
-    def jacobian(self, theta: Array, free: NDArray[np.intp]) -> Array:
-        """Return the derivatives (m, 6, k) of the residuals by the free unknowns."""
-        scale, here, columns = scale_of(theta), self.residuals(theta), list[Array]()
+    def jacobian(self, theta: Array, free: NDArray[np.intp], here: Array) -> Array:
+        """Return the derivatives (m, 6, k) of the residuals by the free unknowns.
+
+        `here` (m, 6) are the residuals at theta.
+        """
+        scale, columns = scale_of(theta), list[Array]()
         for k in free:
             moved = theta.copy()
             moved[k] += _DELAY_STEP if k == D else _STEP * scale[k]
@@ -382,7 +385,9 @@ def identify_servos(
     found = _fitted(model, regression(model, False), np.arange(BALL_FRICTION), rounding)
     if found.residual >= CODES * rounding:
         progress.phase("friction of the ball joints")
-        rubbing = _fitted(model, regression(model, True), np.arange(len(NAMES)), rounding)
+        start = regression(model, True)
+        start[ARMATURE] = found.theta[ARMATURE]  # a motor without inertia takes short steps
+        rubbing = _fitted(model, start, np.arange(len(NAMES)), rounding)
         better = rubbing.residual < GAIN * found.residual
         found = rubbing if better else replace(found, ball_joints_tried=True)
     moving = model.speeds >= STICKS * found.theta[SPEED]
@@ -404,7 +409,7 @@ def _fitted(
     """Return the fit of the free unknowns to samples (m, 6), all if None, by output error."""
     fitted = np.ones(model.speeds.shape, bool) if samples is None else samples
     first, scale = _in_reach(model, start), scale_of(start)[free]
-    iterations = count(1)
+    iterations, here = count(1), np.empty(0)
 
     def whole(x: Array) -> Array:
         theta = first.copy()
@@ -412,11 +417,14 @@ def _fitted(
         return theta
 
     def residuals(x: Array) -> Array:
-        return (model.residuals(whole(x)) * fitted).ravel()
+        nonlocal here
+        here = model.residuals(whole(x))
+        return (here * fitted).ravel()
 
     def jacobian(x: Array) -> Array:
         progress.iteration(next(iterations), _ITERATIONS)
-        J = model.jacobian(whole(x), free) * fitted[:, :, None]
+        # The solver asks for it where it has just asked for the residuals.
+        J = model.jacobian(whole(x), free, here) * fitted[:, :, None]
         return J.reshape(-1, len(free)) * scale
 
     found = least_squares(

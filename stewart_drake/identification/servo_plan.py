@@ -132,7 +132,7 @@ def plan_servos(
         model=seen_by,
         theta=planner.theta,
         residuals=residuals,
-        jacobian=seen_by.jacobian(planner.theta, free),
+        jacobian=seen_by.jacobian(planner.theta, free, residuals),
         fitted=np.ones(residuals.shape, bool),
         free=free,
         rounding=rounding,
