@@ -52,11 +52,6 @@ void stewart_residual_derivatives(const stewart_plant *plant, const real *pose, 
                                   const real *accelerations, const real *torque, real *dF_dx,
                                   real *dF_dp, real *M, real *B);
 
-/* dF (6) by crank, rod, plate joint (3) and shaft (3) of each leg, leg by leg (6, 48), of the same F by
-   central differences. */
-void stewart_leg_derivatives(const stewart_plant *plant, const real *pose, const real *rates,
-                             const real *accelerations, const real *torque, real *dF_dlegs);
-
 /* Sine of each crank's angle off dead centre (6), the signed measure of parallel singularity, minus
    the pitch's amount; `angles` of the cranks where they are known, else NULL. */
 void stewart_measures(const real *geometry, const real *pose, const real *angles, real *measures);
