@@ -98,7 +98,7 @@ def test_it_answers_in_words(html, summary):
         said = summary["analyses"][name]["verdict"]
         assert said[1:].removesuffix(".") in text
     assert "stewart-drake report paper --set plant.kind=exact" in text
-    assert "drake " in text and "casadi " in text and "python " in text
+    assert "drake " in text and "numpy " in text and "python " in text
 
 
 def test_table_ii_has_the_papers_numbers_and_ours(html, summary):

@@ -8,5 +8,5 @@ _version = cache(version)  # read from files, which takes ms
 
 
 def versions() -> dict[str, str]:
-    packages = ("stewart-drake", "drake", "casadi", "numpy", "scipy")
+    packages = ("stewart-drake", "drake", "numpy", "scipy")
     return {"python": platform.python_version()} | {name: _version(name) for name in packages}
