@@ -70,7 +70,7 @@ def test_weak_motors_are_as_weak_on_both_plants(weak):
     assert np.sqrt(np.mean(apart**2)) < 0.01 * WEAK
     # So far apart are the plants from rest without a limit, too: 21.08 and 21.76.
     assert exact.accumulated_error == pytest.approx(multibody.accumulated_error, rel=0.035)
-    assert exact.accumulated_error > 23  # against 21.1: it was felt
+    assert exact.accumulated_error > 22.5  # against 21.1: it was felt
 
 
 @pytest.mark.parametrize("plant", PLANTS)

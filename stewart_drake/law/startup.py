@@ -40,6 +40,8 @@ BLOCK = 64
 """Holds per prediction; over a long delay the comparison may end with the first ones."""
 INSTANTS = 200
 """Number of instants at which torques along a reference are evaluated."""
+FILTER_INSTANTS = 24
+"""Number of instants at which the integration error of the filter's model is evaluated."""
 TOLERANCE = 0.03
 """Pose error that is tolerable, as a share of half the reference's peak to peak.
 
@@ -209,7 +211,7 @@ def filter_substeps(
         return float(np.max(np.abs(coarse - fine) / model_std))
 
     substeps = 1
-    for t in spread_instants(duration, 8):
+    for t in spread_instants(duration, FILTER_INSTANTS):
         while substeps < MOST_SUBSTEPS and error(t, substeps) > 1:
             substeps *= 2
     return substeps

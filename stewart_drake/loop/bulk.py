@@ -37,6 +37,7 @@ from stewart_drake.loop.law_design import (
     on_its_way,
     sizing_of,
     way_onto,
+    white_errors,
 )
 from stewart_drake.loop.link import begun, buffer_places, measurement_link
 from stewart_drake.loop.preparation import Experiment, assemble, network_of, prepare
@@ -88,7 +89,8 @@ _DRAWN: Final = (
     ("actuator", "torque_limit"),
     *(("controller", name) for name in ("w_Q", "w_R", "delay_steps", "delay_fraction")),
 )
-"""Fields of a scenario without effect on a `Preparation`, apart from the believed delay."""
+"""Fields of a scenario without effect on a `Preparation`, apart from the believed delay and whether
+errors are white."""
 _PREPARATIONS: Final = 16
 """Largest number of preparations that a process keeps."""
 _NODES: Final = 5e-3
@@ -274,6 +276,7 @@ def _key(scenario: Scenario) -> tuple[Any, ...]:
         del fields[section][name]
     del fields["tuner"]
     fields["delay"] = believed.steps, believed.fraction
+    fields["white"] = white_errors(scenario)  # for the integration steps of the filter
     fields["link"] = scenario.link.kind
     machines = scenario.mechanism, scenario.plant.mechanism
     files = [resolve("mechanism", name) for name in machines if name is not None]

@@ -165,7 +165,7 @@ def sizing_of(experiment: Experiment) -> Sizing:
     period, steps = sc.controller.period, believed_delay(sc).steps
     substeps = choose_substeps(nominal, reference, period, steps, sc.duration)
     if sc.controller.estimate:
-        given = period, sc.controller.model_error, *_white(sc)
+        given = period, sc.controller.model_error, *white_errors(sc)
         model_std = assumed_model_error(experiment.motion_scale, *given)
         assumed = filter_substeps(nominal, reference, period, sc.duration, model_std)
         substeps = max(substeps, assumed)
@@ -213,7 +213,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     motion_torque = max(STILL * machine_scale, reachable)
     parameters = estimated_parameters(experiment, torque_scale, motion_torque)
     noise = sc.sensor.noise_std if isinstance(sc.sensor, StateSensorConfig) else None
-    tolerated, (white, noisy) = tolerated_timing(experiment), _white(sc)
+    tolerated, (white, noisy) = tolerated_timing(experiment), white_errors(sc)
     settings = filter_settings(
         motion,
         c.period,
@@ -405,7 +405,7 @@ def _learns(scenario: Scenario) -> bool:
     return scenario.plant.kind == "exact"
 
 
-def _white(scenario: Scenario) -> tuple[bool, bool]:
+def white_errors(scenario: Scenario) -> tuple[bool, bool]:
     """Return whether plant and sensor have white errors, and whether such a sensor has noise."""
     sensor = scenario.sensor
     white = _learns(scenario) and isinstance(sensor, StateSensorConfig)
