@@ -31,6 +31,7 @@ from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.law_design import (
+    Sizing,
     compose_law,
     first_queue,
     followed_motion,
@@ -89,8 +90,7 @@ _DRAWN: Final = (
     ("actuator", "torque_limit"),
     *(("controller", name) for name in ("w_Q", "w_R", "delay_steps", "delay_fraction")),
 )
-"""Fields of a scenario without effect on a `Preparation`, apart from the believed delay and whether
-errors are white."""
+"""Fields of a scenario without effect on a `Preparation`, apart from the believed delay."""
 _PREPARATIONS: Final = 16
 """Largest number of preparations that a process keeps."""
 _NODES: Final = 5e-3
@@ -183,7 +183,7 @@ class Preparation:
 
     def __init__(self, scenario: Scenario) -> None:
         self._base = prepare(scenario)
-        self._sizing = sizing_of(self._base)
+        self._sizings: dict[tuple[bool, bool], Sizing] = {}
         self._ways: dict[bytes, CatchUp | None] = {}
         self._previews: dict[int, tuple[Trajectory, Array]] = {}
         self._motions: dict[tuple[int, float], tuple[Trajectory, tuple[Array, Array]]] = {}
@@ -201,7 +201,10 @@ class Preparation:
         if experiment.scenario.controller.command == "cranks":
             servos, motion, _ = servo_law(experiment)
             return Prepared(experiment, servos, motion, self._preview(motion, servos), None)
-        law = compose_law(experiment, self._sizing)
+        white = white_errors(experiment.scenario)
+        if white not in self._sizings:
+            self._sizings[white] = sizing_of(experiment)
+        law = compose_law(experiment, self._sizings[white])
         queue = experiment.torques_in_flight(law.timeline.delay).tobytes()
         if queue not in self._ways:
             self._ways[queue] = way_onto(experiment, law)
@@ -276,7 +279,6 @@ def _key(scenario: Scenario) -> tuple[Any, ...]:
         del fields[section][name]
     del fields["tuner"]
     fields["delay"] = believed.steps, believed.fraction
-    fields["white"] = white_errors(scenario)  # for the integration steps of the filter
     fields["link"] = scenario.link.kind
     machines = scenario.mechanism, scenario.plant.mechanism
     files = [resolve("mechanism", name) for name in machines if name is not None]
