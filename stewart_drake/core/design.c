@@ -16,7 +16,8 @@ int stewart_order(const stewart_cost *cost, int pending)
 
        T_k = mean_k - (s_{k+1} - s_{k-1}) / 24                                              (hold)
 
-   and the rates there differ by -dt/24 B (s_{k-1} + s_k), which feedback must not correct. */
+   and the rates there differ by -dt/24 B (s_{k-1} + s_k), which feedback must not correct. Torques that
+   do not move the plate along the reference have no such difference: s = 0. */
 void stewart_hold(const stewart_machine *machine, const stewart_cost *cost, const real *theta,
                   int pending, const real *nodes, stewart_held *held)
 {
@@ -32,7 +33,7 @@ void stewart_hold(const stewart_machine *machine, const stewart_cost *cost, cons
         }
         for (int i = 0; i < U; i++) {
             mean[k][i] = (at[0][i] + at[1][i]) / 2;
-            held->change[k][i] = SQRT_3 * (at[1][i] - at[0][i]);
+            held->change[k][i] = moves ? SQRT_3 * (at[1][i] - at[0][i]) : 0;
         }
     }
     for (int k = 1; k < holds - 1; k++)
