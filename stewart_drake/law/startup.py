@@ -137,6 +137,11 @@ def reference_torque(
     return float(reference_torques(dynamics, reference, duration, space).max())
 
 
+def near(mechanism: Mechanism) -> Array:
+    """Return the distance (6,) from the reference up to which a prediction is useful, rad and m."""
+    return ASTRAY * np.repeat([1.0, mechanism.crank_lengths.min()], 3)
+
+
 def choose_substeps(
     dynamics: StewartDynamics, reference: Trajectory, period: float, steps: int, duration: float
 ) -> int:
@@ -147,8 +152,7 @@ def choose_substeps(
     may lead far away from the reference, where no number of steps would do: there the comparison
     ends.
     """
-    crank, size = dynamics.mechanism.crank_lengths.min(), sizes(dynamics.mechanism)
-    near, horizon = ASTRAY * np.repeat([1.0, crank], 3), max(steps, 1)
+    size, horizon = sizes(dynamics.mechanism), max(steps, 1)
     instants = spread_instants(duration, 8)
 
     @functools.cache
@@ -168,7 +172,7 @@ def choose_substeps(
                     for before, n in ((coarse, substeps), (fine, 2 * substeps))
                 )
                 away = np.abs(fine[:, POSE] - wanted)
-                useful = np.logical_and.accumulate(np.all(away < near, axis=1))
+                useful = np.logical_and.accumulate(np.all(away < near(dynamics.mechanism), axis=1))
                 moved = np.abs((coarse - fine)[:, POSE] / size)[useful]
                 if moved.max(initial=0.0) > PREDICTION_BUDGET:
                     return False
@@ -205,6 +209,7 @@ def filter_substeps(
     begin = spread_instants(duration, FILTER_INSTANTS)
     torques = mean_torques(dynamics, reference, begin, begin + period)
     states = [evaluate(reference, t)[:NUM_STATE] for t in begin]
+    ends = np.array([evaluate(reference, t)[POSE] for t in begin + period])
 
     def after(substeps: int) -> Array:
         """States (FILTER_INSTANTS, 12) a period after each instant."""
@@ -214,7 +219,10 @@ def filter_substeps(
     substeps, coarse = 1, after(1)
     while substeps < MOST_SUBSTEPS:
         fine = after(2 * substeps)
-        if np.mean(((coarse - fine) / model_std) ** 2, axis=0).max() <= 1:
+        astray = np.abs([coarse[:, POSE] - ends, fine[:, POSE] - ends]) >= near(dynamics.mechanism)
+        useful = ~astray.any(axis=(0, 2))
+        errors = (coarse - fine)[useful] / model_std
+        if useful.any() and np.mean(errors**2, axis=0).max() <= 1:
             break
         substeps, coarse = 2 * substeps, fine
     return substeps

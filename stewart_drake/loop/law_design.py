@@ -164,15 +164,15 @@ def sizing_of(experiment: Experiment) -> Sizing:
     sc, nominal, reference = experiment.scenario, experiment.nominal, experiment.reference
     period, steps = sc.controller.period, believed_delay(sc).steps
     substeps = choose_substeps(nominal, reference, period, steps, sc.duration)
-    if sc.controller.estimate:
-        given = period, sc.controller.model_error, *white_errors(sc)
-        model_std = assumed_model_error(experiment.motion_scale, *given)
-        assumed = filter_substeps(nominal, reference, period, sc.duration, model_std)
-        substeps = max(substeps, assumed)
     largest = reachable = reference_torque(nominal, reference, sc.duration)
     if sc.controller.limits == "qp":
         space = clear_space(experiment)
         reachable = reference_torque(nominal, reference, sc.duration, space)
+    if sc.controller.estimate and reachable == largest:  # no number of steps does beyond the reach
+        given = period, sc.controller.model_error, *white_errors(sc)
+        model_std = assumed_model_error(experiment.motion_scale, *given)
+        assumed = filter_substeps(nominal, reference, period, sc.duration, model_std)
+        substeps = max(substeps, assumed)
     return Sizing(
         max(substeps, turning_substeps(nominal, reference, period, sc.duration)),
         largest,
