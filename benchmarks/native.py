@@ -35,7 +35,8 @@ def replayed_steps(name: str, samples: int = 60, repeats: int = 8) -> dict[str, 
 
     Both repeat the steps of one run, in turns, and use the compiled dynamics.
     """
-    scenario = sd.load_scenario(name, settings=["plant.kind=exact", f"duration={samples / 10}"])
+    settings = ["plant.kind=exact", "controller.replan=0", f"duration={samples / 10}"]
+    scenario = sd.load_scenario(name, settings=settings)
     recorded = record(scenario)
     law = recorded.law
     assert isinstance(law, PredictiveLqi)
