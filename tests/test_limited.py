@@ -195,7 +195,8 @@ def test_the_root_of_the_pose_is_that_of_sampled_predictions(paper):
     timeline = Timeline(0.1, Delay(4))
     belief = replace(Belief.nothing(timeline, 12, dynamics.parameters), estimate=Estimate(mean, C))
     schedule = timeline.until_next(np.tile(dynamics.equilibrium_torque(paper.home), (4, 1)))
-    W = pose_root(plant, belief, schedule)
+    states = plant.predict(belief.state, schedule, belief.parameters)
+    W = pose_root(plant, belief, schedule, states)
     drawn = mean + spread * rng.standard_normal((size, n))
     ends = [plant.predict(xi[:12], schedule, xi[12:])[-1, :6] for xi in drawn]
     stated = np.linalg.cholesky(W @ W.T)

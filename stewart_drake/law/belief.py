@@ -47,6 +47,12 @@ class Estimate:
         return np.sqrt(np.diag(self.covariance)[THETA])
 
     @property
+    def covariance_root(self) -> Array:
+        """A root L (12 + p, 12 + p) of the covariance, L L'."""
+        w, V = np.linalg.eigh(self.covariance)
+        return np.asarray(V * np.sqrt(np.maximum(w, 0.0)))
+
+    @property
     def uncertain(self) -> bool:
         """Whether there is a covariance."""
         return not np.isnan(self.covariance[0, 0])

@@ -1,7 +1,7 @@
 """Structures of the core for parts of the law, each made once."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -28,17 +28,18 @@ class Compiled(NamedTuple):
     keeps: tuple[Any, ...] = ()  # objects that it points to
     raised: tuple[list[BaseException], ...] = ()  # errors of Python parts that C has called
 
-    def raise_errors(self) -> None:
-        """Raise the first error of a Python part since the last call."""
-        for errors in self.raised:
-            if errors:
-                first = errors[0]
-                errors.clear()
-                raise first
-
     def pointed(self) -> list[Any]:
         """Return the structure and all arrays and structures that it points to."""
         return [self.it, *_flat(self.keeps)]
+
+
+def raise_first(raised: Iterable[list[BaseException]]) -> None:
+    """Raise the first error of a Python part since the last call."""
+    for errors in raised:
+        if errors:
+            first = errors[0]
+            errors.clear()
+            raise first
 
 
 def _flat(kept: Any) -> list[Any]:

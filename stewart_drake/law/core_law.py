@@ -13,7 +13,14 @@ import numpy as np
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.law.channel import Packets, Wire, packets_of, report_of
-from stewart_drake.law.compiled import DYNAMICS, address_of, machine_of, numbers, resists
+from stewart_drake.law.compiled import (
+    DYNAMICS,
+    address_of,
+    machine_of,
+    numbers,
+    raise_first,
+    resists,
+)
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.feedforward import (
     EquilibriumFeedforward,
@@ -212,7 +219,7 @@ class CompiledLaw:
             c.lib.stewart_servo_start(*given, c.at(first))
         else:
             c.lib.stewart_start(*given, len(first), c.at(first))
-        self._raise_errors()
+        raise_first(self._raised)
         return memory
 
     def step(
@@ -250,7 +257,7 @@ class CompiledLaw:
             compiled, torque = report_of(report), np.empty(NUM_TORQUES)
             sample.report, sample.weights = compiled.it, list(weights)
             c.lib.stewart_step(*given, c.at(torque))
-        self._raise_errors()
+        raise_first(self._raised)
         return after
 
     def followed(self, memory: Memory, motion: Motion, times: Array) -> Array:
@@ -263,13 +270,5 @@ class CompiledLaw:
         sample.goal = goal if isinstance(motion, KnownMotion) else c.ffi.NULL
         given = c.at(memory.field("planner")), sample, len(times), c.at(times), c.at(rows)
         planner.rows(self.data, *given)
-        self._raise_errors()
+        raise_first(self._raised)
         return rows
-
-    def _raise_errors(self) -> None:
-        """Raise the first error of a part in Python since the last call."""
-        for errors in self._raised:
-            if errors:
-                first = errors[0]
-                errors.clear()
-                raise first

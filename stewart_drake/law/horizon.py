@@ -145,29 +145,38 @@ def _by_bias(plant: NominalPlant) -> NominalPlant:
     return NominalPlant(own, plant.substeps, plant.coarse_torque_limit, plant.motors)
 
 
-def pose_root(plant: NominalPlant, belief: Belief, schedule: TorqueSchedule) -> Array:
+def pose_root(
+    plant: NominalPlant, belief: Belief, schedule: TorqueSchedule, states: Array
+) -> Array:
     """Return a root W (6, n) of the covariance W W' of the pose at the end of a prediction.
 
     With C the covariance of [state; parameters] now, and H the derivative of the predicted pose by
     both, W W' = H C H'. Without a covariance W is zero.
+
+    Args:
+        plant: model of the plant.
+        belief: now.
+        schedule: torques (k, 6) of the prediction.
+        states: (k, 12) predicted after each of them.
+
+    Raises:
+        ArithmeticError: the derivatives do not exist, as at a dead centre.
     """
-    C, number = belief.estimate.covariance, len(schedule.torques)
+    mean, number = belief.estimate.mean, len(schedule.torques)
     if not belief.estimate.uncertain:
         return np.zeros((NUM_COORDINATES, 1))
-    w, U = np.linalg.eigh(C)
-    H = np.eye(len(C))[:NUM_STATE]
+    H = np.eye(len(mean))[:NUM_STATE]
     if number:
-        c, maps = core(), np.empty((number, NUM_STATE, len(C)))
-        states = numbers(plant.predict(belief.state, schedule, belief.parameters))
-        given = [numbers(a) for a in (belief.estimate.mean, *schedule)]
-        mean, torques, durations = map(c.at, given)
+        c, maps = core(), np.empty((number, NUM_STATE, len(mean)))
+        given = [numbers(a) for a in (mean, states, *schedule)]
+        xi, after, torques, durations = map(c.at, given)
         until = c.ffi.new("stewart_schedule *", [number, torques, durations, 0])
         scratch = c.scratch(c.lib.stewart_transitions_scratch(len(belief.parameters)))
-        arrays = until, 0, c.at(states), c.at(maps), scratch
-        if not c.lib.stewart_transitions(machine_of(plant).it, mean, *arrays):
+        arrays = until, 0, after, c.at(maps), scratch
+        if not c.lib.stewart_transitions(machine_of(plant).it, xi, *arrays):
             raise ArithmeticError("prediction: no derivatives at a state of it")
         H = maps[-1]
-    return H[POSE] @ (U * np.sqrt(np.maximum(w, 0.0)))
+    return np.asarray(H[POSE] @ belief.estimate.covariance_root)
 
 
 class HorizonCost(NamedTuple):

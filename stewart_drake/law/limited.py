@@ -251,11 +251,12 @@ class LimitedLqi(OuterLqi):
         if quiet or not after.belief.feeds_back or not np.isfinite(further).all():
             return memory.following(after)
         belief, timeline = after.belief, after.belief.timeline
-        start, flying = belief.state, after.in_flight[:-1]
+        flying = after.in_flight[:-1]
         queue = flying[len(flying) - timeline.queue_length :]
-        schedule = timeline.until_next(queue)
+        schedule, start, predicted = timeline.until_next(queue), belief.state, np.empty(0)
         if len(queue):
-            start = self.plant.predict(start, schedule, belief.parameters)[-1]
+            predicted = self.plant.predict(belief.state, schedule, belief.parameters)
+            start = predicted[-1]
         holds = HoldModel(self.plant, belief.parameters, timeline.period)
         ahead = self._ahead(further, belief)
         if self._meets_limits(after, ahead, start, holds):
@@ -266,7 +267,7 @@ class LimitedLqi(OuterLqi):
         cause = None
         try:
             cost = self._cost(after, ahead, holds, weights * [1.0, self.caution(belief)])
-            root = pose_root(self.plant, belief, schedule)
+            root = pose_root(self.plant, belief, schedule, predicted)
             try:
                 plan = search.within(last or search.reference, cost, root, until)
             except (ArithmeticError, np.linalg.LinAlgError):

@@ -21,7 +21,7 @@ from scipy.special import chdtri
 from stewart_drake.core.library import core
 from stewart_drake.files.arguments import fixed, positive
 from stewart_drake.law.belief import Belief, Estimate, Innovations
-from stewart_drake.law.compiled import Compiled, Once, machine_of, numbers
+from stewart_drake.law.compiled import Compiled, Once, machine_of, numbers, raise_first
 from stewart_drake.law.counts import Counts
 from stewart_drake.law.filter_settings import FilterSettings
 from stewart_drake.law.nominal import NominalPlant
@@ -182,7 +182,7 @@ class CoreObserver:
         values, torques = measurement.known(sensing.size), numbers(in_flight)
         given = c.at(memory), len(torques), c.at(torques), c.at(values)
         status = observer.observe(law.it, *given, c.scratch(observer.scratch(law.it)))
-        law.raise_errors()
+        raise_first(law.raised)
         return belief_of(self, law.it, memory, timeline, status)
 
     def law(self, timeline: Timeline, sensing: Sensing, plant: NominalPlant) -> Compiled:

@@ -146,8 +146,7 @@ class OwnParts:
         if root is not None:
             root[:] = 0.0
         if root is not None and belief.estimate.uncertain:
-            w, V = np.linalg.eigh(belief.estimate.covariance)
-            root[:] = np.ravel(V * np.sqrt(np.maximum(w, 0.0)))
+            root[:] = belief.estimate.covariance_root.ravel()
         return float(belief.timing)
 
     # -------------------------------------------------------------- prediction and gain
