@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from stewart_drake.core.build import FOLDER, compiler
 from stewart_drake.core.library import core
@@ -28,6 +28,7 @@ from stewart_drake.files.fileio import replacing
 from stewart_drake.law.compiled import Compiled, address_of
 from stewart_drake.law.core_law import CompiledLaw
 from stewart_drake.law.predictive_lqi import PredictiveLqi
+from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.peer import FAULTS, identity_of
 from stewart_drake.loop.preparation import Experiment, prepare
@@ -55,16 +56,9 @@ EXAMPLES: Final = (
 DIGESTS: Final = "exported.sha256"
 """Digests of the written files, for `sha256sum -c`."""
 TEMPLATES: Final = Path(__file__).with_name("templates")
+README: Final = "README.md"
 TOLERANCES: Final = {"double": 1e-9, "float": 1e-3}
 """Tolerance of the replay, as a share of the peak."""
-_README: Final = Environment(
-    variable_start_string="@",
-    variable_end_string="@",
-    undefined=StrictUndefined,
-    trim_blocks=True,
-    lstrip_blocks=True,
-    keep_trailing_newline=True,
-)
 _UNMEASURED: Final = "Not compiled here: run `make size` and `make test`.\n"
 
 
@@ -77,67 +71,77 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         measured: whether to compile and run it here, for the sizes in its README.
     """
     recorded, experiment = record(scenario), prepare(scenario)
-    compiled, suffix = CompiledLaw(recorded.law), "f" if single else ""
-    law, tuner = recorded.law, None
-    if isinstance(law, PredictiveLqi):
+    law, compiled, suffix = recorded.law, CompiledLaw(recorded.law), "f" if single else ""
+    servos, tuner = isinstance(law, ServoPreview), None
+    if not isinstance(law, ServoPreview):
         source = weights_source(experiment, law)
         tuner = None if source is None else source.compiled
-    files = {name: (FOLDER / name).read_text("utf-8") for name in _sources(compiled, tuner)}
+    over_udp, sources = _is_example(recorded, tuner), _sources(compiled, tuner)
+    names = {path.name for path in TEMPLATES.iterdir()}
+    names -= set() if over_udp else set(EXAMPLES)
+    names -= set() if over_udp or recorded.moves else {"stewart_motion.c", "stewart_motion.h"}
+    files = {
+        name: (FOLDER / name).read_text("utf-8")
+        for name in (*sources, *(MACHINE if over_udp else ()))
+    }
     if single:
         defined = "#define STEWART_FLOAT\n\n#include"
         files["real.h"] = files["real.h"].replace("#include", defined, 1)
-    over_udp = _is_example(recorded, tuner)
-    values = {
-        "SCENARIO": scenario_yaml(scenario).replace("*/", "* /").strip(),
-        "PERIOD": f"{law.timeline.period:g}",
-        "TOLERANCE": f"{TOLERANCES['float' if single else 'double']:g}",
-        "REAL": "float" if single else "double",
-        "ESTIMATES": _estimates(scenario),
-        "OWN_WEIGHTS": numbers(experiment.scenario.controller.weights, suffix),
-        "TESTS": "stewart_test protocol_test" if over_udp else "stewart_test",
-        "TEST_OBJECTS": "stewart_motion.o" if recorded.moves else "",
-    }
-    values |= _workspace(experiment)
-    values |= _configuration(recorded, compiled, tuner, suffix)
-    values |= _replay(recorded, experiment, tuner, suffix)
-    kind = "torques" if isinstance(law, PredictiveLqi) else "servos"
-    names = {path.name for path in TEMPLATES.iterdir() if not path.name.startswith("replay_")}
-    if over_udp or recorded.moves:
-        values |= _example_data(experiment, recorded, suffix)
-    else:
-        names -= {"stewart_motion.c", "stewart_motion.h"}
-    if over_udp:
-        files |= {name: (FOLDER / name).read_text("utf-8") for name in MACHINE}
-    else:
-        names -= set(EXAMPLES)
-    texts = {name: (TEMPLATES / name).read_text("utf-8") for name in sorted(names)}
-    texts["replay.h"] = (TEMPLATES / f"replay_{kind}.h").read_text("utf-8")
-    readme = _README.from_string(texts.pop("README.md"))
-    files |= {name: _filled(text, values) for name, text in texts.items()}
-    values["SIZES"] = _sizes(files) if measured else _UNMEASURED
-    kinds = {
-        "servos": kind == "servos",
-        "tuned": tuner is not None,
-        "over_udp": over_udp,
-        "moves": recorded.moves,
+    values: dict[str, Any] = {
         "law": law,
         "scenario": scenario,
+        "experiment": experiment,
+        "scenario_yaml": scenario_yaml(scenario).replace("*/", "* /").strip(),
+        "real": "float" if single else "double",
+        "tolerance": f"{TOLERANCES['float' if single else 'double']:g}",
+        "servos": servos,
+        "over_udp": over_udp,
+        "moves": recorded.moves,
+        "steps": recorded.steps,
+        "queue": np.atleast_2d(recorded.first),
+        "headers": [name for name in sources if name.endswith(".h") and name != "equations.h"],
+        "objects": [
+            name.replace(".c", ".o") for name in (*sources, "stewart_config.c") if ".c" in name
+        ],
+        "configuration": Constants(
+            compiled.keep, compiled.tables, suffix, compiled.data[0], "stewart_law"
+        ),
+        "memory": compiled.data.memory,
+        "scratch": compiled.scratch,
+        "sizes": compiled.data.law if servos else compiled.data,
+        "tuner": None,
+        "least": LEAST,
+        "home_sign": home_sign(experiment.mechanism),
     }
-    return files | {"README.md": readme.render(values | kinds)}
+    if tuner is not None:
+        values |= _tuner(tuner, compiled, recorded, experiment, suffix)
+    if over_udp or recorded.moves:
+        values |= _motion(experiment, recorded)
+    if over_udp:
+        values |= {"identity": identity_of(scenario), "faults": FAULTS.values()}
+    texts = _templates(suffix)
+    files |= {name: texts.get_template(name).render(values) for name in names - {README}}
+    values["measured_sizes"] = _sizes(files) if measured else _UNMEASURED
+    return files | {README: texts.get_template(README).render(values)}
 
 
-def _estimates(scenario: Scenario) -> str:
-    names = [name.replace("_", " ") for name in scenario.controller.estimate]
-    if scenario.controller.delay_estimator != "none":
-        names.append("delay")
-    return ", ".join(names) or "no parameters"
-
-
-def _workspace(experiment: Experiment) -> dict[str, str]:
-    """Return the limits of `stewart_measures`, to three digits."""
-    names = {"LEAST_SINE": LEAST[0], "LEAST_PARALLEL": LEAST[-2], "LEAST_PITCH": LEAST[-1]}
-    sign = {"SIGN": f"{home_sign(experiment.mechanism):g}"}
-    return {name: f"{value:.3g}" for name, value in names.items()} | sign
+def _templates(suffix: str) -> Environment:
+    """Return the templates, with filters for arrays; `exact_rows` are in double precision."""
+    texts = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        variable_start_string="@",
+        variable_end_string="@",
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    texts.filters |= {
+        "c": partial(numbers, suffix=suffix),
+        "rows": partial(_rows, suffix=suffix),
+        "exact_rows": partial(_rows, suffix=""),
+    }
+    return texts
 
 
 def _is_example(recorded: Recorded, tuner: Compiled | None) -> bool:
@@ -166,143 +170,32 @@ def objects(files: Mapping[str, str]) -> list[str]:
     return found[1].split()
 
 
-def _configuration(
-    recorded: Recorded, compiled: CompiledLaw, tuner: Compiled | None, suffix: str
-) -> dict[str, str]:
-    """Return the constants of a law in C, and the sizes of its memory."""
-    written = Constants(compiled.keep, compiled.tables, suffix)
-    torques, c = isinstance(recorded.law, PredictiveLqi), core()
-    text = written.struct(compiled.data[0], "stewart_law")
-    law = compiled.data if torques else compiled.data.law
-    sources = _sources(compiled, tuner)
-    headers = (name for name in sources if name.endswith(".h") and name != "equations.h")
-    made = [name.replace(".c", ".o") for name in sources if name.endswith(".c")]
-    queue = np.atleast_2d(recorded.first)
-    values = {
-        "INCLUDES": "\n".join(f'#include "{name}"' for name in headers),
-        "HEADER": "law.h" if torques else "servo.h",
-        "OBJECTS": " ".join([*made, "stewart_config.o"]),
-        "KIND": "stewart_law" if torques else "stewart_servo",
-        "CONFIGURATION": text,
-        "MEMORY": str(compiled.data.memory),
-        "SCRATCH": str(compiled.scratch),
-        "ROWS": str(law.rows),
-        "MEASURED": str(law.measured),
-        "QUEUE": numbers(queue if queue.size else [0.0], suffix),
-        "QUEUE_ROWS": str(len(queue) if queue.size else 0),
-        "QUEUE_MEANING": (
-            "torques under way at the start, the oldest first"
-            if torques
-            else "the command that was sent last"
-        ),
-        "TUNER": "",
-        "TUNER_DECLARATION": "",
-    }
-    if tuner is not None:
-        kept = [array for array in tuner.keeps if isinstance(array, np.ndarray)]
-        own = Constants(kept, {}, suffix)
-        text = own.struct(tuner.it[0], "tuner")
-        lines = [*own.before, f"const stewart_tuner stewart_own_tuner = {text};"]
-        values["TUNER"] = "\n" + "\n".join(lines)
-        values["TUNER_DECLARATION"] = (
-            "extern const stewart_tuner stewart_own_tuner;\n#define STEWART_TUNER_MEMORY "
-            f"{c.lib.stewart_tuner_memory(tuner.it)} /* numbers that the tuner remembers */\n"
-        )
-        values["HEADER"] = "tuner.h"
-        values["SCRATCH"] = str(c.lib.stewart_tuned_step_scratch(compiled.data))
-    return values | {"CONSTANTS": "\n".join(written.before)}
-
-
-def _replay(
-    recorded: Recorded, experiment: Experiment, tuner: Compiled | None, suffix: str
-) -> dict[str, str]:
-    """Return the recorded steps that the test replays."""
-    steps, period = recorded.steps, recorded.law.timeline.period
-    rows = partial(_rows, suffix=suffix)
-    values = {
-        "STEPS": str(len(steps)),
-        "MEASUREMENT": rows(step.measurement for step in steps),
-        "AGE": ", ".join(str(step.age) for step in steps),
-        "STATUS": ", ".join(str(step.status) for step in steps),
-        "ANSWERS": rows(step.answer for step in steps),
-        "PREVIEW_ROWS": rows(step.preview for step in steps),
-        "UNIT": "N m",
-    }
-    if not isinstance(recorded.law, PredictiveLqi):
-        reports = [np.asarray(step.report) for step in steps]
-        size = {"REPORT_SIZE": str(reports[0].size), "SERVO_REPORTS": rows(reports)}
-        return values | size | {"UNIT": "rad, rad/s or N m"}
-    wanted = (evaluate(experiment.reference, k * period)[:NUM_STATE] for k in range(len(steps)))
-    return values | {
-        "WEIGHTS": rows(step.weights for step in steps),
-        "SENT": rows(step.sent for step in steps),
-        "TORQUES": str(recorded.law.channel.torques),
-        "REPORTS": _reports([step.report for step in steps], suffix),
-        "MOVES": str(int(recorded.moves)),
-        "TUNED": str(int(tuner is not None)),
-        "WANTED": "" if tuner is None else rows(wanted),
+def _tuner(
+    tuner: Compiled, compiled: CompiledLaw, recorded: Recorded, experiment: Experiment, suffix: str
+) -> dict[str, Any]:
+    """Return the constants of a tuner in C, sizes of memory, and the reference of each sample."""
+    c, period = core(), recorded.law.timeline.period
+    kept = [array for array in tuner.keeps if isinstance(array, np.ndarray)]
+    samples = range(len(recorded.steps))
+    return {
+        "tuner": Constants(kept, {}, suffix, tuner.it[0], "tuner"),
+        "tuner_memory": c.lib.stewart_tuner_memory(tuner.it),
+        "scratch": c.lib.stewart_tuned_step_scratch(compiled.data),
+        "wanted": [evaluate(experiment.reference, k * period)[:NUM_STATE] for k in samples],
     }
 
 
-def _reports(reports: list[Any], suffix: str) -> str:
-    """Return the reports of a run in C, and the function that returns the k-th one."""
-    head = "static const stewart_report *report_of(int k)"
-    if not any(reports):
-        return f"{head}\n{{\n    (void)k;\n    return NULL;\n}}\n"
-    lines, rows = [], []
-    for k, report in enumerate(reports):
-        if report is None:
-            rows.append("{0, 0, 0, 0, -1}")
-            continue
-        arrived, acted = report.arrived.astype(float), report.acted
-        lines += [f"static const real arrived_{k}[] = {numbers(arrived, suffix)};"]
-        lines += [f"static const real acted_{k}[] = {numbers(acted.ravel(), suffix)};"]
-        sizes = len(arrived), len(acted)
-        rows.append(f"{{{sizes[0]}, arrived_{k}, {sizes[1]}, acted_{k}, {report.age}}}")
-    table = ",\n    ".join(rows)
-    lines += [f"static const stewart_report reports[STEPS] = {{\n    {table}}};\n", head]
-    return "\n".join([*lines, "{\n    return reports[k].age < 0 ? NULL : &reports[k];\n}\n"])
-
-
-def _example_data(experiment: Experiment, recorded: Recorded, suffix: str) -> dict[str, str]:
-    """Return the data of the scenario that the examples need."""
-    scenario = experiment.scenario
+def _motion(experiment: Experiment, recorded: Recorded) -> dict[str, Any]:
+    """Return the scenario's motion by its knots, and that which a plan returns to."""
     rows = recorded.motion
     if rows is None:
         motion, times = control_law(experiment)[1], recorded.law.preview_times
-        rows = knots(motion, scenario.duration + max(0.0, float(times.max())))
-    return {
-        "DURATION": repr(float(scenario.duration)),
-        "START": numbers(experiment.start, suffix),
-        "LEAST": numbers(LEAST, suffix),
-        "HOME_SIGN": numbers(home_sign(experiment.mechanism), suffix),
-        "IDENTITY": ",\n    ".join(
-            f'{{{{{", ".join(f"0x{b:02x}" for b in part.digest)}}}, "{part.name}"}}'
-            for part in identity_of(scenario)
-        ),
-        "FAULTS": ",\n    ".join(
-            f'"{words.replace("{:", "%").replace("}", "")}"' for words in FAULTS.values()
-        ),
-        "KNOTS": str(len(rows)),
-        "MOTION": _rows(rows),
-        "GOAL": _goal(recorded.goal),
-        "MOTION_TOLERANCE": f"{TOLERANCE:g}",
-    }
+        rows = knots(motion, experiment.scenario.duration + max(0.0, float(times.max())))
+    return {"motion": rows, "goal": recorded.goal, "motion_tolerance": TOLERANCE}
 
 
-def _rows(rows: Iterable[Array], suffix: str = "") -> str:
+def _rows(rows: Iterable[Array], suffix: str) -> str:
     return ",\n    ".join(numbers(row, suffix) for row in rows)
-
-
-def _goal(rows: Array | None) -> str:
-    if rows is None:
-        return "void stewart_goal(double t, real *reference) { stewart_reference(t, reference); }\n"
-    number = len(rows)
-    return (
-        f"\nstatic const double goal[{number}][1 + STEWART_REFERENCE] = {{\n"
-        f"    {_rows(rows)}}};\n\n"
-        f"void stewart_goal(double t, real *reference) {{ along({number}, goal, t, reference); }}\n"
-    )
 
 
 def write(files: Mapping[str, str], folder: Path) -> list[Path]:
@@ -350,11 +243,6 @@ def _digests(folder: Path) -> dict[str, str]:
     return {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
 
 
-def _filled(text: str, values: Mapping[str, str]) -> str:
-    """Replace each @NAME@ that has a value."""
-    return re.sub(r"@([A-Z_]+)@", lambda found: values.get(found[1], found[0]), text)
-
-
 def _sizes(files: Mapping[str, str]) -> str:
     """Return the output of `make size` and `make test`, or without a compiler how to get it."""
     command = compiler()
@@ -382,18 +270,22 @@ def _make(folder: str, command: Iterable[str], target: str) -> str:
 
 
 class Constants:
-    """Initialisers of C structures, and definitions of the data that they point to.
+    """Initialiser of a C structure, and definitions of the data that it points to.
 
     Args:
         keep: arrays and C structures that a pointer may refer to.
         tables: names of the core's tables of functions, by address.
         suffix: of a number, `f` in single precision.
+        data: structure, and the beginning of the names of what it points to.
 
     Attributes:
-        before: definitions that must precede the initialisers.
+        text: initialiser of the structure.
+        before: definitions that must precede it.
     """
 
-    def __init__(self, keep: Iterable[Any], tables: dict[int, str], suffix: str) -> None:
+    def __init__(
+        self, keep: Iterable[Any], tables: dict[int, str], suffix: str, data: Any, about: str
+    ) -> None:
         self._tables, self._suffix = tables, suffix
         self._arrays, self._structures = {}, {}
         for kept in keep:
@@ -402,8 +294,9 @@ class Constants:
             else:
                 self._structures[address_of(kept)] = kept
         self.before: list[str] = []
+        self.text = self._struct(data, about)
 
-    def struct(self, data: Any, about: str) -> str:
+    def _struct(self, data: Any, about: str) -> str:
         fields = core().ffi.typeof(data).fields
         parts = (
             f".{name} = {self._value(getattr(data, name), field.type, f'{about}_{name}')}"
@@ -413,7 +306,7 @@ class Constants:
 
     def _value(self, value: Any, kind: Any, about: str) -> str:
         if kind.kind == "struct":
-            return self.struct(value, about)
+            return self._struct(value, about)
         if kind.kind == "array":
             return "{" + ", ".join(self._value(v, kind.item, about) for v in value) + "}"
         if kind.kind in ("pointer", "function"):
@@ -433,7 +326,7 @@ class Constants:
             return about
         pointer = self._structures[address]
         kind = core().ffi.typeof(pointer).item.cname
-        text = self.struct(pointer[0], about)
+        text = self._struct(pointer[0], about)
         self.before.append(f"static const {kind} {about} = {text};")
         return f"&{about}"
 

@@ -5,7 +5,7 @@
 
 #include "meter.h"
 
-#define STEPS @STEPS@
+#define STEPS @steps|length@
 
 static clock_t began;
 static int replays[STEPS];

@@ -1,17 +1,25 @@
 /* The configuration of one controller, of the scenario
 
-@SCENARIO@
+@scenario_yaml@
 */
 
 #include <math.h>
 
 #include "stewart_config.h"
-@INCLUDES@
+{% for name in headers %}
+#include "@name@"
+{% endfor %}
 
-@CONSTANTS@
+@configuration.before|join("\n")@
 
-const @KIND@ stewart_configuration = @CONFIGURATION@;
+const @"stewart_servo" if servos else "stewart_law"@ stewart_configuration = @configuration.text@;
 
-const real stewart_queue[] = @QUEUE@;
-const int stewart_queue_rows = @QUEUE_ROWS@;
-@TUNER@
+const real stewart_queue[] = @(queue if queue.size else [0.0])|c@;
+const int stewart_queue_rows = @queue|length if queue.size else 0@;
+{% if tuner %}
+
+{% for line in tuner.before %}
+@line@
+{% endfor %}
+const stewart_tuner stewart_own_tuner = @tuner.text@;
+{% endif %}

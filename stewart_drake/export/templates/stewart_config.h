@@ -3,15 +3,23 @@
 #ifndef STEWART_CONFIG_H
 #define STEWART_CONFIG_H
 
-#include "@HEADER@"
+#include "@"tuner" if tuner else "servo" if servos else "law"@.h"
 
-#define STEWART_MEMORY @MEMORY@ /* numbers of the state that the law keeps between samples */
-#define STEWART_SCRATCH @SCRATCH@ /* numbers of the workspace of a step */
-#define STEWART_MEASURED @MEASURED@ /* numbers of a measurement */
-#define STEWART_PREVIEW @ROWS@ /* largest number of instants of a preview */
+#define STEWART_MEMORY @memory@ /* numbers of the state that the law keeps between samples */
+#define STEWART_SCRATCH @scratch@ /* numbers of the workspace of a step */
+#define STEWART_MEASURED @sizes.measured@ /* numbers of a measurement */
+#define STEWART_PREVIEW @sizes.rows@ /* largest number of instants of a preview */
 
-extern const @KIND@ stewart_configuration;
-extern const real stewart_queue[]; /* @QUEUE_MEANING@ */
+extern const @"stewart_servo" if servos else "stewart_law"@ stewart_configuration;
+{% if servos %}
+extern const real stewart_queue[]; /* the command that was sent last */
+{% else %}
+extern const real stewart_queue[]; /* torques under way at the start, the oldest first */
+{% endif %}
 extern const int stewart_queue_rows;
-@TUNER_DECLARATION@
+{% if tuner %}
+extern const stewart_tuner stewart_own_tuner;
+#define STEWART_TUNER_MEMORY @tuner_memory@ /* numbers that the tuner remembers */
+{% endif %}
+
 #endif

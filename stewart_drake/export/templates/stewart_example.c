@@ -2,11 +2,15 @@
 
 #include "stewart_example.h"
 
-const real stewart_weights[2] = @OWN_WEIGHTS@;
-const real stewart_first_state[STEWART_STATES] = @START@;
-const real stewart_least[STEWART_MEASURES] = @LEAST@;
-const real stewart_home_sign = @HOME_SIGN@;
+const real stewart_weights[2] = @scenario.controller.weights|c@;
+const real stewart_first_state[STEWART_STATES] = @experiment.start|c@;
+const real stewart_least[STEWART_MEASURES] = @least|c@;
+const real stewart_home_sign = @home_sign|c@;
 const stewart_identity stewart_own_identity = {{
-    @IDENTITY@}};
+{% for part in identity %}
+    {{@part.digest|map("string")|join(", ")@}, "@part.name@"}@"," if not loop.last else "}};"@
+{% endfor %}
 const char *const stewart_faults[STEWART_FAULTS] = {
-    @FAULTS@};
+{% for words in faults %}
+    "@words|replace("{:", "%")|replace("}", "")@"@"," if not loop.last else "};"@
+{% endfor %}

@@ -1,12 +1,12 @@
 /* The motion as polynomials of fifth order between instants: pose, rates and accelerations there are
-   those of the scenario, in between they differ by less than @MOTION_TOLERANCE@ of their size. */
+   those of the scenario, in between they differ by less than @"%g" % motion_tolerance@ of their size. */
 
 #include "stewart_motion.h"
 
-const double stewart_duration = @DURATION@;
-#define KNOTS @KNOTS@
+const double stewart_duration = @scenario.duration|float@;
+#define KNOTS @motion|length@
 static const double motion[KNOTS][1 + STEWART_REFERENCE] = {
-    @MOTION@};
+    @motion|exact_rows@};
 
 /* The row at t of a number of knots. */
 static void along(int number, const double (*knots)[1 + STEWART_REFERENCE], double t, real *reference)
@@ -33,7 +33,16 @@ static void along(int number, const double (*knots)[1 + STEWART_REFERENCE], doub
 }
 
 void stewart_reference(double t, real *reference) { along(KNOTS, motion, t, reference); }
-@GOAL@
+{% if goal is none %}
+void stewart_goal(double t, real *reference) { stewart_reference(t, reference); }
+{% else %}
+
+static const double goal[@goal|length@][1 + STEWART_REFERENCE] = {
+    @goal|exact_rows@};
+
+void stewart_goal(double t, real *reference) { along(@goal|length@, goal, t, reference); }
+{% endif %}
+
 void stewart_look_ahead(void *context, int number, const real *times, real *rows)
 {
     for (int i = 0; i < number; i++)

@@ -6,7 +6,7 @@
 #include "meter.h"
 #include "stewart_config.h"
 
-#define STEPS @STEPS@
+#define STEPS @steps|length@
 #ifndef REPEATS
 #ifdef __SANITIZE_ADDRESS__ /* steps are slow, and their time means nothing */
 #define REPEATS 2
@@ -14,17 +14,17 @@
 #define REPEATS 20
 #endif
 #endif
-#define TOLERANCE @TOLERANCE@
+#define TOLERANCE @tolerance@
 
 static const real measurement[STEPS][STEWART_MEASURED] = {
-    @MEASUREMENT@};
-static const int age[STEPS] = {@AGE@};
+    @steps|map(attribute="measurement")|rows@};
+static const int age[STEPS] = {@steps|map(attribute="age")|join(", ")@};
 
 #include "replay.h"
 
 static const real expected[STEPS][ANSWER] = {
-    @ANSWERS@};
-static const int status[STEPS] = {@STATUS@};
+    @steps|map(attribute="answer")|rows@};
+static const int status[STEPS] = {@steps|map(attribute="status")|join(", ")@};
 
 int main(void)
 {
@@ -47,7 +47,7 @@ int main(void)
             }
         }
     }
-    printf("%d steps, largest error %.1e of the peak of %.3g @UNIT@, tolerance %.0e\n", STEPS,
+    printf("%d steps, largest error %.1e of the peak of %.3g @"rad, rad/s or N m" if servos else "N m"@, tolerance %.0e\n", STEPS,
            error / peak, peak, TOLERANCE);
     printf("statuses that differ: %d\n", different);
     meter_report(STEPS);
