@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 
 from benchmarks import short_logs
 from benchmarks.identification import calm_torque, excitation, find
+from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.fit import (
@@ -33,10 +34,12 @@ from stewart_drake.identification.model import (
     NUM_DYNAMIC,
     NUM_GEOMETRY,
     MachineModel,
+    Segment,
+    integrate,
+    plan_steps,
 )
 from stewart_drake.identification.plan import fitted_multisine, multisine
 from stewart_drake.identification.progress import shown_by
-from stewart_drake.identification.shooting import Segment, integrate, plan_steps
 from stewart_drake.identification.start import coarse_delay, measured_poses
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import (
@@ -87,6 +90,14 @@ def exact_states(mechanism, parameters, gravity, first, sent, torques, delay, ti
 # ---------------------------------------------------------------- the model
 
 
+def slopes(model, state, torque, numbers):
+    """Return accelerations (6,) and their derivatives by the state and by the numbers."""
+    (plant, _kept), legs = model.plant(numbers), NUM_GEOMETRY * model.free_legs
+    found = [np.empty((6, n)) for n in (1, 12, NUM_DYNAMIC + legs)]
+    core().call("slopes", plant, model.free_legs, state.copy(), torque.copy(), *found)
+    return found[0][:, 0], found[1], found[2]
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_model_is_that_of_the_dynamics(seed):
     rng = np.random.default_rng(seed)
@@ -104,9 +115,7 @@ def test_the_model_is_that_of_the_dynamics(seed):
     expected = [
         dynamics.accelerations(x[:6], x[6:], T) for x, T in zip(states, torques, strict=True)
     ]
-    found = [
-        model.slopes(x, T, numbers).accelerations for x, T in zip(states, torques, strict=True)
-    ]
+    found = [slopes(model, x, T, numbers)[0] for x, T in zip(states, torques, strict=True)]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
     alpha, J, _ = model.crank_angles(states[:, :6], numbers)
     np.testing.assert_allclose(alpha, [machine.crank_angles(x[:6]) for x in states], atol=1e-13)
@@ -123,7 +132,7 @@ def test_its_derivatives_are_those_of_other_machines():
     torque = 0.1 * rng.standard_normal(6)
     model = MachineModel(PAPER, 9.81)
     numbers = unknowns.numbers(values)
-    found = model.slopes(state, torque, numbers)
+    _, by_state, by_numbers = slopes(model, state, torque, numbers)
     by_geometry = model.crank_angles(state[None, :6], numbers)[2][0]
 
     def at(values, state=state):
@@ -140,14 +149,14 @@ def test_its_derivatives_are_those_of_other_machines():
         unit = np.eye(NUM_UNKNOWNS)[k]
         slope = difference(lambda h, unit=unit: at(values + h * unit), 1e-6)
         scale = np.abs(slope[:6]).max() + 1e-3
-        np.testing.assert_allclose(found.numbers[:, k], slope[:6], atol=1e-5 * scale)
+        np.testing.assert_allclose(by_numbers[:, k], slope[:6], atol=1e-5 * scale)
         if k >= NUM_DYNAMIC:
             expected = by_geometry[:, k - NUM_DYNAMIC]
             np.testing.assert_allclose(expected, slope[6:], atol=1e-6 * (1 + np.abs(slope).max()))
     for k in range(12):
         unit = np.eye(12)[k]
         slope = difference(lambda h, unit=unit: at(values, state + h * unit), 1e-6)[:6]
-        np.testing.assert_allclose(found.state[:, k], slope, atol=1e-5 * np.abs(slope).max())
+        np.testing.assert_allclose(by_state[:, k], slope, atol=1e-5 * np.abs(slope).max())
 
 
 def test_the_model_with_drawn_legs_is_the_same():
@@ -155,8 +164,8 @@ def test_the_model_with_drawn_legs_is_the_same():
     state = np.concatenate([PAPER.home, STILL]) + 0.05 * rng.standard_normal(12)
     numbers = unknowns.numbers(unknowns.mean)._replace(parameters=CONSTANTS)
     at = state, 0.1 * rng.standard_normal(6), numbers
-    expected, found = (MachineModel(PAPER, 9.81, free).slopes(*at) for free in (True, False))
-    dynamic = expected._replace(numbers=expected.numbers[:, :NUM_DYNAMIC])
+    expected, found = (slopes(MachineModel(PAPER, 9.81, free), *at) for free in (True, False))
+    dynamic = (*expected[:2], expected[2][:, :NUM_DYNAMIC])
     for one, other in zip(found, dynamic, strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -184,9 +193,9 @@ def test_trajectories_are_those_of_an_adaptive_integrator():
     values[DYNAMIC] = CONSTANTS
     model, numbers = MachineModel(PAPER, 0.0), unknowns.numbers(values)
     course = integrate(model, numbers, states[[0, 2]], plan_steps(segments, 0.23, 1e-3), False)
-    np.testing.assert_allclose(course.states[:, 0], states, atol=2e-7)
-    np.testing.assert_allclose(course.states[:3, 1], states[2:5], atol=2e-7)
-    assert np.isnan(course.states[3:, 1]).all()
+    np.testing.assert_allclose(course[0][:, 0], states, atol=2e-7)
+    np.testing.assert_allclose(course[0][:3, 1], states[2:5], atol=2e-7)
+    assert np.isnan(course[0][3:, 1]).all()
 
 
 @pytest.mark.parametrize("delay", [0.23, 0.2, 0.271])
@@ -204,21 +213,19 @@ def test_sensitivities_are_differences_of_trajectories(delay):
         plan = plan_steps(segment, values[DELAY], 2e-3)
         return integrate(model, unknowns.numbers(values), first[None], plan, sensitive)
 
-    slopes = at(values, sensitive=True).sensitivities[:, 0]
+    slopes = at(values, sensitive=True)[1][:, 0]
     column = {DELAY: -1, 0: 12, 6: 18, 7: 19, 8: 20, 11: 23}
     column |= {GEOMETRY.start + k: 12 + NUM_DYNAMIC + k for k in (0, 1, 3, 7, 41, 47)}
     for place, k in column.items():
         h = 1e-5 * np.eye(NUM_UNKNOWNS)[place]
-        expected = (at(values + h).states - at(values - h).states)[:, 0] / 2e-5
+        expected = (at(values + h)[0] - at(values - h)[0])[:, 0] / 2e-5
         scale = np.abs(expected).max()
         np.testing.assert_allclose(
             slopes[:, :, k], expected, atol=2e-4 * scale, err_msg=NAMES[place]
         )
     for k in range(12):
         h = 1e-5 * np.eye(12)[k]
-        expected = (at(values, states[0] + h).states - at(values, states[0] - h).states)[
-            :, 0
-        ] / 2e-5
+        expected = (at(values, states[0] + h)[0] - at(values, states[0] - h)[0])[:, 0] / 2e-5
         np.testing.assert_allclose(slopes[:, :, k], expected, atol=1e-6)
 
 
@@ -230,7 +237,7 @@ def test_the_delay_s_slope_is_that_of_exact_trajectories():
     model = MachineModel(PAPER, 0.0)
     plan = plan_steps([Segment(log, 0.255, np.arange(len(times)))], 0.23, 1e-3)
     numbers = some_unknowns(PAPER).numbers(values)
-    slope = integrate(model, numbers, states[:1], plan, True).sensitivities[:, 0, :, -1]
+    slope = integrate(model, numbers, states[:1], plan, True)[1][:, 0, :, -1]
     later, sooner = (
         exact_states(PAPER, PARAMETERS, 0.0, states[0], log.sent, log.torques, 0.23 + h, times)
         for h in (1e-5, -1e-5)

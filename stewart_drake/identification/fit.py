@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 
 from stewart_drake.identification import progress
 from stewart_drake.identification.logs import ANGLES, KINDS, NUM_MEASURED, POSE
-from stewart_drake.identification.model import NUM_DYNAMIC, MachineModel
-from stewart_drake.identification.shooting import (
+from stewart_drake.identification.model import (
     DELAY_COLUMN,
     FIRST_COLUMNS,
+    NUM_DYNAMIC,
     PARAMETER_COLUMNS,
+    MachineModel,
     Segment,
     integrate,
     plan_steps,

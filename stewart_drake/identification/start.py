@@ -11,7 +11,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.fit import Guess, Problem
 from stewart_drake.identification.logs import ANGLES, POSE, Log
 from stewart_drake.identification.logs import RATES as MEASURED_RATES
-from stewart_drake.identification.shooting import Segment
+from stewart_drake.identification.model import Segment
 from stewart_drake.identification.unknowns import DELAY, Unknowns
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import ForwardKinematicsError
