@@ -1,5 +1,5 @@
-/* See protocol.h. Numbers are put together byte by byte, so that the byte order and the alignment of
-   this processor do not matter. */
+/* See protocol.h. Numbers go byte by byte, so that the byte order and the alignment of this processor do
+   not matter. A function `pass_..` does both, write and read. */
 
 #include <math.h>
 #include <string.h>
@@ -138,34 +138,24 @@ static uint64_t get(const uint8_t **at, size_t bytes)
     return value;
 }
 
-/* A number of 1, 4 or 8 bytes as an unsigned one; a double by its bits. */
-typedef union {
-    uint8_t one;
-    uint32_t four;
-    uint64_t eight;
-} number;
+/* A datagram up to here, to write to, or with `to` NULL to read from. */
+typedef struct {
+    uint8_t *to;
+    const uint8_t *from;
+} datagram;
 
-static void put_numbers(uint8_t **at, const void *from, size_t size, size_t count)
+/* Write or read numbers of `size` bytes, the lowest byte first. */
+static void pass(datagram *d, void *numbers, size_t size, size_t count)
 {
-    for (size_t i = 0; i < count; i++) {
-        number n = {0};
-        memcpy(&n, (const uint8_t *)from + size * i, size);
-        put(at, size == 1 ? n.one : size == 4 ? n.four : n.eight, size);
-    }
-}
-
-static void get_numbers(const uint8_t **at, void *to, size_t size, size_t count)
-{
-    for (size_t i = 0; i < count; i++) {
-        number n;
-        uint64_t value = get(at, size);
-        if (size == 1)
-            n.one = (uint8_t)value;
-        else if (size == 4)
-            n.four = (uint32_t)value;
+    const uint16_t one = 1;
+    const int lowest_first = *(const uint8_t *)&one;
+    uint8_t *bytes = numbers;
+    for (size_t i = 0; i < size * count; i++) {
+        uint8_t *byte = bytes + (lowest_first ? i : i / size * size + size - 1 - i % size);
+        if (d->to)
+            *d->to++ = *byte;
         else
-            n.eight = value;
-        memcpy((uint8_t *)to + size * i, &n, size);
+            *byte = *d->from++;
     }
 }
 
@@ -183,19 +173,12 @@ typedef struct {
 } field;
 
 #define FIELD(type, member) {offsetof(type, member), sizeof(((type *)NULL)->member)}
-#define PUT(at, structure, fields) put_fields(at, structure, fields, sizeof fields / sizeof *fields)
-#define GET(at, structure, fields) get_fields(at, structure, fields, sizeof fields / sizeof *fields)
+#define PASS(d, structure, fields) pass_fields(d, structure, fields, sizeof fields / sizeof *fields)
 
-static void put_fields(uint8_t **at, const void *structure, const field *fields, size_t count)
+static void pass_fields(datagram *d, void *structure, const field *fields, size_t count)
 {
     for (size_t i = 0; i < count; i++)
-        put_numbers(at, (const uint8_t *)structure + fields[i].place, fields[i].size, 1);
-}
-
-static void get_fields(const uint8_t **at, void *structure, const field *fields, size_t count)
-{
-    for (size_t i = 0; i < count; i++)
-        get_numbers(at, (uint8_t *)structure + fields[i].place, fields[i].size, 1);
+        pass(d, (uint8_t *)structure + fields[i].place, fields[i].size, 1);
 }
 
 /* ---------------------------------------------------------------- head and tag */
@@ -205,23 +188,25 @@ static const field HEAD[] = {OF(session), OF(nonce), OF(sequence), OF(acknowledg
                              OF(time),    OF(echo),  OF(held),     OF(flags)};
 #undef OF
 
-static void put_head(uint8_t **at, const char *magic, const stewart_head *h, stewart_key key)
+/* Write a head. */
+static datagram put_head(uint8_t *data, const char *magic, stewart_head *h, stewart_key key)
 {
-    memcpy(*at, magic, 4);
-    *at += 4;
-    put(at, STEWART_PROTOCOL, 1);
-    put(at, key.size ? STEWART_TAG : 0, 1);
-    put(at, 0, 2); /* the length, once it is known */
-    PUT(at, h, HEAD);
+    datagram d = {data + 4, NULL};
+    memcpy(data, magic, 4);
+    put(&d.to, STEWART_PROTOCOL, 1);
+    put(&d.to, key.size ? STEWART_TAG : 0, 1);
+    put(&d.to, 0, 2); /* the length, once it is known */
+    PASS(&d, h, HEAD);
+    return d;
 }
 
-static size_t finish(uint8_t *data, uint8_t *end, stewart_key key)
+static size_t finish(uint8_t *data, datagram d, stewart_key key)
 {
-    size_t size = (size_t)(end - data) + (key.size ? STEWART_TAG : 0);
+    size_t size = (size_t)(d.to - data) + (key.size ? STEWART_TAG : 0);
     uint8_t *length = data + 6;
     put(&length, size, 2);
     if (key.size)
-        tag_of(key, data, (size_t)(end - data), end);
+        tag_of(key, data, (size_t)(d.to - data), d.to);
     return size;
 }
 
@@ -230,18 +215,18 @@ static int same_kind(const uint8_t *data, const char *magic)
     return memcmp(data, magic, 4) == 0;
 }
 
-/* Read and check head and tag of a datagram of a kind. `at` ends at the body, of `body` bytes, which are
+/* Read and check head and tag of a datagram of a kind. `d` ends at the body, of `body` bytes, which are
    at least `least`. */
 static int get_head(const char *magic, size_t least, const uint8_t *data, size_t size, stewart_key key,
-                    stewart_head *h, const uint8_t **at, size_t *body)
+                    stewart_head *h, datagram *d, size_t *body)
 {
     if (size < STEWART_HEAD || size > STEWART_LONGEST ||
         !(same_kind(data, "STWM") || same_kind(data, "STWC")))
         return STEWART_MALFORMED;
     if (data[4] != STEWART_PROTOCOL)
         return STEWART_VERSION;
-    *at = data + 5;
-    size_t tag = (size_t)get(at, 1), length = (size_t)get(at, 2);
+    *d = (datagram){NULL, data + 5};
+    size_t tag = (size_t)get(&d->from, 1), length = (size_t)get(&d->from, 2);
     if (length != size || !(tag == 0 || tag == STEWART_TAG) || size < STEWART_HEAD + tag)
         return STEWART_MALFORMED;
     if ((tag != 0) != (key.size != 0))
@@ -254,7 +239,7 @@ static int get_head(const char *magic, size_t least, const uint8_t *data, size_t
         if (differs)
             return STEWART_KEY;
     }
-    GET(at, h, HEAD);
+    PASS(d, h, HEAD);
     *body = size - STEWART_HEAD - tag;
     return h->session && h->sequence && same_kind(data, magic) && *body >= least ? STEWART_TAKEN
                                                                                  : STEWART_MALFORMED;
@@ -265,44 +250,26 @@ size_t stewart_write_version(const uint8_t *data, uint8_t *answer)
     const uint8_t *session = data + 8, *sequence = data + 24;
     stewart_key none = {NULL, 0};
     stewart_head head = {get(&session, 8), 0, 1, (uint32_t)get(&sequence, 4), 0, 0, 0, 0};
-    put_head(&answer, "STWM", &head, none);
-    return finish(answer - STEWART_HEAD, answer, none);
+    return finish(answer, put_head(answer, "STWM", &head, none), none);
 }
 
 /* ---------------------------------------------------------------- identity */
 
 #define IDENTITY (STEWART_PARTS * (STEWART_DIGEST + STEWART_NAME))
 
-static void put_identity(uint8_t **at, const stewart_identity *identity)
-{
-    for (int i = 0; i < STEWART_PARTS; i++) {
-        const stewart_part *part = &identity->parts[i];
-        int ended = 0;
-        memcpy(*at, part->digest, STEWART_DIGEST);
-        *at += STEWART_DIGEST;
-        for (int j = 0; j < STEWART_NAME; j++) {
-            ended |= part->name[j] == 0;
-            *(*at)++ = ended ? 0 : (uint8_t)part->name[j];
-        }
-    }
-}
-
-/* Read an identity; return whether all names can be printed. */
-static int get_identity(const uint8_t **at, stewart_identity *identity)
+/* Write or read an identity, names with zeros at the end; return whether all names can be printed. */
+static int pass_identity(datagram *d, stewart_identity *identity)
 {
     int printable = 1;
     for (int i = 0; i < STEWART_PARTS; i++) {
         stewart_part *part = &identity->parts[i];
-        int ended = 0;
-        memcpy(part->digest, *at, STEWART_DIGEST);
-        *at += STEWART_DIGEST;
-        for (int j = 0; j < STEWART_NAME; j++) {
-            uint8_t letter = *(*at)++;
-            ended |= letter == 0;
-            printable &= ended ? letter == 0 : letter >= 0x20 && letter <= 0x7e;
-            part->name[j] = (char)(letter & 0x7f);
-        }
+        pass(d, part->digest, 1, STEWART_DIGEST);
+        if (d->to)
+            memset(part->name + strlen(part->name), 0, STEWART_NAME - strlen(part->name));
+        pass(d, part->name, 1, STEWART_NAME);
         part->name[STEWART_NAME] = 0;
+        for (size_t j = 0, size = strlen(part->name); j < STEWART_NAME; j++)
+            printable &= j < size ? part->name[j] >= 0x20 && part->name[j] <= 0x7e : !part->name[j];
     }
     return printable;
 }
@@ -331,21 +298,27 @@ static const field MACHINE[] = {
 };
 #undef OF
 
-size_t stewart_write_measured(const stewart_measured *m, stewart_key key, uint8_t *data)
+/* Write or read what follows these fields; return whether it is plausible. */
+static int pass_measured(datagram *d, stewart_measured *m)
 {
-    uint8_t *at = data;
-    put_head(&at, "STWM", &m->head, key);
-    PUT(&at, m, MACHINE);
-    if (m->kind == STEWART_OFFER)
-        put_identity(&at, &m->identity);
+    int good = m->kind != STEWART_OFFER || pass_identity(d, &m->identity);
     if (m->kind == STEWART_STATE)
-        put_numbers(&at, m->state, 8, 12);
+        pass(d, m->state, 8, 12); /* NaN for a lost value */
     if (m->kind == STEWART_ENCODERS) {
-        put_numbers(&at, m->zeros, 8, 6);
-        put_numbers(&at, m->codes, 4, 6u * m->samples);
+        pass(d, m->zeros, 8, 6);
+        pass(d, m->codes, 4, 6u * m->samples);
     }
-    put_numbers(&at, m->acted, 8, 6u * m->history);
-    return finish(data, at, key);
+    pass(d, m->acted, 8, 6u * m->history);
+    return good && all_finite(m->zeros, 6) && all_finite(m->acted[0], 6 * m->history);
+}
+
+size_t stewart_write_measured(const stewart_measured *message, stewart_key key, uint8_t *data)
+{
+    stewart_measured m = *message;
+    datagram d = put_head(data, "STWM", &m.head, key);
+    PASS(&d, &m, MACHINE);
+    pass_measured(&d, &m);
+    return finish(data, d, key);
 }
 
 static int plausible(const stewart_measured *m)
@@ -363,32 +336,20 @@ static int plausible(const stewart_measured *m)
 
 int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key, stewart_measured *m)
 {
-    const uint8_t *at;
+    datagram d;
     size_t body;
     memset(m, 0, sizeof *m);
-    int refused = get_head("STWM", MACHINE_BODY, data, size, key, &m->head, &at, &body);
+    int refused = get_head("STWM", MACHINE_BODY, data, size, key, &m->head, &d, &body);
     if (refused)
         return refused;
-    GET(&at, m, MACHINE);
-    if (!plausible(m))
-        return STEWART_MALFORMED;
+    PASS(&d, m, MACHINE);
     size_t measured = m->kind == STEWART_STATE      ? 96u
                       : m->kind == STEWART_OFFER    ? IDENTITY
                       : m->kind == STEWART_ENCODERS ? 48u + 24u * m->samples
                                                     : 0u;
-    if (body != MACHINE_BODY + measured + 48u * m->history)
-        return STEWART_MALFORMED;
-    if (m->kind == STEWART_OFFER)
-        return get_identity(&at, &m->identity) ? STEWART_TAKEN : STEWART_MALFORMED;
-    if (m->kind == STEWART_STATE)
-        get_numbers(&at, m->state, 8, 12); /* NaN for a lost value */
-    if (m->kind == STEWART_ENCODERS) {
-        get_numbers(&at, m->zeros, 8, 6);
-        get_numbers(&at, m->codes, 4, 6u * m->samples);
-    }
-    get_numbers(&at, m->acted, 8, 6u * m->history);
-    return all_finite(m->zeros, 6) && all_finite(m->acted[0], 6 * m->history) ? STEWART_TAKEN
-                                                                              : STEWART_MALFORMED;
+    return plausible(m) && body == MACHINE_BODY + measured + 48u * m->history && pass_measured(&d, m)
+               ? STEWART_TAKEN
+               : STEWART_MALFORMED;
 }
 
 /* ---------------------------------------------------------------- controller to machine */
@@ -396,54 +357,48 @@ int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key, ste
 #define CONTROLLER_BODY 28
 #define PADDING (MACHINE_BODY - CONTROLLER_BODY) /* a request is as long as its answer */
 
-static const field PLAN[] = {FIELD(stewart_plan, sampled), FIELD(stewart_plan, playout),
-                             FIELD(stewart_plan, begin)};
+#define OF(member) FIELD(stewart_plan, member)
+static const field PLAN[] = {OF(rows),    OF(content), OF(reserved),
+                             OF(sampled), OF(playout), OF(begin)};
+#undef OF
 
-size_t stewart_write_plan(const stewart_plan *m, stewart_key key, uint8_t *data)
+/* Write or read what follows these fields; return whether it is plausible. */
+static int pass_plan(datagram *d, stewart_plan *m)
 {
-    const int asks = m->content == STEWART_REQUEST;
-    uint8_t *at = data;
-    put_head(&at, "STWC", &m->head, key);
-    put(&at, asks ? 0 : m->rows, 1);
-    put(&at, m->content, 1);
-    put(&at, 0, 2);
-    PUT(&at, m, PLAN);
-    if (asks) {
-        put_identity(&at, &m->identity);
-        memset(at, 0, PADDING);
-        at += PADDING;
-    } else {
-        put_numbers(&at, m->torques, 8, 6u * m->rows);
-    }
-    return finish(data, at, key);
+    uint8_t padding[PADDING] = {0};
+    int good = m->content != STEWART_REQUEST || pass_identity(d, &m->identity);
+    pass(d, padding, 1, m->content == STEWART_REQUEST ? PADDING : 0);
+    for (int i = 0; i < PADDING; i++)
+        good &= padding[i] == 0;
+    pass(d, m->torques, 8, 6u * m->rows);
+    return good && all_finite(m->torques[0], 6 * m->rows) && !(m->rows && m->begin == STEWART_NEVER);
+}
+
+size_t stewart_write_plan(const stewart_plan *message, stewart_key key, uint8_t *data)
+{
+    stewart_plan m = *message;
+    m.rows = m.content == STEWART_REQUEST ? 0 : m.rows;
+    m.reserved = 0;
+    datagram d = put_head(data, "STWC", &m.head, key);
+    PASS(&d, &m, PLAN);
+    pass_plan(&d, &m);
+    return finish(data, d, key);
 }
 
 int stewart_read_plan(const uint8_t *data, size_t size, stewart_key key, stewart_plan *m)
 {
-    const uint8_t *at;
+    datagram d;
     size_t body;
     memset(m, 0, sizeof *m);
-    int refused = get_head("STWC", CONTROLLER_BODY, data, size, key, &m->head, &at, &body);
+    int refused = get_head("STWC", CONTROLLER_BODY, data, size, key, &m->head, &d, &body);
     if (refused)
         return refused;
-    m->rows = (uint8_t)get(&at, 1);
-    m->content = (uint8_t)get(&at, 1);
+    PASS(&d, m, PLAN);
     const int asks = m->content == STEWART_REQUEST;
-    const uint64_t zero = get(&at, 2);
-    GET(&at, m, PLAN);
-    if (m->rows > STEWART_ROWS || m->content > STEWART_CRANKS || (asks && m->rows) || zero ||
+    if (m->rows > STEWART_ROWS || m->content > STEWART_CRANKS || (asks && m->rows) || m->reserved ||
         m->head.flags > 3 || body != CONTROLLER_BODY + (asks ? IDENTITY + PADDING : 48u * m->rows))
         return STEWART_MALFORMED;
-    if (asks) {
-        int good = get_identity(&at, &m->identity);
-        for (int i = 0; i < PADDING; i++)
-            good &= *at++ == 0;
-        return good ? STEWART_TAKEN : STEWART_MALFORMED;
-    }
-    get_numbers(&at, m->torques, 8, 6u * m->rows);
-    return all_finite(m->torques[0], 6 * m->rows) && !(m->rows && m->begin == STEWART_NEVER)
-               ? STEWART_TAKEN
-               : STEWART_MALFORMED;
+    return pass_plan(&d, m) ? STEWART_TAKEN : STEWART_MALFORMED;
 }
 
 /* ---------------------------------------------------------------- sessions */

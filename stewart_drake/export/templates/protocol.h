@@ -115,6 +115,7 @@ typedef struct {
 typedef struct {
     stewart_head head;
     uint8_t rows, content;
+    uint16_t reserved; /* 0 */
     uint64_t sampled, playout, begin;
     stewart_identity identity;
     double torques[STEWART_ROWS][6];
