@@ -44,7 +44,6 @@ from stewart_drake.mechanism.kinematics import leg_geometry, rotation
 from stewart_drake.scenario.config import ControllerConfig, Scenario
 from stewart_drake.scenario.loading import load_compatible, load_controller, setting_choices
 from stewart_drake.scenario.reference_files import read_waypoints
-from stewart_drake.scenario.renames import CONTROLLER
 from stewart_drake.scenario.signals import SIGNALS, exported_ports, ports_of
 from stewart_drake.scenario.trajectories import evaluate, make_reference
 from tests.mechanisms import PAPER
@@ -146,7 +145,7 @@ def gone():
     """Return names of 0.1 and 0.2 that no longer exist, by docs/upgrading.md and the renames."""
     table = prose(ROOT / "docs" / "upgrading.md").split("| before | now |")[1]
     modules = re.findall(r"^\| `(?:stewart_drake\.)?([\w.]+)`", table, re.MULTILINE)
-    return frozenset([*modules, *(f"controller.{name}" for name in CONTROLLER)])
+    return frozenset([*modules, *(f"controller.{name}" for name in ControllerConfig.renamed)])
 
 
 @functools.cache

@@ -7,7 +7,7 @@ import pytest
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.config import ControllerConfig, Scenario
 from stewart_drake.scenario.loading import load_scenario, scenario_to_dict
-from stewart_drake.scenario.renames import CONTROLLER, with_new_names
+from stewart_drake.scenario.run_log import with_new_names
 
 ALL_FIELDS = """
 mechanism: paper
@@ -59,7 +59,7 @@ def test_a_fraction_below_1e_9_is_none():
     assert load_scenario("paper", settings=["delay.fraction=1e-10"]).eta == 8 * 0.1
 
 
-@pytest.mark.parametrize("name", CONTROLLER)
+@pytest.mark.parametrize("name", ControllerConfig.renamed)
 def test_an_old_name_that_a_person_writes_is_refused_with_the_new_one(tmp_path, name):
     scenario, controller, row = (tmp_path / f"{file}.yaml" for file in ("scenario", "law", "row"))
     scenario.write_text(f"controller: {{{name}: 1}}\n")
@@ -71,7 +71,9 @@ def test_an_old_name_that_a_person_writes_is_refused_with_the_new_one(tmp_path, 
         {"name_or_path": row},
         {"name_or_path": "paper", "settings": [f"controller.{name}=1"]},
     ):
-        with pytest.raises(ConfigError, match=rf"{name}: .*called .*{CONTROLLER[name]} since") as e:
+        with pytest.raises(
+            ConfigError, match=rf"{name}: .*called .*{ControllerConfig.renamed[name]} since"
+        ) as e:
             load_scenario(**given)
         assert "\n" not in str(e.value)
     with pytest.raises(ConfigError, match=r"expected one of kind, .*, learned$"):

@@ -37,12 +37,12 @@ from stewart_drake.live.protocol import (
 )
 from stewart_drake.live.simulated import (
     Body,
+    LinkTimes,
     MeasurementFields,
     Motors,
     Plan,
     body_of,
     first_rows,
-    link_times,
 )
 from stewart_drake.loop.peer import FAULTS, Fault, Reason, identity_of, in_words
 from stewart_drake.loop.preparation import Experiment
@@ -132,7 +132,7 @@ class Machine:
         sc = experiment.scenario
         self.period = round(sc.controller.period * SECOND)
         self.watchdog = round(self._settings.watchdog * SECOND)
-        self._times, self._fields = link_times(sc), MeasurementFields(sc)
+        self._times, self._fields = LinkTimes(sc), MeasurementFields(sc)
         self._make, self.simulated_by = body or body_of(experiment)
         self._queue = first_rows(experiment)
         self.session: Session | None = None
@@ -202,7 +202,7 @@ class Machine:
             number = message.head.sequence
             if self.begin != NEVER and len(message.torques):
                 number = max(0, round((message.sampled - self.begin) / self.period))
-            under_way = self._times.forward(number)
+            under_way = self._times.of("forward", number)
             self.counts["received"] += 1
             if under_way is None:
                 self.counts["lost"] += 1
@@ -297,12 +297,9 @@ class Machine:
         early = delay.fraction - 1 if delay.fraction > 0 else 0.0
         playout = self.begin + round(early * sc.controller.period * SECOND)
         self._running, self._origin, self._safe = True, time, False
-        self._motors.begin(Plan(0, time, 0, playout, self._first_rows()))
+        self._motors.begin(Plan(0, time, 0, playout, self._queue))
         self.counts["runs"] += 1
         self._report(time, "the run began")
-
-    def _first_rows(self) -> Array:
-        return self._queue
 
     def _change(self, time: int) -> None:
         self._follow(time)
@@ -322,7 +319,7 @@ class Machine:
             self._at(time, 3, lambda _: self._write_row(time, row))  # after the torque's change
         if self._running:
             number = max(0, round((time - self._origin) / self.period))
-        waits = self._times.sensor(number)
+        waits = self._times.of("sensor", number)
         fields = {} if waits is None else self._fields.of(values)
         self._at(time + (waits or 0), 1, lambda _: self._answer(time, fields, number))
         self._at(time + self.period, 1, self._take_sample)
@@ -462,7 +459,7 @@ class Machine:
             self._send(message, self.session.address, number)
 
     def _send(self, message: MachineMessage, to: Address, number: int | None = None) -> None:
-        under_way = self._times.back(message.head.sequence if number is None else number)
+        under_way = self._times.of("back", message.head.sequence if number is None else number)
         if under_way is None:
             self.counts["measurements lost"] += 1
         else:

@@ -305,13 +305,11 @@ class RobotMachine(Machine):
         settings = options.model_copy(update={"restart": "motion", "safe": "hold", "rate": 1.0})
         body = (lambda: robot), "the robot"
         super().__init__(experiment, endpoint, settings, say, body=body, **kwargs)
+        self._queue = np.empty((0, NUM_LEGS))
         self._at(-self._ahead % self.period, 4, self._drive)
 
     def _new_motors(self) -> Motors:
         return Motors(math.inf, self.period, cranks=True)
-
-    def _first_rows(self) -> Array:
-        return np.empty((0, NUM_LEGS))
 
     def _flags(self) -> MachineFlags:
         flags = super()._flags()

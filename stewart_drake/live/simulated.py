@@ -48,26 +48,20 @@ _WITHOUT_DRAKE: Final[Accepted] = {
 # ---------------------------------------------------------------- link
 
 
-class LinkTimes(NamedTuple):
-    """Transit times by the number of a datagram, ns, or None for a lost one."""
+class LinkTimes:
+    """Transit times of a scenario by the number of a datagram, the same as in its simulation."""
 
-    forward: Callable[[int], int | None]
-    back: Callable[[int], int | None]
-    sensor: Callable[[int], int | None]
+    def __init__(self, scenario: Scenario) -> None:
+        self._ways = {
+            "forward": forward_times(scenario, _TIMES),
+            "back": return_times(scenario, _TIMES),
+            "sensor": sensor_times(scenario, _TIMES),
+        }
 
-
-def link_times(scenario: Scenario) -> LinkTimes:
-    """Return the transit times of a scenario, the same as in its simulation."""
-    every = (forward_times, return_times, sensor_times)
-    return LinkTimes(*(_by_number(times(scenario, _TIMES)) for times in every))
-
-
-def _by_number(times: Array) -> Callable[[int], int | None]:
-    def time(number: int) -> int | None:
-        seconds = times[number % len(times)]
+    def of(self, way: str, number: int) -> int | None:
+        """Return a time on one of the ways, ns, or None for a lost datagram."""
+        seconds = self._ways[way][number % _TIMES]
         return round(seconds * SECOND) if np.isfinite(seconds) else None
-
-    return time
 
 
 # ---------------------------------------------------------------- motors

@@ -14,7 +14,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
 from stewart_drake.law.startup import STILL, initial_queue
 from stewart_drake.loop.own import NOTHING, Own, own_motion, take
-from stewart_drake.machines import reachy_moves  # noqa: F401 registers its kind of reference
+from stewart_drake.machines import reachy_mini  # noqa: F401 registers its kind of reference
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint, with_rotors
 from stewart_drake.scenario.calibration import (

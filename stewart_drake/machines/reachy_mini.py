@@ -1,26 +1,43 @@
-"""Reachy Mini's coordinates: the pose of its head in its SDK, and the pose of the plate here.
+"""Reachy Mini's coordinates and recorded moves, in its SDK and here.
 
 The SDK gives the head's frame H as a matrix X_WH without the height h = 0.177 m of the head at
 home, in a world W that stands still while the body turns by its yaw about z. The platform stands on
 the body B. With c the head's centre of mass in H,
 
     R_BP = Rz(-yaw) R_WH,   p_BP = Rz(-yaw) (p_WH + [0, 0, h]) + R_BP c.
+
+A recorded move has the times of its samples, and for each the target of the head, the body and the
+antennas:
+
+    {"description": "...", "time": [0.0, ...],
+     "set_target_data": [{"head": [16 numbers, or 4 rows of 4], "antennas": [0.0, 0.0],
+                          "body_yaw": 0.0}, ...]}
 """
 
 from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.trajectories import Trajectory
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.jsonio import load_json
+from stewart_drake.files.yamlio import brief
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.kinematics import rotation
-from stewart_drake.scenario.signals import ANGLES, POSITION
+from stewart_drake.scenario.reference_config import ReachyMoveConfig
+from stewart_drake.scenario.reference_files import check_motion
+from stewart_drake.scenario.signals import ANGLES, COORDINATE_NAMES, POSITION
+from stewart_drake.scenario.trajectories import make_reference, through_samples
 from stewart_drake.types import Array
 
 HEAD_HEIGHT = 0.177
 """Height of the head's frame over the robot's foot at home, m."""
 _ROUNDING = 1e-3  # rotation matrices of the SDK are written with three digits
+_EXPECTED: Final = "a recorded move of Reachy Mini: `time` and `set_target_data` of equal length"
+_MAX_BYTES: Final = 100_000_000
 
 
 @lru_cache(maxsize=1)
@@ -61,3 +78,66 @@ def head_of_pose(pose: Array, body_yaw: float = 0.0) -> Array:
     X_WH[:3, :3] = turn @ R
     X_WH[:3, 3] = turn @ (pose[POSITION] - R @ _center()) - [0.0, 0.0, HEAD_HEIGHT]
     return X_WH
+
+
+# ---------------------------------------------------------------- recorded moves
+
+
+def read_move(path: str | Path) -> tuple[Array, Array]:
+    """Read a recorded move.
+
+    The first sample is at time 0. Antennas and the description are ignored, and a missing
+    `body_yaw` is 0.
+
+    Returns:
+        Times (n,) in s, and poses (n, 6) of the plate on the robot's body, rad and m.
+
+    Raises:
+        ConfigError: no such file, or samples that are refused in a CSV file of a motion too.
+    """
+    path = Path(path)
+    data = load_json(path, _MAX_BYTES, _EXPECTED)
+    stamps, targets = data.get("time"), data.get("set_target_data")
+    if not (isinstance(stamps, list) and isinstance(targets, list)):
+        raise ConfigError(f"{path}: got keys {brief(sorted(data))}; expected {_EXPECTED}")
+    if len(stamps) != len(targets):
+        raise ConfigError(
+            f"{path}: got {len(stamps)} times and {len(targets)} targets; expected {_EXPECTED}"
+        )
+    times = np.array([_number(t, f"{path}: time[{i}]") for i, t in enumerate(stamps)])
+    poses = np.array([_pose(t, f"{path}: set_target_data[{i}]") for i, t in enumerate(targets)])
+    poses = poses.reshape(-1, len(COORDINATE_NAMES))
+    times -= times[:1].sum()  # of no sample 0
+    poses[:, ANGLES] = np.unwrap(poses[:, ANGLES], axis=0)
+
+    def place(row: int, name: str) -> str:
+        return f"{path}: " + (f"time[{row}]" if name == "time" else f"sample {row}, {name}")
+
+    check_motion(path, times, poses, place, dict.fromkeys(COORDINATE_NAMES, 1.0))
+    return times, poses
+
+
+def _number(value: Any, where: str) -> float:
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e12:
+        return float(value)
+    raise ConfigError(f"{where}: got {brief(value)}; expected a finite number")
+
+
+def _pose(target: Any, where: str) -> Array:
+    if not isinstance(target, dict) or "head" not in target:
+        raise ConfigError(f"{where}: got {brief(target)}; expected an object with `head`")
+    yaw = _number(target.get("body_yaw", 0.0), f"{where}.body_yaw")
+    try:
+        return pose_of_head(np.array(target["head"], dtype=np.float64), yaw)
+    except (ValueError, TypeError):  # ConfigError is a ValueError; ragged lists and words too
+        raise ConfigError(
+            f"{where}.head: got {brief(target['head'])}; expected 4 rows of 4 numbers, or 16, of a "
+            "rotation and a translation in m"
+        ) from None
+
+
+@make_reference.register
+def _recorded(config: ReachyMoveConfig, duration: float) -> Trajectory:
+    if config.file is None:
+        raise ConfigError(config.problem() or "")
+    return through_samples(*read_move(config.file), duration, config.file)

@@ -42,7 +42,6 @@ from stewart_drake.scenario.link_config import (
     WireConfig,
 )
 from stewart_drake.scenario.reference_config import ReferenceConfig, SineConfig
-from stewart_drake.scenario.renames import CONTROLLER
 from stewart_drake.scenario.signals import DEFAULT_BALL_JOINT_SPEED, DEFAULT_COULOMB_SPEED, SHAFTS
 from stewart_drake.scenario.timing import METRIC_PERIOD, log_problem, step_problem
 
@@ -305,7 +304,14 @@ class ControllerConfig:
             same period and delay. It is added to the torques of the law, or to its setpoints.
     """
 
-    renamed = CONTROLLER  # not annotated: no field
+    renamed = {  # since 0.2, see `files.yamlio.validate`; not annotated: no field
+        "estimator": "estimate",
+        "estimate_coulomb": "estimate",
+        "estimate_offsets": "estimate",
+        "quiet_start": "open_loop_start",
+        "rejoin": "replan",
+        "known": "calibration",
+    }
     kind: Literal["lqi", "pd"] = "lqi"
     kp: Annotated[float, Field(gt=0, le=1e9)] | None = None
     kd: Annotated[float, Field(gt=0, le=1e6)] | None = None

@@ -124,7 +124,7 @@ class ReachyMoveConfig:
     """A recorded move of Reachy Mini, in the format of its SDK.
 
     Attributes:
-        file: JSON of `time` and `set_target_data`, see `machines.reachy_moves.read_move`.
+        file: JSON of `time` and `set_target_data`, see `machines.reachy_mini.read_move`.
     """
 
     kind: Literal["reachy_move"] = "reachy_move"

@@ -30,9 +30,8 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.versions import versions
 from stewart_drake.files.yamlio import parse_yaml, validate
-from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.config import ESTIMATED, ControllerConfig, Scenario
 from stewart_drake.scenario.loading import scenario_yaml
-from stewart_drake.scenario.renames import with_new_names
 from stewart_drake.scenario.signals import (
     COORDINATE_NAMES,
     COORDINATES,
@@ -362,6 +361,19 @@ def read_log(path: str | Path) -> xr.Dataset:
     except (OSError, ValueError, KeyError) as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise ConfigError(f"{path}: cannot be read ({reason}); expected {EXPECTED}") from None
+
+
+def with_new_names(scenario: dict[str, Any]) -> dict[str, Any]:
+    """Return the data of a scenario that the program wrote, 0.2 included, under the new names."""
+    given = scenario.get("controller")
+    if not isinstance(given, dict):
+        return scenario
+    controller = {ControllerConfig.renamed.get(name, name): value for name, value in given.items()}
+    if "estimator" in given:
+        asked = {name: given.get(f"estimate_{name}", False) for name in ("coulomb", "offsets")}
+        chosen = [*ESTIMATED, *(name for name in asked if asked[name])]
+        controller["estimate"] = chosen if given["estimator"] == "parameters" else []
+    return scenario | {"controller": controller}
 
 
 def scenario_of(signals: xr.Dataset, path: Path) -> Scenario:
