@@ -82,8 +82,6 @@ def _refine(
 
 
 class Step(NamedTuple):
-    """Input and result of one sample."""
-
     measurement: Array  # (m,), NaN where it is missing
     age: int  # of the measurement, periods
     preview: Array  # (p, 18) rows of the reference; none if the law chooses their instants

@@ -133,7 +133,6 @@ def plan_steps(segments: list[Segment], delay: float, longest_step: float) -> li
 
 
 def _steps_of(segment: Segment, delay: float, longest_step: float) -> Steps:
-    """Return the steps of one segment."""
     log, start = segment.log, segment.start
     samples = log.times[segment.rows]
     arrivals = log.sent + delay

@@ -124,7 +124,6 @@ class Contact:
 
     @property
     def refused(self) -> dict[str, int]:
-        """Number of refused datagrams by cause."""
         return {cause.value: n for cause, n in self.endpoint.refused.items()}
 
     @property
@@ -246,7 +245,6 @@ class Contact:
         return max((p - soonest for p in self._phases if p - soonest <= longest), default=0.0)
 
     def _check_identity(self) -> None:
-        """Refuse a machine that the controller is not designed for."""
         offered = None if self.last is None else self.last.identity
         differs = None if offered is None else offered.differing(self.identity)
         if differs is not None:

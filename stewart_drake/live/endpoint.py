@@ -180,7 +180,6 @@ def read_key(path: Path | None) -> bytes | None:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address or a name is a loopback one."""
     try:
         return ipaddress.ip_address(socket.gethostbyname(host)).is_loopback
     except (OSError, UnicodeError, ValueError):

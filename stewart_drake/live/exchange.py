@@ -237,7 +237,6 @@ class Watch:
         self._stalled = stalled
 
     def report(self, k: int, text: str) -> None:
-        """Report an event at sample k."""
         self._say(f"at {k * self._period:.1f} s: {text}")
 
     def _end(self, status: str, k: int, reason: str, leg: int | None = None) -> End:

@@ -292,8 +292,6 @@ class Governor:
 
 
 class Request(NamedTuple):
-    """Request of a person."""
-
     target: Array | None = None  # pose (6,), rad and m, or None for the scenario's motion
     rest: bool = False  # whether to stop instead
 

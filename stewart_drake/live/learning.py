@@ -69,8 +69,6 @@ _EACH: Final = 4
 
 
 class _Asked(NamedTuple):
-    """A request to learn a scenario's motion on a machine."""
-
     scenario: Scenario
     machine: str  # HOST:PORT
     options: LiveOptions
@@ -109,8 +107,6 @@ class _Asked(NamedTuple):
 
 
 class LiveLessons(NamedTuple):
-    """Results of learning from a machine."""
-
     run: SimulationResult  # of all repetitions; of setpoints the best one, or the last one
     study: LearnStudy | None  # None if no repetition completed
 
@@ -197,7 +193,6 @@ class TorqueLessons(Viewer):
         return LearnedSignal(self._period, before + self._share * (present - before))
 
     def request(self) -> Request:
-        """Request the motion, or a target on the way back to the start."""
         return Request(target=self._target) if self._returns else Request()
 
     def finished(self) -> bool:
@@ -265,7 +260,6 @@ class TorqueLessons(Viewer):
         return least + (self._slowest - least) % self._period
 
     def _judge(self) -> None:
-        """Compute the error of the repetition; end after the last one."""
         times = np.array([time for time, _ in self._rows])
         errors = np.array([row["pose"] - row["reference"] for _, row in self._rows])
         error = accumulated_error(times, errors, self.experiment.scale)

@@ -100,7 +100,6 @@ class LiveRecord(Record):
         self._file = RowFile(path, [*header, "step[s]", "late[s]"], say)
 
     def acted(self, torques: dict[int, Array]) -> None:
-        """Note reported torques by period."""
         self.applied |= torques
         if torques:
             newest = max(torques)

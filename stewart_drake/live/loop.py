@@ -184,7 +184,6 @@ class LiveLoop:
         return None
 
     def _rests(self, k: int) -> bool:
-        """Return whether the plate is at rest at sample k."""
         way, t = self._steering.way, k * self._period
         wanted = np.array([way.at(t)[RATES], way.at(t + self._horizon)[RATES]])
         rates = np.vstack([wanted, self.memory.belief.state[RATES]])
@@ -371,7 +370,6 @@ class LiveLoop:
         return None
 
     def _recover(self, t: float) -> None:
-        """Plan a new reference if the prediction is too far from the old one."""
         steering = recovered(self._steering, self._design.law, self.memory, t, self._size)
         if isinstance(steering, Steering):  # otherwise tried again at the next sample
             self._steering, self.memory = steering, self.memory.without_error()

@@ -516,7 +516,6 @@ class Machine:
         )
 
     def summary(self) -> dict[str, Any]:
-        """Return the counts of the whole run."""
         counted = ("sessions", "runs", "received", "lost", "sent", "measurements lost", "silences")
         return {
             "machine": self._experiment.truth.name,

@@ -7,8 +7,6 @@ from stewart_drake.studies.options import Options, option, refuse
 
 
 class Settings(Options):
-    """How a machine is run."""
-
     rate: float = option(1.0, "Speed of the machine's clock, 1: real time.", ge=1e-3, le=1e3)
     watchdog: float = option(1.0, "Seconds of silence before the safe torque.", ge=1e-2, le=1e4)
     safe: Literal["zero", "hold"] = option("zero", "Safe torque: zero, or the last one.")
@@ -20,8 +18,6 @@ class Settings(Options):
 
 
 class MachineOptions(Settings):
-    """Options of a simulated machine in real time."""
-
     port: int = option(47000, "UDP port; 0: any free one.", ge=0, le=65535)
     host: str = option("127.0.0.1", "Address to listen at; beyond loopback with a key.")
     key: Path | None = option(None, "File with the shared key.", "FILE")
@@ -39,8 +35,6 @@ class MachineOptions(Settings):
 
 
 class LiveOptions(Options):
-    """Options of the loop in real time."""
-
     duration: float | None = option(
         None, "Duration, s; until it is stopped by default.", "S", ge=0.1
     )

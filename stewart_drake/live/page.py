@@ -46,8 +46,6 @@ class PageRequest(NamedTuple):
 
 
 class PageViewer(Viewer):
-    """The page, in a separate process."""
-
     def __init__(self, mechanism: Mechanism, title: str) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, other = context.Pipe()

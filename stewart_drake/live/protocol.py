@@ -78,8 +78,6 @@ _OFFERS: Final = 3
 
 
 class Refusal(Enum):
-    """Cause of the refusal of a datagram."""
-
     MALFORMED = "malformed"
     """Not a datagram of this protocol: length, magic, a count or a number outside its range."""
     VERSION = "version"
@@ -96,16 +94,12 @@ class Refusal(Enum):
 
 
 class RefusedError(Exception):
-    """A datagram that is refused, with its cause."""
-
     def __init__(self, cause: Refusal, detail: str = "") -> None:
         super().__init__(f"{cause.value}: {detail}" if detail else cause.value)
         self.cause, self.detail = cause, detail
 
 
 class MachineFlags(IntFlag):
-    """State of a machine."""
-
     SIMULATION = 1
     """A simulation. Without it a controller must be armed."""
     PARKED = 2
@@ -129,8 +123,6 @@ class MachineFlags(IntFlag):
 
 
 class ControllerFlags(IntFlag):
-    """Requests of a controller."""
-
     STOP = 1
     """The safe torque at once, and the end of the session."""
     ARMED = 2
@@ -142,8 +134,6 @@ NOTHING: Final = ControllerFlags(0)
 
 @dataclass(frozen=True)
 class Head:
-    """Head of every datagram."""
-
     session: int  # random number of the controller, not 0
     nonce: int  # nonce of the machine's offer; 0 in a first request and in its refusal
     sequence: int  # number of the sender's datagram in the session, from 1 on

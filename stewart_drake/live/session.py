@@ -60,7 +60,6 @@ class Ready(NamedTuple):
 
     @property
     def simulated(self) -> bool:
-        """Whether the machine reports that it is a simulation."""
         return MachineFlags.SIMULATION in self.contact.machine.flags
 
     @property
@@ -213,7 +212,6 @@ def _queue_advice(scenario: Scenario) -> str | None:
 
 
 def check_armed(ready: Ready, armed: bool) -> None:
-    """Refuse a real machine without --arm."""
     if not ready.simulated and not armed:
         ready.endpoint.close()
         raise ConfigError(
@@ -223,7 +221,6 @@ def check_armed(ready: Ready, armed: bool) -> None:
 
 
 def check_jitter(ready: Ready, accepted: bool) -> None:
-    """Refuse a link with more jitter than the loop is stable for, unless that is accepted."""
     problem = ready.jitter_problem
     if problem is not None and not accepted:
         ready.endpoint.close()

@@ -68,8 +68,6 @@ class LinkTimes:
 
 
 class Plan(NamedTuple):
-    """Torques of a datagram."""
-
     sequence: int  # sequence of the datagram; 0 for torques in flight at the begin
     sampled: int  # time of the sample that they were computed for
     sample: int  # number of that sample, from the begin on
@@ -149,7 +147,6 @@ class Motors:
         return int(self._link.number(self._memory, name))
 
     def begin(self, queue: Plan) -> None:
-        """Begin with the torques in flight."""
         self._begun = True
         self._link.preload(self._memory, queue.playout, queue.torques)
 

@@ -26,7 +26,6 @@ class End(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Status and failure in words."""
         status = self.status.replace("_", " ")
         return status if self.stopped is None else f"{status}: {self.stopped}"
 
@@ -37,8 +36,6 @@ class End(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """The loop at a sample."""
-
     time: float  # time since the begin, s
     state: Array  # estimated state (12,)
     wanted: Array  # reference (18,)

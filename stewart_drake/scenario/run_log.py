@@ -88,8 +88,6 @@ def _field(label: str | int) -> str:
 
 
 class RunLog(Protocol):
-    """A log that is being written."""
-
     def write(self, time: float, values: Mapping[str, Array]) -> None:
         """Add the values of channels at a time in s; others have none then."""
         ...
@@ -461,7 +459,6 @@ def _scenario_near(path: Path) -> str | None:
 
 
 def _mcap(module: str) -> Any:
-    """Import a module of the package mcap."""
     import importlib
 
     try:
