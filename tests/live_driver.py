@@ -200,7 +200,7 @@ class Driver:
         arrived = []
         for i in range(64):
             behind = message.head.acknowledged - (self.first + sample - 1 - i)
-            arrived.append(0 <= behind < 64 and bool(message.arrived[behind]))
+            arrived.append(0 <= behind < 64 and bool(message.arrived >> behind & 1))
         return Report(np.array(arrived), message.acted, age)
 
 

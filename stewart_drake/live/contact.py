@@ -228,9 +228,10 @@ class Contact:
         link.missed = self._unanswered + max(0, gaps)
 
     def _acknowledge(self, message: MachineMessage) -> None:
-        for i in np.flatnonzero(message.arrived).tolist():
-            if message.head.acknowledged - i in self._pending:
-                self._pending[message.head.acknowledged - i] = True
+        for sequence in self._pending:
+            behind = message.head.acknowledged - sequence
+            if 0 <= behind < 64 and message.arrived >> behind & 1:
+                self._pending[sequence] = True
 
     def due(self, sampled: int, rate: float) -> float:
         """Return the earliest arrival of a measurement taken at `sampled`, s of the own clock."""

@@ -37,7 +37,7 @@ import numpy as np
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.dynamics.workspace import PITCH_LIMIT, home_sign, margins, measures_at
+from stewart_drake.dynamics.workspace import PITCH_LIMIT, border, home_sign, margins, measures_at
 from stewart_drake.law.motion import between
 from stewart_drake.law.startup import sizes
 from stewart_drake.scenario.signals import (
@@ -240,13 +240,12 @@ class Governor:
                 yield pace
 
     def _share(self, governed: GovernorState, step: Array) -> float:
-        low, high, size = 0.0, 1.0, np.abs(step / self._size).max()
-        while (high - low) * size > _RESOLUTION:
-            middle = (low + high) / 2
-            applied = governed.applied + middle * step
-            future = self.future(governed.state, applied, governed.pace)
-            low, high = (middle, high) if self._within(future) else (low, middle)
-        return low
+        def fits(share: float) -> bool:
+            applied = governed.applied + share * step
+            return self._within(self.future(governed.state, applied, governed.pace))
+
+        size = max(_RESOLUTION, np.abs(step / self._size).max())
+        return border(fits, 0.0, 1.0, _RESOLUTION / size)[0]
 
     def after(self, governed: GovernorState, time: float) -> GovernorState:
         """Advance the reference by `time` s."""

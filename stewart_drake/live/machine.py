@@ -33,7 +33,6 @@ from stewart_drake.live.protocol import (
     MachineFlags,
     MachineMessage,
     Refusal,
-    bits_of,
 )
 from stewart_drake.live.simulated import (
     Body,
@@ -406,8 +405,7 @@ class Machine:
             *(time, head.time, 0),
         )
         flags = offer.flags | (MachineFlags.BUSY if self._alive(time) else MachineFlags(0))
-        there = np.arange(64) == 0
-        self._send(replace(offer, head=answer, flags=flags, arrived=there), address)
+        self._send(replace(offer, head=answer, flags=flags, arrived=1), address)
 
     def _adopt(self, session: Session, time: int) -> None:
         self.session, self._stopped = session, False
@@ -503,7 +501,7 @@ class Machine:
             watchdog=self.watchdog,
             rate=self._settings.rate,
             torque_limit=self._experiment.torque_limit,
-            arrived=bits_of(seen),
+            arrived=seen,
             acted_from=acted[0][0] if acted else NEVER,
             acted=np.array(rows).reshape(-1, NUM_TORQUES),
             played=self._motors.played,

@@ -58,11 +58,6 @@ _MACHINE_NUMBERS: Final = (
     *("torque_limit", "arrived", "acted_from", "played", "dry", "refused"),
     *("fault", "leg", "before", "content", "lasted", "before_lasted"),
 )
-_OWN: Final = (
-    *("bits", "sampled", "begin", "period", "watchdog", "rate", "torque_limit"),
-    *("acted_from", "played", "dry", "refused"),
-)
-"""Those of them that are attributes of `MachineMessage`."""
 # rows, content, reserved (2); sampled, playout, begin
 _CONTROLLER: Final = struct.Struct("<BB2xQQQ")
 _PART: Final = struct.Struct(f"<{DIGEST}s{NAME}s")
@@ -155,7 +150,7 @@ class MachineMessage:
     watchdog: int  # silence after which the safe torque acts, ns
     rate: float  # seconds of the machine's clock in a second
     torque_limit: float  # limit of each motor at the machine, N m; may be infinite
-    arrived: NDArray[np.bool_]  # whether the datagram `acknowledged` - i has arrived, (64,)
+    arrived: int  # bit i of 64: whether the datagram `acknowledged` - i has arrived
     acted_from: int  # time at which the first row of `acted` began to act, ns; NEVER without rows
     acted: Array  # torques (h, 6) that acted, N m; row i acted i periods before the first
     played: int = 0  # number of periods with a torque of a plan
@@ -252,11 +247,10 @@ def _machine_body(m: MachineMessage) -> bytes:
         measured = zeros.tobytes() + codes.tobytes()
     elif m.identity is not None:
         kind, measured = _OFFERS, _identity_bytes(m.identity)
-    arrived = sum(1 << i for i, there in enumerate(m.arrived[:64]) if there)
     numbers = vars(m) | {"kind": kind, "samples": samples, "history": len(m.acted)}
-    numbers |= {"arrived": arrived, "content": _CRANKS * m.cranks}
     numbers |= {"fault": m.reason.fault, "leg": m.reason.leg, "lasted": m.reason.lasted}
     numbers |= {"before": m.before.fault, "before_lasted": m.before.lasted}
+    numbers |= {"content": _CRANKS * m.cranks}
     packed = _MACHINE.pack(*(numbers[name] for name in _MACHINE_NUMBERS))
     return packed + measured + np.asarray(m.acted, "<f8").tobytes()
 
@@ -355,25 +349,12 @@ def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
     identity = _identity(measured) if kind == _OFFERS else None
     if not np.all(np.isfinite(acted)) or (zeros is not None and not np.all(np.isfinite(zeros))):
         raise RefusedError(Refusal.MALFORMED, "a torque or an angle that is not finite")
-    return MachineMessage(
-        head=head,
-        flags=MachineFlags(flags),
-        arrived=bits_of(n["arrived"]),
-        acted=acted,
-        state=state,
-        codes=codes,
-        zeros=zeros,
-        identity=identity,
-        reason=Reason(Fault(n["fault"]), n["leg"], n["lasted"]),
-        before=Reason(Fault(n["before"]), 0, n["before_lasted"]),
-        cranks=n["content"] == _CRANKS,
-        **{name: n[name] for name in _OWN},
-    )
-
-
-def bits_of(number: int) -> NDArray[np.bool_]:
-    """Return the bits (64,) of a number, the lowest first."""
-    return np.array([bool(number >> i & 1) for i in range(64)])
+    own = {name: n[name] for name in n.keys() & MachineMessage.__annotations__.keys()}
+    own |= {"head": head, "flags": MachineFlags(flags), "acted": acted, "state": state}
+    own |= {"codes": codes, "zeros": zeros, "identity": identity, "cranks": n["content"] == _CRANKS}
+    own["reason"] = Reason(Fault(n["fault"]), n["leg"], n["lasted"])
+    own["before"] = Reason(Fault(n["before"]), 0, n["before_lasted"])
+    return MachineMessage(**own)
 
 
 def _identity(data: bytes) -> Identity:
