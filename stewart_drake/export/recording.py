@@ -13,7 +13,6 @@ from stewart_drake.files.resources import shipped
 from stewart_drake.files.schema import plain
 from stewart_drake.law.channel import Report
 from stewart_drake.law.coverage import uncovered
-from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import KnownMotion, Motion, between
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.predictive_lqi import PredictiveLqi
@@ -87,9 +86,11 @@ class Step(NamedTuple):
     preview: Array  # (p, 18) rows of the reference; none if the law chooses their instants
     answer: Array  # (6,) torque before the limit, or (18,) command
     status: int  # bits of the causes that were counted
-    weights: Array  # (2,) w_Q and w_R
-    sent: Array  # (6 N,) torques within the limit, of this sample and of later ones
-    report: Report | Array | None  # with the measurement: on packets, or (r,) of servos
+    # with the measurement: on packets (or None), or (r,) of servos
+    report: Report | Array | None
+    # of torques: (2,) w_Q and w_R, and (6 N,) those within the limit, of this sample and later ones
+    weights: Array | None = None
+    sent: Array | None = None
 
 
 @dataclass
@@ -109,22 +110,29 @@ class Recorded:
         law = self.law
         return isinstance(law, PredictiveLqi) and law.moves
 
-    def begin(self, first: Array) -> None:
-        """Begin anew with what is in flight."""
-        self.steps.clear()
-        self.first = first
-
     def note(
-        self, measurement: Measurement, before: Any, after: Any, preview: Array, *rest: Any
+        self,
+        measurement: Measurement,
+        before: Any,
+        after: Any,
+        motion: Motion,
+        given: tuple[Any, ...],
     ) -> None:
-        """Keep a step by its memories, with the last numbers of a `Step`."""
-        if len(self.steps) < MOST_SAMPLES:
-            new = np.subtract(after.counts, before.counts) > 0
-            status = int(new @ 2 ** np.arange(len(new)))
-            age = round(measurement.age / self.law.timeline.period)
-            answer = after.torque if isinstance(self.law, PredictiveLqi) else after.command
-            measured = measurement.known(self.law.sensing.size)
-            self.steps.append(Step(measured, age, preview, answer, status, *rest))
+        """Keep a step by its memories; `given` are weights and report, or the report of servos."""
+        if len(self.steps) >= MOST_SAMPLES:
+            return
+        law, size = self.law, self.law.sensing.size
+        new = np.subtract(after.counts, before.counts) > 0
+        status = int(new @ 2 ** np.arange(len(new)))
+        age = round(measurement.age / law.timeline.period)
+        preview = np.empty(0) if self.moves else motion(law.preview_times)
+        seen = measurement.known(size), age, preview
+        if isinstance(law, PredictiveLqi):
+            weights, report = given
+            sent = after.plan.ravel()
+            self.steps.append(Step(*seen, after.torque, status, report, weights, sent))
+        else:
+            self.steps.append(Step(*seen, after.command, status, np.array(given[0])))
 
     def tabulated(self, motion: Motion) -> Motion:
         """Return the motion interpolated between its knots, as C follows it."""
@@ -155,49 +163,24 @@ def _trajectory(rows: Array, then: Trajectory) -> Trajectory:
     return through_states(pieces, then)
 
 
-@dataclass(frozen=True)
-class RecordedLqi(PredictiveLqi):
-    """A law that records its steps since its memory was last initialised."""
+def _recording(law: Any, record: Recorded) -> Any:
+    """Return a law that records its steps since its memory was last initialised."""
+    kind: Any = type(law)
 
-    record: Recorded = field(kw_only=True)
+    class Recording(kind):  # type: ignore[misc]
+        def initial_memory(self, first: Array) -> Any:
+            record.steps.clear()
+            record.first = first
+            record.law = kind(**{f.name: getattr(self, f.name) for f in fields(kind)})
+            return super().initial_memory(first)
 
-    def initial_memory(self, queue: Array) -> Memory:
-        self.record.begin(queue)
-        self.record.law = PredictiveLqi(**self.parts)
-        return super().initial_memory(queue)
+        def step(self, memory: Any, measurement: Measurement, motion: Motion, *given: Any) -> Any:
+            motion = record.tabulated(motion)
+            after = super().step(memory, measurement, motion, *given)
+            record.note(measurement, memory, after, motion, given)
+            return after
 
-    def step(
-        self,
-        memory: Memory,
-        measurement: Measurement,
-        motion: Motion,
-        weights: Array,
-        report: Report | None = None,
-    ) -> Memory:
-        motion = self.record.tabulated(motion)
-        after = super().step(memory, measurement, motion, weights, report)
-        rows = np.empty(0) if self.record.moves else motion(self.preview_times)
-        self.record.note(measurement, memory, after, rows, weights, after.plan.ravel(), report)
-        return after
-
-
-@dataclass(frozen=True)
-class RecordedServo(ServoPreview):
-    """A law for servos that records its steps since its memory was last initialised."""
-
-    record: Recorded = field(kw_only=True)
-
-    def initial_memory(self, command: Array) -> Memory:
-        self.record.begin(command)
-        return super().initial_memory(command)
-
-    def step(
-        self, memory: Memory, measurement: Measurement, motion: Motion, report: Array
-    ) -> Memory:
-        after = super().step(memory, measurement, motion, report)
-        rest = np.full(2, np.nan), np.full(6, np.nan), np.array(report)
-        self.record.note(measurement, memory, after, motion(self.preview_times), *rest)
-        return after
+    return Recording(**{f.name: getattr(law, f.name) for f in fields(kind)})
 
 
 def _refusal(scenario: Scenario, field: str) -> str:
@@ -227,8 +210,7 @@ def record(scenario: Scenario) -> Recorded:
         if problem is not None:
             raise ConfigError(_refusal(scenario, problem))
         found.append(Recorded(law, scenario.duration))
-        kind = RecordedLqi if isinstance(law, PredictiveLqi) else RecordedServo
-        return kind(**{f.name: getattr(law, f.name) for f in fields(law)}, record=found[-1])
+        return _recording(law, found[-1])
 
     exact: Callable[..., Any] = replace
     scenario = replace(scenario, plant=exact(scenario.plant, kind="exact"))
