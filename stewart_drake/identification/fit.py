@@ -88,15 +88,6 @@ class Normal(NamedTuple):
         return self.of_segments[:, k:, :k], self.of_segments[:, k:, k:]
 
 
-class Fit(NamedTuple):
-    """End of the iterations."""
-
-    guess: Guess
-    residuals: Residuals
-    covariance: Array  # (k, k) of the free unknowns
-    iterations: int
-
-
 @dataclass(frozen=True)
 class Problem:
     """Segments of logs under the same gravity, unknowns, and the longest integration step in s."""
@@ -225,8 +216,63 @@ def misfit(residuals: Residuals, problem: Problem) -> Array:
     return np.asarray(np.sum(residuals.measured**2, axis=(0, 2)) / counts)
 
 
-def solve(problem: Problem, start: Guess, most: int = MOST_ITERATIONS) -> Fit:
-    """Return the most probable guess after up to `most` iterations from a finite start."""
+class Solution(NamedTuple):
+    """End of the iterations for segments of logs, without those that were left out."""
+
+    whole: Problem  # all segments
+    problem: Problem  # segments that were fitted
+    begun: Guess  # start of the iterations
+    guess: Guess
+    residuals: Residuals
+    covariance: Array  # (k, k) of the free unknowns
+    iterations: int
+
+    @property
+    def delay(self) -> float:
+        """Delay, s."""
+        return float(self.guess.values[DELAY])
+
+    @property
+    def delay_std(self) -> float:
+        """Standard deviation of the delay, s, the last of the unknowns."""
+        return float(np.sqrt(self.covariance[-1, -1]))
+
+    @property
+    def left_out(self) -> int:
+        return len(self.whole.segments) - len(self.problem.segments)
+
+    @property
+    def share(self) -> float:
+        """Share of the values of all segments that was fitted."""
+        return self.problem.count / self.whole.count
+
+    @property
+    def chi2(self) -> float:
+        """chi^2 per value that was fitted."""
+        return chi2_per_value(self.residuals, self.problem)["all"]
+
+    @property
+    def misfit(self) -> Array:
+        """chi^2 per value (n,) of each segment that was fitted."""
+        return misfit(self.residuals, self.problem)
+
+    def without_worst(self, most: int = MOST_ITERATIONS) -> "Solution":
+        """Return the fit from the same start without the segment of the largest misfit."""
+        kept = np.delete(np.arange(len(self.problem.segments)), self.misfit.argmax())
+        return solve(*self.problem.kept(self.begun, kept), most, self.whole)
+
+    def refitted(self, problem: Problem) -> "Solution":
+        """Return the fit of a problem with other steps, from the end of this fit."""
+        return solve(problem, self.guess, whole=self.whole)
+
+
+def solve(
+    problem: Problem, start: Guess, most: int = MOST_ITERATIONS, whole: Problem | None = None
+) -> Solution:
+    """Return the most probable guess after up to `most` iterations from a finite start.
+
+    `whole` has the segments that were left out, too.
+    """
     evaluator = Evaluator(problem)
     guess, damping, iterations = start, _DAMPING[0], 0
     residuals, normal = evaluator.normal(guess)
@@ -245,55 +291,8 @@ def solve(problem: Problem, start: Guess, most: int = MOST_ITERATIONS) -> Fit:
         if gained > 0.0:
             damping = max(damping / 10, _DAMPING[1])
             residuals, normal = evaluator.normal(guess)
-    return Fit(guess, residuals, covariance(normal), iterations)
-
-
-class Solution(NamedTuple):
-    """Fit of segments of logs, without those that were left out."""
-
-    whole: Problem  # all segments
-    problem: Problem  # segments that were fitted
-    begun: Guess  # start of the fit
-    fit: Fit
-
-    @property
-    def delay(self) -> float:
-        """Delay, s."""
-        return float(self.fit.guess.values[DELAY])
-
-    @property
-    def delay_std(self) -> float:
-        """Standard deviation of the delay, s, the last of the unknowns."""
-        return float(np.sqrt(self.fit.covariance[-1, -1]))
-
-    @property
-    def left_out(self) -> int:
-        return len(self.whole.segments) - len(self.problem.segments)
-
-    @property
-    def share(self) -> float:
-        """Share of the values of all segments that was fitted."""
-        return self.problem.count / self.whole.count
-
-    @property
-    def chi2(self) -> float:
-        """chi^2 per value that was fitted."""
-        return chi2_per_value(self.fit.residuals, self.problem)["all"]
-
-    @property
-    def misfit(self) -> Array:
-        """chi^2 per value (n,) of each segment that was fitted."""
-        return misfit(self.fit.residuals, self.problem)
-
-    def without_worst(self, most: int = MOST_ITERATIONS) -> "Solution":
-        """Return the fit from the same start without the segment of the largest misfit."""
-        kept = np.delete(np.arange(len(self.problem.segments)), self.misfit.argmax())
-        problem, begun = self.problem.kept(self.begun, kept)
-        return Solution(self.whole, problem, begun, solve(problem, begun, most))
-
-    def refitted(self, problem: Problem) -> "Solution":
-        """Return the fit of a problem with other steps, from the end of this fit."""
-        return self._replace(problem=problem, fit=solve(problem, self.fit.guess))
+    found = guess, residuals, covariance(normal), iterations
+    return Solution(problem if whole is None else whole, problem, start, *found)
 
 
 def with_half_step(problem: Problem, guess: Guess, residual: float = 1.0) -> Problem | None:

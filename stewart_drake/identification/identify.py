@@ -11,7 +11,6 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification import progress, short_logs, start
 from stewart_drake.identification.fit import (
     UNEXPLAINED,
-    Fit,
     Guess,
     Problem,
     Solution,
@@ -51,21 +50,13 @@ class Identification:
 
     logs: Sequence[Log]  # of the machine
     unknowns: Unknowns  # before the logs
-    solution: Solution
+    fit: Solution
     middle: Array  # median of the measured poses (6,)
-
-    @property
-    def problem(self) -> Problem:
-        return self.solution.problem
-
-    @property
-    def fit(self) -> Fit:
-        return self.solution.fit
 
     @cached_property
     def chi2(self) -> dict[str, float]:
         """chi^2 per value: by kind of measurement, of the prior, and of all."""
-        return chi2_per_value(self.fit.residuals, self.problem)
+        return chi2_per_value(self.fit.residuals, self.fit.problem)
 
     @property
     def right(self) -> bool:
@@ -142,8 +133,8 @@ class Identification:
             },
             "pose_uncertainty": None if poses is None else poses.summary,
             "unseen": {"directions": self.unseen[0], "names": self.unseen[1]},
-            "segments": len(self.problem.segments),
-            "left_out": self.solution.left_out,
+            "segments": len(self.fit.problem.segments),
+            "left_out": self.fit.left_out,
             "iterations": self.fit.iterations,
         }
 
@@ -189,7 +180,7 @@ def identify(
     else:
         found = _grown(min(tried, key=lambda one: one.chi2))
     progress.phase("shorter steps")
-    while (halved := with_half_step(found.problem, found.fit.guess)) is not None:
+    while (halved := with_half_step(found.problem, found.guess)) is not None:
         found = found.refitted(halved)
     return Identification(logs, unknowns, found, middle)
 
@@ -209,8 +200,7 @@ def _begin(values: Array, share: float, pairs: Sequence[start.Pair], unknowns: U
         return _Begun(np.inf, whole, first)
     near, guess = nearest_half(problem, guess)
     fit = solve(near, guess, _FEW)
-    chi2 = chi2_per_value(fit.residuals, near)["all"]
-    return _Begun(chi2, whole, Guess(fit.guess.values, first.first))
+    return _Begun(fit.chi2, whole, Guess(fit.guess.values, first.first))
 
 
 def _grown(begun: _Begun) -> Solution:
@@ -228,14 +218,14 @@ def _grown(begun: _Begun) -> Solution:
             "expected a log of this machine, torques in N m as they were commanded"
         )
     if begun.chi2 > WRONG:
-        return Solution(begun.whole, problem, guess, solve(problem, guess))
+        return solve(problem, guess, whole=begun.whole)
     fewest = len(problem.segments) // 2 + 1
-    found = Solution(begun.whole, problem, guess, solve(problem, guess, _FEW))
+    found = solve(problem, guess, _FEW, begun.whole)
     while found.chi2 > WRONG and len(found.problem.segments) > fewest:
         if found.misfit.max() < UNEXPLAINED:
             break
         found = found.without_worst(_FEW)
-    return found if found.fit.iterations < _FEW else found.refitted(found.problem)
+    return found if found.iterations < _FEW else found.refitted(found.problem)
 
 
 def _unknowns(

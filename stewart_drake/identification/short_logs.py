@@ -108,7 +108,7 @@ def _scanned(pairs: Sequence[Pair], unknowns: Unknowns) -> list[Array]:
     for one in found:
         if _cost(one) <= _RIVAL * max(1.0, _cost(found[0])) and _is_apart(one, kept):
             kept.append(one)
-    return [one.fit.guess.values for one in kept[:_STARTS]]
+    return [one.guess.values for one in kept[:_STARTS]]
 
 
 def _is_apart(one: Solution, others: Sequence[Solution]) -> bool:
@@ -141,7 +141,7 @@ def _fitted(
     problem, begun = without_diverged(whole, guess) if whole.segments else (whole, guess)
     if not problem.segments:
         return None
-    return Solution(whole, problem, begun, solve(problem, begun, most))
+    return solve(problem, begun, most, whole)
 
 
 def _grown(pairs: Sequence[Pair], unknowns: Unknowns, values: Array) -> Solution | None:
@@ -157,8 +157,8 @@ def _grown(pairs: Sequence[Pair], unknowns: Unknowns, values: Array) -> Solution
             break
         one = one.without_worst()
     while one.chi2 <= UNEXPLAINED:
-        away = max(1.0, float(np.sqrt(np.mean(one.fit.residuals.measured**2))))
-        halved = with_half_step(one.problem, one.fit.guess, away)
+        away = max(1.0, float(np.sqrt(np.mean(one.residuals.measured**2))))
+        halved = with_half_step(one.problem, one.guess, away)
         if halved is None:
             break
         one = one.refitted(halved)

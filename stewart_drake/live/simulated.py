@@ -208,7 +208,7 @@ class Body(Protocol):
 
 
 class NativeBody:
-    """The exact plant by DOP853, and a sensor of pose and rates with white noise."""
+    """The exact plant by DOP853, also under position servos, and a sensor with white noise."""
 
     def __init__(self, experiment: Experiment) -> None:
         sc, sensor = experiment.scenario, experiment.scenario.sensor
@@ -224,6 +224,8 @@ class NativeBody:
         self._accuracy = SHARE * sc.plant.accuracy
         self._noise, self._seed = np.array(sensor.noise_std), sensor.seed
         self._period, self.state, self.time = sc.controller.period, experiment.start.copy(), 0.0
+        cranks = sc.controller.command == "cranks"
+        self._servo = position_servo(experiment).compiled if cranks else None
 
     def advance(self, time: float, torque: Array) -> Failure | None:
         push = self._push
@@ -242,25 +244,15 @@ class NativeBody:
         return None if left is None else left._replace(time=began + left.time)
 
     def _course(self, dynamics: StewartDynamics, torque: Array, span: float) -> Course:
-        drives = (Drive(torque + self._bias),)
-        return integrate(dynamics, self.state, drives, (span,), self._accuracy, LONGEST_STEP)
+        how = self._accuracy, LONGEST_STEP
+        if self._servo is not None:
+            return follow(dynamics, self.state, self._servo, torque, span, *how)
+        return integrate(dynamics, self.state, (Drive(torque + self._bias),), (span,), *how)
 
     def measurement(self) -> Array:
         if not self._noise.any():
             return self.state
         return self.state + self._noise * white_noise(self._seed, round(self.time / self._period))
-
-
-class ServoBody(NativeBody):
-    """The exact plant under servos given by their stiffness, and the same sensor."""
-
-    def __init__(self, experiment: Experiment) -> None:
-        super().__init__(experiment)
-        self._servo = position_servo(experiment).compiled
-
-    def _course(self, dynamics: StewartDynamics, torque: Array, span: float) -> Course:
-        args = (self._servo, torque, span, self._accuracy, LONGEST_STEP)
-        return follow(dynamics, self.state, *args)
 
 
 class DrakeBody:
@@ -314,10 +306,9 @@ class DrakeBody:
 def body_of(experiment: Experiment) -> tuple[Callable[[], Body], str]:
     """Return a factory of the plant and sensor of an experiment, and the integrator's name."""
     found = differing(experiment.scenario, _WITHOUT_DRAKE)
-    cranks = experiment.scenario.controller.command == "cranks"
     if found is None:
-        return lambda: (ServoBody if cranks else NativeBody)(experiment), "DOP853"
-    if cranks:
+        return lambda: NativeBody(experiment), "DOP853"
+    if experiment.scenario.controller.command == "cranks":
         raise ConfigError(found.problem("for a machine with servos"))
     return lambda: DrakeBody(experiment), f"Drake ({found.field})"
 

@@ -51,7 +51,7 @@ def document(found: Identification) -> Document:
         interval=interval,
         wrong=WRONG,
         logs=names,
-        segments=len(found.problem.segments),
+        segments=len(found.fit.problem.segments),
         cautions=cautions,
         found=_table(found, geometry=False),
         geometry=_table(found, geometry=True),
@@ -116,7 +116,7 @@ def _cautions(found: Identification) -> list[str]:
             f"a log of the multibody plant: its steps shift the delay by about {1e3 * step:g} ms, "
             "which no interval contains; plant.kind=exact has no such error"
         )
-    if left_out := found.solution.left_out:
+    if left_out := found.fit.left_out:
         stretches = "1 stretch" if left_out == 1 else f"{left_out} stretches"
         cautions.append(f"{stretches} of the logs left out: no trajectory fits there")
     beyond = np.abs(found.fit.residuals.prior) > 4
@@ -188,7 +188,7 @@ def residual_figure(found: Identification, log: int) -> Figure:
 def residuals_of(found: Identification, log: int) -> tuple[Array, Array]:
     """Return times (n,) of a log in s, and residuals (n, 18) in standard deviations."""
     times, rows = [], []
-    for i, segment in enumerate(found.problem.segments):
+    for i, segment in enumerate(found.fit.problem.segments):
         if segment.log is not found.logs[log]:
             continue
         fitted = found.fit.residuals.measured[: len(segment.rows), i]
