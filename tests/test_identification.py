@@ -14,7 +14,6 @@ from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.fit import (
     CONVERGED,
-    Evaluator,
     Guess,
     Problem,
     chi2_per_value,
@@ -272,7 +271,7 @@ def few_unknowns():
 def test_the_fit_is_that_of_a_general_solver():
     """scipy's, on the residuals alone, without the structure of segments."""
     problem, guess = few_unknowns()
-    evaluator, free = Evaluator(problem), problem.unknowns.free
+    evaluator, free = problem, problem.unknowns.free
 
     def residuals(z):
         values = guess.values.copy()
@@ -585,7 +584,7 @@ def test_steps_are_halved_until_they_do_not_matter():
     while (more := with_half_step(halved, guess)) is not None:
         halved = more
     one, exact = (
-        Evaluator(dataclasses.replace(problem, longest_step=h)).residuals(guess).measured
+        dataclasses.replace(problem, longest_step=h).residuals(guess).measured
         for h in (halved.longest_step, 2e-4)
     )
     assert np.sqrt(np.mean((one - exact) ** 2)) < 0.05

@@ -14,6 +14,7 @@ and the inverse of the last matrix, without damping, is the covariance of p for 
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -96,39 +97,33 @@ class Problem:
     unknowns: Unknowns
     longest_step: float = 0.02
 
-    @property
-    def count(self) -> int:
-        return sum(int(np.isfinite(s.log.values[s.rows]).sum()) for s in self.segments)
-
+    @cached_property
     def model(self) -> MachineModel:
-        """Return the machine of all segments."""
+        """Machine of all segments."""
         gravity, free_legs = self.segments[0].log.gravity, bool(self.unknowns.std[GEOMETRY].any())
         return MachineModel(self.unknowns.mechanism, gravity, free_legs)
 
-    def measured(self) -> tuple[Array, Array]:
-        """Return values (m, n, 18) of the segments, NaN for missing ones, and their std (n, 18)."""
+    @cached_property
+    def values(self) -> Array:
+        """Measurements (m, n, 18) of the segments, NaN for missing ones."""
         longest = max(len(s.rows) for s in self.segments)
         values = np.full((longest, len(self.segments), NUM_MEASURED), np.nan)
         for i, s in enumerate(self.segments):
             values[: len(s.rows), i] = s.log.values[s.rows]
-        return values, np.array([s.log.std for s in self.segments])
+        return values
+
+    @cached_property
+    def there(self) -> NDArray[np.bool_]:
+        """(m, n, 18) of those that are not missing."""
+        return np.isfinite(self.values)
 
     def kept(self, start: Guess, kept: NDArray[np.intp]) -> "tuple[Problem, Guess]":
         """Return the problem and a guess of it with these segments only."""
         segments = [self.segments[k] for k in kept]
         return replace(self, segments=segments), Guess(start.values, start.first[kept])
 
-
-class Evaluator:
-    """Residuals of guesses, and their derivatives."""
-
-    def __init__(self, problem: Problem) -> None:
-        self.problem, self.model = problem, problem.model()
-        self.values, self.std = problem.measured()
-        self.free = problem.unknowns.free
-
     def residuals(self, guess: Guess) -> Residuals:
-        return self._evaluate(guess, self.problem.longest_step)[0]
+        return self._evaluate(guess, self.longest_step)[0]
 
     def normal(self, guess: Guess) -> tuple[Residuals, Normal]:
         """Return the residuals and the normal equations of a guess.
@@ -137,14 +132,14 @@ class Evaluator:
         their relative error moves the minimum by the same share of a standard deviation only.
         """
         residuals = self.residuals(guess)
-        sensitivity_step = max(self.problem.longest_step, _SENSITIVITY_STEP)
+        sensitivity_step = max(self.longest_step, _SENSITIVITY_STEP)
         _, J = self._evaluate(guess, sensitivity_step, sensitive=True)
         # Points and values of a segment in one column.
         _, n, _, columns = J.shape
         rows = J.transpose(1, 0, 2, 3).reshape(n, -1, columns)
         r = residuals.measured.transpose(1, 0, 2).reshape(n, -1, 1)
         transposed = rows.transpose(0, 2, 1)
-        weight = 1 / self.problem.unknowns.std[self.free]
+        weight = 1 / self.unknowns.std[self.unknowns.free]
         normal = Normal(
             transposed @ rows, (transposed @ r)[:, :, 0], weight**2, weight * residuals.prior
         )
@@ -154,15 +149,15 @@ class Evaluator:
         self, guess: Guess, longest_step: float, sensitive: bool = False
     ) -> tuple[Residuals, Array]:
         """Return the residuals and J (m, n, 18, columns) at m samples of n segments."""
-        unknowns, free = self.problem.unknowns, self.free
+        unknowns, free = self.unknowns, self.unknowns.free
         numbers = unknowns.numbers(guess.values)
-        steps = plan_steps(self.problem.segments, guess.values[DELAY], longest_step)
+        steps = plan_steps(self.segments, guess.values[DELAY], longest_step)
         states, state_sensitivities = integrate(self.model, numbers, guess.first, steps, sensitive)
         m, n, _ = states.shape
         predicted = np.empty((m, n, NUM_MEASURED))
         J = np.zeros((m, n, NUM_MEASURED, len(free) + NUM_STATE if sensitive else 0))
         predicted[:, :, POSE.start :] = states
-        any_angle = bool(np.isfinite(self.values[:, :, ANGLES]).any())
+        any_angle = bool(self.there[:, :, ANGLES].any())
         with np.errstate(all="ignore"):
             if any_angle:
                 alpha, by_pose, by_geometry = self.model.crank_angles(states[:, :, :6], numbers)
@@ -174,12 +169,13 @@ class Evaluator:
                     J[:, :, ANGLES] = self._columns(sensitivities, np.eye(6))
             residual = self.values - predicted
             residual[:, :, ANGLES] = np.remainder(residual[:, :, ANGLES] + np.pi, 2 * np.pi) - np.pi
-            residual /= self.std
+            std = np.array([s.log.std for s in self.segments])
+            residual /= std
         if sensitive:
             J[:, :, POSE.start :] = self._columns(state_sensitivities, np.zeros((NUM_STATE, 6)))
-            J *= -1 / self.std[:, :, None]
-            J[np.isnan(self.values)] = 0.0
-        residual[np.isnan(self.values)] = 0.0
+            J *= -1 / std[:, :, None]
+            J[~self.there] = 0.0
+        residual[~self.there] = 0.0
         prior = ((guess.values - unknowns.mean)[free]) / unknowns.std[free]
         return Residuals(residual, prior), J
 
@@ -189,12 +185,14 @@ class Evaluator:
         whole[..., : OFFSETS.start] = sensitivities[..., PARAMETER_COLUMNS]
         whole[..., OFFSETS] = offsets
         whole[..., DELAY] = sensitivities[..., DELAY_COLUMN]
-        return np.concatenate([whole[..., self.free], sensitivities[..., FIRST_COLUMNS]], axis=-1)
+        return np.concatenate(
+            [whole[..., self.unknowns.free], sensitivities[..., FIRST_COLUMNS]], axis=-1
+        )
 
 
 def without_diverged(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
     """Return a problem without the segments whose first trajectory leaves the workspace."""
-    measured = Evaluator(problem).residuals(start).measured
+    measured = problem.residuals(start).measured
     with np.errstate(over="ignore"):
         finite = np.isfinite(np.sum(measured**2, axis=(0, 2)))
     return problem.kept(start, np.flatnonzero(finite))
@@ -206,14 +204,13 @@ def nearest_half(problem: Problem, start: Guess) -> tuple[Problem, Guess]:
     The others, such as the last one before a plate was lost, would pull all unknowns towards
     shorter trajectories. From the values of this half they start near, too.
     """
-    away = misfit(Evaluator(problem).residuals(start), problem)
+    away = misfit(problem.residuals(start), problem)
     return problem.kept(start, np.sort(np.argsort(away)[: (len(away) + 1) // 2]))
 
 
 def misfit(residuals: Residuals, problem: Problem) -> Array:
     """Return chi^2 per value (n,) of each segment."""
-    counts = np.isfinite(problem.measured()[0]).sum(axis=(0, 2))
-    return np.asarray(np.sum(residuals.measured**2, axis=(0, 2)) / counts)
+    return np.asarray(np.sum(residuals.measured**2, axis=(0, 2)) / problem.there.sum(axis=(0, 2)))
 
 
 class Solution(NamedTuple):
@@ -244,7 +241,7 @@ class Solution(NamedTuple):
     @property
     def share(self) -> float:
         """Share of the values of all segments that was fitted."""
-        return self.problem.count / self.whole.count
+        return float(self.problem.there.sum() / self.whole.there.sum())
 
     @property
     def chi2(self) -> float:
@@ -273,24 +270,23 @@ def solve(
 
     `whole` has the segments that were left out, too.
     """
-    evaluator = Evaluator(problem)
     guess, damping, iterations = start, _DAMPING[0], 0
-    residuals, normal = evaluator.normal(guess)
+    residuals, normal = problem.normal(guess)
     gained = np.inf
     while iterations < most and gained >= CONVERGED:
         iterations += 1
         progress.iteration(iterations, most)
         before, gained = residuals.chi2, 0.0
         while damping < _DAMPING[2] and gained == 0.0:
-            trial = _moved(guess, *_step(normal, damping), evaluator.free)
-            chi2 = evaluator.residuals(trial).chi2
+            trial = _moved(guess, *_step(normal, damping), problem.unknowns.free)
+            chi2 = problem.residuals(trial).chi2
             if chi2 < before:
                 guess, gained = trial, before - chi2
             else:
                 damping *= 10
         if gained > 0.0:
             damping = max(damping / 10, _DAMPING[1])
-            residuals, normal = evaluator.normal(guess)
+            residuals, normal = problem.normal(guess)
     found = guess, residuals, covariance(normal), iterations
     return Solution(problem if whole is None else whole, problem, start, *found)
 
@@ -304,7 +300,7 @@ def with_half_step(problem: Problem, guess: Guess, residual: float = 1.0) -> Pro
     halved = replace(problem, longest_step=problem.longest_step / 2)
     if halved.longest_step < _SHORTEST_STEP:
         return None
-    coarse, fine = (Evaluator(one).residuals(guess).measured for one in (problem, halved))
+    coarse, fine = (one.residuals(guess).measured for one in (problem, halved))
     return halved if np.sqrt(np.mean((coarse - fine) ** 2)) > _STEP_ERROR * residual else None
 
 
@@ -347,7 +343,7 @@ def chi2_per_value(residuals: Residuals, problem: Problem) -> dict[str, float]:
     Each fitted first state takes twelve degrees of freedom, in equal shares of all values. The
     prior's terms make up for the unknowns.
     """
-    there = np.isfinite(problem.measured()[0])
+    there = problem.there
     fitted = NUM_STATE * len(problem.segments)
     share = 1 - fitted / there.sum()
     found = {

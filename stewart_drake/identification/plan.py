@@ -23,7 +23,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin, margins
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.identification.fit import Evaluator, Guess, Problem, covariance, without_diverged
+from stewart_drake.identification.fit import Guess, Problem, covariance, without_diverged
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
 from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, POSE, Log
 from stewart_drake.identification.start import segment_length, segments_of
@@ -178,7 +178,7 @@ def plan(experiment: Experiment, std: Array, tolerances: Tolerances | None = Non
             "plan: got a motion along which the plate cannot be followed; expected one that "
             "stays off the edge of the workspace"
         )
-    spread = covariance(Evaluator(problem).normal(guess)[1])
+    spread = covariance(problem.normal(guess)[1])
     reference = CsvConfig(file=MOTION)
     changed = dataclasses.replace(sc, reference=reference, duration=float(times[-1]))
     return Plan(changed, share, times, poses, unknowns, spread)

@@ -41,20 +41,16 @@ def proportions(mechanism: Legs) -> Proportions:
     return Proportions(crank, 1.6 * crank, 0.22 * u, 0.40 * u, 0.012 * rod, 0.03 * rod)
 
 
-class Lines(NamedTuple):
-    """Centre lines of the links at n poses."""
+def center_lines(mechanism: Legs, poses: Array, legs: LegGeometry) -> tuple[Array, Array]:
+    """Return the lines of cranks, then rods, at poses (n, 6) whose legs are `legs`.
 
-    start: Array  # (n, 12, 3) in m, W
-    along: Array  # (n, 12, 3), from one end to the other
-
-
-def center_lines(mechanism: Legs, poses: Array, legs: LegGeometry) -> Lines:
-    """Return the lines of cranks, then rods; `legs` are those of the poses (n, 6)."""
+    These are the starts in W, m, and the vectors from there to the ends, (n, 12, 3).
+    """
     cranks = mechanism.crank_lengths[:, None] * legs.crank
     rods = mechanism.rod_lengths[:, None] * legs.rod
     joints = poses[:, None, POSITION] + legs.p_PQ_W
     shafts = np.broadcast_to(mechanism.p_WS, joints.shape)
-    return Lines(np.hstack([shafts, joints - rods]), np.hstack([cranks, rods]))
+    return np.hstack([shafts, joints - rods]), np.hstack([cranks, rods])
 
 
 def segment_distances(p: Array, u: Array, q: Array, v: Array) -> Array:
