@@ -5,12 +5,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Final
 
-
-def _hide(text: str) -> None:
-    pass
-
-
-_show: Final = ContextVar[Callable[[str], None]]("show", default=_hide)
+_show: Final = ContextVar[Callable[[str], None]]("show", default=lambda _: None)
 _phase: Final = ContextVar[str]("phase", default="")
 
 

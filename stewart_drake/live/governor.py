@@ -346,7 +346,9 @@ class Steering:
         """Fix the reference up to `time` in s, and follow a request from there on."""
         if time - self.until < _UPDATE_INTERVAL - 1e-9:
             return self
-        governed = self._governed_at(time)
+        governed = self.governed
+        if governed is not None:
+            governed = self.governor.after(governed, time - self.until)
         if request.target is None and not request.rest:
             if governed is None:
                 return replace(self, until=time, limit=None)
@@ -362,11 +364,6 @@ class Steering:
             governed = begun
         target = governed.applied if request.rest or request.target is None else request.target
         return self._by_hand(self.governor.follow(governed, target), time)
-
-    def _governed_at(self, time: float) -> GovernorState | None:
-        if self.governed is None:
-            return None
-        return self.governor.after(self.governed, time - self.until)
 
     def _by_hand(self, governed: GovernorState, time: float) -> "Steering":
         way = self.way.then(time, _future(self.governor, governed, time))
