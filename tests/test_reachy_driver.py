@@ -19,7 +19,7 @@ from stewart_drake.live.protocol import (
     Head,
     MachineFlags,
 )
-from stewart_drake.live.reachy import Daemon, Positions, RobotMachine, SoftSetpoints, open_robot
+from stewart_drake.live.reachy import Daemon, Positions, RobotMachine, SoftSetpoints, open_chosen
 from stewart_drake.live.session import drive, prepare_session
 from stewart_drake.loop.peer import Fault
 from stewart_drake.loop.preparation import prepare
@@ -189,7 +189,7 @@ def test_no_daemon_is_one_line(capsys):
 )
 def test_another_machine_or_address_is_refused(name, reachy, message):
     options = MachineOptions(reachy=reachy, port=0)
-    with pytest.raises(ConfigError, match=message), open_robot(sd.load_scenario(name), options):
+    with pytest.raises(ConfigError, match=message), open_chosen(sd.load_scenario(name), options):
         pass
 
 
@@ -279,7 +279,7 @@ def test_setpoints_ahead_are_of_a_robot_only(capsys):
 def test_live_moves_the_head(daemon):
     scenario = sd.load_scenario("reachy_mini", settings=("delay.steps=13",))
     options = MachineOptions(reachy=f"127.0.0.1:{daemon.port}", port=0)
-    with open_robot(scenario, options, [].append) as (running, address), in_a_thread(running):
+    with open_chosen(scenario, options, [].append) as (running, address), in_a_thread(running):
         ready = prepare_session(scenario, address)
         result = drive(ready, 4.0, accept_jitter=True, say=lambda line: None)
         began = (running._started + running.begin) / 1e9

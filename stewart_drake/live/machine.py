@@ -10,8 +10,7 @@ import heapq
 import math
 import select
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final
@@ -20,8 +19,8 @@ import numpy as np
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.live.endpoint import STALL, Address, Endpoint, Offers, Session, now, read_key
-from stewart_drake.live.options import MachineOptions, Settings
+from stewart_drake.live.endpoint import STALL, Address, Endpoint, Offers, Session, now
+from stewart_drake.live.options import Settings
 from stewart_drake.live.protocol import (
     MOST_SAMPLES,
     NEVER,
@@ -47,7 +46,7 @@ from stewart_drake.loop.peer import FAULTS, Fault, Reason, identity_of, in_words
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing
-from stewart_drake.scenario.run_log import Background, RunLog, open_log
+from stewart_drake.scenario.run_log import RunLog
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE, RATES
 from stewart_drake.types import Array
 
@@ -69,21 +68,6 @@ def check_scenario(scenario: Scenario) -> None:
             f"sensor.samples: got {samples}; expected at most {MOST_SAMPLES}, which a datagram "
             "holds"
         )
-
-
-@contextmanager
-def socket_and_log(
-    scenario: Scenario, options: MachineOptions, say: Callable[[str], None]
-) -> Iterator[tuple[Endpoint[ControllerMessage], RunLog | None]]:
-    """Yield the socket of a machine, and the log that its options ask for."""
-    with ExitStack() as opened:
-        endpoint = Endpoint(ControllerMessage, options.host, options.port, read_key(options.key))
-        opened.callback(endpoint.close)
-        log = None
-        if options.log is not None:
-            log = Background(open_log(options.log, scenario), str(options.log), say)
-            opened.callback(log.close)
-        yield endpoint, log
 
 
 def reason_of(failure: Failure) -> Reason:

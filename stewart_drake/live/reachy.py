@@ -11,7 +11,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
@@ -22,8 +22,8 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import brief
 from stewart_drake.law.servos import Stiffness, rise
 from stewart_drake.live.contact import address_of
-from stewart_drake.live.endpoint import Address, Endpoint, now
-from stewart_drake.live.machine import Machine, check_scenario, socket_and_log
+from stewart_drake.live.endpoint import Address, Endpoint, now, read_key
+from stewart_drake.live.machine import Machine, check_scenario
 from stewart_drake.live.options import MachineOptions
 from stewart_drake.live.protocol import (
     NEVER,
@@ -40,6 +40,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import ForwardKinematicsError
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing
+from stewart_drake.scenario.run_log import Background, open_log
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_STATE, POSE
 from stewart_drake.types import Array
 
@@ -359,31 +360,35 @@ def open_chosen(
     """Yield the robot behind `options.reachy`, or a simulated machine, and where it listens.
 
     Raises:
-        ConfigError: a scenario that the protocol does not cover, an address in use, or see
-            `open_robot`.
+        ConfigError: a scenario that the protocol does not cover, or an address in use. For a robot
+            also other motors than position servos, more samples than the daemon sends, no package
+            websockets, or no daemon that sends positions.
     """
+    check_scenario(scenario)
     if options.reachy:
-        with open_robot(scenario, options, say) as opened:
-            yield opened
-        return
-    if options.ahead:
+        _check_robot(scenario)
+    elif options.ahead:
         raise ConfigError(f"--ahead: got {options.ahead:g} s without --reachy; expected both")
-    check_scenario(scenario)
-    with socket_and_log(scenario, options, say) as (endpoint, log):
-        yield Machine(prepare(scenario), endpoint, options, say, log=log), endpoint.address
+    experiment = prepare(scenario)
+    with ExitStack() as opened:
+        endpoint = Endpoint(ControllerMessage, options.host, options.port, read_key(options.key))
+        opened.callback(endpoint.close)
+        log = None
+        if options.log is not None:
+            log = Background(open_log(options.log, scenario), str(options.log), say)
+            opened.callback(log.close)
+        how: Any = {"say": say, "log": log}
+        if options.reachy:
+            daemon = Daemon(address_of(options.reachy, "--reachy"))
+            opened.callback(daemon.close)
+            _await_positions(daemon, options.reachy)
+            machine: Machine = RobotMachine(experiment, endpoint, options, daemon, **how)
+        else:
+            machine = Machine(experiment, endpoint, options, **how)
+        yield machine, endpoint.address
 
 
-@contextmanager
-def open_robot(
-    scenario: Scenario, options: MachineOptions, say: Callable[[str], None] = print
-) -> Iterator[tuple[RobotMachine, Address]]:
-    """Yield the machine of a robot, and the address at which it listens.
-
-    Raises:
-        ConfigError: motors other than position servos, more samples than the daemon sends, no
-            package websockets, no daemon that sends positions, or an address in use.
-    """
-    check_scenario(scenario)
+def _check_robot(scenario: Scenario) -> None:
     wanted = {"actuator.kind": "position_servo", "sensor.samples": (None, 1)}
     if found := differing(scenario, wanted):
         raise ConfigError(found.problem("with --reachy"))
@@ -393,14 +398,6 @@ def open_robot(
         raise ConfigError(
             "--reachy: needs the package websockets; expected pip install 'stewart_drake[reachy]'"
         ) from None
-    assert options.reachy is not None
-    address, experiment = address_of(options.reachy, "--reachy"), prepare(scenario)
-    with (
-        socket_and_log(scenario, options, say) as (endpoint, log),
-        closing(Daemon(address)) as daemon,
-    ):
-        _await_positions(daemon, options.reachy)
-        yield RobotMachine(experiment, endpoint, options, daemon, say, log=log), endpoint.address
 
 
 def _await_positions(daemon: Daemon, where: str) -> None:
