@@ -40,6 +40,7 @@ from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.recording import summarize
 from stewart_drake.loop.results import LEAST_MEASURED, LiveSummary, SimulationResult
+from stewart_drake.reporting.document import templates
 from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.link_config import WireConfig
 from stewart_drake.scenario.run_log import Background, RunLog, UdpMirror, open_log
@@ -120,84 +121,27 @@ def _in_time(experiment: Experiment) -> Experiment:
 
 def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
     """Return lines about the machine, the link and the law, for before the begin."""
-    contact, made = ready.contact, ready.design
-    machine, link, sc = contact.machine, contact.link, made.experiment.scenario
-    host, port = contact.session.address
-    kind = "a simulation" if ready.simulated else "A REAL MACHINE: it will move"
-    eta = made.law.timeline.eta
-    limit = "without a limit" if math.isinf(made.torque_limit) else f"{made.torque_limit:g} N m"
-    rate = "" if machine.rate == 1 else f", {machine.rate:g} of its seconds in one"
-    packets, trips = (
-        "each torque as it is computed, on a simulated wire",
-        ", as the machine simulates it",
-    )
-    if sc.link.kind == "network":
-        trips = ", which leaves time for the longest round trip, computing and repetitions"
-        c = sc.controller
-        packets = f"packets of {c.packet_repeats + c.packet_torques} torques"
-    acts = "torques act"
-    if made.cranks:
-        acts = "setpoints act"
-        packets = (
-            f"plans of {made.rows} setpoints"
-            if made.sends
-            else packets.replace("torque", "setpoint")
+    made, contact = ready.design, ready.contact
+    text = (
+        templates()
+        .get_template("live_plan.txt.j2")
+        .render(
+            ready=ready,
+            made=made,
+            contact=contact,
+            machine=contact.machine,
+            margin=ready.margin,
+            duration=duration,
+            scenario=scenario,
+            period=made.experiment.scenario.controller.period,
+            second=SECOND,
+            infinity=math.inf,
+            most=_MOST,
+            ms=milliseconds,
+            advice=_queue_advice(made.experiment.scenario),
         )
-    held = "" if made.cranks else " (--hold controls the plate at rest until Ctrl-C)"
-    until = "until it is stopped" if math.isinf(duration) else f"for {duration:g} s"
-    return [
-        f"machine at {host}:{port}: {kind}{rate}",
-        f"link: a round trip takes {1e3 * link.typical:.0f} ms ({1e3 * link.shortest:.0f} to "
-        f"{1e3 * link.longest:.0f}), {100 * link.loss_there:.0f} % are lost on the way there, "
-        f"{100 * link.loss_back:.0f} % on the way back",
-        f"delay of the loop: {acts} {eta:g} s after the measurement that they rest on{trips}",
-        f"the controller sends {packets}, every {1e3 * sc.controller.period:g} ms; motors {limit}",
-        f"motion: {scenario}, {until}, then rest",
-        f"at the end, and after {machine.watchdog / SECOND:g} s without a word, "
-        f"{made.left_alone(machine)}{held}",
-        *_stability(ready),
-        *_cautions(made),
-    ]
-
-
-def _stability(ready: Ready) -> list[str]:
-    """Return lines that compare the stability margin with the jitter, and remedies."""
-    margin, link, sc = ready.margin, ready.contact.link, ready.design.experiment.scenario
-    shorter, longer = (milliseconds(s) for s in (margin.margins.shorter, margin.margins.longer))
-    judged = f"stable for delay errors from -{shorter} to +{longer}"
-    if margin.stable is None:
-        judged = f"not judged: {margin.problem}"
-    elif not margin.stable:
-        judged = "unstable"
-    found = (
-        f"this loop is {judged}; round trips vary by {milliseconds(link.jitter)} (standard "
-        f"deviation {milliseconds(link.spread)})"
     )
-    if sc.link.kind == "network":
-        found += (
-            "; the machine's play-out buffer absorbs that while they take less than "
-            f"{milliseconds(sc.eta)}"
-        )
-    if ready.jitter_problem is None:
-        return [found]
-    return [
-        found,
-        f"warning: {ready.jitter_problem}. Remedies: a machine with a play-out buffer that is "
-        "longer than any round trip; a lower bandwidth (--set controller.w_R=1000); --controller "
-        "adaptive_lqi where the delay is off by a constant",
-    ]
-
-
-def _cautions(made: Design) -> list[str]:
-    """Return lines about the time of a step and an unsuitable queue."""
-    sc, (step, backend) = made.experiment.scenario, made.step
-    period = sc.controller.period
-    slow = f"; more than {_MOST:.0%}: expect missed deadlines" if step > _MOST * period else ""
-    lines = [
-        f"law: {backend}, a step takes {1e3 * step:.1f} ms of a period of {1e3 * period:g} ms{slow}"
-    ]
-    advice = _queue_advice(sc)
-    return lines if advice is None else [*lines, advice]
+    return [" ".join(line.split()) for line in text.split("\n\n") if line.strip()]
 
 
 def _queue_advice(scenario: Scenario) -> str | None:
