@@ -276,7 +276,8 @@ class Constants:
         keep: arrays and C structures that a pointer may refer to.
         tables: names of the core's tables of functions, by address.
         suffix: of a number, `f` in single precision.
-        data: structure, and the beginning of the names of what it points to.
+        data: the structure.
+        about: beginning of the names of its targets.
 
     Attributes:
         text: initialiser of the structure.
