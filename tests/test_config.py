@@ -56,24 +56,13 @@ def one_line(caught):
 # Defaults and shipped files
 
 
-def test_the_paper_scenario_spells_the_defaults_out():
-    assert load_scenario("paper") == Scenario()
-
-
-def test_the_paper_scenario_lists_every_field_of_its_kinds():
+def test_the_paper_scenario_spells_all_defaults_out():
+    assert load_scenario("paper") == load_scenario("paper", "predictor_lqi") == Scenario()
     data = load_yaml(resolve("scenario", "paper"))
     for section, fields in scenario_to_dict(Scenario()).items():
         if isinstance(fields, dict):
             assert set(fields) <= set(data[section])
         assert section in data
-
-
-def test_the_gravity_scenario_is_short_delayed_and_starts_on_the_reference():
-    scenario = load_scenario("gravity")
-    assert scenario.plant == PlantConfig(gravity=True)
-    assert scenario.delay == DelayConfig(steps=16)
-    assert scenario.controller == ControllerConfig(period=0.01)
-    assert (scenario.start, scenario.queue) == ("on_reference", "reference")
 
 
 @pytest.mark.parametrize("scenario", shipped("scenario"))
@@ -111,10 +100,6 @@ def test_the_papers_controllers(name, integral, delay_steps):
         catch_up=0,
         open_loop_start=False,
     )
-
-
-def test_the_predictor_is_the_default_controller():
-    assert load_scenario("paper", controller="predictor_lqi") == Scenario()
 
 
 # Layers
@@ -184,19 +169,6 @@ def test_a_null_for_a_field_of_another_kind_says_nothing(tmp_path):
         load_scenario(write(tmp_path, "reference: {fil: null}"))
 
 
-def test_what_a_kind_does_not_have_cannot_be_read_from_it():
-    hold = load_scenario("paper", settings=["reference.kind=hold"]).reference
-    with pytest.raises(AttributeError):
-        hold.amplitude  # noqa: B018
-    with pytest.raises(ConfigError):
-        hold.kind = "sine"
-    scenario = Scenario()
-    with pytest.raises(ConfigError):
-        scenario.reference = PlantConfig()
-    with pytest.raises(ConfigError):
-        scenario.tuner = HoldConfig()
-
-
 def test_paths_start_where_they_were_written(tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
@@ -220,7 +192,6 @@ BAD_FILES = {
     "empty": ("", ["is empty", "a YAML mapping"]),
     "a list": ("- 1\n", ["[1]", "a YAML mapping"]),
     "duplicate key": ("delay: {steps: 1}\nduration: 1\nduration: 2\n", ["line 3", "duration"]),
-    "duplicate nested key": ("delay:\n  steps: 1\n  steps: 2\n", ["line 3", "steps"]),
     "two documents": ("duration: 1\n---\nduration: 2\n", ["line 2", "document"]),
     "alias": ("duration: &a 1\nsensor: {seed: *a}\n", ["line 1", "anchors"]),
     "python tag": ("duration: !!python/object/apply:os.getcwd []\n", ["line 1", "tags"]),
@@ -228,8 +199,6 @@ BAD_FILES = {
     "merge key": ("<<: {duration: 1}\n", ["line 1", "a key must be a word"]),
     "deep": ("[" * 5000, ["depth"]),
     "many digits": ("duration: " + "9" * 5000, ["YAML"]),
-    "unclosed": ("delay: {steps: 1\n", ["line"]),
-    "nul": ("duration: 1\0\n", ["YAML"]),
     "unknown section": ("contoller: {period: 1}", ["contoller: unknown key", "controller"]),
     "key that begins with a dot": ("{.o: {}}", [".o: unknown key"]),
     "unknown field": ("controller: {perod: 1}", ["controller.perod", "controller.period"]),
@@ -237,33 +206,22 @@ BAD_FILES = {
     "empty section": ("delay:\n", ["delay: got None", "a mapping of fields"]),
     "overflow": ("controller: {w_Q: 1e999}", ["controller.w_Q: got inf", "finite"]),
     "yes for a boolean": ("plant: {gravity: yes}", ["plant.gravity: got 'yes'", "true or false"]),
-    "number for a boolean": ("plant: {gravity: 1}", ["plant.gravity: got 1", "true or false"]),
     "float for an integer": ("delay: {steps: 8.5}", ["delay.steps: got 8.5", "a whole number"]),
-    "date for text": ("duration: 2021-05-30", ["duration: got '2021-05-30'", "expected a number"]),
     "five numbers": ("reference: {offset: [0, 0, 0, 0, 0]}", ["reference.offset", "6 items"]),
     "text in a list": ("reference: {offset: [0, 0, 0, a, 0, 0]}", ["reference.offset[3]", "'a'"]),
-    "negative noise": (
-        "sensor: {noise_std: [0, 0, 0, 0, 0, -1, 0, 0, 0, 0, 0, 0]}",
-        ["sensor.noise_std[5]: got -1", "at least 0"],
-    ),
     "unknown kind": (
         "reference: {kind: square}",
         ["reference.kind: got 'square'", "'sine', 'hold', 'waypoints', 'csv'"],
     ),
-    "one kind": ("link: {kind: radio}", ["link.kind: got 'radio'", "'wire'"]),
     "nearest of its kind": (
         "reference: {kind: waypoints, pose: []}",
         ["reference.pose: unknown key", "reference.poses?"],
     ),
-    "unknown start": ("start: now", ["start: got 'now'", "'rest' or 'on_reference'"]),
-    "unknown unit": ("reference: {frequency_unit: rpm}", ["frequency_unit: got 'rpm'", "'Hz'"]),
     "no mechanism": ("mechanism: ''", ["mechanism: got ''"]),
     "foreign field": (
         "reference: {kind: hold, amplitude: [0, 0, 0, 0, 0, 0]}",
         ["reference.amplitude", "kind 'hold' does not use"],
     ),
-    "foreign to the default kind": ("reference: {file: a.csv}", ["reference.file", "kind 'sine'"]),
-    "weights nobody uses": ("tuner: {weights: paper}", ["tuner.weights", "kind 'fixed'"]),
     "csv without file": ("reference: {kind: csv}", ["reference.file: got None", "CSV"]),
     "waypoints without poses": (
         "reference: {kind: waypoints, times: [0, 1]}",
@@ -278,17 +236,9 @@ BAD_FILES = {
         "poses: [[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0]]}",
         ["reference.poses: got 2 poses", "expected 3"],
     ),
-    "one waypoint": (
-        "reference: {kind: waypoints, times: [0], poses: [[0, 0, 0, 0, 0, 0]]}",
-        ["reference.times", "at least 2 items"],
-    ),
     "pitch of the sine": (
         "reference: {amplitude: [0, 1, 0, 0, 0, 0], offset: [0, -0.6, 0, 0, 0, 0.38]}",
         ["reference.offset", "1.6 rad", "pi/2"],
-    ),
-    "pitch of the hold": (
-        "reference: {kind: hold, offset: [0, 1.6, 0, 0, 0, 0.38]}",
-        ["reference.offset", "1.6 rad"],
     ),
     "half a belief": (
         "controller: {delay_fraction: 0.5}",
@@ -297,14 +247,6 @@ BAD_FILES = {
     "a map of no model": (
         "controller: {torque_map: printed}",
         ["controller.torque_map: got 'printed'", "or another controller.model"],
-    ),
-    "a step beside the grid": (
-        "plant: {time_step: 0.003}",
-        ["plant.time_step: got 0.003", "0.02 s divided by a whole number", "0.0028571"],
-    ),
-    "a period between steps": (
-        "controller: {period: 0.1004}",
-        ["controller.period: got 0.1004", "plant.time_step (0.001 s)", "nearest 0.1"],
     ),
     "a fraction between steps": (
         "delay: {fraction: 0.123}",
@@ -333,12 +275,9 @@ REFUSED = [
     ("a.b.c=1", "got 'a.b.c=1'; expected section.field=value"),
     ("duration=", "duration: got None; expected a number"),
     ("duration=[1", "duration: line 1"),
-    ("duration=&a 1", "anchors"),
-    ("duraton=1", "duraton: unknown key; did you mean duration?"),
     ("controller.perid=1", "controller.perid: unknown key; did you mean controller.period?"),
     ("controller=5", "controller: got 5; expected a mapping of fields"),
     ("duration.x=5", "duration: got {'x': 5}"),
-    ("reference.times=[0, 1]", "reference.times: got [0, 1], which kind 'sine' does not use"),
     (
         "link.loss=0.1",
         "link.loss: got 0.1, which kind 'wire' does not use; expected link.kind=network",
@@ -359,23 +298,12 @@ REFUSED = [
     ),
     (NETWORK, "delay.steps=0", "link.low: got null with a delay that is 0; expected link.low and"),
     (NETWORK, "delay.drift=0.01", "link.low: got null with a delay that is not constant; expected"),
-    (NETWORK, "delay.jitter_std=0.001", "link.low: got null with a delay that is not constant"),
     (NETWORK, "link.low=0.5", "link.high: got null with distribution 'uniform'; expected a number"),
-    (NETWORK, "link.high=0.5", "link.low: got null with distribution 'uniform'; expected a number"),
     (NETWORK, "link.return={loss: 0.1}", "link.return.low: got null with distribution 'uniform'"),
     (NETWORK, "link.median=0.6", "link.median: got 0.6 with distribution 'uniform'; expected null"),
-    (NETWORK, "link.sigma=0.2", "link.sigma: got 0.2 with distribution 'uniform'; expected null"),
-    (
-        *(NETWORK, "link.low=0.5", "link.high=0.9", "link.sigma=0.2"),
-        "link.sigma: got 0.2 with distribution 'uniform'; expected null",
-    ),
     (
         *(NETWORK, "link.distribution=lognormal", "link.median=1", "link.sigma=0.2"),
         *("link.low=0.5", "link.low: got 0.5 with distribution 'lognormal'; expected null"),
-    ),
-    (
-        *(NETWORK, "link.return={low: 0, high: 1, median: 0.5}"),
-        "link.return.median: got 0.5 with distribution 'uniform'; expected null",
     ),
     (
         *(NETWORK, "controller.delay_steps=6"),
@@ -391,9 +319,6 @@ REFUSED = [
         *("plant.kind=paper", "plant.gravity=true"),
         "plant.gravity: got true with plant.kind 'paper'; expected false",
     ),
-    ("plant.kind=paper", "plant.payload_mass=0.1", "plant.payload_mass: got 0.1"),
-    ("plant.kind=paper", "plant.joint_damping=1e-3", "plant.joint_damping: got 0.001"),
-    ("plant.kind=paper", "plant.coulomb_friction=1e-3", "plant.coulomb_friction: got 0.001"),
     ("plant.kind=paper", "sensor.kind=encoders", "sensor.kind: got 'encoders'"),
     ("plant.kind=multibody", "log_period=0.0015", "whole number of plant.time_step"),
     ("plant.kind=exact", "duration=1000", "log_period=1e-4", "at least 0.0002 s"),
@@ -410,17 +335,12 @@ REFUSED = [
         "actuator.torque_limit=nonsense",
         "'nonsense'; expected a number above 0 and of at most 1e6, none for no limit",
     ),
-    ("actuator.torque_limit=[1]", "[1]; expected a number above 0 and of at most 1e6"),
     ("compare={lqr: {w_Q: -1}}", "compare.lqr: w_Q"),
-    ("compare={lqr: {colour: red}}", "compare.lqr: colour"),
     ("compare={lqr: 3}", "compare"),
     (
         "plant.push={from: 4, to: 4}",
         "plant.push.to: got 4 s; expected more than plant.push.from",
     ),
-    ("plant.push={wrench: [0, 0, 1]}", "plant.push.wrench: got [0, 0, 1]; expected at least 6"),
-    ("plant.push={from: -1}", "plant.push.from: got -1"),
-    ("plant.push={force: 1}", "plant.push.force: unknown key; expected one of wrench, from, to"),
     (
         *("plant.push={wrench: [0, 0, 0, 1, 0, 0]}", "plant.kind=paper"),
         "plant.push.wrench: got [0.0, 0.0, 0.0, 1.0, 0.0, 0.0] with plant.kind 'paper'",
@@ -431,8 +351,6 @@ REFUSED = [
         "controller.prior.wrench: got [1.0, 1.0] with controller.estimate ['torque_bias', "
         "'payload', 'damping'], where it has no effect",
     ),
-    (WRENCH, "controller.prior={wrench: [1, 0]}", "controller.prior.wrench[1]: got 0"),
-    (WRENCH, "controller.prior={wrench_walk: 1}", "controller.prior.wrench_walk: got 1"),
     *(
         (f"sensor.faults=[{text}]", f"sensor.faults[0]{said}")
         for text, said in (
@@ -443,10 +361,6 @@ REFUSED = [
                 ".frm: unknown key; did you mean sensor.faults[0].fr",
             ),
             ("{kind: frozen, to: 4}", ".from: is missing"),
-            ("{kind: frozen, from: -1, to: 4}", ".from: got -1"),
-            ("{kind: frozen, from: 1, to: .nan}", ".to: got nan; expected a finite number"),
-            ("{kind: spike, from: 1, to: 4, size: 0}", ".size: got 0"),
-            ("3", ": got 3; expected a mapping of fields"),
         )
     ),
     ("sensor.faults=[{kind: frozen, from: 5, to: 4}]", "'to': 4}; expected `to` after `from`"),
@@ -468,16 +382,10 @@ def test_bad_settings_are_refused_in_one_line(row):
     assert said in one_line(caught)
 
 
-def test_a_file_may_end_in_yml(tmp_path, monkeypatch):
+def test_a_file_may_end_in_yml_and_begin_with_a_byte_order_mark(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("own.yml").write_text("duration: 3.0\n")
-    assert load_scenario("own.yml").duration == 3.0
-
-
-def test_a_file_with_a_byte_order_mark_is_read(tmp_path):
-    path = tmp_path / "bom.yaml"
-    path.write_bytes(b"\xef\xbb\xbfduration: 3\n")
-    assert load_scenario(path).duration == 3
+    Path("own.yml").write_bytes(b"\xef\xbb\xbfduration: 3\n")
+    assert load_scenario("own.yml").duration == 3
 
 
 # Changes in memory
@@ -485,26 +393,26 @@ def test_a_file_with_a_byte_order_mark_is_read(tmp_path):
 
 def test_an_assignment_is_checked():
     scenario = Scenario()
-    scenario.duration = 5.0
-    scenario.delay.steps = 3
-    scenario.reference = HoldConfig()
+    scenario.duration, scenario.reference = 5.0, HoldConfig()
     scenario.check()
-    for bad in (-1.0, float("nan"), "5"):
+    for owner, name, bad in (
+        *((scenario, "duration", value) for value in (-1.0, float("nan"), "5")),
+        (scenario.plant, "mass", 1.0),
+        (scenario.reference, "kind", "sine"),
+        (scenario, "tuner", HoldConfig()),
+    ):
         with pytest.raises(ConfigError):
-            scenario.duration = bad
-    with pytest.raises(ConfigError):
-        scenario.plant.mass = 1.0
-    assert scenario.duration == 5.0
+            setattr(owner, name, bad)
+    assert scenario.duration == 5.0 and not hasattr(scenario.reference, "amplitude")
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: PlantConfig(kind="exakt"), "kind: got 'exakt'; expected 'multibody', 'exact' or"),
-        (lambda: PlantConfig("exakt"), "kind: got 'exakt'; expected 'multibody', 'exact' or"),
         (lambda: PlantConfig(gravty=True), "gravty: unknown key; did you mean gravity?"),
     ],
-    ids=["by name", "by place", "unknown"],
+    ids=["by name", "unknown"],
 )
 def test_a_wrong_argument_in_python_is_one_line(make, message):
     with pytest.raises(ConfigError, match="^PlantConfig: " + re.escape(message)) as caught:
@@ -519,7 +427,6 @@ def test_check_sees_changes_that_assignment_does_not():
     with pytest.raises(ConfigError, match=r"^scenario: plant.torque_bias\[2\]: got nan"):
         scenario.check()
     scenario.plant.torque_bias[2] = np.float64(0.5)
-    scenario.check("mine")
     scenario.controller.period = 0.1005
     with pytest.raises(ConfigError, match=r"^mine: controller\.period: got 0\.1005"):
         scenario.check("mine")
