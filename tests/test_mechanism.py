@@ -68,51 +68,40 @@ def third_leg(**changes):
 INVALID = [
     ({"rod.length": [0.4] * 5}, "rod.length: got [0.4, 0.4, 0.4, 0.4, 0.4]", "list of six"),
     ({"rod.length": [-0.4] + [0.4] * 5}, "rod.length: got [-0.4, 0.4,", "positive"),
-    ({"rod.length": 0.11}, "rod.length: got 0.11 m for leg 1", "longer than its crank"),
-    ({"rod.length": [0.404] * 5 + [0.1]}, "rod.length: got 0.1 m for leg 6", "longer than its"),
-    ({"plate.mass": "4 kg"}, "plate.mass: got '4 kg'", "number"),
+    ({"rod.length": [0.404] * 5 + [0.11]}, "rod.length: got 0.11 m for leg 6", "longer than its"),
     ({"plate.inertia": [0, 30e-4, 30e-4]}, "plate.inertia: got [0, 0.003, 0.003]", "positive"),
-    ({"rod.inertia": [-1e-6, 1e-4, 1e-4]}, "rod.inertia: got [-1e-06, 0.0001,", "positive"),
     ({"rod.inertia": [1e-6, 1e-4]}, "rod.inertia: got [1e-06, 0.0001]", "3 items"),
     (
         {"crank.inertia": [0.01e-4, 0.58e-4, 0.60e-4]},  # as printed in Table I
         "crank.inertia: got [1e-06, 5.8e-05, 6e-05] kg m^2, which violates the triangle inequality",
         "at most the sum of the other two",
     ),
-    ({"base.inertia": [1.0, 1.0, 3.0]}, "base.inertia: got [1, 1, 3]", "sum of the other two"),
+    (  # all impossible bodies at once
+        {"base.inertia": [1.0, 1.0, 3.0], "crank.mass": 0, "rod.inertia": [0, 1e-3, 1e-3]},
+        "base.inertia: got [1, 1, 3]",
+        "crank.mass: got 0 kg",
+    ),
     ({"pattern.branches": [-1, 1, -1, 0, -1, 1]}, "pattern.branches[3]: got 0", "-1 or 1"),
-    ({"pattern.branches": [1] * 5}, "pattern.branches: got [1, 1, 1, 1, 1]", "6 items"),
     (
         {"pattern.plate_order": [0, 0, 1, 2, 3, 4]},
         "pattern.plate_order: got [0, 0, 1, 2, 3, 4]",
         "each of 0 to 5 once",
     ),
-    ({"pattern.plate_order": [6, 0, 1, 2, 3, 4]}, "pattern.plate_order[0]: got 6", "at most 5"),
     (
         {"home": [0, 0, 0, 0, 0, 0.6]},
         "home: got [0, 0, 0, 0, 0, 0.6], out of reach: all legs short by ",
         "within reach",
     ),
-    ({"home": [0, 0, 0, 0, 0.38]}, "home: got [0, 0, 0, 0, 0.38]", "6 items"),
-    ({"home": [0, 0, 0, 0, 0, float("nan")]}, "home[5]: got nan", "finite"),
     ({"home": [0, np.pi / 2, 0, 0, 0, 0.38]}, "home: got a pitch of 1.5708", "less than pi/2"),
     ({"pattern": ABSENT}, "pattern, legs: got neither", "exactly one of the two"),
     ({"legs": [LEG] * 6}, "pattern, legs: got both", "exactly one of the two"),
     ({"pattern": ABSENT, "legs": [LEG] * 5}, "legs: got [{'shaft'", "6 items"),
-    ({"pattern": ABSENT, "legs": LEG}, "legs: got {'shaft'", "array"),
     (third_leg(motor_axis=[0, 0, 0]), "legs[2].motor_axis: got [0.0, 0.0, 0.0]", "not zero"),
     (third_leg(crank_zero=[0, 0, 0]), "legs[2].crank_zero: got [0.0, 0.0, 0.0]", "not zero"),
-    (third_leg(crank_zero=[1, 1, 0]), "legs[2].crank_zero: got 45 degrees", "perpendicular"),
     (third_leg(crank_zero=[0.005, 1, 0]), "legs[2].crank_zero: got 89.7", "perpendicular"),
-    (third_leg(crank_zero=[2, 0, 0]), "legs[2].crank_zero: got 0 degrees", "perpendicular"),
     (third_leg(branch=0.5), "legs[2].branch: got 0.5", "-1 or 1"),
-    (third_leg(plate_joint=[0.1, 0]), "legs[2].plate_joint: got [0.1, 0]", "3 items"),
     ({"name": "world"}, "name: got 'world'", "none of world, "),
-    ({"name": "DefaultModelInstance"}, "name: got 'DefaultModelInstance'", "none of "),
-    ({"name": "my robot"}, "name: got 'my robot'", "letters, digits"),
     ({"name": "ab\n"}, r"name: got 'ab\n'", "letters, digits"),
-    ({"name": ""}, "name: got ''", "letters, digits"),
-    ({"name": 3}, "name: got 3", "text"),
 ]
 
 
@@ -131,20 +120,8 @@ def test_invalid_fields_are_refused_in_one_line(edits, got, allowed, load):
 @pytest.mark.parametrize(
     ("edits", "problem"),
     [
-        ({"plat": 1}, "plat: unknown key; did you mean plate?"),
         ({"crank.lenght": 1}, "crank.lenght: unknown key; did you mean crank.length?"),
-        (
-            {"pattern.plat_radius": 1},
-            "pattern.plat_radius: unknown key; did you mean pattern.plate_radius?",
-        ),
         (third_leg(shft=[0]), "legs[2].shft: unknown key; did you mean legs[2].shaft?"),
-        ({"rod": ABSENT}, "rod: is missing"),
-        ({"crank.mass": ABSENT}, "crank.mass: is missing"),
-        ({"home": ABSENT}, "home: is missing"),
-        (
-            {"crank.mass": ABSENT, "rod.length": ABSENT, "plate.mass": ABSENT},
-            "plate.mass: is missing; crank.mass: is missing; rod.length: is missing",
-        ),
         (
             {"plate.mass": "heavy", "rod.mass": ABSENT},
             "plate.mass: got 'heavy'; expected a number; rod.mass: is missing",
@@ -155,16 +132,6 @@ def test_unknown_and_missing_keys_are_named(edits, problem, load):
     with pytest.raises(ConfigError) as caught:
         load(paper_with(edits))
     assert str(caught.value).endswith(f"mine.yaml: {problem}")
-
-
-def test_all_impossible_bodies_are_reported_at_once(load):
-    edits = {"base.inertia": [1.0, 1.0, 3.0], "crank.mass": 0, "rod.inertia": [0, 1e-3, 1e-3]}
-    with pytest.raises(ConfigError) as caught:
-        load(paper_with(edits))
-    message = str(caught.value)
-    assert "\n" not in message
-    for problem in ("base.inertia: got [1, 1, 3]", "crank.mass: got 0 kg", "rod.inertia: got [0,"):
-        assert problem in message
 
 
 # ------------------------------------------------------------------ moments that nobody measured
@@ -297,7 +264,6 @@ REFUSED = [
     ({"R_WS": -PAPER.R_WS}, "motor frames: off a rotation by"),
     ({"branches": np.zeros(6)}, "branches: got [0, 0, 0, 0, 0, 0]; expected -1 or 1"),
     ({"base": Body(np.inf, [1, 1, 1])}, "base.mass: got inf kg"),
-    ({"name": "a b"}, "name: got 'a b'"),
 ]
 
 
@@ -307,18 +273,6 @@ def test_constructor_refuses_what_no_mechanism_has(changes, problem):
         dataclasses.replace(PAPER, **changes)
     assert str(caught.value).startswith(problem)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("inertia", "problem"),
-    [
-        (np.eye(3), "inertia: got shape (3, 3); expected (3,)"),
-        ([1, 1, np.nan], "inertia: got [1, 1, nan]; expected finite numbers"),
-    ],
-)
-def test_a_body_has_three_finite_moments(inertia, problem):
-    with pytest.raises(ConfigError, match=re.escape(problem)):
-        Body(4.0, inertia)
 
 
 def test_arrays_are_copies_and_read_only():
@@ -341,7 +295,7 @@ def test_arrays_are_copies_and_read_only():
 # ------------------------------------------------------------------ what files describe
 
 
-def test_paper_geometry_is_the_tabulated_one():
+def test_the_paper_s_machine_is_the_tabulated_one():
     """Pairs 15 and 5 degrees apart on circles of 0.22 and 0.12 m, installed at 70 degrees."""
     base_deg = 24 + np.array([-7.5, 7.5, 112.5, 127.5, 232.5, 247.5])
     t = 24 + 60 + np.array([-2.5, 2.5, 117.5, 122.5, 237.5, 242.5])
@@ -361,20 +315,14 @@ def test_paper_geometry_is_the_tabulated_one():
     np.testing.assert_array_equal(PAPER.crank_lengths, 0.11)
     np.testing.assert_array_equal(PAPER.rod_lengths, 0.404)
     np.testing.assert_array_equal(PAPER.home, [0, 0, 0, 0, 0, 0.38])
-
-
-@pytest.mark.parametrize(
-    ("body", "mass", "inertia"),
-    [
-        ("base", 7, [270, 270, 540]),
-        ("plate", 4, [30, 30, 60]),
-        ("crank", 0.04, [0.01, 0.58, 0.59]),
-        ("rod", 0.08, [0.01, 16, 16]),
-    ],
-)
-def test_paper_bodies_are_those_of_table_1(body, mass, inertia):
-    assert getattr(PAPER, body).mass == mass
-    np.testing.assert_allclose(getattr(PAPER, body).inertia, np.multiply(inertia, 1e-4), rtol=1e-15)
+    for body, mass, inertia in (
+        (PAPER.base, 7, [270, 270, 540]),
+        (PAPER.plate, 4, [30, 30, 60]),
+        (PAPER.crank, 0.04, [0.01, 0.58, 0.59]),
+        (PAPER.rod, 0.08, [0.01, 16, 16]),
+    ):
+        assert body.mass == mass
+        np.testing.assert_allclose(body.inertia, np.multiply(inertia, 1e-4), rtol=1e-15)
     assert PAPER.crank.center == PAPER.rod.center == 0.5
 
 
@@ -408,20 +356,11 @@ def test_directions_may_be_written_with_three_decimals(load):
     np.testing.assert_allclose(right, np.broadcast_to(np.eye(3), (6, 3, 3)), atol=1e-14)
 
 
-def test_lengths_may_differ_from_leg_to_leg(load):
-    cranks = [0.10, 0.11, 0.12, 0.13, 0.14, 0.15]
-    rods = [0.40, 0.41, 0.42, 0.43, 0.44, 0.45]
-    mechanism = load(paper_with({"crank.length": cranks, "rod.length": rods}))
+def test_lengths_may_differ_from_leg_to_leg_and_a_limit_may_lack(load):
+    cranks, rods = np.linspace(0.10, 0.15, 6).tolist(), np.linspace(0.40, 0.45, 6).tolist()
+    edits = {"crank.length": cranks, "rod.length": rods, "rod.center": 0.25, "motor": ABSENT}
+    mechanism = load(paper_with(edits))
     np.testing.assert_array_equal(mechanism.crank_lengths, cranks)
     np.testing.assert_array_equal(mechanism.rod_lengths, rods)
-    alike = load(paper_with({"crank.length": [0.11] * 6}))
-    np.testing.assert_array_equal(alike.crank_lengths, PAPER.crank_lengths)
-
-
-def test_optional_fields_have_defaults(load):
-    massless = {"mass": 0, "inertia": [0, 0, 0]}
-    mechanism = load(paper_with({"motor": ABSENT, "base": massless}))
-    assert mechanism.effort_limit is None
-    assert mechanism.base.mass == 0
+    assert mechanism.rod.center == 0.25 and mechanism.effort_limit is None
     assert load(paper_with({"motor.effort_limit": None})).effort_limit is None
-    assert load(paper_with({"rod.center": 0.25})).rod.center == 0.25
