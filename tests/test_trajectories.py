@@ -122,28 +122,19 @@ def test_waypoints_are_joined_with_continuous_acceleration(gaps, values, start):
         assert_derivatives_agree(trajectory, middle)
 
 
-def test_two_waypoints_are_the_minimum_jerk_motion():
-    config = WaypointsConfig(times=[0.0, 2.0], poses=[[0.0] * 6, [0.4] * 6])
-    trajectory = make_reference(config, 2.0)
+def test_two_waypoints_of_a_file_are_the_minimum_jerk_motion(tmp_path):
+    path = tmp_path / "poses.yaml"
+    path.write_text(f"times: [0, 2]\nposes: {[[0.0] * 6, [0.4] * 6]}\n")
+    trajectory = make_reference(WaypointsConfig(file=str(path)), 2.0)
     for s in np.linspace(0, 1, 11):
         expected = 0.4 * (10 * s**3 - 15 * s**4 + 6 * s**5)
         np.testing.assert_allclose(evaluate(trajectory, 2 * s)[POSE], expected, atol=1e-15)
-
-
-def test_waypoints_from_a_file_are_the_same(tmp_path):
-    path = tmp_path / "poses.yaml"
-    path.write_text(f"times: {WAYPOINTS.times}\nposes: {WAYPOINTS.poses}\n")
-    inline = make_reference(WAYPOINTS, 10.0)
-    from_file = make_reference(WaypointsConfig(file=str(path)), 10.0)
-    for t in np.linspace(0, 4, 41):
-        np.testing.assert_array_equal(evaluate(from_file, t), evaluate(inline, t))
 
 
 @pytest.mark.parametrize(
     ("times", "poses", "parts"),
     [
         ([0, 1, 1], [HOME] * 3, ["times[2]: got 1.0 after 1.0", "increasing"]),
-        ([0, 1], [HOME] * 3, ["poses: got 3 poses", "expected 2"]),
         ([0, 1], [HOME, [0, 1.6, 0, 0, 0, 0]], ["poses[1][1]: got 1.6 rad", "90 degrees"]),
         ([0, 1], [HOME, [0, 0, 3.5, 0, 0, 0]], ["poses[1][2]: got 3.5 rad", "unwrap"]),
         ([0, 1], [HOME, [0, 0, 0, 2e3, 0, 0]], ["poses[1][3]: got 2000 m", "1000"]),
@@ -219,7 +210,6 @@ def changed(row, text):
 
 
 BAD_CSV = {
-    "empty": ("", ["is empty", "time[s]"]),
     "no header": ("\n".join(GOOD_ROWS), ["row 1", "'0.0'", "a header time[s]"]),
     "three rows": ("\n".join([HEADER, *GOOD_ROWS[:3]]), ["got 3 samples", "at least 4"]),
     "semicolons": (HEADER.replace(",", ";"), ["row 1", "separated by ';'", "expected commas"]),
@@ -227,17 +217,13 @@ BAD_CSV = {
         changed(1, "0,1,0,0,0,0,0,0,38"),
         ["7 fields in line 3, saw 9", "points for the decimals"],
     ),
-    "no units": ("time,roll,pitch,yaw,x,y,z", ["row 1", "unknown column 'time'"]),
     "odd unit": (HEADER.replace("x[m]", "x[ft]"), ["row 1", "'x[ft]'", "x in m or mm"]),
     "missing column": (HEADER.replace(",z[m]", ""), ["row 1", "column z is missing"]),
     "column twice": (HEADER.replace("y[m]", "x[mm]"), ["row 1", "a second column 'x[mm]'"]),
-    "extra column": (HEADER + ",w[m]", ["row 1", "unknown column 'w[m]'"]),
-    "short row": (changed(2, "0.2,0,0"), ["row 4", "yaw[rad]: got ''"]),
     "text": (
         changed(2, "0.2,0,abc,0,0,0,0.38"),
         ["row 4", "pitch[rad]", "'abc'", "a finite number"],
     ),
-    "nan": (changed(3, "0.3,0,0,nan,0,0,0.38"), ["row 5", "yaw[rad]", "nan", "finite"]),
     "late start": (changed(0, "0.05,0,0,0,0,0,0.38"), ["row 2", "time[s]", "0.05", "subtract"]),
     "time twice": (changed(2, "0.1,0,0,0,0,0,0.38"), ["row 4", "time[s]", "0.1 after 0.1"]),
     "gap": (changed(5, "9,0,0,0,0,0,0.38"), ["row 7", "time[s]", "8.6 s", "resampling"]),
@@ -255,10 +241,6 @@ BAD_CSV = {
     "glitch": (
         f"{MOVING}\n0.6,0,0,0,0.06,0,0.40\n0.7,0,0,0,0.07,0,0.38\n0.8,0,0,0,0.08,0,0.38",
         ["row 8", "z[m]", "0.02 m off", "resample"],
-    ),
-    "jump": (
-        "\n".join([HEADER, *(f"{t / 10},0,{0.2 * (t > 5)},0,0,0,0.38" for t in range(12))]),
-        ["pitch[rad]", "0.1 rad off", "smooth"],
     ),
     "too few samples": (
         "\n".join([HEADER, *(f"{t},0,0,0,{math.sin(1.5 * t)},0,0" for t in range(20))]),
@@ -313,10 +295,8 @@ def test_the_peak_to_peak_of_a_sine_is_twice_its_amplitude_however_short_the_run
 
 
 def test_the_peak_to_peak_of_a_constant_is_zero():
-    config = HoldConfig()
-    np.testing.assert_array_equal(peak_to_peak(config, make_reference(config, 5.0), 5.0), [0] * 6)
-    still = WaypointsConfig(times=[0, 1, 3], poses=[[0.3] * 6] * 3)
-    np.testing.assert_array_equal(peak_to_peak(still, make_reference(still, 5.0), 5.0), [0] * 6)
+    for config in (HoldConfig(), WaypointsConfig(times=[0, 1, 3], poses=[[0.3] * 6] * 3)):
+        assert not peak_to_peak(config, make_reference(config, 5.0), 5.0).any()
 
 
 def test_the_peak_to_peak_of_samples_is_their_range_within_the_run(tmp_path):
@@ -372,32 +352,19 @@ def test_a_catch_up_leaves_the_start_and_joins_the_reference_smoothly(t_start, d
     assert_derivatives_agree(blend, t_start + duration / 2)
 
 
-def test_a_catch_up_from_the_first_microsecond_is_one_from_zero():
-    reference = make_reference(SineConfig(), 10.0)
-    at_zero, late = (catch_up(HOME, [0.1] * 6, reference, t, 0.5) for t in (0.0, 1e-300))
-    for t in (0.0, 0.2, 0.6):
-        np.testing.assert_array_equal(evaluate(late, t), evaluate(at_zero, t))
-
-
 def test_a_catch_up_onto_itself_is_the_reference():
     """A start on a straight line that the reference follows anyway needs no blend."""
     line = PiecewisePolynomial.FirstOrderHold([0.0, 10.0], np.array([[0.0, 1.0]] * 6))
-    blend = catch_up([0.0] * 6, [0.1] * 6, line, 1.0, 0.5)
-    for t in (0.0, 0.9, 1.2, 1.5, 5.0):
-        np.testing.assert_allclose(evaluate(blend, t)[POSE], t / 10, atol=1e-15)
+    for t_start in (1.0, 1e-300):  # the second counts as 0
+        blend = catch_up([0.0] * 6, [0.1] * 6, line, t_start, 0.5)
+        for t in (0.0, 0.9, 1.2, 1.5, 5.0):
+            np.testing.assert_allclose(evaluate(blend, t)[POSE], t / 10, atol=1e-15)
 
 
 @pytest.mark.parametrize(
-    ("pose", "t_start", "duration"),
-    [
-        ([0.0] * 5, 0.0, 1.0),
-        ([0.0] * 6, -0.1, 1.0),
-        ([0.0] * 6, 0.0, 0.0),
-        ([0.0] * 6, 1.0, 1e-17),
-        ([0.0] * 6, 0.0, math.nan),
-        ([0.0] * 6, math.inf, 1.0),
-    ],
+    ("length", "t_start", "duration"),
+    [(5, 0.0, 1.0), (6, -0.1, 1.0), (6, 0.0, 0.0), (6, 1.0, 1e-17), (6, math.inf, 1.0)],
 )
-def test_a_catch_up_refuses_what_has_no_blend(pose, t_start, duration):
+def test_a_catch_up_refuses_what_has_no_blend(length, t_start, duration):
     with pytest.raises(ValueError, match="expected"):
-        catch_up(pose, [0.0] * 6, make_reference(SineConfig(), 1.0), t_start, duration)
+        catch_up([0.0] * length, [0.0] * 6, make_reference(SineConfig(), 1.0), t_start, duration)
