@@ -7,7 +7,10 @@ import joblib
 import pytest
 
 from stewart_drake.live import contact
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.simulation import simulate
 from stewart_drake.reporting import terminal
+from stewart_drake.scenario.loading import load_scenario
 from tests import building  # noqa: F401  (before the workers start: it makes their folder)
 from tests.browser import Browser, browser
 from tests.shorter import leave_blank, map_few_poses
@@ -51,3 +54,10 @@ def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 def few_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     """Map the workspace coarsely."""
     map_few_poses(monkeypatch)
+
+
+@pytest.fixture(scope="session")
+def followed() -> SimulationResult:
+    """Return 0.3 s on the paper's reference, of the exact plant."""
+    settings = ("plant.kind=exact", "duration=0.3", "start=on_reference", "queue=reference")
+    return simulate(load_scenario("paper", settings=settings), judge_stability=False)

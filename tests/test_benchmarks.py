@@ -66,33 +66,26 @@ def test_what_scripts_send_to_workers_can_be_read_there(monkeypatch, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-def test_every_part_of_a_step_is_timed(monkeypatch):
+def test_every_part_of_a_step_and_one_evaluation_are_timed(monkeypatch):
     """The law runs in Python."""
     steps = script("controller_step", monkeypatch)
-    monkeypatch.setattr(steps, "RUNS", 1)
-    monkeypatch.setattr(steps, "SCENARIOS", {"paper": ["duration=1.5"]})
+    for name, value in {"RUNS": 1, "SCENARIOS": {"paper": ["duration=1.5"]}, "REPEATS": 1}.items():
+        monkeypatch.setattr(steps, name, value)
     for rows in steps.steps():
         assert len(rows) == 2
         assert all(float(value) > 0 for row in rows for value in row[2:])
-
-
-def test_one_evaluation_is_timed(monkeypatch):
-    steps = script("controller_step", monkeypatch)
-    monkeypatch.setattr(steps, "REPEATS", 1)
     rows = steps.evaluations()
     assert len(rows) == 4 and all(float(value.split()[0]) > 0 for _, value in rows)
 
 
-def test_every_claim_has_a_name_and_settings_that_load(monkeypatch, tmp_path):
+def test_the_table_of_claims_has_all_rows_as_they_are_and_their_settings_load(
+    monkeypatch, tmp_path
+):
     claims = script("claims", monkeypatch)
-    rows = [row for make in claims.SECTIONS.values() for row in make()]
-    assert len({row.name for row in rows}) == len(rows) > 200
-    for row in rows:
+    made = [row for make in claims.SECTIONS.values() for row in make()]
+    assert len({row.name for row in made}) == len(made) > 200
+    for row in made:
         claims.scenario_of(row, claims.SEEDS[0], str(tmp_path))
-
-
-def test_the_table_of_claims_has_all_rows_as_they_are(monkeypatch):
-    claims = script("claims", monkeypatch)
     data, rows = json.loads(claims.DATA.read_text("utf-8")), claims.chosen_rows([])
     assert set(data["rows"]) == set(rows) and set(data["studies"]) == set(claims.STUDIES)
     for name, row in rows.items():

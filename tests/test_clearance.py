@@ -1,6 +1,5 @@
 """Clearances against closed forms and second implementations: segments, boxes, cylinders."""
 
-import json
 from itertools import combinations, product
 
 import numpy as np
@@ -9,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from stewart_drake.cli import main
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop.clearance import ClearanceScene, Pair
 from stewart_drake.loop.preparation import assemble as made
@@ -23,13 +21,12 @@ from stewart_drake.mechanism.clearance import (
     segment_distances,
 )
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.mechanism.kinematics import (
-    legs_along,
-)
+from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.clearance import clearance_along, study_clearance
 from stewart_drake.studies.workspace_map import sections, travel
 from tests.mechanisms import PAPER, random_mechanism, random_pose
+from tests.screen import said, summary_in
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -71,12 +68,6 @@ def test_segments_in_the_plane(q, v, wanted):
     axis = np.array([1.0, 0, 0])
     found = segment_distances(np.zeros(3), axis, np.array(q, float), np.array(v, float))
     assert found == pytest.approx(wanted, abs=1e-12)
-
-
-def test_out_of_reach_there_are_no_legs():
-    far = PAPER.home + [0, 0, 0, 0, 0, 1.0]
-    legs = legs_along(PAPER, np.array([PAPER.home, far]))
-    assert np.isfinite(legs.rod[0]).all() and np.isnan(legs.rod[1]).all()
 
 
 # ------------------------------------------------------------------ shapes
@@ -272,8 +263,10 @@ def test_sections_tell_where_links_touch():
     assert 0 < found.sections[2].touching < 1  # tilted far enough, rods of two pairs meet
 
 
-def test_out_of_reach_nothing_is_said_to_be_clear():
+def test_out_of_reach_there_are_no_legs_and_nothing_is_said_to_be_clear():
     far = np.array([PAPER.home + [0, 0, 0, 0, 0, 1.0]])
+    legs = legs_along(PAPER, np.array([PAPER.home, far[0]]))
+    assert np.isfinite(legs.rod[0]).all() and np.isnan(legs.rod[1]).all()
     found = study_clearance(PAPER, np.zeros(1), far, [], [])
     assert found.along.nearest == [] and found.summary["least"] is None
     assert "nothing is known" in found.verdict
@@ -281,9 +274,8 @@ def test_out_of_reach_nothing_is_said_to_be_clear():
 
 @pytest.mark.usefixtures("few_poses")
 def test_the_command_names_the_links_that_cross(tmp_path, capsys):
-    assert main(["analyze", "workspace", "paper", "--out", str(tmp_path)]) == 0
-    told = " ".join(capsys.readouterr().out.split())
-    found = json.loads((tmp_path / "summary.json").read_text())["clearance"]
+    told = " ".join(said(capsys, "analyze", "workspace", "paper", "--out", tmp_path).split())
+    found = summary_in(tmp_path)["clearance"]
     page = (tmp_path / "report.html").read_text()
     for one in found["touching"]:
         name = " and ".join(one["parts"])
@@ -293,6 +285,4 @@ def test_the_command_names_the_links_that_cross(tmp_path, capsys):
     assert len(found["pairs"]) == len(ClearanceScene(PAPER).pairs)
     assert found["base"]["distance"] < 0
     assert " base," not in told and "into a base that is a full disc; cutouts" in told
-    assert (
-        told.count("crosses a base that is a full disc") == 1
-    )  # the rows of the table are on the page
+    assert told.count("crosses a base that is a full disc") == 1  # its rows are on the page

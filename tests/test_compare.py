@@ -26,6 +26,7 @@ from stewart_drake.studies.compare import (
     shown,
 )
 from stewart_drake.studies.verdict import Verdict, delay_verdict
+from tests.screen import summary_in
 
 SHORT = ("plant.kind=exact", "duration=1.0")
 
@@ -43,26 +44,21 @@ def test_every_shipped_controller_takes_part():
     assert tuple(LABELS) == everyone
 
 
-def test_the_order_is_kept_and_each_run_is_that_of_its_controller(results):
+def test_the_order_is_kept_and_each_run_is_that_of_its_controller_alone(results):
     assert tuple(results) == CONTROLLERS
     for name, result in results.items():
         assert result.scenario == load_scenario("paper", name, SHORT)
         assert result.status == "completed"
-
-
-def test_processes_give_what_one_run_gives(results):
     alone = simulate(load_scenario("paper", "delay_lqi", SHORT), judge_stability=False)
     xr.testing.assert_identical(alone.signals, results["delay_lqi"].signals)
 
 
 def test_saved_files_are_complete(results, tmp_path):
-    save_comparison(results, tmp_path / "new" / "folder")
     folder = tmp_path / "new" / "folder"
-    assert {path.name for path in folder.iterdir()} == {
-        "summary.json",
-        *(f"{name}.nc" for name in CONTROLLERS),
-    }
-    summary = json.loads((folder / "summary.json").read_text())["controllers"]
+    save_comparison(results, folder)
+    signals = {f"{name}.nc" for name in CONTROLLERS}
+    assert {path.name for path in folder.iterdir()} == signals | {"summary.json"}
+    summary = summary_in(folder)["controllers"]
     assert list(summary) == list(CONTROLLERS)
     assert summary["lqr"]["accumulated_error"] == results["lqr"].accumulated_error
     with xr.open_dataset(folder / "lqr.nc") as read:
@@ -149,36 +145,24 @@ def verdict(*settings, scenario="paper"):
     return delay_verdict(prepare(load_scenario(scenario, settings=settings)))
 
 
-def test_a_counterbalanced_plate_at_rest_has_no_unstable_pole():
-    at_rest = verdict("reference.kind=hold")
-    assert at_rest.pole == 0 and at_rest.amplification == 1
-    assert str(at_rest) == (
-        "the delay of 0.8 s can be compensated: under any controller, prediction errors grow by "
-        "a factor of 1.0 over it"
-    )
-
-
 def test_the_papers_delay_is_beatable_without_gravity_and_not_with_it():
+    at_rest = verdict("reference.kind=hold")
+    assert at_rest.pole == 0 and at_rest.amplification == 1, "a counterbalanced plate"
+    assert "can be compensated: under any controller" in str(at_rest)
     assert verdict().beatable == "yes"
     hopeless = verdict("plant.gravity=true")
     assert hopeless.beatable == "no"
     assert hopeless.pole > 30 and hopeless.amplification > 1e10
     assert hopeless.amplification == pytest.approx(math.exp(hopeless.pole * 0.8))
 
-
-def test_at_home_under_gravity_the_fastest_pole_is_about_5():
     at_home = verdict("plant.gravity=true", "reference.kind=hold")
-    assert at_home.pole == pytest.approx(5.0, abs=0.1)
-    assert at_home.beatable == "hardly"
+    assert at_home.pole == pytest.approx(5.0, abs=0.1) and at_home.beatable == "hardly"
     assert "= 55 fold at t = 0.0 s (pole 5 /s)" in str(at_home)
 
 
-def test_the_true_delay_counts_with_its_fraction():
+def test_the_true_delay_counts_with_its_fraction_and_beyond_all_numbers():
     settings = ("delay.steps=3", "delay.fraction=0.5", "controller.delay_steps=0")
     assert verdict(*settings).eta == pytest.approx(0.35)
-
-
-def test_a_delay_beyond_all_numbers_still_has_a_verdict():
     text = str(Verdict(eta=1000.0, pole=5.0, time=2.0))
     assert "cannot be compensated" in text and "3.0e2171 fold" in text
 
@@ -211,10 +195,6 @@ def test_a_bad_row_is_refused_in_one_line(row, message, tmp_path):
     assert len(str(caught.value).splitlines()) == 1
     with pytest.raises(ConfigError, match=re.escape("compare.lqi: " + message)):
         load_scenario(file)
-
-
-def test_a_row_that_could_not_be_saved_is_refused(tmp_path):
-    file = tmp_path / "scenario.yaml"
     file.write_text("compare: {a/b: {controller: lqi}}\n")
     with pytest.raises(ConfigError, match=r"compare\.a/b: names a file of signals"):
         load_scenario(file)

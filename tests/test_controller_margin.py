@@ -16,10 +16,7 @@ from stewart_drake.law.motion import Preview
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.stability import fastest_pole
 from stewart_drake.loop.cautions import cautions_after, cautions_before, coarse_step
-from stewart_drake.loop.controller_margin import (
-    controller_margin,
-    true_model,
-)
+from stewart_drake.loop.controller_margin import controller_margin, true_model
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.loop.preparation import prepare
@@ -208,9 +205,6 @@ def test_what_is_known_of_the_papers_loops():
         assert (off.margins.longer, off.margins.gain_up) == (0, 1)
     light = judged(scenario(*HOLD, "controller.w_Q=1e-6", controller="delay_lqi"))
     assert light.stable  # but at home only
-
-
-def test_only_the_predictor_is_stable_on_the_papers_experiment():
     verdicts = {name: judged(scenario(controller=name)).stable for name in CONTROLLERS}
     assert verdicts == dict.fromkeys(CONTROLLERS, False) | {"predictor_lqi": True}
 
@@ -229,16 +223,16 @@ def test_a_delay_of_very_many_periods_is_not_judged_but_reported():
 def test_a_run_tells_the_margin_of_its_loop():
     short = scenario("plant.kind=exact", "duration=0.5")
     told = sd.simulate(short).summary["controller_margin"]
-    assert set(told) == {
-        "stable", "spectral_radius", "delay_margin_s", "gain_margin", "growth"
-    }  # fmt: skip
+    assert set(told) == {"stable", "spectral_radius", "delay_margin_s", "gain_margin", "growth"}
     for name, value in judged(short).summary.items():  # threads of BLAS round as they like
         np.testing.assert_allclose(told[name], value, rtol=1e-9, err_msg=name)
-    assert told["stable"] and told["spectral_radius"] < 1
     down, up = told["gain_margin"]
-    assert 0 < down < 1 < up
+    assert told["stable"] and told["spectral_radius"] < 1 and 0 < down < 1 < up
     assert min(told["delay_margin_s"]) > 0
     assert sd.simulate(short, judge_stability=False).summary["controller_margin"] is None
+    unstable = sd.simulate(scenario("plant.kind=exact", "duration=1", controller="lqi"))
+    assert unstable.status == "completed"
+    assert any("unstable" in line for line in unstable.summary["warnings"])
 
 
 def test_the_first_line_is_about_the_loop(capsys, monkeypatch):
@@ -255,20 +249,13 @@ def test_the_first_line_is_about_the_loop(capsys, monkeypatch):
     assert first.startswith("this loop is unstable: linearised along the reference")
     assert (fold(1.2345), fold(1.0004)) == ("1.23 fold", "by 0.04 %")
     assert any("left workspace" in line for line in others)
-    network = ["simulate", "paper", "--set", "plant.kind=exact", "--set", "link.kind=network"]
-    assert main([*network, "--set", "duration=0.2"]) == 0
-    assert capsys.readouterr().out.count("judged") == 1, "a warning repeats nothing"
     settings = ("plant.kind=exact", "link.kind=network", "duration=0.2")
-    result = sd.simulate(sd.load_scenario("paper", settings=settings))
+    assert main(["simulate", "paper", *(w for one in settings for w in ("--set", one))]) == 0
+    assert capsys.readouterr().out.count("judged") == 1, "a warning repeats nothing"
+    result = sd.simulate(scenario(*settings))
     said = result.summary["warnings"]
     assert "warning: the loop was not judged" in comparison_document({"lqi": result}).plain()
     assert "warning:" not in comparison_document({"lqi": result}, said=said).plain()
-
-
-def test_an_unstable_loop_that_completes_is_warned_about():
-    result = sd.simulate(scenario("plant.kind=exact", "duration=1", controller="lqi"))
-    assert result.status == "completed"
-    assert any("unstable" in line for line in result.summary["warnings"])
 
 
 @pytest.mark.parametrize(

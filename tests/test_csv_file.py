@@ -19,12 +19,6 @@ ON_REFERENCE = ("start=on_reference", "queue=reference")
 SHORT = ("--set", "plant.kind=exact", "--set", "duration=0.3")
 
 
-@pytest.fixture(scope="module")
-def run():
-    settings = ("plant.kind=exact", "duration=0.3", "start=on_reference", "queue=reference")
-    return sd.simulate(sd.load_scenario("paper", settings=settings), judge_stability=False)
-
-
 def table(text):
     head, *rows = csv.reader(io.StringIO(text))
     assert len(set(head)) == len(head) and {len(row) for row in rows} == {len(head)}
@@ -32,10 +26,10 @@ def table(text):
     return dict(zip(head, values.T, strict=True))
 
 
-def test_every_number_of_every_signal_is_there(run):
-    columns = table(signals_csv(run.signals))
-    assert len(columns) == 1 + sum(signal[0].size for signal in run.signals.values())
-    assert np.array_equal(columns["time[s]"], run.signals.time.values)
+def test_every_number_of_every_signal_is_there(followed):
+    columns = table(signals_csv(followed.signals))
+    assert len(columns) == 1 + sum(signal[0].size for signal in followed.signals.values())
+    assert np.array_equal(columns["time[s]"], followed.signals.time.values)
     for name, column, unit in (
         ("pose", "roll", "rad"),
         ("pose", "z", "m"),
@@ -50,34 +44,39 @@ def test_every_number_of_every_signal_is_there(run):
         ("measurement", "y", "m"),
         ("state_estimate", "z_dot", "m/s"),
     ):
-        signal = run.signals[name]
+        signal = followed.signals[name]
         dimension = next(d for d in signal.dims if d != "time")
         labels = [str(label) for label in signal[dimension].values]
         label = {"roll": "phi", "pitch": "theta", "yaw": "psi"}.get(column, column)
         expected = signal.values[:, labels.index(label)]
         assert np.allclose(columns[f"{name}_{column}[{unit}]"], expected, rtol=1e-11, atol=0)
+    signals = followed.signals.copy(deep=True)  # what is not a number is an empty cell
+    signals.parameters.values[2, 6] = np.nan
+    column = table(signals_csv(signals))["parameters_payload_mass[kg]"]
+    assert np.isnan(column[2]) and np.isfinite(column[3:]).all()
+    assert "nan" not in signals_csv(signals)
 
 
-def test_a_run_comes_back_as_a_motion(run, tmp_path):
+def test_a_run_comes_back_as_a_motion(followed, tmp_path):
     """An exported run is the reference of the next run."""
     path = tmp_path / "run.csv"
-    path.write_text(signals_csv(run.signals))
+    path.write_text(signals_csv(followed.signals))
     settings = ("plant.kind=exact", "duration=0.3", "reference.kind=csv", f"reference.file={path}")
     reference = prepare(sd.load_scenario("paper", settings=settings)).reference
-    poses = np.array([reference.value(t)[:, 0] for t in run.signals.time.values])
-    np.testing.assert_allclose(poses, run.signals.pose.values, rtol=1e-11, atol=1e-12)
-    inside = run.signals.time.values[:-1]  # at its end a sampled motion stops
+    poses = np.array([reference.value(t)[:, 0] for t in followed.signals.time.values])
+    np.testing.assert_allclose(poses, followed.signals.pose.values, rtol=1e-11, atol=1e-12)
+    inside = followed.signals.time.values[:-1]  # at its end a sampled motion stops
     rates = np.array([reference.EvalDerivative(t)[:, 0] for t in inside])
-    assert np.abs(rates - run.signals.rates.values[:-1]).max() < 1e-3
+    assert np.abs(rates - followed.signals.rates.values[:-1]).max() < 1e-3
     again = sd.simulate(
         sd.load_scenario("paper", settings=(*settings, *ON_REFERENCE)), judge_stability=False
     )
     assert again.status == "completed" and again.accumulated_error < 0.01
 
 
-def test_an_exported_file_must_be_whole_in_its_motion_only(run, tmp_path):
+def test_an_exported_file_must_be_whole_in_its_motion_only(followed, tmp_path):
     path = tmp_path / "run.csv"
-    path.write_text(signals_csv(run.signals))
+    path.write_text(signals_csv(followed.signals))
     lines = path.read_text().splitlines()
     header = lines[0].split(",")
     place = header.index("pose_yaw[rad]")
@@ -89,14 +88,6 @@ def test_an_exported_file_must_be_whole_in_its_motion_only(run, tmp_path):
     path.write_text("\n".join(map(",".join, emptied)))
     with pytest.raises(ConfigError, match=r"row 4, column pose_yaw\[rad\]: got ''"):
         read_csv(path)
-
-
-def test_what_is_not_a_number_is_an_empty_cell(run):
-    signals = run.signals.copy(deep=True)
-    signals.parameters.values[2, 6] = np.nan
-    column = table(signals_csv(signals))["parameters_payload_mass[kg]"]
-    assert np.isnan(column[2]) and np.isfinite(column[3:]).all()
-    assert "nan" not in signals_csv(signals)
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 import dataclasses
 import io
-import json
 
 import numpy as np
 import pytest
@@ -47,7 +46,7 @@ from stewart_drake.tuning.families import (
     with_gain,
 )
 from stewart_drake.tuning.training import curves_of, labels
-from tests.screen import too_long
+from tests.screen import said, summary_in
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -158,17 +157,16 @@ def test_a_resumed_data_set_has_the_same_bytes(folder, monkeypatch):
 
 
 def test_a_missing_or_foreign_file_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="tune dataset"):
-        load_data(tmp_path)
-    (tmp_path / "curves").mkdir()
-    with pytest.raises(ConfigError, match="run the same `tune dataset` again"):
-        load_data(tmp_path)
-    (tmp_path / "dataset.nc").write_text("text")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        load_data(tmp_path)
-    xr.Dataset({"x": ("run", [1.0])}).to_netcdf(tmp_path / "dataset.nc", engine="h5netcdf")
-    with pytest.raises(ConfigError, match="is not a data set"):
-        load_data(tmp_path)
+    file, foreign = tmp_path / "dataset.nc", xr.Dataset({"x": ("run", [1.0])})
+    for put, problem in (
+        (lambda: None, "tune dataset"),
+        (lambda: (tmp_path / "curves").mkdir(), "run the same `tune dataset` again"),
+        (lambda: file.write_text("text"), "cannot be read"),
+        (lambda: foreign.to_netcdf(file, engine="h5netcdf"), "is not a data set"),
+    ):
+        put()
+        with pytest.raises(ConfigError, match=problem):
+            load_data(tmp_path)
 
 
 def test_the_hash_sees_every_value(data):
@@ -198,6 +196,8 @@ def made_up(error, weights=PAIRS):
 
 
 def test_the_best_in_a_cell_labels_all_its_runs():
+    for kind in ("best_in_cell", "best_in_cell_torque"):
+        assert np.isnan(labels(made_up([np.nan] * 9), kind)).all(), "without a survivor"
     error = np.arange(9.0, 0.0, -1.0)
     error[5] = 0.1  # (1, 4)
     expected = np.tile([0.5, 2.0], (9, 1))
@@ -211,20 +211,12 @@ def test_torque_can_outweigh_the_error():
     error = np.linspace(1.1, 1.0, 9)  # least at the end, where the torque is twice the least
     assert np.allclose(labels(made_up(error), "best_in_cell")[0], [1.0, 1.0])
     assert np.allclose(labels(made_up(error), "best_in_cell_torque")[0], [1.0, 1.0])
-    error = np.linspace(1.1, 1.0, 9)[::-1]
-    weights = PAIRS[::-1]
-    found = labels(made_up(error, weights), "best_in_cell_torque")[0]
+    found = labels(made_up(error[::-1], PAIRS[::-1]), "best_in_cell_torque")[0]
     assert np.allclose(found, [1.0, 1.0])
     error = np.array([2.0] * 4 + [1.0] + [0.99] * 4)
-    ratio = np.divide(*labels(made_up(error), "best_in_cell_torque")[0])
-    assert ratio == pytest.approx(PAIRS[4][0] / PAIRS[4][1])
-    ratio = np.divide(*labels(made_up(error), "best_in_cell")[0])
-    assert ratio == pytest.approx(PAIRS[5][0] / PAIRS[5][1])
-
-
-def test_a_cell_without_a_survivor_has_no_best():
-    assert np.isnan(labels(made_up([np.nan] * 9), "best_in_cell")).all()
-    assert np.isnan(labels(made_up([np.nan] * 9), "best_in_cell_torque")).all()
+    for kind, best in (("best_in_cell_torque", PAIRS[4]), ("best_in_cell", PAIRS[5])):
+        ratio = np.divide(*labels(made_up(error), kind)[0])
+        assert ratio == pytest.approx(np.divide(*best))
 
 
 # ---------------------------------------------------------------- drawn conditions
@@ -295,26 +287,21 @@ def faulty(name, *settings):
     return faulty_family(name, 0, 0, "training", settings).base
 
 
-def test_a_run_says_how_it_ended():
+def test_a_run_begins_at_rest_at_the_reference_s_first_pose():
+    """At t = 0 only the rates differ."""
     scenario = base("delay.steps=8", "reference.frequency=2")
     with np.load(io.BytesIO(run_condition(scenario, ((1.0, 1.0),))), allow_pickle=False) as file:
-        assert file["status"][0] in ("completed", "left_workspace")
-        assert file["samples"].shape == (1, 100, 18)
         first = file["samples"][0, 0]
-    # At t = 0 the plate rests at the reference's first pose: only the rates differ.
     assert np.abs(first[:6]).max() == 0 and np.abs(first[6:12]).min() > 0
-
-
-def test_the_cost_of_a_completed_run_is_its_error():
-    ending = run_in_bulk(faulty("N2", "duration=2"))
-    assert cost(ending, 2.0) == pytest.approx(ending.figures.accumulated_error)
 
 
 def at_ratio(scenario, ratio):
     return with_gain(scenario, *weights_of(ratio).tolist())
 
 
-def test_a_lost_plate_counts_by_when_it_was_lost():
+def test_the_cost_of_a_run_is_its_error_and_a_lost_plate_counts_by_when_it_was_lost():
+    whole = run_in_bulk(faulty("N2", "duration=2"))
+    assert cost(whole, 2.0) == pytest.approx(whole.figures.accumulated_error)
     lost = at_ratio(faulty("N2", "delay.fraction=0.5", "controller.delay_steps=8"), 1.0)
     ending = run_in_bulk(lost)
     assert ending.stopped is not None
@@ -356,11 +343,8 @@ def test_the_command_writes_a_data_set_of_disturbed_runs(tmp_path, capsys, monke
     arguments = ["tune", "dataset", "paper", "--controller", "delay_lqi", "--disturbed", "1"]
     monkeypatch.setattr(families, "PAIRS", ((1.0, 1.0),))
     arguments += [part for setting in SMALL for part in ("--set", setting)]
-    assert main([*arguments, "--workers", "1", "--out", str(tmp_path)]) == 0
-    out, err = capsys.readouterr()
-    assert err == "" and not too_long(out)
-    assert "1 runs, 100 rows" in out
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert "1 runs, 100 rows" in said(capsys, *arguments, "--workers", "1", "--out", tmp_path)
+    summary = summary_in(tmp_path)
     assert summary["runs"] == 1 and summary["rows"] == 100
     assert summary["data_sha256"] == data_hash(load_data(tmp_path))
     assert len(summary["draws"]) == 1

@@ -1,17 +1,14 @@
 """Names, commands, code and figures in the documents agree with the project.
 
-Conventions of README, CHANGELOG (without what is before 0.2), CONTRIBUTING, `docs/` and
-`benchmarks/results/`, so that names can be checked:
+Of README, CHANGELOG (without what is before 0.2), CONTRIBUTING, `docs/` and `benchmarks/results/`:
 
 * a dotted name in code type is relative to the package (`law.riccati.lqr`), a field of a
   scenario (`plant.gravity`) or a port of the loop (`plant.torque`); `sd.NAME` is public;
-* a path in code type is relative to the repository or to the package; `file.py::name` is a test;
-  a path below `out/` is what a command of a block, or the Makefile, writes;
-* a file in *italics* is in the repository, or is named by the code or by a block of the document;
+* a path in code type is relative to the repository or to the package; one below `out/` is what a
+  command of a block, or the Makefile, writes;
 * a command in code type (`analyze delay`, `make test`, `python FILE`) exists, with its options;
-* names of 0.1 that are gone stand in the first column of docs/upgrading.md, and nowhere exist;
 * a word in code type with an underscore or an inner capital occurs in the package's source, its
-  tests or its data files;
+  tests or its data files; names that are gone stand in the first column of docs/upgrading.md;
 * ```python blocks run, ```yaml blocks load, `stewart-drake` lines of ```sh blocks parse; what is
   only for reading is ```text.
 """
@@ -19,10 +16,10 @@ Conventions of README, CHANGELOG (without what is before 0.2), CONTRIBUTING, `do
 import ast
 import dataclasses
 import functools
-import importlib
 import importlib.util
 import itertools
 import os
+import pydoc
 import re
 import shlex
 from pathlib import Path
@@ -102,42 +99,25 @@ def each(found):
 # ------------------------------------------------------------------ names
 
 
-@functools.cache
-def words():
-    """All identifiers and words of the package, the tests and the data files."""
-    folders = (PACKAGE, ROOT / "tests", ROOT / "models", ROOT / "diagrams")
-    texts = (
-        path.read_text(encoding="utf-8")
-        for folder in folders
-        for path in folder.rglob("*")
-        if path.suffix in (".py", ".yaml", ".c", ".h") and path != Path(__file__)
-    )
-    return frozenset(word for text in texts for word in re.findall(r"[A-Za-z_]\w*", text))
-
-
-@functools.cache
-def functions_in(path):
-    """Names of the test functions in a file."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    return frozenset(node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+def texts(kinds, *folders):
+    """Return the texts of all files of these kinds in folders of the repository."""
+    paths = (path for folder in folders for path in (ROOT / folder).rglob("*"))
+    kept = (path for path in paths if path.suffix in kinds and path != Path(__file__))
+    return "\n".join(path.read_text(encoding="utf-8") for path in kept)
 
 
 @functools.cache
 def sources():
     """Return the texts of the package, the Makefile and the data files."""
-    package = (path for kind in ("py", "j2", "c", "h") for path in PACKAGE.rglob(f"*.{kind}"))
-    paths = (*package, ROOT / "Makefile", ROOT / "mkdocs.yml")
-    data = (*(ROOT / "models").rglob("*.yaml"), *(ROOT / "diagrams").rglob("*.yaml"))
-    return "\n".join(path.read_text(encoding="utf-8") for path in (*paths, *data))
+    more = ((ROOT / name).read_text(encoding="utf-8") for name in ("Makefile", "mkdocs.yml"))
+    kinds = (".py", ".j2", ".c", ".h", ".yaml")
+    return "\n".join((texts(kinds, "stewart_drake", "models", "diagrams"), *more))
 
 
 @functools.cache
-def files():
-    """Names of the repository's files, but for what is made."""
-    folders = (path for path in ROOT.iterdir() if path.is_dir() and path.name != "out")
-    kept = [path for path in folders if not path.name.startswith(".")]
-    found = itertools.chain(ROOT.glob("*"), *(folder.rglob("*") for folder in kept))
-    return frozenset(path.name for path in found)
+def words():
+    """All identifiers and words of the package, the tests and the data files."""
+    return frozenset(re.findall(r"[A-Za-z_]\w*", sources() + texts((".py", ".c", ".h"), "tests")))
 
 
 @functools.cache
@@ -195,24 +175,10 @@ def is_field(dotted):
 
 def is_name(dotted):
     """Whether the package has this module, or an attribute of it by this name."""
-    parts = ["stewart_drake", *dotted.split(".")]
-    for end in range(len(parts), 1, -1):
-        module = ".".join(parts[:end])
-        try:
-            if importlib.util.find_spec(module) is None:
-                continue
-        except ModuleNotFoundError:
-            continue
-        value = importlib.import_module(module)
-        for part in parts[end:]:
-            fields = getattr(value, "__dataclass_fields__", {})
-            if part in fields:
-                return True
-            if not hasattr(value, part):
-                return False
-            value = getattr(value, part)
+    above, _, last = f"stewart_drake.{dotted}".rpartition(".")
+    if pydoc.locate(f"{above}.{last}") is not None:
         return True
-    return False
+    return last in getattr(pydoc.locate(above), "__dataclass_fields__", {})
 
 
 @functools.cache
@@ -230,19 +196,6 @@ def ports():
         outputs = (system.get_output_port(i) for i in range(system.num_output_ports()))
         found |= {f"{system.get_name()}.{port.get_name()}" for port in (*inputs, *outputs)}
     return frozenset(found)
-
-
-@functools.cache
-def modules():
-    """Modules and packages directly below the package."""
-    return frozenset(path.stem for path in PACKAGE.iterdir() if path.suffix in ("", ".py"))
-
-
-@functools.cache
-def shell():
-    """Return the text of the shell blocks, the Makefile and the site's settings."""
-    told = "".join(block.text for block in blocks("sh", "bash", "shell", "console"))
-    return told + sources()
 
 
 def problem_at_a_shell(program, rest):
@@ -264,6 +217,7 @@ def problem_at_a_shell(program, rest):
     return None if script is None or (ROOT / script).is_file() else f"{script} does not exist"
 
 
+@functools.cache
 def problem_with(code):
     """Return the problem with a piece of code type, None where none is found."""
     code = code.strip()
@@ -275,13 +229,9 @@ def problem_with(code):
     if first.startswith("--") or (rest and first in commands()):
         return problem_with_command(code)
     if code.startswith("out/"):
-        written = code.rstrip("/") in shell() or code.rpartition("/")[0] in shell()
+        told = sources() + "".join(block.text for block in blocks("sh"))
+        written = code.rstrip("/") in told or code.rpartition("/")[0] in told
         return None if written else f"no command writes {code}"
-    if "::" in code:
-        file, _, test = code.partition("::")
-        if not (ROOT / file).is_file():
-            return f"{file} does not exist"
-        return None if test in functions_in(ROOT / file) else f"{file} has no {test}"
     if re.fullmatch(r"[\w./-]+/", code) or (code.endswith(SUFFIXES) and not re.search(r"\s", code)):
         exists = any((base / code).exists() for base in (ROOT, PACKAGE))
         return None if exists else f"{code} does not exist"
@@ -295,7 +245,8 @@ def problem_with(code):
         return None
     if re.fullmatch(r"[A-Za-z_]\w*(\.\w+)+", dotted):
         first = dotted.split(".")[0]
-        if first not in modules() | {"controller", "sensor", "delay_chain"} and not is_field(first):
+        parts = {path.stem for path in PACKAGE.iterdir() if path.suffix in ("", ".py")}
+        if first not in parts | {"controller", "sensor", "delay_chain"} and not is_field(first):
             return None
         known = is_field(dotted) or is_name(dotted) or dotted in ports()
         return None if known else f"nothing is called {dotted}"
@@ -311,12 +262,6 @@ def test_what_is_named_exists(path):
         codes = {code for code in codes if not code.startswith("_") and not code.endswith(SUFFIXES)}
     problems = {problem_with(code) for code in codes} - {None}
     assert not problems, "\n".join(sorted(map(str, problems)))
-
-
-@pytest.mark.parametrize("path", DOCS, ids=document)
-def test_names_for_the_reference_exist(path):
-    for name in re.findall(r"^::: stewart_drake\.?(.*)$", prose(path), re.MULTILINE):
-        assert not name or is_name(name), name
 
 
 def docstrings(path):
@@ -355,17 +300,6 @@ def test_links_lead_somewhere(path):
         target = path.parent / file if file else path
         assert target.exists(), f"{path.name}: {link}"
         assert not anchor or anchor in anchors(target), f"{path.name}: {link}"
-
-
-def test_the_site_has_every_page_once():
-    def leaves(tree):
-        for part in tree if isinstance(tree, list) else tree.values():
-            yield from [part] if isinstance(part, str) else leaves(part)
-
-    shown = list(leaves(load_yaml(ROOT / "mkdocs.yml")["nav"]))
-    pages = {"README.md" if path == "index.md" else path for path in shown}
-    assert len(pages) == len(shown)
-    assert pages == {document(path).removeprefix("docs/") for path in DOCS}
 
 
 # ------------------------------------------------------------------ code blocks
@@ -556,31 +490,6 @@ def test_figures_of_a_row_are_those_of_the_table_of_claims(path):
     assert not problems, "\n".join(sorted(map(str, problems)))
 
 
-RETIRED = {
-    "nobody": "unknown to",
-    "whatever": "any",
-    "whoever": "the user who",
-    "reckon": "compute",
-    "let_go": "dispose",
-    "so many": "a number of",
-    "thereof": "of it",
-    "is borne": "is tolerated",
-    "one's own": "your own",
-}
-"""Words that readers stumbled over, and their replacements."""
-
-
-def test_retired_words_stay_away():
-    texts = [path for kind in ("py", "c", "h", "j2", "md") for path in PACKAGE.rglob(f"*.{kind}")]
-    words = re.compile(rf"\b({'|'.join(RETIRED)})\b", re.IGNORECASE)
-    found = [
-        f"{document(path)}: {match[0]}; write: {RETIRED[match[0].lower()]}"
-        for path in (*texts, *DOCS)
-        for match in words.finditer(prose(path))
-    ]
-    assert not found, "\n".join(found)
-
-
 def port_rows(text):
     """Port -> size and unit, of the table of output ports in a text; a row may name several."""
     table = text.split("with output ports", 1)[1].split("\n\n", 2)[1]
@@ -677,26 +586,6 @@ def test_errata_desired_acceleration_is_a_disturbance():
     assert peak == pytest.approx([0.2618] * 3 + [0.02, 0.02, 0.08], rel=1e-3)
 
 
-def test_errata_density_is_unbounded():
-    """Entry 18: 31 samples of a sine in the window of (45)."""
-    error = np.sin(0.1 * np.arange(101))
-    density = [31 * error[k] / error[k - 30 : k + 1].sum() for k in range(30, 101)]
-    assert np.abs(density).max() == pytest.approx(92, abs=1)
-
-
-def test_errata_seven_ratios_of_weights():
-    """Entry 19."""
-    weights = (0.1, 1.0, 4.0)
-    assert len({round(q / r, 12) for q in weights for r in weights}) == 7
-    assert 7 * 5 * 4 == 140
-
-
-def test_errata_six_hertz_is_four():
-    """Entry 20: at 10 Hz they are the same samples but for the sign."""
-    t = 0.1 * np.arange(100)
-    assert np.sin(2 * np.pi * 6 * t) == pytest.approx(-np.sin(2 * np.pi * 4 * t), abs=1e-12)
-
-
 def test_errata_accumulated_error_is_a_mean_over_six():
     """Entry 21: one coordinate off by its peak to peak for 10 s counts a sixth of 1000 % s."""
     time = np.linspace(0, 10, 501)
@@ -747,3 +636,59 @@ def test_errata_cranks_of_a_pair_intersect():
             assert shares == pytest.approx(share, abs=5e-4)
             assert p + shares[0] * u == pytest.approx(q + shares[1] * v, abs=1e-12)
             assert np.linalg.norm(points[0] - points[1]) < 1e-3
+
+
+def test_the_site_has_every_page_once():
+    def leaves(tree):
+        for part in tree if isinstance(tree, list) else tree.values():
+            yield from [part] if isinstance(part, str) else leaves(part)
+
+    shown = list(leaves(load_yaml(ROOT / "mkdocs.yml")["nav"]))
+    pages = {"README.md" if path == "index.md" else path for path in shown}
+    assert len(pages) == len(shown)
+    assert pages == {document(path).removeprefix("docs/") for path in DOCS}
+
+
+RETIRED = {
+    "nobody": "unknown to",
+    "whatever": "any",
+    "whoever": "the user who",
+    "reckon": "compute",
+    "let_go": "dispose",
+    "so many": "a number of",
+    "thereof": "of it",
+    "is borne": "is tolerated",
+    "one's own": "your own",
+}
+"""Words that readers stumbled over, and their replacements."""
+
+
+def test_retired_words_stay_away():
+    texts = [path for kind in ("py", "c", "h", "j2", "md") for path in PACKAGE.rglob(f"*.{kind}")]
+    words = re.compile(rf"\b({'|'.join(RETIRED)})\b", re.IGNORECASE)
+    found = [
+        f"{document(path)}: {match[0]}; write: {RETIRED[match[0].lower()]}"
+        for path in (*texts, *DOCS)
+        for match in words.finditer(prose(path))
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_errata_density_is_unbounded():
+    """Entry 18: 31 samples of a sine in the window of (45)."""
+    error = np.sin(0.1 * np.arange(101))
+    density = [31 * error[k] / error[k - 30 : k + 1].sum() for k in range(30, 101)]
+    assert np.abs(density).max() == pytest.approx(92, abs=1)
+
+
+def test_errata_seven_ratios_of_weights():
+    """Entry 19."""
+    weights = (0.1, 1.0, 4.0)
+    assert len({round(q / r, 12) for q in weights for r in weights}) == 7
+    assert 7 * 5 * 4 == 140
+
+
+def test_errata_six_hertz_is_four():
+    """Entry 20: at 10 Hz they are the same samples but for the sign."""
+    t = 0.1 * np.arange(100)
+    assert np.sin(2 * np.pi * 6 * t) == pytest.approx(-np.sin(2 * np.pi * 4 * t), abs=1e-12)

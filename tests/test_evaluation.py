@@ -1,7 +1,5 @@
 """The evaluation of a tuner: its statistics, the candidates, the command."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -28,7 +26,7 @@ from stewart_drake.tuning.families import (
     faulty_family,
 )
 from stewart_drake.tuning.families import FIXED as GAINS_OF_FAMILIES
-from tests.screen import too_long
+from tests.screen import said, summary_in
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -78,11 +76,8 @@ def test_means_are_over_the_scenarios_that_all_complete():
     assert found["best_fixed"] == "a"
     assert found["improvement"] == pytest.approx(1 - 1 / 1.5)
     assert found["hindsight"] == 0.0
-
-
-def test_few_failures_come_before_a_small_mean():
-    error = np.array([[5.0, 5, 5], [1, 1, np.nan], [4, 4, 4]])
-    assert compare_errors(NAMES, 2, error, 0)["best_fixed"] == "a"
+    error = np.array([[5.0, 5, 5], [1, 1, nan], [4, 4, 4]])
+    assert compare_errors(NAMES, 2, error, 0)["best_fixed"] == "a", "before a smaller mean"
 
 
 def test_the_interval_of_the_improvement_covers_the_truth():
@@ -100,9 +95,6 @@ def test_hindsight_bounds_what_any_choice_of_gain_can_do():
     error = np.array([[1.0, 4], [4, 1], [2.5, 2.5]])
     found = compare_errors(NAMES, 2, error, 0)
     assert found["hindsight"] == pytest.approx(1 - 1 / 2.5) and found["improvement"] == 0
-
-
-def test_without_common_conditions_there_is_no_mean():
     found = compare_errors(NAMES, 2, np.array([[np.nan, 1], [1, np.nan], [1, 1]]), 0)
     assert found["common"] == 0 and np.isnan(found["improvement"])
 
@@ -202,11 +194,9 @@ def test_the_command_prints_a_table_and_writes_a_summary(tmp_path, capsys):
     path = constant((1.0, 1.0), tmp_path / "net.json")
     arguments = ["tune", "evaluate", str(path), "--controller", "delay_lqi", "--scenarios", "2"]
     arguments += [part for setting in SMALL for part in ("--set", setting)]
-    assert main([*arguments, "--workers", "1", "--out", str(tmp_path / "out")]) == 0
-    out, err = capsys.readouterr()
-    assert err == "" and not too_long(out)
+    out = said(capsys, *arguments, "--workers", "1", "--out", tmp_path / "out")
     assert "of 2 conditions that all complete" in " ".join(out.split())
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    summary = summary_in(tmp_path / "out")
     assert set(summary["candidates"]) == {*GAINS, TUNER, HINDSIGHT}
     assert len(summary["scenarios"]) == 2
     assert main([*arguments, "--seed", "1", "--out", str(tmp_path / "out")]) == 2
@@ -227,7 +217,7 @@ def test_data_training_and_evaluation_by_commands(tmp_path):
     out = tmp_path / "evaluation"
     words = ["tune", "evaluate", str(net), "--family", "N2", "--scenarios", "4", "--out", str(out)]
     assert main([*words, *short]) == 0
-    summary = json.loads((out / "summary.json").read_text())
+    summary = summary_in(out)
     assert set(summary["gains"]) == {RULE, "mine", HINDSIGHT}
     assert summary["conditions"] == 4
     assert set(summary["nominal"]["mine"]) == {"on_reference", "from_rest"}

@@ -76,19 +76,6 @@ def test_files_of_a_run(written):
             assert ElementTree.parse(path).getroot().tag.endswith("svg")
 
 
-def test_figures_of_a_comparison(comparison):
-    drawn = draw_comparison(comparison)
-    torques = ["torques_delay_lqr", "torques_delay_lqi", "torques_predictor_lqi"]
-    assert list(drawn) == ["states", "errors", *torques]
-
-
-def test_a_controller_without_estimator_has_no_parameters_to_show():
-    settings = ("plant.kind=exact", "duration=0.1")
-    scenario = load_scenario("paper", "lqr", settings)
-    drawn = draw_run(simulate(scenario, judge_stability=False))
-    assert list(drawn) == ["states", "errors", "torques"]
-
-
 def test_axes_name_their_units(run):
     drawn = draw_run(run)
     for name, units in {
@@ -105,6 +92,8 @@ def test_axes_name_their_units(run):
 
 def test_a_diverging_run_does_not_squash_the_others_and_ends_with_a_cross(comparison):
     drawn = draw_comparison(comparison)
+    torques = ["torques_delay_lqr", "torques_delay_lqi", "torques_predictor_lqi"]
+    assert list(drawn) == ["states", "errors", *torques]
     run = comparison["lqi"].signals
     shown = drawn["states"].axes[0]
     motion = np.rad2deg(np.ptp(run.reference.values[:, 0]))

@@ -52,14 +52,10 @@ def test_every_example_is_of_a_command_and_parses():
 
 
 def test_robustness_tells_the_unit_of_everything_that_it_varies(capsys):
-    """In the help, in docs/theory.md, and in the line about a wrong value."""
-    names = {field.name for field in dataclasses.fields(Ranges)}
-    assert set(RANGE_UNITS) == names
-    assert main(["analyze", "robustness", "--help"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
+    """In docs/theory.md, and in the line about a wrong value."""
+    assert set(RANGE_UNITS) == {field.name for field in dataclasses.fields(Ranges)}
     theory = (test_docs.ROOT / "docs" / "theory.md").read_text(encoding="utf-8")
     for name, unit in RANGE_UNITS.items():
-        assert f"{name}: {unit}" in said
         assert f"| `{name}` | {unit} |" in theory
         assert main(["analyze", "robustness", "--vary", f"{name}=-1"]) == 2
         error = capsys.readouterr().err
@@ -73,19 +69,12 @@ def test_robustness_tells_the_unit_of_everything_that_it_varies(capsys):
 # ---------------------------------------------------------------- completion
 
 
-def asked(typed):
-    """How bash asks what to offer after this line."""
-    return {
-        "_STEWART_DRAKE_COMPLETE": "complete_bash",
-        "COMP_WORDS": typed,
-        "COMP_CWORD": str(len(typed.split(" ")) - 1),
-    }
-
-
 def test_the_shell_completes_commands_names_and_settings(monkeypatch, capsys):
+    monkeypatch.setenv("_STEWART_DRAKE_COMPLETE", "complete_bash")
+
     def offered(typed):
-        for name, value in asked(typed).items():
-            monkeypatch.setenv(name, value)
+        monkeypatch.setenv("COMP_WORDS", typed)
+        monkeypatch.setenv("COMP_CWORD", str(len(typed.split(" ")) - 1))
         with pytest.raises(SystemExit) as done:
             main([])
         out, err = capsys.readouterr()

@@ -323,6 +323,25 @@ def test_forward_kinematics_passes_through_a_dead_centre(stretched):
         np.testing.assert_allclose(stretched.forward_kinematics(angles, guess), home, atol=1e-12)
 
 
+# ------------------------------------------------------------------ the paper's mechanism
+
+
+def test_trajectory_of_the_paper_is_within_reach_and_well_conditioned():
+    """Equation (46); the angle between rod and crank tangent is taken from Drake's rotations."""
+    amplitude = np.array([np.pi / 12, np.pi / 12, np.pi / 12, 0.02, 0.02, 0.08])
+    worst, closest = 1.0, np.inf
+    for t in np.linspace(0, 2 * np.pi, 400, endpoint=False):
+        pose = amplitude * np.sin(t) + [0, 0, 0, 0, 0, 0.38]
+        angles = PAPER.crank_angles(pose)
+        closest = min(closest, PAPER.reach_margins(pose).min())
+        h = 1e-6
+        tangent = (crank_tips(PAPER, angles + h) - crank_tips(PAPER, angles - h)) / (2 * h * 0.11)
+        rod = (plate_joints(PAPER, pose) - crank_tips(PAPER, angles)) / 0.404
+        worst = min(worst, np.abs(np.sum(rod * tangent, axis=1)).min())
+    np.testing.assert_allclose(worst, 0.40, atol=0.01)
+    assert closest == pytest.approx(7.4e-3, abs=5e-5)
+
+
 # ------------------------------------------------------------------ the compiled core
 
 

@@ -41,7 +41,7 @@ from stewart_drake.studies.study_options import LayoutOptions
 from stewart_drake.studies.workspace import size_motors
 from stewart_drake.studies.workspace_map import margins_along
 from tests.mechanisms import PAPER
-from tests.screen import too_long
+from tests.screen import said, summary_in
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -207,7 +207,7 @@ def test_reach_counts_before_limits_and_limits_before_the_goal():
     assert asked.cost(asked.trial(crank_as_long, OWN)) > tight.cost(missed)
 
 
-def test_a_judgement_is_of_all_instants_and_a_run():
+def test_a_judgement_is_of_all_instants_and_a_run_unless_out_of_reach():
     asked = problem(limits={"clearance": -1.0})
     found = json.loads(judge(asked, "paper"))
     along = margins_along(PAPER, assemble(asked.scenario).reference, check_instants(1.5))
@@ -215,9 +215,6 @@ def test_a_judgement_is_of_all_instants_and_a_run():
     assert found["measures"]["clearance"] == found["nearest"][1] < 0
     assert found["outcome"]["status"] == "completed"
     assert set(found["measures"]) == {*MEASURES, "parallel"}
-
-
-def test_a_motion_out_of_reach_is_judged_without_a_run():
     far = load_scenario("paper", None, (*QUICK, "reference.offset=[0, 0, 0, 0, 0, 0.9]"))
     found = json.loads(judge(problem_of(far, LayoutOptions()), "paper"))
     assert found["outcome"]["status"] == "refused" and found["measures"]["reach"] < 0
@@ -278,19 +275,16 @@ def in_process(monkeypatch):
 @pytest.mark.slow
 def test_the_command_writes_machines_that_run_and_goes_on(tmp_path, capsys, in_process):
     command = [*SMALL, "--limit", "clearance=-1", "--seed", "2", "--out", str(tmp_path)]
-    assert main(command) == 0
-    said = capsys.readouterr().out
-    assert said.startswith("yes: of ") and not too_long(said)
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert said(capsys, *command).startswith("yes: of ")
+    summary = summary_in(tmp_path)
     (best,) = summary["layouts"]
     machine = load_mechanism(tmp_path / "layout_1.yaml")
     assert machine.name == "layout_1" and best["run"]["status"] == "completed"
     assert best["measures"]["condition"] <= 1.01 * summary["before"]["measures"]["condition"]
-    experiment = prepare(
+    reference = prepare(
         load_scenario("paper", None, (f"mechanism={tmp_path / 'layout_1.yaml'}", *QUICK))
-    )
-    time = check_instants(1.5)
-    reach = margins_along(machine, experiment.reference, time).reach.min()
+    ).reference
+    reach = margins_along(machine, reference, check_instants(1.5)).reach.min()
     assert best["measures"]["reach"] <= reach < best["measures"]["reach"] + 0.01
     page = (tmp_path / "report.html").read_text()
     assert "layout_1" in page and "stewart-drake layout paper" in page and page.count("<img") == 2
@@ -307,8 +301,7 @@ def test_the_command_writes_machines_that_run_and_goes_on(tmp_path, capsys, in_p
 
 
 def test_limits_that_nothing_keeps_are_reported_and_no_machine_is_written(tmp_path, capsys):
-    assert main([*SMALL, "--limit", "clearance=1", "--out", str(tmp_path)]) == 0
-    told = " ".join(capsys.readouterr().out.split())
+    told = " ".join(said(capsys, *SMALL, "--limit", "clearance=1", "--out", tmp_path).split())
     assert told.startswith("no: of ") and "the nearest misses" in told and "clearance by" in told
     assert not list(tmp_path.glob("*.yaml"))
-    assert json.loads((tmp_path / "summary.json").read_text())["layouts"] == []
+    assert summary_in(tmp_path)["layouts"] == []

@@ -1,6 +1,7 @@
 """model check and model view: summary, drawing, and a viewer that survives any slider."""
 
 import contextlib
+import dataclasses
 import json
 
 import numpy as np
@@ -19,7 +20,7 @@ from stewart_drake.reporting.mechanism import mechanism_figure
 from stewart_drake.reporting.viewer import SLIDERS, STOP, PoseViewer, place, slider_range
 from stewart_drake.studies.new_machine import check_mechanism
 from tests.mechanisms import PAPER
-from tests.screen import too_long
+from tests.screen import said, summary_in
 from tests.singular import parallel_rods, stretched, write_mechanism
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -32,15 +33,10 @@ HOME_VALUES = PAPER.home * ([180 / np.pi] * 3 + [1e3] * 3)
 
 @pytest.mark.parametrize("name", shipped("mechanism"))
 def test_check_tells_what_the_dynamics_say(name, tmp_path, capsys):
-    assert main(["model", "check", name, "--out", str(tmp_path)]) == 0
-    said = capsys.readouterr().out
-    assert said.startswith("yes: ") and not too_long(said)
-    assert {path.name for path in tmp_path.iterdir()} == {
-        "summary.json",
-        "mechanism.png",
-        "mechanism.svg",
-    }
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert said(capsys, "model", "check", name, "--out", tmp_path).startswith("yes: ")
+    pictures = {"mechanism.png", "mechanism.svg"}
+    assert {path.name for path in tmp_path.iterdir()} == pictures | {"summary.json"}
+    summary = summary_in(tmp_path)
     mechanism = load_mechanism(name)
     dynamics = StewartDynamics(mechanism, gravity=True)
     np.testing.assert_allclose(summary["torque"], dynamics.equilibrium_torque(mechanism.home))
@@ -58,17 +54,12 @@ def test_check_marks_moments_that_nobody_measured(tmp_path, capsys):
     path = tmp_path / "mine.yaml"
     text = (data_root() / "models" / "paper.yaml").read_text()
     path.write_text(text.replace(", inertia: [30.0e-4, 30.0e-4, 60.0e-4]", ""))
-    assert main(["model", "check", str(path), "--out", str(tmp_path)]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "plate 0.0144, 0.0144, 0.0288 (estimated: uniform disc); crank 1e-06, " in said
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    told = " ".join(said(capsys, "model", "check", path, "--out", tmp_path).split())
+    assert "plate 0.0144, 0.0144, 0.0288 (estimated: uniform disc); crank 1e-06, " in told
+    summary = summary_in(tmp_path)
     assert summary["inertia_estimated"] == ["plate"]
     np.testing.assert_allclose(summary["inertia"]["plate"], [144e-4, 144e-4, 288e-4])
-    assert main(["model", "check", "paper"]) == 0
-    assert "estimated" not in capsys.readouterr().out
-
-
-def test_check_prints_json_and_nothing_else(capsys):
+    assert "estimated" not in said(capsys, "model", "check", "paper")
     assert main(["model", "check", "desktop", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["name"] == "desktop"
 
@@ -76,18 +67,18 @@ def test_check_prints_json_and_nothing_else(capsys):
 @pytest.mark.parametrize(
     ("machine", "why"), [(parallel_rods(), "parallel singularity"), (stretched(), "end of its")]
 )
-def test_check_of_a_singular_machine_is_a_verdict(machine, why, tmp_path, capsys):
+def test_a_singular_machine_gets_a_verdict_and_can_be_viewed(machine, why, tmp_path, capsys):
     path = write_mechanism(machine, tmp_path / "machine.yaml")
-    assert main(["model", "check", str(path), "--out", str(tmp_path / "out")]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = said(capsys, "model", "check", path, "--out", tmp_path / "out").splitlines()
     assert lines[0].startswith("no: the home pose is singular") and why in " ".join(lines[:2])
     assert (tmp_path / "out" / "mechanism.png").exists()
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["torque"] == []
+    with contextlib.closing(PoseViewer(machine, Meshcat())) as viewer:
+        assert place(machine, viewer.values()).failure is not None
+    assert summary_in(tmp_path / "out")["torque"] == []
 
 
 def test_motors_that_cannot_hold_the_plate_are_reported():
-    weak = load_mechanism("motion_base")
-    object.__setattr__(weak, "effort_limit", 500.0)
+    weak = dataclasses.replace(load_mechanism("motion_base"), effort_limit=500.0)
     assert "cannot hold the plate, 928 N m" in check_mechanism(weak).verdict
 
 
@@ -121,6 +112,12 @@ def test_the_viewer_starts_at_home_with_a_slider_per_coordinate(viewer):
     assert np.all(low < HOME_VALUES) and np.all(high > HOME_VALUES)
 
 
+def plate_of(viewer):
+    """Return the position (3,) at which the plate is shown."""
+    tree = viewer._plant.GetMyContextFromRoot(viewer._context)
+    return viewer._plant.GetBodyByName("plate").EvalPoseInWorld(tree).translation()
+
+
 def test_sliders_place_the_machine(viewer):
     values = HOME_VALUES + [5, -4, 10, 15, -20, 30]
     placement = viewer.step(values)
@@ -128,9 +125,7 @@ def test_sliders_place_the_machine(viewer):
     np.testing.assert_allclose(placement.pose, pose)
     np.testing.assert_allclose(placement.reach, PAPER.reach_margins(pose))
     assert str(placement).startswith("reach margin")
-    tree = viewer._plant.GetMyContextFromRoot(viewer._context)
-    X_WP = viewer._plant.GetBodyByName("plate").EvalPoseInWorld(tree)
-    np.testing.assert_allclose(X_WP.translation(), pose[3:], atol=1e-12)
+    np.testing.assert_allclose(plate_of(viewer), pose[3:], atol=1e-12)
 
 
 def test_out_of_reach_is_shown_and_the_machine_stays_where_it_was(viewer):
@@ -142,9 +137,7 @@ def test_out_of_reach_is_shown_and_the_machine_stays_where_it_was(viewer):
     assert f"leg {leg} short by {-1e3 * margins.min():.3g} mm" in str(placement)
     assert str(placement).startswith("out of reach: ")
     assert viewer.meshcat.GetButtonClicks(str(placement)) == 0  # the panel says it
-    tree = viewer._plant.GetMyContextFromRoot(viewer._context)
-    X_WP = viewer._plant.GetBodyByName("plate").EvalPoseInWorld(tree)
-    np.testing.assert_allclose(X_WP.translation(), PAPER.home[3:], atol=1e-12)
+    np.testing.assert_allclose(plate_of(viewer), PAPER.home[3:], atol=1e-12)
     viewer.step(HOME_VALUES)
     with pytest.raises(RuntimeError):  # Drake's way to say that the old label is gone
         viewer.meshcat.GetButtonClicks(str(placement))
@@ -156,13 +149,6 @@ def test_no_slider_value_crashes(viewer, values):
     placement = viewer.step(values)
     assert (placement.failure is None) == (diagnose(PAPER, 0.0, placement.pose) is None)
     assert len(str(placement)) > 10
-
-
-@pytest.mark.parametrize("machine", [parallel_rods(), stretched()])
-def test_a_singular_machine_can_be_viewed(machine):
-    with contextlib.closing(PoseViewer(machine, Meshcat())) as viewer:
-        assert place(machine, viewer.values()).failure is not None
-        assert viewer.values().shape == (6,)
 
 
 def test_the_viewer_follows_the_sliders_until_it_is_stopped(viewer):
@@ -194,6 +180,5 @@ def test_the_viewer_follows_the_sliders_until_it_is_stopped(viewer):
 
 
 def test_view_writes_a_page_that_needs_no_server(tmp_path, capsys):
-    assert main(["model", "view", "desktop", "--out", str(tmp_path)]) == 0
+    assert "view.html" in said(capsys, "model", "view", "desktop", "--out", tmp_path)
     assert (tmp_path / "view.html").stat().st_size > 500_000
-    assert "view.html" in capsys.readouterr().out

@@ -77,28 +77,26 @@ def run(build, until=0.1, state=None, change=None, look=None):
     return diagram.GetOutputPort("state").Eval(context)
 
 
+MOVING = np.concatenate([PAPER.home + 0.02, np.full(6, 0.05)])
+
+
 def test_both_kinds_in_a_diagram_of_ones_own_agree():
-    state = np.concatenate([PAPER.home + 0.02, np.full(6, 0.05)])
     loads = {"gravity": True, "payload_mass": 0.2, "torque_bias": [0.3] * 6}
     loads |= {"payload_position": [0.1, 0.0, 0.05], "coulomb_friction": 0.05, "coulomb_speed": 0.5}
+    configs = [
+        sd.PlantConfig(**c, **loads)
+        for c in ({"kind": "exact"}, {"time_step": 1e-3}, {"time_step": 5e-4})
+    ]
     exact, coarse, fine = (
-        run(
-            lambda b, c=c: sd.AddStewartPlatform(b, PAPER, sd.PlantConfig(**c, **loads)), 0.1, state
-        )
-        for c in (
-            {"kind": "exact"},
-            {"time_step": 1e-3},
-            {"time_step": 5e-4},
-        )
+        run(lambda b, c=c: sd.AddStewartPlatform(b, PAPER, c), state=MOVING) for c in configs
     )
-    moved = np.abs(exact - state).max()
+    moved = np.abs(exact - MOVING).max()
     errors = [np.abs(found - exact).max() for found in (coarse, fine)]
     assert errors[0] < 0.1 * moved and errors[0] / errors[1] == pytest.approx(2, rel=0.2)
 
 
 def test_without_gravity_it_does_not_matter_where_the_base_is_welded():
     """Pose and rates are relative to the base, which here is turned over and far away."""
-    state = np.concatenate([PAPER.home + 0.02, np.full(6, 0.05)])
 
     def welded(builder):
         plant, _ = AddMultibodyPlantSceneGraph(builder, 1e-3)
@@ -107,8 +105,8 @@ def test_without_gravity_it_does_not_matter_where_the_base_is_welded():
         plant.Finalize()
         return platform
 
-    here = run(lambda builder: sd.AddStewartPlatform(builder, PAPER), 0.1, state)
-    np.testing.assert_allclose(run(welded, 0.1, state), here, atol=1e-9)
+    here = run(lambda builder: sd.AddStewartPlatform(builder, PAPER), state=MOVING)
+    np.testing.assert_allclose(run(welded, state=MOVING), here, atol=1e-9)
 
 
 def test_two_machines_in_one_plant_move_on_their_own():
@@ -209,15 +207,14 @@ def test_derivatives_by_parameters_are_exact():
     dynamics = sd.StewartDynamics(PAPER, True, free=PLANT_PARAMETERS)
     plant = sd.systems.ExactPlant(dynamics).ToAutoDiffXd()
     context = plant.CreateDefaultContext()
-    state = np.concatenate([PAPER.home + 0.02, np.full(6, 0.05)])
     values = plant_parameters([*np.full(6, 0.01), 0.3, 0.02, 0.01, 0.5, 0.05, 0.0, 0.1])
-    context.SetContinuousState([AutoDiffXd(x) for x in state])
+    context.SetContinuousState([AutoDiffXd(x) for x in MOVING])
     plant.GetInputPort("torque").FixValue(context, np.array([AutoDiffXd(T) for T in TORQUE]))
     varied = InitializeAutoDiff(values).ravel()
     context.get_mutable_numeric_parameter(0).SetFromVector(varied)
     change = plant.EvalTimeDerivatives(context).CopyToVector()
     found = ExtractGradient(change)
-    expected = dynamics.derivatives(state[:6], state[6:], TORQUE, values).G
+    expected = dynamics.derivatives(MOVING[:6], MOVING[6:], TORQUE, values).G
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
     plate = context.get_mutable_numeric_parameter(1)
     plate.SetFromVector(InitializeAutoDiff(ExtractValue(plate.CopyToVector())).ravel())
@@ -233,7 +230,6 @@ def test_derivatives_by_parameters_are_exact():
         ({"payload_mass": -1.0}, "payload_mass: got -1"),
         ({"payload_mass": np.nan}, "payload_mass: got nan"),
         ({"plate_mass": 0.0}, "plate.mass: got 0 kg"),
-        ({"plate_mass": np.nan}, "plate.mass: got nan kg"),
     ],
 )
 def test_wrong_parameters_are_refused_and_change_nothing(kind, change, message):
@@ -305,7 +301,6 @@ def own_plant(builder, finalized):
         (lambda b: sd.AddStewartPlatform(b, PAPER, start=[0.0]), "start: got shape (1,)"),
         (lambda b: sd.AddStewartPlatform(b, PAPER, start=[np.nan] * 6), "start: got [nan"),
         (lambda b: sd.AddStewartPlatform(b, PAPER, {"kind": "exact"}), "config: got {'kind'"),
-        (lambda b: sd.AddStewartPlatform(b, "no_such_machine"), "no_such_machine"),
         (lambda b: set_state(b, [np.nan] * 12), "state: got [nan"),
         (lambda b: set_state(b, [0.0] * 6), "state: got shape (6,)"),
         (lambda b: sd.StewartDynamics("no_such_machine"), "no_such_machine"),

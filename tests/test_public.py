@@ -23,6 +23,7 @@ from stewart_drake.reporting.results import Figures, Replay
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
+ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = ("plant.kind=exact", "duration=0.1")
 
 
@@ -35,32 +36,19 @@ def test_only_public_names_are_listed():
 
 def test_type_checkers_see_the_public_names():
     """`python .ci/public_names.py` writes the file again."""
-    path = Path(__file__).parents[1] / ".ci" / "public_names.py"
-    namespace = runpy.run_path(str(path))
+    namespace = runpy.run_path(str(ROOT / ".ci" / "public_names.py"))
     written, wanted = (
         ast.parse(text) for text in (namespace["STUB"].read_text(), namespace["text"]())
     )
     assert {ast.unparse(node) for node in written.body} == {ast.unparse(n) for n in wanted.body}
 
 
-@pytest.mark.parametrize("name", ["Answer", "plot", "replay", "table"])
-def test_a_name_of_0_2_leads_to_todays(name):
-    with pytest.raises(AttributeError, match=f"no attribute '{name}'; it is .* now"):
-        getattr(sd, name)
-
-
-def test_an_option_of_0_2_leads_to_todays():
+def test_a_name_and_an_option_of_0_2_lead_to_todays():
+    for name in ("Answer", "plot", "replay", "table"):
+        with pytest.raises(AttributeError, match=f"no attribute '{name}'; it is .* now"):
+            getattr(sd, name)
     with pytest.raises(TypeError, match=r"got beside, an option of 0\.2; expected also"):
         sd.analyze_robustness("paper", beside={})
-
-
-def test_the_signature_of_an_analysis_shows_its_options():
-    shown = inspect.signature(sd.analyze_robustness).parameters
-    assert list(shown)[:2] == ["scenario", "runs"] and shown["runs"].default == 200
-    assert shown["limit"].kind is inspect.Parameter.KEYWORD_ONLY
-    assert "limit: E_ac above which a run counts as failed, % s" in (
-        sd.analyze_robustness.__doc__ or ""
-    )
 
 
 @pytest.mark.parametrize(
@@ -109,29 +97,11 @@ def test_an_error_names_the_argument(call, message):
     assert str(refused.value).startswith(message) and "--" not in str(refused.value)
 
 
-def test_help_names_arguments_and_not_options_of_the_command():
-    for name in sd.__all__:
-        if inspect.isfunction(function := getattr(sd, name)):
-            assert " --" not in (function.__doc__ or ""), name
-
-
-def test_help_names_arrays_instead_of_the_unions_behind_them():
-    assert str(inspect.signature(sd.StewartDynamics.mass_matrix)).startswith(
-        "(self, pose: ArrayLike"
-    )
-
-
-def test_a_scenario_tells_what_is_not_as_usual():
-    assert repr(sd.Scenario()) == "Scenario()"
-    scenario = sd.load_scenario("paper", settings=SETTINGS)
-    assert repr(scenario) == "Scenario(duration=0.1, plant.kind='exact')"
+def test_scenarios_and_results_tell_what_is_not_as_usual():
     long = sd.load_scenario(
-        "paper", settings=("sensor.noise_std=[" + "0.00123456789, " * 11 + "0]",)
+        "paper", settings=("sensor.noise_std=[" + "0.0012345678, " * 11 + "0]",)
     )
     assert "sensor.noise_std=[0.00123" in repr(long) and len(repr(long)) < 100
-
-
-def test_results_tell_how_it_went():
     run = sd.simulate(sd.load_scenario("paper", settings=SETTINGS))
     assert repr(run) == (
         f"SimulationResult(completed, E_ac={run.accumulated_error:.4g}, "
@@ -161,8 +131,7 @@ FUNCTIONS = {
 def test_every_command_has_a_function(words):
     name = FUNCTIONS.get(words, words.replace(" ", "_").replace("-", "_"))
     assert name in sd.__all__
-    documented = (Path(__file__).parents[1] / "docs" / "python.md").read_text()
-    assert f"`sd.{name}`" in documented
+    assert f"`sd.{name}`" in (ROOT / "docs" / "python.md").read_text()
 
 
 @pytest.mark.slow
@@ -181,22 +150,9 @@ def test_a_machine_and_a_live_run_from_python():
         assert serving.result(20)["runs"] == 1
 
 
-ROOT = Path(__file__).resolve().parents[1]
-PACKAGE = ROOT / "stewart_drake"
-CONNECTING = ("loop/diagram.py", "loop/law_design.py", "loop/platforms.py")
-"""The modules that build diagrams."""
-
-
-def test_diagrams_are_connected_in_one_place():
-    calls = {
-        path.relative_to(PACKAGE).as_posix()
-        for path in PACKAGE.rglob("*.py")
-        if ".Connect(" in path.read_text(encoding="utf-8")
-    }
-    assert calls == set(CONNECTING)
-
-
-def test_importing_the_package_leaves_torch_and_drake_out():
+def test_the_package_has_version_and_types_and_imports_neither_torch_nor_drake():
+    assert sd.__version__ == importlib.metadata.version("stewart-drake")
+    assert (Path(sd.__file__).parent / "py.typed").is_file()
     code = "import sys, stewart_drake; sys.exit(bool({'torch', 'pydrake'} & sys.modules.keys()))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr or "torch or pydrake was imported"
@@ -227,11 +183,6 @@ class Push(LeafSystem):
         self.DeclareVectorOutputPort(
             "wrench", 6, lambda _, output: output.SetFromVector([0.0] * 5 + [-1.0])
         )
-
-
-def test_version_and_types_are_reported():
-    assert sd.__version__ == importlib.metadata.version("stewart-drake")
-    assert (Path(sd.__file__).parent / "py.typed").is_file()
 
 
 def test_figures_of_a_run(run, tmp_path):
@@ -295,19 +246,33 @@ def test_compare_takes_own_controllers_and_disturbances(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("name", "make", "message"),
     [
-        ({"controllers": {"lqr": Still}}, "got 'lqr', a shipped one"),
-        ({"controllers": {"adaptive_lqi": Still}}, "got 'adaptive_lqi', a shipped one"),
-        ({"disturbance": "made"}, "got an instance, which serves one run"),
-        ({"reference": "handle"}, "cannot be sent to other processes"),
+        ("controllers", lambda: {"adaptive_lqi": Still}, "got 'adaptive_lqi', a shipped one"),
+        ("disturbance", Push, "got an instance, which serves one run"),
+        (
+            "reference",
+            lambda: FunctionHandleTrajectory(lambda t: np.zeros((6, 1)), 6, 1),
+            "cannot be sent to other processes",
+        ),
     ],
 )
-def test_what_compare_cannot_run_is_reported_in_one_line(given, message):
-    if given.get("disturbance"):
-        given = {"disturbance": Push()}
-    if given.get("reference"):
-        given = {"reference": FunctionHandleTrajectory(lambda t: np.zeros((6, 1)), 6, 1)}
+def test_what_compare_cannot_run_is_reported_in_one_line(name, make, message):
     with pytest.raises(sd.ConfigError) as refused:
-        sd.compare("paper", SHORT, **given)
+        sd.compare("paper", SHORT, **{name: make()})
     assert message in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_the_signature_of_an_analysis_shows_its_options():
+    shown = inspect.signature(sd.analyze_robustness).parameters
+    assert list(shown)[:2] == ["scenario", "runs"] and shown["runs"].default == 200
+    assert shown["limit"].kind is inspect.Parameter.KEYWORD_ONLY
+    assert "limit: E_ac above which a run counts as failed, % s" in (
+        sd.analyze_robustness.__doc__ or ""
+    )
+
+
+def test_help_names_arrays_instead_of_the_unions_behind_them():
+    assert str(inspect.signature(sd.StewartDynamics.mass_matrix)).startswith(
+        "(self, pose: ArrayLike"
+    )

@@ -8,10 +8,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from ruamel.yaml import YAML
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.files.resources import data_root
 from stewart_drake.law.riccati import full_gain
 from stewart_drake.law.startup import machine_torque
 from stewart_drake.loop import preparation as experiment_module
@@ -21,6 +19,7 @@ from stewart_drake.mechanism.geometry import Body, Link
 from stewart_drake.scenario.loading import load_scenario
 from tests.mechanisms import PAPER
 from tests.oracles import relative
+from tests.singular import write_mechanism
 from tests.test_riccati import STEPS, UNIT, delayed
 
 SIZES = [(0.1, 1e-3), (0.01, 1e-6), (10.0, 1e3), (1.0, 100.0)]
@@ -50,12 +49,16 @@ def scaled(s, m):
     )
 
 
-def run(monkeypatch, s, m, *settings):
-    """Run on the exact plant; return the torques in units of m s^2, too."""
-    sc = load_scenario("paper", None, ("plant.kind=exact", *settings))
+def shrink_motion(sc, s):
     for field in {"amplitude", "offset"} & set(vars(sc.reference)):  # a hold has one of them
         values = np.array(getattr(sc.reference, field)) * np.repeat([1, s], 3)
         setattr(sc.reference, field, values.tolist())
+
+
+def run(monkeypatch, s, m, *settings):
+    """Run on the exact plant; return the torques in units of m s^2, too."""
+    sc = load_scenario("paper", None, ("plant.kind=exact", *settings))
+    shrink_motion(sc, s)
     if sc.actuator.torque_limit is not None:
         sc.actuator.torque_limit *= m * s**2
     sc.plant.torque_bias = [m * s**2 * bias for bias in sc.plant.torque_bias]
@@ -117,28 +120,12 @@ def test_the_machines_torque_is_in_proportion(s, m):
 
 def test_a_file_may_describe_a_machine_of_a_few_millimetres(tmp_path):
     s, m = 0.01, 1e-6
-    yaml = YAML(typ="safe")
-    data = yaml.load((data_root() / "models" / "paper.yaml").read_text())
-    data["home"] = [*data["home"][:3], *(s * v for v in data["home"][3:])]
-    for name in ("base_radius", "plate_radius", "shaft_height"):
-        data["pattern"][name] *= s
-    for name in ("base", "plate", "crank", "rod"):
-        part = data[name]
-        part["mass"] *= m
-        part["inertia"] = [m * s**2 * moment for moment in part["inertia"]]
-        if "length" in part:
-            part["length"] *= s
-    data["motor"]["effort_limit"] *= m * s**2
-    path = tmp_path / "small.yaml"
-    with path.open("w") as file:
-        yaml.dump(data, file)
+    path = write_mechanism(scaled(s, m), tmp_path / "small.yaml")
     assert relative(load_mechanism(path).p_WS, scaled(s, m).p_WS) < 1e-12
     settings = ("plant.kind=exact", "duration=2", *ON)
     sc = load_scenario("paper", None, (f"mechanism={path}", *settings))
     one = simulate(load_scenario("paper", None, settings), judge_stability=False)
-    for field in ("amplitude", "offset"):
-        values = np.array(getattr(sc.reference, field)) * np.repeat([1, s], 3)
-        setattr(sc.reference, field, values.tolist())
+    shrink_motion(sc, s)
     result = simulate(sc, judge_stability=False)
     assert result.status == "completed"
     assert result.summary["counts"]["riccati_failures"] == 0

@@ -121,9 +121,10 @@ OTHER = {name: value for value, names in NUMBERS.items() for name in names.split
 
 
 def fields_of(scenario):
-    """Every field of the scenario's sections, as --set has them; `kind` is each section's own."""
+    """Name, annotation and value of every field, as --set has them; a `kind` is its section's."""
 
     def walk(owner, above):
+        hints = typing.get_type_hints(type(owner))
         for field in dataclasses.fields(owner):
             name = f"{above}{spelling(type(owner), field.name)}"
             value = getattr(owner, field.name)
@@ -132,7 +133,7 @@ def fields_of(scenario):
             ):
                 yield from walk(value, f"{name}.")
             else:
-                yield name
+                yield name, hints[field.name], value
 
     return walk(scenario, "")
 
@@ -149,22 +150,6 @@ def other_values(owner_hint, name, value):
         return [one for one in ([], *extra, some) if one != value]
     words = getattr(owner_hint, "__args__", ())
     return [word for word in words if word != value]
-
-
-def hint_of(scenario, name):
-    owner = scenario
-    for part in name.split(".")[:-1]:
-        owner = getattr(owner, part)
-    hints = {spelling(type(owner), n): h for n, h in typing.get_type_hints(type(owner)).items()}
-    return hints[name.split(".")[-1]]
-
-
-def value_of(scenario, name):
-    owner = scenario
-    for part in name.split("."):
-        names = {spelling(type(owner), f.name): f.name for f in dataclasses.fields(owner)}
-        owner = getattr(owner, names[part])
-    return owner
 
 
 def setting_of(name, value):
@@ -315,7 +300,8 @@ def test_a_setting_without_an_effect_is_refused_in_one_line(beside):
 
 
 def test_every_row_of_the_table_names_fields_that_exist():
-    known = {name for chosen in SCENARIOS.values() for name in fields_of(load_scenario(*chosen))}
+    scenarios = [load_scenario(*chosen) for chosen in SCENARIOS.values()]
+    known = {name for scenario in scenarios for name, *_ in fields_of(scenario)}
     assert {name for row in NEEDS for name in (*row.fields, row.other)} <= known
 
 
@@ -376,13 +362,12 @@ def test_every_field_has_an_effect_or_is_refused_or_documented(called, files):
     errors, wrong = {}, {}
     before = simulate(scenario, judge_stability=False, progress=errors.__setitem__).signals
     assert np.all(np.isfinite([*errors.values()]))  # NaN would differ from itself
-    for name in fields_of(scenario):
+    for name, hint, value in fields_of(scenario):
         if name.endswith(".kind") and name != "plant.kind":
             continue  # each is another class, whose fields are refused beside it
         if name in NO_EFFECT and NO_EFFECT[name](scenario):
             continue
-        value = value_of(scenario, name)
-        values = other_values(hint_of(scenario, name), name, value)
+        values = other_values(hint, name, value)
         assert values, f"{name}: no other value"
         values = [files(name, scenario) if one == "FILE" else one for one in values]
         found = set[str]()

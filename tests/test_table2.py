@@ -45,16 +45,11 @@ def test_rows_are_the_controllers_and_what_the_scenario_adds(rows):
         assert scenario == sd.load_scenario("paper", name)
 
 
-@pytest.mark.parametrize(
-    ("compare", "message"),
-    [
-        ("{mine: {}}", "mine"),
-        ("{lqr: {torque_map: printed, model: multibody}}", "compare.lqr: controller.torque_map"),
-    ],
-)
-def test_a_row_that_does_not_fit_is_refused_in_one_line(compare, message):
-    with pytest.raises(sd.ConfigError, match=rf"^[^\n]*{message}[^\n]*$"):
-        load_comparison("paper", CONTROLLERS, [f"compare={compare}"])
+def test_a_row_that_does_not_fit_is_refused_in_one_line():
+    printed = "{lqr: {torque_map: printed, model: multibody}}"
+    for row, message in (("{mine: {}}", "mine"), (printed, "compare.lqr: controller.torque_map")):
+        with pytest.raises(sd.ConfigError, match=rf"^[^\n]*{message}[^\n]*$"):
+            load_comparison("paper", CONTROLLERS, [f"compare={row}"])
 
 
 def test_the_integral_weight_scales_its_block_alone():
@@ -70,21 +65,15 @@ def test_the_integral_weight_scales_its_block_alone():
 @pytest.mark.parametrize(
     ("row", "error", "within"),
     [
-        ("delay_lqr", 225, 3),
-        ("delay_lqi", 199, 3),
-        ("delay_lqi_sum", 91, 2),
-        ("delay_lqi_200", 82, 2),
+        *(("lqr", np.nan, 0), ("lqi", np.nan, 0)),  # who does not know of the delay
+        *(("delay_lqr", 225, 3), ("delay_lqi", 199, 3)),
+        *(("delay_lqi_sum", 91, 2), ("delay_lqi_200", 82, 2)),
     ],
 )
 def test_table_two_comes_out(row, error, within):
     result = run(row)
-    assert result.status == "completed"
-    assert result.accumulated_error == pytest.approx(error, abs=within)
-
-
-@pytest.mark.parametrize("row", ["lqr", "lqi"])
-def test_who_does_not_know_of_the_delay_loses_the_plate(row):
-    assert run(row).status == "left_workspace"
+    assert result.status == ("left_workspace" if np.isnan(error) else "completed")
+    assert result.accumulated_error == pytest.approx(error, abs=within, nan_ok=True)
 
 
 def test_a_multibody_plant_gives_the_same(rows):
@@ -122,11 +111,8 @@ def test_the_table_has_paper_printed_and_reproduced_beside_each_other():
 
 
 def test_it_is_shown_once_and_every_row_is_in_the_summary(short):
-    assert list(short) == [*CONTROLLERS, "delay_lqi_sum", "delay_lqi_200"]
     text = short.table()
     assert text.count("Table II") == 1 and max(map(len, text.splitlines())) <= 80
-    heads = [line for line in text.splitlines() if line.startswith("controller")]
-    assert len(heads) == 2 and "as printed" in text
     assert list(comparison_summary(short)["controllers"]) == list(short)
     table, _ = of_the_paper(short)
     assert [row[0] for row in table.rows] == [

@@ -8,7 +8,6 @@ import pytest
 import xarray as xr
 from scipy.optimize import least_squares
 
-from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.signals import TUNER_INPUTS
 from stewart_drake.tuner.network import load_network, save_network
@@ -31,7 +30,7 @@ from stewart_drake.tuning.training import (
     train_by_regret,
     unpack,
 )
-from tests.screen import too_long
+from tests.screen import said, summary_in
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -192,19 +191,15 @@ def test_the_card_tells_where_it_comes_from(trained, data, tmp_path):
 
 
 def test_labels_as_run_train_the_weights_themselves(data):
+    rows = labelled_rows(data, "as_run", "magnitude")  # none after a failure
+    assert len(rows.inputs) == data.sizes["run"] * 100 - 60 and (rows.runs == 3).sum() == 40
+    assert np.isfinite(rows.inputs).all()
     network = train(data, kind="as_run", max_rows=300, evaluations=3).network
     assert network.output == "weights"
     np.testing.assert_array_equal(network.bounds, [[0.1, 0.1], [4, 4]])
     best = train(data, max_rows=300, evaluations=3).network
     assert best.output == "log_weights"
     np.testing.assert_allclose(best.bounds, [[40**-0.5] * 2, [40**0.5] * 2])
-
-
-def test_rows_after_a_failure_are_not_trained_on(data):
-    rows = labelled_rows(data, "as_run", "magnitude")
-    assert len(rows.inputs) == data.sizes["run"] * 100 - 60
-    assert (rows.runs == 3).sum() == 40
-    assert np.isfinite(rows.inputs).all()
 
 
 @pytest.mark.parametrize("split", get_args(Split))
@@ -216,16 +211,16 @@ def test_splits_keep_together_what_belongs_together(data, split):
     assert not set(group[mask]) & set(group[~mask])
 
 
-def test_without_survivors_there_is_nothing_to_train_on(data):
+def test_data_that_cannot_be_trained_on_are_refused(data, tmp_path):
     dead = data.copy(deep=True)
     dead["accumulated_error"][:] = np.nan
-    with pytest.raises(ConfigError, match="expected more runs that complete"):
-        train(dead)
-
-
-def test_fewer_rows_than_numbers_to_find_are_refused(data):
-    with pytest.raises(ConfigError, match="100 rows are too few to train the 212 parameters"):
-        train(data, max_rows=100)
+    for call, problem in (
+        (lambda: train(dead), "expected more runs that complete"),
+        (lambda: train(data, max_rows=100), "100 rows are too few to train the 212 parameters"),
+        (lambda: train_by_regret(data, tmp_path), "has no cost curves"),
+    ):
+        with pytest.raises(ConfigError, match=problem):
+            call()
 
 
 def test_without_torch_the_message_tells_the_fix(data, monkeypatch):
@@ -261,6 +256,7 @@ def test_the_loss_is_the_regret_between_the_ratios():
     curves = synthetic()
     one = RegretTrainer(curves, 0)
     theta = initial_theta(18, 10, np.array([[0.3, -0.4]]), 5)
+    theta += 0.1 * rng(6).standard_normal(len(theta))  # biases too
     rows = feature_rows(curves)
     inputs = (rows.inputs - one.mean) / one.scale
     found = float(
@@ -310,11 +306,8 @@ def test_a_network_begins_where_it_is_asked_to(start, tmp_path):
     found = train_by_regret(family_data(curves), tmp_path, features="densities", start=start)
     expected = curves.best_ratio if start is None else start
     assert ratio_of(found.network.start) == pytest.approx(expected)
-
-
-def test_data_without_cost_curves_are_refused(data, tmp_path):
-    with pytest.raises(ConfigError, match="has no cost curves"):
-        train_by_regret(data, tmp_path)
+    # Of ratios from 10^-4 to 10^2 with w_Q w_R = 1.
+    np.testing.assert_allclose(found.network.bounds, [[0.01, 0.1], [10, 100]])
 
 
 # ---------------------------------------------------------------- the command
@@ -324,14 +317,11 @@ def test_data_without_cost_curves_are_refused(data, tmp_path):
 def test_the_command_writes_network_figures_and_summary(tmp_path, capsys):
     toy_data(cells=3).to_netcdf(tmp_path / "dataset.nc", engine="h5netcdf")
     out = tmp_path / "new" / "net.json"
-    assert main(["tune", "train", str(tmp_path), "--out", str(out), "--split", "cell"]) == 0
-    printed, err = capsys.readouterr()
-    assert err == "" and not too_long(printed)
+    said(capsys, "tune", "train", tmp_path, "--out", out, "--split", "cell")
     assert {path.name for path in out.parent.iterdir()} == {
         "net.json",
         "summary.json",
         *(f"{n}.{s}" for n in ("training_curve", "regression") for s in ("png", "svg")),
     }
-    summary = json.loads((out.parent / "summary.json").read_text())
-    assert summary["rows"]["trained_on"] <= training.MAX_ROWS
+    assert summary_in(out.parent)["rows"]["trained_on"] <= training.MAX_ROWS
     assert load_network(out).card["split"] == "cell"

@@ -135,6 +135,7 @@ def test_two_waypoints_of_a_file_are_the_minimum_jerk_motion(tmp_path):
     ("times", "poses", "parts"),
     [
         ([0, 1, 1], [HOME] * 3, ["times[2]: got 1.0 after 1.0", "increasing"]),
+        ([0, 1], [HOME] * 3, ["poses: got 3 poses", "expected 2"]),
         ([0, 1], [HOME, [0, 1.6, 0, 0, 0, 0]], ["poses[1][1]: got 1.6 rad", "90 degrees"]),
         ([0, 1], [HOME, [0, 0, 3.5, 0, 0, 0]], ["poses[1][2]: got 3.5 rad", "unwrap"]),
         ([0, 1], [HOME, [0, 0, 0, 2e3, 0, 0]], ["poses[1][3]: got 2000 m", "1000"]),
@@ -189,10 +190,10 @@ def test_a_csv_motion_is_smooth_at_its_samples_and_held_after(tmp_path):
 
 def test_units_and_the_order_of_columns_are_read_from_the_header(tmp_path):
     path = tmp_path / "a.csv"
-    rows = [f"{380 + t},{t},0,10,20,30,{t}" for t in range(5)]
+    rows = [f"{380 + t},{t},0,10,20,30,{t}" for t in range(4)]  # the least number of samples
     header = "\ufeff Z [mm], Time[s],roll[deg],pitch[deg],yaw[deg],x[mm],y[m]"
     path.write_text("\n".join([header, *rows, "", " , ", ""]), encoding="utf-8")
-    trajectory = make_reference(CsvConfig(file=str(path)), 4.0)
+    trajectory = make_reference(CsvConfig(file=str(path)), 3.0)
     expected = [0, math.radians(10), math.radians(20), 0.03, 2, 0.382]
     np.testing.assert_allclose(evaluate(trajectory, 2.0)[POSE], expected, atol=1e-12)
 
@@ -210,6 +211,7 @@ def changed(row, text):
 
 
 BAD_CSV = {
+    "empty": ("", ["is empty", "time[s]"]),
     "no header": ("\n".join(GOOD_ROWS), ["row 1", "'0.0'", "a header time[s]"]),
     "three rows": ("\n".join([HEADER, *GOOD_ROWS[:3]]), ["got 3 samples", "at least 4"]),
     "semicolons": (HEADER.replace(",", ";"), ["row 1", "separated by ';'", "expected commas"]),
@@ -217,6 +219,7 @@ BAD_CSV = {
         changed(1, "0,1,0,0,0,0,0,0,38"),
         ["7 fields in line 3, saw 9", "points for the decimals"],
     ),
+    "no units": ("time,roll,pitch,yaw,x,y,z", ["row 1", "unknown column 'time'"]),
     "odd unit": (HEADER.replace("x[m]", "x[ft]"), ["row 1", "'x[ft]'", "x in m or mm"]),
     "missing column": (HEADER.replace(",z[m]", ""), ["row 1", "column z is missing"]),
     "column twice": (HEADER.replace("y[m]", "x[mm]"), ["row 1", "a second column 'x[mm]'"]),
@@ -224,6 +227,7 @@ BAD_CSV = {
         changed(2, "0.2,0,abc,0,0,0,0.38"),
         ["row 4", "pitch[rad]", "'abc'", "a finite number"],
     ),
+    "nan": (changed(3, "0.3,0,0,nan,0,0,0.38"), ["row 5", "yaw[rad]", "nan", "finite"]),
     "late start": (changed(0, "0.05,0,0,0,0,0,0.38"), ["row 2", "time[s]", "0.05", "subtract"]),
     "time twice": (changed(2, "0.1,0,0,0,0,0,0.38"), ["row 4", "time[s]", "0.1 after 0.1"]),
     "gap": (changed(5, "9,0,0,0,0,0,0.38"), ["row 7", "time[s]", "8.6 s", "resampling"]),

@@ -81,16 +81,20 @@ def sample_in(system, context, sample):
     return np.array(system.GetOutputPort("density").Eval(context))
 
 
-def test_window_topology_and_initial_state():
+def test_ports_and_initial_states_of_window_and_tuner():
     system = DensityWindow(0.1)
-    assert ports(system) == (
-        {"measurement": 12, "reference": 18, "torque": 6},
-        {"density": 18},
-    )
+    assert ports(system) == ({"measurement": 12, "reference": 18, "torque": 6}, {"density": 18})
     assert not system.HasAnyDirectFeedthrough()
     context = system.CreateDefaultContext()
     assert np.all(np.isnan(system.window(context)))
-    assert np.all(np.isnan(system.GetOutputPort("density").Eval(context)))
+    unknown = system.GetOutputPort("density").Eval(context)
+    assert np.all(np.isnan(unknown))
+    tuner = AnnTuner(small_network(), FIXED, 0.1)
+    assert ports(tuner) == ({"density": 18}, {"weights": 2})
+    context = tuner.CreateDefaultContext()
+    tuner.GetInputPort("density").FixValue(context, unknown)
+    np.testing.assert_array_equal(tuner.GetOutputPort("weights").Eval(context), FIXED)
+    assert tuner.fallbacks(context) == 0
 
 
 @pytest.mark.parametrize("kind", ["magnitude", "signed"])
@@ -109,16 +113,6 @@ def test_window_gives_the_densities_of_the_samples_so_far(kind):
             np.testing.assert_allclose(found, expected[k], rtol=1e-9)
 
 
-def test_tuner_topology_state_and_output():
-    system = AnnTuner(small_network(), FIXED, 0.1)
-    assert ports(system) == ({"density": 18}, {"weights": 2})
-    context = system.CreateDefaultContext()
-    out = system.GetOutputPort("weights")
-    system.GetInputPort("density").FixValue(context, np.full(18, np.nan))
-    np.testing.assert_array_equal(out.Eval(context), FIXED)
-    assert system.fallbacks(context) == 0
-
-
 # ------------------------------------------------------------------ the loop
 
 
@@ -131,9 +125,11 @@ def scenario(tmp_path, network, *settings):
     return sd.load_scenario("paper", settings=["plant.kind=exact", *tuner, *settings])
 
 
-def at_samples(result):
-    """Return the signals at the controller's samples, 0.1 s apart."""
-    return result.signals.isel(time=slice(None, None, 5))
+def sampled(result):
+    """Return signals, and samples (n, 18) of errors and torques, at the controller's instants."""
+    s = result.signals.isel(time=slice(None, None, 5))  # 0.1 s apart
+    rate_error = s.rates.values - s.reference_rates.values
+    return s, np.hstack([s.error.values, rate_error, s.torque_commanded.values])
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +154,7 @@ def test_the_papers_experiment_completes_with_a_network(tuned):
 
 def test_weights_rest_on_the_samples_before(tuned):
     """w_k = tune(rho_{k-1}, w_{k-1}), w_0 = fixed; neither earlier nor later data."""
-    s, network = at_samples(tuned), small_network()
+    s, network = sampled(tuned)[0], small_network()
     weights, rho = s.weights.values, s.density.values
     np.testing.assert_array_equal(weights[0], [1.0, 1.0])
 
@@ -176,7 +172,7 @@ def test_weights_rest_on_the_samples_before(tuned):
 
 def test_the_network_in_the_loop_is_the_torch_network(tuned):
     torch = pytest.importorskip("torch")
-    s, network = at_samples(tuned), small_network()
+    s, network = sampled(tuned)[0], small_network()
     weights = s.weights.values
     twin = torch_twin(torch, network)(s.density.values[:-1])
     goal = np.clip(twin, *network.bounds)
@@ -193,9 +189,7 @@ def test_recorded_densities_are_those_of_the_recorded_signals(tmp_path, kind):
     result = sd.simulate(
         scenario(tmp_path, small_network(density=kind), *settings), judge_stability=False
     )
-    s = at_samples(result)
-    rate_error = s.rates.values - s.reference_rates.values
-    samples = np.hstack([s.error.values, rate_error, s.torque_commanded.values])
+    s, samples = sampled(result)
     expected = densities(samples, kind)
     # The reference is read 5e-15 t apart. Signed sums can cancel: a density as large as x / sum
     # multiplies what rounding leaves in the sum by itself.
@@ -204,17 +198,15 @@ def test_recorded_densities_are_those_of_the_recorded_signals(tmp_path, kind):
     assert list(s.tuner_input.values[[0, 6, 12]]) == ["error_phi", "rate_error_phi", "torque_1"]
 
 
-def subsystems(loop):
-    return {system.get_name() for system in loop.GetSystems()}
-
-
 def test_fixed_weights_stay_and_a_network_takes_their_place(tmp_path):
     fixed = scenario(tmp_path, None, "duration=1.0", "controller.w_R=3")
     result = sd.simulate(fixed, judge_stability=False)
     np.testing.assert_array_equal(result.signals.weights.values, np.tile([1.0, 3.0], (51, 1)))
     assert result.summary["counts"]["tuner_fallbacks"] == 0
-    with_network = build_closed_loop(scenario(tmp_path, small_network()))
-    assert subsystems(build_closed_loop(fixed)) ^ subsystems(with_network) == {"weights", "tuner"}
+    loops = [build_closed_loop(sc) for sc in (fixed, scenario(tmp_path, small_network()))]
+    without, parts = ({system.get_name() for system in loop.GetSystems()} for loop in loops)
+    assert without ^ parts == {"weights", "tuner"}
+    with_network = loops[1]
     tuner = with_network.GetSubsystemByName("tuner")
     sources = {
         target.get_name(): source.get_name()
@@ -251,10 +243,8 @@ def test_missed_measurements_do_not_reach_the_weights(tmp_path, monkeypatch):
     assert result.status == "completed"
     counts = result.summary["counts"]
     assert counts["bad_measurements"] == 3 and counts["tuner_fallbacks"] == 0
-    s = at_samples(result)
+    s, samples = sampled(result)
     assert np.all(np.isfinite(s.weights.values)) and np.all(np.isfinite(s.density.values))
     np.testing.assert_array_equal(s.density.values[list(missed), :12], 1.0)
-    rate_error = s.rates.values - s.reference_rates.values
-    samples = np.hstack([s.error.values, rate_error, s.torque_commanded.values])
     samples[list(missed), :12] = np.nan
     np.testing.assert_allclose(s.density.values, densities(samples), rtol=1e-6)

@@ -1,7 +1,5 @@
 """Files of 0.1 and 0.2 mean what docs/upgrading.md says of them."""
 
-import dataclasses
-
 import pytest
 
 from stewart_drake.files.errors import ConfigError
@@ -33,29 +31,16 @@ tuner: {kind: fixed, weights: null}
 """Every field of 0.1 with its default, but for `controller.estimator`, which has another name."""
 
 
-@pytest.fixture
-def old(tmp_path):
-    def load(text):
-        path = tmp_path / "old.yaml"
-        path.write_text(text)
-        return load_scenario(path)
-
-    return load
-
-
-def test_a_scenario_of_0_1_is_todays_with_all_that_is_new_at_its_default(old):
-    rounded = (
-        "reference: {amplitude: [0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08]}\n"
-        "controller: {w_R: 1.0}"
+def test_a_scenario_of_0_1_is_todays_with_all_that_is_new_at_its_default(tmp_path):
+    """But for the motion's digits; and a fraction below 1e-9 is none."""
+    (tmp_path / "old.yaml").write_text(ALL_FIELDS)
+    old, today = (
+        load_scenario(tmp_path / "old.yaml"),
+        Scenario(controller=ControllerConfig(w_R=1.0)),
     )
-    assert old(ALL_FIELDS) == old(rounded)
-    # But for the motion's digits that is the default.
-    assert old(ALL_FIELDS).reference.amplitude == pytest.approx(Scenario().reference.amplitude)
-    today = dataclasses.replace(Scenario(), controller=ControllerConfig(w_R=1.0))
-    assert dataclasses.replace(old(ALL_FIELDS), reference=Scenario().reference) == today
-
-
-def test_a_fraction_below_1e_9_is_none():
+    assert old.reference.amplitude == pytest.approx(today.reference.amplitude)
+    old.reference.amplitude = today.reference.amplitude
+    assert old == today
     assert load_scenario("paper", settings=["delay.fraction=1e-10"]).eta == 8 * 0.1
 
 
@@ -111,9 +96,6 @@ def test_an_estimator_of_0_2_is_read_as_the_list_of_what_it_finds(old, estimate)
 def test_any_part_of_the_estimates_is_accepted_and_nothing_else():
     for some in ("[payload]", "[coulomb]", "[damping, torque_bias]"):
         load_scenario("paper", settings=[f"controller.estimate={some}"])
-    for some in ("[torque_bias, payload, damping, payload]", "[speed]"):
-        with pytest.raises(ConfigError, match=r"controller\.estimate: got .*; expected \[\], or"):
-            load_scenario("paper", settings=[f"controller.estimate={some}"])
-    for wrong in ("null", "5", "none", "[5]", "[null]", "{payload: true}"):
+    for wrong in ("[torque_bias, payload, damping, payload]", "[speed]", "null", "5", "[5]"):
         with pytest.raises(ConfigError, match=r"controller\.estimate(\[0\])?: got .*; expected"):
             load_scenario("paper", settings=[f"controller.estimate={wrong}"])
