@@ -305,6 +305,11 @@ static int step(void *context, long k, const stewart_sample *measured, double *t
         sample.reference = stewart_given_rows;
         sample.context = (void *)(in->previews + STEWART_REFERENCE * in->preview_rows * k);
     }
+    if (in->servos) {
+        stewart_fill(U, 0, torque); /* replaced by that of the servos */
+        stewart_servo_step(in->servos, in->memory, in->scratch, &sample, in->report, command);
+        return 0;
+    }
     stewart_copy(2, in->weights + 2 * k, sample.weights);
     if (in->tuner) {
         stewart_tuned_step(in->law, in->tuner, in->memory, in->tuner_memory, in->scratch, &sample,
@@ -318,23 +323,6 @@ static int step(void *context, long k, const stewart_sample *measured, double *t
         sent = stewart_newest_packet(in->law->packets, in->memory + in->law->layout.channel.at);
     stewart_copy(U * in->rows, sent, command);
     return 0;
-}
-
-static int servo_step(void *context, long k, const stewart_sample *measured, double *torque,
-                      double *command)
-{
-    const stewart_servo_in_loop *in = context;
-    stewart_sample sample = *measured;
-    sample.reference = stewart_given_rows;
-    sample.context = (void *)(in->previews + STEWART_REFERENCE * k);
-    stewart_fill(U, 0, torque); /* replaced by that of the servos */
-    stewart_servo_step(in->law, in->memory, in->scratch, &sample, in->report, command);
-    return 0;
-}
-
-int stewart_closed_loop_of_servo(stewart_run *r, stewart_loop *o, stewart_servo_in_loop *law)
-{
-    return stewart_closed_loop(r, o, servo_step, law);
 }
 
 int stewart_closed_loop_of_law(stewart_run *run, stewart_loop *loop, stewart_law_in_loop *law)

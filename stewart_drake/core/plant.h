@@ -84,9 +84,10 @@ typedef struct {
     const double *rows;  /* (number, 2, 18) at both ends of each piece */
 } stewart_motion;
 
-/* The law of law.h as the controller; its memories have been started. */
+/* The law of law.h, or of servo.h without reports, as the controller; its memories have been started. */
 typedef struct {
     const stewart_law *law;
+    const stewart_servo *servos; /* or NULL */
     const stewart_tuner *tuner; /* NULL for fixed weights */
     double *memory, *tuner_memory, *scratch;
     const double *previews; /* (samples, preview_rows, 18), or NULL for the motions */
@@ -97,17 +98,8 @@ typedef struct {
     double *kept;         /* (samples, columns) result: rows of the tuner's window */
     long preview_rows, columns;
     int rows; /* torques of a command */
+    const double *report; /* of servos, of NaN */
 } stewart_law_in_loop;
-
-/* The law of servo.h as the controller of servos, without reports; its memory has been started. */
-typedef struct {
-    const stewart_servo *law;
-    double *memory, *scratch;
-    const double *previews; /* (samples, 18) */
-    const double *report;   /* of NaN */
-} stewart_servo_in_loop;
-
-int stewart_closed_loop_of_servo(stewart_run *run, stewart_loop *loop, stewart_servo_in_loop *law);
 
 /* Run under setpoints (number, 6) of servos, each from its time on (number) in s, the first one from the
    start on. Returns how the run has ended. */

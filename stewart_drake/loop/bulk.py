@@ -8,7 +8,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,10 @@ from stewart_drake.dynamics.open_loop import Ended, IntegrationError, NativePlan
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
-from stewart_drake.law.catch_up import CatchUp
 from stewart_drake.law.channel import Packets, Report
+from stewart_drake.law.compiled import Compiled
 from stewart_drake.law.counts import Counts
+from stewart_drake.law.coverage import backend
 from stewart_drake.law.coverage import uncovered as uncovered_part
 from stewart_drake.law.motion import KnownMotion, Motion, Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
@@ -31,7 +32,6 @@ from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.law_design import (
-    Sizing,
     compose_law,
     first_queue,
     followed_motion,
@@ -40,11 +40,16 @@ from stewart_drake.loop.law_design import (
     way_onto,
     white_errors,
 )
-from stewart_drake.loop.link import begun, buffer_places, measurement_link
+from stewart_drake.loop.link import begun, buffer_of, wire_of
 from stewart_drake.loop.preparation import Experiment, assemble, network_of, prepare
 from stewart_drake.loop.results import Figures, SimulationResult, accumulated_error, figures
 from stewart_drake.loop.sensor import white_noises
-from stewart_drake.loop.servos import commands_in_flight, position_servo, servo_law
+from stewart_drake.loop.servos import (
+    command_sent_last,
+    commands_in_flight,
+    position_servo,
+    servo_law,
+)
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.loop.tuner import weights_source
 from stewart_drake.mechanism.geometry import Mechanism
@@ -52,7 +57,6 @@ from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.link import (
-    SIMULTANEOUS,
     forward_times,
     measurement_times,
     torque_delays,
@@ -99,6 +103,7 @@ _NODES: Final = 5e-3
 _BEFORE: Final = 1e-12
 """Time before a node at which its values on the left are taken, s."""
 
+Made = TypeVar("Made")
 MakeTuner = Callable[[Experiment, PredictiveLqi], WeightsSource | None]
 """Returns the tuner of an experiment with a law, or None for fixed weights."""
 
@@ -135,8 +140,9 @@ def uncovered(scenario: Scenario) -> str | None:
     if found is None and servos:
         if scenario.link.kind == "network":
             return "link.kind"
-        if scenario.controller.estimate:
-            return "controller.estimate"
+        for name in ("estimate", "learned"):
+            if getattr(scenario.controller, name):
+                return f"controller.{name}"
     return found and found.field
 
 
@@ -183,10 +189,7 @@ class Preparation:
 
     def __init__(self, scenario: Scenario) -> None:
         self._base = prepare(scenario)
-        self._sizings: dict[tuple[bool, bool], Sizing] = {}
-        self._ways: dict[bytes, CatchUp | None] = {}
-        self._previews: dict[int, tuple[Trajectory, Array]] = {}
-        self._motions: dict[tuple[int, float], tuple[Trajectory, tuple[Array, Array]]] = {}
+        self._made: dict[tuple[Any, ...], Any] = {}
         self.when: Instants = instants_of(scenario.duration, scenario.controller.period)
         reference = self._base.reference
         self.references = np.array([evaluate(reference, t)[:NUM_STATE] for t in self.when.looks])
@@ -202,40 +205,41 @@ class Preparation:
             servos, motion, _ = servo_law(experiment)
             return Prepared(experiment, servos, motion, self._preview(motion, servos), None)
         white = white_errors(experiment.scenario)
-        if white not in self._sizings:
-            self._sizings[white] = sizing_of(experiment)
-        law = compose_law(experiment, self._sizings[white])
+        law = compose_law(experiment, self._once(sizing_of, experiment, key=white))
         queue = experiment.torques_in_flight(law.timeline.delay).tobytes()
-        if queue not in self._ways:
-            self._ways[queue] = way_onto(experiment, law)
-        law, motion, _ = on_its_way(law, experiment, self._ways[queue])
+        way = self._once(way_onto, experiment, law, key=queue)
+        law, motion, _ = on_its_way(law, experiment, way)
         source = (tuner or weights_source)(experiment, law)
         previews = self._preview(motion, law)
         followed = followed_motion(law, motion, experiment.reference) or ()
-        motions = tuple(self._pieces(one, followed, law.longest_plan) for one in followed)
+        until = self._read_until(law.longest_plan)
+        motions = tuple(
+            self._once(pieces_of, one, followed, until, key=(one, until)) for one in followed
+        )
         return Prepared(experiment, law, motion, previews, source, motions)
+
+    def _once(self, make: Callable[..., Made], *arguments: Any, key: Any) -> Made:
+        """Return a result that is made once for all runs with the same key."""
+        if (make.__name__, key) not in self._made:
+            self._made[make.__name__, key] = make(*arguments)
+        made: Made = self._made[make.__name__, key]
+        return made
 
     def _preview(self, motion: Trajectory, law: PredictiveLqi | ServoPreview) -> Array:
         """Return the rows (k, p, 18) of `loop.controller.Reference` at all samples."""
-        # The motion is kept too, so that no other one gets its id.
-        if id(motion) not in self._previews:
-            times = np.maximum(0.0, self.when.samples[:, None] + law.preview_times)
-            rows = [[evaluate(motion, t) for t in preview] for preview in times]
-            self._previews[id(motion)] = motion, np.array(rows)
-        return self._previews[id(motion)][1]
+        times = np.maximum(0.0, self.when.samples[:, None] + law.preview_times)
+        return self._once(_rows_at, motion, times, key=motion)
 
-    def _pieces(
-        self, motion: Trajectory, followed: tuple[Trajectory, ...], longest: float
-    ) -> tuple[Array, Array]:
-        """Return `pieces_of` a motion, as far as laws with plans of at most `longest` s read it."""
-        key = id(motion), longest
-        if key not in self._motions:
-            sc, c = self._base.scenario, self._base.scenario.controller
-            delay = (c.delay_max or 0.0) + believed_delay(sc).eta(c.period)
-            # Delay, plan and horizon are read beyond the end; estimates of the delay may be longer.
-            until = sc.duration + 2 * (delay + longest + 20 * c.period)
-            self._motions[key] = motion, pieces_of(motion, followed, until)
-        return self._motions[key][1]
+    def _read_until(self, longest: float) -> float:
+        """Return the instant up to which laws with plans of at most `longest` s read motions."""
+        sc, c = self._base.scenario, self._base.scenario.controller
+        delay = (c.delay_max or 0.0) + believed_delay(sc).eta(c.period)
+        # Delay, plan and horizon are read beyond the end; estimates of the delay may be longer.
+        return sc.duration + 2 * (delay + longest + 20 * c.period)
+
+
+def _rows_at(motion: Trajectory, times: Array) -> Array:
+    return np.array([[evaluate(motion, t) for t in preview] for preview in times])
 
 
 def pieces_of(
@@ -307,10 +311,11 @@ class Course(NamedTuple):
     asked: Array  # (k, 6) torques in N m that the law asked for there
     sent: Array  # (k, 6) the same within the limit
     stopped: Failure | None  # reason of an early end, or None
+    saturated: int  # periods in which a servo reached its limit
 
 
 class CompiledController:
-    """Law and tuner in C.
+    """Law and tuner in C, or the law for servos without estimates.
 
     Args:
         prepared: a run with a law that `law.coverage.uncovered` accepts.
@@ -318,17 +323,22 @@ class CompiledController:
         wanted: (k, 12) reference at each sample, for a tuner.
 
     Attributes:
-        weights: (k, 2) of each sample, after the run.
+        weights: (k, 2) of each sample, after the run; NaN for servos.
         rows: (k, n) of the tuner's window, after the run, see `Ending`.
     """
 
-    def __init__(self, prepared: Prepared, tuner: Any, wanted: Array) -> None:
-        c, config = core(), prepared.experiment.scenario.controller
-        self._memory = prepared.law.initial_memory(first_queue(prepared.experiment, prepared.law))
+    def __init__(self, prepared: Prepared, tuner: Compiled | None, wanted: Array) -> None:
+        c, experiment, law = core(), prepared.experiment, prepared.law
+        if isinstance(law, ServoPreview):
+            self._memory = law.initial_memory(command_sent_last(experiment, law))
+            report, weights = np.full(law.reports.size, np.nan), (np.nan, np.nan)
+        else:
+            self._memory = law.initial_memory(first_queue(experiment, law))
+            report, weights = None, experiment.scenario.controller.weights
         compiled = self._memory.compiled
-        samples = len(prepared.previews)
-        self.weights, self.rows = np.tile(config.weights, (samples, 1)), np.empty((samples, 0))
-        self._tuned, scratch = np.empty(0), compiled.scratch
+        samples, scratch = len(prepared.previews), compiled.scratch
+        self.weights, self.rows = np.tile(weights, (samples, 1)), np.empty((samples, 0))
+        self._tuned = np.zeros(3)  # two weights, fallbacks
         if tuner is not None:
             self._tuned = np.empty(c.lib.stewart_tuner_memory(tuner.it))
             c.lib.stewart_tuner_start(tuner.it, c.at(self._tuned))
@@ -338,12 +348,13 @@ class CompiledController:
             scratch = c.lib.stewart_tuned_step_scratch(compiled.data)
         previews = np.ascontiguousarray(prepared.previews)
         self._kept = prepared, tuner, previews, np.ascontiguousarray(wanted), np.empty(scratch)
+        self._report = report
         motions = [(len(rows), c.at(times), c.at(rows)) for times, rows in prepared.motions]
         planned, goal = motions or [(0, c.ffi.NULL, c.ffi.NULL)] * 2
         self.data = c.ffi.new(
             "stewart_law_in_loop *",
             {
-                "law": compiled.data,
+                "law" if report is None else "servos": compiled.data,
                 "tuner": c.ffi.NULL if tuner is None else tuner.it,
                 "memory": c.at(self._memory.data),
                 "tuner_memory": c.at(self._tuned),
@@ -351,63 +362,24 @@ class CompiledController:
                 "previews": c.ffi.NULL if prepared.motions else c.at(previews),
                 "planned": planned,
                 "goal": goal,
-                "period": config.period,
+                "period": law.timeline.period,
                 "wanted": c.at(self._kept[3]),
                 "weights": c.at(self.weights),
                 "kept": c.at(self.rows),
                 "preview_rows": previews.shape[1],
                 "columns": self.rows.shape[1],
+                "report": c.at(report),
             },
         )
 
     @property
-    def counts(self) -> dict[str, int]:
-        fallbacks = int(self._tuned[2]) if len(self._tuned) else 0  # after two weights
-        counts = self._memory.counts
-        return counts.summary() | {"tuner_fallbacks": fallbacks}
-
-
-class CompiledServo:
-    """Law for servos in C, without estimates.
-
-    Attributes:
-        weights, rows: as of `CompiledController`, NaN and empty.
-    """
-
-    def __init__(self, prepared: Prepared) -> None:
-        c, law, experiment = core(), prepared.law, prepared.experiment
-        assert isinstance(law, ServoPreview)
-        first, believed = commands_in_flight(experiment, law, law.timeline.delay)
-        self._memory = law.initial_memory(believed[-1] if len(believed) else first)
-        compiled = self._memory.compiled
-        samples = len(prepared.previews)
-        self.weights, self.rows = np.full((samples, len(WEIGHTS)), np.nan), np.empty((samples, 0))
-        previews = np.ascontiguousarray(prepared.previews)
-        scratch = np.empty(compiled.scratch)
-        self._servo, self._saturated = position_servo(experiment).compiled, 0
-        self._kept = previews, scratch, np.full(law.reports.size, np.nan)
-        self.data = c.ffi.new(
-            "stewart_servo_in_loop *",
-            {
-                "law": compiled.data,
-                "memory": c.at(self._memory.data),
-                "scratch": c.at(scratch),
-                "previews": c.at(previews),
-                "report": c.at(self._kept[2]),
-            },
-        )
+    def counts(self) -> Counts:
+        return self._memory.counts
 
     @property
-    def counts(self) -> dict[str, int]:
-        counts = self._memory.counts
-        survived = counts.plus(*["saturated_steps"] * self._saturated)
-        return survived.summary() | {"tuner_fallbacks": 0}
-
-    def run(self, plant: NativePlant, loop: Any) -> Ended:
-        loop.servo = self._servo
-        ended = plant.call("closed_loop_of_servo", loop, self.data)
-        self._saturated = loop.saturated
-        return ended
+    def fallbacks(self) -> int:
+        """Samples at which the tuner failed."""
+        return int(self._tuned[2])
 
 
 Controller = Callable[[int, Measurement, Report | None], tuple[Array, Array]]
@@ -453,15 +425,19 @@ class PythonController:
         return after.torque, after.sent.packets[-1] if packets else after.torque[None]
 
     @property
-    def counts(self) -> dict[str, int]:
-        fallbacks = 0 if self._tuned is None else self._tuned.fallbacks
-        return self._memory.counts.summary() | {"tuner_fallbacks": fallbacks}
+    def counts(self) -> Counts:
+        counts: Counts = self._memory.counts
+        return counts
+
+    @property
+    def fallbacks(self) -> int:
+        return 0 if self._tuned is None else int(self._tuned.fallbacks)
 
 
 def run_loop(
     experiment: Experiment,
     when: Instants,
-    controller: CompiledController | CompiledServo | Controller,
+    controller: CompiledController | Controller,
     law: PredictiveLqi | ServoPreview | None = None,
 ) -> Course:
     """Run an experiment to its end.
@@ -484,17 +460,18 @@ def run_loop(
     drawn = noise * white_noises(sensor.seed, number) if noise.any() else None
     channel = law.channel if isinstance(law, PredictiveLqi) else None
     packets = channel if isinstance(channel, Packets) else None
-    link, memory, transit = _link(experiment, law, number)
+    rows, repeats = (1, 0) if packets is None else (len(packets.in_time), packets.repeats)
+    link, memory, transit = _link(experiment, law, number, rows)
+    servos = None
+    if isinstance(law, ServoPreview):
+        rows, servos = NUM_REFERENCE // NUM_TORQUES, position_servo(experiment).compiled
     reports = link.history if packets is not None and sc.link.acknowledged else 0
     late = np.zeros(number)
     if sensor.delay or sensor.loss or sc.link.back is not None:
         late = _padded(measurement_times(sc), number)
     size = NUM_STATE + (1 + NUM_TORQUES) * reports
-    back = measurement_link(sc.controller.period, late, size)
+    back = wire_of(size, sc.controller.period, late)
     back_memory = back.start()
-    rows, repeats = (1, 0) if packets is None else (_rows(packets), packets.repeats)
-    if isinstance(law, ServoPreview):
-        rows = NUM_REFERENCE // NUM_TORQUES
     scratch = np.empty(size + NUM_TORQUES * rows)
     measured, asked = np.empty((number, NUM_STATE)), np.empty((number, NUM_TORQUES))
     loop = c.ffi.new(
@@ -519,6 +496,7 @@ def run_loop(
             "push_from": sc.plant.push.start,
             "push_to": sc.plant.push.end,
             "wrench": c.at(plant.wrench),
+            "servo": servos or c.ffi.NULL,
             "scratch": c.at(scratch),
             "measured": c.at(measured),
             "asked": c.at(asked),
@@ -527,8 +505,6 @@ def run_loop(
     if isinstance(controller, CompiledController):
         controller.data.rows = rows
         ended = plant.call("closed_loop_of_law", loop, controller.data)
-    elif isinstance(controller, CompiledServo):
-        ended = controller.run(plant, loop)
     else:
         ended = _call_back(plant, loop, controller)
     if ended == Ended.TOO_SHORT_STEPS:
@@ -538,19 +514,15 @@ def run_loop(
         stopped = diagnose(experiment.truth, plant.time, plant.final[POSE])
     measured, asked = measured[: loop.taken], asked[: loop.taken]
     sent = np.clip(asked, -experiment.torque_limit, experiment.torque_limit)
-    return Course(plant.states[: plant.seen], measured, asked, sent, stopped)
-
-
-def _rows(packets: Packets) -> int:
-    return packets.repeats + packets.torques
+    return Course(plant.states[: plant.seen], measured, asked, sent, stopped, loop.saturated)
 
 
 def _link(
-    experiment: Experiment, law: PredictiveLqi | ServoPreview | None, number: int
+    experiment: Experiment, law: PredictiveLqi | ServoPreview | None, number: int, rows: int
 ) -> tuple[Link, Array, Array]:
     """Return the link to the motors, its memory at t = 0, and the transit times (number,) in s.
 
-    The link is a wire or a play-out buffer, as in `loop.link`.
+    Packets have a number of `rows`.
     """
     sc, delay = experiment.scenario, experiment.scenario.true_delay
     period, size = sc.controller.period, NUM_TORQUES
@@ -559,25 +531,14 @@ def _link(
         size, limit = NUM_REFERENCE, np.inf
     else:
         queue, limit = experiment.torques_in_flight(delay), experiment.torque_limit
-    more: dict[str, Any] = {}
     if sc.link.kind == "network":
-        transit, rows = _padded(forward_times(sc, number), number), 1
-        more["hold_when_dry"] = sc.link.dry == "hold"
-        if isinstance(law, PredictiveLqi):
-            more["history"] = reported(law.kept)
-            rows = _rows(law.channel) if isinstance(law.channel, Packets) else 1
-        kept = buffer_places(delay, rows)
+        history = reported(law.kept) if isinstance(law, PredictiveLqi) else 1
+        transit = _padded(forward_times(sc, number), number)
+        link = buffer_of(period, delay, rows, sc.link.dry, history, limit)
     else:
         drawn = [delay.eta(period)] if sc.delay.constant else torque_delays(sc)
         transit = np.array(drawn)[np.minimum(np.arange(number), len(drawn) - 1)]
-        kept = len(queue) + int(transit.max(initial=0.0) / period) + 2
-    link = Link(
-        *(size, kept, period),
-        is_wire=sc.link.kind == "wire",
-        time_tolerance=SIMULTANEOUS * period,
-        limit=limit,
-        **more,
-    )
+        link = wire_of(size, period, transit, len(queue), limit)
     return link, begun(link, delay, period, queue), transit
 
 
@@ -658,30 +619,28 @@ def _refused_start(experiment: Experiment) -> Ending | None:
     failure = diagnose(experiment.truth, 0.0, experiment.start[POSE])
     if failure is None:
         return None
-    counts = Counts().summary() | {"tuner_fallbacks": 0}
-    unknown = Figures(*[np.nan] * len(Figures._fields))
+    counts, unknown = _summary(Counts()), Figures(*[np.nan] * len(Figures._fields))
     samples, weights, rows = (np.empty((0, n)) for n in (len(TUNER_INPUTS), len(WEIGHTS), 0))
     return Ending("left_workspace", failure, unknown, counts, samples, np.nan, weights, rows, "")
+
+
+def _summary(counts: Counts, fallbacks: int = 0) -> dict[str, int]:
+    return counts.summary() | {"tuner_fallbacks": fallbacks}
 
 
 def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
     """Run a prepared run in C, with law and tuner in C if the core has all their parts."""
     law, when, source = prepared.law, preparation.when, prepared.tuner
-    wanted = preparation.references[when.sampled]
-    field, tuner = uncovered_part(law), None if source is None else source.compiled
-    experiment = prepared.experiment
-    controller: CompiledController | CompiledServo | PythonController
-    if isinstance(law, ServoPreview):
-        loop, controller = "native", CompiledServo(prepared)
-        course = run_loop(experiment, when, controller, law)
-    elif field is None:
-        loop, controller = "native", CompiledController(prepared, tuner, wanted)
-        course = run_loop(experiment, when, controller, law)
-    else:
-        loop = f"native, {field} in Python"
+    wanted, experiment = preparation.references[when.sampled], prepared.experiment
+    controller: CompiledController | PythonController
+    if uncovered_part(law) is not None:
         controller = PythonController(prepared, when, wanted)
         with one_blas_thread:
             course = run_loop(experiment, when, controller, law)
+    else:
+        tuner = None if source is None else source.compiled
+        controller = CompiledController(prepared, tuner, wanted)
+        course = run_loop(experiment, when, controller, law)
     looked = len(course.states)
     error = course.states[:, POSE] - preparation.references[:looked, POSE]
     grid, sampled = when.on_grid[:looked], when.sampled[:looked]
@@ -696,12 +655,14 @@ def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
         status="completed" if done else "left_workspace",
         stopped=course.stopped,
         figures=found,
-        counts=controller.counts,
+        counts=_summary(
+            controller.counts.plus(*["saturated_steps"] * course.saturated), controller.fallbacks
+        ),
         samples=np.hstack([measured - wanted[:taken], asked]),
         error_so_far=accumulated_error(time, error[grid], experiment.scale),
         weights=weights.reshape(taken, len(WEIGHTS)),
         rows=rows.reshape(taken, rows.size // max(taken, 1)),
-        loop=loop,
+        loop=backend(law),
     )
 
 

@@ -36,6 +36,7 @@ from stewart_drake.loop.push import Push
 from stewart_drake.loop.servos import (
     PositionServos,
     Servos,
+    command_sent_last,
     commands_in_flight,
     position_servo,
     servo_law,
@@ -211,11 +212,10 @@ def _add_servos(builder: DiagramBuilder, experiment: Experiment) -> float:
         hint = ", or a machine and live, which send plans of setpoints over a network"
         raise ConfigError(found.problem("with servos in a simulation", hint))
     law, planned, catch_up = servo_law(experiment)
-    first, believed = commands_in_flight(experiment, law, law.timeline.delay)
-    last = believed[-1] if len(believed) else first
+    last = command_sent_last(experiment, law)
     builder.AddNamedSystem("controller", ServoController(law, last))
     _add_reference(builder, experiment, planned, law.preview_times)
-    _, in_flight = commands_in_flight(experiment, law, sc.true_delay)
+    first, in_flight = commands_in_flight(experiment, law, sc.true_delay)
     builder.AddNamedSystem("delay_chain", wire(experiment, in_flight, "command"))
     rest = machine, first, sc.controller.period, law.reports
     servos: Servos | PositionServos

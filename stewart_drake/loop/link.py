@@ -5,6 +5,7 @@ Those of a link come slightly earlier (`scenario.timing.event_time`), the first 
 plant that steps at t feels the torque released at t.
 """
 
+import math
 from abc import abstractmethod
 from typing import Final, Literal
 
@@ -89,16 +90,39 @@ def begun(link: Link, delay: Delay, period: float, queue: Array) -> Array:
     return memory
 
 
+def wire_of(
+    size: int, period: float, times: Array, queue: int = 0, limit: float = math.inf
+) -> Link:
+    """Return a wire for commands (size,) with transit times in s, and a queue at t = 0."""
+    longest = times.max(initial=0.0, where=np.isfinite(times))
+    places, tolerance = queue + int(longest / period) + 2, SIMULTANEOUS * period
+    return Link(size, places, period, is_wire=True, time_tolerance=tolerance, limit=limit)
+
+
+def buffer_of(
+    period: float, delay: Delay, rows: int, dry: str, history: int, limit: float = math.inf
+) -> Link:
+    """Return a buffer for packets of `rows` torques; see `PlayoutBuffer`."""
+    places = (delay.steps + rows + 2) * rows  # a packet counts until its last row was due
+    return Link(
+        *(NUM_TORQUES, places + delay.queue_length, period),
+        is_wire=False,
+        hold_when_dry=dry == "hold",
+        history=history,
+        time_tolerance=SIMULTANEOUS * period,
+        limit=limit,
+    )
+
+
 class Wire(LinkSystem):
     """A link on which every command acts when it arrives."""
 
-    def _lay(self, period: float, kept: int, delay: Delay, queue: Array, carries: Carried) -> None:
-        """Declare ports and state, with places for `kept` commands beyond the queue."""
+    def _lay(
+        self, period: float, times: Array, delay: Delay, queue: Array, carries: Carried
+    ) -> None:
+        """Declare ports and state, for transit times in s."""
         one_of("carries", carries, list(CARRIED))
-        kept += delay.queue_length
-        link = Link(
-            CARRIED[carries], kept, period, is_wire=True, time_tolerance=SIMULTANEOUS * period
-        )
+        link = wire_of(CARRIED[carries], period, times, delay.queue_length)
         self._begin(link, period, 1, delay, queue)
         self._put_out(carries, slice(1, None))
         if carries == "command":
@@ -146,7 +170,7 @@ class DelayChain(Wire):
     ) -> None:
         super().__init__()
         period, self._delay = positive("period", period), Delay(steps, fraction)
-        self._lay(period, steps + 2, self._delay, queue, carries)
+        self._lay(period, np.array([self._delay.eta(period)]), self._delay, queue, carries)
         if fraction > 0:
             self.DeclarePeriodicUnrestrictedUpdateEvent(
                 event_time(period), event_time(fraction * period), weak(self._release)
@@ -203,8 +227,7 @@ class VaryingDelay(Wire):
         super().__init__()
         period, delays = positive("period", period), _times("delays", delays, 1)
         self._delays = np.where(delays > SIMULTANEOUS * period, delays, 0.0)
-        longest = self._delays.max(initial=0.0, where=np.isfinite(delays))
-        self._lay(period, int(longest / period) + 2, delay, queue, carries)
+        self._lay(period, self._delays, delay, queue, carries)
         ticket = self.discrete_state_ticket(self._memory)
         self.DeclareVectorOutputPort("delay", 1, weak(self._delay), {ticket})
         declare_constant(self, "packets", np.full(len(PACKETS), np.nan))
@@ -277,14 +300,7 @@ class PlayoutBuffer(LinkSystem):
         self._repeats, history = whole("repeats", repeats, 0), whole("history", history, 1)
         one_of("dry", dry, ("hold", "zero"))
         self._arrivals = period * np.arange(len(times)) + times
-        link = Link(
-            *(NUM_TORQUES, buffer_places(delay, rows), period),
-            is_wire=False,
-            hold_when_dry=dry == "hold",
-            history=history,
-            time_tolerance=SIMULTANEOUS * period,
-        )
-        self._begin(link, period, rows, delay, queue)
+        self._begin(buffer_of(period, delay, rows, dry, history), period, rows, delay, queue)
         self._put_out("torque", slice(1, None))
         declare_constant(self, "delay", np.array([delay.eta(period)]))
         memory, timed = self.discrete_state_ticket(self._memory), self.time_ticket()
@@ -335,11 +351,6 @@ class PlayoutBuffer(LinkSystem):
         output.SetFromVector(np.concatenate([flags, past.ravel()]))
 
 
-def buffer_places(delay: Delay, rows: int) -> int:
-    """Return the places of a play-out buffer: a packet counts until its last row was due."""
-    return (delay.steps + rows + 2) * rows + delay.queue_length
-
-
 class LateMeasurements(LeafSystem):
     """Passes on, at each sample, the newest measurement that has arrived since the one before.
 
@@ -365,8 +376,7 @@ class LateMeasurements(LeafSystem):
     def __init__(self, period: float, times: Array, size: int) -> None:
         super().__init__()
         self._times, self._period = _times("times", times), positive("period", period)
-        whole("size", size, 1)
-        self._link = measurement_link(period, self._times, size)
+        self._link = wire_of(whole("size", size, 1), period, self._times)
         self._memory = self.DeclareDiscreteState(self._link.start())
         self._measured = self.DeclareVectorInputPort("measured", size)
         self.DeclareVectorOutputPort("measurement", size, weak(self._measurement))
@@ -403,10 +413,3 @@ class LateMeasurements(LeafSystem):
         memory = self._now(context)
         behind = self._link.number(memory, "offered") - self._link.number(memory, "newest")
         output.SetFromVector([0.0 if self._given(memory) is None else behind * self._period])
-
-
-def measurement_link(period: float, times: Array, size: int) -> Link:
-    """Return the link for measurements (size,) with transit times in s."""
-    longest = times.max(initial=0.0, where=np.isfinite(times))
-    tolerance = SIMULTANEOUS * period
-    return Link(size, int(longest / period) + 2, period, is_wire=True, time_tolerance=tolerance)

@@ -402,3 +402,9 @@ def commands_in_flight(
         law = replace(law, feedforward=NoFeedforward())
     commands = np.array([law.command(x, law.plant.dynamics.parameters) for x in wanted])
     return commands[0], commands[1:]
+
+
+def command_sent_last(experiment: Experiment, law: ServoPreview) -> Array:
+    """Return the last command (18,) before t = 0, for the delay that the law assumes."""
+    first, flying = commands_in_flight(experiment, law, law.timeline.delay)
+    return flying[-1] if len(flying) else first
