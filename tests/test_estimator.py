@@ -72,7 +72,7 @@ def transition(dynamics, xi, period):
     until, scratch = c.ffi.new("stewart_schedule *", schedule), c.lib.stewart_transitions_scratch(8)
     machine = machine_of(NominalPlant(dynamics, 1, np.inf, TorqueLimit()))
     c.lib.stewart_predict(machine.it, c.at(xi[12:]), until, c.at(xi), c.at(states))
-    along = c.at(xi), until, 1, c.at(states), c.at(H)
+    along = c.at(xi), until, 1, c.at(states), H[0].size, c.at(H)
     assert c.lib.stewart_transitions(machine.it, *along, c.scratch(scratch))
     F[:12] = H[-1]
     return states[-1], F

@@ -109,8 +109,7 @@ static int predict(const stewart_period *t, const real *xi, Path *path, real *st
 
 int stewart_period_scratch(int p, int flights)
 {
-    return 2 * (U + 1) * (flights + 3) + MOST * X * (X + p) + X + p + 2
-        + stewart_transitions_scratch(p);
+    return 2 * (U + 1) * (flights + 3) + X * (X + p) + X + p + 2 + stewart_transitions_scratch(p);
 }
 
 int stewart_delay_advance_scratch(int p, int m, int flights)
@@ -136,13 +135,13 @@ static int linearize_along(const stewart_period *t, const real *xi, const Path *
 {
     const int n = size_of(t->delay), known = n - 2;
     const stewart_schedule schedule = {path->number, path->torques, path->durations, 0};
-    real *all = stewart_take(&scratch, MOST * X * known), *moved = stewart_take(&scratch, n);
+    real *by_known = stewart_take(&scratch, X * known), *moved = stewart_take(&scratch, n);
     real later[X], sooner[X];
-    if (!stewart_transitions(t->delay->machine, xi, &schedule, fourth_order, path->states, all,
+    if (!stewart_transitions(t->delay->machine, xi, &schedule, fourth_order, path->states, 0, by_known,
                              scratch))
         return 0;
     for (int i = 0; i < X; i++) {
-        stewart_copy(known, all + X * known * (path->number - 1) + known * i, H + n * i);
+        stewart_copy(known, by_known + known * i, H + n * i);
         H[n * i + STEWART_ETA(n)] = H[n * i + STEWART_RATE(n)] = 0;
     }
     if (!(xi[STEWART_ETA(n)] < STEWART_NEVER))

@@ -85,7 +85,7 @@ static int along(Legs *s, const real *xi, stewart_scratch scratch)
     const stewart_encoders *encoders = s->encoders;
     const int n = a->n, last = s->coarse.number - 1;
     stewart_predict(f->machine, xi + X, &s->coarse, xi, s->states);
-    if (!stewart_transitions(f->machine, xi, &s->coarse, s->coarse.number <= 2, s->states, s->H,
+    if (!stewart_transitions(f->machine, xi, &s->coarse, s->coarse.number <= 2, s->states, X * n, s->H,
                              scratch))
         return 0;
     stewart_copy(X, s->states + X * last, a->end);

@@ -99,8 +99,8 @@ static int predict(void *context, const real *xi, real *end)
 static int linearize(void *context, const real *xi, real *H, stewart_scratch scratch)
 {
     Sample *s = context;
-    return stewart_transition(s->attempt->filter->machine, xi, &s->attempt->period->schedule,
-                              s->fourth_order, s->states, H, scratch);
+    return stewart_transitions(s->attempt->filter->machine, xi, &s->attempt->period->schedule,
+                               s->fourth_order, s->states, 0, H, scratch);
 }
 
 /* Predict and linearise from the prior's mean, or copy the last result from `kept` if the mean is the same. */

@@ -5,11 +5,6 @@
 
 #define MAX_ACTIVE STEWART_MAX_BOUNDED
 #define BOUND_TOLERANCE ((real)1e-9) /* standard deviations out of bounds that are rounding */
-#ifdef STEWART_FLOAT
-#define ROUNDING ((real)1e-5) /* of a variance, as a share */
-#else
-#define ROUNDING ((real)1e-13)
-#endif
 
 /* A reflection of one column x of [row; W], rows of W being n numbers apart, by v = [v; f]:
 
@@ -122,30 +117,6 @@ void stewart_widen_root(int n, const real *jump, real *L, stewart_scratch scratc
     for (int i = 0; i < X; i++)
         same[(n + 1) * i] = 1;
     stewart_root_of_prediction(n, same, none, jump, 0, NULL, L, scratch);
-}
-
-int stewart_root(int n, real *P)
-{
-    for (int j = 0; j < n; j++) {
-        real *row = P + n * j, left = row[j], scale = 0;
-        const real least = ROUNDING * row[j];
-        for (int k = 0; k < j; k++)
-            left -= row[k] * row[k];
-        if (!(left >= -least)) /* or NaN */
-            return 0;
-        if (left > least)
-            scale = 1 / REAL(sqrt)(left);
-        row[j] = scale > 0 ? REAL(sqrt)(left) : 0;
-        for (int i = j + 1; i < n; i++) {
-            real *below = P + n * i, sum = below[j];
-            for (int k = 0; k < j; k++)
-                sum -= below[k] * row[k];
-            below[j] = sum * scale;
-        }
-        for (int i = j + 1; i < n; i++)
-            row[i] = 0;
-    }
-    return stewart_all_finite(n * n, P);
 }
 
 static real clipped(real x, real lower, real upper)

@@ -50,11 +50,6 @@ void stewart_root_of_prediction(int n, const real *H, const real *std, const rea
 /* L (n, n) <- root of L L' + diag(0, jump)^2 with jump (n - 12). Scratch: 2 n n + 12 n numbers. */
 void stewart_widen_root(int n, const real *jump, real *L, stewart_scratch scratch);
 
-/* P (n, n) <- L, lower triangular with L L' = P, which is symmetric and may be singular: a component
-   that those before it determine has a column of zeros. Returns 0 for NaN, or a variance below 0 by more
-   than rounding. */
-int stewart_root(int n, real *P);
-
 /* Compute the mean within bounds that is nearest to `mean` in the metric of the covariance L L'. Returns 0
    for NaN, or if a component without variance is out of bounds.
    Scratch: n + STEWART_MAX_BOUNDED^2 numbers. */

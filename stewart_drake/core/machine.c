@@ -211,9 +211,8 @@ static int transition_of_hold(const stewart_machine *machine, const stewart_beli
     return 1;
 }
 
-/* See `stewart_transitions`, with the H of each torque `next` numbers after that of the one before. */
-static int transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
-                       int fourth_order, const real *states, int next, real *H, stewart_scratch scratch)
+int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
+                        int fourth_order, const real *states, int next, real *H, stewart_scratch scratch)
 {
     const int p = machine->estimated, n = X + p;
     real *Phi = stewart_take(&scratch, X * X), *S = stewart_take(&scratch, X * p);
@@ -238,18 +237,6 @@ static int transitions(const stewart_machine *machine, const real *xi, const ste
         stewart_copy(X * n, H, before);
     }
     return 1;
-}
-
-int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
-                        int fourth_order, const real *states, real *H, stewart_scratch scratch)
-{
-    return transitions(machine, xi, schedule, fourth_order, states, X * (X + machine->estimated), H, scratch);
-}
-
-int stewart_transition(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
-                       int fourth_order, const real *states, real *H, stewart_scratch scratch)
-{
-    return transitions(machine, xi, schedule, fourth_order, states, 0, H, scratch);
 }
 
 int stewart_transitions_scratch(int p)

@@ -83,14 +83,11 @@ int stewart_derivatives(const stewart_machine *machine, const stewart_belief *be
                         const real *state, const real *torque, real *A, real *B, real *G,
                         stewart_scratch scratch);
 
-/* First 12 rows H (number, 12, 12 + p) of F = [Phi S; 0 1] from xi = [state; theta] to the end of each
-   torque, along the `states` of `stewart_predict` from xi. `fourth_order`: Magnus steps of fourth
-   order, else the midpoint rule, of second order. Returns 0 where they do not exist. */
+/* First 12 rows H (12, 12 + p) of F = [Phi S; 0 1] from xi = [state; theta] to the end of each torque,
+   `next` numbers apart, or with next = 0 to the end of the last torque alone; along the `states` of
+   `stewart_predict` from xi. `fourth_order`: Magnus steps of fourth order, else the midpoint rule, of
+   second order. Returns 0 where they do not exist. */
 int stewart_transitions(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
-                        int fourth_order, const real *states, real *H, stewart_scratch scratch);
-
-/* The same to the end of the last torque alone, H (12, 12 + p). */
-int stewart_transition(const stewart_machine *machine, const real *xi, const stewart_schedule *schedule,
-                       int fourth_order, const real *states, real *H, stewart_scratch scratch);
+                        int fourth_order, const real *states, int next, real *H, stewart_scratch scratch);
 
 int stewart_transitions_scratch(int estimated);

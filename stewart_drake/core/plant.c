@@ -14,15 +14,6 @@
 
 const char *stewart_source(void) { return SOURCE; }
 
-void stewart_steps(const stewart_plant *plant, long number, const double *state,
-                   const double *torques, const double *h, double *states)
-{
-    for (long k = 0; k < number; k++, state = states, states += X) {
-        stewart_copy(X, state, states);
-        stewart_move(plant, torques + U * k, h[k], states);
-    }
-}
-
 /* The plant of a run under its torque; `drive` gives a torque that changes with time, else NULL. */
 typedef struct {
     stewart_run *run;

@@ -15,10 +15,6 @@
 /* Hash of the source that this library was compiled from. */
 const char *stewart_source(void);
 
-/* States (number, 12) after Runge-Kutta steps of h (number) seconds under torques (number, 6). */
-void stewart_steps(const stewart_plant *plant, long number, const double *state,
-                   const double *torques, const double *h, double *states);
-
 enum { STEWART_INSIDE, STEWART_LEFT, STEWART_TOO_SHORT_STEPS, STEWART_CONTROLLER_FAILED };
 
 /* One run. The state is the start, then the last one. */

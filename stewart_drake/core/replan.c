@@ -26,17 +26,11 @@ static int most_pieces(const stewart_law *law)
 
 static int replan_memory(const stewart_law *law) { return PATH + PIECE * most_pieces(law); }
 
-static int sure_scratch(int estimated, int torques)
-{
-    const int n = X + estimated;
-    return X * n * torques + n + stewart_transitions_scratch(estimated);
-}
-
 static int replan_scratch(const stewart_law *law)
 {
     const stewart_replan *replan = law->planning;
     const int p = law->machine.estimated;
-    const int judged = (X + p) * (X + p) + sure_scratch(p, replan->until);
+    const int judged = (X + p) * (X + p + X + 1) + stewart_transitions_scratch(p);
     const int planned = PIECE * most_pieces(law) + stewart_plan_scratch(law->period, replan->most);
     return X * (replan->until + 1) + (judged > planned ? judged : planned);
 }
@@ -103,20 +97,20 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
 static int is_sure(const stewart_machine *machine, const stewart_schedule *schedule, const real *states,
                    const real *theta, const real *L, const real *size, real sure, stewart_scratch scratch)
 {
-    const int p = machine->estimated, n = X + p, last = schedule->number - 1;
-    real *H = stewart_take(&scratch, X * n * schedule->number), *xi = stewart_take(&scratch, n);
-    if (last < 0)
+    const int p = machine->estimated, n = X + p;
+    real *H = stewart_take(&scratch, X * n), *xi = stewart_take(&scratch, n);
+    if (schedule->number == 0)
         return 1;
     stewart_copy(X, states, xi);
     stewart_copy(p, theta, xi + X);
-    if (!stewart_transitions(machine, xi, schedule, 0, states + X, H, scratch))
+    if (!stewart_transitions(machine, xi, schedule, 0, states + X, 0, H, scratch))
         return 0;
     for (int i = 0; i < 6; i++) {
         real variance = 0;
         for (int j = 0; j < n; j++) {
             real part = 0; /* (H L)_ij */
             for (int k = 0; k < n; k++)
-                part += H[X * n * last + n * i + k] * L[n * k + j];
+                part += H[n * i + k] * L[n * k + j];
             variance += part * part;
         }
         if (!(REAL(sqrt)(variance) <= sure * size[i])) /* or NaN */

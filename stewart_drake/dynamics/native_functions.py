@@ -183,8 +183,9 @@ class NativeFunctions:
         c, states = core(), np.empty((len(torques), NUM_STATE))
         given = state, torques, parameters, [gravity], h
         x, held, p, g, steps = (c.at(np.array(one, np.float64, order="C")) for one in given)
-        plant = c.plant(self._first, p, g)
-        c.lib.stewart_steps(plant, len(states), x, held, steps, c.at(states))
+        plant, every = c.plant(self._first, p, g), c.at(np.arange(len(states), dtype=np.intc))
+        given = steps, held, held, every, x, c.at(states), c.ffi.NULL
+        c.lib.stewart_shoot(plant, 0, len(states), *given)
         return states
 
 

@@ -49,13 +49,18 @@ class Estimate:
     @property
     def covariance_root(self) -> Array:
         """A root L (12 + p, 12 + p) of the covariance, L L'."""
-        w, V = np.linalg.eigh(self.covariance)
-        return np.asarray(V * np.sqrt(np.maximum(w, 0.0)))
+        return root_of(self.covariance)
 
     @property
     def uncertain(self) -> bool:
         """Whether there is a covariance."""
         return not np.isnan(self.covariance[0, 0])
+
+
+def root_of(covariance: Array) -> Array:
+    """Return a root L (n, n) of a covariance that may be singular, L L'."""
+    w, V = np.linalg.eigh(covariance)
+    return np.asarray(V * np.sqrt(np.maximum(w, 0.0)))
 
 
 class Innovations(NamedTuple):

@@ -116,7 +116,7 @@ class HoldModel:
         for j, (state, torque) in enumerate(zip(states[:-1], torques, strict=True)):
             self._xi[:NUM_STATE], self._torques[:] = state, torque
             lib.stewart_predict(self._machine, theta, self._parts, xi, at)
-            given = self._machine, xi, self._parts, 0, at, maps, self._scratch
+            given = self._machine, xi, self._parts, 0, at, NUM_STATE * size, maps, self._scratch
             if not lib.stewart_transitions(*given):
                 raise ArithmeticError("plan: no derivatives at a state of it")
             ends[j], H[j] = self._states, self._H
@@ -167,15 +167,14 @@ def pose_root(
         return np.zeros((NUM_COORDINATES, 1))
     H = np.eye(len(mean))[:NUM_STATE]
     if number:
-        c, maps = core(), np.empty((number, NUM_STATE, len(mean)))
+        c, H = core(), np.empty((NUM_STATE, len(mean)))
         given = [numbers(a) for a in (mean, states, *schedule)]
         xi, after, torques, durations = map(c.at, given)
         until = c.ffi.new("stewart_schedule *", [number, torques, durations, 0])
         scratch = c.scratch(c.lib.stewart_transitions_scratch(len(belief.parameters)))
-        arrays = until, 0, after, c.at(maps), scratch
+        arrays = until, 0, after, 0, c.at(H), scratch
         if not c.lib.stewart_transitions(machine_of(plant).it, xi, *arrays):
             raise ArithmeticError("prediction: no derivatives at a state of it")
-        H = maps[-1]
     return np.asarray(H[POSE] @ belief.estimate.covariance_root)
 
 

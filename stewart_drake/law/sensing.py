@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.core.library import core
 from stewart_drake.files.arguments import fixed, whole
+from stewart_drake.law.belief import root_of
 from stewart_drake.law.compiled import Compiled, Once, Out, call_back, geometry, numbers
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_LEGS, NUM_STATE
@@ -192,10 +193,13 @@ def described(sensing: Sensing, mechanism: Mechanism) -> Compiled:
 
     def start(_: Any, values: Array, near: Array | None, state: Array, root: Array, __: Any) -> int:
         first = sensing.start(Measurement.of(values), near)
-        if first is None:
+        if first is None or not np.isfinite(first.covariance).all():
             return 0
-        state[:], root[:] = first.state, np.ravel(first.covariance)
-        return int(c.lib.stewart_root(NUM_STATE, c.at(root)))
+        least, *_, most = np.linalg.eigvalsh(first.covariance)
+        if least < -ROUNDING * most:
+            return 0
+        state[:], root[:] = first.state, np.ravel(root_of(first.covariance))
+        return 1
 
     def fault(_: Any, __: Any, period: float, values: Array, last: Array) -> int:
         found = sensing.fault(Measurement.of(values), last, period, mechanism)
@@ -213,6 +217,8 @@ def described(sensing: Sensing, mechanism: Mechanism) -> Compiled:
     return Compiled(it, (noise, *kept), (raised,))
 
 
+ROUNDING = 1e-13
+"""Largest negative variance of a covariance, as a share of its largest one."""
 NODES = 3
 """Largest number of nodes per period."""
 FINEST = 1e-7
