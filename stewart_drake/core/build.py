@@ -15,6 +15,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parent
@@ -39,6 +40,7 @@ FLAGS = (
     *("-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"),
     *("-fPIC", "-shared", "-fno-semantic-interposition"),
 )
+_DEFINITION = r"^[a-z][\w ]+[ *](stewart_\w+)(?:\(| =)"
 SOURCES = sorted(str(path) for path in FOLDER.glob("*.c"))
 
 
@@ -127,6 +129,28 @@ def _include(name: str, headers: dict[str, str]) -> None:
 
 def _is_directive(line: str) -> bool:
     return line.startswith("#") and not re.fullmatch(r"#define \w+ +\d+ *", line)
+
+
+def sources_of(symbols: Iterable[str]) -> list[str]:
+    """Return the files that define functions or tables, with all files that these need."""
+    texts = {path.name: path.read_text("utf-8") for path in sorted(FOLDER.glob("*.[ch]"))}
+    code = {name: re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL) for name, text in texts.items()}
+    defined = {
+        symbol: name
+        for name in code
+        if name.endswith(".c")
+        for symbol in re.findall(_DEFINITION, code[name], re.MULTILINE)
+    }
+    found, left = dict[str, None](), [defined[symbol] for symbol in symbols]
+    while left:
+        name = left.pop()
+        if name not in found:
+            found[name] = None
+            left += re.findall(r'#include "(.*)"', code[name])
+            if name.endswith(".c"):
+                used = re.findall(r"\bstewart_\w+", code[name])
+                left += [defined[symbol] for symbol in used if symbol in defined]
+    return list(found)
 
 
 def declare(target: Path) -> None:

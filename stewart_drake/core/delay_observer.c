@@ -24,14 +24,14 @@ static void sizes_of(const stewart_law *law, Sizes *s)
     s->numbers = stewart_delay_size(s->p, s->m, s->flights);
 }
 
-int stewart_delayed_memory(const stewart_law *law)
+static int delayed_memory(const stewart_law *law)
 {
     Sizes s;
     sizes_of(law, &s);
     return s.numbers + s.m + X;
 }
 
-int stewart_delayed_scratch(const stewart_law *law)
+static int delayed_scratch(const stewart_law *law)
 {
     Sizes s;
     sizes_of(law, &s);
@@ -48,7 +48,7 @@ static stewart_arrivals arrivals_of(const stewart_law *law, const real *memory)
                               s.flights > 1 ? s.flights - 1 : 1, m->numbers};
 }
 
-void stewart_delayed_start(const stewart_law *law, real *memory)
+static void delayed_start(const stewart_law *law, real *memory)
 {
     Sizes s;
     sizes_of(law, &s);
@@ -65,8 +65,8 @@ static const real *best_of(const Sizes *s, const real *memory)
     return stewart_delay_guess(s->p, s->m, s->flights, m, (int)m->best)->numbers;
 }
 
-int stewart_delayed_observe(const stewart_law *law, real *memory, int number, const real *torques,
-                            const real *values, stewart_scratch scratch)
+static int delayed_observe(const stewart_law *law, real *memory, int number, const real *torques,
+                           const real *values, stewart_scratch scratch)
 {
     Sizes s;
     sizes_of(law, &s);
@@ -86,7 +86,7 @@ int stewart_delayed_observe(const stewart_law *law, real *memory, int number, co
     return believed->rejected > 0 ? STEWART_MEASUREMENT_REJECTED : fault << STEWART_CAUSES_AT;
 }
 
-void stewart_delayed_parameters(const stewart_law *law, const real *memory, real *theta, real *std)
+static void delayed_parameters(const stewart_law *law, const real *memory, real *theta, real *std)
 {
     Sizes s;
     sizes_of(law, &s);
@@ -99,7 +99,7 @@ void stewart_delayed_parameters(const stewart_law *law, const real *memory, real
             std[i - X] = stewart_norm(i + 1, row);
 }
 
-real stewart_delayed_uncertainty(const stewart_law *law, const real *memory, real *L)
+static real delayed_uncertainty(const stewart_law *law, const real *memory, real *L)
 {
     Sizes s;
     sizes_of(law, &s);
@@ -115,8 +115,26 @@ real stewart_delayed_uncertainty(const stewart_law *law, const real *memory, rea
     return m->known > 0 ? REAL(sqrt)(best->timing) : 0;
 }
 
-void stewart_delayed_outlook(const stewart_law *law, const real *memory, int number,
-                             const real *torques, stewart_outlook *outlook, stewart_scratch *scratch)
+static void delayed_last_period(const stewart_law *law, const real *memory, int number,
+                                const real *torques, stewart_schedule *schedule,
+                                const real **following, stewart_scratch *scratch)
+{
+    const stewart_arrivals arrivals = arrivals_of(law, memory);
+    const real begins[2] = {-law->period, 0};
+    for (int i = 0; i < 1 + (following != NULL); i++) {
+        real *each = stewart_take(scratch, U * STEWART_MAX_SCHEDULE);
+        real *durations = stewart_take(scratch, STEWART_MAX_SCHEDULE);
+        const int pieces = stewart_torque_schedule(&arrivals, number, torques, begins[i],
+                                                   begins[i] + law->period, -1, each, durations);
+        if (i == 0)
+            *schedule = (stewart_schedule){pieces, each, durations, 0};
+        else
+            *following = each;
+    }
+}
+
+static void delayed_outlook(const stewart_law *law, const real *memory, int number,
+                            const real *torques, stewart_outlook *outlook, stewart_scratch *scratch)
 {
     const stewart_delay_memory *m = (const stewart_delay_memory *)(memory + X);
     const stewart_arrivals arrivals = arrivals_of(law, memory);
@@ -137,31 +155,12 @@ void stewart_delayed_outlook(const stewart_law *law, const real *memory, int num
     times[outlook->samples++] = outlook->eta;
     outlook->times = times;
     stewart_schedule last;
-    stewart_delayed_last_period(law, memory, number, torques, &last, NULL, scratch);
+    delayed_last_period(law, memory, number, torques, &last, NULL, scratch);
     outlook->limited = stewart_at_limit(&law->machine, last.number, last.torques);
 }
 
-void stewart_delayed_last_period(const stewart_law *law, const real *memory, int number,
-                                 const real *torques, stewart_schedule *schedule,
-                                 const real **following, stewart_scratch *scratch)
-{
-    const stewart_arrivals arrivals = arrivals_of(law, memory);
-    const real begins[2] = {-law->period, 0};
-    for (int i = 0; i < 1 + (following != NULL); i++) {
-        real *each = stewart_take(scratch, U * STEWART_MAX_SCHEDULE);
-        real *durations = stewart_take(scratch, STEWART_MAX_SCHEDULE);
-        const int pieces = stewart_torque_schedule(&arrivals, number, torques, begins[i],
-                                                   begins[i] + law->period, -1, each, durations);
-        if (i == 0)
-            *schedule = (stewart_schedule){pieces, each, durations, 0};
-        else
-            *following = each;
-    }
-}
-
 const stewart_observer stewart_delay_observer = {
-    stewart_delayed_memory,  stewart_delayed_scratch, stewart_delayed_start,
-    stewart_delayed_observe, stewart_delayed_start,   stewart_delayed_parameters,
-    stewart_state_sensing, stewart_delayed_outlook, stewart_delayed_last_period,
-    stewart_delayed_uncertainty,
+    delayed_memory, delayed_scratch,    delayed_start,   delayed_observe,
+    delayed_start,  delayed_parameters, delayed_outlook, delayed_last_period,
+    delayed_uncertainty,
 };

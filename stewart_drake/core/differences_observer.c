@@ -31,7 +31,6 @@ static int differences_scratch(const stewart_law *law)
 }
 
 const stewart_observer stewart_differences_observer = {
-    stewart_plain_memory,  differences_scratch,      stewart_plain_start,     differences_observe,
-    stewart_plain_restart, stewart_plain_parameters, stewart_encoder_sensing, NULL, NULL,
-    NULL,
+    stewart_plain_memory,  differences_scratch,      stewart_plain_start, differences_observe,
+    stewart_plain_restart, stewart_plain_parameters, NULL, NULL, NULL,
 };

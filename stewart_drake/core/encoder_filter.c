@@ -310,16 +310,9 @@ static void count_still(const stewart_sensing *sensing, const real *values, cons
 const stewart_legs stewart_encoder_legs = {attempt, attempt_scratch, moved, start_scratch,
                                            count_still};
 
-static stewart_sensing sensing_with_legs(const void *sensor)
+stewart_sensing stewart_encoder_instants(const void *sensor)
 {
     stewart_sensing sensing = stewart_encoder_sensing(sensor);
     sensing.legs = &stewart_encoder_legs;
     return sensing;
 }
-
-const stewart_observer stewart_encoder_observer = {
-    stewart_filtered_memory,  stewart_filtered_scratch, stewart_filtered_start,
-    stewart_filtered_observe, stewart_filtered_restart, stewart_filtered_parameters,
-    sensing_with_legs,        NULL,                     NULL,
-    stewart_filtered_uncertainty,
-};

@@ -11,7 +11,7 @@ static int estimate_numbers(const stewart_law *law)
     return stewart_posterior_size(X + estimated(law), law->measured);
 }
 
-int stewart_filtered_memory(const stewart_law *law)
+static int filtered_memory(const stewart_law *law)
 {
     return estimate_numbers(law) + law->measured + LEGS;
 }
@@ -30,7 +30,7 @@ static Filtered filtered_at(const stewart_law *law, real *memory)
                       values + law->measured};
 }
 
-void stewart_filtered_restart(const stewart_law *law, real *memory)
+static void filtered_restart(const stewart_law *law, real *memory)
 {
     const int n = X + estimated(law);
     const Filtered f = filtered_at(law, memory);
@@ -42,18 +42,18 @@ void stewart_filtered_restart(const stewart_law *law, real *memory)
     stewart_fill(LEGS, 0, f.still);
 }
 
-void stewart_filtered_start(const stewart_law *law, real *memory)
+static void filtered_start(const stewart_law *law, real *memory)
 {
     const stewart_filter_settings *settings = law->estimation;
-    stewart_fill(stewart_filtered_memory(law), (real)NAN, memory);
-    stewart_filtered_restart(law, memory);
+    stewart_fill(filtered_memory(law), (real)NAN, memory);
+    filtered_restart(law, memory);
     const stewart_posterior e = filtered_at(law, memory).estimate;
     *e.squares = *e.values = 0;
     stewart_noise_start(e.noise);
     stewart_copy(estimated(law), settings->prior, e.mean + X);
 }
 
-void stewart_filtered_parameters(const stewart_law *law, const real *memory, real *theta, real *std)
+static void filtered_parameters(const stewart_law *law, const real *memory, real *theta, real *std)
 {
     const int n = X + estimated(law);
     const stewart_posterior e = filtered_at(law, (real *)memory).estimate;
@@ -62,7 +62,7 @@ void stewart_filtered_parameters(const stewart_law *law, const real *memory, rea
         std[i - X] = stewart_norm(n, e.root + n * i);
 }
 
-real stewart_filtered_uncertainty(const stewart_law *law, const real *memory, real *L)
+static real filtered_uncertainty(const stewart_law *law, const real *memory, real *L)
 {
     const int n = X + estimated(law);
     const stewart_filter_settings *settings = law->estimation;
@@ -90,8 +90,8 @@ static stewart_interval last_interval(const stewart_law *law, int number, const 
     return period;
 }
 
-int stewart_filtered_observe(const stewart_law *law, real *memory, int number, const real *torques,
-                             const real *values, stewart_scratch scratch)
+static int filtered_observe(const stewart_law *law, real *memory, int number, const real *torques,
+                            const real *values, stewart_scratch scratch)
 {
     const int n = X + estimated(law), m = law->measured;
     const stewart_sensing sensing = stewart_sensing_of(law);
@@ -129,7 +129,7 @@ int stewart_filtered_observe(const stewart_law *law, real *memory, int number, c
                            : (fault | (int)*e.left_out) << STEWART_CAUSES_AT;
 }
 
-int stewart_filtered_scratch(const stewart_law *law)
+static int filtered_scratch(const stewart_law *law)
 {
     const stewart_sensing sensing = stewart_sensing_of(law);
     const stewart_filter filter = filter_of(law, &sensing);
@@ -139,10 +139,9 @@ int stewart_filtered_scratch(const stewart_law *law)
 }
 
 const stewart_observer stewart_filter_observer = {
-    stewart_filtered_memory,  stewart_filtered_scratch,    stewart_filtered_start,
-    stewart_filtered_observe, stewart_filtered_restart,    stewart_filtered_parameters,
-    stewart_state_sensing,    NULL,                        NULL,
-    stewart_filtered_uncertainty,
+    filtered_memory,  filtered_scratch,    filtered_start, filtered_observe,
+    filtered_restart, filtered_parameters, NULL,           NULL,
+    filtered_uncertainty,
 };
 
 /* ---- over gaps -----------------------------------------------------------------------------------
@@ -175,20 +174,20 @@ typedef struct {
 
 static Gap gap_at(const stewart_law *law, real *memory)
 {
-    real *anchor = memory + stewart_filtered_memory(law), *torques = anchor + estimate_numbers(law);
+    real *anchor = memory + filtered_memory(law), *torques = anchor + estimate_numbers(law);
     real *durations = torques + U * GAP_TORQUES, *counts = durations + GAP_TORQUES;
     return (Gap){anchor, torques, durations, counts, counts + 1};
 }
 
 static int gap_memory(const stewart_law *law)
 {
-    return stewart_filtered_memory(law) + estimate_numbers(law) + (U + 1) * GAP_TORQUES + 2;
+    return filtered_memory(law) + estimate_numbers(law) + (U + 1) * GAP_TORQUES + 2;
 }
 
 static void gap_start(const stewart_law *law, real *memory)
 {
     stewart_fill(gap_memory(law), 0, memory);
-    stewart_filtered_start(law, memory);
+    filtered_start(law, memory);
 }
 
 static int gap_observe(const stewart_law *law, real *memory, int number, const real *torques,
@@ -206,7 +205,7 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
     stewart_copy(m, now.values, last);
     const stewart_posterior before = stewart_posterior_at(known, n, m);
     const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, last);
-    const int status = stewart_filtered_observe(law, memory, number, torques, values, scratch);
+    const int status = filtered_observe(law, memory, number, torques, values, scratch);
     const int had_anchor = *gap.periods > 0, parts = (int)*gap.pieces;
     stewart_interval period = last_interval(law, number, torques, &scratch);
     const stewart_history history = {last, NULL};
@@ -253,12 +252,12 @@ static int gap_scratch(const stewart_law *law)
 {
     const stewart_sensing sensing = stewart_sensing_of(law);
     const stewart_filter filter = filter_of(law, &sensing);
-    return stewart_filtered_scratch(law) + estimate_numbers(law) + law->measured +
+    return filtered_scratch(law) + estimate_numbers(law) + law->measured +
            (U + 1) * 2 + stewart_filter_scratch(&filter, GAP_TORQUES);
 }
 
 const stewart_observer stewart_gap_observer = {
-    gap_memory,               gap_scratch,                 gap_start,             gap_observe,
-    stewart_filtered_restart, stewart_filtered_parameters, stewart_state_sensing, NULL, NULL,
-    stewart_filtered_uncertainty,
+    gap_memory,       gap_scratch,         gap_start, gap_observe,
+    filtered_restart, filtered_parameters, NULL,      NULL,
+    filtered_uncertainty,
 };

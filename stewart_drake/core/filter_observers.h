@@ -15,21 +15,8 @@ typedef struct {
     const real *prior; /* (p) initial estimate of the parameters */
 } stewart_filter_settings;
 
-extern const stewart_observer stewart_filter_observer;  /* of the measured state */
-extern const stewart_observer stewart_gap_observer;     /* the same, re-linearised over gaps */
-extern const stewart_observer stewart_encoder_observer; /* of encoders */
+extern const stewart_observer stewart_filter_observer; /* of the measured state, or of encoders */
+extern const stewart_observer stewart_gap_observer;    /* of the state, re-linearised over gaps */
 
 extern const stewart_legs stewart_encoder_legs; /* filter step with encoders, see filter_attempt.h */
-
-/* Callbacks of `stewart_observer` that these observers share: size of the memory, scratch numbers of
-   `observe`, start from the prior, one period of the filter, restart with the estimated parameters,
-   parameters with their standard deviations, and the covariance. */
-
-int stewart_filtered_memory(const stewart_law *law);
-int stewart_filtered_scratch(const stewart_law *law);
-void stewart_filtered_start(const stewart_law *law, real *memory);
-int stewart_filtered_observe(const stewart_law *law, real *memory, int number, const real *torques,
-                             const real *values, stewart_scratch scratch);
-void stewart_filtered_restart(const stewart_law *law, real *memory);
-void stewart_filtered_parameters(const stewart_law *law, const real *memory, real *theta, real *std);
-real stewart_filtered_uncertainty(const stewart_law *law, const real *memory, real *L);
+stewart_sensing stewart_encoder_instants(const void *sensor); /* with that step; `stewart_encoders` */

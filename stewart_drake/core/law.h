@@ -122,6 +122,7 @@ struct stewart_law {
     const stewart_observer *observer;
     const stewart_design *design;     /* NULL: prediction and gain of the core */
     const void *sensing, *estimation; /* assumptions of the observer */
+    stewart_sensing (*read)(const void *sensing); /* the model of the sensor */
     const stewart_sensing *described; /* a sensor given by its functions, in the place of `sensing`; or NULL */
     const stewart_channel *channel;   /* NULL: every torque arrives, after the delay */
     const stewart_packets *packets;   /* assumptions of the channel */

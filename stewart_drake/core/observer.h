@@ -55,7 +55,6 @@ typedef struct {
     void (*restart)(const stewart_law *law, real *memory);
     /* Parameters (p) and their standard deviations (p), NaN where nothing is estimated. */
     void (*parameters)(const stewart_law *law, const real *memory, real *theta, real *std);
-    stewart_sensing (*sensing)(const void *sensor); /* model of the law's sensor */
     /* NULL if the delay is the assumed one. Fill in all that follows from the estimated delay, with
        torques (number, 6) in flight now. */
     void (*outlook)(const stewart_law *law, const real *memory, int number, const real *torques,
@@ -68,5 +67,5 @@ typedef struct {
     real (*uncertainty)(const stewart_law *law, const real *memory, real *L);
 } stewart_observer;
 
-/* The sensor of the law: `described`, else `sensing` as its observer reads it. */
+/* The sensor of the law: `described`, else `read` of `sensing`. */
 stewart_sensing stewart_sensing_of(const stewart_law *law);

@@ -67,7 +67,6 @@ static int state_observe(const stewart_law *law, real *memory, int number, const
 static int state_scratch(const stewart_law *law) { return X * X + stewart_moving_scratch(law); }
 
 const stewart_observer stewart_state_observer = {
-    stewart_plain_memory,  state_scratch,            stewart_plain_start,   state_observe,
-    stewart_plain_restart, stewart_plain_parameters, stewart_state_sensing, NULL, NULL,
-    NULL,
+    stewart_plain_memory,  state_scratch,            stewart_plain_start, state_observe,
+    stewart_plain_restart, stewart_plain_parameters, NULL, NULL, NULL,
 };

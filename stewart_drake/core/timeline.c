@@ -7,7 +7,7 @@ int stewart_queue_length(const stewart_law *law) { return law->steps + (law->fra
 
 stewart_sensing stewart_sensing_of(const stewart_law *law)
 {
-    return law->described ? *law->described : law->observer->sensing(law->sensing);
+    return law->described ? *law->described : law->read(law->sensing);
 }
 
 int stewart_limit(const stewart_machine *machine, const real *torque, real *limited)

@@ -184,8 +184,8 @@ class NativeFunctions:
         given = state, torques, parameters, [gravity], h
         x, held, p, g, steps = (c.at(np.array(one, np.float64, order="C")) for one in given)
         plant, every = c.plant(self._first, p, g), c.at(np.arange(len(states), dtype=np.intc))
-        given = steps, held, held, every, x, c.at(states), c.ffi.NULL
-        c.lib.stewart_shoot(plant, 0, len(states), *given)
+        times = 0, len(states), steps, held, held, every
+        c.lib.stewart_shoot(plant, *times, x, c.at(states), c.ffi.NULL)
         return states
 
 

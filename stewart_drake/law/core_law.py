@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from stewart_drake.core.build import sources_of
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.workspace import home_sign
 from stewart_drake.law.channel import Packets, Wire, packets_of, report_of
@@ -78,9 +79,8 @@ class CompiledLaw:
         law: the law.
         data: `stewart_law *`, or of servos `stewart_servo *`.
         fields: (place, rows, columns) of each field of the memory.
-        tables: name of each table of functions that the law points to, by its address.
+        tables: name of each function, or table of them, that the law points to, by its address.
         keep: arrays and C structures that it points to.
-        sources: of the core, beyond those of every law.
     """
 
     def __init__(self, law: Any, more: int = 0) -> None:
@@ -92,9 +92,6 @@ class CompiledLaw:
         given = c.ffi.addressof(self.data, "law") if self._servos else self.data
         self.torques_law = given
         self._own, self._python = OwnParts(law, given), in_python(law)
-        self.sources: tuple[str, ...] = ("servo", "kinematics.c")
-        if not self._servos:
-            self.sources = "reference", "law.c"
         self._raised = [self._own.raised]
         self._fill(given)
         if self._servos:
@@ -115,7 +112,6 @@ class CompiledLaw:
         machine = machine_of(law.plant)
         if resists(law.plant.dynamics):
             self.tables[address_of(machine.it.joints)] = "stewart_ball_joints"
-            self.sources += ("ball_joints",)
         data.machine = machine.it[0]
         self._raised += machine.raised
         self.keep += machine.pointed()
@@ -129,7 +125,7 @@ class CompiledLaw:
         part = part_of(law.observer, law.sensing, law.plant, timeline.period)
         part.fill(data)
         self.tables[address_of(data.observer)] = part.table
-        self.sources += part.sources
+        self.tables[address_of(data.read)] = part.read
         self._raised += part.sensor.raised
         self.keep += [one for it in (part.sensor, part.estimation) if it for one in it.pointed()]
 
@@ -165,7 +161,6 @@ class CompiledLaw:
             d.packets = packets.it
             self.tables[address_of(d.channel)] = "stewart_network"
             self.keep += packets.pointed()
-            self.sources += ("network.c", "packets.c")
         if "planner" in python:
             self._own.planner()
         elif isinstance(law.planner, Replan):
@@ -197,7 +192,12 @@ class CompiledLaw:
         d.planner, d.planning = c.ffi.addressof(c.lib, "stewart_replanner"), plan
         self.tables[address_of(d.planner)] = "stewart_replanner"
         self.keep.append(plan)
-        self.sources += ("replan", "planning")
+
+    @property
+    def sources(self) -> list[str]:
+        """Files of the core that the law needs."""
+        step = "stewart_servo_step" if self._servos else "stewart_step"
+        return sources_of([step, *self.tables.values()])
 
     @cached_property
     def scratch(self) -> int:

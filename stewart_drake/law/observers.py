@@ -195,14 +195,15 @@ class Part(NamedTuple):
     """An observer in the core."""
 
     table: str  # name of its table of functions
+    read: str  # name of the function that reads its sensor
     sensor: Compiled  # C structure of the sensor
     own: bool  # whether the sensor is written in Python
     estimation: Compiled | None  # C structure of its assumptions, or None
-    sources: tuple[str, ...]  # files of the core for it, see `export.controller.SOURCES`
 
     def fill(self, law: Any) -> None:
         """Set the observer of a `stewart_law`."""
-        law.observer = core().ffi.addressof(core().lib, self.table)
+        c = core()
+        law.observer, law.read = (c.ffi.addressof(c.lib, one) for one in (self.table, self.read))
         if self.own:
             law.described = self.sensor.it
         else:
@@ -211,43 +212,37 @@ class Part(NamedTuple):
             law.estimation = self.estimation.it
 
 
-_KALMAN: Final = ("sensing", "instant", "kalman")
-_SOURCES: Final[dict[str, tuple[str, ...]]] = {
-    "state": ("observers", "sensing"),
-    "timing": ("observers", "sensing", "timing_observer.c"),
-    "differences": ("observers", "sensing", "encoders", "kinematics.c", "differences_observer.c"),
-    "filter": ("observers", "filter_observers", "filter", "filter_attempt.h", "noise", *_KALMAN),
-    "delay": ("delay_observer", "delay", "delay_search.c", "arrivals", *_KALMAN),
+_ENCODERS: Final = {
+    "differences": "stewart_encoder_sensing",
+    "filter": "stewart_encoder_instants",
+    "delay": "stewart_newest_encoders",
 }
-_SOURCES["gap"] = _SOURCES["filter"]
-_SOURCES["encoder"] = (*_SOURCES["filter"], "encoders", "kinematics.c", "encoder_filter.c")
-_SOURCES["encoder_delay"] = (
-    *_SOURCES["delay"],
-    *("encoders", "kinematics.c", "encoder_delay_observer.c"),
-)
-"""Files of the core for each kind of observer."""
+"""Functions of the core that read encoders, by the kind of observer."""
 
 
 def part_of(observer: CoreObserver, sensing: Sensing, plant: NominalPlant, period: float) -> Part:
     """Return the observer in the core for a sensor and a plant."""
-    own, within = type(sensing) is not StateSensing, type(sensing) is EncoderSensing
+    within, own = type(sensing) is EncoderSensing, False
     if within:
-        sensor, own = encoders_of(sensing), False
+        sensor = encoders_of(sensing)
+    elif type(sensing) is StateSensing:
+        sensor = state_sensor(sensing)
     else:
-        sensor = described(sensing, plant.mechanism) if own else state_sensor(sensing)
+        sensor, own = described(sensing, plant.mechanism), True
     estimation, settings = None, observer.settings
     kind = "differences" if within else "timing" if observer.timing else "state"
     if settings is not None and settings.parameters.names != tuple(plant.dynamics.free):
         free = ", ".join(plant.dynamics.free)
         raise ValueError(f"settings.parameters: got other names than those of the plant: {free}")
     if settings is not None and observer.delay is not None:
-        kind = "encoder_delay" if within else "delay"
+        kind = "delay"
         size = NUM_LEGS if within else sensing.size
         estimation = _delay_settings_of(observer, settings, size, period)
     elif settings is not None:
-        kind = "encoder" if within else "gap" if observer.gaps else "filter"
+        kind = "gap" if observer.gaps and not within else "filter"
         estimation = filter_settings_of(settings, sensing.size)
-    return Part(f"stewart_{kind}_observer", sensor, own, estimation, _SOURCES[kind])
+    read = _ENCODERS[kind] if within else "stewart_state_sensing"
+    return Part(f"stewart_{kind}_observer", read, sensor, own, estimation)
 
 
 @Once
