@@ -20,7 +20,6 @@ from stewart_drake.live.session import drive, prepare_session
 from stewart_drake.loop import results as metrics
 from stewart_drake.loop.law_design import control_law, first_queue
 from stewart_drake.loop.preparation import prepare
-from stewart_drake.loop.recording import Table
 from stewart_drake.reporting.csv_file import signals_csv
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
@@ -98,11 +97,11 @@ class Shadow(LiveRecord):
     def sample(self, number, memory, measurement, wanted, seconds, late, packets):
         super().sample(number, memory, measurement, wanted, seconds, late, packets)
         if not hasattr(self, "shadow"):
-            self.shadow = Table(13), Table(19), []
+            self.shadow = [], [], []
         state = measurement.values if self.usable else memory.belief.state
         error = state[POSE] - wanted[POSE]
-        self.shadow[0].append(number * self._period, error, wanted[POSE])
-        self.shadow[1].append(error, memory.torque, memory.in_flight[-1], seconds)
+        self.shadow[0].append([number * self._period, *error, *wanted[POSE]])
+        self.shadow[1].append([*error, *memory.torque, *memory.in_flight[-1], seconds])
         self.shadow[2].append(late)
 
     def count(self, memory):
@@ -125,16 +124,16 @@ def test_figures_from_the_file_are_those_from_memory(tmp_path, monkeypatch):
         how = {"accept_jitter": True, "say": lambda line: None, "log": path}
         result = drive(ready, 3.0, **how)
     assert result.status == "completed"
-    grid, samples, late = records[0].shadow
-    time_, error = grid.column(0), grid.columns(slice(1, 7))
-    errors, asked, sent = (samples.columns(slice(n, n + 6)) for n in (0, 6, 12))
+    grid, samples, late = map(np.array, records[0].shadow)
+    time_, error = grid[:, 0], grid[:, 1:7]
+    errors, asked, sent = np.split(samples[:, :18], 3, axis=1)
     experiment = ready.design.experiment
     c = experiment.scenario.controller
     found = metrics.figures(time_, error, experiment.scale, errors, asked, sent, c, True)
     summary = result.summary
     for name, value in found._asdict().items():
         assert summary[name] == value, name
-    assert summary["controller_step_ms"]["median"] == 1e3 * np.median(samples.column(18))
+    assert summary["controller_step_ms"]["median"] == 1e3 * np.median(samples[:, 18])
     assert summary["live"]["sent_after_due_ms"]["worst"] >= 1e3 * max(late)
     header, rows = lines_of(path)
     named = signals_csv(result.signals).splitlines()[0].split(",")

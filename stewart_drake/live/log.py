@@ -20,7 +20,7 @@ from stewart_drake.law.memory import Memory
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.controller import held_by
 from stewart_drake.loop.preparation import Experiment
-from stewart_drake.loop.recording import Record, Table
+from stewart_drake.loop.recording import Record
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.run_log import Background, CsvFile, RunLog, channels_of, csv_heads
 from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, TUNER_INPUTS, ports_of
@@ -167,9 +167,9 @@ class LiveRecord(Record):
         reference, asked = columns["reference"], columns["torque_commanded"]
         error = columns["pose"] - reference
         sent = np.clip(asked, -self._limit, self._limit)
-        self._log = Table.of(logged)
-        self.on_grid = Table.of(np.column_stack([logged[:, 0], error, reference]))
-        self.samples = Table.of(np.column_stack([error, asked, sent, seconds]))
+        self._log = list(logged)
+        self.on_grid = list(np.column_stack([logged[:, 0], error, reference]))
+        self.samples = list(np.column_stack([error, asked, sent, seconds]))
         return late
 
     def _write(self, number: int) -> None:

@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -118,7 +118,28 @@ def reported(kept: int) -> int:
     return kept + 1
 
 
-class DelayLqiController(SteppedLaw):
+class _RecordedLaw(SteppedLaw):
+    """A law of the core, whose memory is recorded."""
+
+    _age: InputPort | None
+
+    def _record(self, law: PredictiveLqi | ServoPreview, first: Memory) -> None:
+        """Begin with a memory, and declare the estimate and what is recorded of the memory."""
+        self._begin(first, law.timeline.period)
+        self._put_out("estimate", NUM_STATE, lambda m: m.belief.state, now=True)
+        held = held_by(law.plant.dynamics)
+        for port, signal in ports_of("controller").items():
+            part = held[signal.name]
+            self._put_out(port, len(part(first)), part)
+
+    def _age_of(self, context: Context) -> float:
+        """Return the age of the measurement in s; 0 where the port is missing or unconnected."""
+        if self._age is None or not self._age.HasValue(context):
+            return 0.0
+        return float(np.asarray(self._age.Eval(context))[0])
+
+
+class DelayLqiController(_RecordedLaw):
     """Predictive LQI with any parts of the law, in C if the core has all of them.
 
     With m the memory (`law.memory.Memory`) and `step` the law (`law.predictive_lqi.PredictiveLqi`):
@@ -177,27 +198,20 @@ class DelayLqiController(SteppedLaw):
         sends = isinstance(law.channel, Packets)
         size = reported(law.kept) * (1 + NUM_TORQUES)
         self._report = self.DeclareVectorInputPort("report", size) if sends else None
-        self._begin(first, law.timeline.period)
+        self._record(law, first)
         self._put_out("torque", NUM_TORQUES, lambda m: m.torque, now=True)
-        self._put_out("estimate", NUM_STATE, lambda m: m.belief.state, now=True)
         self.DeclareAbstractOutputPort(
             "memory", lambda: Value(Sample(first, 0.0)), weak(self._left), {self._step.ticket()}
         )
         if sends:
             size = first.sent.packets[0].size
             self._put_out("plan", size, lambda m: m.sent.packets[-1].ravel(), now=True)
-        held = held_by(law.plant.dynamics)
-        for port, signal in ports_of("controller").items():
-            part = held[signal.name]
-            self._put_out(port, len(part(first)), part)
 
     def memory(self, context: Context) -> Memory:
         return self.sample(context).memory
 
     def _prepared(self, context: Context) -> Callable[[], Memory]:
-        age = 0.0
-        if self._age is not None:
-            age = float(np.asarray(self._age.Eval(context))[0])
+        age = self._age_of(context)
         measurement = Measurement.of(np.asarray(self._measurement.Eval(context)), age)
         weights = np.asarray(self._weights.Eval(context))
         memory, motion = self.memory(context), self._followed(context)
@@ -224,7 +238,7 @@ class DelayLqiController(SteppedLaw):
         output.set_value(self._step.Eval(context))
 
 
-class ServoController(SteppedLaw):
+class ServoController(_RecordedLaw):
     """Controller for servos: sends crank angles ahead of time.
 
     With m the memory and `step` the law (`law.servo_preview.ServoPreview`):
@@ -259,18 +273,13 @@ class ServoController(SteppedLaw):
         self._preview = self.DeclareVectorInputPort("preview", NUM_REFERENCE)
         self._report = self.DeclareVectorInputPort("report", law.reports.size)
         self._age = self.DeclareVectorInputPort("age", 1)
-        self._begin(first, law.timeline.period)
+        self._record(law, first)
         self._put_out("command", NUM_REFERENCE, lambda m: m.command, now=True)
-        self._put_out("estimate", NUM_STATE, lambda m: m.belief.state, now=True)
         self._put_out("torque", NUM_TORQUES, HELD["torque_commanded"])
-        held = held_by(law.plant.dynamics)
-        for port, signal in ports_of("controller").items():
-            part = held[signal.name]
-            self._put_out(port, len(part(first)), part)
 
     def _prepared(self, context: Context) -> Callable[[], Memory]:
-        age = float(np.asarray(self._age.Eval(context))[0]) if self._age.HasValue(context) else 0.0
-        measurement = Measurement.of(np.asarray(self._measurement.Eval(context)), age)
+        measured = np.asarray(self._measurement.Eval(context))
+        measurement = Measurement.of(measured, self._age_of(context))
         reference = np.reshape(np.asarray(self._preview.Eval(context)), (-1, NUM_REFERENCE))
         motion, report = Preview(self._law.preview_times, reference), self._report.Eval(context)
         memory = self.sample(context).memory

@@ -1,6 +1,5 @@
 """The record of a running loop, and the summary of a run."""
 
-from array import array
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -35,35 +34,6 @@ _HELD_BY = ("controller", "density")
 """Systems whose signals change at the controller's samples only."""
 
 
-class Table:
-    """Rows of numbers, 8 bytes each."""
-
-    def __init__(self, width: int) -> None:
-        self._width, self._numbers = width, array("d")
-
-    @classmethod
-    def of(cls, rows: Array) -> "Table":
-        """Return a table with rows (n, width)."""
-        table = cls(rows.shape[1])
-        table._numbers.frombytes(np.ascontiguousarray(rows, np.float64).tobytes())
-        return table
-
-    def __len__(self) -> int:
-        return len(self._numbers) // self._width
-
-    def append(self, *parts: Array | float) -> None:
-        """Add a row that consists of these parts."""
-        row = np.concatenate([np.atleast_1d(part) for part in parts])
-        self._numbers.frombytes(row.astype(np.float64, copy=False).tobytes())
-
-    def columns(self, part: slice) -> Array:
-        """Return a copy of columns (rows, columns)."""
-        return np.array(np.reshape(self._numbers, (-1, self._width))[:, part], order="C")
-
-    def column(self, place: int) -> Array:
-        return self.columns(slice(place, place + 1))[:, 0]
-
-
 class Record:
     """Record of a run, in simulation or in real time.
 
@@ -72,9 +42,9 @@ class Record:
         logs: to be written while the run goes on.
 
     Attributes:
-        on_grid: time, pose error (6) and reference (6) on the metric's grid and at the end.
-        samples: at each of the controller's samples: pose error (6), torque of the law (6), the
-            same within the limit (6), computing time.
+        on_grid: rows (13,) of time, pose error and reference on the metric's grid and at the end.
+        samples: rows (19,) at the controller's samples: pose error, torque of the law, the same
+            within the limit, computing time.
         peak_applied: largest torque that acted, N m.
         counts: survived problems up to the last sample.
         sampled: number of the controller's samples.
@@ -89,8 +59,7 @@ class Record:
         self._logs, self._scenario = logs, experiment.scenario
         samples = experiment.scenario.sensor.samples
         self._recorded = [one for one in run_signals(samples).values() if one.source]
-        self._log = Table(1 + sum(signal.size for signal in self._recorded))
-        self.on_grid, self.samples = Table(13), Table(19)
+        self._log, self.on_grid, self.samples = list[Array](), list[Array](), list[Array]()
         self.peak_applied = 0.0
         self.counts, self.tuner_fallbacks = Counts(), 0
         self.sampled = self.measured = 0
@@ -103,7 +72,7 @@ class Record:
         """Add a row to the log: a time in s, and the value of each exported port."""
         row = [seen[signal.exported][signal.part] for signal in self._recorded]
         self.packets = seen["packets"]
-        self._log.append(time, *row)
+        self._log.append(np.concatenate([[time], *row]))
         self.mirror(time, seen)
 
     def count(self, memory: Any) -> bool:
@@ -117,12 +86,11 @@ class Record:
 
     def dataset(self) -> xr.Dataset:
         """Return the log, see `SimulationResult.signals`."""
-        values, start = {}, 1
-        for signal in self._recorded:
-            stop = start + signal.size
-            values[signal.name], start = self._log.columns(slice(start, stop)), stop
+        ends = np.cumsum([1, *(signal.size for signal in self._recorded)])
+        time, *columns, _ = np.split(np.reshape(self._log, (-1, ends[-1])), ends, axis=1)
+        values = {s.name: np.array(c) for s, c in zip(self._recorded, columns, strict=True)}
         text, samples = scenario_yaml(self._scenario), self._scenario.sensor.samples
-        return dataset_of(self._log.column(0), values, text, samples)
+        return dataset_of(time[:, 0], values, text, samples)
 
     def mirror(self, time: float, seen: Mapping[str, Array]) -> None:
         """Write a row to the logs: a time in s, and the value of each exported port."""
@@ -175,11 +143,13 @@ class Recorder(Record):
                 "estimated_s": float(self._port(context, "delay_estimate")[0]),
                 "std_s": float(self._port(context, "delay_std")[0]),
             }
-            self.samples.append(self._error, memory.torque, memory.in_flight[-1], seconds)
+            torques = memory.torque, memory.in_flight[-1]
+            self.samples.append(np.concatenate([self._error, *torques, [seconds]]))
             held = (port for port, system in self._systems.items() if system in _HELD_BY)
             self._held = {port: self._port(context, port) for port in held}
         if instant.on_grid:
-            self.on_grid.append(self._instant, self._error, self._wanted[POSE])
+            of_grid = [self._instant], self._error, self._wanted[POSE]
+            self.on_grid.append(np.concatenate(of_grid))
         if instant.logged:
             # Plant and reference as of `look`: the plant may have moved since.
             seen = self._held | {"state": self._state, "reference": self._wanted}
@@ -214,10 +184,11 @@ def summarize(
 ) -> RunSummary:
     """Return the summary of a run, without its warnings."""
     sc, nan = experiment.scenario, float("nan")
-    time, error = recorder.on_grid.column(0), recorder.on_grid.columns(slice(1, 7))
-    reference = recorder.on_grid.columns(slice(7, 13))
-    errors, torques, sent = (recorder.samples.columns(slice(n, n + 6)) for n in (0, 6, 12))
-    seconds, some, scale = recorder.samples.column(18), len(recorder.samples) > 0, experiment.scale
+    on_grid = np.reshape(recorder.on_grid, (-1, 13))
+    samples = np.reshape(recorder.samples, (-1, 19))
+    time, (error, reference) = on_grid[:, 0], np.split(on_grid[:, 1:], 2, axis=1)
+    errors, torques, sent, rest = np.split(samples, [6, 12, 18], axis=1)
+    seconds, some, scale = rest[:, 0], len(samples) > 0, experiment.scale
     completed = status == "completed"
     found = metrics.figures(*(time, error, scale, errors, torques, sent), sc.controller, completed)
     peaks = metrics.peak_error(error, scale).tolist() if len(error) else [nan] * 6
