@@ -230,23 +230,29 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
     return 1;
 }
 
+/* Compute `after` from `now`, in `before` with a share of `std` (p) added. */
+static int attempt_changed(stewart_attempt *a, const stewart_posterior *now,
+                           const stewart_posterior *before, const real *std, real share,
+                           stewart_scratch scratch)
+{
+    real added[STEWART_MAX_ESTIMATED];
+    for (int i = 0; i < a->n - X; i++)
+        added[i] = share * std[i];
+    stewart_copy(stewart_posterior_size(a->n, a->filter->sensing->size), now->mean, before->mean);
+    stewart_widen_root(a->n, added, before->root, scratch);
+    return attempt(a, scratch);
+}
+
 /* Compute `after` for a jump of parameters, from `now` with widened variances in `before`. Returns 0 if no
    jump explains the values. A large jump is not tried if only one leg does not fit: that is a fault. */
 static int jump(stewart_attempt *a, const stewart_posterior *now, const stewart_posterior *before,
                 stewart_scratch scratch)
 {
-    const stewart_filter *filter = a->filter;
-    real std[STEWART_MAX_ESTIMATED];
     const real largest = a->gated == 1 ? 1 : STEWART_LARGEST_JUMP;
     a->prior = before;
-    for (real share = 1; share <= largest; share *= 10) {
-        for (int i = 0; i < a->n - X; i++)
-            std[i] = share * filter->jump_std[i];
-        stewart_copy(stewart_posterior_size(a->n, filter->sensing->size), now->mean, before->mean);
-        stewart_widen_root(a->n, std, before->root, scratch);
-        if (attempt(a, scratch) && !a->gated)
+    for (real share = 1; share <= largest; share *= 10)
+        if (attempt_changed(a, now, before, a->filter->jump_std, share, scratch) && !a->gated)
             return 1;
-    }
     a->prior = now;
     return 0;
 }
@@ -261,18 +267,6 @@ static void accept(int n, int m, const stewart_posterior *found, stewart_posteri
     *now->squares = *found->squares;
     *now->values = *found->values;
     *now->noise = *found->noise;
-}
-
-/* Compute `after` from `now` with a share of `usual_std` added, in `before`. */
-static int attempt_changed(stewart_attempt *a, const stewart_posterior *now,
-                           const stewart_posterior *before, real share, stewart_scratch scratch)
-{
-    real std[STEWART_MAX_ESTIMATED];
-    for (int i = 0; i < a->n - X; i++)
-        std[i] = share * a->filter->usual_std[i];
-    stewart_copy(stewart_posterior_size(a->n, a->filter->sensing->size), now->mean, before->mean);
-    stewart_widen_root(a->n, std, before->root, scratch);
-    return attempt(a, scratch);
 }
 
 /* Return the largest log-density of an outlier over all factors on its covariance S. A cause must exceed it.
@@ -309,9 +303,10 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
         }
     }
     /* The largest share has the least distance: if that one is hopeless, all are. */
-    if (attempt_changed(a, now, before, most, scratch) || a->distance <= a->hopeless)
+    const real *std = filter->usual_std;
+    if (attempt_changed(a, now, before, std, most, scratch) || a->distance <= a->hopeless)
         for (real share = CHANGED; !found && share <= most; share *= REAL(sqrt)(10))
-            found = attempt_changed(a, now, before, share, scratch);
+            found = attempt_changed(a, now, before, std, share, scratch);
     if (untimely > 0 && !(found && a->likelihood >= late)) {
         stewart_copy(size, now->mean, before->mean);
         before->noise->timing = untimely;

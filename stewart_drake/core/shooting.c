@@ -37,16 +37,12 @@ void stewart_slopes(const stewart_plant *plant, int legs, const double *state, c
     }
 }
 
-/* Slopes of x, and of S (12, columns) if there are columns. */
+/* Slopes of x, and of S (12, columns). */
 static void change(const stewart_plant *plant, int legs, int columns, const double *x, const double *S,
                    const double *torque, double *dx, double *dS)
 {
     const int numbers = numbers_of(legs);
     double A[6 * X], P[6 * MOST];
-    if (!columns) {
-        stewart_change(plant, x, torque, dx);
-        return;
-    }
     stewart_copy(6, x + 6, dx);
     stewart_slopes(plant, legs, x, torque, dx + 6, A, P);
     stewart_copy(6 * columns, S + 6 * columns, dS);
@@ -93,7 +89,10 @@ void stewart_shoot(const stewart_plant *plant, int legs, long number, const doub
         S[columns * i + i] = 1;
     for (long k = 0; k < number; k++) {
         const double *torque = torques + U * k, *next = after + U * k;
-        step(plant, legs, columns, torque, h[k], x, S);
+        if (columns)
+            step(plant, legs, columns, torque, h[k], x, S);
+        else
+            stewart_move(plant, torque, h[k], x);
         if (columns && memcmp(torque, next, U * sizeof *torque)) {
             /* before the sample: one at the very switch has the derivative from the right */
             stewart_accelerations(plant, x, x + 6, torque, before);

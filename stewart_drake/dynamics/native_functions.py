@@ -45,13 +45,10 @@ class NativeFunction:
     Args:
         name: in `core.layout.SIGNATURES`.
         geometry: numbers of the machine.
-        points: number n of points that a call evaluates; arguments but parameters and gravity, and
-            results, are then (n, ...). None for one point.
     """
 
-    def __init__(self, name: str, geometry: Array, points: int | None = None) -> None:
+    def __init__(self, name: str, geometry: Array) -> None:
         self._name, self._geometry, self._own = name, geometry, threading.local()
-        self._points = () if points is None else (points,)
 
     def __call__(self, *arguments: ArrayLike) -> Sequence[Array]:
         places, results, evaluate, _ = self.own_buffers()
@@ -70,28 +67,15 @@ class NativeFunction:
 
     def _buffers(self) -> Buffers:
         (names, shapes), c = SIGNATURES[self._name], core()
-        lead = dict.fromkeys(names, self._points) | {"parameters": (), "gravity": ()}
-        given = {name: np.zeros((*lead[name], *SHAPES[name])) for name in names}
-        results, first = [np.zeros((*self._points, *s)) for s in shapes], c.at(self._geometry)
-        at_points = dict(given)
-        if "gravity" in given:
-            shared = at_points.pop("parameters"), at_points.pop("gravity")
-            first = c.plant(first, *map(c.at, shared))
+        given, results = ([np.zeros(s) for s in of] for of in ([SHAPES[n] for n in names], shapes))
+        first, inputs = c.at(self._geometry), [c.at(array) for array in given]
+        if "gravity" in names:
+            *inputs, parameters, gravity = inputs
+            first = c.plant(first, parameters, gravity)
         no_angles = [c.ffi.NULL] if self._name == "measures" else []
         function = getattr(c.lib, f"stewart_{self._name.removesuffix('_of_tree')}")
-        calls = []
-        for point in np.ndindex(self._points):
-            inputs, outputs = (
-                [c.at(array[(*point, ...)]) for array in arrays]
-                for arrays in (at_points.values(), results)
-            )
-            calls.append(partial(function, first, *inputs, *no_angles, *outputs))
-
-        def evaluate() -> None:
-            for call in calls:
-                call()
-
-        return Buffers(list(given.values()), results, evaluate if self._points else calls[0], first)
+        call = partial(function, first, *inputs, *no_angles, *map(c.at, results))
+        return Buffers(given, results, call, first)
 
 
 class NativeFunctions:

@@ -45,7 +45,7 @@ class NativePlant:
         longest_step: s.
 
     Attributes:
-        states: (n, 12) result; the first `seen` are valid.
+        states: (n, 12) result; the first `run.seen` are valid.
         wrench: (6,) on the plate, a view of the parameters that the run reads.
     """
 
@@ -58,6 +58,7 @@ class NativePlant:
         longest_step: float,
     ) -> None:
         c, mechanism = core(), dynamics.mechanism
+        self._mechanism = mechanism
         self.states = np.empty((len(times), NUM_STATE))
         numbers = geometry_of(mechanism), dynamics.plant_parameters, dynamics.gravity
         copies = [np.array(one, np.float64) for one in numbers]
@@ -74,14 +75,19 @@ class NativePlant:
         """Run by a function of plant.h with its further arguments."""
         return Ended(getattr(core().lib, f"stewart_{name}")(self.run, *arguments))
 
-    @property
-    def seen(self) -> int:
-        return int(self.run.seen)
+    def failure(self, ended: Ended) -> Failure | None:
+        """Return why the plate left its workspace, None if it did not.
 
-    @property
-    def time(self) -> float:
-        """End of the run, s."""
-        return float(self.run.time)
+        Raises:
+            IntegrationError: no step is short enough for the accuracy.
+        """
+        time = self.run.time
+        if ended == Ended.TOO_SHORT_STEPS:
+            raise IntegrationError(
+                f"no step is short enough at t = {time:.6g} s for an accuracy of "
+                f"{self.run.tolerance:g}"
+            )
+        return diagnose(self._mechanism, time, self.final[POSE]) if ended == Ended.LEFT else None
 
     @property
     def final(self) -> Array:
@@ -141,7 +147,7 @@ def integrate(
     """
     x0, looks = np.array(start, dtype=np.float64), np.array(times, dtype=np.float64)
     plant = NativePlant(dynamics, x0, looks, accuracy, longest_step)
-    return _course(plant, dynamics, plant.call("open_loop", *in_c(drives)), looks, accuracy)
+    return _course(plant, plant.call("open_loop", *in_c(drives)), looks)
 
 
 def follow(
@@ -160,21 +166,13 @@ def follow(
     looks, held, at = np.array([end]), np.array(setpoint, np.float64), core().at
     plant = NativePlant(dynamics, np.array(start), looks, accuracy, longest_step)
     ended = plant.call("servo_run", servo, 1, at(np.zeros(1)), at(held))
-    return _course(plant, dynamics, ended, looks, accuracy)
+    return _course(plant, ended, looks)
 
 
-def _course(
-    plant: NativePlant, dynamics: StewartDynamics, ended: Ended, looks: Array, accuracy: float
-) -> Course:
-    if ended == Ended.TOO_SHORT_STEPS:
-        raise IntegrationError(
-            f"no step is short enough at t = {plant.time:.6g} s for an accuracy of {accuracy:g}"
-        )
-    failure = None
-    if ended == Ended.LEFT:
-        failure = diagnose(dynamics.mechanism, plant.time, plant.final[POSE])
-    kept = looks[: plant.seen], plant.states[: plant.seen]
-    return Course(*kept, plant.time, plant.final, failure, plant.run.steps)
+def _course(plant: NativePlant, ended: Ended, looks: Array) -> Course:
+    failure, run = plant.failure(ended), plant.run
+    kept = looks[: run.seen], plant.states[: run.seen]
+    return Course(*kept, run.time, plant.final, failure, run.steps)
 
 
 def in_c(drives: Sequence[Drive]) -> tuple[Any, int]:

@@ -47,30 +47,19 @@ class KnownMotion:
         planned: trajectory (6, 1) to follow: the way onto the reference, then the reference.
         reference: trajectory that a new plan leads back to.
         now: s, on the clock of both.
-        pieces: (n, 38) of a plan made in flight, see core/planning.h, which replaces `planned`
-            until its end; then the reference follows.
     """
 
     planned: Trajectory
     reference: Trajectory
     now: float
-    pieces: Array | None = None
 
     def __call__(self, times: Array) -> Array:
         """Return the motion at all of `times`."""
-        return np.array([self._at(max(0.0, self.now + t)) for t in times])
+        return np.array([evaluate(self.planned, max(0.0, self.now + t)) for t in times])
 
     def goal(self, times: Array) -> Array:
         """Return the reference at all of `times`."""
         return np.array([evaluate(self.reference, max(0.0, self.now + t)) for t in times])
-
-    def _at(self, time: float) -> Array:
-        if self.pieces is None:
-            return evaluate(self.planned, time)
-        c, row = core(), np.empty(NUM_REFERENCE)
-        if c.lib.stewart_along(len(self.pieces), c.at(self.pieces), time, c.at(row)):
-            return row
-        return evaluate(self.reference, time)
 
 
 def between(a: Array, b: Array, h: float, s: float) -> Array:

@@ -507,14 +507,11 @@ def run_loop(
         ended = plant.call("closed_loop_of_law", loop, controller.data)
     else:
         ended = _call_back(plant, loop, controller)
-    if ended == Ended.TOO_SHORT_STEPS:
-        raise IntegrationError(f"no step is short enough at t = {plant.time:.6g} s")
-    stopped = None
-    if ended == Ended.LEFT:
-        stopped = diagnose(experiment.truth, plant.time, plant.final[POSE])
+    stopped = plant.failure(ended)
     measured, asked = measured[: loop.taken], asked[: loop.taken]
     sent = np.clip(asked, -experiment.torque_limit, experiment.torque_limit)
-    return Course(plant.states[: plant.seen], measured, asked, sent, stopped, loop.saturated)
+    seen = plant.states[: plant.run.seen]
+    return Course(seen, measured, asked, sent, stopped, loop.saturated)
 
 
 def _link(

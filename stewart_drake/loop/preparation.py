@@ -28,7 +28,6 @@ from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import as_scenario
 from stewart_drake.scenario.signals import (
     BIAS,
-    CONSTANTS,
     COULOMB,
     DAMPING,
     PARAMETERS,
@@ -247,9 +246,7 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
     parameters = plant_parameters()
     if scenario.actuator.shafts is not None:
         parameters[SHAFTS] = scenario.actuator.shafts
-    for i, name in enumerate(PLANT_PARAMETERS):
-        value = None if calibration is None else calibration.value(name)
-        parameters[i] = parameters[i] if value is None else value
+    parameters = _calibrated(parameters, calibration)
     dynamics = FrozenDynamics if scenario.plant.kind == "paper" else StewartDynamics
     return Experiment(
         scenario=scenario,
@@ -268,13 +265,17 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
 def known_dynamics(experiment: Experiment) -> StewartDynamics:
     """Return the dynamics with the numbers of the scenario's plant, or of its calibration."""
     scenario = experiment.scenario
-    parameters = np.array(scenario.plant_parameters)
-    if experiment.calibration is not None:
-        for i, name in enumerate(CONSTANTS):
-            value = experiment.calibration.value(name)
-            parameters[i] = parameters[i] if value is None else value
+    known = np.array(scenario.plant_parameters)
+    parameters = _calibrated(known, experiment.calibration)
     names = estimated_names(scenario)
     return StewartDynamics(experiment.mechanism, scenario.plant.gravity, parameters, names)
+
+
+def _calibrated(parameters: Array, calibration: Calibration | None) -> Array:
+    """Return the first of `PLANT_PARAMETERS` (n,), calibrated ones in their place."""
+    values = [calibration and calibration.value(name) for name in PLANT_PARAMETERS]
+    pairs = zip(values, parameters, strict=False)
+    return np.array([own if value is None else value for value, own in pairs])
 
 
 def estimated_names(scenario: Scenario) -> tuple[str, ...]:
