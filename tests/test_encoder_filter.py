@@ -191,8 +191,9 @@ def test_a_code_that_stands_still_is_worth_less_and_less():
     codes[7:, 1] += ten.quantum
     said, last = Measurement.of(codes.ravel()), np.tile(codes[0], 10)
     still, c = np.zeros(6), core()
+    sensor = c.ffi.new("stewart_sensing *", c.lib.stewart_encoder_sensing(encoders_of(ten).it))
     for periods in range(1, 4):
-        c.lib.stewart_count_still(encoders_of(ten).it, *map(c.at, (said.values, last, still)))
+        c.lib.stewart_count_still(sensor, *map(c.at, (said.values, last, still)))
         assert np.array_equal(still, [0, 0, *[periods] * 4])
         variance = reading(ten, said, shown, last, still).variance[0]
         white = variance[1] * 2  # that of one sample, projected

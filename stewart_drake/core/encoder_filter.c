@@ -297,18 +297,7 @@ static int moved(const stewart_filter *filter, const real *state, real *B, stewa
            && stewart_solve(LEGS, filter->machine->estimated, J, B);
 }
 
-static int start_scratch(const stewart_filter *filter)
-{
-    return stewart_encoder_scratch(filter->sensing->kind);
-}
-
-static void count_still(const stewart_sensing *sensing, const real *values, const real *last, real *still)
-{
-    stewart_count_still(sensing->kind, values, last, still);
-}
-
-const stewart_legs stewart_encoder_legs = {attempt, attempt_scratch, moved, start_scratch,
-                                           count_still};
+const stewart_legs stewart_encoder_legs = {attempt, attempt_scratch, moved, stewart_count_still};
 
 stewart_sensing stewart_encoder_instants(const void *sensor)
 {

@@ -185,9 +185,10 @@ static int changes_of(const stewart_encoders *encoders, const real *values, cons
     return changes;
 }
 
-void stewart_count_still(const stewart_encoders *encoders, const real *values, const real *last,
-                            real *still)
+void stewart_count_still(const stewart_sensing *sensing, const real *values, const real *last,
+                         real *still)
 {
+    const stewart_encoders *encoders = sensing->kind;
     for (int leg = 0; leg < LEGS; leg++) {
         int silent = 1;
         for (int n = 0; n < encoders->samples; n++)

@@ -26,8 +26,8 @@ stewart_sensing stewart_newest_encoders(const void *sensor);
 
 /* Count in `still` (6) the periods for which each leg's code has been constant, with values (6 N) after
    `last`. */
-void stewart_count_still(const stewart_encoders *encoders, const real *values, const real *last,
-                            real *still);
+void stewart_count_still(const stewart_sensing *sensing, const real *values, const real *last,
+                         real *still);
 
 /* Residuals of values (6 N) with respect to a motion, and their variances.
 

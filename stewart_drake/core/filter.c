@@ -389,6 +389,5 @@ int stewart_filter_scratch(const stewart_filter *filter, int torques)
     const int sample = m * (m + 3 + X) + m * (torques + 1) + X * (n + torques) + stewart_kalman_scratch(n, m);
     const int step = legs ? legs->scratch(filter, torques) : sample;
     const int within = step + stewart_transitions_scratch(p) + 2 * n * n + (X + 3 + torques) * n;
-    const int start = X * X + m + LEGS * (6 + p) + (legs ? legs->start_scratch(filter) : 0);
-    return 2 * stewart_posterior_size(n, m) + kept_numbers(n) + 2 * X * (torques + 1) + (within > start ? within : start);
+    return 2 * stewart_posterior_size(n, m) + kept_numbers(n) + 2 * X * (torques + 1) + within;
 }

@@ -44,11 +44,10 @@ struct stewart_legs {
     /* Compute mean and root after a period and values, if there are any. Returns 0 for an outlier, or
        without a finite result. */
     int (*attempt)(stewart_attempt *attempt, stewart_scratch scratch);
-    int (*scratch)(const stewart_filter *filter, int torques); /* numbers for `attempt` */
+    int (*scratch)(const stewart_filter *filter, int torques); /* numbers for `attempt`, more than a start */
     /* B (6, p) <- J^-1 B with J = dh/dq at a state: from changes of the angles to the changes of the pose
        that cause them. Returns 0 for a singular J. Scratch: 36 numbers. */
     int (*moved)(const stewart_filter *filter, const real *state, real *B, stewart_scratch scratch);
-    int (*start_scratch)(const stewart_filter *filter); /* numbers for `start` of the sensing */
     /* Count in `still` (6) the periods for which the code of each leg has been constant. */
     void (*count_still)(const stewart_sensing *sensing, const real *values, const real *last,
                         real *still);

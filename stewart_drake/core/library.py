@@ -1,6 +1,6 @@
 """The compiled core, loaded once in a process through cffi, which reads its headers."""
 
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,13 @@ class Core:
         names = {np.float64: "double[]", np.intc: "int[]"}
         self._kinds = {np.dtype(kind): self.ffi.typeof(name) for kind, name in names.items()}
         self._block = self.ffi.new_allocator(should_clear_after_alloc=False)
+
+    @cached_property
+    def symbols(self) -> dict[int, str]:
+        """Names of the functions and their tables, by address."""
+        names = [name for name in dir(self.lib) if name.startswith("stewart_")]
+        at = {name: self.ffi.addressof(self.lib, name) for name in names}
+        return {int(self.ffi.cast("intptr_t", pointer)): name for name, pointer in at.items()}
 
     def at(self, array: NDArray[Any] | None) -> Any:
         """Return a pointer to a contiguous array of doubles or C ints.

@@ -17,9 +17,6 @@
 #define SHORTEST ((real)1e-6)
 /* Share of a piece by which rounding may move an instant: one at a joint belongs to the later piece. */
 #define ROUNDING ((real)1e-5)
-/* Share of the motion by which a prediction is off, when the delay was just found and else. */
-#define SURPRISE ((real)0.02)
-#define OFF ((real)0.08)
 
 real stewart_margin(const real *geometry, const real *pose, real sign, const real *least)
 {
@@ -95,18 +92,6 @@ int stewart_predicted_pieces(const stewart_belief *belief, const stewart_schedul
                       pieces + STEWART_PIECE * number++);
     }
     return number;
-}
-
-int stewart_is_off(const real *size, const real *state, const real *wanted, int found)
-{
-    real most = 0;
-    for (int i = 0; i < X; i++) {
-        const real away = REAL(fabs)(state[i] - wanted[i]) / size[i % 6];
-        if (isnan(away))
-            return 0;
-        most = away > most ? away : most;
-    }
-    return most > (found ? SURPRISE : OFF);
 }
 
 /* ---- plans --------------------------------------------------------------------------------------

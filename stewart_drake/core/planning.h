@@ -34,10 +34,6 @@ int stewart_plan_way(const stewart_belief *belief, real sign, const real *start,
 int stewart_predicted_pieces(const stewart_belief *belief, const stewart_schedule *schedule,
                              const real *states, real begin, real *pieces);
 
-/* Whether a predicted state (12) is far enough off the wanted one for a new plan; `size` (6) is that of
-   the motion, peak to peak; `found`: whether the delay has just been found. */
-int stewart_is_off(const real *size, const real *state, const real *wanted, int found);
-
 /* The row of a way at an instant. Before a piece the pose goes on the straight line that its first
    rates continue. Returns 0 after the last piece. */
 int stewart_along(int number, const real *pieces, real time, real *row);

@@ -306,7 +306,8 @@ static int step(void *context, long k, const stewart_sample *measured, double *t
         stewart_tuned_step(in->law, in->tuner, in->memory, in->tuner_memory, in->scratch, &sample,
                            in->wanted + X * k, torque);
         stewart_copy(2, sample.weights, in->weights + 2 * k);
-        stewart_newest_row(in->tuner, in->tuner_memory, in->kept + in->columns * k);
+        stewart_copy((int)in->columns, in->tuner_memory + 3 + in->columns * (STEWART_WINDOW - 1),
+                     in->kept + in->columns * k);
     } else {
         stewart_step(in->law, in->memory, in->scratch, &sample, torque);
     }

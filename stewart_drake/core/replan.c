@@ -16,6 +16,9 @@ enum {
 #define EARLY ((real)0.5) /* share of the assumed delay before which no torque arrives */
 #define LATE_TORQUES 2 /* factor on the weight of torques (`caution`) above which no plan is made */
 #define MOST_SAMPLES ((real)1e6) /* largest count of samples since the start */
+/* Share of the motion by which a prediction is off, when the delay was just found and else. */
+#define SURPRISE ((real)0.02)
+#define OFF ((real)0.08)
 #define ROUNDING ((real)1e-3) /* samples; an instant nearer to a sample than this is at the sample */
 
 static int most_pieces(const stewart_law *law)
@@ -119,6 +122,20 @@ static int is_sure(const stewart_machine *machine, const stewart_schedule *sched
     return 1;
 }
 
+/* Whether a predicted state (12) is far enough off the wanted one for a new plan; `found`: whether the delay
+   has just been found. */
+static int is_off(const real *size, const real *state, const real *wanted, int found)
+{
+    real most = 0;
+    for (int i = 0; i < X; i++) {
+        const real away = REAL(fabs)(state[i] - wanted[i]) / size[i % 6];
+        if (isnan(away))
+            return 0;
+        most = away > most ? away : most;
+    }
+    return most > (found ? SURPRISE : OFF);
+}
+
 static int replan_follow(const stewart_law *law, real *memory, const stewart_outlook *outlook,
                          const stewart_sample *sample, stewart_scratch scratch)
 {
@@ -141,8 +158,7 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     /* A known delay counts as found from the sample at which the first torque has acted for a period
        until the next plan. */
     const int first = outlook->assumed && has_acted(law, outlook, memory) && !(memory[PLANNED] > 0);
-    if (!stewart_is_off(replan->size, states + X * outlook->until_next.number, wanted,
-                        outlook->found || first))
+    if (!is_off(replan->size, states + X * outlook->until_next.number, wanted, outlook->found || first))
         return 0;
     if (law->observer->uncertainty) {
         const int n = X + law->machine.estimated;

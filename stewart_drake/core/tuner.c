@@ -53,13 +53,6 @@ void stewart_tuner_start(const stewart_tuner *t, real *memory)
     memory[2] = 0;
 }
 
-int stewart_newest_row(const stewart_tuner *t, const real *memory, real *row)
-{
-    const int columns = columns_of(t);
-    stewart_copy(columns, memory + 3 + columns * (N - 1), row);
-    return columns;
-}
-
 static real between(real low, real x, real high) { return x < low ? low : x > high ? high : x; }
 
 static real decades(real x)

@@ -41,13 +41,11 @@ typedef struct {
     const real *std;           /* (p) of the estimated parameters */
 } stewart_tuner_input;
 
-/* Numbers of the tuner's memory: weights of the last sample, fallbacks, the window (31, columns). */
+/* Numbers of the tuner's memory: weights of the last sample, fallbacks, the window (31, columns), the
+   newest row last. */
 int stewart_tuner_memory(const stewart_tuner *tuner);
 
 void stewart_tuner_start(const stewart_tuner *tuner, real *memory);
-
-/* The newest row of the window, and its length. */
-int stewart_newest_row(const stewart_tuner *tuner, const real *memory, real *row);
 
 /* Features (18) of a window. */
 void stewart_tuner_features(const stewart_tuner *tuner, const real *window, real *values);

@@ -104,7 +104,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
             name.replace(".c", ".o") for name in (*sources, "stewart_config.c") if ".c" in name
         ],
         "configuration": Constants(
-            compiled.keep, compiled.tables, suffix, compiled.data[0], "stewart_law"
+            compiled.keep, core().symbols, suffix, compiled.data[0], "stewart_law"
         ),
         "memory": compiled.data.memory,
         "scratch": compiled.scratch,

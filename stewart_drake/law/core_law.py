@@ -20,7 +20,6 @@ from stewart_drake.law.compiled import (
     machine_of,
     numbers,
     raise_first,
-    resists,
 )
 from stewart_drake.law.cost import QuadraticCost
 from stewart_drake.law.feedforward import (
@@ -31,7 +30,7 @@ from stewart_drake.law.feedforward import (
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import KnownMotion, Motion
 from stewart_drake.law.nominal import MultibodyModel
-from stewart_drake.law.observers import CoreObserver, part_of
+from stewart_drake.law.observers import CoreObserver, set_observer
 from stewart_drake.law.own_parts import OwnParts, Step, preview_rows
 from stewart_drake.law.planner import NoPlanner, Replan
 from stewart_drake.law.predictors import ArrivalPredictor, NonlinearPredictor
@@ -79,14 +78,12 @@ class CompiledLaw:
         law: the law.
         data: `stewart_law *`, or of servos `stewart_servo *`.
         fields: (place, rows, columns) of each field of the memory.
-        tables: name of each function, or table of them, that the law points to, by its address.
         keep: arrays and C structures that it points to.
     """
 
     def __init__(self, law: Any, more: int = 0) -> None:
         c = core()
         self.law, self._servos, self._more = law, not hasattr(law, "cost"), more
-        self.tables: dict[int, str] = {}
         self.keep: list[Any] = []
         self.data = c.ffi.new("stewart_servo *" if self._servos else "stewart_law *")
         given = c.ffi.addressof(self.data, "law") if self._servos else self.data
@@ -110,8 +107,6 @@ class CompiledLaw:
     def _fill(self, data: Any) -> None:
         c, law, timeline = core(), self.law, self.law.timeline
         machine = machine_of(law.plant)
-        if resists(law.plant.dynamics):
-            self.tables[address_of(machine.it.joints)] = "stewart_ball_joints"
         data.machine = machine.it[0]
         self._raised += machine.raised
         self.keep += machine.pointed()
@@ -122,12 +117,9 @@ class CompiledLaw:
         if "observer" in self._python:
             self._own.observer()
             return
-        part = part_of(law.observer, law.sensing, law.plant, timeline.period)
-        part.fill(data)
-        self.tables[address_of(data.observer)] = part.table
-        self.tables[address_of(data.read)] = part.read
-        self._raised += part.sensor.raised
-        self.keep += [one for it in (part.sensor, part.estimation) if it for one in it.pointed()]
+        part = set_observer(data, law.observer, law.sensing, law.plant, timeline.period)
+        self._raised += part.raised
+        self.keep += part.pointed()
 
     def _of_servos(self) -> None:
         law, d = self.law, self.data
@@ -159,7 +151,6 @@ class CompiledLaw:
             d.channel = c.ffi.addressof(c.lib, "stewart_network")
             packets = packets_of(law.channel)
             d.packets = packets.it
-            self.tables[address_of(d.channel)] = "stewart_network"
             self.keep += packets.pointed()
         if "planner" in python:
             self._own.planner()
@@ -190,14 +181,15 @@ class CompiledLaw:
         plan.size, plan.sign = planner.size.tolist(), home_sign(law.plant.mechanism)
         plan.sure = planner.sure
         d.planner, d.planning = c.ffi.addressof(c.lib, "stewart_replanner"), plan
-        self.tables[address_of(d.planner)] = "stewart_replanner"
         self.keep.append(plan)
 
     @property
     def sources(self) -> list[str]:
         """Files of the core that the law needs."""
-        step = "stewart_servo_step" if self._servos else "stewart_step"
-        return sources_of([step, *self.tables.values()])
+        law, step = self.torques_law, "stewart_servo_step" if self._servos else "stewart_step"
+        parts = law.observer, law.read, law.channel, law.planner, law.machine.joints
+        names = [core().symbols.get(address_of(part)) for part in parts]
+        return sources_of([step, *filter(None, names)])
 
     @cached_property
     def scratch(self) -> int:

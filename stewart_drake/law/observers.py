@@ -13,7 +13,7 @@ sensor and by what is to be estimated:
 import math
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Final, Literal, NamedTuple, Protocol
+from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 from scipy.special import chdtri
@@ -191,27 +191,6 @@ class CoreObserver:
         return _law_of(self, sensing, plant, *clock)
 
 
-class Part(NamedTuple):
-    """An observer in the core."""
-
-    table: str  # name of its table of functions
-    read: str  # name of the function that reads its sensor
-    sensor: Compiled  # C structure of the sensor
-    own: bool  # whether the sensor is written in Python
-    estimation: Compiled | None  # C structure of its assumptions, or None
-
-    def fill(self, law: Any) -> None:
-        """Set the observer of a `stewart_law`."""
-        c = core()
-        law.observer, law.read = (c.ffi.addressof(c.lib, one) for one in (self.table, self.read))
-        if self.own:
-            law.described = self.sensor.it
-        else:
-            law.sensing = self.sensor.it
-        if self.estimation is not None:
-            law.estimation = self.estimation.it
-
-
 _ENCODERS: Final = {
     "differences": "stewart_encoder_sensing",
     "filter": "stewart_encoder_instants",
@@ -220,29 +199,33 @@ _ENCODERS: Final = {
 """Functions of the core that read encoders, by the kind of observer."""
 
 
-def part_of(observer: CoreObserver, sensing: Sensing, plant: NominalPlant, period: float) -> Part:
-    """Return the observer in the core for a sensor and a plant."""
-    within, own = type(sensing) is EncoderSensing, False
-    if within:
-        sensor = encoders_of(sensing)
-    elif type(sensing) is StateSensing:
-        sensor = state_sensor(sensing)
+def set_observer(
+    law: Any, observer: CoreObserver, sensing: Sensing, plant: NominalPlant, period: float
+) -> Compiled:
+    """Set observer and sensor of a `stewart_law`; return the sensor and all that these point to."""
+    c, within, settings = core(), type(sensing) is EncoderSensing, observer.settings
+    if not within and type(sensing) is not StateSensing:
+        sensor = described(sensing, plant.mechanism)
+        law.described = sensor.it
     else:
-        sensor, own = described(sensing, plant.mechanism), True
-    estimation, settings = None, observer.settings
-    kind = "differences" if within else "timing" if observer.timing else "state"
+        sensor = encoders_of(sensing) if within else state_sensor(sensing)
+        law.sensing = sensor.it
+    kind, estimation = "differences" if within else "timing" if observer.timing else "state", None
     if settings is not None and settings.parameters.names != tuple(plant.dynamics.free):
         free = ", ".join(plant.dynamics.free)
         raise ValueError(f"settings.parameters: got other names than those of the plant: {free}")
     if settings is not None and observer.delay is not None:
-        kind = "delay"
-        size = NUM_LEGS if within else sensing.size
+        kind, size = "delay", NUM_LEGS if within else sensing.size
         estimation = _delay_settings_of(observer, settings, size, period)
     elif settings is not None:
         kind = "gap" if observer.gaps and not within else "filter"
         estimation = filter_settings_of(settings, sensing.size)
+    if estimation is not None:
+        law.estimation = estimation.it
+    law.observer = c.ffi.addressof(c.lib, f"stewart_{kind}_observer")
     read = _ENCODERS[kind] if within else "stewart_state_sensing"
-    return Part(f"stewart_{kind}_observer", read, sensor, own, estimation)
+    law.read = c.ffi.addressof(c.lib, read)
+    return Compiled(sensor.it, (sensor.keeps, estimation), sensor.raised)
 
 
 @Once
@@ -256,14 +239,12 @@ def _law_of(
     parts: int,
 ) -> Compiled:
     law, machine = core().ffi.new("stewart_law *"), machine_of(plant)
-    part = part_of(observer, sensing, plant, period)
-    part.fill(law)
+    part = set_observer(law, observer, sensing, plant, period)
     law.machine, law.period, law.parts = machine.it[0], period, parts
     law.measured, law.kept = sensing.size, observer.kept(period)
     if observer.delay is None:
         law.steps, law.fraction = steps, fraction
-    raised = *machine.raised, *part.sensor.raised
-    return Compiled(law, (machine, part.sensor, part.estimation), raised)
+    return Compiled(law, (machine, part), (*machine.raised, *part.raised))
 
 
 @cache

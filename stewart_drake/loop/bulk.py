@@ -72,6 +72,7 @@ from stewart_drake.scenario.signals import (
 )
 from stewart_drake.scenario.timing import event_time, instants, look_time
 from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.tuner.network import WINDOW
 from stewart_drake.tuner.source import Decision, WeightsSource
 from stewart_drake.types import Array
 
@@ -342,9 +343,7 @@ class CompiledController:
         if tuner is not None:
             self._tuned = np.empty(c.lib.stewart_tuner_memory(tuner.it))
             c.lib.stewart_tuner_start(tuner.it, c.at(self._tuned))
-            row = self._tuned.copy()
-            columns = c.lib.stewart_newest_row(tuner.it, c.at(self._tuned), c.at(row))
-            self.rows = np.empty((samples, columns))
+            self.rows = np.empty((samples, (len(self._tuned) - 3) // WINDOW))
             scratch = c.lib.stewart_tuned_step_scratch(compiled.data)
         previews = np.ascontiguousarray(prepared.previews)
         self._kept = prepared, tuner, previews, np.ascontiguousarray(wanted), np.empty(scratch)
