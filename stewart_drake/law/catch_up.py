@@ -59,9 +59,8 @@ class CatchUp:
         least: Callable[[], LeastError] | None = None,
     ) -> None:
         self._least, self._reference, self._period = least, reference, period
-        self._start, self._t_start = start, t_start
-        given = reference, start, t_start, period
-        self._planned = cache(partial(Model(dynamics).plan, *given))
+        self._begin = reference, start, t_start, period
+        self._planned = cache(partial(Model(dynamics).plan, *self._begin))
         self._motion, self._improved = cache(self._follow), cache(self._improve)
 
     def plan(self, duration: float | None, torque_limit: float | None) -> tuple[Trajectory, float]:
@@ -99,12 +98,11 @@ class CatchUp:
     def _improve(self, periods: int, torque_limit: float) -> tuple[Trajectory, float] | None:
         """Return the plan of least error in place of the shortest one, or None without one."""
         assert self._least is not None
-        begin = self._reference, self._start, self._t_start, self._period, periods
         limit = LEAST_ERROR_SHARE * torque_limit
-        pieces = self._least().pieces(self._motion(periods), *begin, limit)
+        pieces = self._least().pieces(self._motion(periods), *self._begin, periods, limit)
         if pieces is None:
             return None
-        return self._through(pieces), float(pieces[-1, 1]) - self._t_start
+        return self._through(pieces), float(pieces[-1, 1]) - self._begin[2]
 
     def _through(self, pieces: Array) -> Trajectory:
         """Return the motion along pieces (n, 38), then the reference."""

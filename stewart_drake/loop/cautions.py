@@ -4,7 +4,7 @@ Those known before a run are printed then. All are in `summary.json` as `warning
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable
 from itertools import product
 from typing import Final
 
@@ -57,12 +57,10 @@ def stiff_friction(experiment: Experiment) -> str | None:
     longest = 2 * plant.coulomb_speed / (plant.coulomb_friction * quickest)
     if plant.time_step <= longest:
         return None
-    finer = next((h for h in _finer(experiment.scenario) if h <= longest), None)
-    remedy = f"plant.time_step={finer:g} would do" if finer else "no multibody step would do"
     return (
         f"plant.time_step of {1e3 * plant.time_step:g} ms is too coarse for Coulomb friction of "
         f"{plant.coulomb_friction:g} N m within {plant.coulomb_speed:g} rad/s, with which cranks "
-        f"tremble where they should stand: {remedy}, or plant.kind=exact"
+        f"tremble where they should stand: {_remedy(experiment.scenario, lambda h: h <= longest)}"
     )
 
 
@@ -82,20 +80,20 @@ def coarse_step(experiment: Experiment, margin: ControllerMargin) -> str | None:
         or margin.growth_in_steps(step) < TOLERABLE
     ):
         return None
-    finer = next((h for h in _finer(sc) if margin.growth_in_steps(h) < TOLERABLE), None)
-    remedy = f"plant.time_step={finer:g} would do" if finer else "no multibody step would do"
+    remedy = _remedy(sc, lambda h: margin.growth_in_steps(h) < TOLERABLE)
     return (
         f"plant.time_step of {1e3 * step:g} ms is too coarse for this loop, which is unstable with "
-        f"the engine's errors of first order though stable without: {remedy}, or plant.kind=exact"
+        f"the engine's errors of first order though stable without: {remedy}"
     )
 
 
-def _finer(scenario: Scenario) -> Iterator[float]:
-    """Yield smaller steps of one digit that suit the scenario's periods, s, the largest first."""
+def _remedy(scenario: Scenario, suits: Callable[[float], bool]) -> str:
+    """Name the longest shorter step, of one digit, that suits loop and periods, if there is one."""
     for exponent, digit in product(range(-2, -7, -1), (5, 2, 1)):
         step = float(f"{digit}e{exponent}")
-        if step < scenario.plant.time_step and not scenario.step_problem(step):
-            yield step
+        if step < scenario.plant.time_step and not scenario.step_problem(step) and suits(step):
+            return f"plant.time_step={step:g} would do, or plant.kind=exact"
+    return "no multibody step would do, or plant.kind=exact"
 
 
 def overconfidence(summary: RunSummary) -> list[str]:

@@ -13,10 +13,10 @@ from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 from pydrake.geometry import Capsule, Cylinder, GeometryId, QueryObject, Role, SceneGraph
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
-from stewart_drake.loop.platforms import add_mechanism, set_pose
+from stewart_drake.loop.platforms import add_mechanism, add_scene, set_pose
 from stewart_drake.mechanism.clearance import LINKS, center_lines, proportions, segment_distances
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import legs_along
@@ -54,8 +54,7 @@ class ClearanceScene:
 
     def __init__(self, mechanism: Mechanism, base: bool = True) -> None:
         builder = DiagramBuilder()
-        config = MultibodyPlantConfig(time_step=1e-3, discrete_contact_approximation="sap")
-        plant, scene_graph = AddMultibodyPlant(config, builder)
+        plant, scene_graph = add_scene(builder)
         add_mechanism(plant, mechanism, collision=True)
         _round_off(scene_graph, plant)
         self._mechanism, self._plant = mechanism, plant

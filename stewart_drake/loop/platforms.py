@@ -63,6 +63,15 @@ from stewart_drake.scenario.signals import (
 from stewart_drake.types import Array, ArrayLike
 
 
+def add_scene(
+    builder: DiagramBuilder, time_step: float = 1e-3
+) -> tuple[MultibodyPlant, SceneGraph]:
+    """Add an empty plant with a time step in s, and its scene."""
+    config = MultibodyPlantConfig(time_step=time_step, discrete_contact_approximation="sap")
+    plant, scene_graph = AddMultibodyPlant(config, builder)
+    return plant, scene_graph
+
+
 def add_mechanism(
     plant: MultibodyPlant, mechanism: Mechanism, collision: bool = False
 ) -> ModelInstanceIndex:
@@ -366,8 +375,10 @@ class StewartPlatform:
         names = (_STATE,) if self.model is None else (_STATE, _CRANKS)
         if name not in names:
             raise ConfigError(f"output port: got {name!r}; expected {' or '.join(names)}")
-        source = self.plant if self.model is None else self._plate_state()
-        return source.GetOutputPort(name)
+        if self.model is None:
+            return self.plant.GetOutputPort(name)
+        make = lambda: PlateState(self.plant, self.mechanism, self.model)  # noqa: E731
+        return self._added_once("plate_state", make).GetOutputPort(name)
 
     def SetState(self, context: Context, state: ArrayLike) -> None:
         """Put the platform, in its diagram's root context, into [pose; rates] (12,).
@@ -440,7 +451,9 @@ class StewartPlatform:
                 "after plant.Finalize()"
             )
 
-    def _add(self, name: str, make: Callable[[], System]) -> Any:
+    def _added_once(self, name: str, make: Callable[[], System]) -> Any:
+        if name in self._added:
+            return self._added[name]
         self._check_finalized()
         system = self._builder.AddSystem(make())
         system.set_name(f"{self.plant.GetModelInstanceName(self.model)}_{name}")
@@ -450,12 +463,6 @@ class StewartPlatform:
         self._added[name] = system
         return system
 
-    def _plate_state(self) -> Any:
-        name = "plate_state"
-        if name not in self._added:
-            self._add(name, lambda: PlateState(self.plant, self.mechanism, self.model))
-        return self._added[name]
-
     def _before(self, port: InputPort, name: str, make: Callable[[], System]) -> InputPort:
         """Return the input of a system, made once, with its output connected to `port`."""
         if name not in self._added:
@@ -464,8 +471,7 @@ class StewartPlatform:
                     f"{name}: got a plant whose {port.get_name()} is connected; "
                     "expected it to be free"
                 )
-            system = self._add(name, make)
-            self._builder.Connect(system.get_output_port(), port)
+            self._builder.Connect(self._added_once(name, make).get_output_port(), port)
         return self._added[name].get_input_port(0)
 
 
@@ -544,10 +550,7 @@ def AddStewartPlatform(
             )
     own = plant is None
     if plant is None:
-        plant, scene_graph = AddMultibodyPlant(
-            MultibodyPlantConfig(time_step=config.time_step, discrete_contact_approximation="sap"),
-            builder,
-        )
+        plant, scene_graph = add_scene(builder, config.time_step)
     model = add_model(
         plant,
         dataclasses.replace(machine, effort_limit=None),
@@ -629,8 +632,7 @@ class MultibodyStewart(Diagram):
 def build_viewer(mechanism: Mechanism, meshcat: Meshcat) -> tuple[Diagram, MultibodyPlant]:
     """Build a diagram that shows the SDFormat model in Meshcat."""
     builder = DiagramBuilder()
-    config = MultibodyPlantConfig(time_step=1e-3, discrete_contact_approximation="sap")
-    plant, scene_graph = AddMultibodyPlant(config, builder)
+    plant, scene_graph = add_scene(builder)
     add_mechanism(plant, mechanism)
     MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
     return builder.Build(), plant
