@@ -12,6 +12,7 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.learned import LearnedLqi, LearnedSignal, with_learned
+from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.learned import HARMONICS, save_learned
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.studies.learn import Anderson, Fit, corrected_setpoints, fit, study_learn
@@ -275,6 +276,16 @@ def test_learned_setpoints_are_added_in_the_middle_of_the_period_in_which_they_a
     acting = dt * np.arange(len(plain)) + eta + dt / 2
     np.testing.assert_allclose((corrected - plain)[:, :6], learned(acting), atol=1e-15)
     np.testing.assert_array_equal((corrected - plain)[:, 6:], 0)
+
+
+def test_runs_in_bulk_have_the_learned_setpoints(tmp_path):
+    file, plain = tmp_path / "l.npz", ("controller.estimate=[]", "duration=0.4")
+    save_learned(file, some_torque(2 * np.pi / 3), prepare(head(*plain)))
+    sc = head(*plain, f"controller.learned={file}")
+    ending, result = run_in_bulk(sc), sd.simulate(sc, judge_stability=False)
+    assert ending.loop == "drake, controller.learned"
+    assert ending.error_so_far == result.summary["accumulated_error"]
+    assert ending.error_so_far > 2 * run_in_bulk(head(*plain)).error_so_far
 
 
 def test_a_late_servo_gets_its_setpoint_early():
