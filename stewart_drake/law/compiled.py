@@ -63,7 +63,6 @@ class Once(Generic[Made]):
         self._made: OrderedDict[tuple[Any, ...], tuple[tuple[Any, ...], Made]] = OrderedDict()
 
     def __call__(self, *parts: Any) -> Made:
-        """Return the result for these objects and numbers."""
         key = tuple(part if isinstance(part, int | float) else id(part) for part in parts)
         found = self._made.get(key)  # which holds the parts, so that no other has their id
         if found is None:

@@ -170,7 +170,6 @@ class PdGain:
     integrates = False  # not annotated: no field
 
     def regulated(self, integral: Array) -> Array:
-        """Return no part of the integral (6,)."""
         return np.empty(0)
 
     def sampled(self, model: ContinuousModel, timeline: Timeline) -> DelayedModel:

@@ -96,8 +96,10 @@ def held_by(dynamics: StewartDynamics) -> dict[str, Callable[[Memory], Array]]:
     known = dynamics.plant_parameters[:NUM_PARAMETERS]
     unknown, nothing = np.full(NUM_PARAMETERS, np.nan), np.full(len(WRENCHES), np.nan)
 
+    places = {name: place for place, name in enumerate(dynamics.free)}
+
     def recorded(signal: str, names: Sequence[str], otherwise: Array) -> Callable[[Memory], Array]:
-        place = np.array([_place(name, dynamics.free) for name in names])
+        place = np.array([places.get(name, -1) for name in names])
         return lambda memory: np.where(place < 0, otherwise, HELD[signal](memory)[place])
 
     own = {
@@ -107,10 +109,6 @@ def held_by(dynamics: StewartDynamics) -> dict[str, Callable[[Memory], Array]]:
         "wrench_std": recorded("wrench_std", WRENCHES, nothing),
     }
     return HELD | own
-
-
-def _place(name: str, names: Sequence[str]) -> int:
-    return names.index(name) if name in names else -1
 
 
 def reported(kept: int) -> int:
