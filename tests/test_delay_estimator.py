@@ -17,7 +17,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.compiled import machine_of
 from stewart_drake.law.filter_settings import filter_settings, usual_parameters
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
-from stewart_drake.law.observers import CoreObserver, DelaySettings, part_of
+from stewart_drake.law.observers import CoreObserver, DelaySettings
 from stewart_drake.law.sensing import Measurement, StateSensing, state_sensor
 from stewart_drake.law.timeline import Arrivals, Timeline
 from stewart_drake.loop.controller_margin import controller_margin
@@ -108,9 +108,10 @@ class Period:
     def __init__(self, torques, sent=None, plant=PLANT):
         c = core()
         self.torques, self.before, self.n = torques, np.zeros((1, 6)), 22
-        self.part = part_of(OBSERVER, SENSING, plant, DT)
+        self.law = OBSERVER.law(Timeline(DT, Delay(0)), SENSING, plant)
+        settings = c.ffi.cast("stewart_delay_settings *", self.law.it.estimation)
         sensing = c.lib.stewart_state_sensing(state_sensor(SENSING).it)
-        self.delay = c.ffi.new("stewart_delay *", self.part.estimation.it.delay)
+        self.delay = c.ffi.new("stewart_delay *", settings.delay)
         self.machine, self.sensing = machine_of(plant), c.ffi.new("stewart_sensing *", sensing)
         self.delay.machine, self.delay.sensing = self.machine.it, self.sensing
         view = (DT, 0.0, 0.0, len(torques) if sent is None else sent, 1, c.at(self.before))

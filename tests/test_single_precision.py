@@ -11,7 +11,7 @@ from cffi import FFI
 import stewart_drake as sd
 from stewart_drake.core import build, library
 from stewart_drake.law.compiled import address_of
-from stewart_drake.law.observers import CoreObserver, part_of
+from stewart_drake.law.observers import CoreObserver
 from tests.backends import with_own
 
 HOST = ("dop853", "plant")
@@ -44,8 +44,10 @@ class Single:
             for one in made.pointed()
         }
         law = self._copy(made.it, known)
-        table = part_of(observer, sensing, plant, timeline.period).table
-        law.observer = self.ffi.addressof(self.lib, table)
+        table, read = (
+            library.core().symbols[address_of(one)] for one in (made.it.observer, made.it.read)
+        )
+        law.observer, law.read = self.ffi.addressof(self.lib, table), getattr(self.lib, read)
         return law
 
     def _copy(self, pointer, known):
