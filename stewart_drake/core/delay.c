@@ -114,12 +114,13 @@ int stewart_period_scratch(int p, int flights)
 
 int stewart_delay_advance_scratch(int p, int m, int flights)
 {
-    const int n = X + p + 2, own = (4 * n + MOST + 2 * X + 1 + m) * n + (m + X + 1 + MOST) * m
+    const int n = X + p + 2, own = (2 * n + 2 * X + 1 + m) * n + (m + X + 1 + MOST) * m
         + 2 * X + (U + 1) * (flights + 3); /* L, the model and `attempt` */
     const int tried = (X + 1) * n + (X + 1 + n) * m, judged = (n + m + MOST) * m;
     const int update = stewart_kalman_scratch(n, m);
-    const int more = tried > update ? tried : update, period = stewart_period_scratch(p, flights);
-    return own + 2 * n + (more + period > judged ? more + period : judged);
+    const int more = (tried > update ? tried : update) + stewart_period_scratch(p, flights);
+    const int predicted = (2 * n + MOST) * n, most = more > judged ? more : judged;
+    return own + 2 * n + (most > predicted ? most : predicted);
 }
 
 int stewart_period_end(const stewart_period *t, const real *xi, real *state,
@@ -452,8 +453,9 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
     const int n = a->n;
     const real dt = d->period, std = stewart_norm(n, L + n * STEWART_ETA(n)), timing = timing_of(d, guess);
     const real used = timing > least ? timing : least;
-    real *xi = stewart_take(&scratch, n), *posterior = stewart_take(&scratch, n * n);
-    real *R = stewart_take(&scratch, n * n), *W = stewart_take(&scratch, n * (n + MOST));
+    real *xi = stewart_take(&scratch, n), *root = stewart_take(&scratch, n * n);
+    real *eta = root + n * STEWART_ETA(n), *rate = root + n * STEWART_RATE(n);
+    real walk[STEWART_MAX_ESTIMATED + 2] = {0};
     a->instant.values = y;
     stewart_copy(n, guess->numbers, xi);
     stewart_copy(X, a->first, a->instant.state);
@@ -464,11 +466,10 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
         ((real *)after)[i] = ((const real *)guess)[i];
     after->log_likelihood = 0;
     after->fits = 1;
-    if (y) {
-        if (!correct(a, guess, L, std, used, xi, posterior, after, scratch))
-            return 0;
-        L = posterior;
-    }
+    if (!y)
+        stewart_copy(n * n, L, root);
+    else if (!correct(a, guess, L, std, used, xi, root, after, scratch))
+        return 0;
     /* The mean delay cannot be known better than the timing of the torques that it is the mean of: a
        larger variance of the timing adds to that of eta. */
     real less_sure = 0;
@@ -476,41 +477,21 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
         less_sure = (timing_of(d, after) - timing) / after->heard;
     if (!(less_sure > 0))
         less_sure = 0;
-    /* QR of [noise; (F L)'; kicks] */
-    stewart_fill(n * n, 0, R);
-    for (int i = 0; i < X; i++)
-        R[(n + 1) * i] = a->drift[i];
-    for (int i = X; i < n - 2; i++)
-        R[(n + 1) * i] = d->walk_std[i - X];
+    stewart_copy(n - X - 2, d->walk_std, walk);
     if (guess->numbers[STEWART_ETA(n)] < STEWART_NEVER) {
-        R[(n + 1) * STEWART_ETA(n)] = REAL(sqrt)(less_sure + d->walk * d->walk * dt);
-        R[(n + 1) * STEWART_RATE(n)] = d->rate_walk * REAL(sqrt)(dt);
+        walk[STEWART_ETA(n) - X] = REAL(sqrt)(less_sure + d->walk * d->walk * dt);
+        walk[STEWART_RATE(n) - X] = d->rate_walk * REAL(sqrt)(dt);
     }
-    for (int j = 0; j < n; j++) {
-        real *w = W + n * j;
-        for (int k = 0; k < n; k++)
-            w[k] = L[n * k + j];
-        w[STEWART_ETA(n)] += dt * w[STEWART_RATE(n)];
-        for (int i = 0; i < X; i++) {
-            real sum = 0;
-            for (int k = 0; k < n; k++)
-                sum += a->instant.H[n * i + k] * L[n * k + j];
-            w[i] = sum;
-        }
-    }
-    for (int k = 0; k < a->rows; k++) {
-        real *w = W + n * (n + k);
-        stewart_fill(n, 0, w);
-        stewart_copy(X, a->K + X * k, w);
-    }
-    stewart_absorb(n, n + a->rows, R, W);
+    /* The rate moves eta first, and H is that by the eta before. */
+    for (int j = 0; j < n; j++)
+        eta[j] += dt * rate[j];
+    for (int i = 0; i < X; i++)
+        a->instant.H[n * i + STEWART_RATE(n)] -= dt * a->instant.H[n * i + STEWART_ETA(n)];
+    stewart_root_of_prediction(n, a->instant.H, a->drift, walk, a->rows, a->K, root, scratch);
+    stewart_guess_keep_root(n, root, after);
     stewart_copy(X, a->instant.state, after->numbers);
     stewart_copy(n - X, xi + X, after->numbers + X);
     after->numbers[STEWART_ETA(n)] += dt * xi[STEWART_RATE(n)];
-    real *packed = after->numbers + n;
-    for (int i = 0; i < n; i++)
-        for (int j = 0; j <= i; j++)
-            *packed++ = R[n * j + i];
     return stewart_all_finite(n + n * (n + 1) / 2, after->numbers);
 }
 
