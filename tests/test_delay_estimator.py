@@ -113,7 +113,8 @@ class Period:
         sensing = c.lib.stewart_state_sensing(state_sensor(SENSING).it)
         self.delay = c.ffi.new("stewart_delay *", settings.delay)
         self.machine, self.sensing = machine_of(plant), c.ffi.new("stewart_sensing *", sensing)
-        self.delay.machine, self.delay.sensing = self.machine.it, self.sensing
+        self.delay.filter.machine = self.machine.it
+        self.delay.filter.sensing = self.sensing
         view = (DT, 0.0, 0.0, len(torques) if sent is None else sent, 1, c.at(self.before))
         numbers = (self.delay, view, len(torques), 0, c.at(torques))
         self.it = c.ffi.new("stewart_period *", numbers)

@@ -31,7 +31,7 @@
 #define LARGEST_RATE ((real)0.5) /* s/s */
 #define UNLIKELY ((real)-1e6) /* log-likelihood of a measurement that cannot be explained */
 
-static int size_of(const stewart_delay *d) { return X + d->machine->estimated + 2; }
+static int size_of(const stewart_delay *d) { return X + d->filter.machine->estimated + 2; }
 
 int stewart_guess_size(int p)
 {
@@ -102,7 +102,7 @@ static int predict(const stewart_period *t, const real *xi, Path *path, real *st
     if (!schedule_between(t, xi, 0, t->delay->period, path))
         return 0;
     const stewart_schedule schedule = {path->number, path->torques, path->durations, 0};
-    stewart_predict(t->delay->machine, xi + X, &schedule, xi, path->states);
+    stewart_predict(t->delay->filter.machine, xi + X, &schedule, xi, path->states);
     stewart_copy(X, path->states + X * (path->number - 1), state);
     return 1;
 }
@@ -138,8 +138,8 @@ static int linearize_along(const stewart_period *t, const real *xi, const Path *
     const stewart_schedule schedule = {path->number, path->torques, path->durations, 0};
     real *by_known = stewart_take(&scratch, X * known), *moved = stewart_take(&scratch, n);
     real later[X], sooner[X];
-    if (!stewart_transitions(t->delay->machine, xi, &schedule, fourth_order, path->states, 0, by_known,
-                             scratch))
+    if (!stewart_transitions(t->delay->filter.machine, xi, &schedule, fourth_order, path->states, 0,
+                             by_known, scratch))
         return 0;
     for (int i = 0; i < X; i++) {
         stewart_copy(known, by_known + known * i, H + n * i);
@@ -191,7 +191,7 @@ int stewart_period_late(const stewart_period *t, const real *xi, const real *sta
     Path path = take_path(t, &scratch);
     const real first = ((real)(t->newest + 1 - view.num_own) * dt + view.eta) * (1 + view.rate);
     stewart_belief belief;
-    stewart_believe(t->delay->machine, xi + X, &belief);
+    stewart_believe(t->delay->filter.machine, xi + X, &belief);
     *others = 0;
     if (!schedule_between(t, xi, at, dt - at, &path))
         return -1;
@@ -272,7 +272,7 @@ static int set_noise(Model *a, const real *xi, real used, stewart_scratch scratc
     if (a->rows < 0)
         return 0;
     for (int i = 0; i < X; i++) {
-        real square = d->model_std[i] * d->model_std[i];
+        real square = d->filter.model_std[i] * d->filter.model_std[i];
         for (int k = 0; k < a->rows; k++)
             square += STEWART_ASIDE * a->K[X * k + i] * a->K[X * k + i];
         a->drift[i] = REAL(sqrt)(square);
@@ -300,7 +300,8 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
                 A[X * j + i] += a->instant.H[n * i + k] * L[n * k + j];
         }
     /* With dh/dx at the beginning of the period. */
-    if (!stewart_innovation_root(d->sensing, a->mean, known, A, d->model_std, a->instant.C, scratch))
+    if (!stewart_innovation_root(d->filter.sensing, a->mean, known, A, d->filter.model_std,
+                                 a->instant.C, scratch))
         return 0;
     stewart_copy(n, a->mean, trial);
     for (int k = 0; k < TRIED; k++) {
@@ -308,7 +309,7 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
         trial[STEWART_ETA(n)] = k < TRIED - 1 ? low + (high - low) / (TRIED - 1) * (real)k : high;
         if (!stewart_period_end(a->period, trial, end, scratch))
             return 0;
-        stewart_predict_measurement(d->sensing, end, miss);
+        stewart_predict_measurement(d->filter.sensing, end, miss);
         for (int i = 0; i < m; i++)
             miss[i] = a->instant.values[i] - miss[i];
         stewart_whiten(m, 1, a->instant.C, miss);
@@ -348,12 +349,9 @@ static int judge_timing(Model *a, const real *L, real used, stewart_guess *after
         S[(m + 1) * i] += 1;
     if (!stewart_cholesky(m, S))
         return 0;
+    stewart_fill(m * k, 0, B);
     for (int i = 0; i < m; i++)
-        for (int j = 0; j < k - 1; j++) {
-            B[k * i + j] = a->seen[a->rows * i + a->others + j];
-        }
-    for (int i = 0; i < m; i++)
-        B[k * i + k - 1] = 0;
+        stewart_copy(k - 1, a->seen + a->rows * i + a->others, B + k * i);
     stewart_whiten(m, k, a->instant.C, B);
     for (int i = 0; i < m; i++)
         B[k * i + k - 1] = a->nu[i];
@@ -391,7 +389,7 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
                    real *root, stewart_guess *after, stewart_scratch scratch)
 {
     const stewart_delay *d = a->period->delay;
-    const int n = a->n, m = a->m, p = d->machine->estimated;
+    const int n = a->n, m = a->m;
     const int free_eta = stewart_norm(n, L + n * STEWART_ETA(n)) > 0;
     const int free_rate = stewart_norm(n, L + n * STEWART_RATE(n)) > 0;
     real *lower = stewart_take(&scratch, n), *upper = stewart_take(&scratch, n);
@@ -403,30 +401,22 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
             || !set_noise(a, xi, used, scratch))
             return 0;
     }
-    stewart_measurement_jacobian(d->sensing, a->instant.state, a->instant.J);
-    stewart_apply_jacobian(d->sensing, a->instant.J, a->rows, a->K, a->seen);
-    if (!stewart_innovation_root(d->sensing, a->instant.state, a->rows, a->K, a->drift, C, scratch))
+    stewart_measurement_jacobian(d->filter.sensing, a->instant.state, a->instant.J);
+    stewart_apply_jacobian(d->filter.sensing, a->instant.J, a->rows, a->K, a->seen);
+    if (!stewart_innovation_root(d->filter.sensing, a->instant.state, a->rows, a->K, a->drift, C, scratch))
         return 0;
-    for (int i = 0; i < n; i++) {
-        lower[i] = -(real)INFINITY;
-        upper[i] = (real)INFINITY;
-    }
-    stewart_copy(p, d->lower, lower + X);
-    stewart_copy(p, d->upper, upper + X);
-    if (free_eta) {
-        lower[STEWART_ETA(n)] = guess->low;
-        upper[STEWART_ETA(n)] = guess->high;
-    }
-    if (free_rate) {
-        lower[STEWART_RATE(n)] = -LARGEST_RATE;
-        upper[STEWART_RATE(n)] = LARGEST_RATE;
-    }
+    stewart_copy(n - 2, d->filter.lower, lower);
+    stewart_copy(n - 2, d->filter.upper, upper);
+    lower[STEWART_ETA(n)] = free_eta ? guess->low : -(real)INFINITY;
+    upper[STEWART_ETA(n)] = free_eta ? guess->high : (real)INFINITY;
+    lower[STEWART_RATE(n)] = free_rate ? -LARGEST_RATE : -(real)INFINITY;
+    upper[STEWART_RATE(n)] = free_rate ? LARGEST_RATE : (real)INFINITY;
     const stewart_kalman filter = {
         n, m, std > d->period / 100 ? ITERATIONS : FEW, a->mean, L, lower, upper, a,
         whitened_rows, stewart_instant_settle, 0, NULL, NULL};
     if (!stewart_kalman_update(&filter, xi, root, &distance, &spread, scratch))
         return 0;
-    if (!(distance <= d->gate)) /* or NaN */
+    if (!(distance <= d->filter.gate)) /* or NaN */
         return 0;
     for (int i = 0; i < m; i++)
         spread += 2 * REAL(log)(C[(m + 1) * i]);
@@ -477,7 +467,7 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
         less_sure = (timing_of(d, after) - timing) / after->heard;
     if (!(less_sure > 0))
         less_sure = 0;
-    stewart_copy(n - X - 2, d->walk_std, walk);
+    stewart_copy(n - X - 2, d->filter.walk_std, walk);
     if (guess->numbers[STEWART_ETA(n)] < STEWART_NEVER) {
         walk[STEWART_ETA(n) - X] = REAL(sqrt)(less_sure + d->walk * d->walk * dt);
         walk[STEWART_RATE(n) - X] = d->rate_walk * REAL(sqrt)(dt);
@@ -518,7 +508,7 @@ static int jumped(Model *a, const stewart_guess *guess, real *L, const real *y, 
     real jump[STEWART_MAX_ESTIMATED + 2];
     for (real share = 1; share <= STEWART_LARGEST_JUMP; share *= 10) {
         for (int i = 0; i < n - X; i++)
-            jump[i] = i < p ? share * d->jump_std[i] : 0;
+            jump[i] = i < p ? share * d->filter.jump_std[i] : 0;
         stewart_widen_root(n, jump, L, scratch);
         const int fits = attempt(a, guess, L, y, 0, after, scratch);
         stewart_guess_root(guess, n, L);
@@ -534,7 +524,7 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
                            stewart_guess *after, stewart_scratch scratch)
 {
     const stewart_delay *d = t->delay;
-    const int n = size_of(d), p = n - X - 2, m = d->sensing->size;
+    const int n = size_of(d), p = n - X - 2, m = d->filter.sensing->size;
     Model a = {.period = t, .mean = guess->numbers, .m = m, .n = n};
     real *L = stewart_take(&scratch, n * n);
     a.path = take_path(t, &scratch);
@@ -542,7 +532,7 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
     a.seen = stewart_take(&scratch, m * MOST);
     a.white = stewart_take(&scratch, m * n);
     a.nu = stewart_take(&scratch, m);
-    a.instant = (stewart_instant){.sensing = d->sensing, .n = n, .period = &a,
+    a.instant = (stewart_instant){.sensing = d->filter.sensing, .n = n, .period = &a,
                                   .predict = predict_model, .linearize = linearize_model};
     a.instant.state = stewart_take(&scratch, X);
     a.instant.H = stewart_take(&scratch, X * n);
@@ -550,8 +540,8 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
     a.instant.J = stewart_take(&scratch, m * X);
     stewart_guess_root(guess, n, L);
     for (int i = 0; i < p; i++)
-        if (!(d->walk_std[i] > 0)
-            && !(stewart_norm(n, L + n * (X + i)) <= KNOWN * d->usual_std[i])) /* or NaN */
+        if (!(d->filter.walk_std[i] > 0)
+            && !(stewart_norm(n, L + n * (X + i)) <= KNOWN * d->filter.usual_std[i])) /* or NaN */
             a.fourth_order = 1;
     const int exists =
         stewart_period_at(t, guess->numbers, a.fourth_order, a.first, a.first + X, scratch);
@@ -567,7 +557,7 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
             }
             stewart_guess_root(guess, n, L);
         }
-        if (d->jump_std && guess->heard >= HEARD && guess->outliers == 0
+        if (d->filter.jump_std && guess->heard >= HEARD && guess->outliers == 0
             && jumped(&a, guess, L, y, after, scratch))
             return;
     }

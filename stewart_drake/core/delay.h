@@ -3,7 +3,7 @@
 #pragma once
 
 #include "arrivals.h"
-#include "instant.h"
+#include "filter.h"
 
 #define STEWART_NEVER 1000000 /* s; the delay of torques that do not arrive */
 
@@ -19,17 +19,9 @@ enum {
 
 /* Assumptions about the state, the parameters theta (p) and the delay. */
 typedef struct {
-    const stewart_machine *machine;
-    const stewart_sensing *sensing;
+    stewart_filter filter;           /* of state and theta; `timing_std` is that of the first torques */
+    const real *prior, *std;         /* (p) mean and standard deviation of theta */
     real period;                     /* dt, s */
-    real model_std[STEWART_STATES];  /* error of one step of the model */
-    const real *prior, *prior_root;  /* of theta: mean (p), root of the covariance (p, p) */
-    const real *std, *usual_std;     /* (p) of the prior, and of the prior from a drawing alone */
-    const real *walk_std;            /* (p) change of theta in a period; 0 for a constant */
-    const real *jump_std;            /* (p) sudden change of theta, as of a filter, or NULL */
-    const real *lower, *upper;       /* (p) bounds of theta */
-    real gate;                       /* largest nu' S^-1 nu that is not an outlier */
-    real first_timing;               /* s, first standard deviation of the timing of torques */
     real believed, delay_std;        /* s, mean and standard deviation of the delay's prior */
     real longest;                    /* s */
     real timing_std;                 /* s, least standard deviation of the timing of torques */

@@ -16,8 +16,8 @@ static void sizes_of(const stewart_law *law, Sizes *s)
 {
     s->delay = ((const stewart_delay_settings *)law->estimation)->delay;
     s->sensing = stewart_sensing_of(law);
-    s->delay.machine = &law->machine;
-    s->delay.sensing = &s->sensing;
+    s->delay.filter.machine = &law->machine;
+    s->delay.filter.sensing = &s->sensing;
     s->p = law->machine.estimated;
     s->m = s->sensing.size;
     s->flights = 1 + law->kept + stewart_queue_length(law);

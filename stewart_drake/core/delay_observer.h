@@ -6,7 +6,7 @@
 #include "delay.h"
 #include "law.h"
 
-/* `delay` without machine and sensing, which are the law's. */
+/* `delay` without machine and sensing, which are the law's, as in `stewart_filter_settings`. */
 typedef struct {
     stewart_delay delay;
     int values; /* of one sample */

@@ -175,12 +175,12 @@ static void begin(Search *s, const real *y, const real *near, stewart_scratch sc
     const int n = s->n, p = n - X - 2;
     stewart_guess *master = guess_at(s, 0);
     real *L = stewart_take(&scratch, n * n), root[X * X], state[X];
-    if (!start_of(d->sensing, y, near, state, root, scratch))
+    if (!start_of(d->filter.sensing, y, near, state, root, scratch))
         return;
     stewart_fill(STEWART_GUESS, 0, (real *)master);
     master->high = d->longest;
     master->fits = 1;
-    master->timing = d->first_timing * d->first_timing;
+    master->timing = d->filter.timing_std * d->filter.timing_std;
     master->torques = TORQUES;
     stewart_copy(X, state, master->numbers);
     stewart_copy(p, d->prior, master->numbers + X);
@@ -190,7 +190,7 @@ static void begin(Search *s, const real *y, const real *near, stewart_scratch sc
     for (int i = 0; i < X; i++)
         stewart_copy(X, root + X * i, L + n * i);
     for (int i = 0; i < p; i++)
-        stewart_copy(p, d->prior_root + p * i, L + n * (X + i) + X);
+        stewart_copy(p, d->filter.prior_root + p * i, L + n * (X + i) + X);
     stewart_guess_keep_root(n, L, master);
     s->memory->known = s->memory->searching = 1;
     s->memory->cells = s->memory->best = 0;
@@ -305,7 +305,7 @@ static int compare(const Search *s, const stewart_period *t, const stewart_guess
                    stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
-    const stewart_sensing *sensing = d->sensing;
+    const stewart_sensing *sensing = d->filter.sensing;
     const int n = s->n, m = s->m, known = n - 2;
     real *L = stewart_take(&scratch, n * n), *H = stewart_take(&scratch, X * n);
     real *xi = stewart_take(&scratch, n), *A = stewart_take(&scratch, X * (n + X));
@@ -326,7 +326,7 @@ static int compare(const Search *s, const stewart_period *t, const stewart_guess
         for (int j = 0; j <= k; j++)
             for (int i = 0; i < X; i++)
                 A[X * (k < X ? j : X + j) + i] += H[n * i + k] * L[n * k + j];
-    if (!stewart_innovation_root(sensing, state, known + X, A, d->model_std, C, scratch))
+    if (!stewart_innovation_root(sensing, state, known + X, A, d->filter.model_std, C, scratch))
         return 0;
     for (int k = 0; k < number; k++) {
         xi[STEWART_ETA(n)] = (real)(k + 1) * GRID * d->period;
@@ -379,7 +379,7 @@ static int jump(Search *s, const real *y, stewart_scratch scratch)
     periods[0].newest = 1;
     stewart_fill(number, 0, cost);
     for (int i = 0; i < 2; i++)
-        if (!start_of(d->sensing, seen[i], guess->numbers, states[i], roots[i], scratch))
+        if (!start_of(d->filter.sensing, seen[i], guess->numbers, states[i], roots[i], scratch))
             return 0;
     for (int i = 0; i < 2; i++)
         if (!compare(s, periods + i, guess, states[i], roots[i], seen[i + 1], number, cost, scratch))
@@ -432,7 +432,7 @@ static void restart(Search *s, const real *y, const real *near, stewart_scratch 
         begin(s, y, near, scratch);
         return;
     }
-    if (!start_of(d->sensing, y, guess->numbers, state, root, scratch))
+    if (!start_of(d->filter.sensing, y, guess->numbers, state, root, scratch))
         return;
     const real std = stewart_guess_std(guess, n), least = d->period / 10;
     begin_at(s, guess, guess->numbers[STEWART_ETA(n)], std > least ? std : least, LOOSENED, state, root, anew,
@@ -500,7 +500,7 @@ static void report(Search *s, int measured)
 
 void stewart_delay_start(const stewart_delay *d, int flights, stewart_delay_memory *memory)
 {
-    const int p = d->machine->estimated, m = d->sensing->size;
+    const int p = d->filter.machine->estimated, m = d->filter.sensing->size;
     stewart_fill(stewart_delay_size(p, m, flights), 0, (real *)memory);
     memory->eta = d->believed;
     memory->sent = -1; /* before the first sample */
@@ -514,7 +514,7 @@ void stewart_delay_observe(const stewart_delay *d, int flights, const real *in_f
                            const real *y, const real *near, stewart_delay_memory *memory,
                            stewart_scratch scratch)
 {
-    const int n = X + d->machine->estimated + 2, m = d->sensing->size, first = memory->sent < 0;
+    const int n = X + d->filter.machine->estimated + 2, m = d->filter.sensing->size, first = memory->sent < 0;
     const int others = periods_before(flights);
     Search s = {.delay = d, .n = n, .m = m, .flights = flights, .memory = memory};
     s.before = memory->numbers;

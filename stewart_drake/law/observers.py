@@ -253,32 +253,22 @@ def _gate(size: int) -> float:
     return float(chdtri(size, OUTLIER))
 
 
-def _assumed(settings: FilterSettings) -> dict[str, Array]:
-    """Return the prior of the parameters and their assumed changes, for all filters."""
-    known, p = settings.parameters, len(settings.parameters.names)
-    walk = np.zeros(p) if settings.walk_std is None else settings.walk_std
-    arrays = {
-        "prior_root": numbers(np.linalg.cholesky(known.covariance), p, p),
-        "usual_std": numbers(known.usual_std, p),
-        "walk_std": numbers(walk, p),
-    }
-    if settings.jump_std is not None:
-        arrays["jump_std"] = numbers(settings.jump_std, p)
-    return arrays
-
-
 @Once
 def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
     c, known, p = core(), settings.parameters, len(settings.parameters.names)
-    free = np.full(NUM_STATE, np.inf)
+    free, walk = np.full(NUM_STATE, np.inf), settings.walk_std
     it, prior = c.ffi.new("stewart_filter_settings *"), numbers(known.prior)
     arrays = {
-        **_assumed(settings),
+        "prior_root": numbers(np.linalg.cholesky(known.covariance), p, p),
+        "usual_std": numbers(known.usual_std, p),
+        "walk_std": numbers(np.zeros(p) if walk is None else walk, p),
         "model_std": numbers(settings.model_std, NUM_STATE),
         "wander_std": numbers(settings.wander * known.usual_std, p),
         "lower": numbers([*-free, *known.lower], NUM_STATE + p),
         "upper": numbers([*free, *known.upper], NUM_STATE + p),
     }
+    if settings.jump_std is not None:
+        arrays["jump_std"] = numbers(settings.jump_std, p)
     it.prior, it.filter.gate, it.filter.timing_std = c.at(prior), _gate(size), settings.timing_std
     it.filter.learns_timing, it.filter.keep = settings.learns_timing, settings.keep
     it.filter.offsets = known.names.index(OFFSETS[0]) if OFFSETS[0] in known.names else -1
@@ -290,21 +280,16 @@ def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
 def _delay_settings_of(
     observer: CoreObserver, settings: FilterSettings, size: int, period: float
 ) -> Compiled:
-    c, delay = core(), observer.delay
+    c, delay, std = core(), observer.delay, numbers(settings.parameters.std)
     assert delay is not None
-    it = c.ffi.new("stewart_delay_settings *")
+    it, assumed = c.ffi.new("stewart_delay_settings *"), filter_settings_of(settings, size)
     it.values, it.most = size, observer.max_schedule_length(period)
-    arrays = _assumed(settings)
-    for name in ("prior", "std", "lower", "upper"):
-        arrays[name] = numbers(getattr(settings.parameters, name))
-    for name, array in arrays.items():
-        setattr(it.delay, name, c.at(array))
-    it.delay.period, it.delay.gate, it.delay.believed = period, _gate(size), delay.mean
-    it.delay.model_std, it.delay.first_timing = list(settings.model_std), settings.timing_std
+    it.delay.filter, it.delay.prior = assumed.it.filter, assumed.it.prior
+    it.delay.std, it.delay.period, it.delay.believed = c.at(std), period, delay.mean
     it.delay.delay_std, it.delay.quiet = delay.std, delay.quiet
     for name in ("longest", "timing_std", "walk", "rate_std", "rate_walk"):
         setattr(it.delay, name, getattr(delay, name))
-    return Compiled(it, (arrays,))
+    return Compiled(it, (std, assumed))
 
 
 def _last_values(observer: CoreObserver, law: Any) -> int:
