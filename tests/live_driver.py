@@ -1,7 +1,6 @@
 """The least controller that a machine can be tried with, and a clock that tests turn themselves."""
 
 import functools
-import select
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -14,7 +13,7 @@ import numpy as np
 from stewart_drake.law.channel import Packets, Report
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.live.endpoint import Address, Endpoint, Session, now
+from stewart_drake.live.endpoint import Address, Endpoint, Session
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.protocol import (
     NEVER,
@@ -22,7 +21,6 @@ from stewart_drake.live.protocol import (
     SECOND,
     ControllerFlags,
     ControllerMessage,
-    Head,
     MachineMessage,
     Refusal,
 )
@@ -207,77 +205,6 @@ class Driver:
 def time_of(number: int, period: int) -> float:
     """s, as the scenario's own grid has it."""
     return number * (period / SECOND)
-
-
-@dataclass
-class OtherClock:
-    """The other side's clock, from datagrams that went there and came back.
-
-    A datagram sent at t1 was got there at t2 and answered at t3, which came at t4. On its way back
-    it was half of r = (t4 - t1) - (t3 - t2) / rate, or up to r/2 more or less; the shortest r tells
-    most. What a controller makes of that error is harmless: a measurement that seems older by as
-    much has, it seems, torques on their way for as much less time.
-
-    Attributes:
-        rate: of the other clock, by the own one.
-        round_trip: s, the shortest of the last ones; infinite before there is one.
-    """
-
-    rate: float = 1.0
-    round_trip: float = float("inf")
-    _trips: list[tuple[float, float]] = field(default_factory=list)
-
-    def note(self, head: Head, time: int) -> None:
-        """Take a datagram that came at a time of the own clock, ns."""
-        if head.acknowledged == 0:
-            return
-        trip = (time - head.echo) / SECOND - head.held / SECOND / self.rate
-        there = head.time / SECOND + self.rate * max(trip, 0.0) / 2 - self.rate * time / SECOND
-        self._trips = [*self._trips[-63:], (trip, there)]
-        self.round_trip = min(self._trips)[0]
-
-    def at(self, time: int) -> float:
-        """s of the other clock at a time of the own one, ns; NaN before it is known."""
-        if not self._trips:
-            return float("nan")
-        return self.rate * time / SECOND + min(self._trips)[1]
-
-
-def drive_in_real_time(driver: Driver, samples: int) -> np.ndarray:
-    """Drive from the request for a session to the stop; return measured states, NaN where lost."""
-    clock, period = OtherClock(), driver.period
-
-    def hear(until: int) -> None:
-        while (left := until - now()) > 0:
-            select.select([driver.endpoint], [], [], left / SECOND)
-            for message in driver.receive(now()):
-                clock.note(message.head, now())
-
-    def machine() -> int:
-        return round(clock.at(now()) * SECOND)
-
-    for _ in range(100):
-        driver.say(now())
-        hear(now() + period // 2)
-        trips = sum(m.head.acknowledged > 0 for m in driver.got)
-        if trips >= 10 and driver.begin == NEVER:
-            driver.begin = (machine() // period + 8) * period
-        if driver.got and driver.got[-1].begin == driver.begin != NEVER:
-            break
-    while machine() < driver.begin - period:
-        driver.say(now())
-        hear(now() + period // 2)
-    for k in range(samples):
-        time = driver.begin + k * period
-        while machine() < time + 2 * period // 3:
-            if driver.got[-1].sampled >= time:
-                break
-            hear(now() + period // 50)
-        driver.step(time, now())
-    driver.say(now(), ControllerFlags.STOP)
-    there = {(m.sampled - driver.begin) // period: m.state for m in driver.got}
-    nothing = np.full(12, np.nan)
-    return np.array([there.get(k, nothing) for k in range(samples)])
 
 
 @dataclass

@@ -1,18 +1,18 @@
 """Requests, offers, identities and faults, as both sides say them."""
 
-import math
 import re
 import socket
 import threading
 import time
 import urllib.request
 from dataclasses import replace
+from itertools import count, repeat
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live import contact as contacts
 from stewart_drake.live.checks import ReportCheck
@@ -31,7 +31,6 @@ from stewart_drake.live.protocol import (
     encode,
 )
 from stewart_drake.live.session import drive, prepare_session
-from stewart_drake.live.viewer import End, Viewer
 from stewart_drake.loop.peer import FAULTS, Fault, Part, Reason, identity_of, in_words
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.loading import load_scenario
@@ -114,27 +113,6 @@ def test_answers_to_unknown_addresses_have_a_rate_and_are_no_longer_than_request
     assert len(list(driver.endpoint.receive())) == 100
 
 
-def test_an_offer_ends_with_the_next_session():
-    """A recorded confirmation does not begin a second session."""
-    run = begun(samples=3)
-    driver, time = run.driver, run.machine.time()
-    session = run.machine.session
-    assert session is not None
-    driver.say(time, ControllerFlags.STOP)
-    run.driver = other = Driver(run.scenario, run.ear.address)
-    period = other.period
-    run.greet(run.machine.time() // period * period + period, time // period * period + 9 * period)
-    assert run.machine.session.number == other.session.number
-    other.say(run.machine.time(), ControllerFlags.STOP)
-    run.at(run.machine.time() + 1)
-    driver.session._sent = 0
-    before = run.ear.refused[Refusal.FOREIGN]
-    driver.say(run.machine.time())
-    run.at(run.machine.time() + 1)
-    assert run.ear.refused[Refusal.FOREIGN] == before + 1
-    assert run.machine.counts["sessions"] == 2
-
-
 # ---------------------------------------------------------------- another version
 
 
@@ -155,8 +133,8 @@ def test_a_controller_of_version_1_is_refused_in_one_line():
     old.close()
 
 
-def answering(reply):
-    """Start a machine that answers every datagram with the same bytes."""
+def answering(replies):
+    """Start a machine that answers datagrams with these bytes in turn."""
     ear = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     ear.bind(("127.0.0.1", 0))
     ear.settimeout(0.05)
@@ -168,7 +146,7 @@ def answering(reply):
                 data, address = ear.recvfrom(2000)
             except TimeoutError:
                 continue
-            ear.sendto(changed(reply, 8, data[8:16]), address)
+            ear.sendto(changed(next(replies), 8, data[8:16]), address)
         ear.close()
 
     thread = threading.Thread(target=answer)
@@ -178,11 +156,11 @@ def answering(reply):
 
 @pytest.fixture
 def contact_with():
-    """Make a contact with a machine that always answers the same."""
+    """Make a contact with a machine that answers with these bytes in turn."""
     made = []
 
-    def contact(reply):
-        thread, ends, address = answering(reply)
+    def contact(replies):
+        thread, ends, address = answering(replies)
         endpoint = open_endpoint(address, None)
         made.append((thread, ends, endpoint))
         return Contact(endpoint, address, IDENTITY)
@@ -195,7 +173,7 @@ def contact_with():
 
 
 def test_a_machine_of_version_1_is_refused_in_one_line(contact_with):
-    contact = contact_with(changed(encode(OFFER), 4, b"\1"))
+    contact = contact_with(repeat(changed(encode(OFFER), 4, b"\1")))
     with pytest.raises(ConfigError) as refused:
         call(contact)
     assert re.fullmatch(
@@ -213,37 +191,23 @@ def impatient(monkeypatch):
     monkeypatch.setattr(contacts, "_PATIENCE", 0.3)
 
 
-def test_a_machine_in_use_is_named(impatient):
-    with paper_machine(watchdog=0.5) as running:
-        first = prepare_session(scenario_of(), running.address)
-        await_free(first.contact)
-        first.contact.join()
-        first.contact.send()
-        stays = threading.Event()
-
-        def stay():
-            while not stays.wait(0.1):
-                first.contact.send()
-
-        thread = threading.Thread(target=stay)
-        thread.start()
-        time.sleep(0.2)
-        second = prepare_session(scenario_of(), running.address)
-        with pytest.raises(ConfigError) as refused:
-            await_free(second.contact)
-        stays.set()
-        thread.join()
-        for each in (first, second):
-            each.endpoint.close()
-        host, port = running.address
-    assert str(refused.value) == (
-        f"machine at {host}:{port} is in use by another controller (retry 0.5 s after it stops)"
-    )
+def test_a_machine_in_use_is_named(contact_with, impatient):
+    head, busy = OFFER.head, OFFER.flags | MachineFlags.BUSY
+    used = replace(OFFER, flags=busy, watchdog=SECOND // 2)
+    contact = contact_with(encode(replace(used, head=replace(head, sequence=k))) for k in count(1))
+    while not contact.ask():
+        pass
+    with pytest.raises(
+        ConfigError,
+        match=r"^machine at 127\.0\.0\.1:\d+ is in use by another controller \(retry "
+        r"0\.5 s after it stops\)$",
+    ):
+        await_free(contact)
 
 
 def test_a_sequence_that_restarts_is_named(contact_with, impatient):
     """Every answer has sequence 7: only the first is taken."""
-    contact = contact_with(encode(replace(OFFER, watchdog=SECOND // 10)))
+    contact = contact_with(repeat(encode(replace(OFFER, watchdog=SECOND // 10))))
     while not contact.ask():
         pass
     assert contact.last.head.sequence == 7
@@ -374,30 +338,23 @@ def test_silence_stop_and_end_are_said():
     assert messages(run)[-1].why == FAULTS[Fault.NONE]
 
 
-class Watching(Viewer):
-    """Keeps how it ended."""
-
-    def __init__(self):
-        self.words = ""
-
-    def ended(self, end):
-        self.words = end.words
-
-
 @pytest.mark.slow
-def test_live_and_machine_say_a_loss_in_the_same_words():
+def test_live_its_page_and_the_machine_say_a_loss_in_the_same_words():
     """A machine falls under gravity that is unknown to the controller."""
-    watching = Watching()
+    viewer = PageViewer(load_mechanism("paper"), "live: a test")
+    events = urllib.request.urlopen(viewer.opened().replace("/?", "/events?"))
     with paper_machine("plant.gravity=true", rate=2.0) as running:
         # Outliers alone would end the run before the plate has fallen.
-        result = driven(running, 6.0, viewer=watching, max_missing=5.0)
+        result = driven(running, 6.0, viewer=viewer, max_missing=5.0)
         machine = running.machine
+    viewer.close()
+    first, said = events.readline(), events.read().decode()
     assert result.status == "left_workspace" and result.stopped is not None
     why = in_words(machine.reason, machine.before)
     assert result.stopped.reason == why and machine.failure is not None
     assert result.stopped.leg == machine.failure.leg
     assert any(f"left its workspace: {why}" in line for line in running.lines)
-    assert watching.words.startswith(f"left workspace: {why} at t = ")
+    assert b"ended" not in first and f'"ended": "left workspace: {why} at t = ' in said
 
 
 @pytest.mark.slow
@@ -414,16 +371,3 @@ def test_a_machine_that_is_ended_ends_the_run_with_its_words():
         took = time.monotonic() - began
     assert result.status == "lost_machine" and result.stopped is not None
     assert result.stopped.reason == FAULTS[Fault.ENDED] and took < 8
-
-
-@pytest.mark.slow
-def test_the_page_shows_how_a_run_ended():
-    viewer = PageViewer(load_mechanism("paper"), "live: a test")
-    url = viewer.opened()
-    events = urllib.request.urlopen(url.replace("/?", "/events?"))
-    assert b"ended" not in events.readline()
-    why = "leg 2 reached the end of its reach"
-    viewer.ended(End("left_workspace", Failure(1.5, 2, math.nan, why)))
-    viewer.close()
-    said = events.read().decode()
-    assert '"ended": "left workspace: leg 2 reached the end of its reach at t = 1.500 s"' in said

@@ -2,7 +2,6 @@
 
 import json
 import os
-import random
 import re
 import shutil
 import signal
@@ -24,7 +23,7 @@ from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_scenario
 from tests.building import SANITIZED, c_compiler, make
 from tests.copies import Command
-from tests.live_driver import Driver, drive_in_real_time, in_real_time
+from tests.live_driver import in_real_time
 
 SETTINGS = ("plant.kind=exact", "duration=2.5")
 SAMPLES = 25
@@ -107,12 +106,23 @@ def process(command):
 
 @contextmanager
 def machine(*options, settings=SETTINGS, command=(DRAKE,)):
-    """`stewart-drake machine`, once it listens, and its port."""
+    """`stewart-drake machine`, once it listens, and its port; Ctrl-C ends it."""
     said = [word for setting in settings for word in ("--set", setting)]
     with process([*command, "machine", "paper", "--port", "0", *said, *options]) as made:
         first = made.until("^machine paper at")
         made.until("waits for a controller")
         yield made, int(first.split("127.0.0.1:")[1].split(":")[0])
+        assert made.end(signal.SIGINT) == 130
+
+
+@contextmanager
+def machine_in_c(folder, *options, kind="simulated", port=None):
+    """`stewart_machine` of a folder, once it listens, and its port; Ctrl-C ends it."""
+    port = port or free_port()
+    with process([str(folder / "stewart_machine"), str(port), *options]) as made:
+        made.until(f"a {kind} machine at port")
+        yield made, port
+        assert made.end(signal.SIGINT) == 0
 
 
 def exported(made, settings):
@@ -154,12 +164,13 @@ def simulated(samples, settings=SETTINGS):
 
 
 def over(folder, settings, log, rate=1.0):
-    """States (k, 12) of the machine of a scenario that C drives, and what the machine said."""
-    with machine("--watchdog", "3", "--rate", f"{rate}", settings=settings) as (running, port):
-        with process(c_controller(folder, port, f"log={log}")) as driving:
-            assert driving.end() == 0, driving.lines
-        assert running.end(signal.SIGINT) == 130
-    return states_of(log), running.said
+    """States (k, 12) of the machine of a scenario that C drives, and what machine and C said."""
+    with (
+        machine("--watchdog", "3", "--rate", f"{rate}", settings=settings) as (running, port),
+        process(c_controller(folder, port, f"log={log}")) as driving,
+    ):
+        assert driving.end() == 0, driving.lines
+    return states_of(log), running.said, driving.said
 
 
 # ---------------------------------------------------------------- the three pairs with C
@@ -167,17 +178,13 @@ def over(folder, settings, log, rate=1.0):
 
 @in_real_time
 def test_the_controller_in_c_drives_the_machine_in_python(folder, tmp_path):
-    log = tmp_path / "log"
-    with machine("--rate", f"{SLOW}") as (running, port):
-        with process(c_controller(folder, port, f"log={log}")) as driving:
-            assert driving.end() == 0, driving.lines
-        assert running.end(signal.SIGINT) == 130
-    assert "completed after 25 samples, 0 of them without a measurement" in driving.lines[-2]
-    assert driving.lines[-1] == (
+    states, machine_said, said = over(folder, SETTINGS, tmp_path / "log", SLOW)
+    assert "completed after 25 samples, 0 of them without a measurement" in said
+    assert said.endswith(
         "refused: 0 malformed, 0 version, 0 key, 0 foreign, 0 replayed, 0 late, 0 rate"
     )
-    assert "1 sessions, 1 runs" in running.said and "refused: none" in running.said
-    np.testing.assert_allclose(states_of(log), simulated(SAMPLES), atol=1e-6)
+    assert "1 sessions, 1 runs" in machine_said and "refused: none" in machine_said
+    np.testing.assert_allclose(states, simulated(SAMPLES), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -186,7 +193,7 @@ def test_a_lost_datagram_of_the_controller_in_c_costs_nothing(folder, tmp_path):
     """The following datagrams repeat its torque in time: the run equals one without loss."""
     lossy = "link={kind: network, low: 0.0, high: 0.02, loss: 0.3, playout: 0.8}"
     settings = (*SETTINGS, lossy, "controller.packet_repeats=0")
-    states, said = over(folder, settings, tmp_path / "log")
+    states, said, _ = over(folder, settings, tmp_path / "log")
     lost = int(re.search(r"(\d+) lost by", said)[1])
     assert lost >= 5 and "17 played, 0 periods dry" in said
     np.testing.assert_allclose(states, simulated(SAMPLES), atol=1e-6)
@@ -208,7 +215,7 @@ def test_what_the_controller_in_c_plans_ahead_acts_in_the_place_of_what_is_lost(
     """Too late to be said again, where 3 or 7 in a row are lost: as the law in Python under the
     same losses. Without plans the plate leaves its workspace."""
     settings = in_a_row(3, loss=0.3, seed=2)
-    states, said = over(soon, settings, tmp_path / "log", SLOW)
+    states, said, _ = over(soon, settings, tmp_path / "log", SLOW)
     assert "0 periods dry" in said
     off = np.abs(states - simulated(40, settings)) / MOTION
     assert off.max() < 5e-3
@@ -220,26 +227,12 @@ def test_the_controller_in_c_hears_what_has_acted(soon, tmp_path):
     """Ten in a row are lost, so that the last torque is held: without being told, the filter would
     take that for a torque bias, which takes the plate four amplitudes away."""
     settings = (*in_a_row(10, loss=0.2, seed=12), "controller.packet_torques=8")
-    states, said = over(soon, settings, tmp_path / "log", SLOW)
+    states, said, _ = over(soon, settings, tmp_path / "log", SLOW)
     dry = int(re.search(r"(\d+) periods dry", said)[1])
     undisturbed = simulated(40, LONG)
     assert dry >= 2
     most = np.abs(simulated(40, settings) - undisturbed) / MOTION
     assert (np.abs(states - undisturbed) / MOTION).max() < min(0.5, most.max())
-
-
-@pytest.mark.slow
-@in_real_time
-def test_the_controller_in_python_drives_the_machine_in_c(folder):
-    port = free_port()
-    with process([str(folder / "stewart_machine"), str(port)]) as running:
-        running.until("a simulated machine at port")
-        driver = Driver(load_scenario("paper", settings=SETTINGS), ("127.0.0.1", port))
-        states = drive_in_real_time(driver, SAMPLES)
-        running.until("the controller said stop")
-        assert running.end(signal.SIGINT) == 0
-    assert "17 torques played, 0 periods dry, 0 silences" in running.lines[-2]
-    np.testing.assert_allclose(states, simulated(SAMPLES), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -251,14 +244,12 @@ def test_live_drives_a_board_of_ones_own_once_it_is_armed(folder, tmp_path):
     assert simulated_flags in board.read_text()
     board.write_text(board.read_text().replace(simulated_flags, "board_flags = STEWART_RESETS;"))
     make(own, "stewart_machine", f"CFLAGS={' '.join(SANITIZED)}")
-    scenario, port = load_scenario("paper", settings=("plant.kind=exact",)), free_port()
-    with process([str(own / "stewart_machine"), str(port)]) as running:
-        running.until("a real machine at port")
+    scenario = load_scenario("paper", settings=("plant.kind=exact",))
+    with machine_in_c(own, kind="real") as (_, port):
         where = f"127.0.0.1:{port}"
         with pytest.raises(ConfigError, match=r"^armed"):
             sd.run_live(scenario, where, duration=5.0, accept_jitter=True)
         run = sd.run_live(scenario, where, duration=5.0, accept_jitter=True, armed=True)
-        assert running.end(signal.SIGINT) == 0
     assert run.status == "completed" and run.summary["live"]["periods_played"] >= 40
     error = np.abs(run.signals.error.values) / np.array(scenario.reference.amplitude)
     assert np.nanmax(error[-15:]) < 0.02
@@ -267,17 +258,15 @@ def test_live_drives_a_board_of_ones_own_once_it_is_armed(folder, tmp_path):
 @pytest.mark.slow
 @in_real_time
 def test_both_ends_in_c(folder, tmp_path):
-    log, port, key = tmp_path / "log", free_port(), tmp_path / "key"
+    log, key = tmp_path / "log", tmp_path / "key"
     key.write_bytes(b"a key of some length\n")
-    with process([str(folder / "stewart_machine"), str(port), "60", str(key)]) as running:
-        running.until("a simulated machine at port")
+    with machine_in_c(folder, "60", str(key)) as (running, port):
         with process(c_controller(folder, port, f"log={log}", f"key={key}")) as driving:
             assert driving.end() == 0, driving.lines
         # Without the key, and with another one: refused, and nothing is done.
         with process(c_controller(folder, port, "seconds=1")) as other:
             time.sleep(0.5)
             assert other.end(signal.SIGINT) == 1
-        assert running.end(signal.SIGINT) == 0
     np.testing.assert_allclose(states_of(log), simulated(SAMPLES), atol=1e-6)
     assert sum("a session begins" in line for line in running.lines) == 1
     assert re.search(r"refused: 0 malformed, 0 version, [1-9]\d* key", running.lines[-1])
@@ -289,7 +278,7 @@ def test_both_ends_in_c(folder, tmp_path):
 @pytest.mark.slow
 def test_ctrl_c_ends_it_with_one_summary(capfd):
     with machine(command=(sys.executable, "-m", "stewart_drake")) as (running, _):
-        assert running.end(signal.SIGINT) == 130
+        pass
     begun = [line.split()[0] for line in running.lines if not line.startswith(" ")]
     assert begun == ["machine", "waits", "ended", "datagrams:", "torques:"]
     said = ["machine", "paper", "--set", "plant.kind=exact", "--port", "0"]
@@ -318,7 +307,6 @@ def test_either_side_of_a_network_may_stand_still_for_a_second(side):
         suspended.popen.send_signal(signal.SIGCONT)
         suspended.until(r"(stood still|did not run) for (0\.[5-9]|[12]\.)")
         survived = driving.end() == 0
-        assert running.end(signal.SIGINT) == 130
     # A busy computer may suspend it for some tenths of a second more.
     stops = [
         float(s) for s in re.findall(r"(?:stood still|did not run) for ([\d.]+) s", suspended.said)
@@ -343,29 +331,27 @@ def longest_delay(began, until_kill, line, took):
     return min(took, times[1] - times[0] - until_kill)
 
 
-def kills(folder, number, rng):
-    """Kill the controller at random times; the next one takes over from rest."""
-    with machine("--watchdog", "0.4") as (running, port):
-        for k in range(number):
+@pytest.mark.slow
+@pytest.mark.parametrize("language", ["Python", "C"])
+@in_real_time
+def test_a_killed_controller_ends_in_the_safe_torque_and_the_next_one_takes_over(folder, language):
+    python = language == "Python"
+    watchdog = 0.4 if python else 1
+    with machine("--watchdog", "0.4") if python else machine_in_c(folder) as (running, port):
+        for wait in (0.5, 1.5):
             with process(c_controller(folder, port)) as driving:
                 began, read = running.until("the run began"), time.monotonic()
-                wait = rng.uniform(0, 2)
                 time.sleep(wait)
                 driving.popen.kill()
                 killed = time.monotonic()
                 line = running.until("nothing was heard|left its workspace")
                 took = longest_delay(began, killed - read, line, time.monotonic() - killed)
-            assert "nothing was heard from the controller for 0.4 s" in line, line
+            assert f"nothing was heard from the controller for {watchdog} s" in line, line
             # It is heard once a period; scheduling of two busy cores is in it, too.
-            assert took < 0.4 + 0.25, (k, wait, took)
-        assert running.end(signal.SIGINT) == 130
-    assert f"{number} sessions, {number} runs" in running.said
-
-
-@pytest.mark.slow
-@in_real_time
-def test_a_killed_controller_ends_in_the_safe_torque_and_the_next_one_takes_over(folder):
-    kills(folder, 2, random.Random(3))
+            assert took < watchdog + 0.25, (wait, took)
+        with process(c_controller(folder, port, "seconds=1")) as last:
+            assert last.end() == 0, last.lines
+    assert sum("the run began" in line for line in running.lines) == 3
 
 
 @pytest.mark.slow
@@ -376,35 +362,13 @@ def test_a_killed_machine_in_c_ends_its_controller_and_the_next_one_drives_its_s
         running.until("the run began")
         running.popen.kill()
         running.popen.wait()
-        with process(command) as anew:
-            anew.until("a simulated machine at port")
+        with machine_in_c(folder, port=port) as (anew, _):
             assert driving.end() == 1  # what it sends is of a session that the new one never had
             assert "the machine has fallen silent after" in driving.lines[-2]
             with process(c_controller(folder, port, "seconds=1")) as second:
                 assert second.end() == 0, second.lines
-            assert anew.end(signal.SIGINT) == 0
     assert sum("a session begins" in line for line in anew.lines) == 1
     assert re.search(r" [1-9]\d* foreign", anew.lines[-1])
-
-
-@pytest.mark.slow
-@in_real_time
-def test_the_machine_in_c_is_safe_without_its_controller_and_the_next_one_takes_over(folder):
-    port = free_port()
-    with process([str(folder / "stewart_machine"), str(port)]) as running:
-        running.until("a simulated machine at port")
-        with process(c_controller(folder, port)) as driving:
-            began, read = running.until("the run began"), time.monotonic()
-            time.sleep(1.5)
-            driving.popen.kill()
-            killed = time.monotonic()
-        line = running.until("nothing was heard from the controller for 1 s: the safe torque acts")
-        took = longest_delay(began, killed - read, line, time.monotonic() - killed)
-        assert took < 1.0 + 0.25
-        with process(c_controller(folder, port, "seconds=1")) as second:
-            assert second.end() == 0, second.lines
-        assert running.end(signal.SIGINT) == 0
-    assert sum("a session begins" in line for line in running.lines) == 2
 
 
 @pytest.mark.parametrize(
@@ -413,14 +377,11 @@ def test_the_machine_in_c_is_safe_without_its_controller_and_the_next_one_takes_
         (("machine", "0"), "PORT: got 0; expected a whole number above 0 and up to 65535"),
         (("machine", "4700o"), "PORT: got 4700o; expected"),
         (("machine", "47000", "nan"), "SECONDS: got nan; expected a number above 0"),
-        (("machine", "47000", "", "none"), "none: got 0 bytes"),
         (("machine", "47000", "1", "key", "more"), "expected: stewart_machine PORT"),
         (("udp", "127.0.0.1", "65536"), "PORT: got 65536; expected"),
-        (("udp", "127.0.0.1", "80.5"), "PORT: got 80.5; expected"),
         (("udp", "127.0.0.1", "47000", "seconds=-1"), "seconds: got -1; expected"),
         (("udp", "127.0.0.1", "47000", "log=no/log"), "log=no/log: No such file"),
         (("udp", "127.0.0.1", "47000", "key=none"), "none: got 0 bytes"),
-        (("udp", "127.0.0.1", "47000", "armed"), "expected: stewart_udp ADDRESS PORT"),
         (("udp", "10.0.0.1", "47000"), "expected: stewart_udp ADDRESS PORT"),
     ],
 )
@@ -439,11 +400,9 @@ def test_wrong_commands_are_one_line(capfd, tmp_path):
     for options, expected in (
         (("--host", "0.0.0.0"), "host: got 0.0.0.0 without a key"),
         (("--port", str(busy.getsockname()[1])), "expected a free one"),
-        (("--port", "70000"), "65535"),
         (("--rate", "0"), "--rate: got 0.0; expected"),
         (("--watchdog", "nan"), "--watchdog: got nan; expected"),
         (("--key", str(tmp_path / "none")), "--key: got"),
-        (("--safe", "brake"), "brake"),
     ):
         assert main([*exact, *options]) == 2
         error = capfd.readouterr().err

@@ -1,6 +1,5 @@
 """The programs over UDP of export-c, under the sanitizers: odd input, and what both sides say."""
 
-import signal
 import socket
 import subprocess
 import threading
@@ -21,8 +20,8 @@ from tests.test_machine_process import (
     SETTINGS,
     c_controller,
     folder,
-    free_port,
     machine,
+    machine_in_c,
     process,
 )
 from tests.test_protocol import PLAN, changed
@@ -114,10 +113,11 @@ def test_a_datagram_without_a_byte_hides_none(tried):
 
 def test_a_controller_in_c_of_another_machine_is_refused_by_both(folder):
     settings = (*SETTINGS, "mechanism=paper_clear")
-    with machine(settings=settings) as (running, port):
-        with process(c_controller(folder, port)) as driving:
-            assert driving.end() == 1
-        assert running.end(signal.SIGINT) == 130
+    with (
+        machine(settings=settings) as (running, port),
+        process(c_controller(folder, port)) as driving,
+    ):
+        assert driving.end() == 1
     names = "mechanism paper_clear", "mechanism paper"
     assert "the machine has {}; this controller is designed for {}".format(*names) in driving.said
     assert "is designed for {1}; this machine has {0}".format(*names) in running.said
@@ -126,13 +126,12 @@ def test_a_controller_in_c_of_another_machine_is_refused_by_both(folder):
 
 @pytest.mark.slow
 def test_a_machine_in_c_refuses_a_controller_of_another_mechanism(folder):
-    port = free_port()
     live = [DRAKE, "live", "paper", "--no-browser", "--set", "mechanism=paper_clear"]
-    with process([str(folder / "stewart_machine"), str(port)]) as running:
-        running.until("a simulated machine at port")
-        with process([*live, "--machine", f"127.0.0.1:{port}"]) as driving:
-            assert driving.end() == 2
-        assert running.end(signal.SIGINT) == 0
+    with (
+        machine_in_c(folder) as (running, port),
+        process([*live, "--machine", f"127.0.0.1:{port}"]) as driving,
+    ):
+        assert driving.end() == 2
     assert (
         f"machine at 127.0.0.1:{port} has mechanism paper; the controller is designed for "
         "mechanism paper_clear" in driving.said
@@ -147,9 +146,9 @@ def test_a_machine_in_c_refuses_a_controller_of_another_mechanism(folder):
 @pytest.mark.slow
 def test_a_machine_in_c_is_not_locked_by_replayed_requests(folder, tmp_path):
     """Twenty a second, without the key: 10 of 10 runs connect."""
-    port, key = free_port(), tmp_path / "key"
+    key = tmp_path / "key"
     key.write_bytes(b"a key of some length")
-    driver = Driver(load_scenario("paper", settings=SETTINGS), ("127.0.0.1", port))
+    driver = Driver(load_scenario("paper", settings=SETTINGS), ("127.0.0.1", 0))
     asked = ControllerMessage(driver.session.head(0), identity=driver.identity)
     recorded, over = encode(asked, key.read_bytes()), threading.Event()
     attacker = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -159,8 +158,7 @@ def test_a_machine_in_c_is_not_locked_by_replayed_requests(folder, tmp_path):
             attacker.sendto(recorded, ("127.0.0.1", port))
 
     thread = threading.Thread(target=attack)
-    with process([str(folder / "stewart_machine"), str(port), "300", str(key)]) as running:
-        running.until("a simulated machine at port")
+    with machine_in_c(folder, "300", str(key)) as (running, port):
         thread.start()
         connected = 0
         for _ in range(10):
@@ -168,7 +166,6 @@ def test_a_machine_in_c_is_not_locked_by_replayed_requests(folder, tmp_path):
                 connected += driving.end() == 0
         over.set()
         thread.join()
-        assert running.end(signal.SIGINT) == 0
     attacker.close()
     assert connected == 10
     assert sum("a session begins" in line for line in running.lines) == 10
@@ -177,9 +174,7 @@ def test_a_machine_in_c_is_not_locked_by_replayed_requests(folder, tmp_path):
 @pytest.mark.slow
 def test_a_machine_in_c_says_why_it_stopped(folder):
     """Silence and its end, in its datagrams; a controller of version 1 is told the version."""
-    port = free_port()
-    with process([str(folder / "stewart_machine"), str(port)]) as running:
-        running.until("a simulated machine at port")
+    with machine_in_c(folder) as (running, port):
         old = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         old.settimeout(5)
         for _ in range(3):
@@ -201,7 +196,6 @@ def test_a_machine_in_c_says_why_it_stopped(folder):
         heard = driver.got[-1]
         assert isinstance(heard, MachineMessage) and heard.reason.fault == Fault.SILENCE
         assert heard.why == "nothing was heard from the controller for 1 s"
-        assert running.end(signal.SIGINT) == 0
     driver.receive(now())
     last = driver.got[-1]
     assert last.reason.fault in (Fault.ENDED, Fault.REACH)
