@@ -138,6 +138,16 @@ class Browser:
         self.call("Input.dispatchKeyEvent", type=down, text=text, **shared)
         self.call("Input.dispatchKeyEvent", type="keyUp", **shared)
 
+    def go_to(self, element: str) -> None:
+        """Press Tab until an element, a JavaScript expression, has the focus."""
+        for _ in range(40):
+            if self.evaluate(f"document.activeElement === {element}"):
+                outline = self.evaluate("getComputedStyle(document.activeElement).outlineStyle")
+                assert outline != "none", "the focus is not visible"
+                return
+            self.press("Tab")
+        raise AssertionError(f"{element} is not reached by Tab")
+
     def screenshot(self, path: Path | None = None, whole: bool = False) -> NDArray[np.float64]:
         """Return the window, or the whole page, as an image of values 0 to 1; write it if asked."""
         taken = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import stewart_drake as sd
-from stewart_drake.files.errors import ConfigError
-from stewart_drake.live.design import check_controller, design
+from stewart_drake.live.design import design
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.protocol import (
     ControllerFlags,
@@ -18,7 +17,6 @@ from stewart_drake.live.protocol import (
     Refusal,
 )
 from stewart_drake.live.session import drive, plans, prepare_session
-from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import servo_law
 from stewart_drake.scenario.run_log import open_log, read_log
@@ -114,26 +112,6 @@ def test_rows_of_the_other_kind_are_refused():
     fed = Fed(NETWORK)
     fed.say(0, np.zeros((1, 6)), cranks=False)
     assert fed.wire.refused == {Refusal.MALFORMED: 1}
-
-
-def test_the_controller_of_motors_is_refused():
-    servos, motors = (identity_of(sd.load_scenario(name)) for name in ("reachy_mini", "paper"))
-    differing = servos.differing(motors)
-    assert differing is not None and "actuator position_servo" in differing[0]
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        (("controller.estimate=[payload]",), r"controller\.estimate: got \['payload'\] for live"),
-        (("actuator.kind=servo",), r"actuator\.kind: got 'servo' for live"),
-    ],
-)
-def test_what_a_plan_cannot_carry_is_refused(settings, message):
-    scenario = sd.load_scenario("reachy_mini", settings=settings)
-    with pytest.raises(ConfigError, match=message) as said:
-        check_controller(scenario)
-    assert "\n" not in str(said.value)
 
 
 def test_live_compensates_what_the_scenario_says_of_the_plant():
