@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 import urllib.request
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from itertools import count, repeat
 from pathlib import Path
@@ -133,11 +134,9 @@ def test_a_controller_of_version_1_is_refused_in_one_line():
     old.close()
 
 
-def answering(replies):
-    """Start a machine that answers datagrams with these bytes in turn."""
-    ear = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    ear.bind(("127.0.0.1", 0))
-    ear.settimeout(0.05)
+@contextmanager
+def contact_with(replies):
+    """Yield a contact with a machine that answers with these bytes in turn."""
     ends = threading.Event()
 
     def answer():
@@ -147,34 +146,21 @@ def answering(replies):
             except TimeoutError:
                 continue
             ear.sendto(changed(next(replies), 8, data[8:16]), address)
-        ear.close()
 
-    thread = threading.Thread(target=answer)
-    thread.start()
-    return thread, ends, ear.getsockname()
-
-
-@pytest.fixture
-def contact_with():
-    """Make a contact with a machine that answers with these bytes in turn."""
-    made = []
-
-    def contact(replies):
-        thread, ends, address = answering(replies)
-        endpoint = open_endpoint(address, None)
-        made.append((thread, ends, endpoint))
-        return Contact(endpoint, address, IDENTITY)
-
-    yield contact
-    for thread, ends, endpoint in made:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
+        ear.bind(("127.0.0.1", 0))
+        ear.settimeout(0.05)
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with closing(open_endpoint(ear.getsockname(), None)) as endpoint:
+            yield Contact(endpoint, ear.getsockname(), IDENTITY)
         ends.set()
         thread.join()
-        endpoint.close()
 
 
-def test_a_machine_of_version_1_is_refused_in_one_line(contact_with):
-    contact = contact_with(repeat(changed(encode(OFFER), 4, b"\1")))
-    with pytest.raises(ConfigError) as refused:
+def test_a_machine_of_version_1_is_refused_in_one_line():
+    reply = changed(encode(OFFER), 4, b"\1")
+    with contact_with(repeat(reply)) as contact, pytest.raises(ConfigError) as refused:
         call(contact)
     assert re.fullmatch(
         r"--machine: machine at 127.0.0.1:\d+ speaks protocol version 1; expected 3, of the same "
@@ -191,33 +177,32 @@ def impatient(monkeypatch):
     monkeypatch.setattr(contacts, "_PATIENCE", 0.3)
 
 
-def test_a_machine_in_use_is_named(contact_with, impatient):
+def not_free(replies):
+    """Return what is said of a machine that does not become free."""
+    with contact_with(replies) as contact:
+        while not contact.ask():
+            pass
+        with pytest.raises(ConfigError) as refused:
+            await_free(contact)
+    return str(refused.value)
+
+
+def test_a_machine_in_use_is_named(impatient):
     head, busy = OFFER.head, OFFER.flags | MachineFlags.BUSY
     used = replace(OFFER, flags=busy, watchdog=SECOND // 2)
-    contact = contact_with(encode(replace(used, head=replace(head, sequence=k))) for k in count(1))
-    while not contact.ask():
-        pass
-    with pytest.raises(
-        ConfigError,
-        match=r"^machine at 127\.0\.0\.1:\d+ is in use by another controller \(retry "
-        r"0\.5 s after it stops\)$",
-    ):
-        await_free(contact)
+    said = not_free(encode(replace(used, head=replace(head, sequence=k))) for k in count(1))
+    words = "is in use by another controller (retry 0.5 s after it stops)"
+    assert re.fullmatch(rf"machine at 127\.0\.0\.1:\d+ {re.escape(words)}", said), said
 
 
-def test_a_sequence_that_restarts_is_named(contact_with, impatient):
+def test_a_sequence_that_restarts_is_named(impatient):
     """Every answer has sequence 7: only the first is taken."""
-    contact = contact_with(repeat(encode(replace(OFFER, watchdog=SECOND // 10))))
-    while not contact.ask():
-        pass
-    assert contact.last.head.sequence == 7
-    with pytest.raises(ConfigError) as refused:
-        await_free(contact)
+    said = not_free(repeat(encode(replace(OFFER, watchdog=SECOND // 10))))
     assert re.fullmatch(
         r"machine at 127.0.0.1:\d+ sent nothing for 0.\d s that could be taken "
         r"\(\d+ of cause replayed refused\); the last was replayed: sequence 7 after 7",
-        str(refused.value),
-    ), refused.value
+        said,
+    ), said
 
 
 @pytest.mark.parametrize(("off", "word"), [(-1, "early"), (1, "late")])

@@ -33,7 +33,7 @@ NETWORK = (
     "link={kind: network, low: 0.3, high: 0.32, loss: 0.02, "
     "return: {low: 0.3, high: 0.32, loss: 0.02}}"
 )
-BURSTS = "link={kind: network, loss: 0.6, burst: 6}"
+BURSTS = "link={kind: network, loss: 0.4, burst: 4}"
 NOISE = "sensor.noise_std=[1e-5,1e-5,1e-5,1e-6,1e-6,1e-6,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
 BIAS = "plant.torque_bias=[1e-3,-1e-3,2e-3,0,0,0]"
 
@@ -340,7 +340,7 @@ def test_what_was_recorded_of_an_earlier_session_is_foreign():
     assert run.machine.counts["sessions"] == sessions
     assert run.machine.summary()["played"] == played
     np.testing.assert_array_equal(torque_of(run), torque)
-    # Nor does a recorded confirmation begin a session where nobody drives.
+    # A recorded confirmation begins no session after the end of the last one either.
     run.driver.say(run.machine.time(), ControllerFlags.STOP)
     run.at(run.machine.time() + 2 * SECOND)
     for data in recorded:
