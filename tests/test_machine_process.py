@@ -382,6 +382,7 @@ def test_a_killed_machine_in_c_ends_its_controller_and_the_next_one_drives_its_s
         (("udp", "127.0.0.1", "47000", "seconds=-1"), "seconds: got -1; expected"),
         (("udp", "127.0.0.1", "47000", "log=no/log"), "log=no/log: No such file"),
         (("udp", "127.0.0.1", "47000", "key=none"), "none: got 0 bytes"),
+        (("udp", "127.0.0.1", "47000", "armed"), "expected: stewart_udp ADDRESS PORT"),
         (("udp", "10.0.0.1", "47000"), "expected: stewart_udp ADDRESS PORT"),
     ],
 )
@@ -400,6 +401,7 @@ def test_wrong_commands_are_one_line(capfd, tmp_path):
     for options, expected in (
         (("--host", "0.0.0.0"), "host: got 0.0.0.0 without a key"),
         (("--port", str(busy.getsockname()[1])), "expected a free one"),
+        (("--safe", "brake"), "brake"),
         (("--rate", "0"), "--rate: got 0.0; expected"),
         (("--watchdog", "nan"), "--watchdog: got nan; expected"),
         (("--key", str(tmp_path / "none")), "--key: got"),
