@@ -133,24 +133,21 @@ def test_what_is_known_is_the_prior_of_what_is_estimated():
     assert np.array_equal(after.usual_std, before.std)
     assert np.array_equal(before.covariance, np.diag(before.std**2))
     assert np.array_equal(after.upper, before.upper)
-
-
-def test_what_is_known_exactly_is_nearly_so():
+    # What is known exactly is nearly so.
     exactly = Calibration("abc", ("payload_mass", "delay"), np.array([0.4, 1.0]), np.zeros((2, 2)))
     found = usual().knowing(exactly)
     assert found.std[PAYLOAD] == EXACT * usual().std[PAYLOAD]
     assert np.linalg.eigvalsh(found.covariance).min() > 0
 
 
-@pytest.mark.parametrize(("off", "taken"), [(0.9 * CHANCE, True), (1.1 * CHANCE, False)])
-def test_a_mean_is_beyond_a_bound_by_chance_or_refused(off, taken):
-    names, std = ("joint_damping",), 1e-4
-    found = Calibration("abc", names, np.array([-off * std]), np.array([[std**2]]))
-    if taken:
-        assert usual().knowing(found).prior[DAMPING] == 0.0
-        return
+def test_a_mean_is_beyond_a_bound_by_chance_or_refused():
+    near, far = (
+        Calibration("abc", ("joint_damping",), np.array([-off * CHANCE * 1e-4]), np.array([[1e-8]]))
+        for off in (0.9, 1.1)
+    )
+    assert usual().knowing(near).prior[DAMPING] == 0.0
     with pytest.raises(ValueError, match=r"joint_damping: got -0.00033 .*between 0 and"):
-        usual().knowing(found)
+        usual().knowing(far)
 
 
 def test_a_standard_deviation_that_is_said_goes_together_with_nothing():
@@ -247,9 +244,6 @@ def test_what_cannot_be_used_is_refused_in_one_line(file, change, given, message
     save_calibration(file, dataclasses.replace(KNOWN, **change))
     with pytest.raises(ConfigError, match=message):
         compose_law(experiment(f"controller.calibration={file}", *given))
-
-
-def test_a_file_that_is_not_there_names_the_field():
     with pytest.raises(ConfigError, match=r"^controller\.calibration: .*nowhere"):
         experiment("controller.calibration=/nowhere/calibration.yaml")
 
@@ -263,7 +257,7 @@ def test_what_is_known_is_worth_something(file):
         sd.simulate(
             sd.load_scenario("paper", "predictor_lqi", (*settings, *more)), judge_stability=False
         )
-        for more in ((f"controller.calibration={file}",), ())
+        for more in ([f"controller.calibration={file}"], [])
     )
     assert told.status == "completed"
     assert told.accumulated_error < 0.1

@@ -58,9 +58,8 @@ def test_a_csv_log_is_read(tmp_path):
     np.testing.assert_allclose(log.torques[:3, 0], [0.0, 0.1, 0.2])
     np.testing.assert_allclose(log.values[5, ANGLES], np.deg2rad(HOME), atol=1e-8)
     np.testing.assert_allclose(log.values[5, POSE], [np.deg2rad(1.5), 0.1, np.nan, 2e-3, 0, 0.38])
-    np.testing.assert_allclose(
-        log.applied_torque(np.array([0.0, 0.19, 0.21]), 0.1)[:, 0], [0, 0, 0.1]
-    )
+    applied = log.applied_torque(np.array([0.0, 0.19, 0.21]), 0.1)
+    np.testing.assert_allclose(applied[:, 0], [0, 0, 0.1])
 
 
 def test_measurements_come_at_100_hz_at_most(tmp_path):
@@ -116,23 +115,21 @@ def lost(tmp_path_factory):
     return folder / "signals.nc"
 
 
+NETWORK = "link:\n  kind: network\n  low: 0.1\n  high: 0.2\n  return: {low: 0.1, high: 0.2}"
+IN_SCENARIO = {
+    "network": ("link:\n  kind: wire", NETWORK),
+    "sensor.delay": ("  delay: 0.0\n  loss", "  delay: 0.1\n  loss"),
+}
+
+
 def broken(signals, how):
+    """Return the signals of a run as no log has them."""
     if how == "scenario":
         signals.attrs.pop("scenario")
-    elif how in ("network", "sensor.delay"):
-        old, new = {
-            "network": (
-                "link:\n  kind: wire",
-                "link:\n  kind: network\n  low: 0.1\n  high: 0.2\n"
-                "  return:\n    low: 0.1\n    high: 0.2",
-            ),
-            "sensor.delay": ("sensor:\n  kind: state", "sensor:\n  delay: 0.1\n  kind: state"),
-        }[how]
-        text = signals.attrs["scenario"]
-        if how == "sensor.delay":
-            text = text.replace("  delay: 0.0\n", "")
-        assert old in text
-        signals.attrs["scenario"] = text.replace(old, new, 1)
+    elif how in IN_SCENARIO:
+        old, new = IN_SCENARIO[how]
+        assert old in signals.attrs["scenario"]
+        signals.attrs["scenario"] = signals.attrs["scenario"].replace(old, new)
     elif how == "log_period":
         return signals.isel(time=slice(None, None, 9))
     elif how == "at 5 instants":
@@ -232,9 +229,8 @@ def test_a_plan_can_be_run(tmp_path):
     assert main(["identify", "--plan", "paper", "--out", str(tmp_path), "--quiet"]) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert 1e-6 < summary["delay_std_s"] < 1e-4 and summary["share"] == 1
-    assert {f"where the base stands along {axis}" for axis in "xyz"} <= {
-        *summary["unseen"]["names"]
-    }
+    unseen = set(summary["unseen"]["names"])
+    assert {f"where the base stands along {axis}" for axis in "xyz"} <= unseen
     words = ["--set", "plant.kind=exact", "--set", "duration=3", "--out", str(tmp_path / "run")]
     assert main(["simulate", str(tmp_path / "scenario.yaml"), *words, "--quiet"]) == 0
     run = json.loads((tmp_path / "run" / "summary.json").read_text())
