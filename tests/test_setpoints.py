@@ -64,8 +64,7 @@ def test_a_soft_start_begins_at_rest_where_the_head_is():
     assert np.allclose(soft.angles[50:], made(ON, plain=True).angles[50:], atol=1e-12)
     low = ROBOT.home + [0.0, 0.4, 0.0, 0.0, 0.0, -0.04]
     assert np.abs(made(start=low, plain=True).crank_rates).max() > 1.8
-    slow = made("actuator.speed_limit=1.8", start=low, plain=True)
-    assert slow.blend == 2.0
+    assert made("actuator.speed_limit=1.8", start=low, plain=True).blend == 2.0
 
 
 def test_the_soft_start_has_the_rates_of_its_pose():
@@ -89,10 +88,7 @@ def test_the_soft_start_has_the_rates_of_its_pose():
         (("actuator.torque_limit=0.2",), r"motor \d at t = [\d.]+ s: got a torque of .*0\.2 N m"),
         (("actuator.speed_limit=0.5",), r"motor \d at t = .* speed of the setpoint .* rad/s"),
         (("actuator.angle_range=[-0.6, 1.0]",), r"motor \d at t = .* setpoint of .* -0\.6 to 1"),
-        (
-            ("reference.amplitude=[0.9, 0, 0, 0, 0, 0]",),
-            r"leg \d reached the end of its reach at t",
-        ),
+        (("reference.amplitude=[0.9, 0, 0, 0, 0, 0]",), r"leg \d reached the end .* at t"),
         (("actuator.kind=torque", "controller.command=torque"), "actuator.kind: got 'torque'"),
     ],
 )
@@ -108,9 +104,10 @@ def test_a_rate_out_of_range_is_refused(rate):
         sd.setpoints("reachy_mini", rate)
 
 
-@pytest.mark.parametrize(
-    "pose", [[0, 0, 0], [np.nan] * 6, [0, 0, 0, 0, 0, 1.0], [0, 0, 0, 0.2, 0, 0.23]]
-)
+BESIDE = [0, 0, 0, 0.2, 0, 0.23]
+
+
+@pytest.mark.parametrize("pose", [[0, 0, 0], [np.nan] * 6, [0, 0, 0, 0, 0, 1.0], BESIDE])
 def test_a_pose_that_the_head_cannot_have_is_refused(pose):
     with pytest.raises(ConfigError, match="start: got"):
         made(start=pose)
@@ -125,17 +122,10 @@ def test_units_are_those_of_the_servos(tmp_path):
     path = tmp_path / "units.yaml"
     path.write_text("unit: ticks\noffset: 2048.0\n")
     assert load_units(path) == ServoUnits(unit="ticks", offset=2048.0)
-    for wrong in (
-        "unit: turns\n",
-        "sign: 2\n",
-        "offset: [1.0, 2.0]\n",
-        "ticks: 3\n",
-        "sign: .nan\n",
-    ):
-        path.write_text(wrong)
-        with pytest.raises(ConfigError, match=r"units\.yaml: ") as said:
+    for wrong in ("unit: turns", "sign: 2", "offset: [1.0, 2.0]", "ticks: 3", "sign: .nan"):
+        path.write_text(wrong + "\n")
+        with pytest.raises(ConfigError, match=r"^[^\n]*units\.yaml: [^\n]*$") as said:
             load_units(path)
-        assert "\n" not in str(said.value)
         assert str(said.value).count("; expected") <= 1  # one complaint about one field
 
 
@@ -154,12 +144,9 @@ def test_the_command_writes_the_file(tmp_path, capsys):
     assert main([*common, "--rate", "100", "--plain", "--from", home, "--units", str(units)]) == 0
     header, *rows = out.read_text().splitlines()
     assert "setpoint_6[deg]" in header and len(rows) == 100
-    kept = out.read_text()
-    missing, far = str(tmp_path / "none.yaml"), "0,0,0,0,0,1"
-    for wrong in (["--from", "1,2"], ["--from", far], ["--rate", "0"], ["--units", missing]):
-        assert main([*common, *wrong]) == 2
+    kept, missing = out.read_text(), str(tmp_path / "none.yaml")
+    for option, wrong in (("--from", "0,0,0,0,0,1"), ("--rate", "0"), ("--units", missing)):
+        assert main([*common, option, wrong]) == 2
         said = capsys.readouterr().err
-        assert said.count("\n") == 1 and (
-            wrong[0] == "--units" or f"error: {wrong[0]}: got" in said
-        )
+        assert said.count("\n") == 1 and (option == "--units" or f"error: {option}: got" in said)
     assert out.read_text() == kept
