@@ -7,7 +7,6 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.belief import THETA
 from stewart_drake.law.filter_settings import filter_settings, usual_parameters
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver
@@ -73,19 +72,15 @@ def test_what_was_learnt_before_a_gap_counts_after_it():
     assert np.median(narrower, axis=0).min() > 3
 
 
-def test_without_a_gap_nothing_is_other():
-    theta = drawn(0)
-    one, _ = watched(CoreObserver(SETTINGS, gaps=True), theta, (True,) * 8, 0)
-    other, _ = watched(CoreObserver(SETTINGS), theta, (True,) * 8, 0)
-    assert np.array_equal(one.estimate.mean, other.estimate.mean)
-    assert np.array_equal(one.estimate.covariance, other.estimate.covariance)
-
-
-def test_a_gap_that_is_too_long_is_left_to_the_filter():
-    theta, there = drawn(1), (True, True, *[False] * (LONGEST + 1), True)
-    one, _ = watched(CoreObserver(SETTINGS, gaps=True), theta, there, 0)
-    other, _ = watched(CoreObserver(SETTINGS), theta, there, 0)
-    assert np.array_equal(one.estimate.mean[THETA], other.estimate.mean[THETA])
+@pytest.mark.parametrize("length", [0, LONGEST + 1])
+def test_without_a_gap_nothing_is_other_and_one_that_is_too_long_is_left_to_the_filter(length):
+    theta, there = drawn(1), (True, True, *[False] * length, True)
+    one, other = (
+        watched(CoreObserver(SETTINGS, gaps=gaps), theta, there, 0)[0].estimate
+        for gaps in (True, False)
+    )
+    assert np.array_equal(one.mean, other.mean)
+    assert np.array_equal(one.covariance, other.covariance)
 
 
 @pytest.mark.parametrize("seed", [0, 7])

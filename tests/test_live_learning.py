@@ -7,7 +7,6 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servos import rise
 from stewart_drake.live import design as designing
@@ -19,13 +18,16 @@ from stewart_drake.live.log import LiveRecord
 from stewart_drake.live.loop import LiveLoop
 from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.protocol import MachineFlags
-from stewart_drake.loop.learned import HARMONICS, motion_period, save_learned
+from stewart_drake.loop.learned import motion_period, save_learned
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.reporting.learn import document
 from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.learn import LearnStudy, Repetition
+from tests import test_learn
 from tests.live_driver import in_real_time, running_machine
+from tests.test_learn import UNKNOWN, some_torque
+from tests.test_live import FROM_REST, OVER_A_NETWORK
 
 STEPS = "delay.steps=13"
 PERIOD = 2 * np.pi / 3.14159
@@ -35,12 +37,6 @@ class Message:
     """What a design reads from a machine's message."""
 
     torque_limit, flags = np.inf, MachineFlags(0)
-
-
-def some_signal(size=0.05, period=PERIOD):
-    coefficients = np.zeros((1 + 2 * HARMONICS, 6))
-    coefficients[[0, 1, 1 + HARMONICS]] = size * np.random.default_rng(3).standard_normal((3, 6))
-    return LearnedSignal(period, coefficients)
 
 
 def plan_of(learned, by_hand=lambda: False):
@@ -53,7 +49,7 @@ def plan_of(learned, by_hand=lambda: False):
 
 
 def test_what_was_learned_begins_and_ends_softly_and_is_by_the_time_of_the_motion():
-    signal, on_hand = some_signal(), [False]
+    signal, on_hand = some_torque(PERIOD, 0.05), [False]
     plan = plan_of(signal, lambda: on_hand[0])
     plans = []
     for k in range(120):
@@ -72,7 +68,7 @@ def test_what_was_learned_begins_and_ends_softly_and_is_by_the_time_of_the_motio
 @pytest.mark.parametrize(("name", "settings"), [("reachy_mini", (STEPS,)), ("paper", ())])
 def test_a_file_gives_the_same_as_the_signal(tmp_path, name, settings):
     wanted = sd.load_scenario(name, settings=settings)
-    signal, file = some_signal(period=motion_period(wanted)), tmp_path / "learned.npz"
+    signal, file = some_torque(motion_period(wanted), 0.05), tmp_path / "learned.npz"
     save_learned(file, signal, prepare(wanted))
     given = sd.load_scenario(name, settings=(*settings, f"controller.learned={file}"))
     bare, learned = designing.read_learned(given)
@@ -103,7 +99,7 @@ def test_a_packet_has_the_sum_and_the_law_the_rest(limit):
     """Each row is that of the law and the learned torque of its hold, within the limit."""
     network = "link={kind: network, low: 0.1, high: 0.3, loss: 0.02}"
     settings = ("plant.kind=exact", network, f"actuator.torque_limit={limit}")
-    signal, on_hand = some_signal(2e-3, 2 * np.pi), [False]
+    signal, on_hand = some_torque(size=2e-3), [False]
     scenario = sd.load_scenario("paper", settings=settings)
     made = designing.design(scenario, Message(), designing.always(signal))
     law, reference = made.law, made.experiment.reference
@@ -166,7 +162,7 @@ def test_the_command_writes_the_page_of_learn(tmp_path, monkeypatch, capsys):
     counts = {"samples": 11, "deadlines_missed": 0, "periods_played": 10, "periods_dry": 0}
     summary = run.summary | {"live": counts | {"sent_after_due_ms": late}}
     run = dataclasses.replace(run, summary=summary)
-    done = [Repetition(None, run, 2.0), Repetition(some_signal(), run, 1.0)]
+    done = [Repetition(None, run, 2.0), Repetition(some_torque(PERIOD, 0.05), run, 1.0)]
     found = LearnStudy(prepare(scenario), 0.5, done, 2, interrupted=False, file="mine.npz")
     monkeypatch.setattr(learning, "learn_live", lambda *_: LiveLessons(run, found))
     command = ["live", "paper", "--machine", "127.0.0.1:9", "--learn", "2", "--out", str(tmp_path)]
@@ -178,23 +174,9 @@ def test_the_command_writes_the_page_of_learn(tmp_path, monkeypatch, capsys):
     assert "controller.learned=mine.npz" in page
 
 
-AMPLITUDE = 0.7 * np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
-LAW = (
-    f"reference.amplitude={AMPLITUDE.tolist()}",
-    "plant.kind=exact",
-    "controller.estimate=[]",
-    "controller.integral=false",
-    "controller.w_R=100",
-)
-UNKNOWN = (
-    "plant.coulomb_friction=1e-4",
-    "plant.payload_mass=0.2",
-    "plant.payload_position=[0.01, -0.008, 0.02]",
-    "plant.torque_bias=[3e-4, -3e-4, 3e-4, -3e-4, 3e-4, -3e-4]",
-)
-WAY = "low: 0.1, high: 0.12, loss: 0.02"
+LAW = ("plant.kind=exact", *test_learn.LAW)
+AMPLITUDE = 0.7 * test_learn.AMPLITUDE
 ON_A_WIRE = ("start=on_reference", "queue=reference")
-OVER_A_NETWORK = ("start=rest", "queue=zero", f"link={{kind: network, {WAY}, return: {{{WAY}}}}}")
 
 
 def learn(wanted, running, file, say):
@@ -205,7 +187,7 @@ def learn(wanted, running, file, say):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("way", [ON_A_WIRE, OVER_A_NETWORK])
+@pytest.mark.parametrize("way", [ON_A_WIRE, (*FROM_REST, OVER_A_NETWORK)])
 @in_real_time
 def test_torques_of_a_machine_with_friction_and_payload_are_learned(tmp_path, way):
     """Friction, a payload off its centre and biases; the machine's clock is 5 times as fast.

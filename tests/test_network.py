@@ -1,7 +1,6 @@
 """The network: its output, and a file that is read strictly and comes back to the last bit."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -39,10 +38,8 @@ def torch_twin(torch, network):
         torch.nn.Linear(18, network.hidden), torch.nn.Sigmoid(), torch.nn.Linear(network.hidden, 2)
     ).double()
     with torch.no_grad():
-        for layer, weight, bias in (
-            (layers[0], network.W1, network.b1),
-            (layers[2], network.W2, network.b2),
-        ):
+        parameters = (network.W1, network.b1), (network.W2, network.b2)
+        for layer, (weight, bias) in zip(layers[::2], parameters, strict=True):
             layer.weight.copy_(torch.tensor(np.array(weight)))
             layer.bias.copy_(torch.tensor(np.array(bias)))
 
@@ -86,9 +83,8 @@ def test_torch_gives_the_same_weights(hidden, output):
     torch = pytest.importorskip("torch")
     network = small_network(hidden, output=output)
     rho = np.random.default_rng(0).uniform(0, 31, (200, 18))
-    np.testing.assert_allclose(
-        network(rho), torch_twin(torch, network)(rho), rtol=1e-12, atol=1e-12
-    )
+    expected = torch_twin(torch, network)(rho)
+    np.testing.assert_allclose(network(rho), expected, rtol=1e-12, atol=1e-12)
 
 
 def test_the_output_is_finite_for_any_density_and_not_for_a_missing_one():
@@ -102,23 +98,10 @@ def test_a_network_does_not_change_once_made():
     W1 = np.ones((10, 18))
     network = small_network(W1=W1)
     W1[:] = 2
-    assert np.all(network.W1 == 1)
-    with pytest.raises(ValueError, match="read-only"):
-        network.W1[0, 0] = 2
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        network.W1 = W1
+    assert np.all(network.W1 == 1) and not network.W1.flags.writeable
 
 
 # ------------------------------------------------------------------ the file
-
-
-def written(tmp_path, change):
-    """Return the file of a network, changed."""
-    path = tmp_path / "network.json"
-    save_network(small_network(), path)
-    data = json.loads(path.read_text())
-    path.write_text(json.dumps(change(data) or data))
-    return path
 
 
 @settings(deadline=None)
