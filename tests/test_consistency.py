@@ -278,10 +278,9 @@ def test_a_jitter_is_learnt_without_an_estimator():
     assert np.sqrt(np.mean(np.square(late))) == pytest.approx(0.003, rel=0.3)
 
 
-@pytest.mark.parametrize("cause", [(), (f"plant.torque_bias={[3e-4, -3e-4] * 3}",)])
-def test_what_is_constant_is_no_jitter(cause):
-    assert timing_of(*cause).max() < 2e-4
-
-
-def test_noise_is_no_jitter():
-    assert not timing_of(NOISY[-1]).any()
+@pytest.mark.parametrize(
+    ("cause", "most"),
+    [((), 2e-4), ((f"plant.torque_bias={[3e-4, -3e-4] * 3}",), 2e-4), (NOISY[-1:], 0.0)],
+)
+def test_neither_noise_nor_what_is_constant_is_jitter(cause, most):
+    assert timing_of(*cause).max() <= most

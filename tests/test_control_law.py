@@ -557,18 +557,8 @@ def test_the_last_good_gain_sees_the_same_errors(fraction):
     assert np.array_equal(failed.torque, well.torque)
 
 
-@pytest.mark.parametrize("weights", [[np.nan, 1.0], [1.0, 0.0], [-1.0, 1.0], [np.inf, 1.0]])
-def test_bad_weights_keep_the_last_good_gain(weights):
-    law = law_of("delay.steps=2", "controller.estimate=[]")
-    good = step(law, sampled(law), HOME[:12], at_home(law))
-    after = step(law, good, HOME[:12], at_home(law), np.array(weights))
-    assert np.array_equal(after.gain, good.gain)
-    assert after.counts.riccati_failures == 1
-    assert np.all(np.isfinite(after.torque))
-
-
 @pytest.mark.parametrize("bad", [slice(None), 0])
-def test_a_gain_of_your_own_cost_that_is_not_finite_is_counted(bad):
+def test_bad_weights_and_a_gain_that_is_not_finite_keep_the_last_good_one(bad):
     class Broken(QuadraticCost):
         def gain(self, model, weights):
             K = super().gain(model, weights)
@@ -577,10 +567,12 @@ def test_a_gain_of_your_own_cost_that_is_not_finite_is_counted(bad):
 
     law = law_of("delay.steps=2", "controller.estimate=[]")
     good = step(law, sampled(law), HOME[:12], at_home(law))
-    cost = Broken(law.cost.errors, law.cost.integrals, law.cost.torques)
-    after = step(dataclasses.replace(law, cost=cost), good, HOME[:12], at_home(law))
-    assert np.array_equal(after.gain, good.gain) and after.counts.riccati_failures == 1
-    assert np.all(np.isfinite(after.torque))
+    own = dataclasses.replace(law, cost=Broken(**vars(law.cost)))
+    odd = [np.nan, 1.0], [1.0, 0.0], [-1.0, 1.0], [np.inf, 1.0]
+    for one, weights in ((own, WEIGHTS), *((law, np.array(weights)) for weights in odd)):
+        after = step(one, good, HOME[:12], at_home(law), weights)
+        assert np.array_equal(after.gain, good.gain) and after.counts.riccati_failures == 1
+        assert np.all(np.isfinite(after.torque))
 
 
 def test_a_step_changes_nothing_it_was_given():

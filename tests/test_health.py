@@ -1,7 +1,5 @@
 """Health features of the law's memory; the rule, networks of both kinds, limits."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -75,21 +73,19 @@ def window(**columns):
 # ------------------------------------------------------------------------- the features
 
 
-@pytest.mark.parametrize("late_ms", [2.0, 8.0, 25.0])
-def test_the_timing_error_is_found(late_ms):
-    """A delay that is longer than believed shows as what it is, from the loop alone."""
-    fraction = late_ms / 100
-    one = scenario(f"delay.fraction={fraction}", "controller.delay_steps=8", *BLIND, "duration=6")
-    values = seen(one, -4.0)
-    found = 10 ** feature(values, "timing_31")[30::2]
-    assert np.median(found) == pytest.approx(late_ms, rel=0.15)
-
-
-def test_a_torque_that_comes_early_is_in_the_bound():
-    early = scenario("delay.steps=7", "delay.fraction=0.9", "controller.delay_steps=8", *BLIND)
-    values = seen(replace(early, duration=6.0), -4.0)
-    bound = 10 ** feature(values, "timing_bound")[30::2]
-    assert np.median(bound) == pytest.approx(10.0, rel=0.3)
+@pytest.mark.parametrize(
+    ("periods", "name", "rel"),
+    [
+        *((8 + late, "timing_31", 0.15) for late in (0.02, 0.08, 0.25)),
+        (7.9, "timing_bound", 0.3),  # early
+    ],
+)
+def test_the_timing_error_is_found(periods, name, rel):
+    """A delay that is not the one believed shows as what it is in ms, from the loop alone."""
+    delay = (f"delay.steps={periods // 1:g}", f"delay.fraction={periods % 1:g}")
+    values = seen(scenario(*delay, "controller.delay_steps=8", *BLIND, "duration=6"), -4.0)
+    found = 10 ** feature(values, name)[30::2]
+    assert np.median(found) == pytest.approx(100 * abs(periods - 8), rel=rel)
 
 
 def test_where_all_is_as_believed_nothing_surprises():

@@ -440,14 +440,11 @@ def path(period, seed=1):
 
 
 @pytest.mark.parametrize(("period", "holds"), [(0.1, 3), (0.02, 15), (0.15, 2), (0.5, 2)])
-def test_it_takes_the_time_of_a_catch_up_or_two_holds(period, holds):
-    assert path(period).holds == holds
-
-
-@pytest.mark.parametrize("period", [0.02, 0.1, 0.5])
-def test_it_ends_at_rest_relative_to_the_reference(period):
+def test_it_ends_at_rest_relative_to_the_reference(period, holds):
+    """After the time of a catch-up, or two holds."""
     back, size = path(period), np.abs(path(period).offset).max()
     n = back.holds
+    assert n == holds
     assert np.abs(back.at(n * period, period)[:NUM_STATE]).max() < 1e-12 * size / period
     assert not np.any(back.at((n + 0.01) * period, period))
     for _ in range(n + back.samples):

@@ -326,19 +326,22 @@ def test_plans_go_over_a_network():
     assert found.error_so_far < 5
 
 
+def recorded(law, kept):
+    """Return a law that keeps the memory after each step in a list."""
+
+    class Kept(LimitedLqi):
+        def step(self, *given):
+            kept.append(super().step(*given))
+            return kept[-1]
+
+    return Kept(**{name: getattr(law, name) for name in law.__dataclass_fields__})
+
+
 def test_packets_carry_the_plan():
     network = ("link.kind=network", "link.low=0.4", "link.high=0.7", "controller.packet_torques=8")
     law, kept = compose_law(prepare(limited(0.9, *network))), []
-
-    def keeping(law):
-        class Kept(LimitedLqi):
-            def step(self, *given):
-                kept.append(super().step(*given))
-                return kept[-1]
-
-        return Kept(**{name: getattr(law, name) for name in law.__dataclass_fields__})
-
-    simulate(limited(0.9, *network, "duration=0.5"), judge_stability=False, modify_law=keeping)
+    scenario = limited(0.9, *network, "duration=0.5")
+    simulate(scenario, judge_stability=False, modify_law=lambda law: recorded(law, kept))
     memory = kept[-1]
     np.testing.assert_array_equal(memory.sent.packets[-1, -8:], memory.plan.torques[:8])
     assert law.channel.torques == 8
@@ -386,14 +389,7 @@ def test_after_a_failure_the_last_plan_goes_on(late, cause):
     plans, solver = [], Failing({11, 12}, late)
 
     def failing(law):
-        class Kept(LimitedLqi):
-            def step(self, *given):
-                after = super().step(*given)
-                plans.append(after)
-                return after
-
-        parts = {name: getattr(law, name) for name in law.__dataclass_fields__}
-        return Kept(**parts | {"limits": replace(law.limits, solver=solver)})
+        return recorded(replace(law, limits=replace(law.limits, solver=solver)), plans)
 
     result = simulate(limited(0.9, "duration=1.2"), judge_stability=False, modify_law=failing)
     assert result.status == "completed" and result.summary["counts"][cause] == 1

