@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 
 from matplotlib.figure import Figure
 
+from stewart_drake.cli.common import command_line
 from stewart_drake.reporting.document import (
     Caution,
     Document,
@@ -19,7 +20,7 @@ from stewart_drake.reporting.document import (
     Table,
     Values,
 )
-from stewart_drake.reporting.page import Provenance, command_line, html
+from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.reporting.style import figure_style
 
 

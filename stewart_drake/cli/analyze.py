@@ -6,22 +6,11 @@ from tempfile import TemporaryDirectory
 
 import typer
 
-from stewart_drake.cli.common import (
-    GO_ON,
-    AsJson,
-    Controller,
-    Delivery,
-    Out,
-    Quiet,
-    ScenarioName,
-    Settings,
-    stopping,
-)
-from stewart_drake.cli.options import Given, with_options
+from stewart_drake.cli.common import GO_ON, Chosen, Delivery, stopping
+from stewart_drake.cli.options import Given, command
 from stewart_drake.reporting.analyses import ANALYSES, analyze, options_of, words_of
 from stewart_drake.reporting.terminal import count_bar
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import load_scenario
 
 app = typer.Typer(rich_markup_mode=None, help="Analyse a loop before it is built.")
 
@@ -33,51 +22,33 @@ def add_analyses(root: typer.Typer) -> None:
         group.command(name, help=row.help)(_callback(name))
 
 
-def _callback(name: str) -> Callable[..., int]:
+def _callback(name: str) -> Callable[..., int | None]:
     """Return a function with the parameters of an analysis on the command line."""
     row = ANALYSES[name]
 
-    @with_options(options_of(name), without=() if row.controller else ("controller",))
-    def run(
-        *,
-        scenario: ScenarioName = "paper",
-        controller: Controller = None,
-        settings: Settings = None,
-        given: Given,
-        out: Out = None,
-        quiet: Quiet = False,
-        as_json: AsJson = False,
-    ) -> int:
-        from stewart_drake.reporting.page import command_line
-
-        typed = settings or []
+    @command(options_of(name), without=() if row.controller else ("controller",))
+    def run(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
         fixed = ("plant.kind=exact",) if row.exact else ()
 
         def load(controller: str | None) -> Scenario:
-            return load_scenario(scenario, controller, (*fixed, *typed))
+            return chosen._replace(controller=controller).load(*fixed)
 
-        options = given.options(load)
-        delivery = Delivery(out, quiet, as_json)
-        command = command_line(
-            *words_of(name),
-            scenario,
-            settings=typed,
-            options={"controller": controller, **given.words, "out": out},
-        )
+        options, out = given.options(load), delivery.out
+        line = chosen.line(*words_of(name), **given.words, out=out)
         kept = GO_ON.replace("runs", row.keeps) if out else "nothing is kept without --out"
         first = "preparing" if row.counts else "computing"
         with (
             TemporaryDirectory() as scratch,
             stopping(kept) if row.keeps else contextlib.nullcontext(),
-            count_bar(row.counts or name, quiet, first) as progress,
+            count_bar(row.counts or name, delivery.quiet, first) as progress,
         ):
-            loaded = load(controller)
+            loaded = chosen.load(*fixed)
             delivery.say_link(loaded)
             found = analyze(
-                name, loaded, options, command=command, directory=out or scratch, progress=progress
+                name, loaded, options, command=line, directory=out or scratch, progress=progress
             )
         files, interrupted = (getattr(found.study, key, ()) for key in ("files", "interrupted"))
-        files = (*files, *found.write_files(delivery.out))
+        files = (*files, *found.write_files(out))
         return delivery.answer(found, *files, interrupted=bool(interrupted))
 
     return run

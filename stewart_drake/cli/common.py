@@ -4,10 +4,11 @@ import contextlib
 import fcntl
 import json
 import os
+import shlex
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import typer
 
@@ -17,7 +18,7 @@ from stewart_drake.files.resources import Kind, shipped
 from stewart_drake.reporting.document import WIDTH, wrap
 from stewart_drake.reporting.terminal import echo
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import setting_choices
+from stewart_drake.scenario.loading import load_scenario, setting_choices, title_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,14 +61,48 @@ Controller = Annotated[
     str | None, typer.Option(metavar="NAME|FILE", help="Controller in place of the scenario's.")
 ]
 Out = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="Folder of summary, signals and figures.")
-]
-Log = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Log to write during the run, .mcap or .csv."),
+    Path | None, typer.Option(metavar="DIR", help="Folder of summary, figures and data.")
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")]
+
+
+class Chosen(NamedTuple):
+    """A scenario as chosen on the command line."""
+
+    scenario: str
+    controller: str | None = None
+    settings: Sequence[str] = ()
+
+    def load(self, *settings: str) -> Scenario:
+        """Return the scenario with these settings, which the typed ones may replace."""
+        return load_scenario(self.scenario, self.controller, (*settings, *self.settings))
+
+    @property
+    def title(self) -> str:
+        return title_of(self.scenario)
+
+    def line(self, *words: str, **options: object) -> str:
+        """Return the command of these words with its options as typed, see `command_line`."""
+        own = {"controller": self.controller} | options
+        return command_line(*words, self.scenario, settings=self.settings, options=own)
+
+
+def command_line(
+    *words: str, settings: Iterable[str] = (), options: Mapping[str, object] | None = None
+) -> str:
+    """Return a command as typed: words, `--set` for each setting, and options that are not None.
+
+    An option with a list or tuple is repeated for each item; one that is on or off has no value.
+    """
+    parts = ["stewart-drake", *words]
+    for name, value in {"set": list(settings), **(options or {})}.items():
+        for one in value if isinstance(value, list | tuple) else (value,):
+            if isinstance(one, bool):
+                parts.append(f"--{name}" if one else f"--no-{name}")
+            elif one is not None:
+                parts += [f"--{name}", str(one)]
+    return shlex.join(parts)
 
 
 def check_writable(directory: Path | None, *, alone: bool = True) -> None:
@@ -163,10 +198,16 @@ class Delivery:
         quiet, as_json: options of the command.
     """
 
-    def __init__(self, out: Path | None, quiet: bool, as_json: bool = False) -> None:
+    def __init__(self, out: Path | None = None, quiet: bool = False, as_json: bool = False) -> None:
         check_writable(out)
-        self.out, self.as_json, self.silent = out, as_json, quiet or as_json
+        self.out, self.quiet, self.as_json, self.silent = out, quiet, as_json, quiet or as_json
         self._written: list[str] = []
+
+    @property
+    def folder(self) -> Path:
+        """Directory of an `--out` with a default."""
+        assert self.out is not None
+        return self.out
 
     def say(self, text: str) -> None:
         """Print a text, unless `--quiet` or `--json` is given."""

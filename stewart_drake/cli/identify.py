@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from stewart_drake.cli.common import AsJson, Delivery, Out, Quiet, Settings
+from stewart_drake.cli.common import Delivery, Settings, command_line
+from stewart_drake.cli.options import command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.progress import shown_by
 from stewart_drake.identification.tolerances import TOLERANCE_UNITS, read_tolerances
@@ -20,7 +21,9 @@ if TYPE_CHECKING:
 _UNITS = "; ".join(f"{name}: {unit}" for name, unit in TOLERANCE_UNITS.items())
 
 
+@command()
 def identify(
+    *,
     logs: list[Path] | None = typer.Argument(
         None, metavar="[LOG]...", help="Logs of one machine: of a run, or CSV."
     ),
@@ -52,9 +55,7 @@ def identify(
     gravity: bool | None = typer.Option(
         None, help="Gravity acts on the machine of a CSV log, or is balanced."
     ),
-    out: Out = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
+    delivery: Delivery,
 ) -> int:
     """Find delay, friction and geometry in a log.
 
@@ -72,7 +73,13 @@ def identify(
         raise ConfigError(f"LOG, --plan: got {given}; expected logs, or --plan SCENARIO")
     if delay is not None and not 0 <= delay <= 100:
         raise ConfigError(f"--delay: got {delay:g}; expected 0 to 100 s")
-    typed = {"delay": delay, "tolerance": tolerance, "bits": bits, "pose-std": pose_std, "out": out}
+    typed: dict[str, Any] = {
+        "delay": delay,
+        "tolerance": tolerance,
+        "bits": bits,
+        "pose-std": pose_std,
+    }
+    typed["out"] = delivery.out
     of_csv = {"--bits": bits, "--pose-std": pose_std, "--gravity": gravity}
     if plan is not None:
         of_scenario = {"--mechanism": mechanism, "--delay": delay, "--gravity": gravity}
@@ -83,13 +90,11 @@ def identify(
         refuse({"--set": settings}, "without --plan; expected it with --plan")
         if all(map(is_run, logs or ())):
             refuse(of_csv, "with logs of runs, which contain it; expected it with a CSV log only")
-    delivery = Delivery(out, quiet, as_json)
     if plan is None and mechanism is None:
         raise ConfigError("--mechanism: is missing; expected a shipped name or a file, as drawn")
     from stewart_drake import functions
     from stewart_drake.identification.plan import MOTION
     from stewart_drake.identification.servo_plan import SETPOINTS_FILE
-    from stewart_drake.reporting.page import command_line
 
     chosen: Any = {"tolerances": tolerances, "precision": precision}
     if plan is not None:
@@ -97,14 +102,14 @@ def identify(
         chosen["command"] = command_line(
             "identify", settings=settings or [], options={"plan": plan, **typed}
         )
-        with phase_bar("plan", quiet):
+        with phase_bar("plan", delivery.quiet):
             found = functions.plan_identification(loaded, poses=pose_std is not None, **chosen)
         delivery.discard(MOTION, functions.SCENARIO, SETPOINTS_FILE)
     else:
         words = [*map(str, logs or []), *(["--no-gravity"] if gravity is False else [])]
         options = {"mechanism": mechanism, **typed}
         chosen["command"] = command_line("identify", *words, options=options)
-        with phase_bar("identify", quiet) as show, shown_by(show):
+        with phase_bar("identify", delivery.quiet) as show, shown_by(show):
             found = functions.identify(
                 logs or [], mechanism or "", delay=delay, gravity=gravity is not False, **chosen
             )

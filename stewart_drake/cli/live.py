@@ -7,28 +7,18 @@ import multiprocessing
 import signal
 import sys
 import webbrowser
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
-from stewart_drake.cli.common import (
-    AsJson,
-    Controller,
-    Delivery,
-    Out,
-    Quiet,
-    ScenarioName,
-    Settings,
-    check_log,
-)
-from stewart_drake.cli.options import Given, with_options
+from stewart_drake.cli.common import Chosen, Delivery, check_log
+from stewart_drake.cli.options import Given, command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.options import LiveOptions, MachineOptions
 from stewart_drake.reporting.terminal import echo
-from stewart_drake.scenario.loading import load_scenario
 
 if TYPE_CHECKING:
     from stewart_drake.live.page import PageViewer
@@ -54,10 +44,10 @@ _REFUSED: Final = {
 _REQUESTS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
-@with_options(LiveOptions)
+@command(LiveOptions)
 def live(
     *,
-    scenario: ScenarioName = "paper",
+    chosen: Chosen,
     machine: str | None = typer.Option(None, metavar="HOST:PORT", help="Address of the machine."),
     demo: bool = typer.Option(
         False,
@@ -66,11 +56,7 @@ def live(
     ),
     no_browser: bool = typer.Option(False, "--no-browser", help="Open no page."),
     given: Given,
-    controller: Controller = None,
-    settings: Settings = None,
-    out: Out = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
+    delivery: Delivery,
 ) -> int:
     """Drive a machine over UDP in real time.
 
@@ -82,22 +68,17 @@ def live(
     options = given.options()
     with given.named():
         options.check_learned()
-    loaded = load_scenario(scenario, controller, settings or ())
-    delivery = Delivery(out, quiet, as_json)
+    loaded, name = chosen.load(), Path(chosen.scenario).stem
     span = math.inf if options.duration is None else options.duration
-    name = Path(scenario).stem
     if options.learn:
         if options.hold or {options.duration, options.log, options.mirror} != {None}:
             raise ConfigError(
                 "--learn: expected none of --duration, --log, --mirror and --hold with it"
             )
-        typed = {"controller": controller, "machine": machine, "demo": demo, **given.words}
-        shown = {name: value for name, value in typed.items() if value} | {"out": out}
-        from stewart_drake.reporting.page import command_line
-
-        command = command_line("live", scenario, settings=settings or (), options=shown)
-        more = controller, settings or ()
-        return _learn(scenario, loaded, machine, options, more, delivery, command)
+        typed = {"machine": machine, "demo": demo, **given.words}
+        shown = {name: value for name, value in typed.items() if value}
+        line = chosen.line("live", **shown, out=delivery.out)
+        return _learn(chosen, loaded, machine, options, delivery, line)
 
     from stewart_drake.live.contact import address_of
     from stewart_drake.live.endpoint import read_key
@@ -109,9 +90,7 @@ def live(
             address_of(address, option)
     with contextlib.ExitStack() as running:
         viewer = None if no_browser else running.enter_context(_page(loaded, name))
-        where = machine or running.enter_context(
-            _demo_machine(scenario, loaded.eta, controller, settings or ())
-        )
+        where = machine or running.enter_context(_demo_machine(chosen, loaded.eta))
         from stewart_drake.live import session
 
         delivery.say(f"calling {where}")
@@ -130,7 +109,7 @@ def live(
             input("Enter begins, Ctrl-C leaves it alone")
         delivery.discard("signals.nc")
         how: Any = options.model_dump(include={"armed", "max_missing", "hold"}) | {"viewer": viewer}
-        how["log"] = None if out is None else out / LOG
+        how["log"] = None if delivery.out is None else delivery.out / LOG
         how["logs"] = session.open_logs(ready, options, delivery.say_wrapped)
         with _Ending() as ending:
             result = session.drive(
@@ -142,13 +121,12 @@ def live(
 
 
 def _learn(
-    scenario: str,
+    chosen: Chosen,
     loaded: "Scenario",
     machine: str | None,
     options: LiveOptions,
-    more: tuple[str | None, Sequence[str]],
     delivery: Delivery,
-    command: str,
+    line: str,
 ) -> int:
     """Learn torques or setpoints, and deliver the run, with the page of `learn`."""
     from stewart_drake.live.learning import learn_live
@@ -159,14 +137,14 @@ def _learn(
 
     check_learning(loaded)
     with contextlib.ExitStack() as running:
-        where = machine or running.enter_context(_demo_machine(scenario, loaded.eta, *more))
+        where = machine or running.enter_context(_demo_machine(chosen, loaded.eta))
         delivery.say(f"calling {where}")
         consent = options if machine else options.model_copy(update={"accept_jitter": True})
         with _Ending() as ending:
             run, study = learn_live(loaded, where, consent, delivery.say_wrapped, ending)
     found = None
     if study is not None:
-        found = AnalysisResult(study, study.summary, document(study), Provenance(command))
+        found = AnalysisResult(study, study.summary, document(study), Provenance(line))
     return _delivered(delivery, run, found=found)
 
 
@@ -230,19 +208,16 @@ def _delivered(
     return delivery.end(result.summary, result.status == "interrupted") or int(lost)
 
 
-def _serve(address: Connection, *scenario: Any) -> None:
-    """Simulate the machine of a scenario in this process; send its address, or why there is none.
-
-    `scenario` are the arguments of `load_scenario`.
-    """
+def _serve(address: Connection, chosen: Chosen) -> None:
+    """Simulate a machine in this process; send its address, or why there is none."""
     if sys.platform == "linux":
         set_death_signal = 1
         ctypes.CDLL(None).prctl(set_death_signal, signal.SIGTERM)  # it ends with its parent
     from stewart_drake.live.reachy import open_chosen
 
     try:
-        loaded = load_scenario(*scenario)
-        with open_chosen(loaded, MachineOptions(port=0), lambda _: None) as (running, where):
+        options = MachineOptions(port=0)
+        with open_chosen(chosen.load(), options, lambda _: None) as (running, where):
             address.send("{}:{}".format(*where))
             running.run()
     except ConfigError as error:
@@ -250,17 +225,15 @@ def _serve(address: Connection, *scenario: Any) -> None:
 
 
 @contextlib.contextmanager
-def _demo_machine(
-    scenario: str, eta: float, controller: str | None, settings: Sequence[str]
-) -> Iterator[str]:
+def _demo_machine(chosen: Chosen, eta: float) -> Iterator[str]:
     """Simulate a machine in another process, over another link; yield its address."""
     low, high = (share * eta for share in _EACH_WAY)
     way = f"low: {low:g}, high: {high:g}, loss: {_LOST}"
     link = f"link={{kind: network, {way}, return: {{{way}}}}}"
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe(duplex=False)
-    args = (there, scenario, controller, [*settings, "plant.kind=exact", link])
-    process = context.Process(target=_serve, args=args, daemon=True)
+    chosen = chosen._replace(settings=[*chosen.settings, "plant.kind=exact", link])
+    process = context.Process(target=_serve, args=(there, chosen), daemon=True)
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the controller
     try:
         process.start()
@@ -311,16 +284,8 @@ class _Ending:
 # ---------------------------------------------------------------- the machine
 
 
-@with_options(MachineOptions)
-def machine(
-    *,
-    scenario: ScenarioName = "paper",
-    given: Given,
-    controller: Controller = None,
-    settings: Settings = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-) -> int:
+@command(MachineOptions, without=("out",))
+def machine(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
     """Simulate a machine, or drive a robot, over UDP in real time.
 
     Plant, sensor, delay, link and limits are those of the scenario. Ctrl-C ends it.
@@ -332,8 +297,7 @@ def machine(
     from stewart_drake.live.reachy import open_chosen
     from stewart_drake.scenario.link import link_text
 
-    options, loaded = given.options(), load_scenario(scenario, controller, settings or ())
-    delivery, interrupted = Delivery(None, quiet, as_json), False
+    options, loaded, interrupted = given.options(), chosen.load(), False
     check_log(options.log)
     with given.named(), open_chosen(loaded, options, delivery.say_wrapped) as (running, address):
         if network := link_text(loaded, bound=False):
@@ -346,7 +310,7 @@ def machine(
             if options.reachy is not None:
                 moved = f"drives the robot behind {options.reachy}"
             delivery.say_wrapped(
-                f"machine {scenario} at {address[0]}:{address[1]}: {moved}, "
+                f"machine {chosen.scenario} at {address[0]}:{address[1]}: {moved}, "
                 f"every {1e-6 * running.period:g} ms",
                 "waits for a controller; Ctrl-C ends it",
             )

@@ -14,10 +14,11 @@ from stewart_drake.cli.common import (
     MechanismName,
     Quiet,
     check_file,
+    command_line,
     open_meshcat,
     stopping,
 )
-from stewart_drake.cli.options import Given, with_options
+from stewart_drake.cli.options import Given, command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.reporting.terminal import echo
@@ -46,12 +47,8 @@ def sdf(
 
 
 @app.command()
-def check(
-    mechanism: MechanismName,
-    out: Path | None = typer.Option(None, metavar="DIR", help="Folder of summary and drawing."),
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-) -> None:
+@command()
+def check(*, mechanism: MechanismName, delivery: Delivery) -> int:
     """Check a mechanism and describe it at its home pose, under gravity."""
     from stewart_drake.reporting.mechanism import document
 
@@ -61,42 +58,38 @@ def check(
 
         write_figures({"mechanism": mechanism_figure(found.mechanism)}, folder)
 
-    delivery = Delivery(out, quiet, as_json)
     found = sd.check_model(mechanism)
     delivery.say(document(found).plain())
     delivery.discard("mechanism.png", "mechanism.svg")
     delivery.write(found.summary)
     delivery.draw("mechanism.png, mechanism.svg", draw)
-    delivery.end(found.summary)
+    return delivery.end(found.summary)
 
 
 @app.command()
-def view(
-    mechanism: MechanismName,
-    out: Path | None = typer.Option(
-        None, metavar="DIR", help="Write a page of the home pose, and end."
-    ),
-    quiet: Quiet = False,
-) -> None:
-    """Show a mechanism in a browser, with sliders for its pose."""
+@command(without=("as_json",))
+def view(*, mechanism: MechanismName, delivery: Delivery) -> int:
+    """Show a mechanism in a browser, with sliders for its pose.
+
+    With --out it writes a page of the home pose, and ends.
+    """
     from stewart_drake.reporting.viewer import STOP, PoseViewer
 
-    delivery = Delivery(out, quiet)
     viewer = PoseViewer(sd.load_mechanism(mechanism), open_meshcat())
-    if out is not None:
-        write_whole(out / "view.html", viewer.meshcat.StaticHtml())
+    if delivery.out is not None:
+        write_whole(delivery.out / "view.html", viewer.meshcat.StaticHtml())
         delivery.wrote("view.html")
-        delivery.end({})
-        return
+        return delivery.end({})
     # The address is printed also with --quiet.
     echo(f"showing it at {viewer.meshcat.web_url()}, ends with {STOP!r} there or Ctrl-C")
     viewer.run(delivery.say)
+    return 0
 
 
 # ---------------------------------------------------------------- a new machine
 
 
-@with_options(Measurements)
+@command(Measurements)
 def new(
     *,
     folder: Path = typer.Argument(metavar="DIR", help="Folder of the files."),
@@ -138,7 +131,7 @@ def _new(
     from stewart_drake.loop.simulation import simulate
     from stewart_drake.reporting.document import Caution
     from stewart_drake.reporting.mechanism import document
-    from stewart_drake.reporting.page import Provenance, command_line, html
+    from stewart_drake.reporting.page import Provenance, html
     from stewart_drake.reporting.report import first_report
     from stewart_drake.reporting.results import PAGE
     from stewart_drake.studies import new_machine as study

@@ -1,13 +1,24 @@
-"""Command-line parameters that follow from the options of a study."""
+"""Parameters of the command line: those that commands share, and the options of a study."""
 
 import contextlib
 import inspect
 from collections.abc import Callable, Collection, Mapping
-from typing import Annotated, Any
+from functools import partial
+from typing import Annotated, Any, Final
 
 import typer
 
-from stewart_drake.cli.common import named
+from stewart_drake.cli.common import (
+    AsJson,
+    Chosen,
+    Controller,
+    Delivery,
+    Out,
+    Quiet,
+    ScenarioName,
+    Settings,
+    named,
+)
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.options import Option, Options
 
@@ -65,28 +76,61 @@ class Given:
         return one.read(typed, load) if typed else one.default
 
 
-def with_options(
-    kind: type[Options], without: Collection[str] = ()
-) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Return a decorator that replaces the argument `given` of a command by options.
+def _shared(
+    *,
+    scenario: ScenarioName = "paper",
+    controller: Controller = None,
+    settings: Settings = None,
+    out: Out = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Have the parameters that commands share."""
+
+
+_CHOSEN: Final = ("scenario", "controller", "settings")
+_DELIVERY: Final = ("out", "quiet", "as_json")
+
+
+def command(
+    kind: type[Options] = Options, without: Collection[str] = (), **defaults: Any
+) -> Callable[[Callable[..., int | None]], Callable[..., int | None]]:
+    """Return a decorator that replaces arguments of a command by parameters of the command line.
+
+    These are `given`, by the options of a study; `chosen`, by those of a scenario; and `delivery`,
+    by those of the output.
 
     Args:
         kind: class of the options.
-        without: arguments that the command does not offer; they keep their defaults.
+        without: parameters that the command does not offer; they keep their defaults.
+        defaults: by the name of a parameter.
     """
+    known = {
+        name: one.replace(default=defaults.get(name, one.default))
+        for name, one in inspect.signature(_shared).parameters.items()
+        if name not in without
+    }
+    groups = {
+        "given": {_name(one): _parameter(one) for one in _offered(kind)},
+        **{
+            group: {name: known[name] for name in names if name in known}
+            for group, names in {"chosen": _CHOSEN, "delivery": _DELIVERY}.items()
+        },
+    }
+    make: dict[str, Callable[[dict[str, Any]], Any]] = {
+        "given": partial(Given, kind),
+        "chosen": lambda typed: Chosen(**typed | {"settings": typed["settings"] or ()}),
+        "delivery": lambda typed: Delivery(**typed),
+    }
 
-    def decorate(command: Callable[..., int]) -> Callable[..., int]:
-        shown: list[inspect.Parameter] = []
-        for one in inspect.signature(command).parameters.values():
-            if one.name == "given":
-                shown += map(_parameter, _offered(kind))
-            elif one.name not in without:
-                shown.append(one.replace(kind=inspect.Parameter.KEYWORD_ONLY))
-        names = [_name(one) for one in _offered(kind)]
+    def decorate(command: Callable[..., int | None]) -> Callable[..., int | None]:
+        own = inspect.signature(command).parameters
+        used = [name for name in make if name in own]
+        shown = [p for name, one in own.items() for p in groups.get(name, {"": one}).values()]
 
-        def run(**typed: Any) -> int:
-            given = Given(kind, {name: typed.pop(name) for name in names})
-            return command(**typed, given=given)
+        def run(**typed: Any) -> int | None:
+            parts = {name: {one: typed.pop(one) for one in groups[name]} for name in used}
+            return command(**typed, **{name: make[name](part) for name, part in parts.items()})
 
         run.__name__, run.__doc__, run.__annotations__ = command.__name__, command.__doc__, {}
         run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]

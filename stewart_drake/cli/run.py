@@ -11,25 +11,20 @@ import typer
 
 import stewart_drake as sd
 from stewart_drake.cli.common import (
-    AsJson,
-    Controller,
+    Chosen,
     Delivery,
-    Log,
-    Out,
-    Quiet,
-    ScenarioName,
-    Settings,
     check_file,
     check_log,
     check_writable,
     named,
     open_meshcat,
 )
+from stewart_drake.cli.options import command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.reporting.document import Caution
 from stewart_drake.reporting.terminal import count_bar, echo, progress_bars
-from stewart_drake.scenario.loading import load_compatible, load_scenario, title_of
+from stewart_drake.scenario.loading import load_compatible
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
@@ -43,21 +38,21 @@ OF_CONTROLLERS: Final = ("torques", "delay")
 """All that `draw_comparison` may return, of all controllers and of each."""
 
 
+@command()
 def simulate(
-    scenario: ScenarioName = "paper",
-    controller: Controller = None,
-    settings: Settings = None,
-    out: Out = None,
+    *,
+    chosen: Chosen,
     csv: bool = typer.Option(False, "--csv", help="Also write signals.csv; needs --out."),
     replay: bool = typer.Option(
         False, "--replay", help="Write replay.html, a 3-D animation; needs --out."
     ),
-    log: Log = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
+    log: Path | None = typer.Option(
+        None, metavar="FILE", help="Log to write during the run, .mcap or .csv."
+    ),
     meshcat: bool = typer.Option(
         False, "--meshcat", help="Show the run in a browser, live and as a replay."
     ),
+    delivery: Delivery,
 ) -> int:
     """Run one scenario."""
     from stewart_drake.loop.cautions import cautions_before
@@ -67,10 +62,9 @@ def simulate(
     from stewart_drake.studies.verdict import Verdict, loop_verdict
 
     for option, given in (("--csv", csv), ("--replay", replay)):
-        if given and out is None:
+        if given and delivery.out is None:
             raise ConfigError(f"{option}: got it without --out; expected --out DIR to write into")
-    experiment = prepare(load_scenario(scenario, controller, settings or ()))
-    delivery = Delivery(out, quiet, as_json)
+    experiment, name = prepare(chosen.load()), chosen.title
     check_log(log)
     viewer = open_meshcat() if meshcat else None
     delivery.say_link(experiment.scenario)
@@ -83,8 +77,7 @@ def simulate(
             delivery.say(Caution(text).plain())
     if viewer is not None:
         _await_viewer(viewer)
-    name = title_of(scenario)
-    with progress_bars([name], experiment.scenario.duration, quiet) as progress:
+    with progress_bars([name], experiment.scenario.duration, delivery.quiet) as progress:
         result = sd.simulate(
             experiment, progress=progress[name], meshcat=viewer, judge_stability=margin, log=log
         )
@@ -95,12 +88,12 @@ def simulate(
 
     # The summary is written last of the results: where it exists, the signals are of the same run.
     delivery.discard(CSV, REPLAY, *_pictures(RUN_FIGURES))
-    if out is not None:
+    if delivery.out is not None:
         if csv:
             from stewart_drake.reporting.csv_file import signals_csv
 
-            write_whole(out / CSV, signals_csv(result.signals))
-        result.save(out)
+            write_whole(delivery.out / CSV, signals_csv(result.signals))
+        result.save(delivery.out)
         delivery.wrote("summary.json", "signals.nc", *[CSV] * csv)
     delivery.figures(result.plot)
     if replay or meshcat:
@@ -162,11 +155,11 @@ def replay(
     echo(f"written to {out}")
 
 
+@command()
 def export_c(
-    scenario: ScenarioName = "paper",
+    *,
+    chosen: Chosen,
     out: Path = typer.Option("out/export-c", metavar="DIR", help="Folder to write."),
-    controller: Controller = None,
-    settings: Settings = None,
     single: bool = typer.Option(False, "--single", help="Use single precision."),
 ) -> None:
     """Write the controller as C, for a board.
@@ -176,14 +169,16 @@ def export_c(
     from stewart_drake.export.controller import changed
 
     check_writable(out)
-    files = sd.export_c(scenario, out, controller, settings or (), single=single)
+    files = sd.export_c(chosen.scenario, out, *chosen[1:], single=single)
     echo(f"written to {out}: {len(files)} files; make test replays the run")
     if kept := changed(out):
         echo(f"kept, as changed since the last export: {', '.join(kept)}; delete to write anew")
 
 
+@command(scenario="reachy_mini")
 def setpoints(
-    scenario: ScenarioName = "reachy_mini",
+    *,
+    chosen: Chosen,
     out: Path = typer.Option("out/setpoints.csv", metavar="FILE.csv", help="File to write."),
     rate: float = typer.Option(50.0, metavar="HZ", help="Setpoints per second."),
     plain: bool = typer.Option(
@@ -198,8 +193,6 @@ def setpoints(
     units: Path | None = typer.Option(
         None, metavar="FILE", help="Units of the servos: rad, deg or ticks, offset, sign."
     ),
-    controller: Controller = None,
-    settings: Settings = None,
 ) -> None:
     """Write the crank angles to send to position servos.
 
@@ -209,12 +202,12 @@ def setpoints(
     check_file(out)
     with named(start="--from", rate="--rate"):
         made = sd.setpoints(
-            *(scenario, rate, out),
+            *(chosen.scenario, rate, out),
             plain=plain,
             start=None if start is None else _pose(start),
             units=units,
-            controller=controller,
-            settings=settings or (),
+            controller=chosen.controller,
+            settings=chosen.settings,
         )
     kind = "plain" if plain else "compensated"
     echo(f"written to {out}: {len(made.times)} {kind} setpoints at {rate:g} Hz")
@@ -237,40 +230,39 @@ def _pose(text: str) -> list[float]:
     return pose
 
 
+@command(without=("controller",))
 def compare(
-    scenario: ScenarioName = "paper",
+    *,
+    chosen: Chosen,
     controllers: str | None = typer.Option(
         None, metavar="A,B,...", help="Names or files of controllers, in this order."
     ),
-    settings: Settings = None,
-    out: Out = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
+    delivery: Delivery,
 ) -> int:
     """Compare controllers on a scenario: by default the shipped ones."""
     from stewart_drake.loop.preparation import prepare
     from stewart_drake.studies import compare as study
     from stewart_drake.studies.verdict import delay_verdict
 
-    chosen = None if controllers is None else [one.strip() for one in controllers.split(",")]
-    names = tuple(study.shown(scenario, settings or (), chosen))
-    experiment = prepare(load_compatible(scenario, settings=settings or ()))
-    delivery = Delivery(out, quiet, as_json)
+    scenario, _, settings = chosen
+    given = None if controllers is None else [one.strip() for one in controllers.split(",")]
+    names = tuple(study.shown(scenario, settings, given))
+    experiment = prepare(load_compatible(*chosen))
     delivery.say_link(experiment.scenario)
     delivery.say_wrapped(str(delay_verdict(experiment)))
-    with progress_bars(names, experiment.scenario.duration, quiet) as progress:
+    with progress_bars(names, experiment.scenario.duration, delivery.quiet) as progress:
         results = sd.compare(
             scenario,
-            settings or (),
+            settings,
             lambda name, time, error: progress[name](time, error),
-            controllers=chosen,
+            controllers=given,
         )
     delivery.say(results.table())
     known = dict.fromkeys((*names, *study.LABELS))
     drawn = [f"{what}_{name}" for what in OF_CONTROLLERS for name in known]
     delivery.discard(*(f"{name}.nc" for name in known), *_pictures((*COMPARED_FIGURES, *drawn)))
-    if out is not None:
-        results.save(out)
+    if delivery.out is not None:
+        results.save(delivery.out)
         delivery.wrote("summary.json", f"{len(results)} signal files")
     delivery.figures(results.plot)
     ended = [result.status for result in results.values()]
@@ -278,28 +270,21 @@ def compare(
     return delivery.end(study.comparison_summary(results), interrupted)
 
 
-def report(
-    scenario: ScenarioName = "paper",
-    controller: Controller = None,
-    settings: Settings = None,
-    out: Path = typer.Option("out/report", metavar="DIR", help="Folder to write."),
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-) -> int:
+@command(out=Path("out/report"))
+def report(*, chosen: Chosen, delivery: Delivery) -> int:
     """Write one HTML file about a scenario.
 
     Runs it, compares all shipped controllers on it, and analyses it.
     """
     from stewart_drake.loop.preparation import simulated_machine
     from stewart_drake.reporting import report as report_document
-    from stewart_drake.reporting.page import Provenance, command_line
+    from stewart_drake.reporting.page import Provenance
     from stewart_drake.reporting.report import collect
     from stewart_drake.reporting.results import PAGE, AnalysisResult
 
-    delivery = Delivery(out, quiet, as_json)
-    started, name = time.perf_counter(), title_of(scenario)
+    started, name = time.perf_counter(), chosen.title
     with count_bar("runs, analyses", delivery.silent) as progress:
-        found = collect(scenario, settings or (), progress, controller)
+        found = collect(chosen.scenario, chosen.settings, progress, chosen.controller)
     delivery.discard(REPLAY, PAGE)
     summary = report_document.report_summary(found)
     delivery.write(summary)
@@ -321,8 +306,7 @@ def report(
 
     if found.run is not None:
         delivery.draw(REPLAY, film)
-    words = {"controller": controller, "out": out}
-    command = command_line("report", scenario, settings=settings or (), options=words)
-    made = Provenance(command, seconds=time.perf_counter() - started)
+    line = chosen.line("report", out=delivery.out)
+    made = Provenance(line, seconds=time.perf_counter() - started)
     delivery.draw(PAGE, page)
     return delivery.end(summary)

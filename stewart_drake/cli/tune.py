@@ -1,57 +1,42 @@
 """Commands of the tuner: tune dataset, tune train, tune evaluate."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stewart_drake.cli.common import (
     GO_ON,
     AsJson,
+    Chosen,
     Controller,
     Delivery,
     Quiet,
-    ScenarioName,
     Settings,
+    command_line,
     stopping,
 )
-from stewart_drake.cli.options import Given, with_options
+from stewart_drake.cli.options import Given, command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.reporting.terminal import count_bar
 from stewart_drake.tuning.options import DataOptions, EvaluationOptions, TrainingOptions
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 app = typer.Typer(
     rich_markup_mode=None, help="Make data for the neural tuner, train it, evaluate it."
 )
 
-Out = Annotated[Path, typer.Option(metavar="DIR", help="Folder of runs, results and summary.")]
-
 
 @app.command()
-@with_options(DataOptions)
-def dataset(
-    *,
-    scenario: ScenarioName = "paper",
-    out: Out = Path("out/tuner/data"),
-    controller: Controller = None,
-    settings: Settings = None,
-    given: Given,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-) -> int:
+@command(DataOptions, out=Path("out/tuner/data"))
+def dataset(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
     """Run a grid of 180 scenarios, or the conditions of a family.
 
     The grid varies delay, frequency and weights. A family has faults of timing, friction and noise.
     """
     from stewart_drake import functions
 
-    options, delivery = given.options(), Delivery(out, quiet, as_json)
-    with given.named(), stopping(GO_ON), count_bar("conditions", quiet) as progress:
+    with given.named(), stopping(GO_ON), count_bar("conditions", delivery.quiet) as progress:
         found = functions.make_tuner_data(
-            out, scenario, controller, settings or (), progress=progress, options=options
+            delivery.folder, *chosen, progress=progress, options=given.options()
         )
     delivery.write(found.summary)
     delivery.say(found.table())
@@ -60,7 +45,7 @@ def dataset(
 
 
 @app.command()
-@with_options(TrainingOptions)
+@command(TrainingOptions)
 def train(
     *,
     data: Path = typer.Argument(metavar="DATA", help="Folder or file that tune dataset wrote."),
@@ -78,20 +63,12 @@ def train(
     By Levenberg-Marquardt on labels. With --regret on the runs of a family, then on runs of the
     network itself.
     """
-
     from stewart_drake import functions
-
-    def draw() -> "dict[str, Figure]":
-        from stewart_drake.reporting.tuner import training_figures
-
-        return training_figures(found.study)
+    from stewart_drake.reporting.tuner import training_figures
 
     if out.suffix != ".json":
         raise ConfigError(f"--out: got {str(out)!r}; expected a file ending in .json")
-    options = given.options()
-    with given.named():
-        options.check()
-    delivery = Delivery(out.parent, quiet, as_json)
+    options, delivery = given.options(), Delivery(out.parent, quiet, as_json)
     name, kept = ("own runs", GO_ON) if options.regret else ("training", "nothing written")
     first = "training" if options.regret else "computing"
     with given.named(), stopping(kept), count_bar(name, delivery.silent, first) as progress:
@@ -101,51 +78,43 @@ def train(
     delivery.write(found.summary)
     delivery.say(found.table())
     if not options.regret:
-        delivery.figures(draw)
+        delivery.figures(lambda: training_figures(found.study))
     return delivery.end(found.summary)
 
 
 @app.command()
-@with_options(EvaluationOptions)
+@command(EvaluationOptions, out=Path("out/tuner/evaluation"))
 def evaluate(
     *,
     weights: list[str] | None = typer.Argument(
         None, metavar="[WEIGHTS]...", help="Shipped name or file; several with --family."
     ),
-    out: Out = Path("out/tuner/evaluation"),
     scenario: str = typer.Option("paper", metavar="SCENARIO", help="Shipped name or file."),
     controller: Controller = None,
     settings: Settings = None,
     given: Given,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
+    delivery: Delivery,
 ) -> int:
     """Compare a tuner with fixed gains on unseen scenarios.
 
     With --family on fresh conditions of a family, where runs that end early count too.
     """
     from stewart_drake import functions
-    from stewart_drake.reporting.page import command_line, write_page
+    from stewart_drake.reporting.page import write_page
 
-    options, delivery = given.options(), Delivery(out, quiet, as_json)
-    names = {"scenario": None if options.family else scenario, "controller": controller}
-    words = given.words
-    command = command_line(
-        "tune",
-        "evaluate",
-        *(weights or []),
-        settings=settings or (),
-        options={"family": words.pop("family"), **names, **dict(sorted(words.items()))},
-    )
-    with given.named(), stopping(GO_ON), count_bar("conditions", quiet) as progress:
+    options, folder = given.options(), delivery.folder
+    named = {"scenario": None if options.family else scenario, "controller": controller}
+    with given.named(), stopping(GO_ON), count_bar("conditions", delivery.quiet) as progress:
         found = functions.evaluate_tuner(
-            out,
+            folder,
             weights or [],
-            scenario,
-            controller,
-            settings or (),
+            *Chosen(scenario, controller, settings or ()),
             progress=progress,
-            command=command,
+            command=command_line(
+                *("tune", "evaluate", *(weights or [])),
+                settings=settings or (),
+                options=named | given.words,
+            ),
             options=options,
         )
     delivery.write(found.summary)

@@ -6,8 +6,7 @@ in dark mode, and printed in grey.
 
 import io
 import re
-import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -61,23 +60,6 @@ def size(figure: Figure) -> tuple[int, int]:
     """Return width and height of a figure in pixels of a browser, 96 per inch."""
     width, height = 96 * figure.get_size_inches()
     return round(width), round(height)
-
-
-def command_line(
-    *words: str, settings: Iterable[str] = (), options: Mapping[str, object] | None = None
-) -> str:
-    """Return a command as typed: words, `--set` for each setting, and options that are not None.
-
-    An option with a list or tuple is repeated for each item; one that is on or off has no value.
-    """
-    parts = ["stewart-drake", *words]
-    for name, value in {"set": list(settings), **(options or {})}.items():
-        for one in value if isinstance(value, list | tuple) else (value,):
-            if isinstance(one, bool):
-                parts.append(f"--{name}" if one else f"--no-{name}")
-            elif one is not None:
-                parts += [f"--{name}", str(one)]
-    return shlex.join(parts)
 
 
 @cache
