@@ -173,13 +173,13 @@ def analyze_robustness(
     scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
     runs: int = 200,
     *,
+    directory: str | pathlib.Path | None = None,
     ranges: stewart_drake.studies.study_options.Ranges | None = None,
     seed: int = 0,
     limit: float | None = None,
     also: collections.abc.Mapping[str, stewart_drake.scenario.config.Scenario] | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
-    directory: str | pathlib.Path | None = None,
 ) -> stewart_drake.reporting.results.AnalysisResult: ...
 def analyze_workspace(
     scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,

@@ -16,8 +16,8 @@ from stewart_drake.cli.common import INTERRUPTED, release
 from stewart_drake.cli.examples import add_examples
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import KINDS, shipped
-from stewart_drake.reporting.analyses import RENAMED
 from stewart_drake.reporting.terminal import echo
+from stewart_drake.studies.options import RENAMED
 
 _BAD_INPUT: Final = 2
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

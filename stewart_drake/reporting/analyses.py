@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from stewart_drake.scenario.config import Scenario
     from stewart_drake.studies.options import Options
 
-RENAMED: Final = {"beside": "also"}
-"""Options of 0.2, with their present names."""
-
 
 class Analysis(NamedTuple):
     help: str  # of the command

@@ -10,12 +10,12 @@ from typing import Any, ParamSpec, TypeVar
 
 from stewart_drake.loop import simulation
 from stewart_drake.loop.preparation import simulated_machine
-from stewart_drake.reporting.analyses import ANALYSES, RENAMED, analyze, options_of, words_of
+from stewart_drake.reporting.analyses import ANALYSES, analyze, options_of, words_of
 from stewart_drake.reporting.results import AnalysisResult, ComparisonResult, SimulationResult
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import as_scenario, title_of
 from stewart_drake.studies import compare as comparison
-from stewart_drake.studies.options import argument_lines, naming_arguments
+from stewart_drake.studies.options import Options, takes
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -66,30 +66,42 @@ def report(
 
 def analysis_function(name: str) -> Callable[..., AnalysisResult]:
     """Return the Python function of an analysis, with its options as arguments."""
-    row, function, signature = ANALYSES[name], "_".join(words_of(name)), _signature(name)
+    row, words = ANALYSES[name], "_".join(words_of(name))
 
-    def call(*args: Any, **kwargs: Any) -> AnalysisResult:
-        for old in RENAMED.keys() & kwargs.keys():
-            raise TypeError(f"{function}: got {old}, an option of 0.2; expected {RENAMED[old]}")
-        given = signature.bind(*args, **kwargs).arguments
-        scenario, directory = given.pop("scenario"), given.pop("directory", None)
-        shown = "".join(f", {key}={value!r}" for key, value in given.items())
+    def call(
+        scenario: Scenario | str | Path, *, options: Options, directory: str | Path | None = None
+    ) -> AnalysisResult:
+        shown = "".join(
+            f", {key}={value!r}" for key, value in options if key in options.model_fields_set
+        )
         loaded = as_scenario(scenario)
         if row.exact:
-            loaded, given = _exact(loaded), _exact(given)
-        with TemporaryDirectory() as scratch, naming_arguments(options_of(name), signature):
+            loaded = _exact(loaded)
+            options = options.model_copy(update=_exact(dict(options)))
+        with TemporaryDirectory() as scratch:
             return analyze(
                 name,
                 loaded,
-                options_of(name)(**given),
-                command=f"sd.{function}({scenario!r}{shown})",
+                options,
+                command=f"sd.{words}({scenario!r}{shown})",
                 directory=directory or scratch,
             )
 
-    call.__name__ = call.__qualname__ = function
-    call.__doc__ = _documentation(name)
-    call.__signature__ = signature  # type: ignore[attr-defined]
-    return call
+    own = inspect.signature(call)
+    kept = [one for one in own.parameters.values() if row.keeps or one.name != "directory"]
+    call.__signature__ = own.replace(parameters=kept)  # type: ignore[attr-defined]
+    folder = f"\n    directory: folder of the {row.keeps}, from which a second call continues."
+    call.__name__ = call.__qualname__ = words
+    call.__doc__ = f"""{row.help.partition(chr(10))[0]}
+
+Args:
+    scenario: a Scenario, a shipped name or a path.
+    OPTIONS{folder if row.keeps else ""}
+
+Raises:
+    ConfigError: bad input.
+"""
+    return takes(options_of(name), row.second)(call)
 
 
 def _exact(value: Any) -> Any:
@@ -97,29 +109,6 @@ def _exact(value: Any) -> Any:
     if isinstance(value, Scenario):
         return replace(value, plant=value.plant.without_engine)
     return {k: _exact(v) for k, v in value.items()} if isinstance(value, Mapping) else value
-
-
-def _signature(name: str) -> inspect.Signature:
-    row, kinds = ANALYSES[name], inspect.Parameter
-    by_place = kinds.POSITIONAL_OR_KEYWORD
-    parameters = options_of(name).parameters()
-    if row.keeps:
-        folder = str | Path | None
-        parameters.append(kinds("directory", kinds.KEYWORD_ONLY, default=None, annotation=folder))
-    second = [one.replace(kind=by_place) for one in parameters if one.name == row.second]
-    others = [one for one in parameters if one.name != row.second]
-    scenario = kinds("scenario", by_place, annotation=Scenario | str | Path)
-    return inspect.Signature([scenario, *second, *others], return_annotation=AnalysisResult)
-
-
-def _documentation(name: str) -> str:
-    row = ANALYSES[name]
-    meanings = {"scenario": "a Scenario, a shipped name or a path."}
-    meanings |= {one.name: one.help for one in options_of(name).described()}
-    if row.keeps:
-        meanings["directory"] = f"folder of the {row.keeps}, from which a second call continues."
-    lines = [row.help.split("\n")[0], "", "Args:", *argument_lines(meanings)]
-    return "\n".join([*lines, "", "Raises:", "    ConfigError: bad input."])
 
 
 def __getattr__(name: str) -> Any:

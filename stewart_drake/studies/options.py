@@ -3,7 +3,6 @@
 The command line, the Python signature and the command that a page names follow from them.
 """
 
-import contextlib
 import functools
 import inspect
 import re
@@ -20,6 +19,9 @@ if TYPE_CHECKING:
     from stewart_drake.scenario.config import Scenario
 
 _R = TypeVar("_R")
+
+RENAMED: Final = {"beside": "also"}
+"""Options of 0.2, with their present names."""
 
 
 def option(
@@ -133,16 +135,6 @@ class Options(BaseModel):
         ]
 
 
-def argument_lines(meanings: Mapping[str, str]) -> list[str]:
-    """Return the lines of a docstring's section `Args`."""
-    shown = {"initial_indent": " " * 4, "subsequent_indent": " " * 8}
-    return [
-        line
-        for name, text in meanings.items()
-        for line in textwrap.wrap(f"{name}: {text}", 96, **shown)  # type: ignore[arg-type]
-    ]
-
-
 def in_python(text: str, kind: type[Options], function: inspect.Signature) -> str:
     """Return a text with arguments of a Python function in place of the command's options."""
     names = {f"--{name}": name for name in function.parameters}
@@ -152,37 +144,44 @@ def in_python(text: str, kind: type[Options], function: inspect.Signature) -> st
     return re.sub(pattern, lambda found: names.get(found[0], found[0]), text)
 
 
-@contextlib.contextmanager
-def naming_arguments(kind: type[Options], function: inspect.Signature) -> Iterator[None]:
-    """Let errors name arguments of a Python function, see `in_python`."""
-    try:
-        yield
-    except ConfigError as error:
-        raise ConfigError(in_python(str(error), kind, function)) from None
+def takes(
+    kind: type[Options], second: str = ""
+) -> Callable[[Callable[..., _R]], Callable[..., _R]]:
+    """Return a decorator that replaces the argument `options` of a function by its options.
 
-
-def takes(kind: type[Options]) -> Callable[[Callable[..., _R]], Callable[..., _R]]:
-    """Return a decorator that replaces the argument `options` of a function by its options."""
+    The argument `second` may be positional. Errors name arguments, see `in_python`.
+    """
+    by_place = inspect.Parameter.POSITIONAL_OR_KEYWORD
 
     def decorate(function: Callable[..., _R]) -> Callable[..., _R]:
         own = inspect.signature(function)
         before = [one for one in own.parameters.values() if one.name != "options"]
-        shown = own.replace(parameters=[*before, *kind.parameters()])
+        parameters = [
+            one.replace(kind=by_place) if one.name == second else one
+            for one in (*before, *kind.parameters())
+        ]
+        shown = own.replace(parameters=sorted(parameters, key=lambda one: one.kind))
 
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> _R:
             if "options" in kwargs:  # of a command, whose errors name its options
                 return function(*args, **kwargs)
+            for old in RENAMED.keys() & kwargs.keys():
+                raise TypeError(
+                    f"{function.__name__}: got {old}, an option of 0.2; expected {RENAMED[old]}"
+                )
             given = shown.bind(*args, **kwargs).arguments
-            options = kind(**{name: given.pop(name) for name in kind.model_fields if name in given})
-            with naming_arguments(kind, shown):
-                return function(**given, options=options)
+            values = {name: given.pop(name) for name in kind.model_fields if name in given}
+            try:
+                return function(**given, options=kind(**values))
+            except ConfigError as error:
+                raise ConfigError(in_python(str(error), kind, shown)) from None
 
         call.__signature__ = shown  # type: ignore[attr-defined]
-        lines = argument_lines(
-            {one.name: in_python(one.help, kind, shown) for one in kind.described()}
-        )
-        call.__doc__ = (function.__doc__ or "").replace("    OPTIONS", "\n".join(lines).lstrip())
+        meanings = [f"{one.name}: {in_python(one.help, kind, shown)}" for one in kind.described()]
+        wrap = textwrap.TextWrapper(96, initial_indent=" " * 4, subsequent_indent=" " * 8)
+        lines = "\n".join(map(wrap.fill, meanings))
+        call.__doc__ = inspect.cleandoc(function.__doc__ or "").replace("    OPTIONS", lines)
         return call
 
     return decorate
