@@ -21,8 +21,6 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario, setting_choices, title_of
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from stewart_drake.reporting.results import AnalysisResult
 
 INTERRUPTED: Final = 130
@@ -241,8 +239,8 @@ class Delivery:
     def draw(self, what: str, draw: Callable[[Path], Any]) -> None:
         """Write figures or a page after the results.
 
-        An error in drawing is only a warning, since the results are written already. An OSError,
-        as on a full disk, is raised.
+        `draw` writes into a folder. An error in drawing is only a warning, since the results are
+        written already. An OSError, as on a full disk, is raised.
         """
         if self.out is None:
             return
@@ -256,16 +254,6 @@ class Delivery:
             echo(text, error=True)
         else:
             self.wrote(f"{len(found)} figures" if what == "figures" else what)
-
-    def figures(self, draw: "Callable[[], Mapping[str, Figure]]") -> None:
-        """Write figures by name after the results, as `draw` does."""
-
-        def write(folder: Path) -> list[Path]:
-            from stewart_drake.reporting.style import write_figures
-
-            return write_figures(draw(), folder)
-
-        self.draw("figures", write)
 
     def wrote(self, *names: str) -> None:
         self._written += names

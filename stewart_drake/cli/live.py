@@ -21,7 +21,6 @@ from stewart_drake.live.options import LiveOptions, MachineOptions
 from stewart_drake.reporting.terminal import echo
 
 if TYPE_CHECKING:
-    from stewart_drake.live.page import PageViewer
     from stewart_drake.loop.results import SimulationResult
     from stewart_drake.reporting.results import AnalysisResult
     from stewart_drake.scenario.config import Scenario
@@ -82,6 +81,8 @@ def live(
 
     from stewart_drake.live.contact import address_of
     from stewart_drake.live.endpoint import read_key
+    from stewart_drake.live.page import PageViewer
+    from stewart_drake.mechanism.files import load_mechanism
 
     key = read_key(options.key)
     check_log(options.log)
@@ -89,7 +90,10 @@ def live(
         if address is not None:
             address_of(address, option)
     with contextlib.ExitStack() as running:
-        viewer = None if no_browser else running.enter_context(_page(loaded, name))
+        viewer = None
+        if not no_browser:  # its process starts while the machine is being contacted
+            page = PageViewer(load_mechanism(loaded.mechanism), f"live: {name}")
+            viewer = running.enter_context(contextlib.closing(page))
         where = machine or running.enter_context(_demo_machine(chosen, loaded.eta))
         from stewart_drake.live import session
 
@@ -154,19 +158,6 @@ def _agreed(problem: str) -> bool:
         return False
     echo(f"{problem}; go on? [y/N]", error=True)
     return sys.stdin.readline().strip().lower() in ("y", "yes")
-
-
-@contextlib.contextmanager
-def _page(scenario: "Scenario", name: str) -> Iterator["PageViewer"]:
-    """Start the process of the page while the machine is being contacted."""
-    from stewart_drake.live.page import PageViewer
-    from stewart_drake.mechanism.files import load_mechanism
-
-    viewer = PageViewer(load_mechanism(scenario.mechanism), f"live: {name}")
-    try:
-        yield viewer
-    finally:
-        viewer.close()
 
 
 def _delivered(

@@ -50,16 +50,14 @@ def sdf(
 @command()
 def check(*, mechanism: MechanismName, delivery: Delivery) -> int:
     """Check a mechanism and describe it at its home pose, under gravity."""
-    from stewart_drake.reporting.mechanism import document
+    from stewart_drake.reporting import mechanism as shown
+    from stewart_drake.reporting.style import write_figures
 
     def draw(folder: Path) -> None:
-        from stewart_drake.reporting.mechanism import mechanism_figure
-        from stewart_drake.reporting.style import write_figures
-
-        write_figures({"mechanism": mechanism_figure(found.mechanism)}, folder)
+        write_figures({"mechanism": shown.mechanism_figure(found.mechanism)}, folder)
 
     found = sd.check_model(mechanism)
-    delivery.say(document(found).plain())
+    delivery.say(shown.document(found).plain())
     delivery.discard("mechanism.png", "mechanism.svg")
     delivery.write(found.summary)
     delivery.draw("mechanism.png, mechanism.svg", draw)

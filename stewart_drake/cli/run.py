@@ -95,7 +95,7 @@ def simulate(
             write_whole(delivery.out / CSV, signals_csv(result.signals))
         result.save(delivery.out)
         delivery.wrote("summary.json", "signals.nc", *[CSV] * csv)
-    delivery.figures(result.plot)
+    delivery.draw("figures", result.plot)
     if replay or meshcat:
         delivery.draw(REPLAY, film)
     if log is not None:
@@ -264,7 +264,7 @@ def compare(
     if delivery.out is not None:
         results.save(delivery.out)
         delivery.wrote("summary.json", f"{len(results)} signal files")
-    delivery.figures(results.plot)
+    delivery.draw("figures", results.plot)
     ended = [result.status for result in results.values()]
     interrupted = "interrupted" in ended or len(ended) < len(names)
     return delivery.end(study.comparison_summary(results), interrupted)

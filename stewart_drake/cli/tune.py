@@ -64,6 +64,7 @@ def train(
     network itself.
     """
     from stewart_drake import functions
+    from stewart_drake.reporting.results import drawn
     from stewart_drake.reporting.tuner import training_figures
 
     if out.suffix != ".json":
@@ -78,7 +79,7 @@ def train(
     delivery.write(found.summary)
     delivery.say(found.table())
     if not options.regret:
-        delivery.figures(lambda: training_figures(found.study))
+        delivery.draw("figures", lambda folder: drawn(training_figures(found.study), folder))
     return delivery.end(found.summary)
 
 

@@ -1,7 +1,6 @@
 """Document and figures of an analysis of the delay."""
 
 import math
-from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
@@ -24,8 +23,7 @@ _BANDWIDTH: Final = 10.0
 """Bandwidth of the servos in the comparison, Hz."""
 FRAGILE: Final = 0.05
 """Smallest tolerable error of a good loop, as a share of the delay."""
-_MAP_WORDS: Final = {"out_of_reach": "no reach", "left_workspace": "left", "not_run": "not run"}
-_CELL_WORDS: Final = {"out_of_reach": "out of reach", "left_workspace": "leaves workspace"}
+_WORDS: Final = {"out_of_reach": "no reach", "left_workspace": "left", "not_run": "not run"}
 
 
 def document(study: DelayStudy) -> Document:
@@ -39,7 +37,6 @@ def document(study: DelayStudy) -> Document:
         _tone(study),
         study=study,
         sc=study.assessment.experiment.scenario,
-        inf=math.inf,
         eta=partial(_eta, study),
         gains=_gains,
         milliseconds=milliseconds,
@@ -91,11 +88,12 @@ def _map_table(study: DelayStudy) -> Table:
     return Table(("amplitude", *(f"mu = {s}" for s in steps)), rows, brief=True)
 
 
-def _cell_word(cell: Cell) -> str:
+def _cell_word(cell: Cell, at: str = " {:.2f}") -> str:
+    """Return E_ac, or how a run ended, with its time in the form `at`."""
     if cell.status == "completed":
         return number(cell.error)
-    word = _MAP_WORDS.get(cell.status, "failed")
-    return word if math.isnan(cell.time) else f"{word} {cell.time:.2f}"
+    word = _WORDS.get(cell.status, "failed")
+    return word if math.isnan(cell.time) else word + at.format(cell.time)
 
 
 def _gains(margins: Margins | MotorMargins) -> str:
@@ -195,19 +193,15 @@ def map_figure(study: DelayStudy) -> Figure:
 
     xlim, ylim = (-0.5, len(steps) - 0.5), (-0.5, len(factors) - 0.5)
     height = 0.8 * len(factors)
-    panel = Panel("amplitude", x="delay", title="E_ac  [% s]", xlim=xlim, ylim=ylim, height=height)
-    return draw([replace(panel, paint=paint)])
+    how: Any = {"xlim": xlim, "ylim": ylim, "height": height, "paint": paint}
+    return draw([Panel("amplitude", x="delay", title="E_ac  [% s]", **how)])
 
 
 def _draw_cell(ax: Axes, cell: Cell, x: int, y: int, floor: float) -> None:
     done = cell.status == "completed"
-    if done:
-        text = number(cell.error) + (f"\nfloor {number(floor)}" if floor else "")
-    elif cell.status == "not_run":
-        text = "not run"
-    else:
-        word = _CELL_WORDS.get(cell.status, cell.status.replace("_", " "))
-        text = f"{word}\nat {cell.time:.2f} s"
+    text = _cell_word(cell, "\nat {:.2f} s")
+    if done and floor:
+        text += f"\nfloor {number(floor)}"
     # 30 % s above the floor is the darkest shade, on which text is still readable.
     shade = 0.55 * min(1.0, np.sqrt(max(0.0, cell.error - floor) / 30)) if done else 0.0
     color = (1 - shade, 1 - 0.55 * shade, 1 - 0.3 * shade) if shade > 0 else DATA_PAPER

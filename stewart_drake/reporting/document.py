@@ -74,9 +74,9 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.{max(0, digits - 1 - exponent if value else 0)}f}"
 
 
-def listed(items: Iterable[object], form: str = "%s", between: str = ", ") -> str:
+def listed(items: Iterable[object], form: str) -> str:
     """Return items in one text, each in a form such as `%s: %g`."""
-    return between.join(form % one for one in items)
+    return ", ".join(form % one for one in items)
 
 
 def capital(text: str) -> str:
@@ -386,4 +386,5 @@ def templates() -> "Environment":
         loader=PackageLoader("stewart_drake.reporting"), undefined=StrictUndefined, finalize=shown
     )
     found.filters |= {"number": number, "capital": capital, "listed": listed}
+    found.globals["inf"] = math.inf
     return found

@@ -89,7 +89,7 @@ class SimulationResult(loop_results.SimulationResult):
         """
         from stewart_drake.reporting.figures import draw_run
 
-        return _drawn(draw_run(self), directory)
+        return drawn(draw_run(self), directory)
 
     def replay(
         self,
@@ -158,7 +158,7 @@ class ComparisonResult(dict[str, SimulationResult]):
         """Return figures by name; see `SimulationResult.plot`."""
         from stewart_drake.reporting.figures import draw_comparison
 
-        return _drawn(draw_comparison(self), directory)
+        return drawn(draw_comparison(self), directory)
 
     def replay(self, directory: str | Path | None = None) -> "dict[str, Replay | Path | Meshcat]":
         """Return the replay of each run by controller, written as NAME.html into a directory."""
@@ -234,7 +234,7 @@ class AnalysisResult:
     def plot(self, directory: str | Path | None = None) -> Figures:
         """Return the figures of the page; see `SimulationResult.plot`."""
         pictures = [one for section in self.document.sections for one in section.all(Picture)]
-        return _drawn({f"figure_{k}": one.drawn for k, one in enumerate(pictures, 1)}, directory)
+        return drawn({f"figure_{k}": one.drawn for k, one in enumerate(pictures, 1)}, directory)
 
     def write_page(self, directory: Path) -> Path:
         """Write report.html into a directory and return its path."""
@@ -277,7 +277,8 @@ def _framed(page: str) -> str:
     )
 
 
-def _drawn(figures: "Mapping[str, Figure]", directory: str | Path | None) -> Figures:
+def drawn(figures: "Mapping[str, Figure]", directory: str | Path | None) -> Figures:
+    """Return figures by name, written into a directory if it is not None."""
     from stewart_drake.reporting.style import write_figures
 
     if directory is not None:

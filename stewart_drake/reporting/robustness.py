@@ -72,7 +72,6 @@ def document(study: RobustnessStudy) -> Document:
         study=study,
         sc=study.experiment.scenario,
         found=found,
-        inf=math.inf,
         significant=SIGNIFICANT,
         named=_NAMED,
         title=title,

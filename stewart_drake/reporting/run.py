@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.loop.preparation import assemble, check_instants
 from stewart_drake.loop.results import LEAST_MEASURED, SimulationResult
-from stewart_drake.reporting.document import Document, from_template, listed, number
+from stewart_drake.reporting.document import Document, from_template, number
 from stewart_drake.reporting.style import FACTORS, UNITS
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import ANGLES, COORDINATE_NAMES, NUM_COORDINATES, POSITION
@@ -40,8 +40,7 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
         "run",
         run=result,
         s=s,
-        inf=math.inf,
-        peaks=listed(_peaks(result)),
+        peaks=", ".join(_peaks(result)),
         least=LEAST_MEASURED,
         # the sum of others is left out
         events=[

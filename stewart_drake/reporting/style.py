@@ -176,12 +176,11 @@ def write_figures(figures: Mapping[str, Figure], directory: str | Path) -> list[
     """Write each figure as NAME.png and NAME.svg; the same figure gives the same bytes."""
     paths = []
     with figure_style():
-        for name, figure in figures.items():
-            for suffix in ("png", "svg"):
-                paths.append(Path(directory) / f"{name}.{suffix}")
-                metadata = {"Date": None} if suffix == "svg" else None
-                with replacing(paths[-1]) as partial:
-                    figure.savefig(partial, format=suffix, metadata=metadata)
+        for (name, figure), suffix in itertools.product(figures.items(), ("png", "svg")):
+            paths.append(Path(directory) / f"{name}.{suffix}")
+            metadata = {"Date": None} if suffix == "svg" else None
+            with replacing(paths[-1]) as partial:
+                figure.savefig(partial, format=suffix, metadata=metadata)
     return paths
 
 

@@ -28,6 +28,7 @@ from pydrake.systems.primitives import (
     IsStabilizable,
     LinearSystem,
 )
+from scipy.cluster.hierarchy import fclusterdata
 from threadpoolctl import threadpool_limits
 
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -172,15 +173,11 @@ def cluster(values: Complex, distance: float) -> list[Complex]:
     A defective eigenvalue of multiplicity p comes out spread over a circle of radius eps^(1/p),
     but the mean of the circle is exact to eps. The pencil is therefore evaluated at the mean.
     """
-    remaining, groups = list(np.argsort(values.real, kind="stable")), []
-    while remaining:
-        group = [remaining.pop(0)]
-        for member in group:  # grows while it is walked through
-            near = [k for k in remaining if abs(values[k] - values[member]) <= distance]
-            group += near
-            remaining = [k for k in remaining if k not in near]
-        groups.append(values[group])
-    return groups
+    if len(values) < 2:
+        return [values]
+    points = np.column_stack([values.real, values.imag])
+    groups = fclusterdata(points, distance, "distance", method="single")
+    return [values[groups == group] for group in np.unique(groups)]
 
 
 def _null_space(A: Array, B: Array, point: complex, threshold: float) -> Complex:

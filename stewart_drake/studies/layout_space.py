@@ -28,12 +28,7 @@ from stewart_drake.mechanism.files import (
     PatternSpec,
     pattern_legs,
 )
-from stewart_drake.mechanism.kinematics import (
-    Legs,
-    legs_along,
-    reach_margins,
-    rotation,
-)
+from stewart_drake.mechanism.kinematics import Legs, legs_along, reach_margins, rotation
 from stewart_drake.scenario.signals import ANGLES, POSE
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.workspace_map import rate_gains, wrenches

@@ -19,12 +19,7 @@ from scipy import stats
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.link_config import NetworkConfig
-from stewart_drake.scenario.packets import (
-    default_bound,
-    in_time,
-    times_under_way,
-    torque_missing,
-)
+from stewart_drake.scenario.packets import default_bound, in_time, times_under_way, torque_missing
 from stewart_drake.studies.jobs import Progress, part_of
 from stewart_drake.studies.runs import run_scenarios
 from stewart_drake.studies.statistics import CONFIDENCE, least_share

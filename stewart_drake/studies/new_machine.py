@@ -36,12 +36,7 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COORDINATES
 from stewart_drake.studies.clearance import clearance_along
 from stewart_drake.studies.study_options import Measurements
-from stewart_drake.studies.workspace_map import (
-    Measures,
-    Travel,
-    measure,
-    travel,
-)
+from stewart_drake.studies.workspace_map import Measures, Travel, measure, travel
 from stewart_drake.types import Array
 
 BODIES: Final = ("base", "plate", "crank", "rod")
