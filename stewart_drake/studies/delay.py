@@ -11,23 +11,10 @@ from threadpoolctl import threadpool_limits
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import diagnose
+from stewart_drake.law import stability
 from stewart_drake.law.cost import law_gain
 from stewart_drake.law.delay_model import DelayedModel, double_integrators, linear_model
 from stewart_drake.law.riccati import RiccatiError
-from stewart_drake.law.stability import (
-    LinearLoop,
-    Margins,
-    Peak,
-    amplification,
-    fastest_pole,
-    frequency_grid,
-    largest_delay,
-    loop_gain,
-    peaks,
-    sensitivity,
-    spectral_radius,
-    worst_margins,
-)
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.law_design import cost_of
@@ -105,9 +92,9 @@ class MotorMargins(NamedTuple):
 class LoopMargins:
     steps: int  # mu
     radius: float  # spectral radius of the closed loop
-    S: Peak  # of sensitivity at the motors
-    T: Peak  # of complementary sensitivity
-    margins: Margins  # errors of the delay, and of all motors alike
+    S: stability.Peak  # of sensitivity at the motors
+    T: stability.Peak  # of complementary sensitivity
+    margins: stability.Margins  # errors of the delay, and of all motors alike
     # classical margins of one motor at a time; None if the loop is unstable
     motor: MotorMargins | None
 
@@ -182,7 +169,7 @@ class DelayStudy:
         worst = self.verdict
         if worst is None:
             return []
-        return [(a, largest_delay(worst.pole, a), worst.time) for a in TOLERABLE]
+        return [(a, stability.largest_delay(worst.pole, a), worst.time) for a in TOLERABLE]
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -197,7 +184,7 @@ class DelayStudy:
                 {
                     "t": point.time,
                     "fastest_pole": point.moving,
-                    "amplification": amplification(point.moving, self.eta),
+                    "amplification": stability.amplification(point.moving, self.eta),
                     "fastest_pole_held": point.held,
                 }
                 for point in self.poles
@@ -273,7 +260,7 @@ def simulated_growth(
     values, vectors = np.linalg.eig(dynamics.linearize(pose, torque=torque)[0])
     at = int(values.real.argmax())
     mode = vectors[:, at].real / np.abs(vectors[POSE, at].real).max()
-    expected = amplification(float(values[at].real), seconds)
+    expected = stability.amplification(float(values[at].real), seconds)
     start = np.concatenate([pose, np.zeros(6)]) + size / expected * mode
     number = max(1, math.ceil(seconds / _STEP))
     states = dynamics.predict(start, np.tile(torque, (number, 1)), seconds / number)
@@ -286,7 +273,7 @@ def _poles(found: Assessment) -> list[PolePoint]:
     end = found.followed_until
     for t in np.linspace(0.0, end, INSTANTS) if end > 0 else ():
         pose = experiment.reference.value(t)[:, 0]
-        held = fastest_pole(experiment.nominal.linearize(pose)[0])
+        held = stability.fastest_pole(experiment.nominal.linearize(pose)[0])
         points.append(PolePoint(float(t), pole_in_motion(experiment, t), held))
     return points
 
@@ -296,7 +283,7 @@ def _growths(found: Assessment, poles: list[PolePoint], eta: float) -> list[Grow
     for point in poles[:: max(1, len(poles) // _CHECKS)][:_CHECKS]:
         if point.held == 0 or eta == 0:
             continue
-        seconds = min(eta, largest_delay(point.held, _LARGEST_GROWTH))
+        seconds = min(eta, stability.largest_delay(point.held, _LARGEST_GROWTH))
         pose = experiment.reference.value(point.time)[:, 0]
         size = _PERTURBATION * float(found.motion.min())
         pair = simulated_growth(experiment.nominal, pose, seconds, size)
@@ -342,18 +329,18 @@ def loop_margins(found: Assessment, delays: Iterable[int] = DELAYS) -> list[Loop
         timeline = Timeline(c.period, believed_delay(at))
         K = law_gain(cost, design, predictor, timeline, weights)
         delay = Delay(steps, sc.delay.fraction)
-        judged.append(_margins_of(LinearLoop(plant, K, c.period, delay, cost.integrates)))
+        judged.append(_margins_of(stability.LinearLoop(plant, K, c.period, delay, cost.integrates)))
     return judged
 
 
-def _margins_of(loop: LinearLoop) -> LoopMargins:
-    radius, true = spectral_radius(loop.matrix()), loop.sampled()
-    S = T = Peak(math.nan, math.nan)
+def _margins_of(loop: stability.LinearLoop) -> LoopMargins:
+    radius, true = stability.spectral_radius(loop.matrix()), loop.sampled()
+    S = T = stability.Peak(math.nan, math.nan)
     motor = None
     if radius < 1:
-        S, T = peaks(true, loop.K, loop.period)
+        S, T = stability.peaks(true, loop.K, loop.period)
         motor = _motor_margins(true, loop.K, loop.period)
-    return LoopMargins(loop.delay.steps, radius, S, T, worst_margins([loop]), motor)
+    return LoopMargins(loop.delay.steps, radius, S, T, stability.worst_margins([loop]), motor)
 
 
 def _motor_margins(plant: DelayedModel, K: Array, period: float) -> MotorMargins:
@@ -365,8 +352,8 @@ def _motor_margins(plant: DelayedModel, K: Array, period: float) -> MotorMargins
 
     nyquist = np.pi / period
     evenly = np.linspace(0.0, _BEYOND * nyquist, _POINTS)[1:]
-    grid = np.union1d(frequency_grid(period, _POINTS // 8), evenly)
-    S = sensitivity(loop_gain(plant, K, np.exp(1j * grid * period)))
+    grid = np.union1d(stability.frequency_grid(period, _POINTS // 8), evenly)
+    S = stability.sensitivity(stability.loop_gain(plant, K, np.exp(1j * grid * period)))
     up, down, phase = math.inf, 0.0, math.inf
     for motor in range(S.shape[1]):
         response = control.frd(1 / S[:, motor, motor] - 1, grid, smooth=True)
