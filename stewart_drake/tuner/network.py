@@ -34,6 +34,7 @@ import numpy as np
 import pydantic.dataclasses
 from scipy.special import expit
 
+from stewart_drake.files.arguments import fixed, one_of
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.jsonio import load_json
@@ -56,7 +57,6 @@ NUM_OUTPUTS: Final = len(WEIGHTS)
 MAX_BYTES: Final = 10_000_000
 EXPECTED: Final = "the JSON file of one network"
 """For messages."""
-_ARRAYS: Final = ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class Network:
             "bounds": (2, NUM_OUTPUTS),
         }
         for name, shape in shapes.items():
-            object.__setattr__(self, name, _frozen(name, getattr(self, name), shape))
+            object.__setattr__(self, name, fixed(name, getattr(self, name), shape))
         if not np.all(self.input_scale > 0):
             raise ConfigError(
                 f"input_scale: got {self.input_scale.min()!r}; expected numbers above 0"
@@ -103,20 +103,14 @@ class Network:
                 "with 0 < lower < upper"
             )
         if self.start is not None:
-            object.__setattr__(self, "start", _frozen("start", self.start, (NUM_OUTPUTS,)))
+            object.__setattr__(self, "start", fixed("start", self.start, (NUM_OUTPUTS,)))
             if not np.all((self.start >= self.bounds[0]) & (self.start <= self.bounds[1])):
                 raise ConfigError(
                     f"start: got {brief(self.start.tolist())}; expected (w_Q, w_R) within bounds"
                 )
-        for name, known in (
-            ("output", ("weights", "log_weights")),
-            ("density", ("magnitude", "signed")),
-            ("features", ("densities", "health")),
-        ):
-            if getattr(self, name) not in known:
-                raise ConfigError(
-                    f"{name}: got {brief(getattr(self, name))}; expected one of {', '.join(known)}"
-                )
+        one_of("output", self.output, ("weights", "log_weights"))
+        one_of("density", self.density, ("magnitude", "signed"))
+        one_of("features", self.features, ("densities", "health"))
 
     @property
     def hidden(self) -> int:
@@ -129,16 +123,6 @@ class Network:
             inputs = (np.asarray(densities, dtype=np.float64) - self.input_mean) / self.input_scale
             outputs = expit(inputs @ self.W1.T + self.b1) @ self.W2.T + self.b2
             return outputs if self.output == "weights" else np.exp(outputs)
-
-
-def _frozen(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = np.array(value, dtype=np.float64)
-    if array.shape != shape:
-        raise ConfigError(f"{name}: got shape {array.shape}; expected {shape}")
-    if not np.all(np.isfinite(array)):
-        raise ConfigError(f"{name}: got a value that is not finite; expected finite numbers")
-    array.flags.writeable = False
-    return array
 
 
 # --------------------------------------------------------------------- the file
@@ -179,10 +163,6 @@ def load_network(name_or_path: str | Path) -> Network:
     """Read a network by its name in `models/weights/` or as a JSON file with its fields."""
     path = resolve("weights", name_or_path)
     file = validate(_File, load_json(path, MAX_BYTES, EXPECTED), str(path))
-    for name in _ARRAYS:
-        rows = getattr(file, name)
-        if rows and isinstance(rows[0], list) and len({len(row) for row in rows}) > 1:
-            raise ConfigError(f"{path}: {name}: got rows of different lengths; expected a matrix")
     try:
         return Network(**vars(file))
     except ConfigError as error:
