@@ -19,10 +19,10 @@ from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.yamlio import yaml_text
 from stewart_drake.identification import identify as identification
 from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
-from stewart_drake.identification.plan import MOTION, Plan, plan
-from stewart_drake.identification.servo_fit import ServoIdentification, identify_servos
+from stewart_drake.identification.plan import MOTION, plan
+from stewart_drake.identification.servo_fit import identify_servos
 from stewart_drake.identification.servo_logs import is_servo_log, read_servo_log
-from stewart_drake.identification.servo_plan import SETPOINTS_FILE, ServoPlan, plan_servos
+from stewart_drake.identification.servo_plan import SETPOINTS_FILE, plan_servos
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.live.options import LiveOptions, MachineOptions
 from stewart_drake.loop.preparation import prepare
@@ -105,7 +105,7 @@ def identify(
             lambda: identify_servos(log, machine, rounding, g),
             servo_identification.document,
             typed,
-            _write_servos,
+            lambda found, folder: _written(folder, {SERVOS: yaml_text(found.overlay)}),
         )
     read = [read_log(Path(path), machine, precision or Precision(), gravity) for path in paths]
     return analysis_result(
@@ -150,7 +150,7 @@ def plan_identification(
             lambda: plan_servos(prepared, rounding),
             servo_identification.plan_document,
             typed,
-            _write_setpoints,
+            lambda found, folder: _written(folder, {SETPOINTS_FILE: found.csv}),
         )
     measured = (precision or Precision()).std
     std = np.full_like(measured, np.inf)
@@ -161,7 +161,9 @@ def plan_identification(
         lambda: plan(experiment, std, tolerances),
         plan_document,
         typed,
-        _write_plan,
+        lambda found, folder: _written(
+            folder, {MOTION: found.motion_csv, SCENARIO: scenario_yaml(found.scenario)}
+        ),
     )
 
 
@@ -172,18 +174,7 @@ def _write_machine(found: identification.Identification, folder: Path) -> list[s
     return [MECHANISM, CALIBRATION]
 
 
-def _write_servos(found: ServoIdentification, folder: Path) -> list[str]:
-    write_whole(folder / SERVOS, yaml_text(found.overlay))
-    return [SERVOS]
-
-
-def _write_setpoints(found: ServoPlan, folder: Path) -> list[str]:
-    write_whole(folder / SETPOINTS_FILE, found.csv)
-    return [SETPOINTS_FILE]
-
-
-def _write_plan(found: Plan, folder: Path) -> list[str]:
-    texts = {MOTION: found.motion_csv, SCENARIO: scenario_yaml(found.scenario)}
+def _written(folder: Path, texts: dict[str, str]) -> list[str]:
     for name, text in texts.items():
         write_whole(folder / name, text)
     return list(texts)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 import typer
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import remove_partials
+from stewart_drake.files.fileio import remove_partials, write_whole
 from stewart_drake.files.resources import Kind, shipped
 from stewart_drake.reporting.document import WIDTH, wrap
 from stewart_drake.reporting.terminal import echo
@@ -60,6 +60,10 @@ Controller = Annotated[
 ]
 Out = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Folder of summary, figures and data.")
+]
+InPlaceOfOutput = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="FILE", help="File to write, in place of standard output."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")]
@@ -156,6 +160,16 @@ def check_file(path: Path | None, option: str = "--out") -> None:
         kind = "a directory" if path.is_dir() else "no regular file"
         raise ConfigError(f"{option}: got {str(path)!r}, {kind}; expected a file")
     check_writable(path.parent, alone=False)
+
+
+def write_or_print(text: Callable[[], str], out: Path | None) -> None:
+    """Write a text into a file, or print it."""
+    check_file(out)
+    if out is None:
+        typer.echo(text(), nl=False)
+    else:
+        write_whole(out, text())
+        echo(f"written to {out}")
 
 
 def check_log(path: Path | None) -> None:

@@ -3,6 +3,7 @@
 import re
 import sys
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import typer
@@ -11,12 +12,13 @@ import stewart_drake as sd
 from stewart_drake.cli.common import (
     AsJson,
     Delivery,
+    InPlaceOfOutput,
     MechanismName,
     Quiet,
-    check_file,
     command_line,
     open_meshcat,
     stopping,
+    write_or_print,
 )
 from stewart_drake.cli.options import Given, command
 from stewart_drake.files.errors import ConfigError
@@ -30,20 +32,9 @@ app = typer.Typer(rich_markup_mode=None, help="Check and view a mechanism.")
 
 
 @app.command()
-def sdf(
-    mechanism: MechanismName,
-    out: Path | None = typer.Option(
-        None, metavar="FILE", help="File to write, in place of standard output."
-    ),
-) -> None:
+def sdf(mechanism: MechanismName, out: InPlaceOfOutput = None) -> None:
     """Write a mechanism as SDFormat."""
-    text = sd.model_sdf(mechanism)
-    if out is None:
-        typer.echo(text, nl=False)
-    else:
-        check_file(out)
-        write_whole(out, text)
-        echo(f"written to {out}")
+    write_or_print(partial(sd.model_sdf, mechanism), out)
 
 
 @app.command()

@@ -4,6 +4,7 @@ import select
 import sys
 import time
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -13,11 +14,13 @@ import stewart_drake as sd
 from stewart_drake.cli.common import (
     Chosen,
     Delivery,
+    InPlaceOfOutput,
     check_file,
     check_log,
     check_writable,
     named,
     open_meshcat,
+    write_or_print,
 )
 from stewart_drake.cli.options import command
 from stewart_drake.files.errors import ConfigError
@@ -127,20 +130,13 @@ def export(
     signals: Path = typer.Argument(
         metavar="FILE", help="signals.nc, log (.mcap, .csv), or run's folder."
     ),
-    out: Path | None = typer.Option(
-        None, metavar="FILE", help="File to write, in place of standard output."
-    ),
+    out: InPlaceOfOutput = None,
 ) -> None:
     """Convert saved signals to CSV.
 
     A line per instant; the header has the unit of each column.
     """
-    check_file(out)
-    text = sd.export_csv(signals, out)
-    if out is None:
-        typer.echo(text, nl=False)
-    else:
-        echo(f"written to {out}")
+    write_or_print(partial(sd.export_csv, signals), out)
 
 
 def replay(
