@@ -217,7 +217,6 @@ class Delivery:
 
     @property
     def folder(self) -> Path:
-        """Directory of an `--out` with a default."""
         assert self.out is not None
         return self.out
 
@@ -294,10 +293,3 @@ class Delivery:
         if self.as_json:  # NaN as null
             typer.echo(json.dumps(jsonable(summary), indent=2, allow_nan=False))
         return INTERRUPTED if interrupted else 0
-
-
-def open_meshcat() -> Any:
-    """Start a Meshcat server on a free port."""
-    from pydrake.geometry import Meshcat
-
-    return Meshcat()

@@ -16,7 +16,6 @@ from stewart_drake.cli.common import (
     MechanismName,
     Quiet,
     command_line,
-    open_meshcat,
     stopping,
     write_or_print,
 )
@@ -62,9 +61,11 @@ def view(*, mechanism: MechanismName, delivery: Delivery) -> int:
 
     With --out it writes a page of the home pose, and ends.
     """
+    from pydrake.geometry import Meshcat
+
     from stewart_drake.reporting.viewer import STOP, PoseViewer
 
-    viewer = PoseViewer(sd.load_mechanism(mechanism), open_meshcat())
+    viewer = PoseViewer(sd.load_mechanism(mechanism), Meshcat())
     if delivery.out is not None:
         write_whole(delivery.out / "view.html", viewer.meshcat.StaticHtml())
         delivery.wrote("view.html")

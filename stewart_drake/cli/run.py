@@ -19,7 +19,6 @@ from stewart_drake.cli.common import (
     check_log,
     check_writable,
     named,
-    open_meshcat,
     write_or_print,
 )
 from stewart_drake.cli.options import command
@@ -58,6 +57,8 @@ def simulate(
     delivery: Delivery,
 ) -> int:
     """Run one scenario."""
+    from pydrake.geometry import Meshcat
+
     from stewart_drake.loop.cautions import cautions_before
     from stewart_drake.loop.controller_margin import controller_margin
     from stewart_drake.loop.preparation import prepare
@@ -69,7 +70,7 @@ def simulate(
             raise ConfigError(f"{option}: got it without --out; expected --out DIR to write into")
     experiment, name = prepare(chosen.load()), chosen.title
     check_log(log)
-    viewer = open_meshcat() if meshcat else None
+    viewer = Meshcat() if meshcat else None
     delivery.say_link(experiment.scenario)
     margin = controller_margin(experiment)
     delay = Verdict(margin.eta, margin.pole, margin.pole_time)

@@ -55,12 +55,10 @@ def whole(field: str, value: Any, least: int) -> int:
 
 
 def one_of(field: str, value: Any, accepted: Sequence[str]) -> None:
-    """Check that a value is one of the accepted words."""
     if value not in tuple(accepted):
         raise ConfigError(f"{field}: got {value!r}; expected {' or '.join(map(repr, accepted))}")
 
 
 def of_kind(field: str, value: Any, kind: type) -> None:
-    """Check that a value is an object of a class."""
     if not isinstance(value, kind):
         raise ConfigError(f"{field}: got {brief(value)}; expected a {kind.__name__}")

@@ -112,7 +112,6 @@ def _exact(value: Any) -> Any:
 
 
 def __getattr__(name: str) -> Any:
-    """Make the functions of `ANALYSES`."""
     for analysis in ANALYSES:
         if "_".join(words_of(analysis)) == name:
             return analysis_function(analysis)

@@ -27,7 +27,6 @@ _WORDS: Final = {"out_of_reach": "no reach", "left_workspace": "left", "not_run"
 
 
 def document(study: DelayStudy) -> Document:
-    """Return poles, limits, margins and simulations."""
     loop, verdict, own = study.loop, study.verdict, study.controller
     known = own if own and own.stable and math.isfinite(own.delay_margin) else None
     stiffness = mean_inertia(study.assessment.experiment.nominal) * (2 * math.pi * _BANDWIDTH) ** 2
@@ -108,7 +107,6 @@ def _least(margins: Margins | MotorMargins) -> float:
 
 
 def growth_figure(study: DelayStudy) -> Figure:
-    """Draw the fastest pole along the reference, and how an error grows over a delay."""
     time = [point.time for point in study.poles]
     moving, held = [p.moving for p in study.poles], [p.held for p in study.poles]
     poles = [
@@ -142,7 +140,6 @@ def growth_figure(study: DelayStudy) -> Figure:
 
 
 def loop_figure(study: DelayStudy) -> Figure:
-    """Draw peaks of S and T, and tolerable errors of gain and delay, over the delay."""
     loops = [loop for loop in study.loops if loop.radius < 1]
     single = [100 * _least(m.motor) if m.motor else np.nan for m in loops]
     curves = {
@@ -177,7 +174,6 @@ def loop_figure(study: DelayStudy) -> Figure:
 
 
 def map_figure(study: DelayStudy) -> Figure:
-    """Draw E_ac over delay and amplitude, with the floor set by the delay alone."""
     steps = sorted({cell.steps for cell in study.cells})
     factors = sorted({cell.factor for cell in study.cells})
 

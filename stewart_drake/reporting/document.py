@@ -90,8 +90,6 @@ def sentence(text: str) -> str:
 
 @dataclass(frozen=True)
 class Paragraph:
-    """Plain text."""
-
     text: str
     brief: bool = False
 
@@ -112,8 +110,6 @@ class Caution:
 
 @dataclass(frozen=True)
 class Values:
-    """Names and values with units."""
-
     entries: Mapping[str, str]
     brief: bool = True
 
@@ -191,8 +187,6 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of a page and its caption."""
-
     # drawn inside `style.figure_style`, or a function that draws it for a page
     figure: "Figure | Callable[[], Figure]"
     caption: str  # the sentence below it
@@ -208,8 +202,6 @@ class Picture:
 
 @dataclass(frozen=True)
 class Listing:
-    """Lines of a page, unchanged."""
-
     text: str
     brief: ClassVar = False
 
@@ -249,8 +241,6 @@ class Section:
 
 @dataclass(frozen=True)
 class Document:
-    """A verdict and sections."""
-
     title: str  # subject
     verdict: str  # the conclusion in a sentence or two, or empty
     sections: list[Section]  # in order; a page lists the headings of more than two
@@ -278,7 +268,6 @@ def _is_number(cell: str) -> bool:
 
 
 def from_template(name: str, tone: Tone = "plain", /, **context: Any) -> Document:
-    """Return the document that a template makes of its context."""
     top, *others = sections(name, **context)
     verdict = " ".join(part.text for part in top.all(Paragraph))
     facts = {key: text for one in top.all(Values) for key, text in one.entries.items()}
@@ -376,7 +365,6 @@ def _template(name: str) -> "list[tuple[Template, bool, list[_Part]]]":
 
 @cache
 def templates() -> "Environment":
-    """Return the templates of all documents and pages."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     def shown(value: object) -> object:

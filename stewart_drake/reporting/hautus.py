@@ -19,7 +19,6 @@ _SMALLEST: Final = 1e-18
 
 
 def document(study: HautusStudy) -> Document:
-    """Return the main models and failures, then all models and modes."""
     sc = study.assessment.experiment.scenario
     chains = [system for name in _CHAINS for system in study.family(name)]
     shown = [s for name in _CHAINS for s in _landmarks(study.family(name), sc.true_delay.steps)]
@@ -102,7 +101,6 @@ def _systems_table(systems: Sequence[System]) -> Table:
 
 
 def chain_figure(study: HautusStudy) -> Figure:
-    """Draw margins of the delay chains over the delay, against the tolerance."""
     lines = {
         name: ([s.steps or 0 for s in study.family(name)], study.family(name), line(k))
         for k, name in enumerate(_CHAINS)
@@ -111,7 +109,6 @@ def chain_figure(study: HautusStudy) -> Figure:
 
 
 def plant_figure(study: HautusStudy) -> Figure:
-    """Draw margins of the plant held still along the reference."""
     lines = {}
     for where, look in (("without", line(0)), ("under", line(2))):
         some = [

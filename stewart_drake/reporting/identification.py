@@ -39,7 +39,6 @@ _OF_KIND: Final = {
 
 
 def document(found: Identification) -> Document:
-    """Return the identified values, their accuracy, and the fit."""
     interval, delay = _measured(1e3 * found.std[DELAY], 1e3 * found.values[DELAY])
     cautions, names = _cautions(found), file_names(found.logs)
     right = found.right
@@ -72,7 +71,6 @@ def document(found: Identification) -> Document:
 
 
 def plan_document(plan: Plan) -> Document:
-    """Return the motion, and the accuracy that its log will allow."""
     free = [k for k in plan.unknowns.free if not _of_geometry(k)]
     columns = {"now ±": plan.unknowns.std, "after ±": plan.std}
     return from_template(
@@ -171,7 +169,6 @@ def _unknowns(free: Sequence[int], columns: dict[str, Array], brief: bool) -> Ta
 
 
 def residual_figure(found: Identification, log: int) -> Figure:
-    """Draw the residuals of a log by kind of measurement, in standard deviations."""
     times, residuals = residuals_of(found, log)
     panels = []
     for kind, part in KINDS.items():
@@ -201,7 +198,6 @@ def residuals_of(found: Identification, log: int) -> tuple[Array, Array]:
 
 
 def motion_figure(plan: Plan) -> Figure:
-    """Draw the planned motion, in degrees and mm from its middle."""
     moved = FACTORS * (plan.poses - np.median(plan.poses, axis=0))
     curves = [
         Curve(plan.times, moved[:, k], name, LEG_LINES[k % 3])

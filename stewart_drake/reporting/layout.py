@@ -24,7 +24,6 @@ _TONES: Final[dict[str, Tone]] = {"yes": "good", "partly": "fair"}
 
 
 def document(study: LayoutStudy) -> Document:
-    """Return a comparison of the layouts found with the first machine."""
     machines = [study.before, *study.layouts]
     goal = study.problem.requirements.goal
     found = from_template(

@@ -17,7 +17,6 @@ from stewart_drake.studies.learn import LearnStudy, Repetition
 
 
 def document(study: LearnStudy) -> Document:
-    """Return the error of each repetition, and replays of the first and the best one."""
     first, best = study.repetitions[0], study.best
     numbers = {id(one): k for k, one in enumerate(study.repetitions, 1)}
     shown = [first] if best is first else [first, best]
@@ -62,8 +61,6 @@ def _count(ax: Axes) -> None:
 
 
 def time_figure(study: LearnStudy) -> Figure:
-    """Draw the mean error of each repetition over time."""
-
     def curve(k: int, one: Repetition) -> Curve:
         signals = one.result.signals
         mean = 100 * np.mean(np.abs(signals.error.values) / study.experiment.scale, axis=1)

@@ -22,7 +22,6 @@ def _mean(cell: Cell) -> float:
 
 
 def document(study: LinkStudy) -> Document:
-    """Return the results by bound, then by loss at the best bound."""
     best, checked = study.best, study.checked
     own = best is not None and all(one is None or one.completed == 1 for one in (best, checked))
     undecided = {bound: excess for bound, excess in study.alike.items() if not excess < SAME}
@@ -45,7 +44,6 @@ def document(study: LinkStudy) -> Document:
 
 
 def bound_figure(study: LinkStudy) -> Figure:
-    """Draw E_ac of every completed run, and the share of late packets, over the bound."""
     done = [cell for cell in study.bounds if cell.errors]
     bounds = [cell.bound for cell in done for _ in cell.errors]
     errors = [error for cell in done for error in cell.errors]

@@ -32,7 +32,6 @@ _VIEWS: Final = {"top view": (0, 1), "front view": (0, 2)}
 
 
 def document(check: MechanismCheck) -> Document:
-    """Return the description that `model check` prints."""
     mechanism = check.mechanism
     bodies = {"plate": "disc", "crank": "bar", "rod": "bar"}
     return from_template(

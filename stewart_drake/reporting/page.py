@@ -23,8 +23,6 @@ from stewart_drake.reporting.style import figure_style, for_dark_too
 
 @dataclass(frozen=True)
 class Provenance:
-    """Origin of a page."""
-
     command: str  # makes the page again
     # of the package and its dependencies
     versions: Mapping[str, str] = field(default_factory=versions)

@@ -55,8 +55,6 @@ class Curve:
 
 @dataclass(frozen=True)
 class Panel:
-    """A pair of axes."""
-
     y: str  # name and unit of the vertical axis
     curves: Sequence[Curve] = ()
     # name and unit of the horizontal axis, shown below the last panel that shares it

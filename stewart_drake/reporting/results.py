@@ -65,7 +65,6 @@ class SimulationResult(loop_results.SimulationResult):
 
     @classmethod
     def of(cls, result: loop_results.SimulationResult) -> "SimulationResult":
-        """Return a result of `loop` with the methods that show it."""
         return cls(**vars(result))
 
     def table(self) -> str:

@@ -61,7 +61,6 @@ _SUCCESS, _ABOVE, _FAILED = "#2F86C6", "#E69F00", "#C4502A"
 
 
 def document(study: RobustnessStudy) -> Document:
-    """Return success rate, quantiles, influences, failures, and the worst runs."""
     influences, found, low = study.influences(), study.explanation, study.success.low
     early = any(one.status != "completed" for one in study.outcomes)
     errors = [one for one in influences if one.error_p < SIGNIFICANT]
@@ -126,7 +125,6 @@ def _rank(one: Correlation, p: float) -> tuple[str, str, str]:
 
 
 def _reason(study: RobustnessStudy, reason: str, runs: int) -> dict[str, Any]:
-    """Return number, time and legs of the failures for a reason."""
     own = [one for one in study.outcomes if study.reason_of(one) == reason]
     times = [one.time for one in own if math.isfinite(one.time)]
     legs = sorted(one.leg for one in own if one.leg is not None)
@@ -184,7 +182,6 @@ def _worst_table(study: RobustnessStudy) -> Table:
 
 
 def distribution_figure(study: RobustnessStudy) -> Figure:
-    """Draw the share of all runs below each E_ac, with its interval."""
     errors, total = np.sort(study.errors[np.isfinite(study.errors)]), len(study.outcomes)
     counts = np.arange(1, len(errors) + 1)
     bounds = [wilson_interval(int(n), total) for n in counts]
@@ -208,7 +205,6 @@ def distribution_figure(study: RobustnessStudy) -> Figure:
 
 
 def influence_figure(influences: Sequence[Influence]) -> Figure:
-    """Draw rank correlations with their intervals, hollow if not significant."""
     shown = {
         "rank correlation with E_ac, completed runs": [(i.error, i.error_p) for i in influences]
     }
@@ -245,7 +241,6 @@ def _dots(ax: Axes, found: Sequence[tuple[Correlation, float]], names: Sequence[
 
 
 def runs_figure(study: RobustnessStudy) -> Figure:
-    """Draw E_ac of every run over every drawn quantity, with failures in a strip on top."""
     units, done = factors(study.draws), np.isfinite(study.errors)
     low, high = _log_range(study.errors[done])
     strip, top = high * (high / low) ** 0.06, high * (high / low) ** 0.18

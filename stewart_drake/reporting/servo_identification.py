@@ -25,7 +25,6 @@ _UNITS: Final = {"s": ("ms", 1e3), "rad": ("mrad", 1e3), "kg m^2": ("g m^2", 1e3
 
 
 def document(found: ServoIdentification) -> Document:
-    """Return the numbers found, their intervals, and the fit."""
     notes, log = _cautions(found) if found.right else [], found.model.log
     return _document(
         found,
@@ -40,7 +39,6 @@ def document(found: ServoIdentification) -> Document:
 
 
 def plan_document(plan: ServoPlan) -> Document:
-    """Return the setpoints, and the accuracy that their log will allow."""
     names, notes = ("sine", "sines", "steps"), []
     smaller = [
         f"{name} {100 * share:.0f} %"

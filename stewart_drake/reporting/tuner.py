@@ -49,13 +49,11 @@ def _grid_table(data: xr.Dataset) -> Table:
 
 
 def training_document(summary: Mapping[str, Any]) -> Document:
-    """Return the training data and the errors of the network."""
     regret = summary.get("loss") == "regret"
     return from_template("tuner_training", regret=regret and summary, labels=not regret and summary)
 
 
 def training_figures(training: Training) -> dict[str, Figure]:
-    """Return the training curve and the regression plot by name."""
     return {"training_curve": _curve(training), "regression": _regression(training)}
 
 
@@ -167,12 +165,10 @@ def _lines(found: Evaluation) -> dict[str, Line]:
 
 
 def _ratios(found: Evaluation) -> Array:
-    """Return log10(w_Q / w_R) of the fixed gains."""
     return np.array([ratio_of(np.array(gain)) for gain in found.family.gains.values()])
 
 
 def distributions(found: Evaluation) -> Figure:
-    """Draw the share of the conditions below each J: equal weights, the best gain, the tuners."""
     best, equal = found.summary["best_g"], found.names[int(np.argmin(np.abs(_ratios(found))))]
     curves = []
     for name, look in ({equal: _CONSTANT, best: Line("#000000", "-", 1.4)} | _lines(found)).items():
@@ -195,7 +191,6 @@ def _shown(found: Evaluation) -> dict[str, int | None]:
 
 
 def weights_over_time(found: Evaluation) -> Figure:
-    """Draw log10(w_Q / w_R) over the samples in some conditions."""
     period, ratios, panels = found.family.base.controller.period, _ratios(found), []
     for title, i in _shown(found).items():
         curves = []

@@ -36,8 +36,6 @@ _GHOST: Final = Rgba(0.80, 0.10, 0.10, 0.35)
 
 @dataclass(frozen=True)
 class Placement:
-    """A pose set by the sliders."""
-
     pose: Array  # (6,) rad and m
     reach: Array  # reach margins (6,) in m, negative where a leg is short
     failure: Failure | None  # why the pose is impossible, or None

@@ -36,7 +36,6 @@ _HOME: Final[dict[str, Any]] = {**_PATH, "marker": "+", "ls": "", "ms": 9, "mew"
 
 
 def document(study: WorkspaceStudy) -> Document:
-    """Return reach and singularity along the reference, motors, and the surroundings of home."""
     summary, sizing, limit = study.summary, study.sizing, study.torque_limit
     along, travelled = study.clearance.along, study.clearance.travel
     limited = sizing is not None and limit is not None
@@ -90,7 +89,6 @@ def _crossing(nearest: Nearest) -> str:
 
 
 def margins_figure(study: WorkspaceStudy) -> Figure:
-    """Draw reach, dead centre, parallel singularity and condition along the reference."""
     margins, left = study.margins, study.exit
     time, top = margins.time, min(np.nanmax(margins.condition, initial=2.0), 1e4)
     sines = leg_curves(time, margins.sines)
@@ -127,7 +125,6 @@ def margins_figure(study: WorkspaceStudy) -> Figure:
 
 
 def motors_figure(sizing: Sizing, torque_limit: float | None) -> Figure:
-    """Draw torque, speed and power of the six cranks along the reference."""
     limited = torque_limit is not None and torque_limit < 3 * np.abs(sizing.torque).max()
     of_torque, torque = unit_for(sizing.torque, TORQUES)
     of_power, power = unit_for(sizing.power, POWERS)
@@ -147,7 +144,6 @@ def motors_figure(sizing: Sizing, torque_limit: float | None) -> Figure:
 
 
 def clearance_figure(study: WorkspaceStudy) -> Figure:
-    """Draw the smallest distances: along the reference, and over a section."""
     along, time = study.clearance.along, study.clearance.along.time
     curves = [
         Curve(time, 1e3 * along.links, "links", line(0, marked=False)),
@@ -183,7 +179,6 @@ def _home(ax: Axes, pair: Section, home: Array) -> None:
 
 
 def sections_figure(study: WorkspaceStudy) -> Figure:
-    """Draw the condition number over the sections, with the reference projected onto them."""
     norm = BoundaryNorm(_LEVELS, 256, extend="max")
     return draw(
         [

@@ -172,7 +172,6 @@ def _chosen(controllers: Sequence[str | Path]) -> Sequence[str | Path]:
 
 
 def label(name: str) -> str:
-    """Return the name of a controller in tables and legends."""
     return LABELS.get(name, name)
 
 
@@ -229,7 +228,6 @@ def save_comparison(results: Mapping[str, SimulationResult], directory: str | Pa
 
 
 def comparison_summary(results: Mapping[str, SimulationResult]) -> dict[str, Any]:
-    """Return the content of `summary.json`: each controller's summary by its name."""
     return {"controllers": {name: result.summary for name, result in results.items()}}
 
 

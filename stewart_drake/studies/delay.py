@@ -116,8 +116,6 @@ class LoopMargins:
 
 
 class Cell(NamedTuple):
-    """Simulation with one delay and amplitude."""
-
     steps: int  # whole periods of delay
     factor: float  # on the reference's amplitude
     # as of a simulation, or `out_of_reach` if the reference leaves the workspace, or `not_run`
@@ -129,8 +127,6 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class DelayStudy:
-    """Result of the analysis of the delay."""
-
     assessment: Assessment
     # the scenario's loop along the reference, as far as that can be followed; None if it cannot be
     # followed at all

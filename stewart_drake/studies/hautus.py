@@ -63,8 +63,6 @@ _SAME: Final = 1e-7
 
 @dataclass(frozen=True)
 class Mode:
-    """One eigenvalue and its test."""
-
     # point at which the pencil fails, else the mean of the cluster; a conjugate pair is represented
     # by the one with imaginary part > 0
     eigenvalue: complex
@@ -78,8 +76,6 @@ class Mode:
 
 @dataclass(frozen=True)
 class Hautus:
-    """The test of one pair."""
-
     tolerance: ClassVar[float] = TOLERANCE  # margin below which a mode fails
     modes: tuple[Mode, ...]  # every distinct eigenvalue, least margin first
 
@@ -247,8 +243,6 @@ def _mode_text(mode: Mode, labels: list[Label]) -> str:
 
 @dataclass(frozen=True)
 class System:
-    """One system and its tests."""
-
     name: str  # unique
     family: str  # `error model`, `minimal chain`, `paper's chain`, `chain under gravity` or `plant`
     steps: int | None  # of delay, or None

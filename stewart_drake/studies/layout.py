@@ -97,8 +97,6 @@ class Judged:
 
 
 class Layout(NamedTuple):
-    """Machine with its measures and its run."""
-
     name: str  # of its file, without the suffix; of the scenario's own machine its name
     mechanism: Mechanism
     order: tuple[int, ...]  # (6,): joint of the plate that each leg takes
@@ -203,7 +201,6 @@ class LayoutStudy:
 
     @property
     def files(self) -> list[str]:
-        """Names of the files and folders of the study."""
         return [*(f"{one.name}.yaml" for one in self.layouts), "searches/", "judged/"]
 
     @property

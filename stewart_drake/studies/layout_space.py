@@ -194,8 +194,6 @@ class Arrangement(NamedTuple):
 
 @dataclass(frozen=True)
 class Space:
-    """Set of the layouts to choose from."""
-
     # of the machine that the search begins from; everything that does not vary stays
     spec: MechanismSpec
     bounds: dict[str, tuple[float, float]]  # lowest and highest value by parameter
@@ -237,7 +235,6 @@ class Space:
         return pattern, crank, rod
 
     def legs(self, values: Sequence[float] | Array, arrangement: Arrangement) -> Legs:
-        """Return the legs for kinematics."""
         return pattern_legs(*self._pattern(values, arrangement))
 
     def machine(

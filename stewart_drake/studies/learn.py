@@ -94,7 +94,6 @@ class LearnStudy:
 
     @property
     def best(self) -> Repetition:
-        """Repetition with the least error."""
         return min(self.repetitions, key=lambda one: one.error)
 
     @property

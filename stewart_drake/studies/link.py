@@ -36,8 +36,6 @@ SAME: Final = 0.01
 
 
 class Cell(NamedTuple):
-    """Simulations with one bound and loss."""
-
     bound: float  # s
     loss: float  # share of lost packets
     late: float  # probability that a packet which is not lost arrives after the bound

@@ -43,8 +43,6 @@ BODIES: Final = ("base", "plate", "crank", "rod")
 
 
 class MechanismCheck(NamedTuple):
-    """Check of a mechanism at rest at its home pose."""
-
     mechanism: Mechanism  # that was checked
     # why the home pose is unusable, or None; then torque, poles and travel are empty
     failure: Failure | None

@@ -206,5 +206,4 @@ class JobOptions(Options):
 
     @property
     def jobs(self) -> dict[str, Any]:
-        """Arguments of `run_jobs`."""
         return {"workers": self.workers, "scheduler": self.scheduler}

@@ -38,8 +38,6 @@ SIGNED: Final = tuple(name for name, one in MACHINE.items() if one.signed)
 
 
 class Influence(NamedTuple):
-    """Correlation of a quantity with the outcome."""
-
     factor: str  # of the quantity
     unit: str  # of the quantity
     error: Correlation  # with E_ac among the runs that completed
@@ -78,7 +76,6 @@ class RobustnessStudy(NamedTuple):
 
     @property
     def files(self) -> list[str]:
-        """Names of the files and folders of the study."""
         return ["runs.csv", "runs/"]
 
     @property
@@ -101,7 +98,6 @@ class RobustnessStudy(NamedTuple):
 
     @property
     def success(self) -> Interval:
-        """Share of runs that did not fail."""
         return wilson_interval(int(np.sum(~self.failed)), len(self.outcomes))
 
     def reason_of(self, outcome: Outcome) -> str:
@@ -142,7 +138,6 @@ class RobustnessStudy(NamedTuple):
 
     @property
     def explanation(self) -> Explanation:
-        """How the failing runs differ from the others."""
         return explain(factor_values(self.draws), self.failed)
 
     @property

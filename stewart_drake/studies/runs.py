@@ -67,12 +67,10 @@ def outcome_of(ending: Ending) -> Outcome:
 
 
 def run_file(outcome: Outcome, draw: dict[str, Any] | None = None) -> bytes:
-    """Return the file of a run, JSON: its drawn values and how it ended."""
     return sealed_json({"draw": draw or {}, "outcome": dataclasses.asdict(outcome)})
 
 
 def run_scenario(scenario: Scenario) -> bytes:
-    """Run a scenario; return the file of the run."""
     return run_file(outcome_of(run_in_bulk(scenario)))
 
 
@@ -93,7 +91,6 @@ def run_scenarios(
 
 
 def read_outcome(path: Path) -> Outcome:
-    """Read how a run ended."""
     return read_kept(_File, "the file of one run of a study", path).outcome
 
 

@@ -222,8 +222,6 @@ class Scales(NamedTuple):
 
 
 class About(NamedTuple):
-    """Ranges and scales that machines are drawn with."""
-
     ranges: Ranges
     scales: Scales
     scenario: Scenario
@@ -331,7 +329,6 @@ MACHINE: Final[Model] = {
 
 
 def run_draw(scenario: Scenario, one: Draw) -> bytes:
-    """Run a scenario with a draw; return the file of the run."""
     return run_file(_run(scenario, one), one)
 
 

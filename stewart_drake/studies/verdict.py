@@ -17,8 +17,6 @@ from stewart_drake.types import Array
 
 
 class Assessment(NamedTuple):
-    """Assessment of a scenario that need not be possible."""
-
     experiment: Experiment
     failure: Failure | None  # when and why the reference leaves the workspace, or None
     home_failure: Failure | None  # why the home pose is outside the workspace, or None

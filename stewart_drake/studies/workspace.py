@@ -82,8 +82,6 @@ def size_motors(dynamics: StewartDynamics, reference: Trajectory, time: Array) -
 
 @dataclass(frozen=True)
 class WorkspaceStudy:
-    """Result of `analyze workspace`."""
-
     experiment: Experiment  # of the scenario, reachable or not
     home: Failure | None  # why the home pose is unusable, or None
     exit: Failure | None  # when and why the reference first leaves the workspace, or None

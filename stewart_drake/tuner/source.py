@@ -261,5 +261,4 @@ def densities(samples: ArrayLike, kind: Kind = "magnitude") -> Array:
 
 
 def density_source(kind: Kind) -> WeightsSource:
-    """Return a source of densities, with fixed weights."""
     return WeightsSource(None, DensityFeatures(kind), FixedPolicy(np.ones(2)))

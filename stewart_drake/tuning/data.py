@@ -87,7 +87,6 @@ def _with_health(policy: FixedPolicy | RatioPolicy) -> MakeTuner:
 
 
 def watching(w_Q: float, w_R: float) -> MakeTuner:
-    """Return the factory of a tuner that computes `health` while the weights are fixed."""
     return _with_health(FixedPolicy(np.array([w_Q, w_R])))
 
 
@@ -166,7 +165,6 @@ def _file(runs: list[tuple[Ending, Array]], duration: float) -> bytes:
 
 
 def read_condition(path: Path, runs: int = 1, samples: int = SAMPLES) -> dict[str, NDArray[Any]]:
-    """Read the file of a condition with a number of runs."""
     shapes: dict[str, tuple[str, tuple[int, ...]]] = {
         "samples": ("f", (runs, samples, len(TUNER_INPUTS))),
         "used": ("f", (runs, samples, len(WEIGHTS))),

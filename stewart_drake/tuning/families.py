@@ -164,7 +164,6 @@ def _about(scenario: Scenario, faults: Faults | None = None) -> About:
 
 
 def _logarithmic(low: float, high: float) -> Callable[[Generator, Any], float]:
-    """Return a draw of a number with a uniform logarithm."""
     return lambda rng, _: float(np.exp(rng.uniform(*np.log((low, high)))))
 
 

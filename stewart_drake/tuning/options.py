@@ -17,8 +17,6 @@ MOST: Final = 10_000
 
 
 class FamilyOptions(JobOptions):
-    """Options of runs under the conditions of a family."""
-
     purpose: ClassVar["Purpose"]
     family: Literal["T", "N2"] | None = option(
         None, "Conditions where weights matter: T with the estimator, N2 without."
@@ -55,8 +53,6 @@ class FamilyOptions(JobOptions):
 
 
 class DataOptions(FamilyOptions):
-    """Options of the data that a tuner is trained on."""
-
     purpose = "training"
     disturbed: int | None = option(
         None, "N drawn conditions instead of the paper's grid.", "N", ge=0, le=MOST

@@ -85,8 +85,6 @@ DECAY: Final = 1e-4
 
 @dataclass(frozen=True)
 class Training:
-    """A trained network and how it was trained."""
-
     network: Network  # with its card
     # one row per step. Labels: root mean square errors of training and test rows. Regret: round,
     # step, regret of the training and of the held-out rows.
@@ -351,8 +349,6 @@ class Curves(NamedTuple):
 
 
 class FeatureRows(NamedTuple):
-    """Training rows: inputs (N, 18), and the number of the condition of each."""
-
     inputs: Array
     condition: Indices
 
@@ -558,7 +554,6 @@ class RegretTrainer:
 
 
 def _key(network: Network) -> str:
-    """Return the SHA-256 of the parameters of a network."""
     names = ("input_mean", "input_scale", "W1", "b1", "W2", "b2", "bounds", "start")
     return hash_of(*(getattr(network, name) for name in names))
 
