@@ -29,7 +29,6 @@ LOG: Final = "log.csv"
 _EACH_WAY: Final = (0.35, 0.4)
 """Transit time of the demo's link each way, as a share of the scenario's delay."""
 _LOST: Final = 0.02
-"""Loss of the demo's link each way."""
 _REFUSED: Final = {
     "malformed": "malformed",
     "version": "of another version",

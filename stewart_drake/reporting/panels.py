@@ -30,8 +30,7 @@ from stewart_drake.types import Array, ArrayLike
 
 Scale = Literal["linear", "log", "powers"]
 """Scale of an axis: `log` has ticks such as 20 and 50, `powers` such as 10⁻³."""
-Ends = tuple[float | None, float | None]
-"""Ends of an axis; None follows the data."""
+Ends = tuple[float | None, float | None]  # None follows the data
 
 _LEGEND_LINE: Final = 0.25
 _HANDLE, _CHARACTER = 0.62, 0.079

@@ -50,11 +50,8 @@ SIGNIFICANT: Final = 0.05
 _GOOD, _FAIR = 0.99, 0.9
 """Smallest lower bound of the success rate for these tones."""
 _WORST: Final = 10
-"""Runs listed one by one."""
 _NAMED: Final = 3
 """Number of quantities, or pairs, in a sentence."""
-_ABREAST: Final = 4
-"""Panels per row."""
 _SOFT: Final = "#666666"
 # Colours of points in a bitmap, readable on light and dark pages.
 _SUCCESS, _ABOVE, _FAILED = "#2F86C6", "#E69F00", "#C4502A"
@@ -276,7 +273,7 @@ def runs_figure(study: RobustnessStudy) -> Figure:
         )
         for name, unit in units.items()
     ]
-    return draw(panels, _ABREAST, sharey=True)
+    return draw(panels, 4, sharey=True)
 
 
 def times_figure(study: RobustnessStudy) -> Figure:

@@ -44,8 +44,7 @@ COMMANDED: Final = Line("#D55E00", "--", 1.0)
 TRUTH: Final = Line("#D55E00", "--", 1.2)
 LIMIT: Final = Line("#8A2B0B", "-", 0.9)
 MARK: Final = Line("#666666", ":", 1.1)
-WIDTH: Final = 10.0
-"""Width of a figure, inches."""
+WIDTH: Final = 10.0  # of a figure, inches
 UNITS: Final = ("deg",) * 3 + ("mm",) * 3
 FACTORS: Final = np.array([180 / np.pi] * 3 + [1e3] * 3)
 """Units in which coordinates are shown, and factors from rad and m."""

@@ -24,9 +24,7 @@ from stewart_drake.types import Array
 
 _COORDINATES: Final = tuple(zip(COORDINATE_NAMES, FACTORS, UNITS, strict=True))
 _NEAREST: Final = 8
-"""Smallest number of pairs in the table."""
 _LEVELS: Final = (1, 2, 3, 5, 8, 13, 30, 100)
-"""Levels of the condition number."""
 _CMAP: Final = colormaps["cividis_r"]
 _OUTSIDE: Final = "#F2F2F2"
 _HALO: Final = (withStroke(linewidth=3, foreground="#FFFFFF"),)

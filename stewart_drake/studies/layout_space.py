@@ -172,7 +172,6 @@ PARAMETERS: Final = (
 )
 """Numbers that vary: fields of `mechanism.files.PatternSpec`, lengths of crank and rod in m."""
 CHOICES: Final = ("plate_order", "branches")
-"""Discrete properties that vary."""
 _LENGTHS: Final = ("base_radius", "plate_radius", "crank", "rod")
 DIGITS: Final = 4
 """Decimals of a found value: tenths of a millimetre."""

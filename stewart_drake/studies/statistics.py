@@ -27,7 +27,6 @@ from scipy.optimize import brentq
 from stewart_drake.types import Array, ArrayLike
 
 CONFIDENCE: Final = 0.95
-"""Default of every interval."""
 _DEVIATIONS: Final = float(stats.norm.ppf((1 + CONFIDENCE) / 2))
 """Half width of an interval in standard deviations."""
 

@@ -67,7 +67,6 @@ class Ranges:
 
 
 RANGE_UNITS: Final = units_of(Ranges)
-"""Unit of each field of `Ranges`."""
 
 
 def read_ranges(settings: Iterable[str]) -> Ranges:

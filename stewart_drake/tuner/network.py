@@ -51,12 +51,10 @@ WINDOW: Final = 31
 NUM_INPUTS: Final = len(TUNER_INPUTS)
 """12 state errors (pose, rates) and 6 torques."""
 DEFAULT: Final = "tuner"
-"""The shipped network."""
 NUM_OUTPUTS: Final = len(WEIGHTS)
 
 MAX_BYTES: Final = 10_000_000
 EXPECTED: Final = "the JSON file of one network"
-"""For messages."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

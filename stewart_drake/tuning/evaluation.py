@@ -42,7 +42,6 @@ RULE: Final = "rule"
 HINDSIGHT: Final = "hindsight"
 RESAMPLES: Final = 10_000
 _FIXED: Final = "fixed"
-"""Folder of the runs with fixed gains."""
 
 Tuner = AnnTunerConfig | RuleTunerConfig
 Runs = dict[str, NDArray[Any]]

@@ -61,7 +61,6 @@ RATIOS: Final = np.linspace(-4.0, 2.0, 13)
 FIXED: Final[dict[str, tuple[float, float]]] = {
     f"{ratio:+.1f}": tuple(weights_of(ratio).tolist()) for ratio in RATIOS
 }
-"""The fixed gains of T and N2 by name."""
 FAULTS: Final = ("offset", "jitter", "friction", "noise")
 LEAST_TORQUE: Final = 0.3
 """Least effort of a motion, as a share of the standard torque."""

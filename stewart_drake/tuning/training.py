@@ -66,7 +66,6 @@ TRAIN_SHARE: Final = 0.7
 MAX_ROWS: Final = 6000
 """Most rows that labels are trained on, drawn at random; QR of the Jacobian takes all the time."""
 EVALUATIONS: Final = 60
-"""Most evaluations of the residuals."""
 
 HELD_OUT: Final = 0.2
 """Share of the conditions."""
