@@ -130,7 +130,7 @@ def list_shipped() -> None:
     """List the shipped models, scenarios and so on."""
     from stewart_drake.reporting.terminal import shipped_table
 
-    for kind, heading in KINDS.items():
+    for kind, (heading, *_) in KINDS.items():
         if shipped(kind):
             typer.echo(heading)
             typer.echo(shipped_table(kind))

@@ -1,6 +1,7 @@
 """Commands of the tuner: tune dataset, tune train, tune evaluate."""
 
 from pathlib import Path
+from typing import Final
 
 import typer
 
@@ -20,6 +21,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.reporting.terminal import count_bar
 from stewart_drake.tuning.options import DataOptions, EvaluationOptions, TrainingOptions
 
+WORTH: Final = "worth.html"
 app = typer.Typer(
     rich_markup_mode=None, help="Make data for the neural tuner, train it, evaluate it."
 )
@@ -101,7 +103,6 @@ def evaluate(
     With --family on fresh conditions of a family, where runs that end early count too.
     """
     from stewart_drake import functions
-    from stewart_drake.reporting.page import write_page
 
     options, folder = given.options(), delivery.folder
     named = {"scenario": None if options.family else scenario, "controller": controller}
@@ -120,6 +121,5 @@ def evaluate(
         )
     delivery.write(found.summary)
     delivery.say(found.table())
-    page = "worth.html"
-    delivery.draw(page, lambda folder: [write_page(found.document, found.made, folder / page)])
+    delivery.draw(WORTH, lambda folder: found.write_page(folder, WORTH))
     return delivery.end(found.summary)

@@ -11,23 +11,16 @@ from stewart_drake.files.errors import ConfigError, resembling
 
 Kind = Literal["mechanism", "scenario", "controller", "overlay", "weights"]
 
-KINDS: Final[dict[Kind, str]] = {
-    "mechanism": "mechanisms",
-    "scenario": "scenarios",
-    "controller": "controllers",
-    "overlay": "overlays",
-    "weights": "tuner weights",
+KINDS: Final[dict[Kind, tuple[str, str, str]]] = {
+    "mechanism": ("mechanisms", "models", ".yaml"),
+    "scenario": ("scenarios", "diagrams/scenarios", ".yaml"),
+    "controller": ("controllers", "diagrams/controllers", ".yaml"),
+    "overlay": ("overlays", "diagrams/overlays", ".yaml"),
+    "weights": ("tuner weights", "models/weights", ".json"),
 }
-"""Kinds of shipped data, with plurals."""
+"""Kinds of shipped data, with plural, folder and suffix."""
 
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
-_PLACES: Final[dict[Kind, tuple[str, str]]] = {
-    "mechanism": ("models", ".yaml"),
-    "scenario": ("diagrams/scenarios", ".yaml"),
-    "controller": ("diagrams/controllers", ".yaml"),
-    "overlay": ("diagrams/overlays", ".yaml"),
-    "weights": ("models/weights", ".json"),
-}
 
 
 def data_root() -> Path:
@@ -42,7 +35,7 @@ def data_root() -> Path:
 
 def shipped(kind: Kind) -> list[str]:
     """Return the sorted names that `resolve` accepts as a bare word for this kind."""
-    folder, suffix = _PLACES[kind]
+    _, folder, suffix = KINDS[kind]
     return sorted(path.stem for path in (data_root() / folder).glob(f"*{suffix}"))
 
 
@@ -75,7 +68,7 @@ def resolve(kind: Kind, name_or_path: str | Path, relative_to: Path | None = Non
         if os.path.exists(path):
             return path
         raise ConfigError(f"{kind}: no file {str(path)!r}; shipped names: {_nearest(kind, '')}")
-    name, (folder, suffix) = str(name_or_path), _PLACES[kind]
+    name, (_, folder, suffix) = str(name_or_path), KINDS[kind]
     path = data_root() / folder / f"{name}{suffix}"
     if not name or not path.exists():
         raise ConfigError(

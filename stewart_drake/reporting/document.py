@@ -268,14 +268,7 @@ def _is_number(cell: str) -> bool:
 
 
 def from_template(name: str, tone: Tone = "plain", /, **context: Any) -> Document:
-    top, *others = sections(name, **context)
-    verdict = " ".join(part.text for part in top.all(Paragraph))
-    facts = {key: text for one in top.all(Values) for key, text in one.entries.items()}
-    return Document(top.heading, verdict, others, tone, facts)
-
-
-def sections(name: str, /, **context: Any) -> list[Section]:
-    """Return the sections of a template that have a named block, or need none."""
+    """Return the document of a template, with the sections that have a named block or need none."""
     found = []
     for heading, folded, parts in _template(name):
         values = [part.entry and part.entry(context) for part in parts]
@@ -283,7 +276,10 @@ def sections(name: str, /, **context: Any) -> list[Section]:
             pairs = zip(parts, values, strict=True)
             blocks = [block for part, value in pairs for block in _blocks(part, value, context)]
             found.append(Section(heading.render(context), *blocks, folded=folded))
-    return found
+    top, *others = found
+    verdict = " ".join(part.text for part in top.all(Paragraph))
+    facts = {key: text for one in top.all(Values) for key, text in one.entries.items()}
+    return Document(top.heading, verdict, others, tone, facts)
 
 
 class _Part(NamedTuple):

@@ -235,11 +235,11 @@ class AnalysisResult:
         pictures = [one for section in self.document.sections for one in section.all(Picture)]
         return drawn({f"figure_{k}": one.drawn for k, one in enumerate(pictures, 1)}, directory)
 
-    def write_page(self, directory: Path) -> Path:
-        """Write report.html into a directory and return its path."""
+    def write_page(self, directory: Path, name: str = PAGE) -> Path:
+        """Write the page into a directory and return its path."""
         from stewart_drake.reporting.page import write_page
 
-        return write_page(self.document, self.made, directory / PAGE)
+        return write_page(self.document, self.made, directory / name)
 
     def save(self, directory: str | Path) -> Path:
         """Write report.html and summary.json into a directory, which is made; return the page."""

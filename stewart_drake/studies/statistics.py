@@ -259,7 +259,11 @@ def _pairs(values: Mapping[str, Array], failed: Flags) -> Iterator[Pair]:
         corners = {
             (u, v): (halves[a] == u, halves[b] == v) for u, v in product((True, False), repeat=2)
         }
-        p = {corner: _both_needed(*sides, failed) for corner, sides in corners.items()}
+        # Both are needed: b matters among the runs with a, and a among those with b.
+        p = {
+            corner: max(_more_often(failed[x], y[x]), _more_often(failed[y], x[y]))
+            for corner, (x, y) in corners.items()
+        }
         regions: list[tuple[tuple[tuple[bool, bool], ...], float]]
         regions = [((corner,), p[corner]) for corner in corners]
         for u in (True, False):
@@ -270,11 +274,6 @@ def _pairs(values: Mapping[str, Array], failed: Flags) -> Iterator[Pair]:
             u, v = region[0]
             counts = int(np.sum(there & failed)), int(np.sum(there & ~failed))
             yield Pair((a, b), (words[u], words[v]), len(region) > 1, chance, *counts)
-
-
-def _both_needed(a: Flags, b: Flags, failed: Flags) -> float:
-    """Return the larger p-value of: b matters among the runs with a, and a among those with b."""
-    return max(_more_often(failed[a], b[a]), _more_often(failed[b], a[b]))
 
 
 def _more_often(failed: Flags, there: Flags) -> float:

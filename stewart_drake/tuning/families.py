@@ -189,13 +189,14 @@ def _effort(variant: Variant) -> float:
     return max(LEAST_TORQUE, share * now["frequency"] ** 2)
 
 
-def _set_delay(variant: Variant, steps: int) -> None:
-    variant.fields["delay"]["steps"] = steps
-
-
 def _set_known_delay(variant: Variant, steps: int) -> None:
-    _set_delay(variant, steps)
+    variant.fields["delay"]["steps"] = steps
     variant.fields["controller"] |= {"delay_steps": steps, "delay_fraction": 0.0}
+
+
+def _set(section: str, field: str) -> Callable[[Variant, Any], None]:
+    """Return a function that sets a field of the scenario."""
+    return lambda variant, value: variant.fields[section].update({field: value})
 
 
 def _set_frequency(variant: Variant, frequency: float) -> None:
@@ -224,13 +225,9 @@ def _set_fault(variant: Variant, fault: tuple[float, ...]) -> None:
     variant.fields["sensor"]["noise_std"] = [noise * s for s in std]
 
 
-def _seed_jitter(variant: Variant, seed: int) -> None:
-    variant.fields["delay"]["seed"] = seed
-
-
 DISTURBED: Final[Model] = {
     # Whole periods, 0 and 15 included, known to the controller.
-    "delay_steps": Quantity(lambda rng, _: int(rng.integers(0, 16)), _set_delay),
+    "delay_steps": Quantity(lambda rng, _: int(rng.integers(0, 16)), _set("delay", "steps")),
     # rad/s of the sine.
     "frequency": Quantity(_logarithmic(0.5, 3.0), _set_frequency),
     # Share of the scenario's own amplitudes.
@@ -264,7 +261,7 @@ FAULTY: Final[Model] = {
     "noise": Quantity(_logarithmic(*NOISE), add_noise),
     "fault": Quantity(_draw_fault, _set_fault),
     "seed": Quantity(draw_seed, seed_noise),
-    "jitter_seed": Quantity(draw_seed, _seed_jitter),
+    "jitter_seed": Quantity(draw_seed, _set("delay", "seed")),
 }
 """Quantities of a condition of T or N2; the order is that of the random numbers."""
 
