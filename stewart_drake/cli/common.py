@@ -6,7 +6,7 @@ import json
 import os
 import shlex
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
@@ -47,7 +47,7 @@ def _complete_setting(incomplete: str) -> list[str]:
 ScenarioName = Annotated[str, _shipped_argument("scenario")]
 MechanismName = Annotated[str, _shipped_argument("mechanism")]
 Settings = Annotated[
-    list[str] | None,
+    list[str],
     typer.Option(
         "--set",
         metavar="FIELD=VALUE",
@@ -72,9 +72,9 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON,
 class Chosen(NamedTuple):
     """A scenario as chosen on the command line."""
 
-    scenario: str
-    controller: str | None = None
-    settings: Sequence[str] = ()
+    scenario: ScenarioName = "paper"
+    controller: Controller = None
+    settings: Settings = []
 
     def load(self, *settings: str) -> Scenario:
         """Return the scenario with these settings, which the typed ones may replace."""
@@ -210,7 +210,7 @@ class Delivery:
         quiet, as_json: options of the command.
     """
 
-    def __init__(self, out: Path | None = None, quiet: bool = False, as_json: bool = False) -> None:
+    def __init__(self, out: Out = None, quiet: Quiet = False, as_json: AsJson = False) -> None:
         check_writable(out)
         self.out, self.quiet, self.as_json, self.silent = out, quiet, as_json, quiet or as_json
         self._written: list[str] = []

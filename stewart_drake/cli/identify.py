@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from stewart_drake.cli.common import Delivery, Settings, command_line
+from stewart_drake.cli.common import Chosen, Delivery, command_line
 from stewart_drake.cli.options import command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.progress import shown_by
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _UNITS = "; ".join(f"{name}: {unit}" for name, unit in TOLERANCE_UNITS.items())
 
 
-@command()
+@command(without=("scenario", "controller"))
 def identify(
     *,
     logs: list[Path] | None = typer.Argument(
@@ -33,7 +33,7 @@ def identify(
     plan: str | None = typer.Option(
         None, metavar="SCENARIO", help="Plan a motion to log for this scenario, without logs."
     ),
-    settings: Settings = None,
+    chosen: Chosen,
     delay: float | None = typer.Option(
         None, metavar="S", help="Assumed delay; that of the log by default, or 0.1 s."
     ),
@@ -87,7 +87,7 @@ def identify(
     else:
         from stewart_drake.scenario.run_log import is_run
 
-        refuse({"--set": settings}, "without --plan; expected it with --plan")
+        refuse({"--set": chosen.settings}, "without --plan; expected it with --plan")
         if all(map(is_run, logs or ())):
             refuse(of_csv, "with logs of runs, which contain it; expected it with a CSV log only")
     if plan is None and mechanism is None:
@@ -96,22 +96,22 @@ def identify(
     from stewart_drake.identification.plan import MOTION
     from stewart_drake.identification.servo_plan import SETPOINTS_FILE
 
-    chosen: Any = {"tolerances": tolerances, "precision": precision}
+    more: Any = {"tolerances": tolerances, "precision": precision}
     if plan is not None:
-        loaded = load_scenario(plan, settings=settings or [])
-        chosen["command"] = command_line(
-            "identify", settings=settings or [], options={"plan": plan, **typed}
+        loaded = load_scenario(plan, settings=chosen.settings)
+        more["command"] = command_line(
+            "identify", settings=chosen.settings, options={"plan": plan, **typed}
         )
         with phase_bar("plan", delivery.quiet):
-            found = functions.plan_identification(loaded, poses=pose_std is not None, **chosen)
+            found = functions.plan_identification(loaded, poses=pose_std is not None, **more)
         delivery.discard(MOTION, functions.SCENARIO, SETPOINTS_FILE)
     else:
         words = [*map(str, logs or []), *(["--no-gravity"] if gravity is False else [])]
         options = {"mechanism": mechanism, **typed}
-        chosen["command"] = command_line("identify", *words, options=options)
+        more["command"] = command_line("identify", *words, options=options)
         with phase_bar("identify", delivery.quiet) as show, shown_by(show):
             found = functions.identify(
-                logs or [], mechanism or "", delay=delay, gravity=gravity is not False, **chosen
+                logs or [], mechanism or "", delay=delay, gravity=gravity is not False, **more
             )
         delivery.discard(functions.MECHANISM, functions.CALIBRATION, functions.SERVOS)
     return delivery.answer(found, *found.write_files(delivery.out))

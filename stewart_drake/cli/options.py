@@ -3,22 +3,11 @@
 import contextlib
 import inspect
 from collections.abc import Callable, Collection, Mapping
-from functools import partial
 from typing import Annotated, Any, Final
 
 import typer
 
-from stewart_drake.cli.common import (
-    AsJson,
-    Chosen,
-    Controller,
-    Delivery,
-    Out,
-    Quiet,
-    ScenarioName,
-    Settings,
-    named,
-)
+from stewart_drake.cli.common import Chosen, Delivery, named
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.studies.options import Option, Options
 
@@ -76,20 +65,7 @@ class Given:
         return one.read(typed, load) if typed else one.default
 
 
-def _shared(
-    *,
-    scenario: ScenarioName = "paper",
-    controller: Controller = None,
-    settings: Settings = None,
-    out: Out = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-) -> None:
-    """Have the parameters that commands share."""
-
-
-_CHOSEN: Final = ("scenario", "controller", "settings")
-_DELIVERY: Final = ("out", "quiet", "as_json")
+_GROUPS: Final = {"chosen": Chosen, "delivery": Delivery}
 
 
 def command(
@@ -97,43 +73,39 @@ def command(
 ) -> Callable[[Callable[..., int | None]], Callable[..., int | None]]:
     """Return a decorator that replaces arguments of a command by parameters of the command line.
 
-    These are `given`, by the options of a study; `chosen`, by those of a scenario; and `delivery`,
-    by those of the output.
+    These are `given`, by the options of a study; `chosen` and `delivery`, by what makes a `Chosen`
+    and a `Delivery`.
 
     Args:
         kind: class of the options.
         without: parameters that the command does not offer; they keep their defaults.
         defaults: by the name of a parameter.
     """
-    known = {
-        name: one.replace(default=defaults.get(name, one.default))
-        for name, one in inspect.signature(_shared).parameters.items()
-        if name not in without
-    }
-    groups = {
-        "given": {_name(one): _parameter(one) for one in _offered(kind)},
-        **{
-            group: {name: known[name] for name in names if name in known}
-            for group, names in {"chosen": _CHOSEN, "delivery": _DELIVERY}.items()
-        },
-    }
-    make: dict[str, Callable[[dict[str, Any]], Any]] = {
-        "given": partial(Given, kind),
-        "chosen": lambda typed: Chosen(**typed | {"settings": typed["settings"] or ()}),
-        "delivery": lambda typed: Delivery(**typed),
-    }
+    options = {_name(one): _parameter(one) for one in _offered(kind)}
+    make: dict[str, Callable[..., Any]] = {"given": lambda **typed: Given(kind, typed), **_GROUPS}
+
+    def expanded(one: inspect.Parameter) -> dict[str, inspect.Parameter]:
+        if one.name not in make:
+            return {one.name: one}
+        if one.name == "given":
+            return options
+        return {
+            name: part.replace(kind=part.KEYWORD_ONLY, default=defaults.get(name, part.default))
+            for name, part in inspect.signature(_GROUPS[one.name]).parameters.items()
+            if name not in without
+        }
 
     def decorate(command: Callable[..., int | None]) -> Callable[..., int | None]:
-        own = inspect.signature(command).parameters
-        used = [name for name in make if name in own]
-        shown = [p for name, one in own.items() for p in groups.get(name, {"": one}).values()]
+        own = {one.name: expanded(one) for one in inspect.signature(command).parameters.values()}
 
         def run(**typed: Any) -> int | None:
-            parts = {name: {one: typed.pop(one) for one in groups[name]} for name in used}
-            return command(**typed, **{name: make[name](part) for name, part in parts.items()})
+            parts = {name: {one: typed[one] for one in shown} for name, shown in own.items()}
+            made = {name: make[name](**parts[name]) for name in own if name in make}
+            return command(**{name: part.get(name) for name, part in parts.items()} | made)
 
         run.__name__, run.__doc__, run.__annotations__ = command.__name__, command.__doc__, {}
-        run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+        parameters = [one for shown in own.values() for one in shown.values()]
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         return run
 
     return decorate

@@ -9,10 +9,8 @@ from stewart_drake.cli.common import (
     GO_ON,
     AsJson,
     Chosen,
-    Controller,
     Delivery,
     Quiet,
-    Settings,
     command_line,
     stopping,
 )
@@ -86,15 +84,14 @@ def train(
 
 
 @app.command()
-@command(EvaluationOptions, out=Path("out/tuner/evaluation"))
+@command(EvaluationOptions, without=("scenario",), out=Path("out/tuner/evaluation"))
 def evaluate(
     *,
     weights: list[str] | None = typer.Argument(
         None, metavar="[WEIGHTS]...", help="Shipped name or file; several with --family."
     ),
     scenario: str = typer.Option("paper", metavar="SCENARIO", help="Shipped name or file."),
-    controller: Controller = None,
-    settings: Settings = None,
+    chosen: Chosen,
     given: Given,
     delivery: Delivery,
 ) -> int:
@@ -105,16 +102,16 @@ def evaluate(
     from stewart_drake import functions
 
     options, folder = given.options(), delivery.folder
-    named = {"scenario": None if options.family else scenario, "controller": controller}
+    named = {"scenario": None if options.family else scenario, "controller": chosen.controller}
     with given.named(), stopping(GO_ON), count_bar("conditions", delivery.quiet) as progress:
         found = functions.evaluate_tuner(
             folder,
             weights or [],
-            *Chosen(scenario, controller, settings or ()),
+            *chosen._replace(scenario=scenario),
             progress=progress,
             command=command_line(
                 *("tune", "evaluate", *(weights or [])),
-                settings=settings or (),
+                settings=chosen.settings,
                 options=named | given.words,
             ),
             options=options,
