@@ -15,7 +15,7 @@ import typer
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials, write_whole
 from stewart_drake.files.resources import Kind, shipped
-from stewart_drake.reporting.document import WIDTH, wrap
+from stewart_drake.reporting.document import PAGE, WIDTH, wrap
 from stewart_drake.reporting.terminal import echo
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario, setting_choices, title_of
@@ -271,14 +271,14 @@ class Delivery:
     def wrote(self, *names: str) -> None:
         self._written += names
 
-    def answer(self, found: "AnalysisResult", *files: str, interrupted: bool = False) -> int:
+    def answer(
+        self, found: "AnalysisResult", *files: str, interrupted: bool = False, page: str = PAGE
+    ) -> int:
         """Print an analysis, write summary.json and the page, and return the exit status."""
-        from stewart_drake.reporting.results import PAGE
-
         self.say(str(found))
-        self.discard(PAGE)  # a page of an earlier run would contradict the new numbers
+        self.discard(page)  # a page of an earlier run would contradict the new numbers
         self.write(found.summary)
-        self.draw(PAGE, found.write_page)
+        self.draw(page, lambda folder: found.write_page(folder, page))
         self.wrote(*files)
         return self.end(found.summary, interrupted)
 

@@ -18,6 +18,7 @@ from stewart_drake.cli.common import Chosen, Delivery, check_log
 from stewart_drake.cli.options import Given, command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.options import LiveOptions, MachineOptions
+from stewart_drake.reporting.document import PAGE
 from stewart_drake.reporting.terminal import echo
 
 if TYPE_CHECKING:
@@ -170,7 +171,6 @@ def _delivered(
     `logs` are the names of files that were written during the run.
     """
     from stewart_drake.live.viewer import End
-    from stewart_drake.reporting.results import PAGE
     from stewart_drake.reporting.run import run_document
 
     summary: Any = result.summary

@@ -22,6 +22,7 @@ from stewart_drake.cli.common import (
 from stewart_drake.cli.options import Given, command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
+from stewart_drake.reporting.document import PAGE, Caution
 from stewart_drake.reporting.terminal import echo
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.options import MissingOption, Option, quantity
@@ -119,11 +120,9 @@ def _new(
 ) -> tuple[int, str]:
     """Write the files; return the exit status and the report as HTML."""
     from stewart_drake.loop.simulation import simulate
-    from stewart_drake.reporting.document import Caution
     from stewart_drake.reporting.mechanism import document
     from stewart_drake.reporting.page import Provenance, html
     from stewart_drake.reporting.report import first_report
-    from stewart_drake.reporting.results import PAGE
     from stewart_drake.studies import new_machine as study
     from stewart_drake.studies.verdict import Verdict, loop_verdict
 

@@ -24,7 +24,7 @@ from stewart_drake.cli.common import (
 from stewart_drake.cli.options import command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
-from stewart_drake.reporting.document import Caution
+from stewart_drake.reporting.document import PAGE, Caution
 from stewart_drake.reporting.terminal import count_bar, echo, progress_bars
 from stewart_drake.scenario.loading import load_compatible
 
@@ -277,7 +277,7 @@ def report(*, chosen: Chosen, delivery: Delivery) -> int:
     from stewart_drake.reporting import report as report_document
     from stewart_drake.reporting.page import Provenance
     from stewart_drake.reporting.report import collect
-    from stewart_drake.reporting.results import PAGE, AnalysisResult
+    from stewart_drake.reporting.results import AnalysisResult
 
     started, name = time.perf_counter(), chosen.title
     with count_bar("runs, analyses", delivery.silent) as progress:

@@ -1,7 +1,6 @@
 """Commands of the tuner: tune dataset, tune train, tune evaluate."""
 
 from pathlib import Path
-from typing import Final
 
 import typer
 
@@ -19,7 +18,6 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.reporting.terminal import count_bar
 from stewart_drake.tuning.options import DataOptions, EvaluationOptions, TrainingOptions
 
-WORTH: Final = "worth.html"
 app = typer.Typer(
     rich_markup_mode=None, help="Make data for the neural tuner, train it, evaluate it."
 )
@@ -116,7 +114,4 @@ def evaluate(
             ),
             options=options,
         )
-    delivery.write(found.summary)
-    delivery.say(found.table())
-    delivery.draw(WORTH, lambda folder: found.write_page(folder, WORTH))
-    return delivery.end(found.summary)
+    return delivery.answer(found, page="worth.html")

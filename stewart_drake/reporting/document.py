@@ -42,6 +42,7 @@ Tone = Literal["good", "fair", "bad", "plain"]
 """Grade of a verdict; a page shows it by the kind of a bar, in grey print too."""
 
 WIDTH: Final = 80
+PAGE: Final = "report.html"
 _NO_BREAK: Final = "\N{NO-BREAK SPACE}"
 _TOGETHER: Final = r"(?<=\d) (?=(?:%|mm|ms|s|N|mN|kg|deg)(?!\w))|(?<=N) (?=m\b)|(?<=\d %) (?=s\b)"
 """Spaces at which no line is broken: before a unit and in it."""

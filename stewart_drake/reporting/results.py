@@ -19,7 +19,7 @@ from stewart_drake.loop import results as loop_results
 from stewart_drake.loop.preparation import simulated_machine
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.reporting.csv_file import columns_of
-from stewart_drake.reporting.document import Document, Picture
+from stewart_drake.reporting.document import PAGE, Document, Picture
 from stewart_drake.reporting.run import comparison_document, run_document
 from stewart_drake.studies.compare import save_comparison
 
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
     from stewart_drake.reporting.page import Provenance
-
-PAGE: Final = "report.html"
 
 
 class Figures(dict[str, "Figure"]):
