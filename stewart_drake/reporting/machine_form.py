@@ -28,24 +28,12 @@ Entries = dict[str, str]
 """Texts of a form by the name of the measurement, without those that are missing."""
 
 
-def measurements_of(entries: Entries) -> Measurements:
-    """Return the measurements.
-
-    Raises:
-        ConfigError: the first problem; it begins with the measurement's name.
-    """
-    for one in Measurements.described():
-        if one.required and one.name not in entries:
-            raise ConfigError(f"{one.name}: is missing")
-    return Measurements(**entries)
-
-
 def drawing(entries: Entries) -> str:
     """Return the drawing as a data URI; masses that are missing do not matter."""
     masses = dict.fromkeys(("plate_mass", "crank_mass", "rod_mass"), str(_ANY_MASS))
     with TemporaryDirectory() as folder:
         path = Path(folder) / "machine.yaml"
-        path.write_text(machine_text(measurements_of(entries | masses), "machine"))
+        path.write_text(machine_text(Measurements(**entries | masses), "machine"))
         try:
             return source(mechanism_figure(load_mechanism(path)))
         except UnreachablePoseError as error:
@@ -57,7 +45,7 @@ def answer(entries: Entries) -> dict[str, Any]:
     found: dict[str, Any] = {"drawing": None, "field": None, "problem": None}
     try:
         found["drawing"] = drawing(entries)
-        measurements_of(entries)
+        Measurements(**entries)
     except ConfigError as error:
         name, _, words = str(error).partition(": ")
         known = name in Measurements.model_fields
@@ -110,7 +98,7 @@ class MachineForm:
     def wait(self) -> Measurements:
         while not self._asked.wait(0.2):  # short, so that Ctrl-C ends it
             pass
-        return measurements_of(self._entries)
+        return Measurements(**self._entries)
 
     def _report_page(self) -> str:
         """Wait for the page that follows the form."""
