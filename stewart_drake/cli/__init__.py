@@ -25,21 +25,14 @@ _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _UsageError: Final[Any] = typer.BadParameter.__mro__[1]
 
 app = typer.Typer(rich_markup_mode=None)
-app.command()(run.simulate)
-app.command()(run.compare)
-app.command()(run.export)
-app.command()(run.replay)
-app.command("export-c")(run.export_c)
-app.command()(run.setpoints)
-app.command()(run.report)
-app.command()(identify.identify)
-app.command()(model.new)
-app.command()(live.machine)
-app.command()(live.live)
+for _one in (
+    *(run.simulate, run.compare, run.export, run.replay, run.export_c, run.setpoints, run.report),
+    *(identify.identify, model.new, live.machine, live.live),
+):
+    app.command()(_one)
 analyze.add_analyses(app)
-app.add_typer(model.app, name="model")
-app.add_typer(analyze.app, name="analyze")
-app.add_typer(tune.app, name="tune")
+for _name, _group in {"model": model, "analyze": analyze, "tune": tune}.items():
+    app.add_typer(_group.app, name=_name)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -112,7 +112,9 @@ def command(
 
 
 def _offered(kind: type[Options], recorded: bool = False) -> list[Option]:
-    return [one for one in kind.described() if one.flag and (one.recorded or not recorded)]
+    return [
+        one for one in kind.described() if one.flag is not None and (one.recorded or not recorded)
+    ]
 
 
 def _parameter(one: Option) -> inspect.Parameter:

@@ -77,7 +77,7 @@ class Option(NamedTuple):
     annotation: Any  # of the Python argument
     default: Any  # in both; `inspect.Parameter.empty` for none
     help: str  # unit and meaning
-    # name on the command line, without dashes; None for an option of Python only
+    # name on the command line if it is another one, or empty; None for an option of Python only
     flag: str | None = None
     metavar: str | None = None  # shown there in place of the value
     # makes the value from the texts of a repeatable option. Its second argument loads the scenario
@@ -119,8 +119,6 @@ class Options(BaseModel):
         found = []
         for name, field in cls.model_fields.items():
             extra: Any = dict(field.json_schema_extra or {})  # type: ignore[arg-type]
-            if extra:
-                extra["flag"] = extra["flag"] or name
             default = inspect.Parameter.empty if field.is_required() else field.default
             found.append(Option(name, field.annotation, default, field.description or "", **extra))
         yield from sorted(found, key=lambda option: not option.recorded)
