@@ -215,6 +215,10 @@ class Delivery:
         self.out, self.quiet, self.as_json, self.silent = out, quiet, as_json, quiet or as_json
         self._written: list[str] = []
 
+    def into(self, out: Path) -> "Delivery":
+        """Return the same output, into a directory."""
+        return Delivery(out, self.quiet, self.as_json)
+
     @property
     def folder(self) -> Path:
         assert self.out is not None

@@ -10,11 +10,9 @@ import typer
 
 import stewart_drake as sd
 from stewart_drake.cli.common import (
-    AsJson,
     Delivery,
     InPlaceOfOutput,
     MechanismName,
-    Quiet,
     command_line,
     stopping,
     write_or_print,
@@ -80,14 +78,13 @@ def view(*, mechanism: MechanismName, delivery: Delivery) -> int:
 # ---------------------------------------------------------------- a new machine
 
 
-@command(Measurements)
+@command(Measurements, without=("out",))
 def new(
     *,
     folder: Path = typer.Argument(metavar="DIR", help="Folder of the files."),
     given: Given,
     form: bool = typer.Option(False, "--form", help="Ask by a form in a browser, with a drawing."),
-    quiet: Quiet = False,
-    as_json: AsJson = False,
+    delivery: Delivery,
 ) -> int:
     """Make a machine and a first scenario from a few measurements.
 
@@ -96,7 +93,7 @@ def new(
     """
     from stewart_drake.studies import new_machine as study
 
-    delivery = Delivery(folder, quiet, as_json)
+    delivery = delivery.into(folder)
     study.check_free(folder)
     if form:
         from stewart_drake.reporting.machine_form import MachineForm
@@ -106,12 +103,12 @@ def new(
             closing(MachineForm(given.given, "new machine")) as page,
         ):
             # The address is printed also with --quiet.
-            echo(f"fill in the form at {page.url}, Ctrl-C ends it", error=as_json)
+            echo(f"fill in the form at {page.url}, Ctrl-C ends it", error=delivery.as_json)
             measurements = page.wait()
             status, text = _new(delivery, given, measurements, folder)
             page.show(text)
         return status
-    asking = sys.stdin.isatty() and not (quiet or as_json)
+    asking = sys.stdin.isatty() and not delivery.silent
     return _new(delivery, given, _measured(given, asking), folder)[0]
 
 

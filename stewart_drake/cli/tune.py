@@ -4,15 +4,7 @@ from pathlib import Path
 
 import typer
 
-from stewart_drake.cli.common import (
-    GO_ON,
-    AsJson,
-    Chosen,
-    Delivery,
-    Quiet,
-    command_line,
-    stopping,
-)
+from stewart_drake.cli.common import GO_ON, Chosen, Delivery, command_line, stopping
 from stewart_drake.cli.options import Given, command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.reporting.terminal import count_bar
@@ -43,7 +35,7 @@ def dataset(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
 
 
 @app.command()
-@command(TrainingOptions)
+@command(TrainingOptions, without=("out",))
 def train(
     *,
     data: Path = typer.Argument(metavar="DATA", help="Folder or file that tune dataset wrote."),
@@ -53,8 +45,7 @@ def train(
         metavar="FILE",
         help="File of the network; figures go to its folder.",
     ),
-    quiet: Quiet = False,
-    as_json: AsJson = False,
+    delivery: Delivery,
 ) -> int:
     """Train the network on a data set.
 
@@ -67,7 +58,7 @@ def train(
 
     if out.suffix != ".json":
         raise ConfigError(f"--out: got {str(out)!r}; expected a file ending in .json")
-    options, delivery = given.options(), Delivery(out.parent, quiet, as_json)
+    options, delivery = given.options(), delivery.into(out.parent)
     name, kept = ("own runs", GO_ON) if options.regret else ("training", "nothing written")
     first = "training" if options.regret else "computing"
     with given.named(), stopping(kept), count_bar(name, delivery.silent, first) as progress:
