@@ -623,8 +623,9 @@ def test_what_is_no_number_is_null_on_the_page():
 def test_the_machine_of_a_demo_ends_with_a_killed_controller():
     parent = """
 import multiprocessing, time
+from stewart_drake.cli.common import Chosen
 from stewart_drake.cli.live import _demo_machine
-with _demo_machine("paper", 0.8, None, ()):
+with _demo_machine(Chosen(), 0.8):
     print(multiprocessing.active_children()[0].pid, flush=True)
     time.sleep(60)
 """
