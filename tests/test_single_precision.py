@@ -70,7 +70,7 @@ class Single:
                     setattr(copy, name, self.at(one))
                 elif one is not None:
                     setattr(copy, name, self._copy(one, known))
-            else:
+            elif kind != "function":
                 setattr(copy, name, value)
 
     def observe(self, law, memory, measurement, in_flight):
