@@ -7,7 +7,9 @@ logs per row. With rows such as perfect-0.1, a servo and its ball joints, only t
 
 A log has the setpoints of `identify --plan reachy_mini`, 12 s at 50 Hz, and crank angles in 12
 bits. Setpoints act 20 to 60 ms late, and angles are 8 ms old. Each seed has its own motion, delay
-and phase of the codes. The machine and the motors' torque limit are known.
+and phase of the codes. The machine and the motors' torque limit are known. MuJoCo moves positions
+by the speeds at the end of a step, so that torques act half a step earlier: the true delay is that
+of the continuous machine.
 
 The head then follows a motion that is not in the log, of three frequencies. Its setpoints have the
 numbers found and are sent ahead by the delay found, so that an error of the delay shifts the
@@ -82,7 +84,7 @@ def log_of(planned: np.ndarray, servo: Any, ball: float, delay: float, seed: int
 def identified(planned: np.ndarray, name: str, ball: float, seed: int) -> Found:
     """Return what the log of a seed shows, and the errors of the head."""
     kp, kv, damping, friction, armature, force = servo = SERVOS[name]
-    delay = READING + STEP * float(np.random.default_rng(seed).integers(20, 61))
+    delay = READING + STEP * (float(np.random.default_rng(seed).integers(20, 61)) - 0.5)
     log = log_of(planned, servo, ball, delay, seed)
     began = time.process_time()
     machine = replace(sd.load_mechanism("reachy_mini"), effort_limit=force)

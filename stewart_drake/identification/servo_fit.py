@@ -14,23 +14,26 @@ friction of the ball joints.
 Output error. The exact plant under the setpoints of the log has crank angles a(t; theta); the least
 squares of their deviations r = a(theta) - measured begin at the regression.
 
-Sticking. Below some 4 s, tanh(a' / s) stands for sticking that no formula describes well, and delay
-and damping make up for its error. Where residuals are above the rounding, slower samples are
-therefore left out of a second fit: the friction of faster ones is F under any law.
+Second fit. About a reversal, the friction of a real or simulated motor is not F tanh(a' / s), and
+delay and damping would make up for it. So near the first fit, a slow crank gets an unknown torque
+with a standard deviation of F in each period, and the second fit minimises the innovations of
+that model (`innovations.py`): the friction of faster cranks is F under any law. If innovations stay
+large, something else is wrong, such as the friction of ball joints. Then the first fit counts, and
+its difference from the second one is added to the intervals in quadrature.
 
-Intervals. Residuals are correlated in time, most of all those that the model leaves, which differ
-from one kind of motion to another: the covariance of white noise is far too small. The log is cut
-into B blocks, about as long as a kind of motion. With J = dr/dtheta,
-H = J'J and g_b = J_b' r_b, whose sum is 0 at the fit, the fit without block b differs by
+Intervals. With J = de/dtheta of the innovations e and H = J'J, H^-1 is their covariance if rounding
+and unknown friction are all that there is. Other errors differ from one kind of motion to another.
+The log is cut into B blocks, about as long as a kind of motion. With g_b = J_b' e_b, whose sum is 0
+at the fit, the fit without block b differs by
 
     delta_b = (H - H_b)^-1 g_b,   P = (B - 1) / B sum_b delta_b delta_b'       (jackknife)
 
-and the interval is t(B - 1) sqrt(P), with Student's t. Blocks may have any correlation inside. The
-change from the first fit to the second is added to it in quadrature: what is left of an effect is
-taken to be at most what was removed.
+Blocks may have any correlation inside. The interval is t(B - 1) sqrt(P), with Student's t, plus
+1.96 sqrt(H^-1) in quadrature: P of few blocks may be small by chance.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count
@@ -39,8 +42,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
+from scipy.linalg import expm
 from scipy.optimize import least_squares
-from scipy.signal import butter, savgol_filter, sosfiltfilt
+from scipy.signal import butter, sosfiltfilt
 from scipy.stats import t as student
 
 from stewart_drake.core.layout import DEFAULT_GRAVITY
@@ -49,6 +53,7 @@ from stewart_drake.dynamics.open_loop import Ended, NativePlant
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification import progress
+from stewart_drake.identification.innovations import Innovations
 from stewart_drake.identification.servo_logs import ServoLog
 from stewart_drake.law.servos import PositionServo, turned
 from stewart_drake.mechanism.geometry import Mechanism, with_rotors
@@ -62,6 +67,7 @@ from stewart_drake.scenario.signals import (
     NUM_TORQUES,
     PLANT_PARAMETERS,
     POSE,
+    RATES,
     SHAFTS,
 )
 from stewart_drake.types import Array
@@ -87,10 +93,10 @@ CODES: Final = 3.0
 """Residual over that of rounding above which friction of the ball joints is tried."""
 GAIN: Final = 0.9
 """Share of the residual that must remain at most, for ball joints to be kept."""
-STICKS: Final = 4.0
-"""Crank speed over s below which a crank may stick."""
-SMOOTH: Final = 1.15
-"""Residual over that of rounding up to which no sticking is seen."""
+SLOW: Final = 2.0
+"""Crank speed over s below which friction is unknown; tanh is 0.96 there."""
+EXPLAINED: Final = 1.5
+"""Innovations, of standard deviation 1, above which the second fit does not explain the log."""
 WRONG: Final = 0.3
 """Residual over the servos' deviation u(t - d) - a above which the fit is wrong."""
 
@@ -108,8 +114,7 @@ _GRID: Final = 2e-3  # s, of the regression
 _CUTOFF: Final = 6.0  # Hz
 _DELAYS: Final = np.arange(0.0, 0.3, 1e-3)  # s
 _START_SPEED: Final = 0.05  # rad/s
-_SPEED_WINDOW: Final = 0.14  # s, of the measured angles for a speed
-_ENOUGH: Final = 0.1  # least share of samples in the second fit
+_QUANTILE: Final = float(student.ppf(0.975, math.inf))
 
 
 @dataclass(frozen=True)
@@ -123,15 +128,9 @@ class ServoModel:
 
     def states(self, theta: Array) -> Array | None:
         """Return states (n, 12) at the times of the log, from rest; None if the plate leaves."""
-        parameters = np.zeros(NUM_PLANT_PARAMETERS)
-        parameters[SHAFTS] = theta[[DAMPING, FRICTION, SPEED]]
-        ball = theta[[BALL_DAMPING, BALL_FRICTION]]
-        parameters[BALL_JOINTS] = [*ball, DEFAULT_BALL_JOINT_SPEED]
-        machine = with_rotors(self.mechanism, theta[ARMATURE])
-        dynamics = StewartDynamics(machine, self.gravity, parameters, PLANT_PARAMETERS)
         times = self.log.times - self.log.times[0]
         start = np.concatenate([self.log.poses[0], np.zeros(NUM_STATE // 2)])
-        plant = NativePlant(dynamics, start, times, _ACCURACY, math.inf)
+        plant = NativePlant(self._dynamics(theta), start, times, _ACCURACY, math.inf)
         servo = PositionServo(theta[K], 0.0, self.torque_limit)
         # The first setpoint acts from the start on.
         acts, setpoints = times + theta[D], np.ascontiguousarray(self.log.setpoints)
@@ -140,18 +139,18 @@ class ServoModel:
         )
         return plant.states if ended == Ended.INSIDE else None
 
+    def _dynamics(self, theta: Array) -> StewartDynamics:
+        parameters = np.zeros(NUM_PLANT_PARAMETERS)
+        parameters[SHAFTS] = theta[[DAMPING, FRICTION, SPEED]]
+        ball = theta[[BALL_DAMPING, BALL_FRICTION]]
+        parameters[BALL_JOINTS] = [*ball, DEFAULT_BALL_JOINT_SPEED]
+        machine = with_rotors(self.mechanism, theta[ARMATURE])
+        return StewartDynamics(machine, self.gravity, parameters, PLANT_PARAMETERS)
+
     @cached_property
     def counted(self) -> Any:
         """(n,) rows whose residuals count."""
         return self.log.times - self.log.times[0] >= _SETTLING
-
-    @cached_property
-    def speeds(self) -> Array:
-        """Measured speeds (m, 6) of the cranks, rad/s."""
-        step = float(np.median(np.diff(self.log.times)))
-        window = max(5, 2 * round(_SPEED_WINDOW / step / 2) + 1)
-        rates = savgol_filter(self.log.cranks, window, 2, deriv=1, delta=step, axis=0)
-        return np.abs(rates[self.counted])
 
     def residuals(self, theta: Array) -> Array:
         """Return crank angles minus measured ones (m, 6), rad; 1 if the plate leaves."""
@@ -173,6 +172,41 @@ class ServoModel:
             columns.append((self.residuals(moved) - here) / (moved[k] - theta[k]))
         return np.stack(columns, axis=2)
 
+    def acting(self, delay: float) -> Array:
+        """Return the setpoints (n, 6) that act at the times of the log."""
+        times = self.log.times
+        newest = np.searchsorted(times + delay, times, side="right") - 1
+        return self.log.setpoints[np.maximum(newest, 0)]
+
+    def innovations(self, theta: Array, rounding: float) -> Innovations:
+        """Return the filter of residuals near theta; friction of slow cranks is unknown."""
+        states = self.states(theta)
+        if states is None:
+            raise ConfigError(f"{self.log.name}: got a motion that leaves the workspace")
+        states, smooth = states[self.counted], theta.copy()
+        smooth[[FRICTION, BALL_FRICTION]] = 0.0
+        dynamics, geometry = self._dynamics(smooth), self.mechanism
+        arms = np.array([geometry.jacobian(x[POSE]) for x in states])
+        angles = legs_along(geometry, states[:, POSE]).crank_angles
+        asked = theta[K] * (turned(self.acting(theta[D])[self.counted], angles) - angles)
+        torques = np.clip(asked, -self.torque_limit, self.torque_limit)
+        stiff = theta[K] * (asked == torques)[:, :, None] * arms
+        slopes = np.zeros((len(states) - 1, NUM_STATE + NUM_TORQUES, NUM_STATE + NUM_TORQUES))
+        for slope, x, torque, back in zip(slopes, states, torques, stiff, strict=False):
+            A, B, _ = dynamics.derivatives(x[POSE], x[RATES], torque)
+            slope[:NUM_STATE] = np.hstack([A, B])
+            slope[:NUM_STATE, POSE] -= B @ back
+        held = expm(slopes * np.diff(self.log.times[self.counted])[:, None, None])
+        rates = np.einsum("nij,nj->ni", arms, states[:, RATES])
+        still = np.abs(rates) < SLOW * theta[SPEED]
+        slow = still[1:] | still[:-1] | (rates[1:] * rates[:-1] < 0)
+        return Innovations(
+            np.concatenate([arms, np.zeros_like(arms)], axis=2),
+            held[:, :NUM_STATE, :NUM_STATE],
+            held[:, :NUM_STATE, NUM_STATE:] * (theta[FRICTION] * slow)[:, None, :],
+            rounding,
+        )
+
 
 def scale_of(theta: Array) -> Array:
     """Return the size (8,) of each unknown, also where it is 0, from the others."""
@@ -189,25 +223,29 @@ class ServoIdentification:
     theta: Array  # (8,) values found, of NAMES
     residuals: Array  # (m, 6) rad
     jacobian: Array  # (m, 6, k) by the free unknowns
-    fitted: NDArray[np.bool_]  # (m, 6) residuals that the fit minimises
+    white: Callable[[Array], Array]  # filter of residuals (m, 6, ...) to those of the fit, std 1
     free: NDArray[np.intp]  # (k,) places of those in theta
     rounding: float  # standard deviation of the rounding of a measured angle, rad
     ball_joints_tried: bool  # whether friction of the ball joints was fitted
     iterations: int  # evaluations of the fit
-    # (8,) of theta from the first fit to the second, 0 for one
+    # (8,) of theta in a second fit that does not explain the log
     change: Array = field(default_factory=lambda: np.zeros(len(NAMES)))
 
     @property
+    def misfit(self) -> float:
+        """Root mean square of the filtered residuals, 1 for those of the filter's model."""
+        return float(np.sqrt(np.mean(self.white(self.residuals) ** 2)))
+
+    @property
     def residual(self) -> float:
-        """Root mean square of the residuals that the fit minimises, rad."""
-        return float(np.sqrt(np.mean(self.residuals[self.fitted] ** 2)))
+        """Root mean square of the residuals, rad."""
+        return float(np.sqrt(np.mean(self.residuals**2)))
 
     @cached_property
     def deviation(self) -> float:
         """Root mean square of u(t - d) - a, rad: what the servos leave."""
         log = self.model.log
-        newest = np.searchsorted(log.times + self.theta[D], log.times, side="right") - 1
-        apart = log.setpoints[np.maximum(newest, 0)] - log.cranks
+        apart = self.model.acting(self.theta[D]) - log.cranks
         return float(np.sqrt(np.mean(apart[self.model.counted] ** 2)))
 
     @property
@@ -222,26 +260,30 @@ class ServoIdentification:
         return max(_FEWEST_BLOCKS, round((log.times[-1] - log.times[0] - _SETTLING) / _BLOCK))
 
     @cached_property
-    def covariance(self) -> Array:
-        """P (8, 8), (jackknife); 0 for unknowns that are not free or at their bound."""
+    def covariances(self) -> tuple[Array, Array]:
+        """P of (jackknife) and H^-1 (8, 8); 0 for unknowns that are fixed or at their bound."""
         inner = self.free[(self.theta > _LOW)[self.free]]
         scale = scale_of(self.theta)[inner]
-        J = self.jacobian[:, :, np.isin(self.free, inner)] * scale
-        both = J, self.residuals * self.fitted
+        J = self.white(self.jacobian[:, :, np.isin(self.free, inner)] * scale)
+        both = J, self.white(self.residuals)
         parts = zip(*(np.array_split(one, self.blocks) for one in both), strict=True)
-        pairs = [(np.vstack(list(j)), r.ravel()) for j, r in parts]
+        pairs = [(np.vstack(list(j)), e.ravel()) for j, e in parts]
         H = sum(j.T @ j for j, _ in pairs)
-        deltas = np.array([np.linalg.lstsq(H - j.T @ j, j.T @ r)[0] for j, r in pairs])
+        deltas = np.array([np.linalg.lstsq(H - j.T @ j, j.T @ e)[0] for j, e in pairs])
         deltas -= deltas.mean(axis=0)
-        B, P = self.blocks, np.zeros((len(NAMES), len(NAMES)))
-        P[np.ix_(inner, inner)] = (B - 1) / B * (scale * deltas).T @ (scale * deltas)
-        return P
+        B, found = self.blocks, np.zeros((2, len(NAMES), len(NAMES)))
+        for whole, one in zip(
+            found, ((B - 1) / B * deltas.T @ deltas, np.linalg.pinv(H)), strict=True
+        ):
+            whole[np.ix_(inner, inner)] = one * np.outer(scale, scale)
+        return found[0], found[1]
 
     def interval(self, slope: Array) -> float:
         """Return the half width of the 95 % interval of a function with this slope (8,)."""
-        std = math.sqrt(float(slope @ self.covariance @ slope))
-        chance = float(student.ppf(0.975, self.blocks - 1)) * std
-        return math.hypot(chance, float(slope @ self.change))
+        quantiles = float(student.ppf(0.975, self.blocks - 1)), _QUANTILE
+        pairs = zip(quantiles, self.covariances, strict=True)
+        parts = (q * math.sqrt(float(slope @ P @ slope)) for q, P in pairs)
+        return math.hypot(*parts, float(slope @ self.change))
 
     @cached_property
     def intervals(self) -> Array:
@@ -390,13 +432,12 @@ def identify_servos(
         rubbing = _fitted(model, start, np.arange(len(NAMES)), rounding)
         better = rubbing.residual < GAIN * found.residual
         found = rubbing if better else replace(found, ball_joints_tried=True)
-    moving = model.speeds >= STICKS * found.theta[SPEED]
-    if found.residual < SMOOTH * rounding or np.mean(moving) < _ENOUGH:
-        return found
-    progress.phase("moving cranks only")
-    again = _fitted(model, found.theta, found.free, rounding, moving)
-    change = again.theta - found.theta
-    return replace(again, change=change, ball_joints_tried=found.ball_joints_tried)
+    progress.phase("friction of slow cranks unknown")
+    white = model.innovations(found.theta, rounding)
+    again = _fitted(model, found.theta, found.free, rounding, white)
+    if again.misfit > EXPLAINED:
+        return replace(found, change=again.theta - found.theta)
+    return replace(again, ball_joints_tried=found.ball_joints_tried)
 
 
 def _fitted(
@@ -404,10 +445,10 @@ def _fitted(
     start: Array,
     free: NDArray[np.intp],
     rounding: float,
-    samples: NDArray[np.bool_] | None = None,
+    white: Callable[[Array], Array] | None = None,
 ) -> ServoIdentification:
-    """Return the fit of the free unknowns to samples (m, 6), all if None, by output error."""
-    fitted = np.ones(model.speeds.shape, bool) if samples is None else samples
+    """Return the fit of the free unknowns by output error, of filtered residuals if given."""
+    filtered = white or (lambda residuals: residuals / rounding)
     first, scale = _in_reach(model, start), scale_of(start)[free]
     iterations, here = count(1), np.empty(0)
 
@@ -419,13 +460,13 @@ def _fitted(
     def residuals(x: Array) -> Array:
         nonlocal here
         here = model.residuals(whole(x))
-        return (here * fitted).ravel()
+        return filtered(here).ravel()
 
     def jacobian(x: Array) -> Array:
         progress.iteration(next(iterations), _ITERATIONS)
         # The solver asks for it where it has just asked for the residuals.
-        J = model.jacobian(whole(x), free, here) * fitted[:, :, None]
-        return J.reshape(-1, len(free)) * scale
+        J = filtered(model.jacobian(whole(x), free, here) * scale)
+        return J.reshape(-1, len(free))
 
     found = least_squares(
         residuals,
@@ -436,14 +477,14 @@ def _fitted(
         xtol=1e-4,
         max_nfev=_ITERATIONS,
     )
-    J: Any = found.jac
     theta = whole(found.x)
+    left = model.residuals(theta)
     return ServoIdentification(
         model=model,
         theta=theta,
-        residuals=model.residuals(theta),
-        jacobian=J.reshape(-1, NUM_TORQUES, len(free)) / scale,
-        fitted=fitted,
+        residuals=left,
+        jacobian=model.jacobian(theta, free, left),
+        white=filtered,
         free=free,
         rounding=rounding,
         ball_joints_tried=bool(np.isin(BALL_FRICTION, free)),

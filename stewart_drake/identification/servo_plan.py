@@ -133,7 +133,7 @@ def plan_servos(
         theta=planner.theta,
         residuals=residuals,
         jacobian=seen_by.jacobian(planner.theta, free, residuals),
-        fitted=np.ones(residuals.shape, bool),
+        white=seen_by.innovations(planner.theta, rounding),
         free=free,
         rounding=rounding,
         ball_joints_tried=rubs,
