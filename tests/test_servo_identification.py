@@ -219,12 +219,13 @@ def with_known_statistics(rng, number, blocks):
     times = np.linspace(0.0, 0.5 + 3.0 * blocks, number)
     log = ServoLog("log", times, *np.full((3, number, 6), [[[0.1]], [[0.0]], [[0.0]]]))
     theta = np.ones(8)
+    residuals = (noise.ravel() + flat @ error).reshape(number, 6)
     fit = ServoIdentification(
         ServoModel(log, ROBOT, 1.0),
         theta,
-        (noise.ravel() + flat @ error).reshape(number, 6),
+        residuals,
+        residuals,
         jacobian,
-        lambda residuals: residuals,
         np.arange(1, 4),
         rounding=1e-3,
         ball_joints_tried=False,

@@ -222,8 +222,8 @@ class ServoIdentification:
     model: ServoModel  # with the log
     theta: Array  # (8,) values found, of NAMES
     residuals: Array  # (m, 6) rad
-    jacobian: Array  # (m, 6, k) by the free unknowns
-    white: Callable[[Array], Array]  # filter of residuals (m, 6, ...) to those of the fit, std 1
+    innovations: Array  # (m, 6) residuals after the filter of the fit, of std 1
+    jacobian: Array  # (m, 6, k) of the innovations by the free unknowns
     free: NDArray[np.intp]  # (k,) places of those in theta
     rounding: float  # standard deviation of the rounding of a measured angle, rad
     ball_joints_tried: bool  # whether friction of the ball joints was fitted
@@ -233,8 +233,8 @@ class ServoIdentification:
 
     @property
     def misfit(self) -> float:
-        """Root mean square of the filtered residuals, 1 for those of the filter's model."""
-        return float(np.sqrt(np.mean(self.white(self.residuals) ** 2)))
+        """Root mean square of the innovations."""
+        return float(np.sqrt(np.mean(self.innovations**2)))
 
     @property
     def residual(self) -> float:
@@ -264,8 +264,7 @@ class ServoIdentification:
         """P of (jackknife) and H^-1 (8, 8); 0 for unknowns that are fixed or at their bound."""
         inner = self.free[(self.theta > _LOW)[self.free]]
         scale = scale_of(self.theta)[inner]
-        J = self.white(self.jacobian[:, :, np.isin(self.free, inner)] * scale)
-        both = J, self.white(self.residuals)
+        both = self.jacobian[:, :, np.isin(self.free, inner)] * scale, self.innovations
         parts = zip(*(np.array_split(one, self.blocks) for one in both), strict=True)
         pairs = [(np.vstack(list(j)), e.ravel()) for j, e in parts]
         H = sum(j.T @ j for j, _ in pairs)
@@ -477,14 +476,15 @@ def _fitted(
         xtol=1e-4,
         max_nfev=_ITERATIONS,
     )
+    J: Any = found.jac
     theta = whole(found.x)
     left = model.residuals(theta)
     return ServoIdentification(
         model=model,
         theta=theta,
         residuals=left,
-        jacobian=model.jacobian(theta, free, left),
-        white=filtered,
+        innovations=filtered(left),
+        jacobian=J.reshape(-1, NUM_TORQUES, len(free)) / scale,
         free=free,
         rounding=rounding,
         ball_joints_tried=bool(np.isin(BALL_FRICTION, free)),

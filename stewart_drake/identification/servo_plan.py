@@ -127,13 +127,14 @@ def plan_servos(
     log = servo_log("plan", model.log.times, model.log.setpoints, rounded, experiment.truth)
     seen_by = ServoModel(log, model.mechanism, model.torque_limit, model.gravity)
     rubs, residuals = bool(np.any(planner.theta[-2:] > 0)), seen_by.residuals(planner.theta)
+    filtered = seen_by.innovations(planner.theta, rounding)
     free = np.arange(len(NAMES) if rubs else len(NAMES) - 2)
     expected = ServoIdentification(
         model=seen_by,
         theta=planner.theta,
         residuals=residuals,
-        jacobian=seen_by.jacobian(planner.theta, free, residuals),
-        white=seen_by.innovations(planner.theta, rounding),
+        innovations=filtered(residuals),
+        jacobian=filtered(seen_by.jacobian(planner.theta, free, residuals)),
         free=free,
         rounding=rounding,
         ball_joints_tried=rubs,
