@@ -172,8 +172,8 @@ class ServoModel:
             columns.append((self.residuals(moved) - here) / (moved[k] - theta[k]))
         return np.stack(columns, axis=2)
 
-    def acting(self, delay: float) -> Array:
-        """Return the setpoints (n, 6) that act at the times of the log."""
+    def held_setpoints(self, delay: float) -> Array:
+        """Return the setpoints (n, 6) in effect at the times of the log."""
         times = self.log.times
         newest = np.searchsorted(times + delay, times, side="right") - 1
         return self.log.setpoints[np.maximum(newest, 0)]
@@ -188,7 +188,7 @@ class ServoModel:
         dynamics, geometry = self._dynamics(smooth), self.mechanism
         arms = np.array([geometry.jacobian(x[POSE]) for x in states])
         angles = legs_along(geometry, states[:, POSE]).crank_angles
-        asked = theta[K] * (turned(self.acting(theta[D])[self.counted], angles) - angles)
+        asked = theta[K] * (turned(self.held_setpoints(theta[D])[self.counted], angles) - angles)
         torques = np.clip(asked, -self.torque_limit, self.torque_limit)
         stiff = theta[K] * (asked == torques)[:, :, None] * arms
         slopes = np.zeros((len(states) - 1, NUM_STATE + NUM_TORQUES, NUM_STATE + NUM_TORQUES))
@@ -245,7 +245,7 @@ class ServoIdentification:
     def deviation(self) -> float:
         """Root mean square of u(t - d) - a, rad: what the servos leave."""
         log = self.model.log
-        apart = self.model.acting(self.theta[D]) - log.cranks
+        apart = self.model.held_setpoints(self.theta[D]) - log.cranks
         return float(np.sqrt(np.mean(apart[self.model.counted] ** 2)))
 
     @property
@@ -270,12 +270,11 @@ class ServoIdentification:
         H = sum(j.T @ j for j, _ in pairs)
         deltas = np.array([np.linalg.lstsq(H - j.T @ j, j.T @ e)[0] for j, e in pairs])
         deltas -= deltas.mean(axis=0)
-        B, found = self.blocks, np.zeros((2, len(NAMES), len(NAMES)))
-        for whole, one in zip(
-            found, ((B - 1) / B * deltas.T @ deltas, np.linalg.pinv(H)), strict=True
-        ):
-            whole[np.ix_(inner, inner)] = one * np.outer(scale, scale)
-        return found[0], found[1]
+        both = (1 - 1 / self.blocks) * deltas.T @ deltas, np.linalg.pinv(H)
+        P, inverse = np.zeros((2, len(NAMES), len(NAMES)))
+        for whole, one in zip((P, inverse), both, strict=True):
+            whole[np.ix_(inner, inner)] = np.outer(scale, scale) * one
+        return P, inverse
 
     def interval(self, slope: Array) -> float:
         """Return the half width of the 95 % interval of a function with this slope (8,)."""
@@ -431,6 +430,8 @@ def identify_servos(
         rubbing = _fitted(model, start, np.arange(len(NAMES)), rounding)
         better = rubbing.residual < GAIN * found.residual
         found = rubbing if better else replace(found, ball_joints_tried=True)
+    if not found.right:
+        return found
     progress.phase("friction of slow cranks unknown")
     white = model.innovations(found.theta, rounding)
     again = _fitted(model, found.theta, found.free, rounding, white)
