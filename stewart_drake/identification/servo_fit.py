@@ -17,9 +17,10 @@ squares of their deviations r = a(theta) - measured begin at the regression.
 Second fit. About a reversal, the friction of a real or simulated motor is not F tanh(a' / s), and
 delay and damping would make up for it. So near the first fit, a slow crank gets an unknown torque
 with a standard deviation of F in each period, and the second fit minimises the innovations of
-that model (`innovations.py`): the friction of faster cranks is F under any law. If innovations stay
-large, something else is wrong, such as the friction of ball joints. Then the first fit counts, and
-its difference from the second one is added to the intervals in quadrature.
+that model (`innovations.py`): the friction of faster cranks is F under any law. If the rms of its
+innovations exceeds 1, something else is wrong, such as the friction of ball joints. Then the change
+from the first fit to the second is added to the intervals in quadrature, and above 1.5 the first
+fit counts.
 
 Intervals. With J = de/dtheta of the innovations e and H = J'J, H^-1 is their covariance if rounding
 and unknown friction are all that there is. Other errors differ from one kind of motion to another.
@@ -95,8 +96,8 @@ GAIN: Final = 0.9
 """Share of the residual that must remain at most, for ball joints to be kept."""
 SLOW: Final = 2.0
 """Crank speed over s below which friction is unknown; tanh is 0.96 there."""
-EXPLAINED: Final = 1.5
-"""Innovations, of standard deviation 1, above which the second fit does not explain the log."""
+FITS: Final = 1.5
+"""Root mean square of the innovations above which the first fit counts."""
 WRONG: Final = 0.3
 """Residual over the servos' deviation u(t - d) - a above which the fit is wrong."""
 
@@ -228,7 +229,7 @@ class ServoIdentification:
     rounding: float  # standard deviation of the rounding of a measured angle, rad
     ball_joints_tried: bool  # whether friction of the ball joints was fitted
     iterations: int  # evaluations of the fit
-    # (8,) of theta in a second fit that does not explain the log
+    # (8,) of theta from the first fit to the second, 0 if that explains the log
     change: Array = field(default_factory=lambda: np.zeros(len(NAMES)))
 
     @property
@@ -435,9 +436,9 @@ def identify_servos(
     progress.phase("friction of slow cranks unknown")
     white = model.innovations(found.theta, rounding)
     again = _fitted(model, found.theta, found.free, rounding, white)
-    if again.misfit > EXPLAINED:
-        return replace(found, change=again.theta - found.theta)
-    return replace(again, ball_joints_tried=found.ball_joints_tried)
+    kept = again if again.misfit <= FITS else found
+    change = again.theta - found.theta if again.misfit > 1 else kept.change
+    return replace(kept, change=change, ball_joints_tried=found.ball_joints_tried)
 
 
 def _fitted(
