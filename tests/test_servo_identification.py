@@ -115,11 +115,11 @@ def test_the_regression_is_a_start(drake_log):
 
 
 @pytest.mark.slow
-def test_friction_of_ball_joints_is_found(mixed):
+def test_friction_of_ball_joints_is_found():
     """The log is of the same equations with friction; its numbers are unknown to the fit."""
     true = TRUE.copy()
     true[6:] = 0.0127, 0.015
-    log, said = log_of(mixed[0], true), list[str]()
+    log, said = log_of(mixed(5.0), true), list[str]()
     with shown_by(said.append):
         found = identify_servos(log, ROBOT, angle_std(12))
     assert said[:2] == ["servos", "servos, iteration 1 of at most 20"]
@@ -144,22 +144,20 @@ def fits_of(log):
     return plain, identify_servos(log, ROBOT, angle_std(12))
 
 
-@pytest.fixture(scope="module")
-def mixed():
-    """Return the model of a log of 9 s without measurements, and its crank rates (n, 6)."""
-    motion = ROBOT.home + np.vstack(mixed_motion(np.repeat([0.2, 0.005], 3), 9.0, 0.02))
+def mixed(duration):
+    """Return the model of a log in s without measurements."""
+    motion = ROBOT.home + np.vstack(mixed_motion(np.repeat([0.2, 0.005], 3), duration, 0.02))
     setpoints = np.array([ROBOT.crank_angles(pose) for pose in motion])
     times = 0.02 * np.arange(len(setpoints))
     given = ServoLog("log", times, setpoints, setpoints, ROBOT.home[None])
-    model = ServoModel(given, ROBOT, 0.8)
-    rates = np.array([ROBOT.jacobian(x[:6]) @ x[6:] for x in model.states(TRUE)])
-    return model, rates
+    return ServoModel(given, ROBOT, 0.8)
 
 
 @pytest.mark.slow
-def test_cranks_that_stick_do_not_move_the_delay(mixed):
+def test_cranks_that_stick_do_not_move_the_delay():
     """Slow cranks stay behind by two codes, which no friction of the fit explains."""
-    model, rates = mixed
+    model = mixed(5.0)
+    rates = np.array([ROBOT.jacobian(x[:6]) @ x[6:] for x in model.states(TRUE)])
     stuck = -2 * CODE * np.sign(rates) * np.exp(-np.abs(rates) / 0.1)
     plain, found = fits_of(log_of(model, TRUE, stuck))
     error, before = found.theta[0] - DELAY, plain.theta[0] - DELAY
@@ -196,8 +194,8 @@ def with_soft_friction(model, late, lead):
 
 
 @pytest.mark.slow
-def test_friction_that_reverses_early_does_not_move_the_delay(mixed):
-    (model, _), late = mixed, 0.045
+def test_friction_that_reverses_early_does_not_move_the_delay():
+    model, late = mixed(9.0), 0.045
     cranks = rounded(with_soft_friction(model, late, lead=0.02))
     plain, found = fits_of(servo_log("log", model.log.times, model.log.setpoints, cranks, ROBOT))
     error, before = found.theta[0] - late, plain.theta[0] - late
