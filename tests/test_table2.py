@@ -110,6 +110,13 @@ def test_the_table_has_paper_printed_and_reproduced_beside_each_other():
     assert "= 1.28 of the motion" in told[1] and "room for 1.07 of (46)" in told[1]
 
 
+def test_the_verdict_names_the_least_error_and_the_runs_that_ended_early():
+    found = {name: run(name) for name in ("lqr", "delay_lqr", "delay_lqi_200")}
+    best = "delay_lqi_200 has the least error, E_ac 82.0 % s"
+    assert comparison_document(found).verdict == f"{best}; ended early: lqr"
+    assert comparison_document({"lqr": found["lqr"]}).verdict == "no run completed"
+
+
 def test_it_is_shown_once_and_every_row_is_in_the_summary(short):
     text = short.table()
     assert text.count("Table II") == 1 and max(map(len, text.splitlines())) <= 80

@@ -120,6 +120,7 @@ def comparison_document(
     loops = {name: loop_word(run.summary["controller_margin"]) for name, run in results.items()}
     return from_template(
         "comparison",
+        verdict=_best({name: run for _, name, run in runs}),
         table_two=table_two and [_two_row(name, run, results) for name, run in paper.items()],
         papers=not table_two
         and any(is_papers(run.scenario, any_size=True) for run in results.values()),
@@ -128,6 +129,17 @@ def comparison_document(
         cautions=[text for text in _shared_warnings(results) if text not in said],
         **context,
     )
+
+
+def _best(runs: _Runs) -> str:
+    """Return which run has the least error, and which ended early."""
+    early = [name for name, run in runs.items() if run.stopped is not None]
+    if len(early) == len(runs):
+        return "no run completed"
+    errors = {n: e for n, run in runs.items() if math.isfinite(e := run.accumulated_error)}
+    least = min(errors, key=errors.__getitem__, default="")
+    parts = [f"{least} has the least error, E_ac {number(errors[least])} % s"] if least else []
+    return "; ".join([*parts, *([f"ended early: {', '.join(early)}"] if early else [])])
 
 
 def _row(title: str, name: str, run: SimulationResult) -> dict[str, Any]:
