@@ -107,6 +107,18 @@ def test_a_diverging_run_does_not_squash_the_others_and_ends_with_a_cross(compar
     assert legend == ["reference", *(LABELS[name] for name in CONTROLLERS), "run ended"]
 
 
+def test_the_title_of_torques_has_the_largest_and_its_motor(comparison):
+    figure = draw_comparison(comparison)["torques_predictor_lqi"]
+    found = re.search(
+        r"at most (\S+) (m?)N m acted, by motor (\d)", figure.legends[0].get_title().get_text()
+    )
+    assert found
+    peaks = np.abs(comparison["predictor_lqi"].signals.torque_applied.values).max(axis=0)
+    factor = 1e-3 if found[2] else 1.0
+    assert factor * float(found[1]) == pytest.approx(peaks.max(), rel=0.05)
+    assert int(found[3]) == 1 + np.argmax(peaks)
+
+
 def test_a_run_stopped_before_its_first_sample_can_be_drawn(run):
     nothing = dataclasses.replace(
         run,

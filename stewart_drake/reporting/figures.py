@@ -173,7 +173,11 @@ def _torques(run: SimulationResult, label: str, line: Line, commanded: bool = Fa
     if has_packets(run):
         strip = partial(_packet_strip, run=run)
         panels.append(Panel("", xlim=xlim, height=1.15, wide=True, paint=strip))
-    title = "Torques of the motors" if commanded else "Torques that acted"
+    title = "Torques of the motors"
+    if np.isfinite(acted).any():
+        peaks = np.nanmax(np.abs(factor * acted), axis=0)
+        most = int(np.nanargmax(peaks))
+        title += f": at most {peaks[most]:.2g} {unit} acted, by motor {LEGS[most]}"
     return draw(panels, 2, down=True, sharey=True, title=title)
 
 
@@ -238,7 +242,9 @@ def _delay(run: SimulationResult) -> Figure:
         found = Curve(time, value, "estimate", steps=True, band=(low, high, "± 2 σ"))
         xlim = (0.0, shown_until(run))
         panels.append(Panel(name, [truth, found], xlim=xlim, ylim=ylim))
-    return draw(panels, 2, title="Delay as the controller estimates it")
+    title = f"Estimated delay: {signals.delay_estimate.values[-1]:.4g} s at the end"
+    title += f", true {true[-1]:.4g} s" if np.isfinite(true[-1]) else ""
+    return draw(panels, 2, title=title)
 
 
 def weights_figure(runs: Mapping[str, SimulationResult]) -> Figure:
