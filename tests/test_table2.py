@@ -112,7 +112,7 @@ def test_the_table_has_paper_printed_and_reproduced_beside_each_other():
 
 def test_the_verdict_names_the_least_error_and_the_runs_that_ended_early():
     found = {name: run(name) for name in ("lqr", "delay_lqr", "delay_lqi_200")}
-    best = "delay_lqi_200 has the least error, E_ac 82.0 % s"
+    best = "least error: delay_lqi_200, E_ac 82.0 % s"
     assert comparison_document(found).verdict == f"{best}; ended early: lqr"
     assert comparison_document({"lqr": found["lqr"]}).verdict == "no run completed"
 

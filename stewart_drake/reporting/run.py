@@ -138,7 +138,7 @@ def _best(runs: _Runs) -> str:
         return "no run completed"
     errors = {n: e for n, run in runs.items() if math.isfinite(e := run.accumulated_error)}
     least = min(errors, key=errors.__getitem__, default="")
-    parts = [f"{least} has the least error, E_ac {number(errors[least])} % s"] if least else []
+    parts = [f"least error: {least}, E_ac {number(errors[least])} % s"] if least else []
     return "; ".join([*parts, *([f"ended early: {', '.join(early)}"] if early else [])])
 
 
