@@ -213,7 +213,7 @@ def test_without_a_measurement_the_model_goes_on_alone():
 def test_kicks_are_what_early_and_late_torques_do(split, tolerance, late):
     """One change: at the start, within the period, or at the end.
 
-    The last is exact, the others but for what a kick feeds back by the end. A change at a sample
+    The last is exact, the others but for what a effect feeds back by the end. A change at a sample
     has its effect in this period only if it is late, or early: half the variance of both.
     """
     rng = np.random.default_rng(5)
@@ -227,15 +227,15 @@ def test_kicks_are_what_early_and_late_torques_do(split, tolerance, late):
     durations = PERIOD * np.array([split, 1 - split] if inside_period else [1.0])
     after = PLANT.predict(x, acted, durations, 8, theta)[-1]
 
-    c, kicks = core(), np.empty((len(acted) + 1, 12))
+    c, effects = core(), np.empty((len(acted) + 1, 12))
     schedule = [len(acted), c.at(acted), c.at(durations), 8]
     period = c.ffi.new("stewart_interval *", [schedule, c.at(old), c.at(new)])
     machine = machine_of(NominalPlant(PLANT, 1, np.inf, TorqueLimit())).it
-    assert c.lib.stewart_changes(period) == len(kicks)
-    c.lib.stewart_kicks(machine, period, *map(c.at, (after, theta, kicks)))
-    changed = np.flatnonzero(np.any(kicks, axis=1))
+    assert c.lib.stewart_changes(period) == len(effects)
+    c.lib.stewart_timing_effects(machine, period, *map(c.at, (after, theta, effects)))
+    changed = np.flatnonzero(np.any(effects, axis=1))
     assert len(changed) == 1
-    kick = late * kicks[changed[0]] * (1 if inside_period else np.sqrt(2))
+    effect = late * effects[changed[0]] * (1 if inside_period else np.sqrt(2))
 
     if split == 1.0 and late > 0:  # still the old torque when the new one should act
         parts = np.array([PERIOD, late])
@@ -250,9 +250,9 @@ def test_kicks_are_what_early_and_late_torques_do(split, tolerance, late):
     else:
         parts = np.array([split * PERIOD + late, PERIOD * (1 - split) - late])
         moved = PLANT.predict(x, np.array([old, new]), parts, 8, theta)[-1] - after
-    assert relative(moved[6:], kick[6:]) < tolerance
+    assert relative(moved[6:], effect[6:]) < tolerance
     if split < 1:  # else there is no time to move the pose
-        assert relative(moved[:6], kick[:6]) < tolerance
+        assert relative(moved[:6], effect[:6]) < tolerance
 
 
 def test_a_period_of_two_torques_is_two_shorter_ones():

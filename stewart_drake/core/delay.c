@@ -246,7 +246,7 @@ static int linearize_model(void *context, const real *xi, real *H, stewart_scrat
 static int whitened_rows(void *context, const real *xi, real *e, real *H, stewart_scratch scratch)
 {
     Model *a = context;
-    stewart_instant_rows(&a->instant, xi, e, H, scratch);
+    stewart_instant_residuals(&a->instant, xi, e, H, scratch);
     stewart_copy(a->m * a->n, H, a->white);
     for (int i = 0; i < a->m; i++) {
         a->nu[i] = e[i];
@@ -274,7 +274,7 @@ static int set_noise(Model *a, const real *xi, real used, stewart_scratch scratc
     for (int i = 0; i < X; i++) {
         real square = d->filter.model_std[i] * d->filter.model_std[i];
         for (int k = 0; k < a->rows; k++)
-            square += STEWART_ASIDE * a->K[X * k + i] * a->K[X * k + i];
+            square += STEWART_UNCORRELATED * a->K[X * k + i] * a->K[X * k + i];
         a->drift[i] = REAL(sqrt)(square);
     }
     return 1;
@@ -393,7 +393,7 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
     const int free_eta = stewart_norm(n, L + n * STEWART_ETA(n)) > 0;
     const int free_rate = stewart_norm(n, L + n * STEWART_RATE(n)) > 0;
     real *lower = stewart_take(&scratch, n), *upper = stewart_take(&scratch, n);
-    real *C = a->instant.C, distance, spread;
+    real *C = a->instant.C, distance, log_ratio;
     if (std > d->period / 10) {
         if (!best_of_many(a, guess, L, std, xi, scratch)
             || !predict(a->period, xi, &a->path, a->instant.state)
@@ -413,14 +413,14 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
     upper[STEWART_RATE(n)] = free_rate ? LARGEST_RATE : (real)INFINITY;
     const stewart_kalman filter = {
         n, m, std > d->period / 100 ? ITERATIONS : FEW, a->mean, L, lower, upper, a,
-        whitened_rows, stewart_instant_settle, 0, NULL, NULL};
-    if (!stewart_kalman_update(&filter, xi, root, &distance, &spread, scratch))
+        whitened_rows, stewart_instant_step, 0, NULL, NULL};
+    if (!stewart_kalman_update(&filter, xi, root, &distance, &log_ratio, scratch))
         return 0;
     if (!(distance <= d->filter.gate)) /* or NaN */
         return 0;
     for (int i = 0; i < m; i++)
-        spread += 2 * REAL(log)(C[(m + 1) * i]);
-    after->log_likelihood = -(distance + spread) / 2;
+        log_ratio += 2 * REAL(log)(C[(m + 1) * i]);
+    after->log_likelihood = -(distance + log_ratio) / 2;
     after->outliers = 0;
     after->squares += distance;
     after->values += (real)m;
@@ -506,7 +506,7 @@ static int jumped(Model *a, const stewart_guess *guess, real *L, const real *y, 
     const stewart_delay *d = a->period->delay;
     const int n = a->n, p = n - X - 2;
     real jump[STEWART_MAX_ESTIMATED + 2];
-    for (real share = 1; share <= STEWART_LARGEST_JUMP; share *= 10) {
+    for (real share = 1; share <= STEWART_MAX_JUMP; share *= 10) {
         for (int i = 0; i < n - X; i++)
             jump[i] = i < p ? share * d->filter.jump_std[i] : 0;
         stewart_widen_root(n, jump, L, scratch);

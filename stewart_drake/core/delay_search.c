@@ -163,7 +163,7 @@ static int start_of(const stewart_sensing *sensing, const real *y, const real *n
         return 0;
     stewart_transpose(X, W);
     stewart_fill(X * X, 0, root);
-    stewart_absorb(X, X, root, W);
+    stewart_add_root(X, X, root, W);
     stewart_transpose(X, root);
     return 1;
 }
@@ -281,7 +281,7 @@ static void begin_at(const Search *s, const stewart_guess *from, real eta, real 
     for (int i = 0; i < X + p; i++) /* the parameters' rows have columns of the state's, too */
         for (int j = 0; j < p; j++)
             W[p * i + j] = L[n * (X + j) + i];
-    stewart_absorb(p, X + p, R, W);
+    stewart_add_root(p, X + p, R, W);
     copy_guess(n, from, guess);
     stewart_copy(X, state, guess->numbers);
     guess->numbers[STEWART_ETA(n)] = eta;

@@ -21,13 +21,13 @@ static int differences_observe(const stewart_law *law, real *memory, int number,
         return 0;
     }
     if (had_state)
-        stewart_move_on(law, number, torques, state, scratch);
+        stewart_predict_nominal(law, number, torques, state, scratch);
     return complete ? STEWART_MEASUREMENT_REJECTED : STEWART_MEASUREMENT_MISSING;
 }
 
 static int differences_scratch(const stewart_law *law)
 {
-    return X * X + stewart_moving_scratch(law) + stewart_encoder_scratch(law->sensing);
+    return X * X + stewart_nominal_scratch(law) + stewart_encoder_scratch(law->sensing);
 }
 
 const stewart_observer stewart_differences_observer = {

@@ -53,7 +53,7 @@ static stewart_schedule cut(const stewart_schedule *schedule, int n, const real 
 
        H_j = J(q_j) F_j[pose],   R_j = diag(var_j) + diag(s_j^2 J Q J'),
 
-   Q the drift of the pose over a period, which counts as noise here as it does there. A torque that
+   Q the covariance of `end_std`, over a period, which counts as noise here as it does there. A torque that
    changes at t_c by that of an acceleration a_c, late by sigma, adds k_c k_c' to the covariance,
 
        k_c = sigma (s_j - t_c) J(q_j) a_c   at nodes after it.
@@ -73,12 +73,12 @@ typedef struct {
     stewart_reading reading;
     int round, number, kept[MAX_ROWS];
     real *since;      /* (M, changes) s from a change of torque to a node, 0 before it */
-    real *kicks;      /* (number, changes) effects of the torques' timing, whitened, of the rows kept */
+    real *effects;    /* (number, changes) effects of the torques' timing, whitened, of the rows kept */
     real *C;          /* (number, number) Cholesky factor of their covariance */
     const real *rows; /* (number, n) whitened, of those kept */
 } Legs;
 
-static int along(Legs *s, const real *xi, stewart_scratch scratch)
+static int predict_readings(Legs *s, const real *xi, stewart_scratch scratch)
 {
     stewart_attempt *a = s->attempt;
     const stewart_filter *f = a->filter;
@@ -88,8 +88,8 @@ static int along(Legs *s, const real *xi, stewart_scratch scratch)
     if (!stewart_transitions(f->machine, xi, &s->coarse, s->coarse.number <= 2, s->states, X * n, s->H,
                              scratch))
         return 0;
-    stewart_copy(X, s->states + X * last, a->end);
-    a->last = s->H + X * n * last;
+    stewart_copy(X, s->states + X * last, a->end_state);
+    a->transition = s->H + X * n * last;
     if (!a->values)
         return 1;
     stewart_predict(f->machine, xi + X, &s->fine, xi, s->seen);
@@ -106,12 +106,12 @@ static int along(Legs *s, const real *xi, stewart_scratch scratch)
 static int causes_of(const Legs *s, const int *there)
 {
     int causes = s->reading.missing ? STEWART_MISSING : 0;
-    s->attempt->gated = 0;
+    s->attempt->gated_legs = 0;
     for (int leg = 0; leg < LEGS; leg++) {
         int gated = 0;
         for (int row = leg; row < LEGS * s->encoders->nodes; row += LEGS)
             gated = gated || (there[row] && !s->kept[row]);
-        s->attempt->gated += gated && !s->reading.odd[leg];
+        s->attempt->gated_legs += gated && !s->reading.odd[leg];
         const int stuck = gated && s->attempt->history->still[leg] > 0 && !s->reading.odd[leg];
         if (stuck)
             causes |= STEWART_FROZEN;
@@ -121,7 +121,7 @@ static int causes_of(const Legs *s, const int *there)
     return causes;
 }
 
-static int rows_of_legs(void *model, const real *xi, real *e, real *H, stewart_scratch scratch)
+static int residuals_of_legs(void *model, const real *xi, real *e, real *H, stewart_scratch scratch)
 {
     Legs *s = model;
     stewart_attempt *a = s->attempt;
@@ -141,20 +141,20 @@ static int rows_of_legs(void *model, const real *xi, real *e, real *H, stewart_s
             const int row = LEGS * node + leg;
             variance[row] = s->reading.variance[row];
             for (int i = 0; i < 6; i++) {
-                const real moved = share * J[6 * leg + i] * a->drift[i];
+                const real moved = share * J[6 * leg + i] * a->end_std[i];
                 variance[row] += moved * moved;
             }
             for (int c = 0; c < a->changes; c++)
-                s->kicks[a->changes * row + c] = s->since[a->changes * node + c]
-                                                 * stewart_dot(6, J + 6 * leg, a->kicks + X * c + 6);
+                s->effects[a->changes * row + c] = s->since[a->changes * node + c]
+                                                 * stewart_dot(6, J + 6 * leg, a->effects + X * c + 6);
             if (offsets >= 0)
                 H[n * row + X + offsets + leg] += 1;
         }
     }
     if (s->round++ == 0) {
         for (int row = 0; row < rows; row++) {
-            const real *kicks = s->kicks + a->changes * row;
-            real S = variance[row] + a->along * stewart_dot(a->changes, kicks, kicks);
+            const real *effects = s->effects + a->changes * row;
+            real S = variance[row] + a->timing_factor * stewart_dot(a->changes, effects, effects);
             for (int j = 0; j < n; j++) {
                 real seen = 0;
                 for (int i = 0; i < n; i++)
@@ -176,25 +176,25 @@ static int rows_of_legs(void *model, const real *xi, real *e, real *H, stewart_s
         e[number] = residual[row];
         variance[number] = variance[row];
         stewart_copy(n, H + n * row, H + n * number);
-        stewart_copy(a->changes, s->kicks + a->changes * row, s->kicks + a->changes * number);
+        stewart_copy(a->changes, s->effects + a->changes * row, s->effects + a->changes * number);
         number++;
     }
-    stewart_multiply_by_transpose(number, a->changes, number, s->kicks, s->kicks, s->C);
+    stewart_multiply_by_transpose(number, a->changes, number, s->effects, s->effects, s->C);
     for (int i = 0; i < number; i++) {
         for (int j = 0; j <= i; j++)
-            s->C[number * i + j] *= a->along;
+            s->C[number * i + j] *= a->timing_factor;
         s->C[(number + 1) * i] += variance[i];
     }
     if (!stewart_cholesky(number, s->C))
         return -1;
     stewart_whiten(number, 1, s->C, e);
     stewart_whiten(number, n, s->C, H);
-    stewart_whiten(number, a->changes, s->C, s->kicks);
+    stewart_whiten(number, a->changes, s->C, s->effects);
     s->rows = H;
     return s->number = number;
 }
 
-static int settle_legs(void *model, const real *xi, const real *better, stewart_scratch scratch)
+static int step_legs(void *model, const real *xi, const real *better, stewart_scratch scratch)
 {
     Legs *s = model;
     const int n = s->attempt->n;
@@ -207,7 +207,7 @@ static int settle_legs(void *model, const real *xi, const real *better, stewart_
     }
     if (small)
         return 1;
-    return along(s, better, scratch) ? 0 : -1;
+    return predict_readings(s, better, scratch) ? 0 : -1;
 }
 
 /* Take the scratch memory of an attempt, and cut the period. */
@@ -244,7 +244,7 @@ static stewart_scratch prepare(Legs *s, stewart_scratch scratch)
             since -= c + 1 < changes ? schedule->durations[c] : 0;
         }
     }
-    s->kicks = stewart_take(&scratch, LEGS * M * changes);
+    s->effects = stewart_take(&scratch, LEGS * M * changes);
     s->C = stewart_take(&scratch, LEGS * M * LEGS * M);
     s->states = stewart_take(&scratch, X * s->coarse.number);
     s->H = stewart_take(&scratch, X * n * s->coarse.number);
@@ -257,26 +257,26 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
     const stewart_schedule *schedule = &a->period->schedule;
     const stewart_history *history = a->history;
     Legs s = {.attempt = a, .encoders = f->sensing->kind};
-    real *xi = a->after->mean, distance = 0, spread;
+    real *xi = a->after->mean, distance = 0, log_ratio;
     real innovations[MAX_ROWS], variances[MAX_ROWS];
     scratch = prepare(&s, scratch);
-    if (!along(&s, xi, scratch))
+    if (!predict_readings(&s, xi, scratch))
         return 0;
-    stewart_attempt_predicted(a);
+    stewart_attempt_noise(a);
     if (!a->values)
-        return stewart_attempt_ended(a, scratch);
+        return stewart_attempt_finish(a, scratch);
     stewart_read(s.encoders, a->values, s.shown, history->last, history->still, &s.reading, scratch);
     const stewart_kalman update = {a->n,     LEGS * s.encoders->nodes, ITERATIONS, a->prior->mean,
-                                   a->prior->root, f->lower, f->upper, &s, rows_of_legs, settle_legs,
+                                   a->prior->root, f->lower, f->upper, &s, residuals_of_legs, step_legs,
                                    0, innovations, variances};
-    if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &spread, scratch))
+    if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &log_ratio, scratch))
         return 0;
     *a->after->squares += distance;
     *a->after->values += (real)s.number;
-    stewart_attempt_learn(a, s.number, innovations, variances, s.rows, s.kicks);
+    stewart_attempt_learn(a, s.number, innovations, variances, s.rows, s.effects);
     stewart_predict(f->machine, xi + X, schedule, xi, s.seen);
-    stewart_copy(X, s.seen + X * (schedule->number - 1), a->end);
-    return stewart_attempt_ended(a, scratch);
+    stewart_copy(X, s.seen + X * (schedule->number - 1), a->end_state);
+    return stewart_attempt_finish(a, scratch);
 }
 
 static int attempt_scratch(const stewart_filter *filter, int torques)
@@ -289,7 +289,7 @@ static int attempt_scratch(const stewart_filter *filter, int torques)
     return legs + X * (n + 1) * coarse + stewart_kalman_scratch(n, LEGS * M) + N;
 }
 
-static int moved(const stewart_filter *filter, const real *state, real *B, stewart_scratch scratch)
+static int pose_changes(const stewart_filter *filter, const real *state, real *B, stewart_scratch scratch)
 {
     const stewart_encoders *encoders = filter->sensing->kind;
     real *J = stewart_take(&scratch, LEGS * 6);
@@ -297,7 +297,7 @@ static int moved(const stewart_filter *filter, const real *state, real *B, stewa
            && stewart_solve(LEGS, filter->machine->estimated, J, B);
 }
 
-const stewart_legs stewart_encoder_legs = {attempt, attempt_scratch, moved, stewart_count_still};
+const stewart_legs stewart_encoder_legs = {attempt, attempt_scratch, pose_changes, stewart_count_still};
 
 stewart_sensing stewart_encoder_instants(const void *sensor)
 {

@@ -16,7 +16,7 @@
 #define MOST_CHANGED ((real)0.01) /* the largest for a single outlier */
 #define MOST_AGREEING ((real)0.3) /* the largest if the last outlier agrees, or the prior is untested */
 #define YOUNG 3                   /* measurements that test the prior */
-#define HOPELESS 100              /* gates: after a first iteration beyond this an update is given up */
+#define MAX_DISTANCE 100          /* gates: after a first iteration beyond this an update is given up */
 
 int stewart_posterior_size(int n, int m)
 {
@@ -42,26 +42,26 @@ static int is_known(const stewart_filter *filter, const real *root, real share)
     return 1;
 }
 
-void stewart_attempt_predicted(stewart_attempt *a)
+void stewart_attempt_noise(stewart_attempt *a)
 {
     const stewart_filter *f = a->filter;
     const real t = a->prior->noise->timing;
-    const real aside = is_known(f, a->prior->root, DIRECTED) ? STEWART_ASIDE : 1;
-    a->along = (1 - aside) * t;
-    stewart_kicks(f->machine, a->period, a->end, a->after->mean + X, a->kicks);
+    const real uncorrelated = is_known(f, a->prior->root, DIRECTED) ? STEWART_UNCORRELATED : 1;
+    a->timing_factor = (1 - uncorrelated) * t;
+    stewart_timing_effects(f->machine, a->period, a->end_state, a->after->mean + X, a->effects);
     for (int i = 0; i < X; i++) {
         real square = f->model_std[i] * f->model_std[i];
         for (int k = 0; k < a->changes; k++) {
-            real *kick = a->kicks + X * k + i;
-            *kick *= f->timing_std;
-            square += aside * t * *kick * *kick;
-            a->late[X * k + i] = REAL(sqrt)(a->along) * *kick;
+            real *effect = a->effects + X * k + i;
+            *effect *= f->timing_std;
+            square += uncorrelated * t * *effect * *effect;
+            a->timing_root[X * k + i] = REAL(sqrt)(a->timing_factor) * *effect;
         }
-        a->drift[i] = REAL(sqrt)(square);
+        a->end_std[i] = REAL(sqrt)(square);
     }
 }
 
-int stewart_attempt_ended(stewart_attempt *a, stewart_scratch scratch)
+int stewart_attempt_finish(stewart_attempt *a, stewart_scratch scratch)
 {
     const int n = a->n;
     const stewart_posterior *after = a->after;
@@ -72,8 +72,9 @@ int stewart_attempt_ended(stewart_attempt *a, stewart_scratch scratch)
         const real own = a->filter->walk_std[i], wander = a->filter->wander_std[i];
         walk[i] = REAL(sqrt)(own * own + after->noise->used * wander * wander);
     }
-    stewart_root_of_prediction(n, a->last, a->drift, walk, a->changes, a->late, after->root, scratch);
-    stewart_copy(X, a->end, after->mean);
+    stewart_root_of_prediction(n, a->transition, a->end_std, walk, a->changes, a->timing_root, after->root,
+                               scratch);
+    stewart_copy(X, a->end_state, after->mean);
     *after->left_out = (real)a->left_out;
     return stewart_all_finite(n, after->mean) && stewart_all_finite(n * n, after->root);
 }
@@ -103,12 +104,12 @@ static int linearize(void *context, const real *xi, real *H, stewart_scratch scr
                                s->fourth_order, s->states, 0, H, scratch);
 }
 
-/* Predict and linearise from the prior's mean, or copy the last result from `kept` if the mean is the same. */
+/* Predict and linearise from the prior's mean, or take the result from `cache` if the mean is the same. */
 static int begin(Sample *s, const real *xi, real *end, stewart_scratch scratch)
 {
     const int n = s->attempt->n;
-    real *kept = s->attempt->kept, *mean = kept + 1, *last = mean + n, *H = last + X;
-    int same = kept[0] == (real)s->fourth_order;
+    real *cache = s->attempt->cache, *mean = cache + 1, *last = mean + n, *H = last + X;
+    int same = cache[0] == (real)s->fourth_order;
     for (int i = 0; i < n && same; i++)
         same = mean[i] == xi[i];
     if (same) {
@@ -118,32 +119,32 @@ static int begin(Sample *s, const real *xi, real *end, stewart_scratch scratch)
     }
     if (!predict(s, xi, end) || !linearize(s, xi, s->instant.H, scratch))
         return 0;
-    kept[0] = (real)s->fourth_order;
+    cache[0] = (real)s->fourth_order;
     stewart_copy(n, xi, mean);
     stewart_copy(X, end, last);
     stewart_copy(X * n, s->instant.H, H);
     return 1;
 }
 
-static int kept_numbers(int n) { return 1 + n + X + X * n; }
+static int cache_size(int n) { return 1 + n + X + X * n; }
 
 void stewart_attempt_learn(const stewart_attempt *a, int m, const real *innovations,
-                           const real *variances, const real *H, const real *kicks)
+                           const real *variances, const real *H, const real *effects)
 {
     const stewart_filter *f = a->filter;
     stewart_noise_learn(m, innovations, variances, a->n - X, H, f->wander_std,
-                        f->learns_timing ? a->changes : 0, kicks, f->keep, a->after->noise);
+                        f->learns_timing ? a->changes : 0, effects, f->forgetting, a->after->noise);
 }
 
 static void learn(const Sample *s, const real *innovations, const real *variances, stewart_scratch scratch)
 {
     const stewart_instant *at = &s->instant;
     const int m = at->sensing->size, changes = s->attempt->changes;
-    real *H = stewart_take(&scratch, m * at->n), *kicks = stewart_take(&scratch, m * changes);
+    real *H = stewart_take(&scratch, m * at->n), *effects = stewart_take(&scratch, m * changes);
     stewart_instant_derivative(at, H);
-    stewart_apply_jacobian(at->sensing, at->J, changes, s->attempt->kicks, kicks);
-    stewart_whiten(m, changes, at->C, kicks);
-    stewart_attempt_learn(s->attempt, m, innovations, variances, H, kicks);
+    stewart_apply_jacobian(at->sensing, at->J, changes, s->attempt->effects, effects);
+    stewart_whiten(m, changes, at->C, effects);
+    stewart_attempt_learn(s->attempt, m, innovations, variances, H, effects);
 }
 
 static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
@@ -153,27 +154,28 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     const int n = a->n, m = f->sensing->size, pieces = a->period->schedule.number;
     /* Corrections of known parameters are too small to need F to fourth order. */
     Sample s = {.attempt = a, .fourth_order = !is_known(f, prior->root, KNOWN)};
-    real *xi = a->after->mean, spread;
+    real *xi = a->after->mean, log_ratio;
     real *innovations = stewart_take(&scratch, m), *variances = stewart_take(&scratch, m);
-    s.instant = (stewart_instant){f->sensing, a->values, n,  a->end,  NULL,
+    s.instant = (stewart_instant){f->sensing, a->values, n,  a->end_state,  NULL,
                                   NULL,       NULL,      &s, predict, linearize};
     s.instant.C = stewart_take(&scratch, m * m);
     s.instant.J = stewart_take(&scratch, m * X);
     s.states = stewart_take(&scratch, X * pieces);
-    a->last = s.instant.H = stewart_take(&scratch, X * n);
-    if (!begin(&s, xi, a->end, scratch))
+    a->transition = s.instant.H = stewart_take(&scratch, X * n);
+    if (!begin(&s, xi, a->end_state, scratch))
         return 0;
-    stewart_attempt_predicted(a);
+    stewart_attempt_noise(a);
     if (!a->values)
-        return stewart_attempt_ended(a, scratch);
-    if (!stewart_innovation_root(f->sensing, a->end, a->changes, a->late, a->drift, s.instant.C, scratch))
+        return stewart_attempt_finish(a, scratch);
+    if (!stewart_innovation_root(f->sensing, a->end_state, a->changes, a->timing_root, a->end_std,
+                                 s.instant.C, scratch))
         return 0;
     const stewart_kalman update = {n, m, ITERATIONS, prior->mean, prior->root, f->lower, f->upper, &s,
-                                   stewart_instant_rows, stewart_instant_settle, a->hopeless,
+                                   stewart_instant_residuals, stewart_instant_step, a->max_distance,
                                    innovations, variances};
-    if (!stewart_kalman_update(&update, xi, a->after->root, &a->distance, &spread, scratch))
+    if (!stewart_kalman_update(&update, xi, a->after->root, &a->distance, &log_ratio, scratch))
         return 0;
-    a->likelihood = -(a->distance + spread) / 2;
+    a->likelihood = -(a->distance + log_ratio) / 2;
     for (int i = 0; i < m; i++)
         a->likelihood -= REAL(log)(s.instant.C[(m + 1) * i]);
     if (!(a->distance <= f->gate)) /* or NaN */
@@ -181,14 +183,14 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     *a->after->squares += a->distance;
     *a->after->values += (real)m;
     learn(&s, innovations, variances, scratch);
-    return stewart_attempt_ended(a, scratch);
+    return stewart_attempt_finish(a, scratch);
 }
 
 /* Compute `after`; the attempt may be repeated with other values or another prior. Returns 0 for an
    outlier, or without a finite result. */
 static int attempt(stewart_attempt *a, stewart_scratch scratch)
 {
-    a->left_out = a->gated = 0;
+    a->left_out = a->gated_legs = 0;
     a->likelihood = -(real)INFINITY;
     stewart_copy(a->n, a->prior->mean, a->after->mean);
     *a->after->squares = *a->prior->squares;
@@ -212,7 +214,7 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
         return 0;
     if (offsets >= 0) { /* an error d of the offsets makes an error -J^-1 d of the pose */
         stewart_copy(LEGS * p, filter->prior_root + p * offsets, back);
-        if (!filter->legs->moved(filter, state, back, scratch))
+        if (!filter->legs->pose_changes(filter, state, back, scratch))
             return 0;
     }
     stewart_fill(n * n, 0, e.root);
@@ -226,7 +228,7 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
     }
     stewart_copy(X, state, e.mean);
     stewart_fill(m, (real)NAN, e.outlier);
-    *e.outliers = *e.unseen = *e.left_out = 0;
+    *e.outliers = *e.age = *e.left_out = 0;
     return 1;
 }
 
@@ -248,10 +250,10 @@ static int attempt_changed(stewart_attempt *a, const stewart_posterior *now,
 static int jump(stewart_attempt *a, const stewart_posterior *now, const stewart_posterior *before,
                 stewart_scratch scratch)
 {
-    const real largest = a->gated == 1 ? 1 : STEWART_LARGEST_JUMP;
+    const real largest = a->gated_legs == 1 ? 1 : STEWART_MAX_JUMP;
     a->prior = before;
     for (real share = 1; share <= largest; share *= 10)
-        if (attempt_changed(a, now, before, a->filter->jump_std, share, scratch) && !a->gated)
+        if (attempt_changed(a, now, before, a->filter->jump_std, share, scratch) && !a->gated_legs)
             return 1;
     a->prior = now;
     return 0;
@@ -262,7 +264,7 @@ static void accept(int n, int m, const stewart_posterior *found, stewart_posteri
     stewart_copy(n, found->mean, now->mean);
     stewart_copy(n * n, found->root, now->root);
     stewart_fill(m, (real)NAN, now->outlier);
-    *now->outliers = *now->unseen = 0;
+    *now->outliers = *now->age = 0;
     *now->left_out = *found->left_out;
     *now->squares = *found->squares;
     *now->values = *found->values;
@@ -291,7 +293,7 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
     real late = without, untimely = 0;
     int found = 0;
     a->prior = before;
-    a->hopeless = HOPELESS * filter->gate;
+    a->max_distance = MAX_DISTANCE * filter->gate;
     stewart_copy(size, now->mean, before->mean);
     for (real t = UNTIMELY; filter->learns_timing && t <= LATEST; t *= 10) {
         if (now->noise->timing >= t)
@@ -302,9 +304,9 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
             untimely = t;
         }
     }
-    /* The largest share has the least distance: if that one is hopeless, all are. */
+    /* The largest share has the least distance: if the update gives up there, it does for all. */
     const real *std = filter->usual_std;
-    if (attempt_changed(a, now, before, std, most, scratch) || a->distance <= a->hopeless)
+    if (attempt_changed(a, now, before, std, most, scratch) || a->distance <= a->max_distance)
         for (real share = CHANGED; !found && share <= most; share *= REAL(sqrt)(10))
             found = attempt_changed(a, now, before, std, share, scratch);
     if (untimely > 0 && !(found && a->likelihood >= late)) {
@@ -317,7 +319,7 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
         a->after->noise->known_timing = 0; /* what is known of it holds near its former value only */
     }
     a->prior = now;
-    a->hopeless = 0;
+    a->max_distance = 0;
     return found;
 }
 
@@ -330,18 +332,18 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
     stewart_posterior now = stewart_posterior_at(estimate, n, m);
     stewart_posterior after = stewart_posterior_at(first, n, m);
     stewart_posterior before = stewart_posterior_at(second, n, m);
-    const real unseen = *now.unseen + 1, *theta = now.mean + X;
+    const real age = *now.age + 1, *theta = now.mean + X;
     real outliers = 1;
     stewart_attempt a = {.filter = filter, .n = n, .period = period, .prior = &now,
                          .values = values, .history = history, .after = &after};
-    a.kept = stewart_take(&scratch, kept_numbers(n));
-    a.kept[0] = (real)NAN;
+    a.cache = stewart_take(&scratch, cache_size(n));
+    a.cache[0] = (real)NAN;
     a.changes = stewart_changes(period);
-    a.kicks = stewart_take(&scratch, X * a.changes);
-    a.late = stewart_take(&scratch, X * a.changes);
+    a.effects = stewart_take(&scratch, X * a.changes);
+    a.timing_root = stewart_take(&scratch, X * a.changes);
     int fits = values && attempt(&a, scratch);
     const real without = without_cause(&a);
-    if (values && filter->jump_std && (!fits || a.gated)) {
+    if (values && filter->jump_std && (!fits || a.gated_legs)) {
         if (jump(&a, &now, &before, scratch)) {
             accept(n, m, &after, &now);
             return;
@@ -349,7 +351,7 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
         fits = fits && attempt(&a, scratch);
     }
     if (fits) {
-        const int lost = *now.unseen >= STEWART_PATIENCE && !is_known(filter, now.root, LEARNT);
+        const int lost = *now.age >= STEWART_PATIENCE && !is_known(filter, now.root, LEARNT);
         if (!lost || !stewart_filter_start(filter, values, theta, after.mean, estimate, scratch))
             accept(n, m, &after, &now);
         return;
@@ -375,7 +377,7 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
         return;
     if (predicted)
         accept(n, m, &after, &now);
-    *now.unseen = unseen;
+    *now.age = age;
     if (values) {
         *now.outliers = outliers;
         stewart_copy(m, values, now.outlier);
@@ -389,5 +391,5 @@ int stewart_filter_scratch(const stewart_filter *filter, int torques)
     const int sample = m * (m + 3 + X) + m * (torques + 1) + X * (n + torques) + stewart_kalman_scratch(n, m);
     const int step = legs ? legs->scratch(filter, torques) : sample;
     const int within = step + stewart_transitions_scratch(p) + 2 * n * n + (X + 3 + torques) * n;
-    return 2 * stewart_posterior_size(n, m) + kept_numbers(n) + 2 * X * (torques + 1) + within;
+    return 2 * stewart_posterior_size(n, m) + cache_size(n) + 2 * X * (torques + 1) + within;
 }

@@ -23,7 +23,7 @@ typedef struct {
     real *root;     /* L (n, n), covariance L L'; NaN where nothing is estimated */
     real *outlier;  /* (m) the last outlier, NaN without one */
     real *outliers; /* consecutive ones that agree with each other, up to the last measurement */
-    real *unseen;   /* periods since a measurement was last used */
+    real *age;      /* periods since a measurement was last used */
     real *left_out; /* reasons for left-out values of that measurement, bits as of a `fault` */
     real *squares;  /* sum of nu' S^-1 nu of all measurements that were used */
     real *values;   /* number of values in them */
@@ -51,7 +51,7 @@ typedef struct {
     const real *walk_std;   /* (p) change of a parameter in a period; 0 for a constant */
     const real *jump_std;   /* (p) sudden change of a parameter; 0 for a constant; NULL for none */
     const real *wander_std; /* (p) assumed change in a period, if innovations show one (noise.h) */
-    real keep;              /* forgetting factor of the noise's information, per period */
+    real forgetting;        /* factor on the information about the noise, per period */
     const real *lower;      /* (n), infinite for the state */
     const real *upper;
 } stewart_filter;

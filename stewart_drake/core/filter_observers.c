@@ -4,16 +4,17 @@
 #include "filter_observers.h"
 #include "short.h"
 
+/* Number of estimated parameters. */
 static int estimated(const stewart_law *law) { return law->machine.estimated; }
 
-static int estimate_numbers(const stewart_law *law)
+static int posterior_size(const stewart_law *law)
 {
     return stewart_posterior_size(X + estimated(law), law->measured);
 }
 
 static int filtered_memory(const stewart_law *law)
 {
-    return estimate_numbers(law) + law->measured + LEGS;
+    return posterior_size(law) + law->measured + LEGS;
 }
 
 /* Views of the memory, in its order. */
@@ -25,7 +26,7 @@ typedef struct {
 
 static Filtered filtered_at(const stewart_law *law, real *memory)
 {
-    real *values = memory + estimate_numbers(law);
+    real *values = memory + posterior_size(law);
     return (Filtered){stewart_posterior_at(memory, X + estimated(law), law->measured), values,
                       values + law->measured};
 }
@@ -38,7 +39,7 @@ static void filtered_restart(const stewart_law *law, real *memory)
     stewart_fill(X, (real)NAN, e.mean);
     stewart_fill(n * n, (real)NAN, e.root);
     stewart_fill(law->measured, (real)NAN, e.outlier);
-    *e.outliers = *e.unseen = *e.left_out = 0;
+    *e.outliers = *e.age = *e.left_out = 0;
     stewart_fill(LEGS, 0, f.still);
 }
 
@@ -102,13 +103,13 @@ static int filtered_observe(const stewart_law *law, real *memory, int number, co
     const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, f.values);
     const stewart_interval period = last_interval(law, number, torques, &scratch);
     const stewart_history history = {last, f.still};
-    int same = 1;
+    int repeated = 1; /* whether all values are the last ones */
     if (sensing.legs)
         sensing.legs->count_still(&sensing, values, f.values, f.still);
     stewart_copy(m, f.values, last);
     stewart_keep_last(m, values, f.values);
     for (int i = 0; i < m; i++)
-        same &= values[i] == last[i];
+        repeated &= values[i] == last[i];
     if (isnan(e.root[0])) {
         const int had_state = stewart_all_finite(X, e.mean);
         real *theta = stewart_take(&scratch, n);
@@ -117,11 +118,11 @@ static int filtered_observe(const stewart_law *law, real *memory, int number, co
                                            scratch))
             return 0;
         if (had_state)
-            stewart_move_on(law, number, torques, e.mean, scratch);
+            stewart_predict_nominal(law, number, torques, e.mean, scratch);
         return fault << STEWART_CAUSES_AT;
     }
     stewart_filter_advance(&filter, &period, fault ? NULL : values, &history, memory, scratch);
-    if (*e.outliers > 0 && same) { /* a repeated outlier does not confirm the one before */
+    if (*e.outliers > 0 && repeated) { /* a repeated outlier does not confirm the one before */
         *e.outliers = 0;
         return STEWART_MEASUREMENT_FROZEN;
     }
@@ -133,15 +134,19 @@ static int filtered_scratch(const stewart_law *law)
 {
     const stewart_sensing sensing = stewart_sensing_of(law);
     const stewart_filter filter = filter_of(law, &sensing);
-    const int parts = law->parts > 0 ? law->parts * STEWART_REPORTED : 2;
-    return law->measured + X + estimated(law) + (U + 1) * parts + stewart_moving_scratch(law) +
-           stewart_filter_scratch(&filter, parts);
+    const int most = law->parts > 0 ? law->parts * STEWART_REPORTED : 2; /* torques in a period */
+    return law->measured + X + estimated(law) + (U + 1) * most + stewart_nominal_scratch(law) +
+           stewart_filter_scratch(&filter, most);
 }
 
 const stewart_observer stewart_filter_observer = {
-    filtered_memory,  filtered_scratch,    filtered_start, filtered_observe,
-    filtered_restart, filtered_parameters, NULL,           NULL,
-    filtered_uncertainty,
+    .memory = filtered_memory,
+    .scratch = filtered_scratch,
+    .start = filtered_start,
+    .observe = filtered_observe,
+    .restart = filtered_restart,
+    .parameters = filtered_parameters,
+    .uncertainty = filtered_uncertainty,
 };
 
 /* ---- over gaps -----------------------------------------------------------------------------------
@@ -161,27 +166,27 @@ const stewart_observer stewart_filter_observer = {
 
 #define LONGEST_GAP 10 /* periods; after more the filter continues from its prediction */
 
-enum { GAP_TORQUES = 2 * (LONGEST_GAP + 1) };
+enum { GAP_TORQUES = 2 * (LONGEST_GAP + 1) }; /* two in each period, that of the measurement included */
 
 /* Views of the memory after that of the filter, in its order. */
 typedef struct {
     real *anchor;    /* estimate, as of the filter */
     real *torques;   /* (GAP_TORQUES, 6) since the anchor, N m */
     real *durations; /* (GAP_TORQUES) s */
-    real *pieces;    /* number of both */
+    real *pieces;    /* number of torques and durations */
     real *periods;   /* number of periods since the anchor; 0 without one */
 } Gap;
 
 static Gap gap_at(const stewart_law *law, real *memory)
 {
-    real *anchor = memory + filtered_memory(law), *torques = anchor + estimate_numbers(law);
+    real *anchor = memory + filtered_memory(law), *torques = anchor + posterior_size(law);
     real *durations = torques + U * GAP_TORQUES, *counts = durations + GAP_TORQUES;
     return (Gap){anchor, torques, durations, counts, counts + 1};
 }
 
 static int gap_memory(const stewart_law *law)
 {
-    return filtered_memory(law) + estimate_numbers(law) + (U + 1) * GAP_TORQUES + 2;
+    return filtered_memory(law) + posterior_size(law) + (U + 1) * GAP_TORQUES + 2;
 }
 
 static void gap_start(const stewart_law *law, real *memory)
@@ -193,35 +198,35 @@ static void gap_start(const stewart_law *law, real *memory)
 static int gap_observe(const stewart_law *law, real *memory, int number, const real *torques,
                        const real *values, stewart_scratch scratch)
 {
-    const int size = estimate_numbers(law), n = X + estimated(law), m = law->measured;
+    const int size = posterior_size(law), n = X + estimated(law), m = law->measured;
     const stewart_filter_settings *settings = law->estimation;
     const Filtered now = filtered_at(law, memory);
     const Gap gap = gap_at(law, memory);
-    real *known = stewart_take(&scratch, size), *last = stewart_take(&scratch, m);
-    real longer[X], walk[STEWART_MAX_ESTIMATED], wander[STEWART_MAX_ESTIMATED];
+    real *old = stewart_take(&scratch, size), *last = stewart_take(&scratch, m);
+    real gap_std[X], gap_walk[STEWART_MAX_ESTIMATED], gap_wander[STEWART_MAX_ESTIMATED];
     const stewart_sensing sensing = stewart_sensing_of(law);
     stewart_filter filter = filter_of(law, &sensing);
-    stewart_copy(size, memory, known);
+    stewart_copy(size, memory, old);
     stewart_copy(m, now.values, last);
-    const stewart_posterior before = stewart_posterior_at(known, n, m);
+    const stewart_posterior before = stewart_posterior_at(old, n, m);
     const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, last);
     const int status = filtered_observe(law, memory, number, torques, values, scratch);
     const int had_anchor = *gap.periods > 0, parts = (int)*gap.pieces;
     stewart_interval period = last_interval(law, number, torques, &scratch);
     const stewart_history history = {last, NULL};
     const int unusable = isnan(before.root[0]) || *before.outliers > 0 || *gap.periods >= LONGEST_GAP;
-    const int unseen = *now.estimate.unseen > *before.unseen && !(*now.estimate.outliers > 0);
-    if (!unusable && (unseen || had_anchor)) {
+    const int unused = *now.estimate.age > *before.age && !(*now.estimate.outliers > 0);
+    if (!unusable && (unused || had_anchor)) {
         if (!had_anchor)
-            stewart_copy(size, known, gap.anchor);
+            stewart_copy(size, old, gap.anchor);
         stewart_copy(U * period.schedule.number, period.schedule.torques, gap.torques + U * parts);
         stewart_copy(period.schedule.number, period.schedule.durations, gap.durations + parts);
         *gap.pieces += (real)period.schedule.number;
         *gap.periods += 1;
     }
-    if (!unusable && unseen)
+    if (!unusable && unused)
         return status;
-    const real passed = *gap.periods, h = law->period;
+    const real steps = *gap.periods, h = law->period;
     period.schedule = (stewart_schedule){(int)*gap.pieces, gap.torques, gap.durations, 0};
     *gap.periods = *gap.pieces = 0;
     if (unusable || !had_anchor || fault)
@@ -229,18 +234,18 @@ static int gap_observe(const stewart_law *law, real *memory, int number, const r
     period.schedule.substeps = stewart_substeps(&law->machine, period.schedule.number, gap.torques);
     for (int i = 0; i < 6; i++) {
         const real pose = settings->filter.model_std[i], rate = settings->filter.model_std[6 + i];
-        const real drifts = (passed - 1) * passed * (2 * passed - 1) / 6 * h * h;
-        longer[i] = REAL(sqrt)(passed * pose * pose + drifts * rate * rate);
-        longer[6 + i] = REAL(sqrt)(passed * rate * rate);
+        const real squares = (steps - 1) * steps * (2 * steps - 1) / 6; /* 0^2 + .. + (steps - 1)^2 */
+        gap_std[i] = REAL(sqrt)(steps * pose * pose + squares * h * h * rate * rate);
+        gap_std[6 + i] = REAL(sqrt)(steps * rate * rate);
     }
     for (int i = 0; i < estimated(law); i++) {
-        walk[i] = REAL(sqrt)(passed) * filter.walk_std[i];
-        wander[i] = REAL(sqrt)(passed) * filter.wander_std[i];
+        gap_walk[i] = REAL(sqrt)(steps) * filter.walk_std[i];
+        gap_wander[i] = REAL(sqrt)(steps) * filter.wander_std[i];
     }
-    filter.model_std = longer;
-    filter.walk_std = walk;
-    filter.wander_std = wander;
-    filter.keep = REAL(pow)(filter.keep, passed);
+    filter.model_std = gap_std;
+    filter.walk_std = gap_walk;
+    filter.wander_std = gap_wander;
+    filter.forgetting = REAL(pow)(filter.forgetting, steps);
     stewart_filter_advance(&filter, &period, values, &history, gap.anchor, scratch);
     if (*stewart_posterior_at(gap.anchor, n, m).outliers > 0)
         return status;
@@ -252,12 +257,16 @@ static int gap_scratch(const stewart_law *law)
 {
     const stewart_sensing sensing = stewart_sensing_of(law);
     const stewart_filter filter = filter_of(law, &sensing);
-    return filtered_scratch(law) + estimate_numbers(law) + law->measured +
+    return filtered_scratch(law) + posterior_size(law) + law->measured +
            (U + 1) * 2 + stewart_filter_scratch(&filter, GAP_TORQUES);
 }
 
 const stewart_observer stewart_gap_observer = {
-    gap_memory,       gap_scratch,         gap_start, gap_observe,
-    filtered_restart, filtered_parameters, NULL,      NULL,
-    filtered_uncertainty,
+    .memory = gap_memory,
+    .scratch = gap_scratch,
+    .start = gap_start,
+    .observe = gap_observe,
+    .restart = filtered_restart,
+    .parameters = filtered_parameters,
+    .uncertainty = filtered_uncertainty,
 };

@@ -74,7 +74,7 @@ void stewart_instant_derivative(const stewart_instant *a, real *H)
     stewart_whiten(m, a->n, a->C, H);
 }
 
-int stewart_instant_rows(void *model, const real *xi, real *e, real *H, stewart_scratch scratch)
+int stewart_instant_residuals(void *model, const real *xi, real *e, real *H, stewart_scratch scratch)
 {
     const stewart_instant *a = model;
     const int m = a->sensing->size;
@@ -105,7 +105,7 @@ static int is_small(const stewart_instant *a, const real *change, stewart_scratc
     return 1;
 }
 
-int stewart_instant_settle(void *model, const real *xi, const real *better, stewart_scratch scratch)
+int stewart_instant_step(void *model, const real *xi, const real *better, stewart_scratch scratch)
 {
     const stewart_instant *a = model;
     real shift[X], linearised[X];

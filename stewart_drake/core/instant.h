@@ -16,7 +16,7 @@ void stewart_apply_jacobian(const stewart_sensing *sensing, const real *J, int k
                           real *JA);
 
 /* Share of the variance of late torques (rows of A below) that is added to `std`, as uncorrelated noise. */
-#define STEWART_ASIDE ((real)0.01)
+#define STEWART_UNCORRELATED ((real)0.01)
 
 /* C (m, m), lower triangular, with C C' = J (A'A + diag(std)^2) J' + diag(noise)^2 at a state, A (k, 12).
    Returns 0 where it does not exist. Scratch: m (12 + k) numbers. */
@@ -47,5 +47,5 @@ void stewart_instant_derivative(const stewart_instant *a, real *H);
 /* Callbacks of a `stewart_kalman` whose `model` has a `stewart_instant` as its first member. Iteration
    ends at a correction below 0.1 standard deviations: the linearisation error, of second order, is then
    negligible. */
-int stewart_instant_rows(void *model, const real *xi, real *e, real *H, stewart_scratch scratch);
-int stewart_instant_settle(void *model, const real *xi, const real *better, stewart_scratch scratch);
+int stewart_instant_residuals(void *model, const real *xi, real *e, real *H, stewart_scratch scratch);
+int stewart_instant_step(void *model, const real *xi, const real *better, stewart_scratch scratch);

@@ -62,7 +62,7 @@ static void reflect_six(int n, int m, real v, const real *f, real beta, real *ro
 }
 
 /* Householder reflections of row k of R and all rows of W make column k of W zero. */
-void stewart_absorb(int n, int m, real *R, real *W)
+void stewart_add_root(int n, int m, real *R, real *W)
 {
     for (int k = 0; k < n && m > 0; k++) {
         real *row = R + n * k, square = row[k] * row[k];
@@ -103,7 +103,7 @@ void stewart_root_of_prediction(int n, const real *H, const real *std, const rea
         stewart_fill(n, 0, W + n * (n + row));
         stewart_copy(X, K + X * row, W + n * (n + row));
     }
-    stewart_absorb(n, n + k, R, W);
+    stewart_add_root(n, n + k, R, W);
     for (int i = 0; i < n; i++)
         for (int j = 0; j < n; j++)
             L[n * i + j] = j <= i ? R[n * j + i] : 0;
@@ -213,9 +213,9 @@ int stewart_within_bounds(int n, const real *mean, const real *L, const real *lo
     return 1;
 }
 
-int stewart_kalman_scratch(int n, int most)
+int stewart_kalman_scratch(int n, int max_rows)
 {
-    return most + most * n + (most + n + 1) * (n + 1) + 2 * n + MAX_ACTIVE * MAX_ACTIVE;
+    return max_rows + max_rows * n + (max_rows + n + 1) * (n + 1) + 2 * n + MAX_ACTIVE * MAX_ACTIVE;
 }
 
 /* With whitened residuals the updated mean is xi = mean + L z, with z the minimum of
@@ -228,14 +228,14 @@ int stewart_kalman_scratch(int n, int most)
 
    nu' S^-1 nu = d^2 and |S| / |C C'| = |1 + W W'| = |R|^2. No covariance is subtracted from another. */
 int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, real *distance,
-                          real *spread, stewart_scratch scratch)
+                          real *log_ratio, stewart_scratch scratch)
 {
     const int n = filter->n, N = n + 1;
-    real *e = stewart_take(&scratch, filter->most), *H = stewart_take(&scratch, filter->most * n);
-    real *R = stewart_take(&scratch, N * N), *W = stewart_take(&scratch, filter->most * N);
+    real *e = stewart_take(&scratch, filter->max_rows), *H = stewart_take(&scratch, filter->max_rows * n);
+    real *R = stewart_take(&scratch, N * N), *W = stewart_take(&scratch, filter->max_rows * N);
     real *change = stewart_take(&scratch, n), *updated = change; /* in turn */
     for (int round = 0; round < filter->iterations; round++) {
-        const int m = filter->rows(filter->model, xi, e, H, scratch);
+        const int m = filter->residuals(filter->model, xi, e, H, scratch);
         if (m < 0)
             return 0;
         for (int k = 0; k < n; k++)
@@ -254,10 +254,10 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
         stewart_fill(N * N, 0, R);
         for (int i = 0; i < n; i++)
             R[(N + 1) * i] = 1;
-        stewart_absorb(N, m, R, W);
-        *spread = 0;
+        stewart_add_root(N, m, R, W);
+        *log_ratio = 0;
         for (int i = 0; i < n; i++)
-            *spread += 2 * REAL(log)(REAL(fabs)(R[(N + 1) * i]));
+            *log_ratio += 2 * REAL(log)(REAL(fabs)(R[(N + 1) * i]));
         *distance = R[N * n + n] * R[N * n + n];
         if (round == 0 && filter->max_distance > 0 && !(*distance <= filter->max_distance)) /* or NaN */
             return 0;
@@ -277,11 +277,11 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
         stewart_copy(n, updated, R);
         if (!stewart_within_bounds(n, R, root, filter->lower, filter->upper, updated, scratch))
             return 0;
-        const int settled = filter->settle(filter->model, xi, updated, scratch);
+        const int status = filter->step(filter->model, xi, updated, scratch);
         stewart_copy(n, updated, xi);
-        if (settled < 0)
+        if (status < 0)
             return 0;
-        if (settled)
+        if (status)
             break;
     }
     return 1;

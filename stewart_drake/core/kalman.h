@@ -4,43 +4,45 @@
 
 #include "matrix.h"
 
-#define STEWART_LARGEST_JUMP ((real)100) /* of a parameter, in its standard deviations jump_std */
-#define STEWART_MAX_BOUNDED 21 /* components that may be at a bound at a time */
+#define STEWART_MAX_JUMP ((real)100) /* largest factor on the `jump_std` of parameters that is tried */
+#define STEWART_MAX_BOUNDED 21       /* components that may be at a bound at a time */
 
 /* Prior N(mean, L L') of xi (n), and the model of a measurement.
 
-   `rows` computes the residuals e (m) at xi and H (m, n), the derivative of the prediction, both
-   whitened: with R = C C' they are C^-1 e and C^-1 H. Returns m, at most `most`, or -1 if xi has no
-   prediction. Values that are left out have no row.
+   `residuals` computes e = y - h(xi) (m) and H = dh/dxi (m, n), both whitened: with noise of covariance
+   R = C C' they are C^-1 e and C^-1 H. Values that are left out have no row. Returns m, at most
+   `max_rows`, or -1 if xi has no prediction.
 
-   `settle` moves from `xi` to `better`, the result of an iteration, and linearises there unless the
+   `step` ends an iteration, which led from `xi` to `better`. It linearises at `better`, unless the
    correction is small. Returns 1 for a small correction, which ends the iterations, 0 for another one,
    or -1 if `better` has no prediction. */
 typedef struct {
-    int n, most, iterations;
-    const real *mean, *root;   /* (n), L (n, n) */
+    int n, max_rows;
+    int iterations;            /* at the most */
+    const real *mean, *root;   /* prior: (n), L (n, n) */
     const real *lower, *upper; /* (n), infinite without a bound */
     void *model;
-    int (*rows)(void *model, const real *xi, real *e, real *H, stewart_scratch scratch);
-    int (*settle)(void *model, const real *xi, const real *better, stewart_scratch scratch);
-    real max_distance; /* of the first iteration, above which the update is given up; 0: none */
-    real *innovations, *variances; /* (most) results, NULL: none: nu and the diagonal of S, both whitened */
+    int (*residuals)(void *model, const real *xi, real *e, real *H, stewart_scratch scratch);
+    int (*step)(void *model, const real *xi, const real *better, stewart_scratch scratch);
+    real max_distance; /* the update is given up if the first iteration's `distance` is larger; 0: never */
+    real *innovations; /* (max_rows) result nu, whitened; or NULL */
+    real *variances;   /* (max_rows) result, diagonal of S, whitened; or NULL */
 } stewart_kalman;
 
-/* Compute the mean xi (n), from a first guess in its place, and the root (n, n) of its covariance, which
-   must not be that of the prior. `distance` is nu' S^-1 nu of the last innovation
-   nu = e + H (xi - mean), with S = H P H' + R, and `spread` is ln |S| - ln |R|. Returns 0 if there is no
+/* Compute the updated mean xi (n), which holds a first guess before, and the root (n, n) of its covariance.
+   `root` must be other memory than that of the prior. `distance` is nu' S^-1 nu of the last innovation
+   nu = e + H (xi - mean), with S = H P H' + R, and `log_ratio` is ln |S| - ln |R|. Returns 0 if there is no
    prediction, for NaN in a bounded mean, or if it is given up; the caller checks all other numbers.
 
    Scratch: `stewart_kalman_scratch` numbers, and what the model takes. */
 int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, real *distance,
-                          real *spread, stewart_scratch scratch);
+                          real *log_ratio, stewart_scratch scratch);
 
-int stewart_kalman_scratch(int n, int most);
+int stewart_kalman_scratch(int n, int max_rows);
 
-/* R (n, n), upper triangular, <- R of the QR decomposition of [R; W]; W (m, n) is lost. With covariances
-   R'R and W'W that is the root of their sum. */
-void stewart_absorb(int n, int m, real *R, real *W);
+/* R (n, n) <- root of R'R + W'W, the sum of two covariances, by the QR decomposition of [R; W]. R is upper
+   triangular; W (m, n) is overwritten. */
+void stewart_add_root(int n, int m, real *R, real *W);
 
 /* L (n, n) <- root of F L L' F' + diag(std, walk)^2 + [K'K, 0; 0, 0], F = [H; 0 1] with H (12, n), std
    (12), walk (n - 12) and K (k, 12). Scratch: (2 n + k) n numbers. */

@@ -1,18 +1,18 @@
-/* Crank angles of a pose, their Jacobian, and the pose of crank angles. */
+/* Inverse kinematics (crank angles of a pose), its Jacobian, and forward kinematics. */
 
 #pragma once
 
 #include "dynamics.h"
 #include "matrix.h"
 
-/* Leg i, with q = p_SQ_S from the shaft centre to the plate joint in the motor's frame, crank length u
-   and rod length l: the crank tip is u [cos(alpha), sin(alpha), 0] from the shaft centre and must lie
-   at distance l from the joint,
+/* Points: P the plate's origin, and of each leg S the shaft centre, T the crank tip, Q the plate joint;
+   p_AB leads from A to B. With q = p_SQ in the motor's frame, crank length u and rod length l, the tip is
+   at u [cos(alpha), sin(alpha), 0] from S, and at the distance l from Q:
 
        A cos(alpha) + B sin(alpha) = C,   A = 2 u q_x,  B = 2 u q_y,  C = q.q + u^2 - l^2,
        alpha = atan2(B, A) + e acos(C / hypot(A, B)),   e = -1 or +1 the crank branch.
 
-   `geometry` is that of a machine, see dynamics.h. */
+   `geometry` is that of a machine, and a pose is roll, pitch, yaw, x, y, z; see dynamics.h. */
 
 /* Crank angles (6) in rad at a pose (6); NaN where a leg does not reach. */
 void stewart_crank_angles(const real *geometry, const real *pose, real *angles);
@@ -27,12 +27,12 @@ int stewart_is_workable(const real *geometry, const real *pose);
 
        u rod.tangent alpha_dot = [(p_PQ x rod)' E, rod'] rates,
 
-   T the crank tip, rod = p_TQ, tangent = the tip's direction of motion, E the map from rates of roll,
-   pitch and yaw to the angular velocity. Returns 0, and J of NaN, where a leg does not reach, or is at
+   rod = p_TQ, tangent = the tip's direction of motion, E the map from rates of roll, pitch and yaw to the
+   angular velocity. Returns 0, and J of NaN, where a leg does not reach, or is at
    its dead centre. */
 int stewart_crank_jacobian(const real *geometry, const real *pose, real *J);
 
-/* The pose (6) with these crank angles (6), from a guess in its place. Newton's method with halving
+/* The pose (6) with these crank angles (6); `pose` holds a guess before. Newton's method with halving
    steps on f_i = |p_TQ|^2 / l^2 - 1 from crank tip to plate joint, which stays smooth through dead
    centres and outside the workspace. A pose on the other side of a parallel singularity than the guess
    is another assembly. If Newton ends in another assembly, the angles of the guess are moved to `angles`

@@ -23,12 +23,12 @@ static real scored(real factor, real slope, real information)
 }
 
 void stewart_noise_learn(int m, const real *innovations, const real *variances, int p, const real *H,
-                         const real *wander, int changes, const real *kicks, real keep,
+                         const real *wander, int changes, const real *effects, real forgetting,
                          stewart_noise *noise)
 {
     real wander_slope = 0, total = 0;
-    noise->known_timing *= keep;
-    noise->known_wander *= keep;
+    noise->known_timing *= forgetting;
+    noise->known_wander *= forgetting;
     for (int i = 0; i < m; i++) {
         real W = 0, S = variances[i];
         total += innovations[i] * innovations[i] / S;
@@ -46,7 +46,7 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
     for (int c = 0; c < changes; c++) {
         real a = 0, b = 0;
         for (int i = 0; i < m; i++) {
-            const real k = kicks[changes * i + c];
+            const real k = effects[changes * i + c];
             a += k * innovations[i] / variances[i];
             b += k * k / variances[i];
         }
@@ -62,7 +62,7 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
     noise->timing = found < LATEST ? found : LATEST;
     noise->wander = scored(noise->wander, wander_slope, noise->known_wander);
     const real excess = noise->wander - SURE / REAL(sqrt)(noise->known_wander);
-    noise->used *= REAL(sqrt)(keep);
+    noise->used *= REAL(sqrt)(forgetting);
     if (excess > 0 || noise->timing > UNTIMELY) /* not for NaN */
         noise->asked += (real)m;
     if (WIDER * excess > noise->used)
@@ -71,8 +71,8 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
 
 int stewart_changes(const stewart_interval *period) { return period->schedule.number + 1; }
 
-void stewart_kicks(const stewart_machine *machine, const stewart_interval *period, const real *state,
-                   const real *theta, real *kicks)
+void stewart_timing_effects(const stewart_machine *machine, const stewart_interval *period,
+                            const real *state, const real *theta, real *effects)
 {
     const stewart_schedule *schedule = &period->schedule;
     const int number = schedule->number;
@@ -82,13 +82,13 @@ void stewart_kicks(const stewart_machine *machine, const stewart_interval *perio
     for (int k = 0; k < number; k++)
         remaining += schedule->durations[k];
     stewart_accelerate(&belief, state, period->preceding, before);
-    for (int k = 0; k <= number; k++, kicks += X) {
+    for (int k = 0; k <= number; k++, effects += X) {
         const real share = k == 0 || k == number ? SQRT_HALF : 1;
         const real *torque = k < number ? schedule->torques + U * k : period->following;
         stewart_accelerate(&belief, state, torque, after);
         for (int i = 0; i < 6; i++) {
-            kicks[6 + i] = share * (before[i] - after[i]);
-            kicks[i] = remaining * kicks[6 + i];
+            effects[6 + i] = share * (before[i] - after[i]);
+            effects[i] = remaining * effects[6 + i];
             before[i] = after[i];
         }
         remaining = k + 1 < number ? remaining - schedule->durations[k] : 0;

@@ -13,7 +13,7 @@
        g_w = 1/2 sum_i W_ii (nu_i^2 - S_ii) / S_ii^2,   I_w = 1/2 sum_i W_ii^2 / S_ii^2,
 
    a_c = k_c' S^-1 nu and b_c = k_c' S^-1 k_c, and Fisher scoring is t <- t + g / J, with J the sum of
-   the information; each period keeps the share `keep` of J. r is the mean square of the innovation
+   the information; each period keeps the share `forgetting` of J. r is the mean square of the innovation
    across all k_c, but at least 1: where the model is wrong in every direction, the timing is not the
    cause. In the slope of w, nu_i^2 / S_ii - 1 is at most ODD, so that a few values do not decide.
 
@@ -39,19 +39,19 @@ typedef struct {
 void stewart_noise_start(stewart_noise *noise);
 
 /* Update the factors by values (m) with innovations nu and variances S. H (m, 12 + p) is the derivative of
-   the values by state and parameters a period before, `kicks` (m, changes) the effects of torques on them
-   at t = 1, and `wander` (p) the standard deviations of the parameters at w = 1; both may be 0. `keep` is
-   the share of J that is kept in a period. */
+   the values by state and parameters a period before, `effects` (m, changes) the effects of torques on them
+   at t = 1, and `wander` (p) the changes of the parameters at w = 1, as standard deviations; both may be 0.
+   `forgetting` is the share of J that is kept in a period. */
 void stewart_noise_learn(int m, const real *innovations, const real *variances, int p, const real *H,
-                         const real *wander, int changes, const real *kicks, real keep,
+                         const real *wander, int changes, const real *effects, real forgetting,
                          stewart_noise *noise);
 
 /* Changes of torque in a period, those at both of its samples included. */
 int stewart_changes(const stewart_interval *period);
 
-/* kicks (changes, 12) <- change of the state at the period's end, per second that a torque comes late. To
+/* effects (changes, 12) <- change of the state at the period's end, per second that a torque comes late. To
    first order the acceleration differs by B dT for that time: this stays in the rates, and moves the
    pose for the rest of the period. A torque that changes at a sample acts in the period after it if it is
    late and in the one before if it is early: each has half the variance. */
-void stewart_kicks(const stewart_machine *machine, const stewart_interval *period, const real *state,
-                   const real *theta, real *kicks);
+void stewart_timing_effects(const stewart_machine *machine, const stewart_interval *period,
+                            const real *state, const real *theta, real *effects);

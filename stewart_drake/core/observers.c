@@ -5,8 +5,8 @@
 
 static int estimated(const stewart_law *law) { return law->machine.estimated; }
 
-void stewart_move_on(const stewart_law *law, int number, const real *torques, real *state,
-                     stewart_scratch scratch)
+void stewart_predict_nominal(const stewart_law *law, int number, const real *torques, real *state,
+                             stewart_scratch scratch)
 {
     const stewart_schedule schedule = stewart_last_periods(law, number, torques, 1, &scratch).schedule;
     real *states = stewart_take(&scratch, X * schedule.number);
@@ -14,7 +14,7 @@ void stewart_move_on(const stewart_law *law, int number, const real *torques, re
     stewart_copy(X, states + X * (schedule.number - 1), state);
 }
 
-int stewart_moving_scratch(const stewart_law *law)
+int stewart_nominal_scratch(const stewart_law *law)
 {
     return (X + U + 1) * (law->parts > 0 ? law->parts : 2) + 2;
 }
@@ -60,11 +60,11 @@ static int state_observe(const stewart_law *law, real *memory, int number, const
     stewart_keep_last(law->measured, values, last);
     if ((fault || !sensing.start(&sensing, values, had_state ? state : NULL, state, root, scratch))
         && had_state)
-        stewart_move_on(law, number, torques, state, scratch);
+        stewart_predict_nominal(law, number, torques, state, scratch);
     return fault << STEWART_CAUSES_AT;
 }
 
-static int state_scratch(const stewart_law *law) { return X * X + stewart_moving_scratch(law); }
+static int state_scratch(const stewart_law *law) { return X * X + stewart_nominal_scratch(law); }
 
 const stewart_observer stewart_state_observer = {
     stewart_plain_memory,  state_scratch,            stewart_plain_start, state_observe,

@@ -1,22 +1,26 @@
-/* Observers without a filter, of a plate with a known delay. Their memory is a state and the last
-   measurement. */
+/* Observers of a known delay that take the measured state as it is, without a covariance. Their memory is
+   a state and the last measurement. */
 
 #pragma once
 
 #include "law.h"
 
-extern const stewart_observer stewart_state_observer;       /* of the measured state */
-extern const stewart_observer stewart_timing_observer;      /* that also learns when torques come */
-extern const stewart_observer stewart_differences_observer; /* of encoders */
+/* The state as measured. */
+extern const stewart_observer stewart_state_observer;
+/* The same; it also learns by how much the timing of torques varies. */
+extern const stewart_observer stewart_timing_observer;
+/* The pose from encoders, and rates by differences of poses. */
+extern const stewart_observer stewart_differences_observer;
 
-/* Predict the state (12) a period later with the known parameters; and scratch memory for it. */
-void stewart_move_on(const stewart_law *law, int number, const real *torques, real *state,
-                     stewart_scratch scratch);
-int stewart_moving_scratch(const stewart_law *law);
+/* Advance the state (12) by a period with the nominal parameters; and the scratch memory for it. */
+void stewart_predict_nominal(const stewart_law *law, int number, const real *torques, real *state,
+                             stewart_scratch scratch);
+int stewart_nominal_scratch(const stewart_law *law);
 
-/* Keep the finite values. */
+/* Copy the finite ones of `values` to `last`. */
 void stewart_keep_last(int number, const real *values, real *last);
 
+/* Parts of these observers: functions of the same names in `stewart_observer`. */
 int stewart_plain_memory(const stewart_law *law);
 void stewart_plain_start(const stewart_law *law, real *memory);
 void stewart_plain_restart(const stewart_law *law, real *memory);

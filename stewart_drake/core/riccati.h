@@ -4,7 +4,7 @@
 
 #include "matrix.h"
 
-#define STEWART_MAX_ORDER 24 /* states: pose, rates, integral, and a torque that is still to act */
+#define STEWART_MAX_ORDER 24 /* states: pose, rates, integral, and the previous torque */
 #define STEWART_INPUTS 6
 
 /* Gain K (6, n) of u = -K x that minimises sum x'Qx + u'Ru of x+ = A x + B u, and P (n, n), its cost

@@ -106,7 +106,7 @@ static int timing_observe(const stewart_law *law, real *memory, int number, cons
     }
     const stewart_interval period = stewart_last_periods(law, number, torques, 1, &scratch);
     const stewart_schedule *schedule = &period.schedule;
-    stewart_move_on(law, number, torques, predicted, scratch);
+    stewart_predict_nominal(law, number, torques, predicted, scratch);
     impulse_between(law, predicted, memory, u);
     const int within = schedule->number > 1;
     const real *first = schedule->torques;
@@ -124,7 +124,7 @@ static int timing_observe(const stewart_law *law, real *memory, int number, cons
 
 static int timing_scratch(const stewart_law *law)
 {
-    return stewart_state_observer.scratch(law) + stewart_moving_scratch(law);
+    return stewart_state_observer.scratch(law) + stewart_nominal_scratch(law);
 }
 
 static real timing_uncertainty(const stewart_law *law, const real *memory, real *L)

@@ -138,7 +138,7 @@ class FilterSettings:
     # assumed change of a parameter in a period, as a share of its usual standard deviation,
     # if innovations show that parameters change (core/noise.h); 0: constants
     wander: float = 0.0
-    keep: float = 1.0  # forgetting factor of the noise estimate, per period
+    forgetting: float = 1.0  # factor on the information about the noise, per period
 
 
 EXACT = 1e-6
@@ -297,5 +297,5 @@ def filter_settings(
         parameters.jump,
         learns_timing=learns and timing_std is None,
         wander=math.sqrt(period) if learns else 0.0,
-        keep=math.exp(-period / NOISE_MEMORY),
+        forgetting=math.exp(-period / NOISE_MEMORY),
     )

@@ -270,7 +270,8 @@ def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
     if settings.jump_std is not None:
         arrays["jump_std"] = numbers(settings.jump_std, p)
     it.prior, it.filter.gate, it.filter.timing_std = c.at(prior), _gate(size), settings.timing_std
-    it.filter.learns_timing, it.filter.keep = settings.learns_timing, settings.keep
+    it.filter.learns_timing = settings.learns_timing
+    it.filter.forgetting = settings.forgetting
     it.filter.offsets = known.names.index(OFFSETS[0]) if OFFSETS[0] in known.names else -1
     for name, array in arrays.items():
         setattr(it.filter, name, c.at(array))
