@@ -13,7 +13,7 @@ from stewart_drake.loop.clearance import ClearanceScene, Pair
 from stewart_drake.loop.preparation import assemble as made
 from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.clearance import (
-    APART,
+    LINK_PAIRS,
     LINKS,
     center_lines,
     clearances,
@@ -77,10 +77,12 @@ def test_every_pair_is_looked_at_but_those_that_meet_in_a_joint():
     names = {frozenset(pair) for pair in ClearanceScene(PAPER).pairs}
     links = {frozenset(pair) for pair in ClearanceScene(PAPER, base=False).pairs}
     assert links == {p for p in names if not Pair(*sorted(p)).fixed}
-    assert links == {frozenset((LINKS[i], LINKS[j])) for i, j in APART} | {
+    assert links == {frozenset((LINKS[i], LINKS[j])) for i, j in LINK_PAIRS} | {
         frozenset(("plate", f"crank {leg}")) for leg in LEG
     }
-    assert len(APART) == 60 and all(frozenset((f"crank {k}", f"rod {k}")) not in links for k in LEG)
+    assert len(LINK_PAIRS) == 60 and all(
+        frozenset((f"crank {k}", f"rod {k}")) not in links for k in LEG
+    )
     for first, second in product(LEG, LEG):
         # A crank turns about its own motor, a rod does not.
         assert (frozenset((f"motor {first}", f"crank {second}")) in names) == (first != second)
@@ -172,7 +174,7 @@ def test_capsules_are_never_further_apart_than_the_links_in_them(seed):
     low = clearances(mechanism, pose[None], legs_along(mechanism, pose[None]))[0]
     scene = ClearanceScene(mechanism, base=False)
     found = {frozenset(p): d for p, d in zip(scene.pairs, scene.distances(pose), strict=True)}
-    for (i, j), least in zip(APART, low, strict=True):
+    for (i, j), least in zip(LINK_PAIRS, low, strict=True):
         if least > 0:
             assert found[frozenset((LINKS[i], LINKS[j]))] >= least - 1e-6
 

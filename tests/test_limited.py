@@ -23,7 +23,7 @@ from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.law_design import clear_space, compose_law, way_onto
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.mechanism.clearance import APART
+from stewart_drake.mechanism.clearance import LINK_PAIRS
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.reporting.run import run_document
 from stewart_drake.scenario.delay import Delay
@@ -233,9 +233,9 @@ def test_slopes_of_the_distances_are_their_derivatives(paper):
 
 def test_pairs_that_touch_on_the_reference_are_not_guarded():
     touching = clear_space(prepare(load_scenario("paper")))
-    names = {APART[pair] for pair in touching.pairs}
+    names = {LINK_PAIRS[pair] for pair in touching.pairs}
     assert (0, 1) not in names and (0, 2) in names  # cranks 1 and 2 touch at home
-    assert len(clear_space(prepare(load_scenario("desktop"))).pairs) == len(APART)
+    assert len(clear_space(prepare(load_scenario("desktop"))).pairs) == len(LINK_PAIRS)
 
 
 # ---------------------------------------------------------------- the law

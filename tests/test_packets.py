@@ -526,7 +526,7 @@ def test_bounds_are_alike_where_the_seeds_do_not_tell_them_apart(known_outcomes)
     assert document(study).tone == "fair"
     assert document(replace(study, bounds=cells[:2])).tone == "good"
     many = [cells[0]._replace(runs=8, errors=(*common, *common)), cells[4]._replace(runs=8)]
-    assert replace(study, bounds=many).hardly_lost == []  # 3 of 8 against 8 of 8
+    assert replace(study, bounds=many).unconfirmed_losses == []  # 3 of 8 against 8 of 8
 
 
 def test_the_worst_run_has_an_interval_from_runs_that_chose_nothing(known_outcomes):

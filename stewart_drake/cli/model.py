@@ -94,7 +94,7 @@ def new(
     from stewart_drake.studies import new_machine as study
 
     delivery = delivery.into(folder)
-    study.check_free(folder)
+    study.refuse_existing(folder)
     if form:
         from stewart_drake.reporting.machine_form import MachineForm
 

@@ -13,14 +13,15 @@ NO_ROOM: Final = 1
 
 
 class Link:
-    """State machine of events. Its memory, a vector of numbers, is the caller's.
+    """Functions of a link. Its state is a vector of numbers, `memory`, that the caller keeps.
 
     Args:
         size: numbers of a command.
         max_waiting: greatest number of waiting commands.
-        period: from each command of a plan to the next, in the unit of all times.
-        is_wire: whether commands act when they arrive.
-        hold_when_dry: whether a dry buffer holds the last command, or puts out zero.
+        period: time between the commands of a plan, in any unit, which is that of all times here.
+        is_wire: whether it is a wire, on which commands act when they arrive, or a buffer.
+        hold_when_dry: whether a buffer without a command for its period (dry) holds the last one,
+            or puts out zero.
         history: number of past commands in memory.
         time_tolerance: times closer than this are equal.
         limit: greatest absolute value of each number of a command.
@@ -40,14 +41,22 @@ class Link:
     ) -> None:
         c = core()
         self._core, self.size, self.history = c, size, history
-        values = (
-            *(size, max_waiting, history, is_wire, hold_when_dry),
-            *(period, time_tolerance, limit),
+        self.data: Any = c.ffi.new(
+            "stewart_link *",
+            {
+                "size": size,
+                "max_waiting": max_waiting,
+                "history": history,
+                "is_wire": is_wire,
+                "hold_when_dry": hold_when_dry,
+                "period": period,
+                "time_tolerance": time_tolerance,
+                "limit": limit,
+            },
         )
-        self.data: Any = c.ffi.new("stewart_link *", values)
 
-    def _call(self, name: str, *given: Any) -> Any:
-        return self._core.call(f"link_{name}", self.data, *given)
+    def _call(self, name: str, *arguments: Any) -> Any:
+        return self._core.call(f"link_{name}", self.data, *arguments)
 
     def start(self) -> Array:
         """Return the memory of an empty link."""
@@ -73,15 +82,15 @@ class Link:
         arrival: float = -math.inf,
     ) -> int:
         """Take a plan (n, size), see core/link.h. Return 0, or the reason for its refusal."""
-        given = now, sequence, arrival, first, len(commands), np.array(commands, np.float64)
-        return int(self._call("take", memory, *given))
+        rows = np.array(commands, np.float64)
+        return int(self._call("take", memory, now, sequence, arrival, first, len(rows), rows))
 
     def next_change(self, memory: Array) -> float:
         """Return when `change` is to be called next, or infinity."""
         return float(self._call("next", memory))
 
     def change(self, memory: Array, time: float) -> None:
-        """Let the command act that is due at a time."""
+        """Let the newest command that is due at a time act; a buffer without one goes dry."""
         self._call("change", memory, time)
 
     def reset(self, memory: Array, time: float, holds: bool) -> None:
@@ -94,5 +103,5 @@ class Link:
         return memory[begin : begin + self.history * (1 + self.size)].reshape(self.history, -1)
 
     def number(self, memory: Array, name: str) -> float:
-        """Return a number of the memory by its name in core/link.h, for example `offered`."""
+        """Return a number of the memory; `offered` is STEWART_LINK_OFFERED of core/link.h."""
         return float(memory[getattr(self._core.lib, f"STEWART_LINK_{name.upper()}")])

@@ -32,19 +32,19 @@ class Table:
     """Columns of a file in SI units."""
 
     path: Path  # of the file
-    header: str  # description of the expected header
+    header: str  # description of the expected header, for messages
     labels: dict[str, str]  # by name, the header's cell of each column that was read
     scales: dict[str, float]  # by name, the factor to SI units
-    lines: NDArray[np.intp]  # (n,) line number of each row
+    lines: NDArray[np.intp]  # (n,) row of each sample in the file, where the header is row 1
     columns: dict[str, Array]  # by name, the numbers (n,); NaN for an empty cell
 
-    def place(self, row: int, name: str | None = None) -> str:
-        """Return the opening of a message about a row, or about one of its cells."""
+    def location(self, row: int, name: str | None = None) -> str:
+        """Return file, row and column, with which a message on a row or its cell begins."""
         column = "" if name is None else f", column {self.labels[name]}"
         return f"{self.path}: row {self.lines[row]}{column}"
 
     def stacked(self, names: Iterable[str]) -> Array:
-        """Return columns (n, k); a missing one is an error."""
+        """Return the named columns (n, k); a missing one is an error."""
         for name in names:
             if name not in self.columns:
                 raise ConfigError(
@@ -66,15 +66,15 @@ def read_table(
 
     Args:
         path: a UTF-8 file of at most 100 MB.
-        expected: description of the file, closing a message.
+        expected: description of the file, at the end of messages.
         header: description of its header, likewise.
         units: of all columns that it may have.
-        prefix: of columns whose names, without it, are in `units`. In a file that has such columns
-            and none of these names without it, apart from `time`, all other columns are ignored.
+        prefix: that the names in `units` may have in the file. If only columns with the prefix
+            are in `units`, apart from `time`, all columns without it are ignored.
         optional: names of columns whose cells may be empty.
 
     Raises:
-        ConfigError: one line, opened by the path, with row and column where there are such.
+        ConfigError: one line that begins with the path, and the row and column if there are any.
     """
     raw = read_bytes(path, _MAX_BYTES, expected)
     try:
@@ -99,17 +99,18 @@ def read_table(
     first = cells.iloc[0].tolist()
     columns: dict[str, Array] = {}
     labels, scales = {}, {}
-    for at, name, scale in _columns(path, first, header, units, prefix):
-        labels[name], scales[name] = first[at], scale
-        texts = cells[at].iloc[lines[1:] - 1]
-        # Read by Python's float, whose last digit is right.
-        there = pd.to_numeric(texts, errors="coerce").notna()
-        values = texts.where(there, "nan").to_numpy(np.float64)
-        allowed = (texts == "").to_numpy() & (name in optional)
-        for row in np.flatnonzero(~(np.isfinite(values) | allowed))[:1]:
+    for column, name, scale in _columns(path, first, header, units, prefix):
+        labels[name], scales[name] = first[column], scale
+        texts = cells[column].iloc[lines[1:] - 1]
+        # Converted by Python's float: that of pandas may round the last digit wrongly.
+        is_number = pd.to_numeric(texts, errors="coerce").notna()
+        values = texts.where(is_number, "nan").to_numpy(np.float64)
+        may_be_empty = (texts == "").to_numpy() & (name in optional)
+        wrong = np.flatnonzero(~(np.isfinite(values) | may_be_empty))
+        if len(wrong):
             raise ConfigError(
-                f"{path}: row {lines[1:][row]}, column {first[at]}: got {texts.iloc[row]!r}; "
-                "expected a finite number"
+                f"{path}: row {lines[1:][wrong[0]]}, column {first[column]}: got "
+                f"{texts.iloc[wrong[0]]!r}; expected a finite number"
             )
         columns[name] = values * scale
     return Table(path, header, labels, scales, lines[1:], columns)
@@ -118,7 +119,7 @@ def read_table(
 def _columns(
     path: Path, first: list[str], header: str, units: Units, prefix: str | None
 ) -> list[tuple[int, str, float]]:
-    """Return place, name and factor to SI units of the columns to read."""
+    """Return index, name and factor to SI units of the columns to read."""
     for separator in (";", "\t"):
         if separator in first[0]:
             raise ConfigError(
@@ -133,20 +134,20 @@ def _columns(
     prefixed = {name for name in names if prefix and name.startswith(prefix)}
     only_prefixed = prefixed and not names & known
     columns: dict[str, tuple[int, str, float]] = {}
-    for at, (label, unit) in enumerate(found):
+    for index, (label, unit) in enumerate(found):
         if only_prefixed and label not in prefixed and label != "time":
             continue
         name = label.removeprefix(prefix or "")
         if name not in units or name in columns:
             problem = "a second" if name in columns else "an unknown"
             raise ConfigError(
-                f"{path}: row 1: got {problem} column {brief(first[at])}; expected {header}"
+                f"{path}: row 1: got {problem} column {brief(first[index])}; expected {header}"
             )
         scale = units[name].get(unit) or units[name].get(unit.lower())
         if scale is None:
             raise ConfigError(
-                f"{path}: row 1: got column {brief(first[at])}; expected {name} in "
+                f"{path}: row 1: got column {brief(first[index])}; expected {name} in "
                 f"{' or '.join(units[name])}"
             )
-        columns[name] = (at, name, scale)
+        columns[name] = (index, name, scale)
     return list(columns.values())

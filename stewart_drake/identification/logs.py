@@ -224,7 +224,7 @@ def _require_radians(table: Table, mechanism: Mechanism) -> None:
         off = np.abs(table.columns[name] - home[name])
         for bad in np.flatnonzero(off > 2 * np.pi)[:1]:
             raise ConfigError(
-                f"{table.place(bad, name)}: got {table.columns[name][bad]:.4g} rad, more than a "
+                f"{table.location(bad, name)}: got {table.columns[name][bad]:.4g} rad, more than a "
                 f"turn from home, {home[name]:.4g} rad; expected radians, or [deg] in the header"
             )
 
@@ -239,14 +239,14 @@ def _of_csv(path: Path, mechanism: Mechanism, precision: Precision, gravity: flo
         values[:, part] = table.stacked(names)
     for bad in 1 + np.flatnonzero(~(np.diff(time) > 0))[:1]:
         raise ConfigError(
-            f"{table.place(bad, 'time')}: got {time[bad]:.9g} s after {time[bad - 1]:.9g} s; "
+            f"{table.location(bad, 'time')}: got {time[bad]:.9g} s after {time[bad - 1]:.9g} s; "
             "expected increasing times"
         )
     _require_radians(table, mechanism)
     there = np.isfinite(torques)
     for bad in np.flatnonzero(there.any(axis=1) != there.all(axis=1))[:1]:
         raise ConfigError(
-            f"{table.place(bad)}: got some of the six torques; expected all or none of them"
+            f"{table.location(bad)}: got some of the six torques; expected all or none of them"
         )
     rows = np.flatnonzero(there.all(axis=1))
     # A repeated torque continues, so only changes are kept.

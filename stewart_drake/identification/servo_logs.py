@@ -48,7 +48,7 @@ def read_servo_log(path: Path, mechanism: Mechanism) -> ServoLog:
     gaps = np.diff(times)
     for bad in 1 + np.flatnonzero(~((gaps > 0) & (gaps <= _LONGEST_GAP)))[:1]:
         raise ConfigError(
-            f"{table.place(bad, 'time')}: got {times[bad]:.9g} s after {times[bad - 1]:.9g} s; "
+            f"{table.location(bad, 'time')}: got {times[bad]:.9g} s after {times[bad - 1]:.9g} s; "
             f"expected a later time, by at most {_LONGEST_GAP:g} s"
         )
     if len(times) < 2 or times[-1] - times[0] < LEAST_LENGTH:
@@ -73,7 +73,7 @@ def servo_log(
         try:
             pose = poses[row] = mechanism.forward_kinematics(angles, pose)
         except ForwardKinematicsError:
-            place = f"{name}: t = {times[row]:g} s" if table is None else table.place(row)
+            place = f"{name}: t = {times[row]:g} s" if table is None else table.location(row)
             raise ConfigError(
                 f"{place}: got crank angles {np.round(angles, 4).tolist()} without a pose; "
                 "expected those of this mechanism, with its signs and zeros"

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stewart_drake.dynamics.workspace import border
-from stewart_drake.mechanism.clearance import APART, clearances
+from stewart_drake.mechanism.clearance import clearances
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import legs_along, reach_margins
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_LEGS, POSE
@@ -15,17 +15,17 @@ from stewart_drake.types import Array
 
 RESERVE = 0.06
 """Distance to keep, of legs from the end of their reach and of links, in shortest cranks."""
-_SHARE = 0.9
+_KEPT_SHARE = 0.9
 """Largest share of the reference's own distances that is kept."""
 _STEP = 1e-6
 """Step of the difference quotients, rad and m."""
 
 
-class Near(NamedTuple):
-    """Distances with little room."""
+class NearLimit(NamedTuple):
+    """Distances near their least values, of several poses."""
 
-    pose: NDArray[np.intp]  # (r,) number of the pose of each
-    room: Array  # (r,) distance beyond the least one, in cranks
+    pose: NDArray[np.intp]  # (r,) index of the pose of each
+    room: Array  # (r,) distance minus its least value, in shortest cranks
     slopes: Array  # (r, 6) its derivative by the pose
 
 
@@ -34,32 +34,32 @@ class ClearSpace:
     """Distances at a pose, each with the least value that a plan keeps, in shortest cranks."""
 
     mechanism: Mechanism  # the machine
-    pairs: NDArray[np.intp]  # (k,) indices of guarded pairs of links in `mechanism.clearance.APART`
+    pairs: NDArray[np.intp]  # (k,) of guarded links, indices in `clearance.LINK_PAIRS`
     least: Array  # (6 + k,) least distances of the six legs and of the pairs
 
     @classmethod
     def along(cls, mechanism: Mechanism, poses: Array) -> "ClearSpace":
         """Return the distances to keep for a reference with these poses (n, 6).
 
-        The distance is RESERVE, or a share of the reference's own if that is less. Pairs that touch
-        somewhere on the reference, by their capsules, are not guarded. Where the reference itself
-        is out of reach, the legs keep RESERVE.
+        Each is RESERVE, or a share of the reference's own distance if that is less. Pairs of links
+        whose capsules touch somewhere on the reference are not guarded. Legs that do not reach it
+        keep RESERVE.
         """
-        unit, every = mechanism.crank_lengths.min(), np.arange(len(APART))
+        unit = mechanism.crank_lengths.min()
         margins = reach_margins(mechanism, poses)
-        within = poses[np.all(margins > 0, axis=1)]
-        within = within if len(within) else mechanism.home[None]
+        reached = poses[np.all(margins > 0, axis=1)]
+        reached = reached if len(reached) else mechanism.home[None]
         legs = margins.min(axis=0) / unit
-        apart = clearances(mechanism, within, legs_along(mechanism, within)).min(axis=0) / unit
-        pairs = every[apart > 0]
+        apart = clearances(mechanism, reached, legs_along(mechanism, reached)).min(axis=0) / unit
+        pairs = np.flatnonzero(apart > 0)
         kept = np.concatenate([np.where(legs > 0, legs, np.inf), apart[pairs]])
-        return cls(mechanism, pairs, np.minimum(RESERVE, _SHARE * kept))
+        return cls(mechanism, pairs, np.minimum(RESERVE, _KEPT_SHARE * kept))
 
     def room(self, poses: Array, pairs: NDArray[np.intp] | None = None) -> Array:
-        """Return the distances (n, 6 + k) beyond the least ones at poses (n, 6), in cranks.
+        """Return distances minus their least values (n, 6 + k) at poses (n, 6), in shortest cranks.
 
-        Legs out of reach have negative ones, and links that cannot be placed then NaN. `pairs`
-        are places of some of the guarded pairs, by default all.
+        They are negative for legs out of reach, and NaN for links that cannot be placed then.
+        `pairs` are indices of guarded pairs, by default all.
         """
         m, unit = self.mechanism, self.mechanism.crank_lengths.min()
         chosen = slice(None) if pairs is None else pairs
@@ -70,26 +70,25 @@ class ClearSpace:
         apart = clearances(m, poses, legs_along(m, poses), guarded) / unit - least
         return np.hstack([legs, apart])
 
-    def near(self, poses: Array, below: float) -> Near:
+    def near(self, poses: Array, below: float) -> NearLimit:
         """Return the distances with less room than `below` at poses (n, 6), with their slopes."""
         room = self.room(poses)
         is_near = room < below
         at = np.flatnonzero(is_near.any(axis=1))
         pairs = np.flatnonzero(is_near[:, NUM_LEGS:].any(axis=0))
         columns = np.concatenate([np.arange(NUM_LEGS), NUM_LEGS + pairs])
-        some = poses[at]
-        moved = np.concatenate([some[:, None], some[:, None] + _STEP * np.eye(6)], axis=1)
-        found = self.room(moved.reshape(-1, NUM_COORDINATES), pairs).reshape(
-            len(at), 7, len(columns)
-        )
-        slopes = np.swapaxes((found[:, 1:] - found[:, :1]) / _STEP, 1, 2)
+        base = poses[at][:, None]
+        stepped = np.concatenate([base, base + _STEP * np.eye(6)], axis=1)
+        rooms = self.room(stepped.reshape(-1, NUM_COORDINATES), pairs)
+        rooms = rooms.reshape(len(at), 7, len(columns))
+        slopes = np.swapaxes((rooms[:, 1:] - rooms[:, :1]) / _STEP, 1, 2)
         row, column = np.nonzero(is_near[at][:, columns] & np.isfinite(slopes).all(axis=2))
-        return Near(at[row], room[at[row], columns[column]], slopes[row, column])
+        return NearLimit(at[row], room[at[row], columns[column]], slopes[row, column])
 
-    def shrunk(self, poses: Array) -> float:
+    def reachable_share(self, poses: Array) -> float:
         """Return the largest share of the way from home at which all poses (n, 6) keep the reach.
 
-        To a tenth of a percent, and 1 where nothing needs to shrink.
+        It is at most 1, and accurate to 0.001.
         """
         home = self.mechanism.home
         legs = self.least[:NUM_LEGS] * self.mechanism.crank_lengths.min()
@@ -103,14 +102,14 @@ class ClearSpace:
             return 1.0
         return border(fits, 0.0, 1.0, 1e-3)[0]
 
-    def within(self, rows: Array) -> Array:
+    def shrunk(self, rows: Array) -> Array:
         """Return the rows (n, 18) of a motion, shrunk towards home until they keep the reach."""
-        return self.moved(rows, self.shrunk(rows[:, POSE]))
+        return self.scaled(rows, self.reachable_share(rows[:, POSE]))
 
-    def moved(self, rows: Array, share: float) -> Array:
+    def scaled(self, rows: Array, share: float) -> Array:
         """Return the rows (n, 18) of a motion, with its distance from home times a share."""
         if share == 1.0:
             return rows
-        moved = share * rows
-        moved[:, POSE] += (1 - share) * self.mechanism.home
-        return moved
+        scaled = share * rows
+        scaled[:, POSE] += (1 - share) * self.mechanism.home
+        return scaled

@@ -121,7 +121,7 @@ class _Ahead(NamedTuple):
 
     def states(self, space: ClearSpace) -> Array:
         """Return the states (N + 1, 12) of the shrunk reference."""
-        return space.moved(self.rows, self.share)[:, :NUM_STATE]
+        return space.scaled(self.rows, self.share)[:, :NUM_STATE]
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,8 +284,8 @@ class LimitedLqi(OuterLqi):
     def _ahead(self, further: Array, belief: Belief) -> _Ahead:
         n, space, dynamics = self.limits.horizon, self.limits.space, self.plant.dynamics
         rows, nodes = further[: n + 1], further[n + 1 :]
-        share = space.shrunk(further[:, POSE])
-        within = space.moved(nodes, share)
+        share = space.reachable_share(further[:, POSE])
+        within = space.scaled(nodes, share)
         held = self.feedforward.held(within, dynamics, belief.parameters)
         return _Ahead(rows, nodes, share, held.torques)
 

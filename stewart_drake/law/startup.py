@@ -124,7 +124,7 @@ def reference_torques(
     With a space it is that along the reference shrunk into reach.
     """
     rows = np.array([evaluate(reference, t) for t in spread_instants(duration, INSTANTS)])
-    return np.abs(dynamics.torques_along(space.within(rows) if space else rows)).max(axis=1)
+    return np.abs(dynamics.torques_along(space.shrunk(rows) if space else rows)).max(axis=1)
 
 
 def reference_torque(

@@ -18,9 +18,11 @@ from stewart_drake.types import Array
 
 LINKS: Final = tuple(f"{kind} {leg}" for kind in ("crank", "rod") for leg in LEGS)
 """Names of the links, in the order of `center_lines`."""
-APART: Final = tuple((i, j) for i, j in combinations(range(2 * NUM_LEGS), 2) if j - i != NUM_LEGS)
+LINK_PAIRS: Final = tuple(
+    (i, j) for i, j in combinations(range(2 * NUM_LEGS), 2) if j - i != NUM_LEGS
+)
 """Pairs (60) of links without a common joint: all but a crank and its own rod."""
-_APART: Final = np.array(APART)
+_LINK_PAIRS: Final = np.array(LINK_PAIRS)
 
 
 class Proportions(NamedTuple):
@@ -76,11 +78,11 @@ def segment_distances(p: Array, u: Array, q: Array, v: Array) -> Array:
 def clearances(
     mechanism: Legs, poses: Array, legs: LegGeometry, pairs: NDArray[np.intp] | None = None
 ) -> Array:
-    """Return lower bounds (n, 60) of the distances of the pairs `APART`, m; may be negative.
+    """Return lower bounds (n, 60) of the distances of the pairs `LINK_PAIRS`, m; may be negative.
 
     `pairs` (k,) chooses some of them.
     """
-    first, second = (_APART if pairs is None else _APART[pairs]).T
+    first, second = (_LINK_PAIRS if pairs is None else _LINK_PAIRS[pairs]).T
     start, along = center_lines(mechanism, poses, legs)
     lines = start[:, first], along[:, first], start[:, second], along[:, second]
     radii = capsule_radii(mechanism)

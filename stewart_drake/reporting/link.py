@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from stewart_drake.reporting.document import Document, from_template
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import Line, line
-from stewart_drake.studies.link import SAME, Cell, LinkStudy
+from stewart_drake.studies.link import NEGLIGIBLE, Cell, LinkStudy
 from stewart_drake.studies.statistics import CONFIDENCE
 
 _ASSURED: Final = 0.9
@@ -24,15 +24,16 @@ def _mean(cell: Cell) -> float:
 def document(study: LinkStudy) -> Document:
     best, checked = study.best, study.checked
     own = best is not None and all(one is None or one.completed == 1 for one in (best, checked))
-    undecided = {bound: excess for bound, excess in study.alike.items() if not excess < SAME}
-    unsure = ", ".join(f"{bound:g}" for bound in study.hardly_lost)
+    same = [f"{bound:g}" for bound, excess in study.alike.items() if excess < NEGLIGIBLE]
+    undecided = {bound: excess for bound, excess in study.alike.items() if not excess < NEGLIGIBLE}
+    unsure = ", ".join(f"{bound:g}" for bound in study.unconfirmed_losses)
     return from_template(
         "link",
         "bad" if not own else "fair" if undecided or unsure else "good",
         study=study,
         mean=_mean,
         spread=lambda cell: float(np.std(cell.errors, ddof=1)),
-        same=", ".join(f"{bound:g}" for bound, excess in study.alike.items() if excess < SAME),
+        same=", ".join(same),
         undecided=undecided,
         unsure=unsure,
         most=lambda cell: max(cell.errors, default=math.nan),

@@ -1,7 +1,7 @@
 """Server of a page on this computer only.
 
 A request must carry the token of the page's address, which other pages in the same browser do not
-know, and one of this computer's names, since a foreign name may resolve to its address.
+know. Its Host must be a name of this computer: another name may resolve to 127.0.0.1, too.
 """
 
 import secrets
@@ -15,18 +15,18 @@ from urllib.parse import parse_qs, urlsplit
 
 from stewart_drake.reporting.page import environment
 
-_LONGEST: Final = 4096
-"""Longest request of a browser, bytes."""
+_MAX_BODY: Final = 4096
+"""Largest content of a POST request, bytes."""
 
 
 class LocalServer(ThreadingHTTPServer):
     """Server on a free port of 127.0.0.1, in background threads.
 
     Args:
-        template: name of the page's template, which gets `values` and the `token`.
-        values: for the template.
-        get: by path, another page or a stream of events.
-        post: returns the answer to a path and data, in JSON, or None for a malformed request.
+        template: name of the page's template.
+        values: variables of the template; `token` is added.
+        get: by path, a function that returns another page, or the events of a stream.
+        post: function of path and data that returns JSON, or None for a malformed request.
     """
 
     daemon_threads = True
@@ -49,7 +49,7 @@ class LocalServer(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_port}/?token={self.token}"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Report an error, except that a browser has closed its connection."""
+        """Report an error, unless the browser has closed its connection."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
 
@@ -81,9 +81,9 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._allowed(self.headers.get("X-Token", "")):
             return
         length = self.headers.get("Content-Length", "")
-        # Python refuses to convert thousands of digits.
-        few = len(length) <= len(str(_LONGEST))
-        if not (few and length.isdecimal() and int(length) <= _LONGEST):
+        # int() raises for thousands of digits.
+        is_short = len(length) <= len(str(_MAX_BODY))
+        if not (is_short and length.isdecimal() and int(length) <= _MAX_BODY):
             self.send_error(413)
             return
         answer = self.server.post(self.path, self.rfile.read(int(length)))
@@ -92,19 +92,20 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._answer("application/json", answer)
 
-    def _allowed(self, given: str) -> bool:
+    def _allowed(self, token: str) -> bool:
+        """Return whether Host and token are right; answer 403 if not."""
         host = self.headers.get("Host", "").rpartition(":")[0]
-        token = self.server.token.encode()
-        good = host in ("127.0.0.1", "localhost")
-        good = good and secrets.compare_digest(given.encode(), token)
-        if not good:
+        expected = self.server.token.encode()
+        allowed = host in ("127.0.0.1", "localhost")
+        allowed = allowed and secrets.compare_digest(token.encode(), expected)
+        if not allowed:
             self.send_error(403)
-        return good
+        return allowed
 
-    def _answer(self, kind: str, text: str) -> None:
+    def _answer(self, content_type: str, text: str) -> None:
         data = text.encode()
         self.send_response(200)
-        self.send_header("Content-Type", kind)
+        self.send_header("Content-Type", content_type)
         self.send_header("Content-Length", str(len(data)))
         self.send_header("Cache-Control", "no-store")
         self.send_header("Referrer-Policy", "no-referrer")

@@ -18,20 +18,24 @@ from stewart_drake.tuning.families import FAULTS, fault_of
 from stewart_drake.tuning.training import Training
 from stewart_drake.types import Array
 
-_CONSTANT: Final = Line("#888888", ":", 1.4)
-_MOST_LEVELS: Final = 12
-"""Largest number of target values that are drawn as boxes, not as a cloud."""
+_BASELINE: Final = Line("#888888", ":", 1.4)
+_MAX_BOXES: Final = 12
+"""Largest number of target values, each a box; with more every row is a dot."""
 
 
 def data_document(data: xr.Dataset, summary: Mapping[str, Any]) -> Document:
-    """Return how runs ended: of the grid by delay and frequency, of drawn conditions by gain."""
-    grid = bool((data.disturbance.values < 0).all())
+    """Return how many runs completed, and how well.
+
+    The table of the paper's grid is by delay and frequency, that of drawn conditions by gain.
+    """
+    grid = bool((data.disturbance.values < 0).all())  # -1: the condition was not drawn
     gains = [] if grid else list(summary["g"])
     return from_template(
         "tuner_data",
         s=summary,
         grid=_grid_table(data) if grid else None,
         gains=gains,
+        # A gain is named by its logarithm, such as +0.5, or by its weights, such as 0.1 / 4.
         head="log10 w_Q/w_R" if all(name[0] in "+-" for name in gains) else "weights",
     )
 
@@ -49,6 +53,7 @@ def _grid_table(data: xr.Dataset) -> Table:
 
 
 def training_document(summary: Mapping[str, Any]) -> Document:
+    """Return the document of a training; its template shows the part of the loss that was used."""
     regret = summary.get("loss") == "regret"
     return from_template("tuner_training", regret=regret and summary, labels=not regret and summary)
 
@@ -58,6 +63,7 @@ def training_figures(training: Training) -> dict[str, Figure]:
 
 
 def _unit(training: Training) -> str:
+    """Return the prefix of w_Q and w_R, as the network puts out weights or their logarithms."""
     return "" if training.network.output == "weights" else "ln "
 
 
@@ -68,7 +74,7 @@ def _curve(training: Training) -> Figure:
     curves = [
         Curve(steps, training.curve[:, 0], "training rows"),
         Curve(steps, training.curve[:, 1], "test rows", TRUTH),
-        Curve(ends, [constant] * 2, "test rows, a constant", _CONSTANT),
+        Curve(ends, [constant] * 2, "test rows, a constant", _BASELINE),
     ]
     name, over = f"rms error of {unit}w_Q, {unit}w_R", "successful Levenberg-Marquardt steps"
     return draw([Panel(name, curves, over, xlim=ends, height=2.6)])
@@ -94,7 +100,7 @@ def _regression(training: Training) -> Figure:
 
 def _outputs(ax: Axes, target: Array, output: Array) -> None:
     levels = np.unique(np.round(target, 9))
-    if 1 < len(levels) <= _MOST_LEVELS:
+    if 1 < len(levels) <= _MAX_BOXES:
         ax.boxplot(
             [output[np.abs(target - level) < 1e-6] for level in levels],
             positions=levels,
@@ -113,16 +119,18 @@ def _outputs(ax: Axes, target: Array, output: Array) -> None:
 def evaluation_document(found: Evaluation) -> Document:
     """Return tables of the candidates by J and by E_ac, and figures.
 
-    A terminal shows the table by J for a family with faults, by E_ac for another one.
+    A terminal shows the table by J for a family with faults, by E_ac for another one; a page shows
+    both. The template leaves out a table whose rows are False.
     """
     s, faulty = found.summary, found.family.has_faults
     networks = [name for name in found.tuners if name != RULE]
     tone: Tone = "plain"
-    if faulty:
-        ends = [s["gains"][one]["g"][1:] for one in networks]
-        tone = "good" if all(low > 0 for low, _ in ends) else "fair"
-        tone = "bad" if any(high < 0 for _, high in ends) else tone
-    by_cost, by_error, failures = (*found.names, HINDSIGHT), found.names, s["candidates"]
+    if faulty:  # 95 % intervals of the reduction of g
+        intervals = [s["gains"][one]["g"][1:] for one in networks]
+        tone = "good" if all(low > 0 for low, _ in intervals) else "fair"
+        tone = "bad" if any(high < 0 for _, high in intervals) else tone
+    by_cost, by_error = (*found.names, HINDSIGHT), found.names
+    failures = {name: one["failures"] for name, one in s["candidates"].items() if name in by_error}
     return from_template(
         "tuner_evaluation",
         tone,
@@ -143,8 +151,7 @@ def evaluation_document(found: Evaluation) -> Document:
         by_error=not faulty and by_error,
         by_error_page=faulty and by_error,
         compared=not faulty,
-        extra_failures=failures[found.names[-1]]["failures"]
-        - failures[s["best_fixed"]]["failures"],
+        extra_failures=failures[found.names[-1]] - failures[s["best_fixed"]],
         by_fault=faulty and (*found.tuners, HINDSIGHT),
         nominal=faulty and s["nominal"].items(),
         distribution=partial(distributions, found),
@@ -152,26 +159,29 @@ def evaluation_document(found: Evaluation) -> Document:
     )
 
 
-def _share(gain: Sequence[float] | None) -> str:
-    if gain is None:
+def _share(interval: Sequence[float] | None) -> str:
+    """Return a share (value, low, high) in percent."""
+    if interval is None:
         return ""
-    value, low, high = (100 * x for x in gain)
+    value, low, high = (100 * x for x in interval)
     return f"{value:.0f} % ({low:.0f} to {high:.0f})"
 
 
 def _lines(found: Evaluation) -> dict[str, Line]:
-    # Every second style: the best fixed gain is a solid line.
+    # Every second style, as the first is that of the best fixed gain: a solid line.
     return {name: line(2 * k + 1, marked=False) for k, name in enumerate(found.tuners)}
 
 
 def _ratios(found: Evaluation) -> Array:
+    """Return log10(w_Q / w_R) of the fixed gains."""
     return np.array([ratio_of(np.array(gain)) for gain in found.family.gains.values()])
 
 
 def distributions(found: Evaluation) -> Figure:
+    """Draw the distribution of J of the tuners, the best fixed gain and that of equal weights."""
     best, equal = found.summary["best_g"], found.names[int(np.argmin(np.abs(_ratios(found))))]
     curves = []
-    for name, look in ({equal: _CONSTANT, best: Line("#000000", "-", 1.4)} | _lines(found)).items():
+    for name, look in ({equal: _BASELINE, best: Line("#000000", "-", 1.4)} | _lines(found)).items():
         J = np.sort(found.cost[found.names.index(name)])
         share = 100 * np.arange(1, len(J) + 1) / len(J)
         label = f"fixed, {name}" if name in found.family.gains else name
@@ -195,16 +205,12 @@ def weights_over_time(found: Evaluation) -> Figure:
     for title, i in _shown(found).items():
         curves = []
         if i is not None:
-            taken = {name: found.ratios[name][i] for name in found.tuners}
             best = ratios[found.cost[: len(ratios), i].argmin()]
-            ends = [0.0, period * max(map(len, taken.values()))]
-            curves = [
-                Curve(ends, [best] * 2, "best fixed there", REFERENCE),
-                *(
-                    Curve(period * np.arange(len(taken[name])), taken[name], name, look, steps=True)
-                    for name, look in _lines(found).items()
-                ),
-            ]
+            longest = max(len(found.ratios[name][i]) for name in found.tuners)
+            curves = [Curve([0.0, period * longest], [best] * 2, "best fixed there", REFERENCE)]
+            for name, look in _lines(found).items():
+                used = found.ratios[name][i]
+                curves.append(Curve(period * np.arange(len(used)), used, name, look, steps=True))
         limits = (ratios.min() - 0.2, ratios.max() + 0.2)
         panels.append(Panel("log10 w_Q / w_R", curves, title=title, ylim=limits))
     return draw(panels, 2, sharey=True)

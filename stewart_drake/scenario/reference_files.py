@@ -96,10 +96,10 @@ def read_csv(path: str | Path) -> tuple[Array, Array]:
     times, poses = samples[:, 0].copy(), samples[:, 1:].copy()
     if len(times) and abs(times[0]) > 1e-9:
         raise ConfigError(
-            f"{table.place(0, 'time')}: got {float(times[0])!r}; expected 0 in the first sample, "
-            "subtract it from every time"
+            f"{table.location(0, 'time')}: got {float(times[0])!r}; expected 0 in the first "
+            "sample, subtract it from every time"
         )
-    check_motion(path, times, poses, table.place, table.scales)
+    check_motion(path, times, poses, table.location, table.scales)
     times[0] = 0.0
     return times, poses
 

@@ -1,10 +1,11 @@
 """Search for the best play-out bound of a network, and for the losses that it survives.
 
-With a longer bound fewer packets are late, but every torque acts later: bound + repetitions after
-its measurement, also if its packet was quicker. The scenario is simulated over bounds, first in
-whole periods, then in half periods near the best, and at the best of them over losses, with several
-seeds each. The seeds of the losses are new, because the first seeds chose the best bound and are
-too good there.
+With a longer bound fewer packets are late, but every torque acts later: the bound and a period per
+repetition after its measurement, also if its packet was quicker.
+
+The scenario is simulated with several seeds for each bound: first for whole periods, then for half
+periods near the best. Then it is simulated at the best bound for each loss, with new seeds: those
+that chose the best bound are biased there.
 """
 
 import math
@@ -27,11 +28,12 @@ from stewart_drake.studies.study_options import LinkOptions
 
 LOSSES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4)
 """Shares of lost packets that are tried, in addition to the scenario's own."""
-_FEW: Final = 0.4
-_NEARLY_ALL: Final = 0.999
+_SHORTEST_ARRIVED: Final = 0.4
+_LONGEST_ARRIVED: Final = 0.999
 """Shares of the packets that arrive within the shortest and the longest bound tried."""
-_MOST_BOUNDS: Final = 12
-SAME: Final = 0.01
+_MAX_BOUNDS: Final = 12
+"""Largest number of whole-period bounds tried."""
+NEGLIGIBLE: Final = 0.01
 """Relative difference of E_ac that does not matter."""
 
 
@@ -45,7 +47,7 @@ class Cell(NamedTuple):
 
     @property
     def completed(self) -> float:
-        """Share of the runs; NaN for none."""
+        """Share of the runs that completed; NaN without runs."""
         return len(self.errors) / self.runs if self.runs else math.nan
 
     @property
@@ -63,8 +65,8 @@ class Cell(NamedTuple):
 
     @property
     def summary(self) -> dict[str, Any]:
-        more = {name: getattr(self, name) for name in ("completed", "expected", "no_worse")}
-        return self._asdict() | more
+        derived = {name: getattr(self, name) for name in ("completed", "expected", "no_worse")}
+        return self._asdict() | derived
 
 
 @dataclass(frozen=True)
@@ -73,8 +75,8 @@ class LinkStudy:
     runs: int  # seeds per bound and loss
     bounds: Sequence[Cell]  # over the bound, the shortest first, at the scenario's loss
     losses: Sequence[Cell]  # over the loss, at the best bound, with new seeds
-    usual: float  # bound of a scenario with `playout: null`, s
-    left_out: tuple[float, ...]  # bounds in s that the multibody plant of the scenario cannot have
+    default: float  # bound of a scenario with `playout: null`, s
+    left_out: tuple[float, ...]  # bounds in s that the multibody plant's time_step does not divide
     interrupted: bool  # whether Ctrl-C ended it early
 
     @property
@@ -86,11 +88,11 @@ class LinkStudy:
     def alike(self) -> dict[float, float]:
         """Bounds in s that the seeds do not show to be worse than the best, each with its excess.
 
-        Excess: how much larger than the best's the mean E_ac may be, with 95 % confidence, as a
-        share; NaN for one seed. The interval is that of a t-test: of the differences, as the runs
-        have the same seeds, or of two samples where some runs were lost. A bound is worse if its
-        mean is larger by 1 % and the one-sided test says so. `hardly_lost` has bounds that lost
-        more runs.
+        The excess is the largest share, with 95 % confidence, by which the mean E_ac exceeds that
+        of the best; NaN for one seed. A bound is worse if its mean is larger by NEGLIGIBLE and a
+        one-sided t-test confirms that it is larger. The test is paired, as all bounds have the same
+        seeds; where runs were lost it is one of two samples. Bounds that lost more runs than the
+        best are in `unconfirmed_losses`.
         """
         best, found = self.best, dict[float, float]()
         for cell in self.bounds:
@@ -98,18 +100,18 @@ class LinkStudy:
                 continue
             mean = np.mean(best.errors)
             with warnings.catch_warnings(), np.errstate(all="ignore"):
-                warnings.simplefilter("ignore", RuntimeWarning)  # of errors that hardly differ
+                warnings.simplefilter("ignore", RuntimeWarning)  # errors that hardly differ
                 paired = cell.completed == best.completed == 1
                 test: Any = stats.ttest_rel if paired else stats.ttest_ind
-                # Each end of the two-sided interval of 90 % is a one-sided one of 95 %.
-                ends = test(cell.errors, best.errors).confidence_interval(2 * CONFIDENCE - 1)
-            if np.mean(cell.errors) / mean - 1 < SAME or not ends.low > 0:
-                found[cell.bound] = float(ends.high / mean)
+                # Each end of the two-sided 90 % interval is a one-sided 95 % bound.
+                interval = test(cell.errors, best.errors).confidence_interval(2 * CONFIDENCE - 1)
+            if np.mean(cell.errors) / mean - 1 < NEGLIGIBLE or not interval.low > 0:
+                found[cell.bound] = float(interval.high / mean)
         return found
 
     @property
-    def hardly_lost(self) -> list[float]:
-        """Bounds in s that lost more runs than the best, but by Fisher's exact test not surely."""
+    def unconfirmed_losses(self) -> list[float]:
+        """Bounds in s that lost more runs than the best, which Fisher's test does not confirm."""
         best, found = self.best, list[float]()
         for cell in self.bounds:
             if best is None or len(cell.errors) >= len(best.errors):
@@ -128,7 +130,7 @@ class LinkStudy:
 
     @property
     def survivable(self) -> float:
-        """Largest loss up to which every run completed; NaN for none."""
+        """Largest loss up to which every run completed at the best bound; NaN for none."""
         survived = math.nan
         for cell in self.losses:
             if cell.completed != 1:
@@ -141,7 +143,7 @@ class LinkStudy:
         return {
             "best_bound": None if self.best is None else self.best.bound,
             "alike_bounds": list(self.alike),
-            "usual_bound": self.usual,
+            "usual_bound": self.default,
             "survivable_loss": self.survivable,
             "runs": self.runs,
             "bounds": [cell.summary for cell in self.bounds],
@@ -168,7 +170,7 @@ def study_link(
     def run(
         base: Scenario, wanted: list[tuple[float, float]], following: int
     ) -> tuple[list[Cell], bool]:
-        """Simulate bounds and losses, before a number of `following` ones."""
+        """Simulate pairs of bound and loss; about `following` more are left, for the progress."""
         before, total = runs * len(found), runs * (len(found) + len(wanted) + following)
         return _simulated(base, wanted, runs, part_of(progress, before, total))
 
@@ -189,15 +191,16 @@ def study_link(
         sensor = replace(base.sensor, seed=base.sensor.seed + runs)
         fresh = replace(base, link=replace(link, seed=link.seed + runs), sensor=sensor)
         checked, stopped = run(fresh, [(best.bound, loss) for loss in losses], 0)
-    usual = default_bound(link, scenario.controller.packet_repeats, period)
-    return LinkStudy(scenario, runs, found, checked, usual, tuple(sorted(left_out)), stopped)
+    default = default_bound(link, scenario.controller.packet_repeats, period)
+    return LinkStudy(scenario, runs, found, checked, default, tuple(sorted(left_out)), stopped)
 
 
 def bounds_for(link: NetworkConfig, period: float) -> list[float]:
-    """Return bounds in whole periods, s, from few packets in time to nearly all."""
+    """Return bounds in s, whole periods, within which few packets arrive up to nearly all."""
     times = times_under_way(link)
-    first, last = (math.ceil(times.ppf(share) / period - 1e-9) for share in (_FEW, _NEARLY_ALL))
-    steps = np.unique(np.linspace(first, last + 1, min(last + 2 - first, _MOST_BOUNDS)).round())
+    shares = (_SHORTEST_ARRIVED, _LONGEST_ARRIVED)
+    first, last = (math.ceil(times.ppf(share) / period - 1e-9) for share in shares)
+    steps = np.unique(np.linspace(first, last + 1, min(last + 2 - first, _MAX_BOUNDS)).round())
     return [float(period * step) for step in steps]
 
 
@@ -207,7 +210,7 @@ def best_of(cells: Iterable[Cell]) -> Cell | None:
 
 
 def _possible(scenario: Scenario, link: NetworkConfig, bound: float) -> bool:
-    """Return whether the scenario's own plant can have a bound in s."""
+    """Return whether the scenario's own plant can be simulated with a bound in s."""
     other = replace(scenario, link=replace(link, playout=bound))
     return scenario.plant.kind != "multibody" or not other.step_problem(scenario.plant.time_step)
 
@@ -228,13 +231,13 @@ def _simulated(
             link=replace(link, playout=bound, loss=loss, seed=link.seed + seed),
             sensor=replace(base.sensor, seed=base.sensor.seed + seed),
         )
-        for (bound, loss), some in keys.items()
-        for seed, key in enumerate(some)
+        for (bound, loss), labels in keys.items()
+        for seed, key in enumerate(labels)
     }
     results, stopped = run_scenarios(variants, progress) if variants else ({}, False)
     cells = []
-    for (bound, loss), some in keys.items():
-        finished = [results[key] for key in some if key in results]
+    for (bound, loss), labels in keys.items():
+        finished = [results[key] for key in labels if key in results]
         errors = tuple(one.error for one in finished if one.status == "completed")
         late = 1 - float(in_time(link, bound))
         missing = torque_missing(replace(link, loss=loss), bound, c.packet_repeats, c.period)

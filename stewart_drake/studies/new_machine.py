@@ -1,14 +1,15 @@
 """A machine, a scenario and a first check, from a few measurements with a ruler and scales.
 
-The legs of a machine of threefold symmetry follow from two circles. Shafts that are d apart on a
-circle of radius R are seen from its centre under
+The machine has threefold symmetry: three pairs of shafts on a circle of the base, three pairs of
+joints on a circle of the plate. Two shafts at the distance d on a circle of radius R have the angle
 
-    separation = 2 asin(d / (2 R)),
+    separation = 2 asin(d / (2 R))
 
-and so are the joints of the plate. Each of its pairs sits between two pairs of the base, and holds
-one rod of either. The height of home is that at which rods push their crank tips best: the largest
-smallest |r.t| of the six legs, r along the rod and t along the crank tip's circle, which is 0 at a
-dead centre. `check_mechanism` checks any machine at home: reach, torque, poles and singularity.
+at its centre, and so have two joints. Each pair of joints sits between two pairs of shafts, and
+holds one rod of each. Home is at the height z that maximises the least |r.t| of the six legs, with
+r along the rod and t along the crank tip's circle. |r.t| is 0 at a dead centre.
+
+`check_mechanism` checks any machine at home: reach, torque, poles and singularity.
 """
 
 import math
@@ -43,8 +44,8 @@ BODIES: Final = ("base", "plate", "crank", "rod")
 
 
 class MechanismCheck(NamedTuple):
-    mechanism: Mechanism  # that was checked
-    # why the home pose is unusable, or None; then torque, poles and travel are empty
+    mechanism: Mechanism
+    # why the home pose is unusable: torque, poles and travel are then empty; or None
     failure: Failure | None
     measures: Measures  # at home
     crank_angles: Array  # (6,) rad
@@ -114,22 +115,26 @@ MACHINE: Final = "machine.yaml"
 SCENARIO: Final = "scenario.yaml"
 
 _HEIGHTS: Final = 400
-_SHARE: Final = 0.25
-"""Share of the travel of z that the first motion takes."""
-_ONCE: Final = 2.0
-_LOOKS: Final = 41
-"""Period of that motion, s, and number of its poses at which links are checked."""
-_PERIODS: Final = 25
-"""Periods of delay up to which torques are computed every 20 ms, beyond that every 100 ms."""
+"""Number of heights of home that are compared."""
+_TRAVEL_SHARE: Final = 0.25
+"""Amplitude of the proposed motion, as a share of the travel of z."""
+_MOTION_PERIOD: Final = 2.0
+"""Period of the proposed motion, s."""
+_CHECKED_POSES: Final = 41
+"""Number of its poses at which the clearance of links is checked."""
+_FAST_PERIOD: Final = 0.02
+_SLOW_PERIOD: Final = 0.1
+"""Sampling periods of the controller, s: the slow one for a delay beyond _MAX_STEPS fast ones."""
+_MAX_STEPS: Final = 25
 
 
 class NewMachine(NamedTuple):
-    """New machine with a first check; torque and crossings are those of the proposed motion."""
+    """New machine with a first check, at home and along the proposed motion."""
 
     check: MechanismCheck
     margin: ControllerMargin
-    peak_torque: float  # N m
-    crossings: list[str]  # `ClearanceAlong.crossings`
+    peak_torque: float  # of the motion, N m
+    crossings: list[str]  # links that cross in the motion, see `ClearanceAlong.crossings`
 
     @property
     def verdict(self) -> str:
@@ -152,7 +157,7 @@ class NewMachine(NamedTuple):
 
 
 def separation(distance: float, radius: float) -> float:
-    """Return the angle in degrees of two points of a circle at its centre; lengths in m."""
+    """Return the angle at a circle's centre, degrees, between points at a distance, m."""
     return math.degrees(2 * math.asin(distance / (2 * radius)))
 
 
@@ -172,22 +177,22 @@ def proposed_pattern(m: Measurements) -> PatternSpec:
 
 
 def best_height(pattern: PatternSpec, m: Measurements) -> float:
-    """Return z in m of the plate's joints at which every rod pushes its crank best."""
+    """Return z in m of the plate's joints that maximises the least |r.t|."""
     legs = pattern_legs(pattern, m.crank, m.rod)
-    above = m.shaft_height + m.rod
-    found = reachable_heights(legs, np.array([0, 0, 0, 0, 0, above]))
-    if found is None:
+    guess = m.shaft_height + m.rod
+    heights_found = reachable_heights(legs, np.array([0, 0, 0, 0, 0, guess]))
+    if heights_found is None:
         gap = float(np.linalg.norm((legs.p_PQ - legs.p_WS)[:, :2], axis=1).max())
         raise ConfigError(
             f"rod: got {m.rod:g} m with cranks of {m.crank:g} m; expected rods that reach the "
             f"plate, whose joints are {gap:.3g} m from the shafts horizontally"
         )
-    low, high = found
+    low, high = heights_found
     heights = np.linspace(low, high, _HEIGHTS + 2)[1:-1]
-    push = [
+    transmission = [
         np.abs(leg_geometry(legs, np.array([0, 0, 0, 0, 0, z])).transmission).min() for z in heights
     ]
-    return float(heights[int(np.argmax(push))])
+    return float(heights[int(np.argmax(transmission))])
 
 
 def machine_text(m: Measurements, name: str) -> str:
@@ -214,8 +219,8 @@ motor: {{effort_limit: {limit}}}
 def scenario_text(m: Measurements, mechanism: Mechanism) -> str:
     """Return a first scenario: up and down, over a quarter of the travel of the plate."""
     z = next(t for t in travel(mechanism) if t.coordinate == COORDINATES[5])
-    amplitude = float(f"{_SHARE * min(-z.low, z.high):.1g}")
-    period = 0.02 if m.delay <= 0.02 * _PERIODS else 0.1
+    amplitude = float(f"{_TRAVEL_SHARE * min(-z.low, z.high):.1g}")
+    period = _FAST_PERIOD if m.delay <= _MAX_STEPS * _FAST_PERIOD else _SLOW_PERIOD
     delay = Delay.of(m.delay, period)
     home = [float(value) for value in mechanism.home]
     return f"""# A first motion of {mechanism.name}; all fields are in the shipped paper.yaml.
@@ -230,7 +235,7 @@ reference:
   kind: sine
   amplitude: [0, 0, 0, 0, 0, {amplitude}]
   offset: {home}
-  frequency: {1 / _ONCE}
+  frequency: {1 / _MOTION_PERIOD}
   frequency_unit: Hz
 
 plant: {{kind: exact, gravity: {str(m.gravity).lower()}}}
@@ -239,18 +244,18 @@ delay: {{steps: {delay.steps}, fraction: {round(delay.fraction, 9)}}}   # of {m.
 """
 
 
-def check_free(folder: Path) -> None:
-    """Refuse a folder that has one of MACHINE and SCENARIO."""
+def refuse_existing(folder: Path) -> None:
+    """Raise an error if a folder has one of MACHINE and SCENARIO."""
     for file in (MACHINE, SCENARIO):
         if (folder / file).exists():
             raise ConfigError(f"{folder / file}: already exists; expected a folder without it")
 
 
 def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
-    """Write MACHINE and SCENARIO into a folder and check them; a bad machine is not written."""
-    check_free(folder)
-    with TemporaryDirectory() as place:
-        machine, scenario = Path(place) / MACHINE, Path(place) / SCENARIO
+    """Check a new machine, and write MACHINE and SCENARIO into a folder if it can be used."""
+    refuse_existing(folder)
+    with TemporaryDirectory() as temporary:
+        machine, scenario = Path(temporary) / MACHINE, Path(temporary) / SCENARIO
         machine.write_text(machine_text(m, name))
         mechanism = load_mechanism(machine)
         check = check_mechanism(mechanism)
@@ -258,7 +263,7 @@ def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
             raise ConfigError(f"{check.verdict}; expected other lengths")
         scenario.write_text(scenario_text(m, mechanism))
         experiment = prepare(load_scenario(scenario))
-        time = np.linspace(0.0, _ONCE, _LOOKS)
+        time = np.linspace(0.0, _MOTION_PERIOD, _CHECKED_POSES)
         poses = np.array([experiment.reference.value(t)[:, 0] for t in time])
         along = clearance_along(ClearanceScene(mechanism), mechanism, time, poses)
         made = NewMachine(
