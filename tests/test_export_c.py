@@ -76,7 +76,8 @@ def test_the_replay_is_exact(case, tmp_path):
     name, settings = RUNS[case]
     folder = exported(tmp_path, name, settings)
     said = make(folder, "test")
-    assert int(said.split()[0]) >= 50 and "statuses that differ: 0" in said
+    passed, steps, *_ = said.split()
+    assert passed == "passed:" and int(steps) >= 50 and "statuses that differ: 0" in said
     over_udp = (folder / "protocol.c").exists()
     assert said.endswith("protocol: as documented\n") == over_udp
     make(folder, "check")
@@ -105,7 +106,7 @@ def test_gravity_is_exported_as_it_is_shipped(tmp_path):
     assert scenario.plant.kind == "multibody"
     export_c.write(export_c.exported(scenario, measured=False), tmp_path)
     said = make(tmp_path, "test")
-    assert said.startswith("100 steps") and "statuses that differ: 0" in said
+    assert said.startswith("passed: 100 steps") and "statuses that differ: 0" in said
 
 
 @pytest.mark.parametrize("option", ["-ffast-math", "-ffinite-math-only"])
@@ -161,7 +162,7 @@ def test_a_controller_that_is_off_is_reported(tmp_path):
         right = (folder / name).read_text()
         assert old in right
         (folder / name).write_text(right.replace(old, new))
-        make(folder, "test", "CFLAGS=-O0", fails=True)
+        assert make(folder, "test", "CFLAGS=-O0", fails=True).startswith("failed: ")
         (folder / name).write_text(right)
 
 

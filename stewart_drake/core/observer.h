@@ -5,19 +5,19 @@
 #include "machine.h"
 #include "sensing.h"
 
-/* Problems of a step that the law compensates; counts[i] of the memory is of bit i. */
+/* Bits of a step's result: problems that the law compensates. counts[i] of the memory counts bit 2^i. */
 enum stewart_status {
     STEWART_RICCATI_FAILURE = 1,      /* no new gain: the last one was used */
     STEWART_UNREACHABLE = 2,          /* the predicted pose is out of the workspace: feedforward alone */
     STEWART_NONFINITE_TORQUE = 4,     /* not a number: the last torque was used */
     STEWART_MEASUREMENT_MISSING = 8,  /* replaced, at least in part, by the model's prediction */
-    STEWART_MEASUREMENT_FROZEN = 16,
-    STEWART_MEASUREMENT_REJECTED = 32,
+    STEWART_MEASUREMENT_FROZEN = 16,  /* repeated bit for bit; replaced as well */
+    STEWART_MEASUREMENT_REJECTED = 32, /* does not fit the machine or the estimate; replaced as well */
     STEWART_SATURATED = 64,           /* a torque is at the limit */
     STEWART_REFERENCE_MISSING = 128   /* NaN or infinity in the preview: the reference continued */
 };
-#define STEWART_CAUSES 8
-#define STEWART_CAUSES_AT 3 /* shift of the causes of `stewart_sensing` in a status */
+#define STEWART_CAUSES 8 /* number of these bits */
+#define STEWART_CAUSES_AT 3 /* shift of a `fault` of `stewart_sensing` to its bits */
 
 typedef struct stewart_law stewart_law;
 

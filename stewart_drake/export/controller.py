@@ -263,7 +263,7 @@ def _make(folder: str, command: Iterable[str], target: str) -> str:
     )
     if done.returncode != 0:
         raise ConfigError(f"export-c: make {target} failed: {done.stdout}{done.stderr}".strip())
-    return done.stdout.strip()
+    return done.stdout.rstrip().lstrip("\n")
 
 
 # ---------------------------------------------------------------- structures as text

@@ -30,5 +30,5 @@ void meter_report(int steps)
         worst = least[k] > worst ? least[k] : worst;
         sum += least[k];
     }
-    printf("a step takes %.0f us, at the most %.0f us\n", 1e6 * sum / steps, 1e6 * worst);
+    printf("a step takes %.0f us on average, %.0f us at the most\n", 1e6 * sum / steps, 1e6 * worst);
 }

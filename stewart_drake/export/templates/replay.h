@@ -87,7 +87,7 @@ static int answer(int k, real *found)
 {% endif %}
 }
 
-static void go_on(int k)
+static void after_step(int k)
 {
 {% if servos %}
     (void)k;

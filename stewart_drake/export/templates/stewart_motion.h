@@ -10,10 +10,10 @@ extern const double stewart_duration; /* s */
 /* The reference at t: pose, rates, accelerations. Before 0 it is that at 0, and for NaN too. */
 void stewart_reference(double t, real *reference);
 
-/* The motion that a law with a planner returns to. */
+/* The same motion without its catch-up from rest: plans lead back to it. */
 void stewart_goal(double t, real *reference);
 
-/* `reference` and `goal` of a sample: rows at instants in s from the time, s, that `context` points to. */
+/* For `.reference` and `.goal` of a sample. `.context` points to the time of the sample, a double in s. */
 void stewart_look_ahead(void *context, int number, const real *times, real *rows);
 void stewart_look_back(void *context, int number, const real *times, real *rows);
 
