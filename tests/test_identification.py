@@ -233,9 +233,9 @@ def test_sensitivities_are_differences_of_trajectories(delay):
 # ---------------------------------------------------------------- the fit
 
 
-def few_unknowns():
-    """Two short segments with noise, and little that is not known."""
-    times = np.arange(0.25, 0.9, 0.02)
+def few_unknowns(spacing=0.02):
+    """Two short segments with noise, a sample every 20 ms, and little that is not known."""
+    times = np.arange(0.25, 0.9, spacing)
     log, states = short_log(times)
     rng = np.random.default_rng(3)
     log.values[:, ANGLES] += log.std[0] * rng.standard_normal((len(times), 6))
@@ -548,14 +548,15 @@ def test_a_mechanism_s_file_is_read_back(tmp_path):
     assert read.effort_limit == machine.effort_limit
 
 
-def test_steps_are_halved_until_they_do_not_matter():
-    """Coulomb friction of a few mN m that turns round within 20 ms."""
-    problem, guess = few_unknowns()
+@pytest.mark.parametrize(("spacing", "friction"), [(0.02, 2e-3), (0.01, 2e-2)])
+def test_steps_are_halved_until_they_do_not_matter(spacing, friction):
+    """Coulomb friction that turns round within 20 ms, also where samples are denser than steps."""
+    problem, guess = few_unknowns(spacing)
     values = guess.values.copy()
-    values[8] = 2e-3
+    values[8] = friction
     guess = Guess(values, guess.first)
     halved = with_half_step(problem, guess)
-    assert halved is not None and halved.longest_step == problem.longest_step / 2
+    assert halved is not None and halved.longest_step == pytest.approx(spacing / 2)
     while (more := with_half_step(halved, guess)) is not None:
         halved = more
     one, exact = (

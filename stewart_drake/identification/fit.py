@@ -295,9 +295,11 @@ def with_half_step(problem: Problem, guess: Guess, residual: float = 1.0) -> Pro
     """Return the problem with half the step, or None if that hardly changes its residuals.
 
     The change is compared with `residual` standard deviations. The necessary step depends on the
-    machine: Coulomb friction changes its sign within some hundredths of a second.
+    machine: Coulomb friction changes its sign within some hundredths of a second. Steps end at
+    samples, so that dense samples already shorten them.
     """
-    halved = replace(problem, longest_step=problem.longest_step / 2)
+    steps = plan_steps(problem.segments, guess.values[DELAY], problem.longest_step)
+    halved = replace(problem, longest_step=max(float(one.h.max()) for one in steps) / 2)
     if halved.longest_step < _SHORTEST_STEP:
         return None
     coarse, fine = (one.residuals(guess).measured for one in (problem, halved))
