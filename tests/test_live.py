@@ -574,6 +574,7 @@ def test_the_jitter_stands_beside_the_margin_and_asks(settings, asks):
         if settings is not None:
             assert "stable for delay errors from -1.72 ms to +1.51 ms" in told
             assert "round trips vary by 11 ms (standard deviation 1.53 ms)" in told
+            assert "the delay of 0.8 s can be compensated: under any controller" in told
         else:
             assert "this loop is unstable; " in told
         assert ("play-out buffer absorbs" in told) == (not asks)

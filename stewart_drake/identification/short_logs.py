@@ -70,11 +70,13 @@ def fit_short(pairs: Sequence[Pair], unknowns: Unknowns, worst: float) -> Soluti
         return right[0]
     found = " and ".join(f"{one.delay:.3g} s (+-{1e3 * one.delay_std:.2g} ms)" for one in right)
     longest, _ = max(pairs, key=lambda pair: len(pair[0].times))
+    lasting, delay = longest.times[-1] - longest.times[0], unknowns.mean[DELAY]
+    narrower = ", or a narrower tolerance of the delay" if lasting > delay + _RESPONSE else ""
     raise ConfigError(
-        f"{longest.name}: got a log of {longest.times[-1] - longest.times[0]:.3g} s, explained by "
+        f"{longest.name}: got a log of {lasting:.3g} s, explained by "
         f"{'delays of ' + found if found else 'no delay'}; expected one delay, known to "
         f"{1e3 * _VAGUE:g} ms: a log of at least {length_needed(unknowns):.3g} s (the longest "
-        f"possible delay and {_RESPONSE:g} s of motion), or a narrower tolerance of the delay"
+        f"possible delay and {_RESPONSE:g} s of motion){narrower}"
     )
 
 

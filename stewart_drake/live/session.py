@@ -44,7 +44,7 @@ from stewart_drake.reporting.document import templates
 from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.link_config import WireConfig
 from stewart_drake.scenario.run_log import Background, RunLog, UdpMirror, open_log
-from stewart_drake.studies.verdict import milliseconds
+from stewart_drake.studies.verdict import Verdict, milliseconds
 from stewart_drake.types import Array
 
 _MOST: Final = 0.5
@@ -131,6 +131,7 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
             contact=contact,
             machine=contact.machine,
             margin=ready.margin,
+            delay=Verdict(ready.margin.eta, ready.margin.pole, ready.margin.pole_time),
             duration=duration,
             scenario=scenario,
             period=made.experiment.scenario.controller.period,

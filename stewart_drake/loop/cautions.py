@@ -104,9 +104,9 @@ def overconfidence(summary: RunSummary) -> list[str]:
     factor = math.sqrt(consistency["nis_ratio"])
     return [
         "the estimator is overconfident: the machine does what its model cannot explain, as "
-        "friction, a payload off the centre, a push or a wrong delay do. Its prediction errors are "
-        f"{factor:.2g} times as large as it states, after it has widened its uncertainty: estimate "
-        "the cause, or raise controller.model_error"
+        "friction, a payload off the centre, a push or a wrong delay do. It has widened its "
+        f"uncertainty, to {1 / factor:.2g} times its prediction errors: estimate the cause, or "
+        "raise controller.model_error"
     ]
 
 

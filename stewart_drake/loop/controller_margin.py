@@ -204,7 +204,9 @@ def controller_margin(loop: Judged, until: float | None = None) -> ControllerMar
     if not all(inside):
         problem = "the true machine does not reach all of the reference"
     elif sc.link.kind == "network" or longest_wait(sc):
-        problem = "its packets or measurements do not all take the same time"
+        problem = (
+            "its packets or measurements do not all take the same time; see analyze robustness"
+        )
     elif isinstance(law.sensing, EncoderSensing) and not law.estimates:
         problem = "its rates are differences of measured poses"
     elif not sc.delay.constant:
