@@ -295,6 +295,13 @@ class Request(NamedTuple):
     rest: bool = False  # whether to stop instead
 
 
+class Segment(NamedTuple):
+    """Part of the reference."""
+
+    begin: float  # s
+    at: Callable[[float], Array]  # states (18,) as a function of time
+
+
 @dataclass(frozen=True)
 class Way:
     """The reference in segments, the earliest first. Before its begin the first one holds too.
@@ -302,14 +309,13 @@ class Way:
     A law reads the same instants again at each sample. They are therefore cached, to 1 ns.
     """
 
-    # the begin of each, s, and its states (18,) as a function of time
-    segments: tuple[tuple[float, Callable[[float], Array]], ...]
+    segments: tuple[Segment, ...]
     _cache: dict[int, Array] = field(default_factory=dict, compare=False)
 
     @classmethod
     def along(cls, motion: Trajectory) -> "Way":
         """Return the reference of a trajectory, constant before t = 0."""
-        return cls(((0.0, lambda t: evaluate(motion, max(0.0, t))),))
+        return cls((Segment(0.0, lambda t: evaluate(motion, max(0.0, t))),))
 
     def at(self, time: float) -> Array:
         """Return pose, rates and accelerations (18,) at a time in s."""
@@ -318,16 +324,16 @@ class Way:
         if state is None:
             if len(self._cache) >= _CACHED:
                 self._cache.clear()
-            begun = (at for begin, at in reversed(self.segments) if begin <= time)
-            state = self._cache[instant] = next(begun, self.segments[0][1])(time)
+            begun = (s for s in reversed(self.segments) if s.begin <= time)
+            state = self._cache[instant] = next(begun, self.segments[0]).at(time)
         return state
 
     def then(self, begin: float, at: Callable[[float], Array]) -> "Way":
         """Replace the reference from `begin` on, and drop segments that are long past."""
-        before = [segment for segment in self.segments if segment[0] < begin]
-        while len(before) > 1 and before[1][0] < begin - _HISTORY:
+        before = [s for s in self.segments if s.begin < begin]
+        while len(before) > 1 and before[1].begin < begin - _HISTORY:
             del before[0]
-        return Way((*before, (begin, at)))
+        return Way((*before, Segment(begin, at)))
 
 
 @dataclass(frozen=True)

@@ -377,8 +377,10 @@ class StewartPlatform:
             raise ConfigError(f"output port: got {name!r}; expected {' or '.join(names)}")
         if self.model is None:
             return self.plant.GetOutputPort(name)
-        make = lambda: PlateState(self.plant, self.mechanism, self.model)  # noqa: E731
-        return self._added_once("plate_state", make).GetOutputPort(name)
+        system = self._added_once(
+            "plate_state", lambda: PlateState(self.plant, self.mechanism, self.model)
+        )
+        return system.GetOutputPort(name)
 
     def SetState(self, context: Context, state: ArrayLike) -> None:
         """Put the platform, in its diagram's root context, into [pose; rates] (12,).

@@ -264,10 +264,10 @@ static int pass_identity(datagram *d, stewart_identity *identity)
     for (int i = 0; i < STEWART_PARTS; i++) {
         stewart_part *part = &identity->parts[i];
         pass(d, part->digest, 1, STEWART_DIGEST);
+        part->name[STEWART_NAME] = 0;
         if (d->to)
             memset(part->name + strlen(part->name), 0, STEWART_NAME - strlen(part->name));
         pass(d, part->name, 1, STEWART_NAME);
-        part->name[STEWART_NAME] = 0;
         for (size_t j = 0, size = strlen(part->name); j < STEWART_NAME; j++)
             printable &= j < size ? part->name[j] >= 0x20 && part->name[j] <= 0x7e : !part->name[j];
     }

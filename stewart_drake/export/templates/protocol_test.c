@@ -163,6 +163,14 @@ static void test_greeting(void)
     check(stewart_differing(&plan.identity, &measured.identity) == 0, "the same identity");
     plan.identity.parts[2].digest[7] ^= 1;
     check(stewart_differing(&plan.identity, &measured.identity) == 4, "another sensor");
+    /* A name without an end is cut. */
+    uint8_t data[STEWART_LONGEST];
+    stewart_part *part = &plan.identity.parts[0];
+    memset(part->name, 'n', sizeof part->name);
+    size_t size = stewart_write_plan(&plan, none, data);
+    check(stewart_read_plan(data, size, none, &plan) == STEWART_TAKEN &&
+              strlen(part->name) == STEWART_NAME && strcmp(plan.identity.parts[2].name, "state") == 0,
+          "a long name");
 }
 
 /* Nonces are of session, address, secret and the sessions so far; answers have a rate. */
