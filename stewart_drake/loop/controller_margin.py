@@ -72,6 +72,8 @@ INSTANTS: Final = 30
 """Number of instants along the reference. A prime number of steps, 29, avoids the same phases
 of a periodic motion. Twice as many change the margins of the shipped scenarios by less than a
 tenth."""
+POLE_INSTANTS: Final = 62
+"""Number of instants at which the open loop's poles are found, also in 61 steps, a prime number."""
 _COSTLY: Final = 150
 """Rows of a loop above which fewer instants are judged: an eigenvalue problem costs rows^3."""
 _LARGEST: Final = 330
@@ -192,11 +194,7 @@ def controller_margin(loop: Judged, until: float | None = None) -> ControllerMar
     times = np.linspace(0.0, end, INSTANTS)
     poses = [evaluate(experiment.reference, t)[POSE] for t in times]
     inside = [margin(truth.mechanism, pose) > 0 for pose in poses]
-    poles = [
-        fastest_pole(true_model(experiment, truth, t).A) if within else 0.0
-        for t, within in zip(times, inside, strict=True)
-    ]
-    fastest = int(np.argmax(poles))
+    pole, pole_time = fastest_in_motion(experiment, truth, end)
     queue = max(sc.true_delay.steps + 1, law.timeline.queue_length)
     rows = 12 + 6 * law.cost.integrates + 6 * queue
     radius, time, margins = math.nan, math.nan, _UNJUDGED
@@ -229,8 +227,8 @@ def controller_margin(loop: Judged, until: float | None = None) -> ControllerMar
         radius=radius,
         time=time,
         margins=margins,
-        pole=poles[fastest],
-        pole_time=float(times[fastest]),
+        pole=pole,
+        pole_time=pole_time,
         estimated=law.estimates,
         delay_found=law.finds_delay,
         tuned=experiment.tuned,
@@ -255,6 +253,21 @@ def true_model(experiment: Experiment, truth: StewartDynamics, time: float) -> C
     x = evaluate(experiment.reference, time)
     torque = truth.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
     return linear_model(*truth.derivatives(x[POSE], x[RATES], torque)[:2])
+
+
+def fastest_in_motion(
+    experiment: Experiment, truth: StewartDynamics, end: float
+) -> tuple[float, float]:
+    """Return the fastest pole of `true_model` in 1/s, 0 without one, and its time in s."""
+    times = np.linspace(0.0, end, POLE_INSTANTS)
+    poles = [
+        fastest_pole(true_model(experiment, truth, t).A)
+        if margin(truth.mechanism, evaluate(experiment.reference, t)[POSE]) > 0
+        else 0.0
+        for t in times
+    ]
+    worst = int(np.argmax(poles))
+    return poles[worst], float(times[worst])
 
 
 def loop_at(loop: Judged, time: float) -> LinearLoop:

@@ -16,7 +16,7 @@ from stewart_drake.law.cost import law_gain
 from stewart_drake.law.delay_model import DelayedModel, double_integrators, linear_model
 from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
+from stewart_drake.loop.controller_margin import POLE_INSTANTS, ControllerMargin, controller_margin
 from stewart_drake.loop.law_design import cost_of
 from stewart_drake.loop.preparation import assemble
 from stewart_drake.loop.results import delay_floor, waits_at_rest
@@ -34,8 +34,6 @@ from stewart_drake.studies.study_options import DelayOptions
 from stewart_drake.studies.verdict import Assessment, Verdict, assess, pole_in_motion
 from stewart_drake.types import Array
 
-INSTANTS: Final = 62
-"""Number of poles along the reference, in 61 steps: a round number may be in step with it."""
 TOLERABLE: Final = (2.0, 10.0, 100.0, 1000.0)
 """Growths of prediction errors for which the largest delay is given."""
 DELAYS: Final = (0, 1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 25, 30)
@@ -267,7 +265,7 @@ def simulated_growth(
 def _poles(found: Assessment) -> list[PolePoint]:
     experiment, points = found.experiment, []
     end = found.followed_until
-    for t in np.linspace(0.0, end, INSTANTS) if end > 0 else ():
+    for t in np.linspace(0.0, end, POLE_INSTANTS) if end > 0 else ():
         pose = experiment.reference.value(t)[:, 0]
         held = stability.fastest_pole(experiment.nominal.linearize(pose)[0])
         points.append(PolePoint(float(t), pole_in_motion(experiment, t), held))

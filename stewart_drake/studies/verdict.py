@@ -9,7 +9,7 @@ import numpy as np
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law.stability import amplification, fastest_pole
 from stewart_drake.law.startup import least_torque, reference_torques
-from stewart_drake.loop.controller_margin import INSTANTS, ControllerMargin, true_model
+from stewart_drake.loop.controller_margin import ControllerMargin, fastest_in_motion, true_model
 from stewart_drake.loop.preparation import REACH_CHECK_PERIOD, Experiment, assemble
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.scenario.config import Scenario
@@ -142,10 +142,8 @@ def loop_word(margin: MarginSummary | None) -> str:
 
 def delay_verdict(experiment: Experiment) -> Verdict:
     """Judge the scenario's true delay by the open loop's poles along its reference."""
-    sc, times = experiment.scenario, np.linspace(0.0, experiment.scenario.duration, INSTANTS)
-    poles = [pole_in_motion(experiment, t) for t in times]
-    worst = int(np.argmax(poles))
-    return Verdict(eta=sc.eta, pole=poles[worst], time=float(times[worst]))
+    sc = experiment.scenario
+    return Verdict(sc.eta, *fastest_in_motion(experiment, experiment.true_dynamics(), sc.duration))
 
 
 def pole_in_motion(experiment: Experiment, time: float) -> float:
