@@ -16,12 +16,13 @@ _PUBLIC: Final = {
     "loop.exact": "ExactPlant set_accuracy",
     "loop.law_design": "DesignedLaw design_law",
     "loop.platforms": "AddStewartPlatform StewartPlatform",
-    "loop.controller_margin": "ControllerMargin controller_margin linear_models",
+    "loop.controller_margin": "linear_models",
     "mechanism.files": "load_mechanism",
     "mechanism.geometry": "Mechanism",
     "mechanism.kinematics": "ForwardKinematicsError UnreachablePoseError",
-    "reporting.api": "compare report simulate " + " ".join("_".join(words_of(n)) for n in ANALYSES),
-    "reporting.results": "AnalysisResult ComparisonResult SimulationResult",
+    "reporting.api": "compare controller_margin report simulate "
+    + " ".join("_".join(words_of(n)) for n in ANALYSES),
+    "reporting.results": "AnalysisResult ComparisonResult ControllerMargin SimulationResult",
     "scenario.config": "ActuatorConfig ControllerConfig DelayConfig EncoderSensorConfig "
     "PlantConfig PositionServoConfig Scenario SensorConfig ServoActuatorConfig StateSensorConfig "
     "TorqueActuatorConfig TunerConfig",

@@ -5,7 +5,6 @@ import typing
 
 import stewart_drake.reporting.results
 import stewart_drake.scenario.config
-import stewart_drake.studies.new_machine
 import stewart_drake.studies.study_options
 from stewart_drake import law as law
 from stewart_drake import systems as systems
@@ -21,8 +20,6 @@ from stewart_drake.functions import plan_identification as plan_identification
 from stewart_drake.functions import replay_log as replay_log
 from stewart_drake.functions import setpoints as setpoints
 from stewart_drake.functions import view_model as view_model
-from stewart_drake.loop.controller_margin import ControllerMargin as ControllerMargin
-from stewart_drake.loop.controller_margin import controller_margin as controller_margin
 from stewart_drake.loop.controller_margin import linear_models as linear_models
 from stewart_drake.loop.diagram import ClosedLoop as ClosedLoop
 from stewart_drake.loop.diagram import build_closed_loop as build_closed_loop
@@ -37,10 +34,12 @@ from stewart_drake.mechanism.geometry import Mechanism as Mechanism
 from stewart_drake.mechanism.kinematics import ForwardKinematicsError as ForwardKinematicsError
 from stewart_drake.mechanism.kinematics import UnreachablePoseError as UnreachablePoseError
 from stewart_drake.reporting.api import compare as compare
+from stewart_drake.reporting.api import controller_margin as controller_margin
 from stewart_drake.reporting.api import report as report
 from stewart_drake.reporting.api import simulate as simulate
 from stewart_drake.reporting.results import AnalysisResult as AnalysisResult
 from stewart_drake.reporting.results import ComparisonResult as ComparisonResult
+from stewart_drake.reporting.results import ControllerMargin as ControllerMargin
 from stewart_drake.reporting.results import SimulationResult as SimulationResult
 from stewart_drake.scenario.config import ActuatorConfig as ActuatorConfig
 from stewart_drake.scenario.config import ControllerConfig as ControllerConfig
@@ -116,7 +115,7 @@ def new(
     torque_limit: float | None = None,
     delay: float = 0.1,
     gravity: bool = True,
-) -> stewart_drake.studies.new_machine.NewMachine: ...
+) -> stewart_drake.reporting.results.NewMachine: ...
 def run_live(
     scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
     machine: str,

@@ -33,18 +33,19 @@ from stewart_drake.reporting import servo_identification
 from stewart_drake.reporting.csv_file import read_signals, signals_csv
 from stewart_drake.reporting.identification import document, plan_document
 from stewart_drake.reporting.page import Provenance
-from stewart_drake.reporting.results import AnalysisResult, SimulationResult, analysis_result
+from stewart_drake.reporting.results import (
+    AnalysisResult,
+    MechanismCheck,
+    NewMachine,
+    SimulationResult,
+    analysis_result,
+)
 from stewart_drake.scenario.calibration import save_calibration
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import as_scenario, scenario_yaml
 from stewart_drake.scenario.run_log import is_run
 from stewart_drake.studies.jobs import Progress
-from stewart_drake.studies.new_machine import (
-    MechanismCheck,
-    NewMachine,
-    check_mechanism,
-    new_machine,
-)
+from stewart_drake.studies.new_machine import check_mechanism, new_machine
 from stewart_drake.studies.options import refuse, takes
 from stewart_drake.studies.study_options import Measurements
 from stewart_drake.tuning.options import DataOptions, EvaluationOptions, TrainingOptions
@@ -296,12 +297,12 @@ def new(directory: str | Path, name: str, *, options: Measurements) -> NewMachin
     """
     folder = Path(directory)
     folder.mkdir(parents=True, exist_ok=True)
-    return new_machine(options, name, folder)
+    return NewMachine(*new_machine(options, name, folder))
 
 
 def check_model(mechanism: Mechanism | str | Path) -> MechanismCheck:
     """Check a mechanism at its home pose, under gravity."""
-    return check_mechanism(as_mechanism(mechanism))
+    return MechanismCheck(*check_mechanism(as_mechanism(mechanism)))
 
 
 def model_sdf(mechanism: Mechanism | str | Path) -> str:

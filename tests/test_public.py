@@ -109,6 +109,33 @@ def test_scenarios_and_results_tell_what_is_not_as_usual():
     )
     lost = sd.simulate(sd.load_scenario("paper", "delay_lqi", ("plant.kind=exact",)))
     assert lost.failure in repr(lost) and "left_workspace" in repr(lost)
+    assert str(lost) == lost.table() and "left workspace at" in str(lost)
+
+
+def test_a_printed_result_begins_with_its_conclusion(tmp_path):
+    """Also results of functions that are neither runs nor analyses."""
+    made = sd.new(
+        tmp_path,
+        "small",
+        base_radius=0.2,
+        shaft_distance=0.13,
+        plate_radius=0.11,
+        joint_distance=0.06,
+        crank=0.05,
+        rod=0.26,
+        plate_mass=2.5,
+        crank_mass=0.06,
+        rod_mass=0.05,
+    )
+    for found, opening in (
+        (sd.controller_margin("paper", until=1.0), "This loop is stable: linearised along"),
+        (sd.check_model("paper"), "yes: it stands at home"),
+        (made, "yes: it stands at home"),
+        (sd.setpoints("reachy_mini"), "every limit kept: largest torque"),
+    ):
+        assert str(found) == found.table() and str(found).startswith(opening)
+        assert max(map(len, str(found).splitlines())) <= 80 and "array" not in repr(found)
+    assert "prediction errors grow" in " ".join(str(made).split())
 
 
 FUNCTIONS = {

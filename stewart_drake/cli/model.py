@@ -20,7 +20,7 @@ from stewart_drake.cli.common import (
 from stewart_drake.cli.options import Given, command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
-from stewart_drake.reporting.document import PAGE, Caution
+from stewart_drake.reporting.document import PAGE
 from stewart_drake.reporting.terminal import echo
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.options import MissingOption, Option, quantity
@@ -46,7 +46,7 @@ def check(*, mechanism: MechanismName, delivery: Delivery) -> int:
         write_figures({"mechanism": shown.mechanism_figure(found.mechanism)}, folder)
 
     found = sd.check_model(mechanism)
-    delivery.say(shown.document(found).plain())
+    delivery.say(found.table())
     delivery.discard("mechanism.png", "mechanism.svg")
     delivery.write(found.summary)
     delivery.draw("mechanism.png, mechanism.svg", draw)
@@ -117,22 +117,15 @@ def _new(
 ) -> tuple[int, str]:
     """Write the files; return the exit status and the report as HTML."""
     from stewart_drake.loop.simulation import simulate
-    from stewart_drake.reporting.mechanism import document
     from stewart_drake.reporting.page import Provenance, html
     from stewart_drake.reporting.report import first_report
+    from stewart_drake.reporting.results import NewMachine
     from stewart_drake.studies import new_machine as study
-    from stewart_drake.studies.verdict import Verdict, loop_verdict
 
     with given.named():
-        made = study.new_machine(measurements, _name_of(folder), folder)
+        made = NewMachine(*study.new_machine(measurements, _name_of(folder), folder))
     delivery.wrote(study.MACHINE, study.SCENARIO)
-    margin = made.margin
-    delay = Verdict(margin.eta, margin.pole, margin.pole_time)
-    findings = [made.verdict, loop_verdict(margin), str(delay)]
-    delivery.say(document(made.check).plain())
-    delivery.say_wrapped(*findings)
-    for text in made.crossings:
-        delivery.say(Caution(text).plain())
+    delivery.say(made.table())
     delivery.discard(PAGE)
     delivery.write(made.summary)
     text = ""
@@ -142,7 +135,7 @@ def _new(
         result = simulate(load_scenario(folder / study.SCENARIO))
         typed = {name.replace("_", "-"): value for name, value in measurements.model_dump().items()}
         made_by = Provenance(command_line("new", str(folder), options=typed))
-        text = html(first_report(made, result, findings), made_by)
+        text = html(first_report(made, result, made.findings), made_by)
         write_whole(where / PAGE, text)
 
     delivery.draw(PAGE, draw)

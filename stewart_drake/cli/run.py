@@ -73,8 +73,7 @@ def simulate(
     viewer = Meshcat() if meshcat else None
     delivery.say_link(experiment.scenario)
     margin = controller_margin(experiment)
-    delay = Verdict(margin.eta, margin.pole, margin.pole_time)
-    delivery.say_wrapped(loop_verdict(margin), str(delay))
+    delivery.say_wrapped(loop_verdict(margin), str(Verdict.of(margin)))
     said = cautions_before(experiment, margin)
     for text in said:
         if not margin.problem or margin.problem not in text:  # which the verdict has
@@ -208,10 +207,7 @@ def setpoints(
         )
     kind = "plain" if plain else "compensated"
     echo(f"written to {out}: {len(made.times)} {kind} setpoints at {rate:g} Hz")
-    torque, speed = abs(made.torques).max(), abs(made.crank_rates).max()
-    echo(f"largest torque {torque:.3g} N m, largest speed of a crank {speed:.3g} rad/s")
-    if made.blend:
-        echo(f"soft start: the motion joins the reference after {made.blend:g} s")
+    echo(made.table())
 
 
 def _pose(text: str) -> list[float]:

@@ -77,6 +77,20 @@ class Setpoints:
     torques: Array  # (n, 6) that the motion takes there from the servos, N m
     blend: float  # length of the soft start, s; 0 without one
 
+    def __repr__(self) -> str:
+        return f"Setpoints({len(self.times)} of six cranks)"
+
+    def __str__(self) -> str:
+        return self.table()
+
+    def table(self) -> str:
+        """Return the largest torque and speed, and the soft start, as text."""
+        torque, speed = np.abs(self.torques).max(), np.abs(self.crank_rates).max()
+        text = f"every limit kept: largest torque {torque:.3g} N m, crank speed {speed:.3g} rad/s"
+        if self.blend:
+            text += f"\nsoft start: the motion joins the reference after {self.blend:g} s"
+        return text
+
     def csv(self, units: ServoUnits | None = None) -> str:
         """Return a header `time[s],setpoint_1[rad],...` and a line per setpoint."""
         units = ServoUnits() if units is None else units

@@ -8,10 +8,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, ParamSpec, TypeVar
 
+from stewart_drake.loop import controller_margin as margins
 from stewart_drake.loop import simulation
 from stewart_drake.loop.preparation import simulated_machine
 from stewart_drake.reporting.analyses import ANALYSES, analyze, options_of, words_of
-from stewart_drake.reporting.results import AnalysisResult, ComparisonResult, SimulationResult
+from stewart_drake.reporting.results import (
+    AnalysisResult,
+    ComparisonResult,
+    ControllerMargin,
+    SimulationResult,
+)
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import as_scenario, title_of
 from stewart_drake.studies import compare as comparison
@@ -34,6 +40,7 @@ def _with(shown: Callable[[S], R], function: Callable[P, S]) -> Callable[P, R]:
 
 simulate = _with(SimulationResult.of, simulation.simulate)
 compare = _with(ComparisonResult, comparison.compare)
+controller_margin = _with(ControllerMargin.of, margins.controller_margin)
 
 
 def report(

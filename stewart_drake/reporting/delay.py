@@ -37,7 +37,7 @@ def document(study: DelayStudy) -> Document:
         study=study,
         sc=study.assessment.experiment.scenario,
         eta=partial(_eta, study),
-        gains=_gains,
+        gains=gains_text,
         milliseconds=milliseconds,
         spoken=own and loop_verdict(own),
         least=_is_fragile(study) and FRAGILE,
@@ -95,7 +95,7 @@ def _cell_word(cell: Cell, at: str = " {:.2f}") -> str:
     return word if math.isnan(cell.time) else word + at.format(cell.time)
 
 
-def _gains(margins: Margins | MotorMargins) -> str:
+def gains_text(margins: Margins | MotorMargins) -> str:
     """Return the range of gains of all motors, or of one."""
     up = f"{margins.gain_up:.3f}" if math.isfinite(margins.gain_up) else "∞"
     return f"{margins.gain_down:.3f} to {up}"

@@ -15,13 +15,16 @@ import xarray
 
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.jsonio import write_json
+from stewart_drake.loop import controller_margin as loop_margin
 from stewart_drake.loop import results as loop_results
 from stewart_drake.loop.preparation import simulated_machine
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.reporting.csv_file import columns_of
-from stewart_drake.reporting.document import PAGE, Document, Picture
+from stewart_drake.reporting.document import PAGE, Caution, Document, Picture, from_template, wrap
 from stewart_drake.reporting.run import comparison_document, run_document
+from stewart_drake.studies import new_machine
 from stewart_drake.studies.compare import save_comparison
+from stewart_drake.studies.verdict import Verdict, loop_verdict, milliseconds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -64,6 +67,9 @@ class SimulationResult(loop_results.SimulationResult):
     @classmethod
     def of(cls, result: loop_results.SimulationResult) -> "SimulationResult":
         return cls(**vars(result))
+
+    def __str__(self) -> str:
+        return self.table()
 
     def table(self) -> str:
         """Return status, errors and torques as text."""
@@ -129,6 +135,9 @@ class ComparisonResult(dict[str, SimulationResult]):
     def __repr__(self) -> str:
         return f"ComparisonResult({', '.join(f'{k}: {run.status}' for k, run in self.items())})"
 
+    def __str__(self) -> str:
+        return self.table()
+
     def table(self) -> str:
         """Return a row per controller as text."""
         return comparison_document(self).plain()
@@ -167,6 +176,60 @@ class ComparisonResult(dict[str, SimulationResult]):
     def save(self, directory: str | Path) -> None:
         """Write NAME.nc of every controller, then summary.json; the directory is made."""
         save_comparison(self, directory)
+
+
+class ControllerMargin(loop_margin.ControllerMargin):
+    __doc__ = loop_margin.ControllerMargin.__doc__
+
+    @classmethod
+    def of(cls, margin: loop_margin.ControllerMargin) -> "ControllerMargin":
+        return cls(**vars(margin))
+
+    def __repr__(self) -> str:
+        return f"ControllerMargin({loop_verdict(self)!r})"
+
+    def __str__(self) -> str:
+        return self.table()
+
+    def table(self) -> str:
+        """Return stability, margins and the growth of prediction errors as text."""
+        from stewart_drake.reporting.delay import gains_text
+
+        verdicts = loop_verdict(self), Verdict.of(self)
+        given = {"margin": self, "verdicts": verdicts, "gains": gains_text}
+        return from_template("margin", milliseconds=milliseconds, **given).plain()
+
+
+class MechanismCheck(new_machine.MechanismCheck):
+    """Check of a mechanism at home. Printed it is a table."""
+
+    def __repr__(self) -> str:
+        return f"MechanismCheck({self.mechanism.name!r}, {self.verdict!r})"
+
+    def __str__(self) -> str:
+        return self.table()
+
+    def table(self) -> str:
+        """Return the text that the command prints."""
+        from stewart_drake.reporting.mechanism import document
+
+        return document(self).plain()
+
+
+class NewMachine(new_machine.NewMachine):
+    """New machine with a first check. Printed it is a table."""
+
+    def __repr__(self) -> str:
+        return f"NewMachine({self.check.mechanism.name!r}, {self.verdict!r})"
+
+    def __str__(self) -> str:
+        return self.table()
+
+    def table(self) -> str:
+        """Return the text that the command prints."""
+        crossings = [Caution(text).plain() for text in self.crossings]
+        check = MechanismCheck(*self.check).table()
+        return "\n".join([check, *map(wrap, self.findings), *crossings])
 
 
 _LEFT_OUT: Final = ("scenario", "versions", "warnings")

@@ -37,6 +37,7 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COORDINATES
 from stewart_drake.studies.clearance import clearance_along
 from stewart_drake.studies.study_options import Measurements
+from stewart_drake.studies.verdict import Verdict, loop_verdict
 from stewart_drake.studies.workspace_map import Measures, Travel, measure, travel
 from stewart_drake.types import Array
 
@@ -146,6 +147,11 @@ class NewMachine(NamedTuple):
         return f"{takes}, the motors have {limit:.3g}" + (
             "" if self.peak_torque < limit else ": too weak"
         )
+
+    @property
+    def findings(self) -> list[str]:
+        """Sentences about torque, stability and delay."""
+        return [self.verdict, loop_verdict(self.margin), str(Verdict.of(self.margin))]
 
     @property
     def summary(self) -> dict[str, Any]:

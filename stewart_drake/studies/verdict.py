@@ -76,6 +76,10 @@ class Verdict:
     pole: float  # fastest unstable pole of the open loop along the reference, 1/s; 0 without one
     time: float  # of that pole, s
 
+    @classmethod
+    def of(cls, margin: ControllerMargin) -> "Verdict":
+        return cls(margin.eta, margin.pole, margin.pole_time)
+
     @property
     def amplification(self) -> float:
         """Growth e^(pole eta), infinite on overflow."""
