@@ -80,9 +80,9 @@ def test_axes_name_their_units(run):
     drawn = draw_run(run)
     for name, units in {
         "states": ["deg"] * 3 + ["mm"] * 3,
-        "errors": ["deg"] * 3 + ["mm"] * 3,
-        "torques": ["N m"] * 6,
-        "parameters": ["µN m"] * 6 + ["kg", "µN m s/rad"],
+        "errors": ["deg"] * 3 + ["mm"] * 3 + ["% of motion"],
+        "torques": ["N m"] * 7,
+        "parameters": ["µN m"] * 6 + ["kg", "mN m s/rad"],
     }.items():
         labels = sorted(ax.get_ylabel() for ax in drawn[name].axes)
         assert sorted(label.partition("[")[2].rstrip("]") for label in labels) == sorted(units)
@@ -136,12 +136,41 @@ def test_a_run_stopped_before_its_first_sample_can_be_drawn(run):
 def test_rounding_is_no_motion(run):
     """A coordinate that stays where it should gets no axis of 1e-14 deg."""
     still = run.signals.copy()
-    still["reference"] = still.reference * 0
-    still["error"] = still.reference + 1e-13 * np.sin(still.time)
+    still["reference"] = still.reference * np.array([0, 0, 0, 0, 0, 1])
+    still["error"] = 0 * still.reference + 1e-13 * np.sin(still.time)
     still["pose"] = still.reference + still.error
     drawn = draw_run(dataclasses.replace(run, signals=still))
     for name in ("states", "errors"):
-        assert all(np.ptp(limits(ax)) > 1e-6 for ax in drawn[name].axes)
+        assert all(np.ptp(limits(ax)) > 1e-6 for ax in drawn[name].axes[:6])
+
+
+def test_a_reference_that_holds_still_has_its_errors_in_the_states(run):
+    held = run.signals.copy()
+    held["reference"] = 0 * held.reference + np.array([0, 0, 0, 0, 0, 0.38])
+    held["error"] = 1e-13 * np.sin(held.time) + 0 * held.reference
+    held["pose"] = held.reference + held.error
+    for drawn in (
+        draw_run(dataclasses.replace(run, signals=held)),
+        draw_comparison({"lqr": dataclasses.replace(run, signals=held)}),
+    ):
+        assert "errors" not in drawn
+        assert all(np.ptp(limits(ax)) > 1e-3 for ax in drawn["states"].axes)
+        title = drawn["states"].legends[0].get_title().get_text()
+        assert "holds still: the error is at most" in title
+        assert all(
+            ax.yaxis.get_major_formatter().get_offset() == "" for ax in drawn["states"].axes[-1:]
+        )
+
+
+def test_axes_of_parameters_fit_what_is_left_after_the_start(run):
+    """An estimate that is wrong by a thousand at first leaves the final interval visible."""
+    estimated = run.signals.copy()
+    early = (run.signals.time < 0.4).values[:, None]
+    estimated["parameters"] = estimated.parameters + 1e3 * early
+    drawn = draw_run(dataclasses.replace(run, signals=estimated))["parameters"]
+    for ax, same in zip(drawn.axes, draw_run(run)["parameters"].axes, strict=True):
+        assert ax.get_ylim() == same.get_ylim()
+    assert "the start is cut off" in drawn.legends[0].get_title().get_text()
 
 
 @pytest.mark.parametrize("number", [3, 12])

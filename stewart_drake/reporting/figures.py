@@ -8,12 +8,14 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
+import xarray
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.reporting import style
 from stewart_drake.reporting.panels import Curve, Panel, draw
+from stewart_drake.reporting.run import STILL, moving, worst
 from stewart_drake.reporting.style import FACTORS, UNITS, Line
 from stewart_drake.scenario.signals import (
     ANGLES,
@@ -42,12 +44,17 @@ _PARAMETER_GROUPS: Final = (
 _STATE_REACH: Final = 0.3
 _ERROR_REACH: Final = 0.5
 """Largest widening of an axis by a diverging run, as a share of the reference's peak to peak."""
-_LEAST_SIGMAS: Final = 0.02
-"""Least half width of a parameter's axis, as a share of its largest standard deviation."""
 _LEAST_SPAN: Final = 0.02
 """Least span of a coordinate's axis, as a share of the largest motion in its unit."""
 _ROUNDING: Final = 1e-6
 """Least span of a coordinate's axis, deg or mm: less is rounding."""
+_FINE: Final = 1e-3
+"""Least span of the pose's axis under a reference that holds still, deg or mm."""
+_TORQUES: Final = ("torque_commanded", "torque_applied")
+_TORQUE_DIGITS: Final = 9
+"""Decimals of torques in N m: smaller ones are rounding."""
+_DECADES: Final = 5
+"""Most decades of an axis of sizes below its largest value."""
 _MARGIN: Final = 0.06
 """Margin of an axis beyond the data, as a share."""
 _AFTER_END: Final = 1.1
@@ -69,7 +76,7 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
     own = (name for name in results if name not in LABELS)
     shown = (*TORQUE_CONTROLLERS, ADAPTIVE, *GRAVITY, *SERVOS, *own)
     aware = {name: results[name] for name in shown if name in results}
-    figures = {"states": _states(runs), "errors": _errors(runs)}
+    figures = _poses(runs)
     for name, result in aware.items():
         alone = lines[name]._replace(linestyle="-", marker="")
         figures[f"torques_{name}"] = _torques(result, spoken(name), alone)
@@ -83,13 +90,12 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
 
 
 def draw_run(result: SimulationResult) -> dict[str, Figure]:
-    """Return states, errors, torques, and if estimated or tuned parameters, delay and weights."""
-    runs = {"plate": (result, style.RUN)}
-    figures = {
-        "states": _states(runs),
-        "errors": _errors(runs),
-        "torques": _torques(result, "applied", style.RUN, commanded=True),
-    }
+    """Return states, errors, torques, and if estimated or tuned parameters, delay and weights.
+
+    A reference that holds still has no errors: the states show them.
+    """
+    figures = _poses({"plate": (result, style.RUN)})
+    figures["torques"] = _torques(result, "applied", style.RUN, commanded=True)
     if np.isfinite(result.signals.parameter_std.values).any():
         figures["parameters"] = _parameters(result)
     if _finds_delay(result):
@@ -112,27 +118,63 @@ def has_packets(run: SimulationResult) -> bool:
     return bool(np.isfinite(run.signals.packets.values).any())
 
 
-def _states(runs: _Runs) -> Figure:
+def _poses(runs: _Runs) -> dict[str, Figure]:
+    """Return the states, and the errors unless nothing moves."""
     wanted = max((run.signals for run, _ in runs.values()), key=lambda s: s.sizes["time"])
+    held = len(wanted.time) > 0 and not any(moving(run).any() for run, _ in runs.values())
+    states = {"states": _states(runs, wanted, held)}
+    return states if held else states | {"errors": _errors(runs, wanted)}
+
+
+def _states(runs: _Runs, wanted: xarray.Dataset, held: bool) -> Figure:
     reference = FACTORS * wanted.reference.values
     spans = _spans(reference)
     motion = np.repeat([spans[ANGLES].max(), spans[POSITION].max()], 3)
-    least = np.maximum(_LEAST_SPAN * motion, _ROUNDING)
+    least = np.maximum(_LEAST_SPAN * motion, _FINE if held else _ROUNDING)
     time = wanted.time.values
     curves = [Curve(time, column, "reference", style.REFERENCE) for column in reference.T]
     title = "Pose of the plate and its reference"
+    if held:
+        errors = ", ".join(worst(run) for run, _ in runs.values())
+        title += f", which holds still: the error is at most {errors}"
     if lost := sum(run.stopped is not None for run, _ in runs.values()):
         title += f": {lost} of {len(runs)} runs ended early"
     return _coordinates(title, runs, "pose", _STATE_REACH * spans, least, curves)
 
 
-def _errors(runs: _Runs) -> Figure:
-    spans = np.max([_spans(FACTORS * run.signals.reference.values) for run, _ in runs.values()], 0)
+def _errors(runs: _Runs, wanted: xarray.Dataset) -> Figure:
+    own = _spans(wanted.reference.values)
+    spans, scale = FACTORS * own, np.where(own > STILL, own, 1.0)
     title, errors = "Errors of the pose", {one: r.accumulated_error for one, (r, _) in runs.items()}
     completed = {one: error for one, error in errors.items() if np.isfinite(error)}
     if completed and len(runs) > 1:
         title += f": least with {min(completed, key=completed.__getitem__)}"
-    return _coordinates(title, runs, "error", _ERROR_REACH * spans, np.full(6, _ROUNDING))
+    elif completed:
+        title += f"; the largest is {', '.join(worst(run) for run, _ in runs.values())}"
+    shares = [100 * np.mean(np.abs(r.signals.error.values) / scale, 1) for r, _ in runs.values()]
+    mean = _sizes(
+        "mean error  [% of motion]", _curves(runs, shares), _trusted(runs, shares), _times(runs)
+    )
+    least = np.full(6, _ROUNDING)
+    return _coordinates(title, runs, "error", _ERROR_REACH * spans, least, below=[mean])
+
+
+def _sizes(
+    name: str, curves: Sequence[Curve], core: Sequence[Array], xlim: tuple[float, float]
+) -> Panel:
+    """Return a wide panel of sizes over some decades, as far as those of `core` reach."""
+    inside = np.concatenate(core)
+    largest = float(np.max(inside, initial=0.0, where=np.isfinite(inside)))
+    low = max(largest * 10**-_DECADES, float(np.min(inside, initial=largest, where=inside > 0)))
+    return Panel(
+        name,
+        curves,
+        xlim=xlim,
+        ylim=(0.7 * low, 2 * largest) if largest > 0 else None,
+        yscale="powers" if largest > 0 else "linear",
+        height=1.5,
+        wide=True,
+    )
 
 
 def _coordinates(
@@ -142,6 +184,7 @@ def _coordinates(
     reach: Array,
     least: Array,
     wanted: Sequence[Curve] = (),
+    below: Sequence[Panel] = (),
 ) -> Figure:
     """Draw the six coordinates of a signal, over the wanted ones; `reach`, `least`: `_limits`."""
     panels, word = [], "" if signal == "pose" else f" {signal}"
@@ -157,12 +200,12 @@ def _coordinates(
                 ylim=_limits(core, data, reach[k], least[k]),
             )
         )
-    return draw(panels, 2, down=True, title=title)
+    return draw([*panels, *below], 2, down=True, title=title)
 
 
 def _torques(run: SimulationResult, label: str, line: Line, commanded: bool = False) -> Figure:
     signals, panels, xlim = run.signals, [], (0.0, shown_until(run))
-    asked, acted = signals.torque_commanded.values, signals.torque_applied.values
+    asked, acted = (np.round(signals[name].values, _TORQUE_DIGITS) for name in _TORQUES)
     unit, factor = style.unit_for([acted, asked] if commanded else acted, style.TORQUES)
     for k, leg in enumerate(LEGS):
         wanted = factor * asked[:, k]
@@ -170,6 +213,11 @@ def _torques(run: SimulationResult, label: str, line: Line, commanded: bool = Fa
         applied = _curve(run, factor * acted[:, k], label, line, steps=True)
         name = f"motor {leg}{'' if commanded else ' applied'}  [{unit}]"
         panels.append(Panel(name, [*curves * commanded, applied], xlim=xlim))
+    if commanded and (acted.any() or asked.any()):
+        sizes = [np.abs(factor * torque).max(axis=1) for torque in (asked, acted)]
+        first = Curve(signals.time.values, sizes[0], "commanded", style.COMMANDED, steps=True)
+        second = _curve(run, sizes[1], label, line, steps=True)
+        panels.append(_sizes(f"largest of six  [{unit}]", [first, second], sizes, xlim))
     if has_packets(run):
         strip = partial(_packet_strip, run=run)
         panels.append(Panel("", xlim=xlim, height=1.15, wide=True, paint=strip))
@@ -177,7 +225,8 @@ def _torques(run: SimulationResult, label: str, line: Line, commanded: bool = Fa
     if np.isfinite(acted).any():
         peaks = np.nanmax(np.abs(factor * acted), axis=0)
         most = int(np.nanargmax(peaks))
-        title += f": at most {peaks[most]:.2g} {unit} acted, by motor {LEGS[most]}"
+        most_text = f"at most {peaks[most]:.2g} {unit} acted, by motor {LEGS[most]}"
+        title += f": {most_text if peaks[most] > 0 else 'none acted'}"
     return draw(panels, 2, down=True, sharey=True, title=title)
 
 
@@ -203,15 +252,17 @@ def _parameters(run: SimulationResult) -> Figure:
     true = np.array(run.scenario.plant_parameters[:NUM_PARAMETERS])
     values, widths = run.signals.parameters.values, 2 * run.signals.parameter_std.values
     units, factors = [""] * NUM_PARAMETERS, np.ones(NUM_PARAMETERS)
-    shown = np.nanmax(np.abs(np.vstack([true, values, _LEAST_SIGMAS * widths / 2])), axis=0)
+    late = time >= xlim[1] / 2
+    late |= not late.any()
+    kept = np.vstack([values[late] - widths[late], values[late] + widths[late], true])
+    shown = np.nanmax(np.abs(kept), axis=0)
     for some, choice in _PARAMETER_GROUPS:
         unit, factors[some] = style.unit_for(shown[some], choice)
         units[some] = [unit] * len(units[some])
     true, values, widths = factors * true, factors * values, factors * widths
-    panels = []
+    panels, kept = [], factors * kept
     for k, name in enumerate(PARAMETERS):
         value, width = values[:, k], widths[:, k]
-        least = _LEAST_SIGMAS * np.nanmax(width) / 2
         panels.append(
             Panel(
                 f"{name.replace('_', ' ')}  [{units[k]}]",
@@ -220,10 +271,13 @@ def _parameters(run: SimulationResult) -> Figure:
                     Curve(time, value, "estimate", band=(value - width, value + width, "± 2 σ")),
                 ],
                 xlim=xlim,
-                ylim=_limits([value, true[k] + np.array([-least, least])], [], 0.0),
+                ylim=_limits([kept[:, k]], [], 0.0),
             )
         )
-    return draw(panels, 2, down=True, title="Parameters as the controller estimates them")
+    inside = np.abs(values[-1] - true) <= widths[-1]
+    title = f"Estimated parameters: {inside.sum()} of {len(inside)} true values in the final ± 2 σ"
+    title += ". Axes fit the second half; the start is cut off"
+    return draw(panels, 2, down=True, title=title)
 
 
 def _delay(run: SimulationResult) -> Figure:

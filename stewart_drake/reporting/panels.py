@@ -141,7 +141,7 @@ def draw(
 
 def _fill(ax: Axes, panel: Panel, last: bool, named: bool) -> None:
     if isinstance(ax.yaxis.get_major_formatter(), ScalarFormatter):
-        ax.ticklabel_format(axis="y", scilimits=(-2, 4), useMathText=True)
+        ax.ticklabel_format(axis="y", scilimits=(-2, 4), useMathText=True, useOffset=False)
     for one in panel.curves:
         how: dict[str, Any] = {"drawstyle": "steps-post"} if one.steps else {}
         ax.plot(one.x, one.y, label=one.label or None, **one.line._asdict(), **how)

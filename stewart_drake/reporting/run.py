@@ -19,7 +19,7 @@ from stewart_drake.studies.verdict import loop_word
 from stewart_drake.studies.workspace_map import largest_factor
 from stewart_drake.types import Array
 
-_STILL: Final = 1e-9
+STILL: Final = 1e-9
 """Motion below which a coordinate counts as still, rad or m."""
 
 _EVENTS: Final = {"measurements_missing": "samples without a new measurement"}
@@ -62,7 +62,7 @@ def _span(run: SimulationResult) -> Array:
 
 def moving(run: SimulationResult) -> NDArray[np.bool_]:
     """Return which coordinates (6,) the reference moves."""
-    return _span(run) > _STILL
+    return _span(run) > STILL
 
 
 def _peaks(run: SimulationResult) -> list[str]:
@@ -84,7 +84,7 @@ def worst(run: SimulationResult) -> str:
     """
     percent, span = np.array(run.summary["peak_error"]), _span(run)
     largest = np.repeat([span[ANGLES].max(), span[POSITION].max()], 3)
-    share = percent / np.where(moving(run) | (largest <= _STILL), 1.0, largest)
+    share = percent / np.where(moving(run) | (largest <= STILL), 1.0, largest)
     return _peaks(run)[int(np.argmax(share))]
 
 
