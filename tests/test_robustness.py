@@ -439,7 +439,22 @@ def test_a_draw_beyond_all_scenarios_is_an_outcome(one, problem, monkeypatch):
 def test_the_summary_counts_runs_by_what_ran_them(tmp_path, changes, loop):
     study = study_robustness(short(**changes), tmp_path, RobustnessOptions(runs=2, workers=1))
     assert study.summary["loops"] == {loop: 2}
-    assert document(study).facts["loop"] == f"{loop}: 2"
+    words = {"native": "compiled code", "drake, plant.kind": "Drake, because of plant.kind"}
+    assert document(study).facts["simulated by"] == f"{words[loop]} (2 runs)"
+
+
+def test_the_text_says_around_what_the_torque_limit_is_drawn():
+    told = " ".join(document(made_up(20)).plain().split())
+    assert "from 1 to 3 times the largest torque of the undisturbed run, 0.660 N m" in told
+
+
+def test_position_servos_get_no_joint_damping():
+    """They have their own friction, and a scenario with both is refused."""
+    scenario = sd.load_scenario("reachy_mini")
+    draws = [draw(Ranges(), SCALES, scenario, 0, index) for index in range(5)]
+    assert [one["damping"] for one in draws] == [0.0] * 5
+    machine = sd.load_mechanism("reachy_mini")
+    assert all(apply_draw(MACHINE, scenario, machine, one).as_scenario() for one in draws)
 
 
 def contents(folder):

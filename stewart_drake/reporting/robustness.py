@@ -50,6 +50,8 @@ SIGNIFICANT: Final = 0.05
 _GOOD, _FAIR = 0.99, 0.9
 """Smallest lower bound of the success rate for these tones."""
 _WORST: Final = 10
+_FEW: Final = 3
+"""Fewest failures that are compared with the other runs, and whose times are drawn."""
 _NAMED: Final = 3
 """Number of quantities, or pairs, in a sentence."""
 _SOFT: Final = "#666666"
@@ -59,7 +61,7 @@ _SUCCESS, _ABOVE, _FAILED = "#2F86C6", "#E69F00", "#C4502A"
 
 def document(study: RobustnessStudy) -> Document:
     influences, found, low = study.influences(), study.explanation, study.success.low
-    early = any(one.status != "completed" for one in study.outcomes)
+    early = sum(one.status != "completed" for one in study.outcomes)
     errors = [one for one in influences if one.error_p < SIGNIFICANT]
     errors.sort(key=lambda one: -abs(one.error.rho))
     return from_template(
@@ -78,8 +80,11 @@ def document(study: RobustnessStudy) -> Document:
         where=_where,
         spans=_spans(study),
         titles=TITLES,
+        few=_FEW,
+        singles=found.failing >= _FEW and found.singles,
+        pairs=found.failing >= _FEW and found.pairs,
         kept=lambda one: int(np.sum(~one.failed)),
-        strong=[title(one.factor) for one in found.found],
+        strong=[title(one.factor) for one in found.found if found.failing >= _FEW],
         for_error=list(dict.fromkeys(title(one.factor.strip("|")) for one in errors)),
         others=study.also and list({"as asked": study, **study.others}.items()),
         quantiles=[(q, study.quantile(q)) for q in QUANTILES],
@@ -88,7 +93,7 @@ def document(study: RobustnessStudy) -> Document:
         influence_figure=partial(influence_figure, influences),
         runs_figure=partial(runs_figure, study),
         reasons=[_reason(study, *one) for one in study.reasons.items()],
-        times_figure=early and partial(times_figure, study),
+        times_figure=early >= _FEW and partial(times_figure, study),
         ranges=list(factors(study.draws)),
         vary=", ".join(
             f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}"

@@ -282,8 +282,9 @@ def _draw_limit(rng: Generator, about: About) -> float | None:
 
 def _draw_damping(rng: Generator, about: About) -> float:
     damping, s = about.ranges.damping * rng.uniform(), about.scales
-    # A reference that rests moves no crank, and friction has no scale.
-    return float(damping * s.torque / s.speed if s.speed > 0 else 0.0)
+    # A reference that rests moves no crank, and friction has no scale. Servos have their own.
+    scaled = s.speed > 0 and about.scenario.actuator.kind != "position_servo"
+    return float(damping * s.torque / s.speed if scaled else 0.0)
 
 
 def _draw_delay(rng: Generator, about: About) -> float:
