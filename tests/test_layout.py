@@ -229,8 +229,11 @@ def test_a_layout_that_loses_its_goal_between_the_instants_looked_at_is_reported
     study = LayoutStudy(problem(), LayoutOptions(), {"a": found}, lost, [lost])
     assert study.verdict == (
         "partly: of 7 layouts in 1 searches the best has no condition at every instant; "
-        "0 of 1 complete the scenario"
+        "0 of 1 complete the scenario; layout_1 misses reach"
     )
+    keeps = lost._replace(name="layout_2", measures={"condition": 3.0}, missed={})
+    both = LayoutStudy(problem(), LayoutOptions(), {"a": found}, lost, [lost, keeps])
+    assert "layout_2, which keeps the limits, has a condition of 3; 0 of 2" in both.verdict
 
 
 def test_errata_another_layout_is_conditioned_better():

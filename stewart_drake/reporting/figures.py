@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.reporting import style
+from stewart_drake.reporting.document import number
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.run import STILL, moving, worst
 from stewart_drake.reporting.style import FACTORS, UNITS, Line
@@ -101,7 +102,7 @@ def draw_run(result: SimulationResult) -> dict[str, Figure]:
     if _finds_delay(result):
         figures["delay"] = _delay(result)
     if _is_tuned(result):
-        figures["weights"] = weights_figure({"weights that the tuner set": result})
+        figures["weights"] = weights_figure({"": result})
     return figures
 
 
@@ -314,7 +315,11 @@ def weights_figure(runs: Mapping[str, SimulationResult]) -> Figure:
         how: dict[str, Any] = {"xlim": (0, end), "yscale": "log" if len(weights) else "linear"}
         above.append(Panel("weight", [first, second], title=title, **how))
         below.append(Panel("w_Q / w_R", [other, constant], **how))
+    ratios = np.concatenate([run.signals.weights.values for run in runs.values()])
     title = "Weights of the cost as the tuner sets them"
+    if len(ratios):
+        low, high = (number(extreme(ratios[:, 0] / ratios[:, 1]), 2) for extreme in (min, max))
+        title += f": w_Q / w_R from {low} to {high}"
     return draw([*above, *below], len(runs), sharey="row", title=title)
 
 

@@ -129,7 +129,8 @@ def _measured(std: float, value: float) -> tuple[str, str]:
     interval = number(std, 2)
     if "e" in interval:
         return interval, f"{value:.6g}"
-    return interval, f"{value:.{len(interval.partition('.')[2])}f}"
+    decimals = len(interval.partition(".")[2])
+    return interval, f"{round(value, decimals) + 0.0:.{decimals}f}"  # without -0
 
 
 def _weak(found: Identification) -> list[str]:

@@ -87,7 +87,7 @@ def _run(one: Layout) -> str:
 
 
 def _shares(shares: dict[str, float]) -> str:
-    return ", ".join(f"{name} by {100 * share:.2g} %" for name, share in shares.items())
+    return ", ".join(f"{name} by {number(100 * share, 2)} %" for name, share in shares.items())
 
 
 def _numbers(study: LayoutStudy, machines: list[Layout]) -> Table:

@@ -12,7 +12,7 @@ from stewart_drake.loop.learned import save_learned
 from stewart_drake.reporting.document import Document, Frame, from_template
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.replay import replay_html
-from stewart_drake.reporting.style import line
+from stewart_drake.reporting.style import TORQUES, line, unit_for
 from stewart_drake.studies.learn import LearnStudy, Repetition
 
 
@@ -21,10 +21,14 @@ def document(study: LearnStudy) -> Document:
     numbers = {id(one): k for k, one in enumerate(study.repetitions, 1)}
     shown = [first] if best is first else [first, best]
     machine = study.experiment.truth
+    largest = [one.largest for one in study.repetitions if one.learned]
+    unit, factor = ("rad", 1.0) if study.setpoints else unit_for(largest, TORQUES)
     return from_template(
         "learn",
         "bad" if best.result.stopped else "plain" if best is first else "good",
         study=study,
+        of_largest=unit,
+        factor=factor,
         first=first,
         best=best,
         learned=best is not first,

@@ -56,12 +56,19 @@ def document(study: WorkspaceStudy) -> Document:
         nearest=along.nearest[: max(crossing, _NEAREST)],
         clearance_figure=partial(clearance_figure, study),
         clear_travel=travelled and list(zip(_COORDINATES, travelled, strict=True)),
+        torque=_unit("peak_torque", summary, TORQUES),
+        power=_unit("peak_power", summary, POWERS),
         use=limited and 100 * max(m["use_of_limit"] for m in summary["motors"]),
         motors_figure=sizing and partial(motors_figure, sizing, limit),
         from_home=study.travel and travel_text(study.travel),
         travel=study.travel and list(zip(_COORDINATES, study.travel, strict=True)),
         sections_figure=study.travel and partial(sections_figure, study),
     )
+
+
+def _unit(name: str, summary: dict[str, Any], choice: dict[str, float]) -> tuple[str, float]:
+    """Return the unit of the motors' largest value, and its factor."""
+    return unit_for([motor[name] for motor in summary["motors"] or ()], choice)
 
 
 def travel_text(travel: list[Travel]) -> str:

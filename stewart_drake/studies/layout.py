@@ -210,7 +210,9 @@ class LayoutStudy:
             least = min(self.searches.values(), key=lambda one: self.problem.cost(one.measures))
             missing = ", ".join(f"{name} by {100 * s:.3g} %" for name, s in least.missed.items())
             return f"no: {tried} none keeps the limits; the nearest misses {missing}"
-        best, goal = self.layouts[0], self.problem.requirements.goal
+        keeping = [one for one in self.layouts if not one.missed]
+        best, goal = (keeping or self.layouts)[0], self.problem.requirements.goal
+        which = "the best" if best is self.layouts[0] else f"{best.name}, which keeps the limits,"
         reached = f"no {goal} at every instant"
         if goal in best.measures:
             value = f"{MEASURES[goal].factor * best.measures[goal]:.3g} {MEASURES[goal].shown}"
@@ -221,7 +223,11 @@ class LayoutStudy:
         if done == count:
             run = "it completes" if count == 1 else "all of them complete"
         kept = done == count and not any(one.missed for one in self.layouts)
-        return f"{'yes' if kept else 'partly'}: {tried} the best has {reached}; {run} the scenario"
+        missed = "".join(
+            f"; {one.name} misses {', '.join(one.missed)}" for one in self.layouts if one.missed
+        )
+        word = "yes" if kept else "partly"
+        return f"{word}: {tried} {which} has {reached}; {run} the scenario{missed}"
 
     @property
     def summary(self) -> dict[str, Any]:
