@@ -80,7 +80,7 @@ def test_axes_name_their_units(run):
     drawn = draw_run(run)
     for name, units in {
         "states": ["deg"] * 3 + ["mm"] * 3,
-        "errors": ["deg"] * 3 + ["mm"] * 3 + ["% of motion"],
+        "errors": ["deg"] * 3 + ["mm"] * 3 + ["%"],
         "torques": ["N m"] * 7,
         "parameters": ["µN m"] * 6 + ["kg", "mN m s/rad"],
     }.items():

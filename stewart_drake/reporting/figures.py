@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.reporting import style
 from stewart_drake.reporting.document import number
-from stewart_drake.reporting.panels import Curve, Panel, draw
+from stewart_drake.reporting.panels import Curve, Panel, Scale, draw
 from stewart_drake.reporting.run import STILL, moving, worst
 from stewart_drake.reporting.style import FACTORS, UNITS, Line
 from stewart_drake.scenario.signals import (
@@ -54,6 +54,8 @@ _FINE: Final = 1e-3
 _TORQUES: Final = ("torque_commanded", "torque_applied")
 _TORQUE_DIGITS: Final = 9
 """Decimals of torques in N m: smaller ones are rounding."""
+_FEW_TICKS: Final = 0.01
+"""Span of an axis of sizes from which powers of ten are enough ticks."""
 _DECADES: Final = 5
 """Most decades of an axis of sizes below its largest value."""
 _MARGIN: Final = 0.06
@@ -153,9 +155,7 @@ def _errors(runs: _Runs, wanted: xarray.Dataset) -> Figure:
     elif completed:
         title += f"; the largest is {', '.join(worst(run) for run, _ in runs.values())}"
     shares = [100 * np.mean(np.abs(r.signals.error.values) / scale, 1) for r, _ in runs.values()]
-    mean = _sizes(
-        "mean error  [% of motion]", _curves(runs, shares), _trusted(runs, shares), _times(runs)
-    )
+    mean = _sizes("mean error  [%]", _curves(runs, shares), _trusted(runs, shares), _times(runs))
     least = np.full(6, _ROUNDING)
     return _coordinates(title, runs, "error", _ERROR_REACH * spans, least, below=[mean])
 
@@ -167,12 +167,13 @@ def _sizes(
     inside = np.concatenate(core)
     largest = float(np.max(inside, initial=0.0, where=np.isfinite(inside)))
     low = max(largest * 10**-_DECADES, float(np.min(inside, initial=largest, where=inside > 0)))
+    scale: Scale = "powers" if low < _FEW_TICKS * largest else "log"
     return Panel(
         name,
         curves,
         xlim=xlim,
         ylim=(0.7 * low, 2 * largest) if largest > 0 else None,
-        yscale="powers" if largest > 0 else "linear",
+        yscale=scale if largest > 0 else "linear",
         height=1.5,
         wide=True,
     )

@@ -370,9 +370,7 @@ def first_report(made: NewMachine, result: SimulationResult, findings: Iterable[
     check, completed = made.check, result.status == "completed"
     good: Tone = "fair" if made.crossings else "good"
     drawing = Picture(lambda: mechanism_figure(check.mechanism), "The machine at its home pose.")
-    figures = [
-        Picture(figure, f"{name.capitalize()}.") for name, figure in draw_run(result).items()
-    ]
+    figures = [Picture(figure, _CAPTIONS[name]) for name, figure in draw_run(result).items()]
     motion = (
         "Up and down, once in two seconds. A log of this motion shows friction and payload, but "
         "hardly the lengths: stewart-drake identify --plan finds a better one."
