@@ -74,7 +74,7 @@ def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys):
     out = said(capsys, "compare", *EXACT, "--set", "duration=1.4", "--out", tmp_path)
     lines = out.splitlines()
     rows = [next(line for line in lines if line.startswith(f"{n} ")) for n in CONTROLLERS]
-    assert all(f"{n} ({LABELS[n]})" in " ".join(out.split()) for n in CONTROLLERS)
+    assert all(f"{n} {LABELS[n]}" in " ".join(out.split()) for n in CONTROLLERS)
     second, third = lines[lines.index(rows[0]) + 1 :][:2]
     assert "left workspace" in rows[0] and "at 1.36 s," in second and "leg 2" in third
     assert [row.split()[1] for row in rows] == ["NaN", "NaN", "225", "80", "-"]

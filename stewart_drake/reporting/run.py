@@ -125,7 +125,7 @@ def comparison_document(
         papers=not table_two
         and any(is_papers(run.scenario, any_size=True) for run in results.values()),
         runs=[_row(title, name, run) for title, name, run in runs],
-        loops=[f"{name} ({label(name)}): {text}" for name, text in loops.items()],
+        loops=[(name, label(name), text) for name, text in loops.items()],
         cautions=[text for text in _shared_warnings(results) if text not in said],
         **context,
     )
