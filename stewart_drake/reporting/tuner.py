@@ -143,7 +143,7 @@ def evaluation_document(found: Evaluation) -> Document:
         faults=FAULTS,
         head="log10 w_Q/w_R" if faulty else "w_Q / w_R",
         share=_share,
-        change=lambda part: f"{-100 * part:+.1f}",
+        change=lambda part: f"{round(-100 * part, 1) + 0.0:+.1f}",  # without -0
         gains=lambda name: s["gains"].get(name) or {},
         by_fault_of=lambda fault: s["by_fault"][fault] or {},
         by_cost=faulty and by_cost,
@@ -163,7 +163,7 @@ def _share(interval: Sequence[float] | None) -> str:
     """Return a share (value, low, high) in percent."""
     if interval is None:
         return ""
-    value, low, high = (100 * x for x in interval)
+    value, low, high = (round(100 * x) + 0.0 for x in interval)  # without -0
     return f"{value:.0f} % ({low:.0f} to {high:.0f})"
 
 
