@@ -36,7 +36,7 @@ def data_document(data: xr.Dataset, summary: Mapping[str, Any]) -> Document:
         grid=_grid_table(data) if grid else None,
         gains=gains,
         # A gain is named by its logarithm, such as +0.5, or by its weights, such as 0.1 / 4.
-        head="log10 w_Q/w_R" if all(name[0] in "+-" for name in gains) else "weights",
+        head="log10 w_Q/w_R" if all(name[0] in "+-" for name in gains) else "w_Q / w_R",
     )
 
 
@@ -191,26 +191,23 @@ def distributions(found: Evaluation) -> Figure:
     )
 
 
-def _shown(found: Evaluation) -> dict[str, int | None]:
+def _shown(found: Evaluation) -> dict[str, int]:
     """Return the condition of each panel: the first of each fault, or the first four."""
     if not found.family.has_faults:
-        count = found.cost.shape[1]
-        return {f"condition {i + 1}": i if i < count else None for i in range(4)}
+        return {f"condition {i + 1}": i for i in range(min(4, found.cost.shape[1]))}
     kinds = [fault_of(one) for one in found.family.draws]
-    return {fault: kinds.index(fault) if fault in kinds else None for fault in FAULTS}
+    return {fault: kinds.index(fault) for fault in FAULTS if fault in kinds}
 
 
 def weights_over_time(found: Evaluation) -> Figure:
     period, ratios, panels = found.family.base.controller.period, _ratios(found), []
     for title, i in _shown(found).items():
-        curves = []
-        if i is not None:
-            best = ratios[found.cost[: len(ratios), i].argmin()]
-            longest = max(len(found.ratios[name][i]) for name in found.tuners)
-            curves = [Curve([0.0, period * longest], [best] * 2, "best fixed there", REFERENCE)]
-            for name, look in _lines(found).items():
-                used = found.ratios[name][i]
-                curves.append(Curve(period * np.arange(len(used)), used, name, look, steps=True))
+        best = ratios[found.cost[: len(ratios), i].argmin()]
+        longest = max(len(found.ratios[name][i]) for name in found.tuners)
+        curves = [Curve([0.0, period * longest], [best] * 2, "best fixed there", REFERENCE)]
+        for name, look in _lines(found).items():
+            used = found.ratios[name][i]
+            curves.append(Curve(period * np.arange(len(used)), used, name, look, steps=True))
         limits = (ratios.min() - 0.2, ratios.max() + 0.2)
         panels.append(Panel("log10 w_Q / w_R", curves, title=title, ylim=limits))
     return draw(panels, 2, sharey=True)
