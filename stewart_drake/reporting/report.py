@@ -299,8 +299,8 @@ def verdict(found: ReportData) -> tuple[str, Tone]:
     text = f"The plate follows its reference for {duration}: E_ac is "
     if bad:
         text = f"Not reliable: {bad}. The run completed {duration}: E_ac is "
-    error, floor = number(s["accumulated_error"]), s["delay_floor"]
-    average = f"{number(mean_error(run), 2)} % {_averaged(run)}"
+    error, floor = number(round(s["accumulated_error"], 9)), s["delay_floor"]
+    average = f"{number(round(mean_error(run), 9), 2)} % {_averaged(run)}"
     if floor > 0:
         text += (
             f"{error} % s. The time before any torque can act contributes {number(floor)} % s; "
