@@ -39,7 +39,7 @@ _OF_KIND: Final = {
 
 
 def document(found: Identification) -> Document:
-    interval, delay = _measured(1e3 * found.std[DELAY], 1e3 * found.values[DELAY])
+    interval, delay = measured(1e3 * found.std[DELAY], 1e3 * found.values[DELAY])
     cautions, names = _cautions(found), file_names(found.logs)
     right = found.right
     return from_template(
@@ -124,7 +124,7 @@ def _cautions(found: Identification) -> list[str]:
     return cautions
 
 
-def _measured(std: float, value: float) -> tuple[str, str]:
+def measured(std: float, value: float) -> tuple[str, str]:
     """Return a standard deviation in two digits, and a value with as many decimals."""
     interval = number(std, 2)
     if "e" in interval:
@@ -164,7 +164,7 @@ def _unknowns(free: Sequence[int], columns: dict[str, Array], brief: bool) -> Ta
         numbers = {head: number(factor * values[k]) for head, values in columns.items()}
         if "±" in columns and np.isfinite(columns["±"][k]):
             (head, values), *_ = columns.items()
-            numbers["±"], numbers[head] = _measured(factor * columns["±"][k], factor * values[k])
+            numbers["±"], numbers[head] = measured(factor * columns["±"][k], factor * values[k])
         rows.append((NAMES[k].replace("_", " "), unit, *numbers.values()))
     return Table(("unknown", "unit", *columns), rows, brief=brief)
 

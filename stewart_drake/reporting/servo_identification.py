@@ -16,6 +16,7 @@ from stewart_drake.identification.servo_fit import (
 )
 from stewart_drake.identification.servo_plan import SETPOINTS_FILE, ServoPlan
 from stewart_drake.reporting.document import Document, Table, Tone, from_template, number
+from stewart_drake.reporting.identification import measured
 from stewart_drake.reporting.panels import Panel, draw, leg_curves
 from stewart_drake.reporting.style import unit_for
 from stewart_drake.types import Array
@@ -79,7 +80,7 @@ def _document(identified: ServoIdentification, tone: Tone, **more: object) -> Do
         residual=number(np.degrees(identified.residual), 2),
         deviation=number(np.degrees(identified.deviation), 2),
         rounding=number(np.degrees(identified.rounding), 2),
-        combined=Table(("number", "unit", "found", "±"), rows, brief=True),
+        combined=Table(("number", "unit", "value", "±"), rows, brief=True),
         **more,
     )
 
@@ -96,8 +97,10 @@ def _cautions(found: ServoIdentification) -> list[str]:
 
 def _row(name: str, value: float, width: float, unit: str) -> tuple[str, ...]:
     shown, factor = _UNITS.get(unit, (unit, 1.0))
-    numbers = number(factor * value, 4), number(factor * width, 2)
-    return (name.replace("_", " "), shown, *numbers)
+    interval, found = measured(factor * width, factor * value)
+    if not np.isfinite(width):
+        found = number(factor * value, 4)
+    return name.replace("_", " "), shown, found, interval
 
 
 def _table(found: ServoIdentification, weak: bool) -> Table:
