@@ -12,6 +12,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 import stewart_drake as sd
+from stewart_drake.cli import main
 from stewart_drake.core.library import core
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.channel import Packets, Report, Sent, Wire, packets_of, report_of
@@ -569,7 +570,11 @@ def test_statements_on_the_worst_run_are_wrong_in_five_percent_at_most(completes
             assert wrong / studies > 0.045
 
 
-def test_the_study_asks_for_a_network_and_for_runs():
+def test_the_study_asks_for_a_network_and_for_runs(monkeypatch, capsys):
+    """The command asks before it imports what it needs."""
+    monkeypatch.setattr("stewart_drake.cli.analyze.analyze", None)
+    assert main(["analyze", "link", "paper"]) == 2
+    assert "got 'wire'; expected 'network'" in capsys.readouterr().err
     with pytest.raises(ConfigError, match="got 'wire'; expected 'network'"):
         study_link(scenario(), LinkOptions())
     with pytest.raises(ConfigError, match="runs: got 0; expected at least 1"):

@@ -3,6 +3,8 @@
 import errno
 import functools
 import os
+import re
+import shlex
 import sys
 import tempfile
 from itertools import pairwise
@@ -14,8 +16,9 @@ import stewart_drake as sd
 from stewart_drake.cli import analyze, identify, live, model, run, tune
 from stewart_drake.cli.common import INTERRUPTED, release
 from stewart_drake.cli.examples import add_examples
-from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.errors import ConfigError, resembling
 from stewart_drake.files.resources import KINDS, shipped
+from stewart_drake.files.yamlio import accepted
 from stewart_drake.reporting.terminal import echo
 from stewart_drake.studies.options import RENAMED
 
@@ -54,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         return _command().main(arguments, "stewart-drake", standalone_mode=False) or 0
     except _UsageError as error:
-        return _complain(_usage_message(error))
+        return _complain(_usage_message(error, words))
     except typer.Abort:  # Ctrl-C
         return INTERRUPTED
     except ImportError as error:  # Drake turns Ctrl-C into nested ones while it is loaded
@@ -140,14 +143,38 @@ def _complain(message: str) -> int:
     return _BAD_INPUT
 
 
-def _usage_message(error: Any) -> str:
-    option = getattr(error, "option_name", "").removeprefix("--")
+def _usage_message(error: Any, words: list[str]) -> str:
+    option = getattr(error, "option_name", "").strip("-")
     if option in RENAMED:
         return f"--{option}: got an option of 0.2; expected --{RENAMED[option]}"
-    if getattr(error, "possibilities", None):
-        return f"{error.message}; did you mean {error.possibilities[0]}?"
-    message = error.format_message().rstrip(".").replace(": Value error, ", ": ")  # pydantic's
+    possible = getattr(error, "possibilities", None) or ()
+    if near := resembling(option, [one.strip("-") for one in possible]):
+        return f"{error.message}; did you mean --{near[0]}?"
+    # The context of the error is missing for an option without a value.
+    command, path = _command(), "stewart-drake"
+    for word in words:
+        if word not in getattr(command, "commands", {}):
+            break
+        command, path = command.commands[word], f"{path} {word}"
+    arguments = [one for one in command.params if one.param_type_name == "argument"]
+    usage = " ".join([path, "[OPTIONS]", *map(_shown, arguments)])
+    message = error.message if possible else error.format_message().rstrip(".")
+    message = message.replace(": Value error, ", ": ")  # pydantic's
     if message.endswith("?"):
-        return message
-    command = "stewart-drake" if error.ctx is None else error.ctx.command_path
-    return f"{message}; see {command} --help"
+        return str(message)
+    parameter: Any = getattr(error, "param", None)
+    if extra := re.fullmatch(r"Got unexpected extra argument[^ ]* \((.*)\)", message):
+        hint = "a value with a blank needs quotes"
+        message = f"got {extra[1]!r}, which is neither argument nor value; expected {usage}; {hint}"
+    elif parameter in arguments and message.startswith("Missing"):
+        message = f"{_shown(parameter)}: got none in {shlex.join(words)!r}; expected {usage}"
+        message += f", {parameter.help[:1].lower()}{parameter.help[1:].rstrip('.')}"
+    elif found := re.fullmatch(r"Invalid value for '(--\S+)': (Input should .*)", message):
+        parts = [part for word in words for part in word.split("=", 1)]
+        typed = dict(pairwise(parts)).get(found[1])
+        message = f"{found[1]}: got {typed!r}; expected {accepted(found[2])}"
+    return f"{message}; see {path} --help"
+
+
+def _shown(argument: Any) -> str:
+    return str(argument.metavar or argument.name.upper())

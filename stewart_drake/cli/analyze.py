@@ -33,7 +33,8 @@ def _callback(name: str) -> Callable[..., int | None]:
         def load(controller: str | None) -> Scenario:
             return chosen._replace(controller=controller).load(*fixed)
 
-        options, out = given.options(load), delivery.out
+        options, out, loaded = given.options(load), delivery.out, chosen.load(*fixed)
+        options.check_scenario(loaded)  # before anything heavy is imported
         line = chosen.line(*words_of(name), **given.words, out=out)
         kept = GO_ON.replace("runs", row.keeps) if out else "nothing is kept without --out"
         first = "preparing" if row.counts else "computing"
@@ -42,7 +43,6 @@ def _callback(name: str) -> Callable[..., int | None]:
             stopping(kept) if row.keeps else contextlib.nullcontext(),
             count_bar(row.counts or name, delivery.quiet, first) as progress,
         ):
-            loaded = chosen.load(*fixed)
             delivery.say_link(loaded)
             found = analyze(
                 name, loaded, options, command=line, directory=out or scratch, progress=progress

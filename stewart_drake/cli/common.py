@@ -15,7 +15,7 @@ import typer
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials, write_whole
 from stewart_drake.files.resources import Kind, shipped
-from stewart_drake.reporting.document import PAGE, WIDTH, wrap
+from stewart_drake.reporting.document import PAGE, WIDTH, counted, wrap
 from stewart_drake.reporting.terminal import echo
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario, setting_choices, title_of
@@ -270,7 +270,7 @@ class Delivery:
             text = f"warning: {what} could not be drawn ({reason}); everything else is kept"
             echo(text, error=True)
         else:
-            self.wrote(f"{len(found)} figures" if what == "figures" else what)
+            self.wrote(counted(len(found), "figures") if what == "figures" else what)
 
     def wrote(self, *names: str) -> None:
         self._written += names

@@ -18,7 +18,7 @@ from stewart_drake.cli.common import Chosen, Delivery, check_log
 from stewart_drake.cli.options import Given, command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.options import LiveOptions, MachineOptions
-from stewart_drake.reporting.document import PAGE
+from stewart_drake.reporting.document import PAGE, counted
 from stewart_drake.reporting.terminal import echo
 
 if TYPE_CHECKING:
@@ -182,11 +182,12 @@ def _delivered(
         delivery.say(run_document(result).plain())
     late = s["sent_after_due_ms"]
     delivery.say_wrapped(
-        f"{s['samples']} samples with those of coming to rest, {s['deadlines_missed']} deadlines "
-        f"missed; torques were sent {late['median']:.0f} ms (99 %: {late['p99']:.0f}, worst "
-        f"{late['worst']:.0f}) after the earliest arrival of their measurement",
-        f"the machine had torques for {s['periods_played']} periods, for {s['periods_dry']} it "
-        "had none (dry)",
+        f"{counted(s['samples'], 'samples')} with those of coming to rest, "
+        f"{counted(s['deadlines_missed'], 'deadlines missed')}; torques were sent "
+        f"{late['median']:.0f} ms (99 %: {late['p99']:.0f}, worst {late['worst']:.0f}) after the "
+        "earliest arrival of their measurement",
+        f"the machine had torques for {counted(s['periods_played'], 'periods')}, for "
+        f"{s['periods_dry']} it had none (dry)",
     )
     if delivery.out is not None:
         delivery.discard(PAGE)  # of an earlier run
@@ -314,11 +315,12 @@ def machine(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
     s: Any = running.summary()
     refused = ", ".join(f"{n} {_REFUSED[cause]}" for cause, n in s["refused"].items() if n)
     delivery.say_wrapped(
-        f"ended after {s['time_s']:.1f} s: {s['sessions']} sessions, {s['runs']} runs, "
-        f"{s['silences']} silences, at most {1e3 * s['longest_lag_s']:.0f} ms behind",
+        f"ended after {s['time_s']:.1f} s: {counted(s['sessions'], 'sessions')}, "
+        f"{counted(s['runs'], 'runs')}, {counted(s['silences'], 'silences')}, at most "
+        f"{1e3 * s['longest_lag_s']:.0f} ms behind",
         f"datagrams: {s['received']} received, {s['sent']} sent, {s['unsent']} not sent, "
         f"{s['lost'] + s['measurements_lost']} lost by the simulated link; refused: "
         f"{refused or 'none'}",
-        f"torques: {s['played']} played, {s['dry']} periods dry",
+        f"torques: {s['played']} played, {counted(s['dry'], 'periods dry')}",
     )
     return delivery.end(s, interrupted)

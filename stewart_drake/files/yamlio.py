@@ -271,12 +271,18 @@ _PLAIN: Final = {
 """Words of pydantic, and those of a message."""
 
 
-def explain(data: Any, error: Any) -> str:
-    """Return an error of pydantic as `place: got value; expected what is accepted`."""
-    place, value = _place(data, error["loc"]), error["input"]
-    expected = re.sub(r"^(\w+ should (be|have) |Value error, )| after validation", "", error["msg"])
+def accepted(message: str) -> str:
+    """Return what a message of pydantic accepts, in words."""
+    words = r"^(\w+ should (be|have) |Value error, )| after validation|, unable to parse.*"
+    expected = re.sub(words, "", message)
     for theirs, plain in _PLAIN.items():
         expected = expected.replace(theirs, plain)
+    return expected
+
+
+def explain(data: Any, error: Any) -> str:
+    """Return an error of pydantic as `place: got value; expected what is accepted`."""
+    place, value, expected = _place(data, error["loc"]), error["input"], accepted(error["msg"])
     if error["type"].startswith("missing"):
         return f"{place}.{error['loc'][-1]}: is missing".removeprefix(".")
     if error["type"] == "union_tag_invalid":

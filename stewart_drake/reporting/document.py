@@ -80,6 +80,15 @@ def listed(items: Iterable[object], form: str) -> str:
     return ", ".join(form % one for one in items)
 
 
+def counted(number: int, words: str) -> str:
+    """Return a number and what it counts, of which the first word is a plural.
+
+    `2 measurements rejected`, but `1 measurement rejected`.
+    """
+    first, blank, rest = words.partition(" ")
+    return f"{number} {first.removesuffix('s') if number == 1 else first}{blank}{rest}"
+
+
 def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
@@ -370,6 +379,6 @@ def templates() -> "Environment":
     found = Environment(
         loader=PackageLoader("stewart_drake.reporting"), undefined=StrictUndefined, finalize=shown
     )
-    found.filters |= {"number": number, "capital": capital, "listed": listed}
+    found.filters |= {"number": number, "capital": capital, "listed": listed, "counted": counted}
     found.globals["inf"] = math.inf
     return found

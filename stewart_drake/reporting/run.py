@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stewart_drake.loop.preparation import assemble, check_instants
 from stewart_drake.loop.results import LEAST_MEASURED, SimulationResult
-from stewart_drake.reporting.document import Document, from_template, number
+from stewart_drake.reporting.document import Document, counted, from_template, number
 from stewart_drake.reporting.style import FACTORS, UNITS
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import ANGLES, COORDINATE_NAMES, NUM_COORDINATES, POSITION
@@ -44,7 +44,7 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
         least=LEAST_MEASURED,
         # the sum of others is left out
         events=[
-            (n, _EVENTS.get(name, name))
+            counted(n, _EVENTS.get(name, name.replace("_", " ")))
             for name, n in s["counts"].items()
             if n and name != "bad_measurements"
         ],

@@ -17,7 +17,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from scipy import stats
 
-from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.link_config import NetworkConfig
 from stewart_drake.scenario.packets import default_bound, in_time, times_under_way, torque_missing
@@ -160,9 +159,9 @@ def study_link(
 
     The scenario's own `playout` is not used.
     """
+    options.check_scenario(scenario)
     link = scenario.assumed_link
-    if link.kind != "network":
-        raise ConfigError(f"link.kind: got {link.kind!r}; expected 'network'")
+    assert link.kind == "network"
     runs, period = options.runs, scenario.controller.period
     base = replace(scenario, link=link, plant=scenario.plant.without_engine)
     losses = sorted({*LOSSES, link.loss})

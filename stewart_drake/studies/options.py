@@ -113,6 +113,9 @@ class Options(BaseModel):
             kind = ConfigError if wrong else MissingOption
             raise kind(explain(values, (wrong or errors)[0])) from None
 
+    def check_scenario(self, scenario: "Scenario") -> None:
+        """Refuse a scenario that the study does not cover."""
+
     @classmethod
     def described(cls) -> Iterator[Option]:
         """Yield all options; those that pages do not record come last."""

@@ -94,6 +94,13 @@ class LearnOptions(Options):
 class LinkOptions(Options):
     runs: int = option(5, "Number of seeds for each bound and loss.", "N", ge=1, le=10_000)
 
+    def check_scenario(self, scenario: Scenario) -> None:
+        if scenario.link.kind != "network":
+            raise ConfigError(
+                f"link.kind: got {scenario.link.kind!r}; expected 'network', which has a play-out "
+                "bound, as by --set link.kind=network"
+            )
+
 
 def _read_also(names: list[str], load: Callable[[str], Scenario]) -> dict[str, Scenario]:
     others = {Path(name).stem: name for name in names}
