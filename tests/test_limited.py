@@ -383,8 +383,14 @@ class Failing:
         return solve_by_daqp(problem, seconds)
 
 
-@pytest.mark.parametrize(("late", "cause"), [(False, "qp_failures"), (True, "qp_late")])
-def test_after_a_failure_the_last_plan_goes_on(late, cause):
+@pytest.mark.parametrize(
+    ("late", "cause", "shown"),
+    [
+        (False, "qp_failures", "1 sample without a plan within the limits"),
+        (True, "qp_late", "1 sample with a plan that was late"),
+    ],
+)
+def test_after_a_failure_the_last_plan_goes_on(late, cause, shown):
     # Two programs a sample; at sample 5 the one about the last plan and about the reference fail.
     plans, solver = [], Failing({11, 12}, late)
 
@@ -397,7 +403,7 @@ def test_after_a_failure_the_last_plan_goes_on(late, cause):
     assert getattr(after, cause) == 1
     np.testing.assert_allclose(after.plan.torques[0], before.plan.torques[1], atol=1e-4 * TAU)
     np.testing.assert_array_equal(after.in_flight[-1], after.plan.torques[0])
-    assert f"1 {cause.replace('_', ' ')}" in run_document(result).plain()
+    assert shown in " ".join(run_document(result).plain().split())
 
 
 def test_without_any_plan_the_cut_torque_of_the_free_law_is_sent():

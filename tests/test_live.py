@@ -116,6 +116,8 @@ def test_over_a_network_packets_bridge_what_is_lost(tmp_path):
     simulated = sd.simulate(scenario_of("duration=4.9", *FROM_REST), judge_stability=False)
     assert result.status == "completed"
     assert result.accumulated_error < simulated.accumulated_error + 0.5
+    lost = result.signals.packets.sel(packet="lost").values
+    assert np.array_equal(lost, np.round(lost)) and np.all(np.diff(lost) >= 0)
     applied = result.signals.torque_applied.values
     assert np.isfinite(applied).all() and result.summary["live"]["periods_played"] > 20
     result.save(tmp_path)
@@ -704,6 +706,7 @@ def test_round_trips_and_losses_are_those_of_the_link(offer):
     assert 0.2 <= link.shortest <= link.typical <= link.longest
     assert link.typical == pytest.approx(0.22, abs=0.03)
     assert 0 <= link.loss_there < 0.2 and 0 <= link.loss_back < 0.2
+    assert link.packets_lost == 0, "a request counts as a packet"
 
 
 # ---------------------------------------------------------------- the page
@@ -790,11 +793,12 @@ def test_the_page_does_what_its_own_buttons_ask_for_and_nobody_else(viewer, capf
         assert viewer.request() is not None
 
 
-def seen_at(time, error=0.1, torque=0.5):
+def seen_at(time, error=0.1, torque=0.5, unmeasured=0.0):
     """Return a sample of a plate at home."""
     state = np.concatenate([load_mechanism("paper").home, np.zeros(6)])
     wanted, torques = np.append(state, np.zeros(6)), np.full(6, torque)
-    return Snapshot(time, state, wanted, torques, error, *[0.1] * 4, 0, None, False, None)
+    last = 0, unmeasured, 0, None, False, None
+    return Snapshot(time, state, wanted, torques, error, *[0.1] * 4, *last)
 
 
 def test_a_page_whose_loop_has_ended_ends_without_a_traceback(monkeypatch):
@@ -813,6 +817,11 @@ def test_after_a_loss_the_page_shows_reason_last_seconds_and_advice(tab, viewer)
         viewer.show(seen_at(0.2 * k, error=10.0 if k < 4 else 0.2 * k, torque=0.5))
         tab.wait(f"window.live !== undefined && window.live.time >= {0.2 * k - 0.3}")
         time.sleep(0.1)
+    viewer.show(seen_at(6.0, error=math.nan, unmeasured=0.2))
+    tab.wait("window.live.time === 6")
+    assert tab.evaluate("document.getElementById('error').textContent") == "unknown"
+    note = tab.evaluate("document.getElementById('note').textContent")
+    assert "no usable measurement for 0.2 s: the picture is the model's" in note
     failure = Failure(5.8, 3, -0.1, "crank 3 passed its dead centre")
     viewer.ended(End("left_workspace", failure))
     tab.wait("document.body.classList.contains('over') && !document.getElementById('last').hidden")
@@ -822,7 +831,7 @@ def test_after_a_loss_the_page_shows_reason_last_seconds_and_advice(tab, viewer)
     last = tab.evaluate("document.getElementById('last').textContent")
     span = float(last.split("last ")[1].split(" s:")[0])
     assert 4.5 < span <= 5.0, "not the last seconds"
-    assert "at most 5.8" in last and "at most 0.500 N m" in last
+    assert "at most 5.8" in last and "at most 0.500 N m" in last and "measured until 5.8 s" in last
     points = tab.evaluate("document.querySelector('#last polyline').points.length")
     assert points > 20
     for width in (400, 1280):
@@ -830,6 +839,27 @@ def test_after_a_loss_the_page_shows_reason_last_seconds_and_advice(tab, viewer)
         assert tab.evaluate("document.documentElement.scrollWidth") == width
     assert tab.evaluate("[...document.querySelectorAll('input, button')].every(x => x.disabled)")
     assert tab.errors == []
+    viewer.close()  # and with it Meshcat's server
+    time.sleep(1.5)
+    scene = "document.querySelector('iframe').contentDocument"
+    banner = f"getComputedStyle({scene}.getElementById('status-message')).display"
+    assert tab.evaluate(banner) == "none"
+    assert tab.evaluate(f"{scene}.querySelector('canvas') !== null")
+
+
+@pytest.mark.slow
+@needs_chromium
+def test_after_a_run_the_page_says_what_becomes_of_the_plate(tab, viewer):
+    tab.open(viewer.opened(), 400, 800)
+    viewer.show(seen_at(1.0, error=1e-6))
+    tab.wait("window.live !== undefined")
+    assert tab.evaluate("document.getElementById('error').textContent") == "< 0.01 %"
+    viewer.ended(End("completed", None, "now the motors have no torque"))
+    tab.wait("document.body.classList.contains('over')")
+    note = "document.getElementById('note')"
+    assert tab.evaluate(f"{note}.textContent") == "completed. Now the motors have no torque."
+    assert not tab.evaluate(f"{note}.classList.contains('warn')")
+    assert tab.evaluate("document.getElementById('last').hidden") and tab.errors == []
 
 
 @pytest.mark.slow

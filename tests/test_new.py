@@ -1,5 +1,6 @@
 """new: a machine, a scenario and a first look from a few measurements."""
 
+import dataclasses
 import json
 import re
 from concurrent.futures import ThreadPoolExecutor
@@ -77,6 +78,13 @@ def test_no_other_height_gives_the_rods_a_better_push(tmp_path):
     assert push(machine.home[5]) >= max(others) - 1e-4
 
 
+@pytest.mark.parametrize(("gravity", "queue"), [(True, "equilibrium"), (False, "zero")])
+def test_its_scenario_starts_as_live_advises(gravity, queue, tmp_path):
+    made(tmp_path, gravity=gravity)
+    scenario = sd.load_scenario(tmp_path / "scenario.yaml")
+    assert (scenario.start, scenario.queue) == ("rest", queue)
+
+
 @pytest.mark.usefixtures("blank_figures")
 def test_what_it_proposes_runs_and_is_reported(tmp_path, capsys):
     folder = tmp_path / "mine"
@@ -88,6 +96,9 @@ def test_what_it_proposes_runs_and_is_reported(tmp_path, capsys):
     assert summary["inertia_estimated"] == ["base", "plate", "crank", "rod"]
     scenario = sd.load_scenario(folder / "scenario.yaml")
     assert scenario.true_delay.eta(scenario.controller.period) == pytest.approx(0.05)
+    from_rest = sd.simulate(scenario, judge_stability=False)
+    assert from_rest.status == "completed" and from_rest.summary["accumulated_error"] < 1.0
+    scenario = dataclasses.replace(scenario, start="on_reference", queue="reference")
     result = sd.simulate(scenario, judge_stability=False)
     assert result.status == "completed" and result.summary["accumulated_error"] < 0.1
     assert summary["peak_torque"] == pytest.approx(result.summary["peak_torque"], rel=0.05)

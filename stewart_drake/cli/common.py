@@ -78,7 +78,8 @@ class Chosen(NamedTuple):
 
     def load(self, *settings: str) -> Scenario:
         """Return the scenario with these settings, which the typed ones may replace."""
-        return load_scenario(self.scenario, self.controller, (*settings, *self.settings))
+        with named(settings="--set"):
+            return load_scenario(self.scenario, self.controller, (*settings, *self.settings))
 
     @property
     def title(self) -> str:

@@ -9,7 +9,6 @@ import sys
 import webbrowser
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import typer
@@ -67,7 +66,7 @@ def live(
     options = given.options()
     with given.named():
         options.check_learned()
-    loaded, name = chosen.load(), Path(chosen.scenario).stem
+    loaded, name = chosen.load(), chosen.title
     span = math.inf if options.duration is None else options.duration
     if options.learn:
         if options.hold or {options.duration, options.log, options.mirror} != {None}:

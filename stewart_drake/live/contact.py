@@ -61,6 +61,7 @@ class Link:
     trips: deque[float] = field(default_factory=lambda: deque(maxlen=_TRIPS))
     sent: int = 0  # number of datagrams whose fate is known
     lost: float = 0  # number of them that did not arrive
+    packets_lost: int = 0  # number of those with torques that did not arrive
     missed: float = 0  # number of measurements that did not come, by their sequence
     came: int = 0  # number of measurements that came
 
@@ -117,7 +118,7 @@ class Contact:
         self.last: MachineMessage | None = None
         self.heard = now()
         self._pending: dict[int, bool] = {}
-        self._requests = set[int]()
+        self._requests, self._packets = set[int](), set[int]()
         self._unanswered, self._first, self._followed = 0.0, 0, 0
         self._phases: deque[float] = deque(maxlen=_PHASES)
         self._newest = 0
@@ -172,6 +173,8 @@ class Contact:
         message = ControllerMessage(head, flags, sampled, playout, begin, rows, cranks=cranks)
         self.endpoint.send(message, self.session.address)
         self._pending[head.sequence] = False
+        if torques is not None:
+            self._packets.add(head.sequence)
         return head.sequence
 
     def has_arrived(self, sequence: int) -> bool:
@@ -225,6 +228,8 @@ class Contact:
             self._requests.discard(settled)
             link.lost += 0.5 * unanswered if asked else unanswered
             self._unanswered += 0.5 * unanswered * asked
+            link.packets_lost += unanswered and settled in self._packets
+            self._packets.discard(settled)
         link.missed = self._unanswered + max(0, gaps)
 
     def _acknowledge(self, message: MachineMessage) -> None:

@@ -206,7 +206,7 @@ class Watch:
         if silent > max(SILENT, 10 * self._period):
             if not self._silent_since:
                 self._silent_since = contact.heard
-                self.report(k, f"the machine is silent since {silent:.1f} s; waiting")
+                self.report(k, f"the machine has been silent for {silent:.1f} s; waiting")
             if silent > PATIENCE:
                 return self._end("lost_machine", k, f"the machine was silent for {PATIENCE:g} s")
         elif self._silent_since:

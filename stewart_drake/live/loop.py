@@ -148,7 +148,8 @@ class LiveLoop:
                 end = self._end("interrupted", k, "stopped")
         self.exchange.stop()
         if end.status in ("completed", "interrupted"):
-            self._say(f"now {self._design.left_alone(self.exchange.contact.machine)}")
+            end = end._replace(then=f"now {self._design.left_alone(self.exchange.contact.machine)}")
+            self._say(end.then)
         self._viewer.ended(end)
         return end
 
@@ -220,17 +221,17 @@ class LiveLoop:
         late = self.exchange.late(k)
         self.missed += late > self.exchange.real_period + self.exchange.jitter
         wanted = self._steering.way.at(t)
+        # A blend onto the motion is judged by the motion, as in a simulation.
+        judged = wanted if self._by_hand else evaluate(self._steering.motion, t)
         if self._recording:
-            # A blend onto the motion is judged by the motion, as in a simulation.
-            judged = wanted if self._by_hand else evaluate(self._steering.motion, t)
             packets = self._packets(k, message)
             self.record.sample(k, self._as_sent(k), measurement, judged, seconds, late, packets)
         else:
             self.resting.append(late)
         self._recover(t)
-        self._viewer.show(self._snapshot(k, wanted))
         if has_measured(self.memory, counts):
             self._measured, self._known, self._late = k, self.memory, self.exchange.overtaken
+        self._viewer.show(self._snapshot(k, wanted, judged))
         return self._lost(k)
 
     def _lost(self, k: int) -> End | None:
@@ -329,7 +330,7 @@ class LiveLoop:
             return np.full(len(PACKETS), np.nan)
         contact = self.exchange.contact
         last = message or contact.machine
-        return np.array([k + 1.0, contact.link.lost, math.nan, last.played, last.dry])
+        return np.array([k + 1.0, contact.link.packets_lost, math.nan, last.played, last.dry])
 
     # -------------------------------------------------------------- reference
 
@@ -375,9 +376,13 @@ class LiveLoop:
             self._steering, self.memory = steering, self.memory.without_error()
             self.recoveries += 1
 
-    def _snapshot(self, k: int, wanted: Array) -> Snapshot:
+    def _snapshot(self, k: int, wanted: Array, judged: Array) -> Snapshot:
         link, memory = self.exchange.contact.link, self.memory
-        error = memory.belief.state[POSE] - wanted[POSE]
+        error = memory.belief.state[POSE] - judged[POSE]
+        # Without measurements the model follows the reference, and its error says nothing.
+        unmeasured = (k - self._measured) * self._period
+        if unmeasured > self._design.law.timeline.eta + self._period / 2:
+            error = np.full(error.shape, np.nan)
         return Snapshot(
             time=k * self._period,
             state=np.array(memory.belief.state),
@@ -389,6 +394,8 @@ class LiveLoop:
             spread=link.spread,
             lost=1 - (1 - link.loss_there) * (1 - link.loss_back),
             missed=self.missed,
+            unmeasured=unmeasured,
+            recoveries=self.recoveries,
             safe=self._watch.safe,
             by_hand=self._by_hand,
             limit=self._steering.limit,

@@ -23,6 +23,7 @@ from stewart_drake.live.governor import Request
 from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.reporting.local_page import LocalServer
+from stewart_drake.reporting.page import environment
 from stewart_drake.reporting.style import FACTORS
 from stewart_drake.reporting.viewer import slider_range
 from stewart_drake.scenario.signals import COORDINATE_NAMES, POSE, RATES
@@ -143,6 +144,7 @@ def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
     from pydrake.geometry import Meshcat, MeshcatParams
 
     from stewart_drake.loop.scene import Scene
+    from stewart_drake.reporting.replay import scene_page
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the loop, which closes this
     logging.getLogger("drake").setLevel(logging.WARNING)  # hides Meshcat's own address
@@ -165,8 +167,10 @@ def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
         {"name": name, "unit": "deg" if i < 3 else "mm", "low": low[i], "high": high[i]}
         for i, name in enumerate(COORDINATE_NAMES)
     ]
-    values = {"title": title, "meshcat": meshcat.web_url(), "sliders": sliders}
-    server = LocalServer("live.html.j2", values, {"/events": readouts.events}, ask)
+    link = environment().get_template("live_scene.html.j2").render(socket=meshcat.ws_url())
+    shown = scene_page(meshcat, link, title)
+    get: dict[str, Any] = {"/events": readouts.events, "/scene": lambda: shown}
+    server = LocalServer("live.html.j2", {"title": title, "sliders": sliders}, get, ask)
     with suppress(EOFError, OSError):  # the loop is gone
         with lock:
             connection.send(server.url)
@@ -188,6 +192,7 @@ def _draw(connection: Connection, lock: threading.Lock, scene: Any, readouts: Re
             received = connection.recv()
             if isinstance(received, End):
                 ended = {"ended": received.words, "advice": received.advice}
+                ended["failed"] = received.failed
                 readouts.put(ended if seen is None else _values(seen) | ended)
                 continue
             seen, came = received, started
@@ -214,10 +219,12 @@ def _values(seen: Snapshot) -> dict[str, Any]:
         "wanted": np.round(FACTORS * seen.wanted[POSE], 2).tolist(),
         "pose": np.round(FACTORS * seen.state[POSE], 2).tolist(),
         "torque": np.round(seen.torque, 4).tolist(),
-        "error": round(seen.error, 3),
+        "error": float(f"{seen.error:.3g}"),
         **{name: round(1e3 * getattr(seen, name), 1) for name in ("eta", "trip", "spread")},
         "lost": round(100 * seen.lost, 1),
         "missed": seen.missed,
+        "unmeasured": round(seen.unmeasured, 2),
+        "recoveries": seen.recoveries,
         "safe": seen.safe,
         "byHand": seen.by_hand,
         "limit": seen.limit,

@@ -4,25 +4,34 @@ from typing import Final, NamedTuple
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.live.governor import Request
+from stewart_drake.reporting.document import sentence
 from stewart_drake.types import Array
 
 _ADVICE: Final = {
     "left_workspace": "Bring the plate back to its start and start live again. With --out the log "
     "shows the loss: stewart-drake replay LOG, stewart-drake identify LOG.",
     "lost_contact": "Datagrams arrive, usable measurements do not. If these are late, relieve both "
-    "computers or the network; else check the sensor. --max-missing 1 allows gaps of 1 s.",
+    "computers or the network; else check the sensor. --max-missing SECONDS allows longer gaps.",
     "lost_machine": "Check the machine's process and the network, and the load of its computer. "
-    "--max-missing 1 allows gaps of 1 s. The machine goes to its safe torque by itself.",
+    "--max-missing SECONDS allows longer gaps. The machine goes to its safe torque by itself.",
     "refused": "Correct what is named, then start live again.",
 }
 """What to do after a run, by its status."""
 
 
 class End(NamedTuple):
-    """How a run ended: its status (`loop.results.RunSummary`) and the failure, if any."""
+    """How a run ended: its status (`loop.results.RunSummary`) and the failure, if any.
+
+    `then` says what becomes of the plate after a run that was not lost.
+    """
 
     status: str
     stopped: Failure | None
+    then: str = ""
+
+    @property
+    def failed(self) -> bool:
+        return self.status in _ADVICE
 
     @property
     def words(self) -> str:
@@ -31,8 +40,8 @@ class End(NamedTuple):
 
     @property
     def advice(self) -> str:
-        """Advice after a run that was lost; else empty."""
-        return _ADVICE.get(self.status, "")
+        """Advice after a run that was lost, else what becomes of the plate."""
+        return _ADVICE.get(self.status) or (self.then and sentence(self.then))
 
 
 class Snapshot(NamedTuple):
@@ -40,12 +49,14 @@ class Snapshot(NamedTuple):
     state: Array  # estimated state (12,)
     wanted: Array  # reference (18,)
     torque: Array  # torque that acts (6,), N m
-    error: float  # mean pose error, % of peak to peak
+    error: float  # mean pose error, % of peak to peak; NaN while `unmeasured` exceeds the delay
     eta: float  # delay from a measurement to its torque as the law assumes it, s
     trip: float  # median round trip, s
     spread: float  # standard deviation of the round trips, s
     lost: float  # share of the datagrams that are lost, there and back
     missed: int  # number of missed deadlines
+    unmeasured: float  # time since the last usable measurement, s
+    recoveries: int  # number of new references that were planned
     safe: str | None  # why the safe torque acts, or None
     by_hand: bool  # whether the target is set by hand
     limit: str | None  # limit that prevents the requested motion, or None

@@ -61,19 +61,21 @@ class Scene:
     def show(self, pose: Array, wanted: Array, time: float = 0.0) -> bool:
         """Put the plate at a pose (6,) and the ring at another; return False if out of reach.
 
+        The ring moves also then.
+
         Args:
             pose, wanted: rad and m.
             time: s, of the frame of a Meshcat recording.
         """
+        angles, position = cast(Any, wanted[ANGLES]), cast(Any, wanted[POSITION])
+        placed = RigidTransform(RollPitchYaw(angles), position)
+        self._meshcat.SetTransform(_GHOST, placed @ self._disc, time)
         try:
             set_pose(self._plant, self._tree, self._mechanism, pose, np.zeros(6))
         except UnreachablePoseError:
             return False  # a multibody run may end slightly outside
         self._context.SetTime(time)
         self._diagram.ForcedPublish(self._context)
-        angles, position = cast(Any, wanted[ANGLES]), cast(Any, wanted[POSITION])
-        placed = RigidTransform(RollPitchYaw(angles), position)
-        self._meshcat.SetTransform(_GHOST, placed @ self._disc, time)
         return True
 
     def close(self) -> None:

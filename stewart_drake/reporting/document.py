@@ -81,9 +81,9 @@ def listed(items: Iterable[object], form: str) -> str:
 
 
 def counted(number: int, words: str) -> str:
-    """Return a number and what it counts, of which the first word is a plural.
+    """Return a number and what it counts: `2 samples late`, `1 sample late`.
 
-    `2 measurements rejected`, but `1 measurement rejected`.
+    The first of the words is a plural.
     """
     first, blank, rest = words.partition(" ")
     return f"{number} {first.removesuffix('s') if number == 1 else first}{blank}{rest}"

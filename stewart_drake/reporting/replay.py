@@ -111,10 +111,15 @@ def _html(signals: xr.Dataset, mechanism: Mechanism, title: str, outcome: str) -
             drake=versions()["drake"],
         )
     )
+    return scene_page(meshcat, overlay, "Replay")
+
+
+def scene_page(meshcat: Meshcat, overlay: str, title: str) -> str:
+    """Return Meshcat's page without a server, with more HTML at its end."""
     page = meshcat.StaticHtml()
     before, end, after = page.rpartition("</body>")
     assert end, "Meshcat's page has no body"
-    whole = f"{before}{overlay}{end}{after}".replace("Drake MeshCat", "Replay", 1)
+    whole = f"{before}{overlay}{end}{after}".replace("Drake MeshCat", title, 1)
     return whole.replace("<head>", f"<head>{_VIEWPORT}", 1)
 
 

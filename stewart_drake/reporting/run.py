@@ -22,7 +22,18 @@ from stewart_drake.types import Array
 STILL: Final = 1e-9
 """Motion below which a coordinate counts as still, rad or m."""
 
-_EVENTS: Final = {"measurements_missing": "samples without a new measurement"}
+_EVENTS: Final = {
+    "riccati_failures": "samples without a new gain",
+    "unreachable": "samples with a predicted pose that is out of reach or singular",
+    "nonfinite_torque": "samples with a torque that was not finite",
+    "measurements_missing": "samples without a new measurement",
+    "saturated_steps": "samples with a torque at the limit",
+    "limited_steps": "samples with a limit within the horizon",
+    "qp_failures": "samples without a plan within the limits",
+    "qp_late": "samples with a plan that was late",
+    "tuner_fallbacks": "fallbacks of the tuner",
+}
+"""Events whose names do not say what is counted; the first word is a plural."""
 _MAY_BE_LATE: Final = (
     "a late measurement is used at the sample at which it comes, unless a newer one has come"
 )

@@ -229,11 +229,12 @@ def scenario_text(m: Measurements, mechanism: Mechanism) -> str:
     period = _FAST_PERIOD if m.delay <= _MAX_STEPS * _FAST_PERIOD else _SLOW_PERIOD
     delay = Delay.of(m.delay, period)
     home = [float(value) for value in mechanism.home]
+    queue = "equilibrium      # the motors hold the plate already" if m.gravity else "zero"
     return f"""# A first motion of {mechanism.name}; all fields are in the shipped paper.yaml.
 mechanism: {MACHINE}
 duration: 10.0          # s
-start: on_reference
-queue: reference        # the motors hold the plate already
+start: rest             # as a machine is before its controller runs
+queue: {queue}
 
 # Up and down: a log of it shows friction and payload, but hardly the lengths.
 # For a log to identify the machine from: stewart-drake identify --plan
