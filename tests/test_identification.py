@@ -37,7 +37,7 @@ from stewart_drake.identification.model import (
     integrate,
     plan_steps,
 )
-from stewart_drake.identification.plan import fitted_multisine, multisine
+from stewart_drake.identification.plan import fitted_multisine, loss_along, multisine
 from stewart_drake.identification.progress import shown_by
 from stewart_drake.identification.start import coarse_delay, measured_poses
 from stewart_drake.identification.tolerances import Tolerances
@@ -52,6 +52,7 @@ from stewart_drake.identification.unknowns import (
 )
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.reporting.identification import document
+from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import BALL_JOINTS
 from tests.mechanisms import PAPER, random_mechanism
 
@@ -534,6 +535,15 @@ def test_a_multisine_rests_at_both_ends_and_stays_inside():
     assert np.linalg.cond(moved / moved.std(axis=0)) < 10  # no two coordinates move alike
     with pytest.raises(ConfigError, match="too large for the workspace even at 5 %"):
         fitted_multisine(PAPER, PAPER.home, np.full(6, 100.0), 2.0)
+
+
+def test_a_motion_that_the_loop_loses_is_shown():
+    peak = [0.13, 0.13, 0.13, 0.01, 0.01, 0.04]
+    times, poses = multisine(PAPER.home, np.array(peak), 20.0)
+    for limit, word in (("none", None), (0.012, "end of its reach")):
+        scenario = load_scenario("paper", settings=(f"actuator.torque_limit={limit}",))
+        lost = loss_along(scenario, times, poses)
+        assert lost is None if word is None else word in str(lost)
 
 
 def test_a_mechanism_s_file_is_read_back(tmp_path):

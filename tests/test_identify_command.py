@@ -238,6 +238,31 @@ def test_a_plan_can_be_run(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("setting", "share", "words"),
+    [
+        (
+            "actuator.torque_limit=0.02",
+            0.7,
+            "amplitude is 70 % of the requested one: the",
+        ),
+        ("controller.delay_steps=4", 1.0, "loses the plate along this motion, and along smaller"),
+    ],
+)
+def test_a_plan_shrinks_until_the_loop_keeps_it_or_says_that_it_does_not(
+    setting, share, words, tmp_path
+):
+    scenario = sd.load_scenario("paper", settings=(setting, "plant.kind=exact"))
+    found = sd.plan_identification(scenario)
+    assert found.summary["share"] == pytest.approx(share)
+    assert found.summary["kept"] == (share < 1) and "of its reach" in found.summary["lost"]
+    assert words in " ".join(str(found).split())
+    found.save(tmp_path)
+    run = sd.simulate(tmp_path / "scenario.yaml", judge_stability=False)
+    assert (run.status == "completed") == found.summary["kept"]
+
+
+@pytest.mark.slow
 def test_the_steps_of_the_multibody_plant_are_no_wrong_machine(tmp_path):
     scenario = sd.load_scenario("paper", settings=("duration=4",))
     sd.simulate(scenario, judge_stability=False).save(tmp_path)

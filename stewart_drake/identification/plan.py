@@ -8,6 +8,8 @@ Its frequencies f_ij = low + (j + i/6) (high - low) / n are its own. Phases are 
 the turn by the golden sequence, so that no two coordinates move alike. The window w rises from rest
 and falls to rest, and a_i gives the peak asked for.
 
+The scenario's loop is simulated along the motion; one that it loses is made smaller.
+
 The information of measurements does not depend on their values: along the motion, under the torques
 that follow it, J'J is known before anything has moved (Fisher's information).
 """
@@ -15,13 +17,15 @@ that follow it, J'J is known before anything has moved (Fisher's information).
 import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
 from pydrake.trajectories import PiecewisePolynomial
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.dynamics.workspace import margin, margins
+from stewart_drake.dynamics.workspace import Failure, margin, margins
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.fit import Guess, Problem, covariance, without_diverged
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
@@ -37,6 +41,7 @@ from stewart_drake.identification.unknowns import (
     unknowns_of,
 )
 from stewart_drake.law.feedforward import mean_torques
+from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
@@ -55,6 +60,7 @@ _GOLDEN: Final = (np.sqrt(5) - 1) / 2
 _RISE: Final = 2.0  # s
 _ROOM: Final = 0.5  # least share of the workspace's margin at the middle of the motion
 _LEAST_SHARE: Final = 0.05
+_SMALLER: Final = 0.7  # factor on the amplitude of a motion that the loop loses
 _AMPLITUDE: Final = 0.5  # share of the scenario's motion
 _DURATION: Final = 20.0  # s
 
@@ -64,7 +70,9 @@ class Plan:
     """Experiment and the expected accuracy of its identification."""
 
     scenario: Scenario  # with the motion of the file `MOTION`
-    share: float  # part of the requested amplitude that fits the workspace
+    share: float  # part of the requested amplitude that fits the workspace and the loop
+    lost: Failure | None  # how the scenario's loop loses a larger motion, or None
+    kept: bool  # whether it keeps this one
     times: Array  # (n,) s, of the motion
     poses: Array  # (n, 6) rad and m
     unknowns: Unknowns  # before the log
@@ -93,6 +101,8 @@ class Plan:
         return {
             "mechanism": self.unknowns.mechanism.name,
             "share": self.share,
+            "lost": None if self.lost is None else str(self.lost),
+            "kept": self.kept,
             "delay_std_s": float(self.std[DELAY]),
             "parameters": {
                 NAMES[k]: {
@@ -109,11 +119,15 @@ class Plan:
     @property
     def motion_csv(self) -> str:
         """Motion as a file for a reference of kind csv."""
-        names = zip(COORDINATE_NAMES, COORDINATE_UNITS, strict=True)
-        lines = [",".join(["time[s]", *(f"{name}[{unit}]" for name, unit in names)])]
-        rows = np.column_stack([self.times, self.poses])
-        lines += [",".join(f"{value:.12g}" for value in row) for row in rows]
-        return "\n".join(lines) + "\n"
+        return motion_csv(self.times, self.poses)
+
+
+def motion_csv(times: Array, poses: Array) -> str:
+    names = zip(COORDINATE_NAMES, COORDINATE_UNITS, strict=True)
+    lines = [",".join(["time[s]", *(f"{name}[{unit}]" for name, unit in names)])]
+    rows = np.column_stack([times, poses])
+    lines += [",".join(f"{value:.12g}" for value in row) for row in rows]
+    return "\n".join(lines) + "\n"
 
 
 def multisine(middle: Array, peak: Array, duration: float) -> tuple[Array, Array]:
@@ -150,6 +164,23 @@ def fitted_multisine(
     )
 
 
+def loss_along(scenario: Scenario, times: Array, poses: Array) -> Failure | None:
+    """Return how the scenario's loop loses the plate along a motion, or None.
+
+    The plant is the exact one.
+    """
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / MOTION
+        file.write_text(motion_csv(times, poses), encoding="utf-8")
+        followed = dataclasses.replace(
+            scenario,
+            reference=CsvConfig(file=str(file)),
+            duration=float(times[-1]),
+            plant=scenario.plant.without_engine,
+        )
+        return run_in_bulk(followed).stopped
+
+
 def plan(experiment: Experiment, std: Array, tolerances: Tolerances | None = None) -> Plan:
     """Plan an experiment with a motion around the scenario's.
 
@@ -161,6 +192,14 @@ def plan(experiment: Experiment, std: Array, tolerances: Tolerances | None = Non
     middle = (seen.min(axis=0) + seen.max(axis=0)) / 2
     peak = _AMPLITUDE * experiment.motion_scale
     times, poses, share = fitted_multisine(mechanism, middle, peak, _DURATION)
+    whole, lost = (times, poses, share), loss_along(sc, times, poses)
+    kept = lost is None
+    while not kept and share > _LEAST_SHARE:
+        share *= _SMALLER
+        times, poses = multisine(middle, share * peak, _DURATION)
+        kept = loss_along(sc, times, poses) is None
+    if not kept:
+        times, poses, share = whole
     motion = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(times, poses.T)
     log, states = _predicted(experiment, motion, times[-1], std)
     torque = float(np.abs(log.torques).max())
@@ -181,7 +220,7 @@ def plan(experiment: Experiment, std: Array, tolerances: Tolerances | None = Non
     spread = covariance(problem.normal(guess)[1])
     reference = CsvConfig(file=MOTION)
     changed = dataclasses.replace(sc, reference=reference, duration=float(times[-1]))
-    return Plan(changed, share, times, poses, unknowns, spread)
+    return Plan(changed, share, lost, kept, times, poses, unknowns, spread)
 
 
 def _predicted(
