@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import math
 import multiprocessing
+import shlex
 import signal
 import sys
 import webbrowser
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 LOG: Final = "log.csv"
 _EACH_WAY: Final = (0.35, 0.4)
 """Transit time of the demo's link each way, as a share of the scenario's delay."""
+_RESERVE: Final = 0.05
+"""Least part of the delay that is left for computing and a busy computer, s."""
 _LOST: Final = 0.02
 _REFUSED: Final = {
     "malformed": "malformed",
@@ -50,7 +53,7 @@ def live(
     demo: bool = typer.Option(
         False,
         "--demo",
-        help="Start a simulated machine too, with 0.35 to 0.4 of the delay each way.",
+        help="Start a simulated machine too, with up to 0.4 of the delay each way.",
     ),
     no_browser: bool = typer.Option(False, "--no-browser", help="Open no page."),
     given: Given,
@@ -62,7 +65,9 @@ def live(
     plate to rest and ends the run; Ctrl-C again, or Stop on the page, stops it at once.
     """
     if (machine is None) != demo:
-        raise ConfigError("--machine: expected either --machine HOST:PORT or --demo")
+        raise ConfigError(
+            f"--machine, --demo: got {'both' if demo else 'neither'}; expected one of them"
+        )
     options = given.options()
     with given.named():
         options.check_learned()
@@ -176,7 +181,11 @@ def _delivered(
     s = summary["live"]
     if result.stopped is not None:
         end = End(result.status, result.stopped)
-        delivery.say_wrapped(*filter(None, (end.words, end.advice)))
+        advice = end.advice
+        if delivery.out is not None and LOG in logs:
+            advice = advice.replace("With --out the log", "The log")
+            advice = advice.replace("LOG", shlex.quote(str(delivery.out / LOG)))
+        delivery.say_wrapped(*filter(None, (end.words, advice)))
     if result.status == "completed":
         delivery.say(run_document(result).plain())
     late = s["sent_after_due_ms"]
@@ -184,10 +193,17 @@ def _delivered(
         f"{counted(s['samples'], 'samples')} with those of coming to rest, "
         f"{counted(s['deadlines_missed'], 'deadlines missed')}; torques were sent "
         f"{late['median']:.0f} ms (99 %: {late['p99']:.0f}, worst {late['worst']:.0f}) after the "
-        "earliest arrival of their measurement",
+        "earliest arrival of their measurement"
+        if s["samples"]
+        else "no sample, nothing was sent",
         f"the machine had torques for {counted(s['periods_played'], 'periods')}, for "
         f"{s['periods_dry']} it had none (dry)",
     )
+    if s["recoveries"]:
+        delivery.say_wrapped(
+            f"the plate was too far off {counted(s['recoveries'], 'times')}: a new path led it "
+            "back from where it was"
+        )
     if delivery.out is not None:
         delivery.discard(PAGE)  # of an earlier run
         result.save(delivery.out)
@@ -217,7 +233,9 @@ def _serve(address: Connection, chosen: Chosen) -> None:
 @contextlib.contextmanager
 def _demo_machine(chosen: Chosen, eta: float) -> Iterator[str]:
     """Simulate a machine in another process, over another link; yield its address."""
-    low, high = (share * eta for share in _EACH_WAY)
+    longest = _EACH_WAY[1] * eta
+    room = min(1.0, max(0.0, eta - _RESERVE) / max(2 * longest, 1e-9))
+    low, high = (share * eta * room for share in _EACH_WAY)
     way = f"low: {low:g}, high: {high:g}, loss: {_LOST}"
     link = f"link={{kind: network, {way}, return: {{{way}}}}}"
     context = multiprocessing.get_context("spawn")

@@ -86,6 +86,11 @@ class Link:
         return min(self.trips, default=math.nan)
 
     @property
+    def usual(self) -> float:
+        """Round trip that 95 % do not exceed, s; NaN without any."""
+        return float(np.quantile(self.trips, 0.95)) if self.trips else math.nan
+
+    @property
     def jitter(self) -> float:
         """Difference of the longest and the shortest round trip, s."""
         return self.longest - self.shortest
@@ -297,8 +302,8 @@ def call(contact: Contact) -> MachineMessage:
         if not first and now() - began > _PATIENCE * SECOND:
             raise ConfigError(
                 f"--machine: got {where.removeprefix('machine at ')}, where nothing "
-                f"answers{_refusals(contact)}; expected a machine of protocol version {VERSION}, "
-                "such as stewart-drake machine SCENARIO --port PORT"
+                f"answers{_refusals(contact)}; expected a machine of protocol version {VERSION} "
+                "with the same --key, such as stewart-drake machine SCENARIO --port PORT"
             )
         known = len(contact.link.trips) >= _ENOUGH_TRIPS or now() - first > _LONGEST_CALL * SECOND
         if first and known and contact.last is not None:
@@ -324,7 +329,7 @@ def await_free(contact: Contact) -> None:
             f"{where} sent nothing for {silent:.1f} s{_refusals(contact)}; the last was "
             f"{contact.endpoint.refusal}"
         )
-    raise ConfigError(f"{where} was silent for {silent:.1f} s")
+    raise ConfigError(f"{where} was silent for {silent:.1f} s; start it and live again")
 
 
 def _refusals(contact: Contact) -> str:

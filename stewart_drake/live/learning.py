@@ -83,7 +83,7 @@ class _Asked(NamedTuple):
         """Find the machine; print the plan of a run of `duration` s."""
         address, key = address_of(self.machine), read_key(self.options.key)
         ready = prepare_session(self.scenario, address, key, learned)
-        for line in plans(ready, duration, self.scenario.mechanism) if plan else ():
+        for line in plans(ready, duration, ready.design.experiment.mechanism.name) if plan else ():
             self.say(line)
         return ready
 
@@ -95,7 +95,8 @@ class _Asked(NamedTuple):
         """Print the number of the best repetition; return all."""
         best = lessons.best
         self.say(
-            f"repetition {1 + best} is the best; {self.file} is for controller.learned"
+            f"repetition {1 + best} is the best; what it added is written to {self.file}, for "
+            "controller.learned"
             if best
             else "nothing was learned: no repetition was better than the first one"
         )
@@ -142,7 +143,7 @@ def _learn_torques(asked: _Asked) -> LiveLessons:
     ready = asked.call(lessons)
     result = asked.drive(ready, viewer=lessons, logs=[lessons], pace=lessons.pace)
     if result.status != "completed":
-        asked.say(f"{End(result.status, result.stopped).words}; learning ends")
+        asked.say(f"learning ends in repetition {len(lessons.learning.errors) + 1}")
     if not lessons.learning.errors:
         return LiveLessons(result, None)
     if best := lessons.learning.best:

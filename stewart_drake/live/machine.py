@@ -120,7 +120,7 @@ class Machine:
         self._queue = first_rows(experiment)
         self.session: Session | None = None
         self.identity, self.offers = identity_of(sc), Offers()
-        self._refusal_said = 0
+        self._refusal_said, self._key_said = 0, False
         self._due: list[tuple[int, int, int, Callable[[int], object]]] = []
         self._number = self.sample = 0
         self.counts: Counter[str] = Counter()
@@ -191,6 +191,12 @@ class Machine:
                 self.counts["lost"] += 1
                 continue
             self._at(time + under_way, 0, partial(self._arrive, message, address))
+        if self._endpoint.refused[Refusal.KEY] and not self._key_said:
+            self._key_said = True
+            self._say(
+                "refused a controller with another key or without one; expected the same --key on "
+                "both sides, or none"
+            )
         for other in self._endpoint.versions:
             if self.offers.may_answer(self._clock()):
                 self._endpoint.refuse_version(other)

@@ -9,7 +9,7 @@ from stewart_drake.types import Array
 
 _ADVICE: Final = {
     "left_workspace": "Bring the plate back to its start and start live again. With --out the log "
-    "shows the loss: stewart-drake replay LOG, stewart-drake identify LOG.",
+    "shows the loss: stewart-drake replay LOG, stewart-drake identify LOG --mechanism FILE.",
     "lost_contact": "Datagrams arrive, usable measurements do not. If these are late, relieve both "
     "computers or the network; else check the sensor. --max-missing SECONDS allows longer gaps.",
     "lost_machine": "Check the machine's process and the network, and the load of its computer. "

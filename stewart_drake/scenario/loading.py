@@ -301,7 +301,8 @@ def _parse_setting(setting: str) -> dict[str, Any]:
     parts = key.strip().split(".")
     if not equals or not all(parts) or len(parts) > 2:
         raise ConfigError(
-            f"{_SETTINGS}: got {brief(setting)}; expected section.field=value or field=value"
+            f"{_SETTINGS}: got {brief(setting)}; expected section.field=value or field=value, "
+            "where a value may be {name: value, ...}"
         )
     value = parse_yaml(text, f"{_SETTINGS}: {key}")
     change: dict[str, Any] = {parts[-1]: value}
