@@ -151,6 +151,7 @@ def test_a_hand_leads_from_the_motion_until_a_leg_is_at_the_end_of_its_reach():
         result = driven(running, 7.0, viewer=hand)
     assert result.status == "completed"
     last = hand.seen[69]  # then it comes to rest
+    assert [one.resting for one in hand.seen[68:72]] == [False, False, True, True]
     assert last.by_hand and "leg" in last.limit and last.state[5] > 0.45
     np.testing.assert_allclose(last.state[POSE], last.wanted[POSE], atol=2e-3)
 

@@ -160,6 +160,7 @@ def test_the_command_writes_the_page_of_learn(tmp_path, monkeypatch, capsys):
     run = sd.simulate(scenario, judge_stability=False)
     late = {"median": 1.0, "p99": 2.0, "worst": 3.0}
     counts = {"samples": 11, "deadlines_missed": 0, "periods_played": 10, "periods_dry": 0}
+    counts |= {"recoveries": 0}
     summary = run.summary | {"live": counts | {"sent_after_due_ms": late}}
     run = dataclasses.replace(run, summary=summary)
     done = [Repetition(None, run, 2.0), Repetition(some_torque(PERIOD, 0.05), run, 1.0)]

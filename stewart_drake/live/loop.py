@@ -399,6 +399,7 @@ class LiveLoop:
             safe=self._watch.safe,
             by_hand=self._by_hand,
             limit=self._steering.limit,
+            resting=not self._recording,
         )
 
 

@@ -227,6 +227,7 @@ def _values(seen: Snapshot) -> dict[str, Any]:
         "recoveries": seen.recoveries,
         "safe": seen.safe,
         "byHand": seen.by_hand,
+        "resting": seen.resting,
         "limit": seen.limit,
     }
 

@@ -60,6 +60,7 @@ class Snapshot(NamedTuple):
     safe: str | None  # why the safe torque acts, or None
     by_hand: bool  # whether the target is set by hand
     limit: str | None  # limit that prevents the requested motion, or None
+    resting: bool = False  # whether the run is over and the plate comes to rest, or is held there
 
 
 class Viewer:
