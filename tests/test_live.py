@@ -26,6 +26,7 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.cli import main
+from stewart_drake.cli.live import transit_times
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.logs import Precision, read_log
@@ -531,6 +532,12 @@ def test_a_law_that_is_too_slow_for_its_period_says_so_before_it_starts():
         (told,) = [line for line in plans(slow, 1.0, "paper") if line.startswith("law: ")]
         assert f"python, a step takes {1e3 * seconds:.1f} ms of a period of 100 ms" in told
         assert ("more than 50%: expect missed deadlines" in told) == (seconds > 0.05)
+    # One slow round trip, which decides the delay, is named as an exception.
+    link = ready.contact.link
+    for longest, named in ((max(link.trips), False), (3 * link.usual, True)):
+        link.trips[-1] = longest
+        told = " ".join(plans(ready, 1.0, "paper"))
+        assert ("the longest is an exception, 95 % take less than" in told) == named
     # Its torques in flight end too soon, too.
     assert any(line.startswith("queue: reference") for line in plans(ready, 1.0, "paper"))
 
@@ -664,6 +671,12 @@ def test_a_demo_that_cannot_start_says_why(capsys):
     wrong = ("--set", "sensor={kind: encoders, samples: 20}")
     assert main(["live", "paper", "--demo", "--no-browser", *wrong]) == 2
     assert capsys.readouterr().err.startswith("error: sensor.samples: got 20; expected at most 16")
+
+
+@pytest.mark.parametrize(("eta", "room"), [(0.8, 0.159), (0.08, 0.049), (0.03, 0.03)])
+def test_a_demo_leaves_time_for_computing(eta, room):
+    low, high = transit_times(eta)
+    assert 0 <= low <= high < 0.401 * eta and eta - 2 * high >= room
 
 
 @pytest.mark.parametrize("text", ["localhost", "127.0.0.1:", "127.0.0.1:0", ":7000", "a b:7000"])

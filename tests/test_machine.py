@@ -307,6 +307,17 @@ def test_a_new_session_begins_where_it_is_said(restart):
         assert any(np.all(m.acted == 0.05, axis=1).any() for m in messages(run))
 
 
+def test_a_machine_says_once_that_a_controller_has_another_key():
+    run = together(EXACT, key=KEY)
+    for key in (None, b"another key, as long"):
+        run.driver = Driver(run.scenario, run.ear.address, key)
+        run.driver.say(run.machine.time())
+        run.at(run.machine.time() + SECOND)
+    assert run.ear.refused == {Refusal.KEY: 2}
+    (line,) = [line for line in run.said if "key" in line]
+    assert "another key or without one; expected the same --key on both sides" in line
+
+
 def test_what_was_recorded_of_an_earlier_session_is_foreign():
     """Replay every datagram of a session after its end, while another session drives."""
     run = together(EXACT, key=KEY)

@@ -230,12 +230,17 @@ def _serve(address: Connection, chosen: Chosen) -> None:
         address.send(error)
 
 
+def transit_times(eta: float) -> tuple[float, float]:
+    """Return the least and the longest time of the demo's link each way, s, for a delay in s."""
+    low, high = (share * eta for share in _EACH_WAY)
+    room = min(1.0, max(0.0, eta - _RESERVE) / max(2 * high, 1e-9))
+    return room * low, room * high
+
+
 @contextlib.contextmanager
 def _demo_machine(chosen: Chosen, eta: float) -> Iterator[str]:
     """Simulate a machine in another process, over another link; yield its address."""
-    longest = _EACH_WAY[1] * eta
-    room = min(1.0, max(0.0, eta - _RESERVE) / max(2 * longest, 1e-9))
-    low, high = (share * eta * room for share in _EACH_WAY)
+    low, high = transit_times(eta)
     way = f"low: {low:g}, high: {high:g}, loss: {_LOST}"
     link = f"link={{kind: network, {way}, return: {{{way}}}}}"
     context = multiprocessing.get_context("spawn")
