@@ -7,6 +7,8 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.cli import main
+from stewart_drake.cli.common import Delivery
+from stewart_drake.cli.live import LOG, _delivered
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servos import rise
 from stewart_drake.live import design as designing
@@ -173,6 +175,22 @@ def test_the_command_writes_the_page_of_learn(tmp_path, monkeypatch, capsys):
     assert "from 2.00 to 1.00 % s" in " ".join(page.split()) and page.count("<iframe") == 2
     assert f"stewart-drake {' '.join(command)}" in " ".join(page.split())
     assert "controller.learned=mine.npz" in page
+
+
+@pytest.mark.slow
+def test_a_lost_run_names_its_log_and_what_may_have_caused_the_loss(tmp_path, capsys):
+    run = sd.simulate(sd.load_scenario("paper", "lqr", ("plant.kind=exact", "duration=2")))
+    late = {"median": 1.0, "p99": 2.0, "worst": 3.0}
+    counts = {"samples": 1, "deadlines_missed": 1, "periods_played": 14, "periods_dry": 1}
+    live = counts | {"recoveries": 2, "sent_after_due_ms": late}
+    run = dataclasses.replace(run, summary=run.summary | {"live": live})
+    assert _delivered(Delivery(tmp_path), run, LOG) == 1
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.startswith("left workspace: leg 2 reached the end of its reach at t = 1.3")
+    assert f"The log shows the loss: stewart-drake replay {tmp_path / LOG}," in said
+    assert "1 sample with those of coming to rest, 1 deadline missed;" in said
+    assert "for 14 periods, for 1 it had none (dry) torques came too late or not at all" in said
+    assert "too far off 2 times: a new path led it back" in said
 
 
 LAW = ("plant.kind=exact", *test_learn.LAW)

@@ -32,6 +32,8 @@ _EACH_WAY: Final = (0.35, 0.4)
 _RESERVE: Final = 0.05
 """Least part of the delay that is left for computing and a busy computer, s."""
 _LOST: Final = 0.02
+_MANY_DRY: Final = 0.05
+"""Share of dry periods from which they are named as a possible cause of a loss."""
 _REFUSED: Final = {
     "malformed": "malformed",
     "version": "of another version",
@@ -199,6 +201,11 @@ def _delivered(
         f"the machine had torques for {counted(s['periods_played'], 'periods')}, for "
         f"{s['periods_dry']} it had none (dry)",
     )
+    if result.stopped is not None and s["periods_dry"] > _MANY_DRY * s["periods_played"]:
+        delivery.say_wrapped(
+            "torques came too late or not at all for many periods: a larger link.playout or "
+            "controller.packet_repeats bridges more; stewart-drake analyze link compares bounds"
+        )
     if s["recoveries"]:
         delivery.say_wrapped(
             f"the plate was too far off {counted(s['recoveries'], 'times')}: a new path led it "
