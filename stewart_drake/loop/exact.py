@@ -2,6 +2,7 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc"
 # A Drake class template over scalar types has no static type.
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -60,7 +61,8 @@ def plate_of_mass(mechanism: Mechanism, mass: float) -> Body:
     return plate
 
 
-@TemplateSystem.define("ExactPlant_", T_list=(float, AutoDiffXd))
+# With the module given, Drake does not search the sources of all callers for it: 0.1 s of the import.
+@TemplateSystem.define("ExactPlant_", (float, AutoDiffXd), scope=sys.modules[__name__])
 def ExactPlant_(T):
     """Class template of `ExactPlant` over float and AutoDiffXd."""
 
