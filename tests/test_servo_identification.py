@@ -11,6 +11,7 @@ import yaml
 import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification import servo_fit
 from stewart_drake.identification.logs import angle_std
 from stewart_drake.identification.progress import shown_by
 from stewart_drake.identification.servo_fit import (
@@ -138,10 +139,18 @@ def log_of(model, theta, change=None):
 
 
 def fits_of(log):
-    """Return the fit to all samples alike, and the fit that `identify` gives."""
-    model, free = ServoModel(log, ROBOT, 0.8), np.arange(6)
-    plain = _fitted(model, regression(model, False), free, angle_std(12))
-    return plain, identify_servos(log, ROBOT, angle_std(12))
+    """Return the first fit of `identify`, to all samples alike, and the one that it gives."""
+    fits = []
+
+    def kept(*arguments):
+        fits.append(_fitted(*arguments))
+        return fits[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(servo_fit, "_fitted", kept)
+        found = identify_servos(log, ROBOT, angle_std(12))
+    np.testing.assert_array_equal(fits[0].free, range(6))
+    return fits[0], found
 
 
 def mixed(duration):

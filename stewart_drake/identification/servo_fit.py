@@ -451,7 +451,7 @@ def _fitted(
     """Return the fit of the free unknowns by output error, of filtered residuals if given."""
     filtered = white or (lambda residuals: residuals / rounding)
     first, scale = _in_reach(model, start), scale_of(start)[free]
-    iterations, here = count(1), np.empty(0)
+    iterations, here, left = count(1), np.empty(0), np.empty(0)
 
     def whole(x: Array) -> Array:
         theta = first.copy()
@@ -464,8 +464,10 @@ def _fitted(
         return filtered(here).ravel()
 
     def jacobian(x: Array) -> Array:
+        nonlocal left
         progress.iteration(next(iterations), _ITERATIONS)
-        # The solver asks for it where it has just asked for the residuals.
+        # The solver asks for it where it has just asked for the residuals, last at the result.
+        left = here
         J = filtered(model.jacobian(whole(x), free, here) * scale)
         return J.reshape(-1, len(free))
 
@@ -479,11 +481,9 @@ def _fitted(
         max_nfev=_ITERATIONS,
     )
     J: Any = found.jac
-    theta = whole(found.x)
-    left = model.residuals(theta)
     return ServoIdentification(
         model=model,
-        theta=theta,
+        theta=whole(found.x),
         residuals=left,
         innovations=filtered(left),
         jacobian=J.reshape(-1, NUM_TORQUES, len(free)) / scale,
