@@ -61,7 +61,7 @@ def plate_of_mass(mechanism: Mechanism, mass: float) -> Body:
     return plate
 
 
-# With the module given, Drake does not search the sources of all callers for it: 0.1 s of the import.
+# Given the module, Drake does not look for it in the sources of all callers, for 0.25 s.
 @TemplateSystem.define("ExactPlant_", (float, AutoDiffXd), scope=sys.modules[__name__])
 def ExactPlant_(T):
     """Class template of `ExactPlant` over float and AutoDiffXd."""
