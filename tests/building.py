@@ -32,7 +32,7 @@ def c_compiler():
 
 
 def make(folder, *arguments, fails=False):
-    """Return what `make` prints; it must succeed, or fail. A run is replayed twice, not 20 times."""
+    """Return what `make` prints; it must succeed, or fail. Runs are replayed twice."""
     surroundings = os.environ | {
         "CFLAGS": "-O2 -DREPEATS=2",
         "REAL_CC": " ".join(c_compiler()),

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 from pydrake.trajectories import Trajectory
 
+from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.clear_space import ClearSpace
 from stewart_drake.law.feedforward import mean_torques
@@ -23,7 +24,6 @@ from stewart_drake.scenario.signals import (
     NUM_TORQUES,
     PLANT_PARAMETERS,
     POSE,
-    RATES,
 )
 from stewart_drake.scenario.trajectories import evaluate, spread_instants
 from stewart_drake.types import Array
@@ -209,7 +209,7 @@ def filter_substeps(
     begin = spread_instants(duration, FILTER_INSTANTS)
     torques = mean_torques(dynamics, reference, begin, begin + period)
     states = [evaluate(reference, t)[:NUM_STATE] for t in begin]
-    ends = np.array([evaluate(reference, t)[POSE] for t in begin + period])
+    ends = np.array([reference.value(t)[:, 0] for t in begin + period])
 
     def after(substeps: int) -> Array:
         """States (FILTER_INSTANTS, 12) a period after each instant."""
@@ -240,9 +240,14 @@ def turning_substeps(
     if values[COULOMB] == 0 and name not in dynamics.free:
         return 1
 
+    functions = functions_of(dynamics.mechanism)
+
     def crank_rates(t: float) -> Array:
-        x = evaluate(reference, t)
-        return dynamics.mechanism.jacobian(x[POSE]) @ x[RATES]
+        pose, rates = reference.value(t)[:, 0], reference.EvalDerivative(t, 1)[:, 0]
+        turning = functions.cranks(np.concatenate([pose, rates]))[NUM_TORQUES:]
+        if np.isnan(turning).any():  # the error names the leg
+            return dynamics.mechanism.jacobian(pose) @ rates
+        return turning
 
     times, h = spread_instants(duration, INSTANTS), 1e-3
     fastest = max(np.abs(crank_rates(t + h) - crank_rates(t)).max() / h for t in times)
