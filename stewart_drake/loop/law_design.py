@@ -159,26 +159,30 @@ class Sizing(NamedTuple):
     machine_torque: float  # see `law.startup.machine_torque`, N m
 
 
+def one_step_sizing(experiment: Experiment) -> Sizing:
+    """Return the sizing of a law that predicts with one step per period, as that for servos."""
+    sc, nominal, reference = experiment.scenario, experiment.nominal, experiment.reference
+    largest = reachable = reference_torque(nominal, reference, sc.duration)
+    if sc.controller.limits == "qp":
+        space = clear_space(experiment)
+        reachable = reference_torque(nominal, reference, sc.duration, space)
+    return Sizing(1, largest, reachable, machine_torque(nominal))
+
+
 def sizing_of(experiment: Experiment) -> Sizing:
     """Return the sizing of a law, for the scenario's duration, period and believed delay."""
     sc, nominal, reference = experiment.scenario, experiment.nominal, experiment.reference
     period, steps = sc.controller.period, believed_delay(sc).steps
     substeps = choose_substeps(nominal, reference, period, steps, sc.duration)
-    largest = reachable = reference_torque(nominal, reference, sc.duration)
-    if sc.controller.limits == "qp":
-        space = clear_space(experiment)
-        reachable = reference_torque(nominal, reference, sc.duration, space)
-    if sc.controller.estimate and reachable == largest:  # no number of steps does beyond the reach
+    sizing = one_step_sizing(experiment)
+    within_reach = sizing.reachable_torque == sizing.reference_torque
+    if sc.controller.estimate and within_reach:  # no number of steps does beyond the reach
         given = period, sc.controller.model_error, *white_errors(sc)
         model_std = assumed_model_error(experiment.motion_scale, *given)
         assumed = filter_substeps(nominal, reference, period, sc.duration, model_std)
         substeps = max(substeps, assumed)
-    return Sizing(
-        max(substeps, turning_substeps(nominal, reference, period, sc.duration)),
-        largest,
-        reachable,
-        machine_torque(nominal),
-    )
+    substeps = max(substeps, turning_substeps(nominal, reference, period, sc.duration))
+    return sizing._replace(substeps=substeps)
 
 
 _PREDICTORS: Final[Mapping[str, Predictor | NonlinearPredictor]] = {

@@ -41,7 +41,7 @@ from stewart_drake.law.servos import (
 )
 from stewart_drake.law.startup import INSTANTS
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.loop.law_design import compose_law
+from stewart_drake.loop.law_design import compose_law, one_step_sizing
 from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.own import NOTHING
 from stewart_drake.loop.preparation import Experiment
@@ -336,7 +336,7 @@ def compose_servo_law(experiment: Experiment) -> ServoPreview:
         observer = replace(observer, settings=replace(observer.settings, timing_std=0.0))
     law = ServoPreview(
         timeline=Timeline(period, like.timeline.delay, parts=parts),
-        plant=replace(like.plant, substeps=1),
+        plant=like.plant,
         sensing=like.sensing,
         observer=observer,
         feedforward=like.feedforward,
@@ -351,7 +351,8 @@ def _law_for_torques(experiment: Experiment) -> PredictiveLqi:
     controller = replace(sc.controller, command="torque", learned=None)
     actuator = compatible_actuator("torque", sc.actuator)
     alike = replace(sc, controller=controller, actuator=actuator)
-    return compose_law(experiment._replace(scenario=alike, own=NOTHING))
+    like = experiment._replace(scenario=alike, own=NOTHING)
+    return compose_law(like, one_step_sizing(like))
 
 
 def servo_law(experiment: Experiment) -> tuple[ServoPreview, Trajectory, float]:
