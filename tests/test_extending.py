@@ -63,10 +63,17 @@ def test_the_blend_is_less_noisy_than_the_measurement():
     assert np.std(off[0][:, :3]) < 0.8 * np.std(off[1][:, :3])
 
 
-def test_spring_and_damper_hold_the_plate_against_gravity():
-    result = example("A controller")["result"]
+def test_the_predictor_holds_the_plate_against_gravity_and_a_delay():
+    names = example("A controller")
+    result = names["result"]
     assert result.status == "completed" and peak_error(result) < 2e-3
-    assert result.summary["own"] == {"controller": "SpringAndDamper"}
+    assert result.summary["own"] == {"controller": "Predictor"}
+    predict = "        x = dynamics.predict(x, sent, PERIOD)[-1]\n"
+    source = EXAMPLES["A controller"]
+    assert source.count(predict) == 1
+    blind = {"__name__": "__main__"}
+    exec(compile(source.replace(predict, ""), f"{GUIDE}: blind", "exec"), blind)
+    assert blind["result"].status == "left_workspace"
 
 
 def test_the_tuners_weights_are_those_that_act():
