@@ -581,7 +581,7 @@ def test_one_cause_of_failing_is_found_and_counted():
     assert cause.auc.value == pytest.approx(wins.mean())
     assert 0.75 < cause.auc.low < cause.auc.value < cause.auc.high < 1
     told = told_of(study)
-    assert "Significant for completing: torque bias, rms." in told
+    assert "Significant for completing: torque bias (rms)." in told
     assert "Significant for E_ac of completed runs: noise of the sensor." in told
     counts = (
         f"for {cause.failing} of the {found.failing} against {cause.others} of the {found.others}"

@@ -33,15 +33,15 @@ from stewart_drake.types import Array
 
 TITLES: Final = {
     "payload": "payload",
-    "torque_bias": "torque bias, rms",
+    "torque_bias": "torque bias (rms)",
     "noise": "noise of the sensor",
     "torque_limit": "torque limit",
     "damping": "joint damping",
     "delay": "delay error",
-    "lengths": "lengths, rms",
-    "anchors": "anchors, rms",
+    "lengths": "lengths (rms)",
+    "anchors": "anchors (rms)",
     "coulomb": "Coulomb friction",
-    "payload_position": "payload's place, rms",
+    "payload_position": "payload's place (rms)",
     "jitter": "jitter of the delay",
     "loss": "lost on the way",
 }
