@@ -1,5 +1,7 @@
 """The closed loop as a whole, through `simulate`: the bounds that the product promises."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -105,6 +107,25 @@ def test_nonlinear_prediction_previews_the_reference():
     assert run(*full, controller="delay_lqi").accumulated_error == pytest.approx(13.7, rel=5e-3)
     lost = run(*law, "controller.w_Q=10", controller="delay_lqr")
     assert lost.status == "left_workspace"
+
+
+def test_the_papers_law_lacks_the_legs_and_the_reference():
+    """The table of docs/paper.md."""
+    text = (data_root() / "docs" / "paper.md").read_text(encoding="utf-8")
+    legs, torque = "controller.model=multibody", "controller.feedforward=inverse_dynamics"
+    told = {"as printed": (), "`controller.model": (legs,), "`controller.feedforward": (torque,)}
+    for row, settings in told.items():
+        lost = run(EXACT, *ON_REFERENCE, *settings, controller="delay_lqi")
+        line = next(line for line in text.splitlines() if line.startswith(f"| {row}"))
+        growth, time = re.search(r"([\d.]+) fold \| lost at ([\d.]+) s", line).groups()
+        assert lost.stopped.time == pytest.approx(float(time), abs=0.0101)
+        margin = sd.controller_margin(lost.scenario)
+        assert margin.radius == pytest.approx(float(growth), abs=0.0051)
+    both = run(EXACT, *ON_REFERENCE, legs, torque, controller="delay_lqi")
+    assert f"| both | stable | {both.accumulated_error:.3f} |" in text
+    small = ",".join(f"{0.05 * a}" for a in [np.pi / 12] * 3 + [0.02, 0.02, 0.08])
+    tiny = run(EXACT, *ON_REFERENCE, f"reference.amplitude=[{small}]", controller="delay_lqi")
+    assert tiny.status == "left_workspace"
 
 
 def test_the_floor_from_rest_is_the_area_above_one_minus_cosine():
