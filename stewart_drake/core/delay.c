@@ -17,17 +17,17 @@
 
 #define MOST STEWART_MAX_SCHEDULE
 
-#define ITERATIONS 6 /* at the most, while the delay is hardly known */
-#define FEW 4        /* the same once it is known */
-#define TRIED 15     /* values of the delay to start the iterations from, while it is hardly known */
-#define DIFFERENCE ((real)1e-3) /* s */
-#define KNOWN ((real)0.01) /* a constant is known at this share of its usual standard deviation */
-#define HEARD 10           /* number of measurements from which on a misfit may be a jump of parameters */
-#define MEMORY 5           /* s over which the timing of single torques is estimated */
-#define UNTIMELY ((real)0.1)  /* periods, largest standard deviation of the timing */
-#define JERKED ((real)0.02)   /* periods, standard deviation of a step of the delay that explains a misfit */
-#define EDGE ((real)0.1)      /* periods before and after a period from which timing moves a torque into it */
-#define BEFORE ((real)1 / 120) /* mean of (phi (1 - phi) / 2)^2, see stewart_period_late */
+#define MAX_ITERATIONS 6       /* of the update, while the delay is hardly known */
+#define MAX_ITERATIONS_KNOWN 4 /* the same once it is known */
+#define DELAYS_TRIED 15        /* first values of the delay for the iterations, while it is hardly known */
+#define DIFFERENCE ((real)1e-3) /* s, step of the central difference by the delay */
+#define KNOWN_SHARE ((real)0.01) /* of its usual standard deviation, at which a constant counts as known */
+#define HEARD_BEFORE_JUMP 10    /* measurements after which a misfit may be a jump of parameters */
+#define TIMING_MEMORY 5         /* s over which the timing of single torques is estimated */
+#define MAX_TIMING_STD ((real)0.1) /* periods, largest standard deviation of the timing */
+#define STEP_STD ((real)0.02)   /* periods, standard deviation of a step of the delay after a misfit */
+#define TIMING_MARGIN ((real)0.1) /* periods around a period from which timing moves a torque into it */
+#define UNKNOWN_PHASE ((real)1 / 120) /* mean of (phi (1 - phi) / 2)^2, see stewart_period_late */
 #define LARGEST_RATE ((real)0.5) /* s/s */
 #define UNLIKELY ((real)-1e6) /* log-likelihood of a measurement that cannot be explained */
 
@@ -169,7 +169,7 @@ int stewart_period_at(const stewart_period *t, const real *xi, int fourth_order,
 }
 
 /* Probability that a normal error of this standard deviation lies between two bounds. */
-static real between(real low, real high, real std)
+static real probability_between(real low, real high, real std)
 {
     const real part = SQRT_HALF / std;
     return (real)0.5 * (REAL(erfc)(low * part) - REAL(erfc)(high * part));
@@ -181,15 +181,16 @@ static real between(real low, real high, real std)
 
    The torques that were in flight at t = 0 changed at unknown instants, phi dt after the samples. Mean
    torques of the periods, with a change dT per period, leave the rates off by B dT dt phi (1 - phi) / 2
-   at the samples. For phi uniform in [0, 1] the mean square is BEFORE (B dT dt)^2. */
+   at the samples. For phi uniform in [0, 1] the mean square is UNKNOWN_PHASE (B dT dt)^2. */
 int stewart_period_late(const stewart_period *t, const real *xi, const real *state, real std,
                         real *K, int *others, stewart_scratch scratch)
 {
     const real dt = t->delay->period;
     const stewart_arrivals view = arriving(t, xi);
-    real before[6], after[6], at = -EDGE * dt;
+    real before[6], after[6], at = -TIMING_MARGIN * dt; /* time of a change of torque */
     Path path = take_path(t, &scratch);
-    const real first = ((real)(t->newest + 1 - view.num_own) * dt + view.eta) * (1 + view.rate);
+    /* Arrival of the controller's first torque, see arrivals.h. */
+    const real first_own = ((real)(t->newest + 1 - view.num_own) * dt + view.eta) * (1 + view.rate);
     stewart_belief belief;
     stewart_believe(t->delay->filter.machine, xi + X, &belief);
     *others = 0;
@@ -197,16 +198,16 @@ int stewart_period_late(const stewart_period *t, const real *xi, const real *sta
         return -1;
     stewart_accelerate(&belief, state, path.torques, before);
     for (int k = 0; k + 1 < path.number; k++, K += X) {
-        real left, share = REAL(sqrt)(BEFORE) * dt;
+        real left, late = REAL(sqrt)(UNKNOWN_PHASE) * dt; /* s, to the end; s, standard deviation */
         at += path.durations[k];
         left = dt - at < 0 ? 0 : dt - at < dt ? dt - at : dt;
-        if (view.num_own > 0 && at >= first - STEWART_INSTANT)
-            share = std * REAL(sqrt)(REAL(fmax)(between(-at, dt - at, std), 0));
+        if (view.num_own > 0 && at >= first_own - STEWART_INSTANT)
+            late = std * REAL(sqrt)(REAL(fmax)(probability_between(-at, dt - at, std), 0));
         else
             ++*others;
         stewart_accelerate(&belief, state, path.torques + U * (k + 1), after);
         for (int i = 0; i < 6; i++) {
-            K[6 + i] = share * (after[i] - before[i]);
+            K[6 + i] = late * (after[i] - before[i]);
             K[i] = left * K[6 + i];
             before[i] = after[i];
         }
@@ -280,9 +281,9 @@ static int set_noise(Model *a, const real *xi, real used, stewart_scratch scratc
     return 1;
 }
 
-/* xi <- the prior with the eta, out of TRIED values, that has the least nu' S^-1 nu, with S the covariance
-   without the delay's. A torque that has not arrived yet has no linearised effect, so iterations from
-   there would never find that it has arrived. */
+/* xi <- the prior with the eta, out of DELAYS_TRIED values, that has the least nu' S^-1 nu, with S the
+   covariance without the delay's. A torque that has not arrived yet has no linearised effect, so
+   iterations from there would never find that it has arrived. */
 static int best_of_many(Model *a, const stewart_guess *guess, const real *L, real std, real *xi,
                         stewart_scratch scratch)
 {
@@ -304,9 +305,10 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
                                  a->instant.C, scratch))
         return 0;
     stewart_copy(n, a->mean, trial);
-    for (int k = 0; k < TRIED; k++) {
+    for (int k = 0; k < DELAYS_TRIED; k++) {
         real cost = 0;
-        trial[STEWART_ETA(n)] = k < TRIED - 1 ? low + (high - low) / (TRIED - 1) * (real)k : high;
+        trial[STEWART_ETA(n)] =
+            k < DELAYS_TRIED - 1 ? low + (high - low) / (DELAYS_TRIED - 1) * (real)k : high;
         if (!stewart_period_end(a->period, trial, end, scratch))
             return 0;
         stewart_predict_measurement(d->filter.sensing, end, miss);
@@ -339,7 +341,7 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
 static int judge_timing(Model *a, const real *L, real used, stewart_guess *after,
                         stewart_scratch scratch)
 {
-    const real dt = a->period->delay->period, most = UNTIMELY * dt * (UNTIMELY * dt);
+    const real dt = a->period->delay->period, most = MAX_TIMING_STD * dt * (MAX_TIMING_STD * dt);
     const int m = a->m, n = a->n, k = a->rows - a->others + 1;
     real *W = stewart_take(&scratch, m * n), *S = stewart_take(&scratch, m * m);
     real *B = stewart_take(&scratch, m * k), square = 0, trace = 0, pull = 0;
@@ -371,7 +373,7 @@ static int judge_timing(Model *a, const real *L, real used, stewart_guess *after
     if (!(square > 0)) /* no torque has changed */
         return 1;
     const real alone = used * (1 + (pull - trace) / square); /* of this measurement */
-    const real kept = after->torques < MEMORY / dt ? after->torques : MEMORY / dt;
+    const real kept = after->torques < TIMING_MEMORY / dt ? after->torques : TIMING_MEMORY / dt;
     const real timing = (kept * after->timing + square * alone) / (kept + square);
     after->timing = timing < 0 ? 0 : timing < most ? timing : most;
     after->torques = kept + square;
@@ -412,7 +414,7 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
     lower[STEWART_RATE(n)] = free_rate ? -LARGEST_RATE : -(real)INFINITY;
     upper[STEWART_RATE(n)] = free_rate ? LARGEST_RATE : (real)INFINITY;
     const stewart_kalman filter = {
-        n, m, std > d->period / 100 ? ITERATIONS : FEW, a->mean, L, lower, upper, a,
+        n, m, std > d->period / 100 ? MAX_ITERATIONS : MAX_ITERATIONS_KNOWN, a->mean, L, lower, upper, a,
         whitened_rows, stewart_instant_step, 0, NULL, NULL};
     if (!stewart_kalman_update(&filter, xi, root, &distance, &log_ratio, scratch))
         return 0;
@@ -487,7 +489,7 @@ static int attempt(Model *a, const stewart_guess *guess, const real *L, const re
 
 /* L <- root of the covariance with std^2 added to the variance of eta, which may have stepped. Only the
    last two rows change. */
-static void jerk(int n, real std, real *L)
+static void widen_delay(int n, real std, real *L)
 {
     real *eta = L + n * STEWART_ETA(n) + STEWART_ETA(n), *rate = L + n * STEWART_RATE(n) + STEWART_ETA(n);
     const real before = *eta, along = rate[0];
@@ -541,7 +543,7 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
     stewart_guess_root(guess, n, L);
     for (int i = 0; i < p; i++)
         if (!(d->filter.walk_std[i] > 0)
-            && !(stewart_norm(n, L + n * (X + i)) <= KNOWN * d->filter.usual_std[i])) /* or NaN */
+            && !(stewart_norm(n, L + n * (X + i)) <= KNOWN_SHARE * d->filter.usual_std[i])) /* or NaN */
             a.fourth_order = 1;
     const int exists =
         stewart_period_at(t, guess->numbers, a.fourth_order, a.first, a.first + X, scratch);
@@ -549,15 +551,15 @@ void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, 
         if (attempt(&a, guess, L, y, 0, after, scratch))
             return;
         if (is_precise(d, guess, n, stewart_guess_std(guess, n))) {
-            const real most = UNTIMELY * d->period;
-            jerk(n, JERKED * d->period, L);
+            const real most = MAX_TIMING_STD * d->period;
+            widen_delay(n, STEP_STD * d->period, L);
             if (attempt(&a, guess, L, y, most * most, after, scratch)) {
                 after->outliers = guess->outliers + 1; /* one more of these may be a jump */
                 return;
             }
             stewart_guess_root(guess, n, L);
         }
-        if (d->filter.jump_std && guess->heard >= HEARD && guess->outliers == 0
+        if (d->filter.jump_std && guess->heard >= HEARD_BEFORE_JUMP && guess->outliers == 0
             && jumped(&a, guess, L, y, after, scratch))
             return;
     }

@@ -30,12 +30,13 @@ static void stage(dop853 *s, int number, double h, double *x)
     s->evaluations++;
 }
 
-/* What an error is compared with. */
+/* Tolerance of the error of one number, with values x and y at both ends of the step. */
 static double scale(const dop853 *s, double x, double y)
 {
     return s->tolerance * (1. + fmax(fabs(x), fabs(y)));
 }
 
+/* Root mean square in units of the tolerance. */
 static double norm(const dop853 *s, const double *values)
 {
     double sum = 0.;
@@ -46,7 +47,7 @@ static double norm(const dop853 *s, const double *values)
     return sqrt(sum / STATES);
 }
 
-/* A first step: one of Euler's tells how the slope changes (section II.4). */
+/* Estimate the first step from the slope, and its change over a step of Euler's method (section II.4). */
 static double first_step(dop853 *s)
 {
     double slope[STATES], x[STATES], change[STATES];
@@ -68,12 +69,12 @@ void dop853_begin(dop853 *s)
 {
     s->slope(s->system, s->time, s->x, s->slopes[LAST]);
     s->evaluations++;
-    if (s->wish == 0.)
-        s->wish = first_step(s);
+    if (s->next_step == 0.)
+        s->next_step = first_step(s);
 }
 
-/* Error of a step of length h to x in units of the tolerance, that of order 5 where the one of order 3
-   agrees with it. */
+/* Error of a step of length h to x in units of the tolerance: |e5|^2 / sqrt(|e5|^2 + 0.01 |e3|^2), from the
+   estimates of order 5 and 3. */
 static double error(const dop853 *s, double h, const double *x)
 {
     double of5 = 0., of3 = 0.;
@@ -92,34 +93,34 @@ static double error(const dop853 *s, double h, const double *x)
 
 int dop853_step(dop853 *s, double end)
 {
-    double x[STATES], grows = 6.;
+    double x[STATES], largest_factor = 6.; /* of one step to the next */
     s->before = s->time;
     memcpy(s->start, s->x, sizeof x);
     memcpy(s->slopes[0], s->slopes[LAST], sizeof x);
     s->has_polynomial = 0;
     for (;;) {
         /* Steps of one length up to the end, so that the last is not a short one. */
-        double left = end - s->before, wish = fmin(s->wish, s->longest);
-        double parts = ceil(left / wish * (1. - 1e-9)), h = parts > 1. ? left / parts : left;
-        if (!(wish > 16. * DBL_EPSILON * fmax(1., fabs(s->before))))
+        double left = end - s->before, most = fmin(s->next_step, s->longest);
+        double parts = ceil(left / most * (1. - 1e-9)), h = parts > 1. ? left / parts : left;
+        if (!(most > 16. * DBL_EPSILON * fmax(1., fabs(s->before))))
             return 0;
         for (int number = 1; number < LAST; number++)
             stage(s, number, h, x);
         combine(s, A[LAST], LAST, h, x);
         double wrong = error(s, h, x);
-        double factor = wrong == 0. ? grows : 0.9 * pow(wrong, -1. / 8.);
+        double factor = wrong == 0. ? largest_factor : 0.9 * pow(wrong, -1. / 8.);
         if (wrong <= 1.) {
             s->time = parts > 1. ? s->before + h : end;
             memcpy(s->x, x, sizeof x);
             s->slope(s->system, s->time, x, s->slopes[LAST]);
             s->evaluations++;
             s->steps++;
-            /* One that was cut short says only that longer ones are possible. */
-            s->wish = factor < grows ? h * factor : fmax(h * grows, s->wish);
+            /* A step that `end` cut short does not shorten the next one. */
+            s->next_step = factor < largest_factor ? h * factor : fmax(h * largest_factor, s->next_step);
             return 1;
         }
-        s->wish = h * (factor >= 0.2 ? fmin(factor, 0.9) : 0.2); /* also where it is NaN */
-        grows = 1.;
+        s->next_step = h * (factor >= 0.2 ? fmin(factor, 0.9) : 0.2); /* 0.2 if the factor is NaN */
+        largest_factor = 1.; /* after a rejected step */
     }
 }
 

@@ -14,7 +14,7 @@ typedef struct {
     double tolerance;  /* of the error of a step: relative and absolute */
     double longest;    /* step, s */
     double time, x[STATES];
-    double wish;       /* the step that the error allows, s; 0 for none known yet */
+    double next_step;  /* largest step that the error allows, s; 0 for none known yet */
     double before, start[STATES]; /* where the last step began */
     double slopes[STAGES][STATES]; /* of its stages */
     double within[7][STATES];     /* coefficients of its polynomial */

@@ -6,8 +6,8 @@
 #include "short.h"
 
 #define MAX_ROWS 18 /* six legs at three nodes */
-#define ITERATIONS 6
-#define SMALL ((real)0.1) /* standard deviations; a shorter correction ends the iterations */
+#define MAX_ITERATIONS 6
+#define SMALL ((real)0.1) /* standard deviations; a smaller correction ends the iterations */
 #ifdef STEWART_FLOAT
 #define ROUNDING ((real)1e-5) /* of a time, as a share of the period */
 #else
@@ -68,16 +68,19 @@ typedef struct {
     stewart_schedule coarse, fine; /* cut at nodes and at samples */
     real places[3];
     real *samples;    /* (N) pieces of `fine` */
-    real *shown;      /* (N, 6) */
+    real *shown;      /* (N, 6) predicted angles, rad, with the estimated offsets */
     real *seen;       /* (number, 12) states of `fine` */
     stewart_reading reading;
-    int round, number, kept[MAX_ROWS];
+    int round;           /* number of residuals computed so far: legs are judged in round 0 */
+    int number;          /* of the rows kept */
+    int kept[MAX_ROWS];  /* whether each row of leg and node is used */
     real *since;      /* (M, changes) s from a change of torque to a node, 0 before it */
     real *effects;    /* (number, changes) effects of the torques' timing, whitened, of the rows kept */
     real *C;          /* (number, number) Cholesky factor of their covariance */
     const real *rows; /* (number, n) whitened, of those kept */
 } Legs;
 
+/* Predict states, transitions and angles from xi. Returns 0 where they do not exist. */
 static int predict_readings(Legs *s, const real *xi, stewart_scratch scratch)
 {
     stewart_attempt *a = s->attempt;
@@ -121,6 +124,7 @@ static int causes_of(const Legs *s, const int *there)
     return causes;
 }
 
+/* Residuals e of the rows kept, and their H, whitened. Returns their number, or -1 for an outlier. */
 static int residuals_of_legs(void *model, const real *xi, real *e, real *H, stewart_scratch scratch)
 {
     Legs *s = model;
@@ -194,6 +198,7 @@ static int residuals_of_legs(void *model, const real *xi, real *e, real *H, stew
     return s->number = number;
 }
 
+/* Predict from a better xi. Returns 1 if the change is small, 0 to go on, -1 without a prediction. */
 static int step_legs(void *model, const real *xi, const real *better, stewart_scratch scratch)
 {
     Legs *s = model;
@@ -266,7 +271,7 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
     if (!a->values)
         return stewart_attempt_finish(a, scratch);
     stewart_read(s.encoders, a->values, s.shown, history->last, history->still, &s.reading, scratch);
-    const stewart_kalman update = {a->n,     LEGS * s.encoders->nodes, ITERATIONS, a->prior->mean,
+    const stewart_kalman update = {a->n,     LEGS * s.encoders->nodes, MAX_ITERATIONS, a->prior->mean,
                                    a->prior->root, f->lower, f->upper, &s, residuals_of_legs, step_legs,
                                    0, innovations, variances};
     if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &log_ratio, scratch))

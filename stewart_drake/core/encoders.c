@@ -4,11 +4,13 @@
 #include "short.h"
 
 #define MAX_NODES 3
-#define ENOUGH ((real)0.3)  /* share of a leg's samples that are needed for it to count */
-#define STANDS_OUT 8        /* median absolute deviations by which a residual stands out (Hampel) */
-#define CURVED 3            /* the same in spans from the 10th to the 90th percentile */
-#define FINEST ((real)1e-7) /* rad, accuracy of the model's crank angles */
-#define LAST_FEW 9          /* samples that fix the angle at the last of them */
+#define ENOUGH ((real)0.3)  /* least share of a leg's samples that must be there for it to count */
+/* An outlier is off the median by more than each of these (Hampel): */
+#define OUTLIER_DEVIATIONS 8   /* median absolute deviations */
+#define OUTLIER_SPANS 3        /* spans from the 10th to the 90th percentile: residuals may be curved */
+#define OUTLIER_QUANTA 3       /* widths of a code */
+#define LEAST_QUANTUM ((real)3e-7) /* rad, least width of a code there, for errors of the model's angles */
+#define LAST_FEW 9          /* samples for the line whose end is the angle at the last sample */
 #define PAIRS (LAST_FEW * (LAST_FEW - 1) / 2)
 
 /* Whether `number` of N samples are enough for a leg. */
@@ -17,12 +19,13 @@ static int is_enough(const stewart_encoders *encoders, int N, int number)
     return number >= (N > 1 ? encoders->nodes : 1) && (real)number >= ENOUGH * (real)N;
 }
 
-/* Instant of a sample in [-1, 1]. */
+/* Instant of sample n within the period, the interval [-1, 1] of the Legendre polynomials. */
 static real instant(const stewart_encoders *encoders, int n)
 {
     return 2 * (real)(n + 1) / (real)encoders->samples - 1;
 }
 
+/* Legendre polynomials of degrees 0 to 2. */
 static void legendre(real t, real *v)
 {
     v[0] = 1;
@@ -218,15 +221,15 @@ static int reject(const stewart_encoders *encoders, const real *shown, int leg, 
         return odd;
     sort(number, sorted);
     middle = median(number, sorted);
-    bound = CURVED * (quantile(number, sorted, (real)0.9) - quantile(number, sorted, (real)0.1));
+    bound = OUTLIER_SPANS * (quantile(number, sorted, (real)0.9) - quantile(number, sorted, (real)0.1));
     for (int i = 0; i < number; i++)
         sorted[i] = REAL(fabs)(sorted[i] - middle);
     sort(number, sorted);
-    least = CURVED * (encoders->quantum > CURVED * FINEST ? encoders->quantum : CURVED * FINEST);
+    least = OUTLIER_QUANTA * (encoders->quantum > LEAST_QUANTUM ? encoders->quantum : LEAST_QUANTUM);
     if (!(bound >= least))
         bound = least;
-    if (STANDS_OUT * median(number, sorted) > bound)
-        bound = STANDS_OUT * median(number, sorted);
+    if (OUTLIER_DEVIATIONS * median(number, sorted) > bound)
+        bound = OUTLIER_DEVIATIONS * median(number, sorted);
     for (int n = 0; n < encoders->samples; n++) {
         real *value = values + LEGS * n + leg;
         const real residual = *value - encoders->offset[leg] - shown[LEGS * n + leg];
@@ -257,15 +260,15 @@ static int project(const stewart_encoders *encoders, const real *values, int leg
         for (int a = 0; a < M; a++)
             nodes[M * a + j] = v[a];
     }
-    real left[MAX_NODES * MAX_NODES];
-    stewart_copy(M * M, nodes, left);
+    real at_nodes[MAX_NODES * MAX_NODES]; /* V(s)', which the solution replaces */
+    stewart_copy(M * M, nodes, at_nodes);
     if (!stewart_solve(M, M, gram, nodes))
         return 0;
     for (int j = 0; j < M; j++) {
         squares[j] = 0;
         for (int a = 0; a < M; a++) {
             K[M * j + a] = nodes[M * a + j];
-            squares[j] += left[M * a + j] * nodes[M * a + j];
+            squares[j] += at_nodes[M * a + j] * nodes[M * a + j];
         }
     }
     return 1;

@@ -137,17 +137,17 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
     const int length = in_flight_length(law), longest = law->longest_wait;
     const real *in_flight = memory + l->in_flight.at, *y = sample->measurement;
     real *missing = stewart_take(scratch, law->measured), *observed = memory + l->observer.at;
-    int lag = (int)memory[l->lag.at] + 1, there = 0;
+    int lag = (int)memory[l->lag.at] + 1, usable = 0;
     for (int i = 0; i < law->measured; i++) {
-        there |= isfinite(y[i]) != 0;
+        usable |= isfinite(y[i]) != 0;
         missing[i] = (real)NAN;
     }
-    there &= sample->age >= 0 && sample->age <= longest && sample->age < lag; /* and is new */
-    const int wanted = there ? sample->age : longest;
-    outlook->status = there ? 0 : STEWART_MEASUREMENT_MISSING;
-    while (lag > wanted) {
+    usable &= sample->age >= 0 && sample->age <= longest && sample->age < lag; /* newer than the last */
+    const int next_lag = usable ? sample->age : longest;
+    outlook->status = usable ? 0 : STEWART_MEASUREMENT_MISSING;
+    while (lag > next_lag) {
         lag--;
-        const int fresh = there && lag == sample->age;
+        const int fresh = usable && lag == sample->age;
         int status = observer->observe(law, observed, length - lag, in_flight,
                                        fresh ? y : missing, *scratch);
         if (fresh)
@@ -201,9 +201,9 @@ static int preview_times(const stewart_law *law, const stewart_outlook *outlook,
     return n;
 }
 
-/* Whether the open-loop start lasts. It does not while a torque in flight is at the limit: what the limit
-   takes away is known without a measurement. */
-static int is_quiet(const stewart_law *law, const real *memory)
+/* Whether this sample belongs to the open-loop start. It does not while a torque in flight is at the limit:
+   what the limit takes away is known without a measurement. */
+static int is_open_loop(const stewart_law *law, const real *memory)
 {
     const stewart_field *in_flight = &law->layout.in_flight;
     return memory[law->layout.silence.at] > 0 &&
@@ -235,7 +235,7 @@ static void follow(const stewart_law *law, real *memory, const stewart_sample *s
     const stewart_course last = last_course(law, memory);
     const stewart_course_input motion = {&law->machine,  law->period,    stewart_queue_length(law),
                                    outlook->eta,   outlook->state, outlook->theta,
-                                   outlook->until_next, is_quiet(law, memory)};
+                                   outlook->until_next, is_open_loop(law, memory)};
     real *given = stewart_take(scratch, ROW * law->rows);
     c->times = stewart_take(scratch, law->rows);
     c->reference = stewart_take(scratch, ROW * law->rows);
@@ -264,7 +264,8 @@ static void remember_course(const stewart_law *law, real *memory, const stewart_
 
 /* ---- feedback --------------------------------------------------------------------------------- */
 
-/* The exact equations until then. The integral waits in every part in which a motor is at its limit. */
+/* Predict state, error and integral at the instant from which the next torque acts, by the exact equations.
+   The integral is constant in every part in which a motor is at its limit (anti-windup). */
 static void predict(const stewart_law *law, const stewart_outlook *outlook, const real *followed,
                     const real *integral, stewart_predicted *a, stewart_scratch scratch)
 {
@@ -274,6 +275,7 @@ static void predict(const stewart_law *law, const stewart_outlook *outlook, cons
         return;
     }
     real *states = stewart_take(&scratch, X * (schedule->number + 1)), before[6];
+    /* Number of torques of the schedule in each period. */
     const int each = outlook->samples > 0 ? schedule->number / outlook->samples : 1;
     stewart_copy(X, outlook->state, states);
     stewart_copy(6, integral, a->integral);
@@ -285,13 +287,13 @@ static void predict(const stewart_law *law, const stewart_outlook *outlook, cons
         stewart_predict(&law->machine, outlook->theta, schedule, states, states + X);
     for (int k = 0; k < outlook->samples; k++) {
         const real *wanted = followed + ROW * (k + 1), *end = states + X * each * (k + 1);
-        const int waits = stewart_at_limit(&law->machine, each, schedule->torques + U * each * k);
+        const int limited = stewart_at_limit(&law->machine, each, schedule->torques + U * each * k);
         real h = 0;
         for (int i = 0; i < each; i++)
             h += schedule->durations[each * k + i];
         for (int i = 0; i < 6; i++) {
             real error = end[i] - wanted[i];
-            if (!waits)
+            if (!limited)
                 a->integral[i] += h / 2 * (before[i] + error);
             before[i] = error;
         }
@@ -353,13 +355,13 @@ static int feed_back(const stewart_law *law, real *memory, const stewart_outlook
                                                 torques, a->error, K, scratch);
     stewart_copy(U, torques + U * pending, torque);
     stewart_copy(U, torque, memory + l->feedforward.at);
-    if (trouble == STEWART_UNREACHABLE) /* nothing to regulate: the feedforward goes on alone */
+    if (trouble == STEWART_UNREACHABLE) /* no linearisation there: the feedforward alone */
         return trouble;
     if (!trouble) {
         stewart_fill(U * l->gain.columns, (real)NAN, gain);
         stewart_copy(n, K, gain);
     }
-    if (!fits(&l->gain, gain, n)) /* nothing to go on with */
+    if (!fits(&l->gain, gain, n)) /* no usable gain: the feedforward alone */
         return trouble;
     a->gain = gain;
     stewart_feed_back(&law->cost, gain, a->error, a->integral, pending, late, torques, torque);
@@ -368,23 +370,24 @@ static int feed_back(const stewart_law *law, real *memory, const stewart_outlook
 
 /* ---- a sample --------------------------------------------------------------------------------- */
 
-/* Compute the torque of a sample, with feedback or without. Returns bits of `stewart_status`. */
-static int respond(const stewart_law *law, real *memory, const stewart_outlook *outlook, const stewart_course *c,
-                   int waiting, const real *weights, stewart_predicted *a, real *torque,
+/* Compute the torque of a sample, with feedback or without; `waiting`: the reference has not been
+   complete yet. Returns bits of `stewart_status`. */
+static int respond(const stewart_law *law, real *memory, const stewart_outlook *outlook,
+                   const stewart_course *c, int waiting, const real *weights, stewart_predicted *a, real *torque,
                    stewart_scratch scratch)
 {
     const stewart_layout *l = &law->layout;
     const real *nodes = c->followed + ROW * (1 + outlook->samples);
-    const int feeds_back = outlook->feeds_back && !is_quiet(law, memory);
+    const int feeds_back = outlook->feeds_back && !is_open_loop(law, memory);
     a->gain = NULL;
     a->theta = feeds_back ? outlook->theta : NULL;
     a->rows = nodes + ROW * 2 * (3 + outlook->pending);
     if (!waiting && feeds_back)
         return feed_back(law, memory, outlook, c->followed, weights, a, torque, scratch);
-    if (waiting) { /* nothing to follow yet: hold the torque */
+    if (waiting) { /* hold the last torque */
         a->theta = outlook->theta;
         stewart_copy(U, memory + l->torque.at, torque);
-    } else { /* by what is known beforehand */
+    } else { /* the feedforward, with the parameters known beforehand */
         real *torques = stewart_take(&scratch, U * (1 + outlook->pending));
         stewart_design_feedback(law, outlook, NULL, nodes, NULL, NULL, torques, NULL, NULL, scratch);
         stewart_copy(U, torques + U * outlook->pending, torque);
@@ -405,24 +408,23 @@ int stewart_step_scratch(const stewart_law *law)
     const stewart_channel *channel = law->channel;
     const int queue = law->design ? in_flight_length(law) + law->rows : stewart_queue_length(law);
     const int rows = ROW * law->rows, parts = 2 * queue + 2, late = law->design ? queue : 1;
-    const int telling = 2 * queue + 2 + (U + 1) * (parts + 2);
+    const int known_delay = 2 * queue + 2 + (U + 1) * (parts + 2); /* of `fixed_delay_outlook` */
     const int lag = (X + U + 1) * 2 * (law->longest_wait + 1);
-    const int following = 2 * rows + X * (queue + 2);
-    int channelled = channel ? channel->scratch(law) : 0;
-    const int gaining = stewart_gain_scratch(&law->cost, law->fraction > 0);
-    const int designing = stewart_linearize_scratch() + gaining;
-    const int feeding = U * (X + 7 + U * late) + U * (1 + late) + X * (X + U) + X * (parts + 1) + designing;
-    const int used = feeding > following ? feeding : following;
-    const int planned = law->planner ? law->planner->scratch(law) : 0;
-    if (planned > channelled)
-        channelled = planned;
-    const int holding = 3 * rows + law->rows + (used > channelled ? used : channelled);
+    const int course = 2 * rows + X * (queue + 2); /* of `stewart_follow` */
+    const int sent = channel ? channel->scratch(law) : 0;
+    const int gain = stewart_gain_scratch(&law->cost, law->fraction > 0);
+    const int design = stewart_linearize_scratch() + gain;
+    const int feedback = U * (X + 7 + U * late) + U * (1 + late) + X * (X + U) + X * (parts + 1) + design;
+    const int planner = law->planner ? law->planner->scratch(law) : 0;
+    const int part = planner > sent ? planner : sent;
+    const int own = feedback > course ? feedback : course;
+    const int followed = 3 * rows + law->rows + (own > part ? own : part);
     const int predicted = shares_prediction(law) ? X * (queue + 1) : 0;
-    const int observing = law->observer->scratch(law);
+    const int observer = law->observer->scratch(law);
     /* An estimated delay has its own instants and torques, of the preview and of the last period. */
-    const int outlook = law->observer->outlook ? (U + 2) * law->rows + 2 * (U + 1) * 8 : telling;
+    const int outlook = law->observer->outlook ? (U + 2) * law->rows + 2 * (U + 1) * 8 : known_delay;
     return law->measured + outlook + lag + predicted +
-           (holding > observing ? holding : observing);
+           (followed > observer ? followed : observer);
 }
 
 int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
@@ -452,11 +454,13 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
     int status = outlook.status | (c.missing ? STEWART_REFERENCE_MISSING : 0);
     const real *nodes = c.followed + ROW * (1 + outlook.samples);
     const int waiting = !stewart_all_finite(ROW * 2 * (3 + outlook.pending), nodes);
-    if (c.missing && !c.gap && !waiting) /* the planned start had other numbers: end it */
+    /* The open-loop start ends at the first numbers of the reference that are filled in: its torques were
+       computed for another reference. */
+    if (c.missing && !c.gap && !waiting)
         memory[l->silence.at] = 0;
     if (!stewart_all_finite(X, outlook.state)) { /* no measurement yet: assume the reference */
         stewart_copy(X, c.followed, outlook.state);
-        if (law->longest_wait == 0)
+        if (law->longest_wait == 0) /* the observer's state is that of now */
             stewart_copy(X, outlook.state, memory + l->observer.at);
     }
     status |= respond(law, memory, &outlook, &c, waiting, sample->weights, &ahead, torque, scratch);

@@ -4,7 +4,7 @@
 
 #include "link.h"
 
-enum { AT, SEQUENCE, ARRIVAL, COMMAND }; /* of a command that waits */
+enum { AT, SEQUENCE, ARRIVAL, COMMAND }; /* places in the row of a waiting command; AT: its time to act */
 
 static int width(const stewart_link *link) { return COMMAND + link->size; }
 
@@ -63,13 +63,13 @@ static int keep(const stewart_link *link, double *memory, double at, double sequ
 {
     const int number = (int)memory[STEWART_LINK_WAITING];
     double *row = waiting(link, memory);
-    if (!isfinite(at) || arrival == (double)HUGE_VAL) /* it is lost */
+    if (!isfinite(at) || arrival == (double)HUGE_VAL) /* the plan is lost */
         return 1;
     for (int i = 0; i < number; i++, row += width(link))
         if (!link->is_wire && fabs(row[AT] - at) <= link->time_tolerance) {
-            if (row[SEQUENCE] > sequence && row[ARRIVAL] <= arrival)
+            if (row[SEQUENCE] > sequence && row[ARRIVAL] <= arrival) /* this one can never act */
                 return 1;
-            if (row[SEQUENCE] <= sequence && row[ARRIVAL] >= arrival)
+            if (row[SEQUENCE] <= sequence && row[ARRIVAL] >= arrival) /* nor can that one, from now on */
                 break;
         }
     if (row == waiting(link, memory) + width(link) * number) {
@@ -91,7 +91,7 @@ void stewart_link_preload(const stewart_link *link, double *memory, double first
                         const double *commands)
 {
     for (int i = 0; i < number; i++)
-        keep(link, memory, first + i * link->period, i - number + 1, -(double)HUGE_VAL,
+        keep(link, memory, first + i * link->period, i - number + 1 /* <= 0 */, -(double)HUGE_VAL,
              commands + link->size * i);
 }
 
@@ -148,7 +148,7 @@ void stewart_link_change(const stewart_link *link, double *memory, double time)
     if (best && !(link->is_wire && best[SEQUENCE] < memory[STEWART_LINK_NEWEST])) {
         act(link, memory, best + COMMAND, best[AT]);
         memory[STEWART_LINK_NEWEST] = best[SEQUENCE];
-        memory[STEWART_LINK_FED] = best[SEQUENCE] > 0;
+        memory[STEWART_LINK_FED] = best[SEQUENCE] > 0; /* else it was preloaded */
         memory[STEWART_LINK_PLAYED] += best[SEQUENCE] > 0;
     } else if (!link->is_wire) {
         memory[STEWART_LINK_DRY]++;

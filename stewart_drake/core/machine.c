@@ -100,7 +100,8 @@ void stewart_predict(const stewart_machine *machine, const real *theta, const st
     }
 }
 
-/* right (6, 18 + p) <- -M^-1 dF/d[state, torque, theta] of the equations F. */
+/* right (6, 18 + p) <- -M^-1 dF/d[state, torque, theta] of the equations F of dynamics.h; dF/dtorque = -B.
+   dF_dx, dF_dp and M are by columns, B and `mass`, which is M, by rows. */
 static int solve_acceleration_derivatives(const stewart_machine *machine, const stewart_belief *belief,
                         const real *state, const real *torque, int p, real *right,
                         stewart_scratch scratch)
@@ -108,10 +109,10 @@ static int solve_acceleration_derivatives(const stewart_machine *machine, const 
     const int columns = X + U + p;
     real *dF_dx = stewart_take(&scratch, 6 * X);
     real *dF_dp = stewart_take(&scratch, 6 * STEWART_PARAMETERS);
-    real accelerations[6], M[36], mass[36], arm[36];
+    real accelerations[6], M[36], mass[36], B[36];
     stewart_accelerations(&belief->plant, state, state + 6, torque, accelerations);
     stewart_residual_derivatives(&belief->plant, state, state + 6, accelerations, torque, dF_dx,
-                                 dF_dp, M, arm);
+                                 dF_dp, M, B);
     for (int i = 0; i < 6; i++) {
         real *row = right + columns * i;
         for (int j = 0; j < 6; j++)
@@ -119,7 +120,7 @@ static int solve_acceleration_derivatives(const stewart_machine *machine, const 
         for (int j = 0; j < X; j++)
             row[j] = -dF_dx[6 * j + i];
         for (int j = 0; j < U; j++)
-            row[X + j] = arm[6 * i + j];
+            row[X + j] = B[6 * i + j];
         for (int j = 0; j < p; j++)
             row[X + U + j] = machine->place[j] < 0 ? 0 : -dF_dp[6 * machine->place[j] + i];
     }
@@ -164,7 +165,8 @@ static void hermite_state(const real *start, const real *end, real h, real s, re
 {
     real left = 1 - s;
     for (int i = 0; i < 6; i++) {
-        real rise = (end[i] - start[i]) / h, a = start[6 + i] - rise, b = end[6 + i] - rise;
+        real rise = (end[i] - start[i]) / h; /* mean rate */
+        real a = start[6 + i] - rise, b = end[6 + i] - rise;
         state[i] = left * start[i] + s * end[i] + h * s * left * (left * a - s * b);
         state[6 + i] = rise + left * (1 - 3 * s) * a + s * (3 * s - 2) * b;
     }
@@ -173,14 +175,14 @@ static void hermite_state(const real *start, const real *end, real h, real s, re
 /* Phi (12, 12) and S (12, p) of one torque that leads from `start` to `end` in h seconds, the first rows
    of the solution F of F_dot = L F, L = [A G; 0 0]. With L1 and L2 at the two Gauss nodes, the method of
    fourth order is F = exp(h/2 (L1 + L2) + sqrt(3)/12 h^2 [L2, L1]). Else the midpoint rule,
-   F = exp(h L). */
+   F = exp(h L). The exponent is [omega omega_theta; 0 0]. */
 static int transition_of_hold(const stewart_machine *machine, const stewart_belief *belief,
                               const real *torque, real h, int fourth_order, const real *start,
                               const real *end, real *Phi, real *S, stewart_scratch scratch)
 {
     const int p = machine->estimated, nodes = 1 + fourth_order;
     real *A = stewart_take(&scratch, nodes * X * X), *G = stewart_take(&scratch, nodes * X * p);
-    real *omega = stewart_take(&scratch, X * X), *turned = stewart_take(&scratch, X * p);
+    real *omega = stewart_take(&scratch, X * X), *omega_theta = stewart_take(&scratch, X * p);
     real *B = stewart_take(&scratch, X * U), state[X];
     for (int node = 0; node < nodes; node++) {
         hermite_state(start, end, h, fourth_order ? GAUSS_NODES[node] : (real)0.5, state);
@@ -191,23 +193,23 @@ static int transition_of_hold(const stewart_machine *machine, const stewart_beli
     if (fourth_order) {
         const real part = SQRT_3 / 12 * h * h;
         const real *A1 = A, *A2 = A + X * X, *G1 = G, *G2 = G + X * p;
-        real *one = stewart_take(&scratch, X * X), *other = stewart_take(&scratch, X * X);
-        real *first = stewart_take(&scratch, X * p), *second = stewart_take(&scratch, X * p);
-        stewart_multiply(X, X, X, A2, A1, one);
-        stewart_multiply(X, X, X, A1, A2, other);
-        stewart_multiply(X, X, p, A2, G1, first);
-        stewart_multiply(X, X, p, A1, G2, second);
+        real *A2A1 = stewart_take(&scratch, X * X), *A1A2 = stewart_take(&scratch, X * X);
+        real *A2G1 = stewart_take(&scratch, X * p), *A1G2 = stewart_take(&scratch, X * p);
+        stewart_multiply(X, X, X, A2, A1, A2A1);
+        stewart_multiply(X, X, X, A1, A2, A1A2);
+        stewart_multiply(X, X, p, A2, G1, A2G1);
+        stewart_multiply(X, X, p, A1, G2, A1G2);
         for (int i = 0; i < X * X; i++)
-            omega[i] = h / 2 * (A1[i] + A2[i]) + part * (one[i] - other[i]);
+            omega[i] = h / 2 * (A1[i] + A2[i]) + part * (A2A1[i] - A1A2[i]);
         for (int i = 0; i < X * p; i++)
-            turned[i] = h / 2 * (G1[i] + G2[i]) + part * (first[i] - second[i]);
+            omega_theta[i] = h / 2 * (G1[i] + G2[i]) + part * (A2G1[i] - A1G2[i]);
     } else {
         for (int i = 0; i < X * X; i++)
             omega[i] = h * A[i];
         for (int i = 0; i < X * p; i++)
-            turned[i] = h * G[i];
+            omega_theta[i] = h * G[i];
     }
-    stewart_exponential(X, p, omega, turned, Phi, S, scratch);
+    stewart_exponential(X, p, omega, omega_theta, Phi, S, scratch);
     return 1;
 }
 
