@@ -256,7 +256,7 @@ def minutes_in_c() -> str:
         output = run.stdout.read().splitlines()
         began.end()
         print("\n".join([*output, *(line for _, line in began.lines[-4:])]))
-        rows = np.loadtxt(log, delimiter=",")
+        rows = np.loadtxt(log, delimiter=",", skiprows=1)
     reference = prepare(sd.load_scenario("paper", settings=(EXACT,))).reference
     # The last column is the age of the measurement in periods; missing ones are NaN.
     measured = rows[np.isfinite(rows[:, 1:7]).all(axis=1)]

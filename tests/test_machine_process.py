@@ -153,7 +153,7 @@ def c_controller(folder, port, *options):
 
 def states_of(log):
     """(k, 12) that the C controller measured."""
-    return np.loadtxt(log, delimiter=",")[:, 1:13]
+    return np.loadtxt(log, delimiter=",", skiprows=1)[:, 1:13]
 
 
 def simulated(samples, settings=SETTINGS):
@@ -268,6 +268,10 @@ def test_both_ends_in_c(folder, tmp_path):
             time.sleep(0.5)
             assert other.end(signal.SIGINT) == 1
     np.testing.assert_allclose(states_of(log), simulated(SAMPLES), atol=1e-6)
+    heads = log.read_text().splitlines()[0].split(",")
+    assert [heads[0], heads[6], heads[12], heads[18]] == [
+        *("time[s]", "z[m]", "z_dot[m/s]", "torque_6[N m]")
+    ]
     assert sum("a session begins" in line for line in running.lines) == 1
     assert re.search(r"refused: 0 malformed, 0 version, [1-9]\d* key", running.lines[-1])
 

@@ -4,8 +4,8 @@
 
    It asks for a session, finds the machine's clock, chooses when to begin, and then steps the
    controller once a period of the machine. Without a key it talks to this computer only; a machine that
-   does not say that it is a simulation is driven with `arm` only. The log has a line per sample: time,
-   measured state (12), torques (6), how many periods before the sample that was measured. */
+   does not say that it is a simulation is driven with `arm` only. The log has a row per sample; `age` is
+   the number of periods before the sample at which the state was measured. */
 
 #define _POSIX_C_SOURCE 200809L
 
@@ -140,6 +140,19 @@ static int take(controller *c, uint64_t sampled, real *measurement)
     c->used = fresh ? c->last.sampled + 1 : c->used;
     c->missing += !fresh;
     return fresh ? (int)age : 0;
+}
+
+static void note_head(const controller *c)
+{
+    static const char *const names[] = {"roll", "pitch", "yaw", "x", "y", "z"};
+    fprintf(c->log, "time[s]");
+    for (int i = 0; i < 6; i++)
+        fprintf(c->log, ",%s[%s]", names[i], i < 3 ? "rad" : "m");
+    for (int i = 0; i < 6; i++)
+        fprintf(c->log, ",%s_dot[%s/s]", names[i], i < 3 ? "rad" : "m");
+    for (int i = 0; i < STEWART_MOTORS; i++)
+        fprintf(c->log, ",torque_%d[N m]", i + 1);
+    fprintf(c->log, ",age[periods]\n");
 }
 
 static void note(const controller *c, double t, const real *measurement, const real *torque,
@@ -353,6 +366,7 @@ static int understood(controller *c, int argc, char **argv)
                 perror(text);
                 return 0;
             }
+            note_head(c);
         } else if (strcmp(text, "arm") == 0) {
             c->flags = STEWART_ARMED;
         } else {
