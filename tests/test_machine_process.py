@@ -263,6 +263,7 @@ def test_both_ends_in_c(folder, tmp_path):
     with machine_in_c(folder, "60", str(key)) as (running, port):
         with process(c_controller(folder, port, f"log={log}", f"key={key}")) as driving:
             assert driving.end() == 0, driving.lines
+            assert "warning" not in driving.said
         # Without the key, and with another one: refused, and nothing is done.
         with process(c_controller(folder, port, "seconds=1")) as other:
             time.sleep(0.5)

@@ -64,6 +64,19 @@ def test_a_controller_in_c_of_another_machine_is_refused_by_both(folder):
 
 
 @pytest.mark.slow
+def test_a_controller_in_c_warns_of_a_link_that_is_too_slow(folder):
+    times = "low=0.45", "high=0.46", "loss=0", "return={low: 0.45, high: 0.46}"
+    link = ("link.kind=network", *(f"link.{time}" for time in times))
+    with (
+        machine(settings=(*SETTINGS, *link)) as (_, port),
+        process(c_controller(folder, port, "seconds=0.2")) as driving,
+    ):
+        driving.end()
+    assert "but torques are to act 800 ms after their sample" in driving.said
+    assert "but are waited for only 50 ms" in driving.said
+
+
+@pytest.mark.slow
 def test_a_machine_in_c_refuses_a_controller_of_another_mechanism(folder):
     live = [DRAKE, "live", "paper", "--no-browser", "--set", "mechanism=paper_clear"]
     with (

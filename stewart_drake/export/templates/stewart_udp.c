@@ -315,12 +315,33 @@ static const char *greet(controller *c)
     return NULL;
 }
 
+/* Longest time to wait for the measurement of a sample, own ns; 0: late ones are used later. */
+static uint64_t longest_patience(const controller *c)
+{
+    if (stewart_configuration.longest_wait)
+        return 0;
+    return c->last.period / (eta(c) > c->last.period ? 2 : 4);
+}
+
+/* Print a warning if the link is too slow for this controller. */
+static void warn_of_link(const controller *c)
+{
+    double trip = c->clock.trip[shortest(&c->clock)];
+    uint64_t patience = longest_patience(c);
+    if (!(c->last.head.flags & STEWART_WIRE) && trip > (double)eta(c))
+        printf("warning: a round trip takes %.3g ms, but torques are to act %.3g ms after their sample: they "
+               "are late; export with a longer delay (delay.steps)\n", 1e-6 * trip, 1e-6 * (double)eta(c));
+    if (patience && trip / 2 > (double)patience)
+        printf("warning: measurements take about %.3g ms, but are waited for only %.3g ms: they are missing; "
+               "export with their delay (sensor.delay, s)\n", 5e-7 * trip, 1e-6 * (double)patience);
+}
+
 /* Run all samples; return why the run ended early, or NULL. */
 static const char *drive(controller *c)
 {
     unsigned number = (unsigned)(c->seconds / (double)stewart_configuration.period + 0.5);
     int waits = stewart_configuration.longest_wait == 0;
-    uint64_t longest = !waits ? 0 : c->last.period / (eta(c) > c->last.period ? 2 : 4);
+    uint64_t longest = longest_patience(c);
     for (uint64_t t = own_time(&c->clock, c->begin); udp_now() + SECOND / 20 < t;) {
         say(c, 0, 0, 0, NULL, 0); /* still here */
         udp_wait(c->socket, udp_now() + SECOND / 20);
@@ -396,6 +417,7 @@ int main(int argc, char **argv)
     if (!problem) {
         printf("begins at %.3f s of the machine, round trip %.2f ms\n", 1e-9 * (double)c.begin,
                1e-6 * c.clock.trip[shortest(&c.clock)]);
+        warn_of_link(&c);
         fflush(stdout);
         problem = drive(&c);
     }
