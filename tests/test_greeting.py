@@ -16,6 +16,7 @@ import pytest
 from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live import contact as contacts
+from stewart_drake.live import session as sessions
 from stewart_drake.live.checks import ReportCheck
 from stewart_drake.live.contact import Contact, await_free, call, open_endpoint
 from stewart_drake.live.endpoint import ANSWERS, ANSWERS_AT_ONCE
@@ -193,6 +194,16 @@ def test_a_machine_in_use_is_named(impatient):
     said = not_free(encode(replace(used, head=replace(head, sequence=k))) for k in count(1))
     words = "is in use by another controller (retry 0.5 s after it stops)"
     assert re.fullmatch(rf"machine at 127\.0\.0\.1:\d+ {re.escape(words)}", said), said
+
+
+def test_a_machine_in_use_is_refused_before_the_design(impatient, monkeypatch):
+    """The design takes seconds, and another controller may keep the machine for hours."""
+    monkeypatch.setattr(sessions, "design", lambda *given: pytest.fail("designed"))
+    head, identity = OFFER.head, identity_of(scenario_of(*FROM_REST))
+    busy = replace(OFFER, flags=OFFER.flags | MachineFlags.BUSY, identity=identity)
+    replies = (encode(replace(busy, head=replace(head, sequence=k))) for k in count(1))
+    with contact_with(replies) as contact, pytest.raises(ConfigError, match="is in use by another"):
+        prepare_session(scenario_of(*FROM_REST), contact.session.address)
 
 
 def test_a_sequence_that_restarts_is_named(impatient):

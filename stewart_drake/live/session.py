@@ -13,7 +13,7 @@ import numpy as np
 
 from stewart_drake.dynamics.native_functions import one_blas_thread
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.live.contact import Contact, address_of, call, open_endpoint
+from stewart_drake.live.contact import Contact, address_of, await_free, call, open_endpoint
 from stewart_drake.live.design import (
     Design,
     Learned,
@@ -95,7 +95,9 @@ def prepare_session(
     endpoint = open_endpoint(address, key)
     try:
         contact = Contact(endpoint, address, identity_of(scenario))
-        machine = call(contact)
+        call(contact)
+        await_free(contact)  # before the design, which takes seconds
+        machine = contact.machine
         check_controller(scenario)
         with one_blas_thread:
             scenario, read = read_learned(scenario)
