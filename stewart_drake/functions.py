@@ -20,7 +20,7 @@ from stewart_drake.files.yamlio import yaml_text
 from stewart_drake.identification import identify as identification
 from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
 from stewart_drake.identification.plan import MOTION, plan
-from stewart_drake.identification.servo_fit import identify_servos
+from stewart_drake.identification.servo_fit import ServoIdentification, identify_servos
 from stewart_drake.identification.servo_logs import is_servo_log, read_servo_log
 from stewart_drake.identification.servo_plan import SETPOINTS_FILE, plan_servos
 from stewart_drake.identification.tolerances import Tolerances
@@ -72,7 +72,7 @@ def identify(
 
     `save` of the result also writes mechanism.yaml and calibration.yaml, for `simulate`. From a CSV
     log of setpoints and crank angles it finds the numbers of position servos instead, and writes
-    servos.yaml, an overlay of a scenario.
+    servos.yaml, an overlay of a scenario, if they explain the log.
 
     Args:
         logs: signals.nc of a run, or CSV; one CSV log of setpoints.
@@ -106,7 +106,7 @@ def identify(
             lambda: identify_servos(log, machine, rounding, g),
             servo_identification.document,
             typed,
-            lambda found, folder: _written(folder, {SERVOS: yaml_text(found.overlay)}),
+            _write_servos,
         )
     read = [read_log(Path(path), machine, precision or Precision(), gravity) for path in paths]
     return analysis_result(
@@ -173,6 +173,14 @@ def _write_machine(found: identification.Identification, folder: Path) -> list[s
     calibration = found.calibration(load_mechanism(folder / MECHANISM))
     save_calibration(folder / CALIBRATION, calibration)
     return [MECHANISM, CALIBRATION]
+
+
+def _write_servos(found: ServoIdentification, folder: Path) -> list[str]:
+    """Write the overlay if servos explain the log; otherwise remove that of an earlier log."""
+    if found.right:
+        return _written(folder, {SERVOS: yaml_text(found.overlay)})
+    (folder / SERVOS).unlink(missing_ok=True)
+    return []
 
 
 def _written(folder: Path, texts: dict[str, str]) -> list[str]:

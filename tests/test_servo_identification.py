@@ -11,6 +11,7 @@ import yaml
 import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.functions import _write_servos
 from stewart_drake.identification import servo_fit
 from stewart_drake.identification.logs import angle_std
 from stewart_drake.identification.progress import shown_by
@@ -335,7 +336,7 @@ def test_a_log_of_motors_that_are_off_is_refused_at_once():
         identify_servos(log, ROBOT, angle_std(12))
 
 
-def test_a_log_that_no_servo_explains_has_no_intervals():
+def test_a_log_that_no_servo_explains_has_neither_intervals_nor_an_overlay(tmp_path):
     rng = np.random.default_rng(0)
     fit, _ = with_known_statistics(rng, 600, 4)
     wrong = dataclasses.replace(fit, residuals=10 + fit.residuals)
@@ -343,3 +344,6 @@ def test_a_log_that_no_servo_explains_has_no_intervals():
     told = " ".join(document(wrong).plain().split())
     assert "Do not use the values" in told and "Next Check units" in told
     assert yaml.safe_dump(wrong.overlay)
+    old = tmp_path / "servos.yaml"
+    old.write_text("actuator: {stiffness: 1}")  # of an earlier log
+    assert _write_servos(wrong, tmp_path) == [] and not old.exists()
