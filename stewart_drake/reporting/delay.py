@@ -16,13 +16,11 @@ from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import DATA_INK, DATA_PAPER, line
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.studies.delay import Cell, DelayStudy, MotorMargins
-from stewart_drake.studies.verdict import HARDLY, NO, loop_verdict, milliseconds
+from stewart_drake.studies.verdict import FRAGILE, HARDLY, NO, loop_verdict, milliseconds
 
 _TONES: Final[dict[str, Tone]] = {"yes": "good", "hardly": "fair", "no": "bad"}
 _BANDWIDTH: Final = 10.0
 """Bandwidth of the servos in the comparison, Hz."""
-FRAGILE: Final = 0.05
-"""Smallest tolerable error of a good loop, as a share of the delay."""
 _WORDS: Final = {"out_of_reach": "no reach", "left_workspace": "left", "not_run": "not run"}
 
 

@@ -67,6 +67,9 @@ HARDLY: Final = 10.0
 NO: Final = 1e3
 """Growth of prediction errors from which a delay can hardly, or not, be compensated."""
 
+FRAGILE: Final = 0.05
+"""Smallest tolerable error of a good loop, as a share of the delay."""
+
 
 @dataclass(frozen=True)
 class Verdict:
