@@ -526,6 +526,10 @@ def test_bounds_are_alike_where_the_seeds_do_not_tell_them_apart(known_outcomes)
 
     assert document(study).tone == "fair"
     assert document(replace(study, bounds=cells[:2])).tone == "good"
+    mostly_late = replace(study, bounds=[cells[0]._replace(late=0.8), cells[1]])
+    for one, warned in ((study, False), (mostly_late, True)):
+        said = " ".join(document(one).plain().split())
+        assert ("Older plans replace most torques" in said) is warned
     many = [cells[0]._replace(runs=8, errors=(*common, *common)), cells[4]._replace(runs=8)]
     assert replace(study, bounds=many).unconfirmed_losses == []  # 3 of 8 against 8 of 8
 
