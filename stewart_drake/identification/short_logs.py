@@ -73,8 +73,9 @@ def fit_short(pairs: Sequence[Pair], unknowns: Unknowns, worst: float) -> Soluti
     lasting, delay = longest.times[-1] - longest.times[0], unknowns.mean[DELAY]
     narrower = ", or a narrower tolerance of the delay" if lasting > delay + _RESPONSE else ""
     raise ConfigError(
-        f"{longest.name}: got a log of {lasting:.3g} s, explained by "
-        f"{'delays of ' + found if found else 'no delay'}; expected one delay, known to "
+        f"{longest.name}: got a log of {lasting:.3g} s, "
+        f"{'explained by delays of ' + found if found else 'too short, and explained by no delay'}"
+        "; expected one delay, known to "
         f"{1e3 * _VAGUE:g} ms: a log of at least {length_needed(unknowns):.3g} s (the longest "
         f"possible delay and {_RESPONSE:g} s of motion){narrower}"
     )
