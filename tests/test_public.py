@@ -299,6 +299,14 @@ def test_the_signature_of_an_analysis_shows_its_options():
     )
 
 
+def test_the_signature_of_a_section_shows_types_without_their_ranges():
+    for name in dir(sd):
+        if name.endswith("Config") and inspect.isclass(getattr(sd, name)):
+            assert "FieldInfo" not in str(inspect.signature(getattr(sd, name))), name
+    shown = str(inspect.signature(sd.DelayConfig))
+    assert shown.startswith("(steps: int = 8, fraction: float = 0.0, drift: float = 0.0")
+
+
 def test_help_names_arrays_instead_of_the_unions_behind_them():
     assert str(inspect.signature(sd.StewartDynamics.mass_matrix)).startswith(
         "(self, pose: ArrayLike"

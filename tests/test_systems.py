@@ -171,6 +171,8 @@ NETWORK = load_network(resolve("weights", "tuner"))
         (lambda: DelayChain(0.1, 0, 0.0, EMPTY, "force"), "carries: got 'force'"),
         (lambda: VaryingDelay(0.0, [0.1], AT_ONCE, EMPTY), "period: got 0.0"),
         (lambda: VaryingDelay(0.1, [NAN], AT_ONCE, EMPTY), "delays: got [nan]"),
+        (lambda: VaryingDelay(0.1, [0.1], 0.1, EMPTY), "delay: got 0.1; expected a Delay"),
+        (lambda: PlayoutBuffer(0.1, [0.0], 1, EMPTY), "delay: got 1; expected a Delay"),
         (lambda: PlayoutBuffer(0.1, [-1.0], AT_ONCE, EMPTY), "times: got [-1.0]"),
         (
             lambda: PlayoutBuffer(0.1, [0.0], AT_ONCE, EMPTY, rows=0),

@@ -13,7 +13,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.core.link import NO_ROOM, Link
-from stewart_drake.files.arguments import fixed, one_of, positive, whole
+from stewart_drake.files.arguments import fixed, of_kind, one_of, positive, whole
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import brief
 from stewart_drake.loop.sampling import declare_constant, update_every, weak
@@ -31,7 +31,15 @@ class LinkSystem(LeafSystem):
     """A link with its memory as discrete state, which takes a command at each sample."""
 
     def _begin(self, link: Link, period: float, rows: int, delay: Delay, queue: Array) -> None:
-        """Declare input, state and samples; `queue` (L, size) is in flight at t = 0."""
+        """Declare input, state and samples.
+
+        Args:
+            link: the commands in flight, in the core.
+            period: dt in s.
+            rows: commands that are sent at a sample.
+            delay: of the commands sent before t = 0.
+            queue: (L, size) commands in flight at t = 0, oldest first.
+        """
         queue = fixed("queue", queue, (delay.queue_length, link.size))
         self._link, self._period = link, period
         self._commanded = self.DeclareVectorInputPort("commanded", rows * link.size)
@@ -208,7 +216,8 @@ class VaryingDelay(Wire):
     Args:
         period: dt in s.
         delays: (n,) eta_k of T_0 to T_{n-1}, s; the last one holds for all later torques.
-        delay: mu and eta0, of the torques sent before t = 0.
+        delay: mu and eta0 / dt, of the torques sent before t = 0, such as
+            `stewart_drake.scenario.delay.Delay(steps=5, fraction=0.5)`.
         queue: (L, n) torques in flight at t = 0, oldest first, L = mu, or mu + 1 when eta0 > 0.
         carries: as of `DelayChain`.
 
@@ -225,6 +234,7 @@ class VaryingDelay(Wire):
         carries: Carried = "torque",
     ) -> None:
         super().__init__()
+        of_kind("delay", delay, Delay)
         period, delays = positive("period", period), _times("delays", delays, 1)
         self._delays = np.where(delays > SIMULTANEOUS * period, delays, 0.0)
         self._lay(period, self._delays, delay, queue, carries)
@@ -271,11 +281,11 @@ class PlayoutBuffer(LinkSystem):
     Args:
         period: dt in s.
         times: (n,) d_k in s, infinite for a lost packet; further ones are lost.
-        delay: mu and eta0.
+        delay: mu and eta0 / dt, as of `VaryingDelay`.
         queue: (L, 6) torques for j = -L to -1, L = mu, or mu + 1 when eta0 > 0.
         rows: torques in a packet.
-        repeats: r.
-        dry: `hold` the last torque or put out `zero`.
+        repeats: r, how many of them are of earlier samples.
+        dry: output where no packet has a torque: `hold` the last one, or `zero`.
         history: periods in a report.
 
     Raises:
@@ -295,6 +305,7 @@ class PlayoutBuffer(LinkSystem):
         history: int = 1,
     ) -> None:
         super().__init__()
+        of_kind("delay", delay, Delay)
         period, times = positive("period", period), _times("times", times)
         self._delay, self._rows = delay, whole("rows", rows, 1)
         self._repeats, history = whole("repeats", repeats, 0), whole("history", history, 1)

@@ -1,7 +1,17 @@
 """Types of the scenario's fields, each with its range; shared by the sections."""
 
 import dataclasses
-from typing import Annotated, Any, Final, Literal, NotRequired, TypeVar, dataclass_transform
+import inspect
+from typing import (
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    NotRequired,
+    TypeVar,
+    dataclass_transform,
+    get_type_hints,
+)
 
 import pydantic
 from pydantic import AfterValidator, ConfigDict, Field, with_config
@@ -19,7 +29,12 @@ STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 def section(cls: type[_T]) -> type[_T]:
     """Return a strict dataclass; a wrong argument or assignment raises ConfigError."""
     config = ConfigDict(**STRICT, validate_assignment=True, populate_by_name=True)
-    return in_one_line(pydantic.dataclasses.dataclass(config=config)(cls))
+    made = in_one_line(pydantic.dataclasses.dataclass(config=config)(cls))
+    # `help` shows the types without their ranges.
+    types, given = get_type_hints(made), inspect.signature(made)
+    plain = [p.replace(annotation=types.get(p.name, Any)) for p in given.parameters.values()]
+    made.__signature__ = given.replace(parameters=plain)
+    return made
 
 
 MOST_PERIODS: Final = 1000
