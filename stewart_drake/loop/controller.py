@@ -143,9 +143,10 @@ class DelayLqiController(_RecordedLaw):
     With m the memory (`law.memory.Memory`) and `step` the law (`law.predictive_lqi.PredictiveLqi`):
 
     Initialise: m holds the torques in flight at t = 0 and nothing else.
-    Update:     every period m <- step(m, measurement, preview, weights), and the time it took
+    Update:     every period m <- step(m, measurement, preview, weights); the duration of the step
+                is recorded.
     Output:     torque        = step(m, measurement, preview, weights).torque, to be read at the
-                samples; the step is shared with the update.
+                samples; the update uses the same step.
                 the others    = parts of m, as of the last sample.
 
     | port | direction | size | unit | rate |
@@ -155,7 +156,7 @@ class DelayLqiController(_RecordedLaw):
     | weights | input | 2 | w_Q, w_R | read every period |
     | age | input | 1 | s, whole periods | of the measurement; only if it may be late |
     | report | input | 7 h | as of `PlayoutBuffer`, NaN is lost | only with a channel of packets |
-    | plan | output | 6 (r + N) | N m, the packet to be sent | the same; direct feedthrough |
+    | plan | output | 6 (r + n) | N m, the packet to be sent | the same; direct feedthrough |
     | torque | output | 6 | N m | direct feedthrough |
     | estimate | output | 12 | rad, m, rad/s, m/s | direct feedthrough; the state for T_k |
     | memory | output | abstract, `Sample` | - | direct feedthrough; after this sample |
@@ -170,6 +171,9 @@ class DelayLqiController(_RecordedLaw):
     | wrench_std | output | 6 | the same | held; NaN where none is estimated |
     | delay_estimate | output | 1 | s | held; as assumed by the law |
     | delay_std | output | 1 | s | held; NaN without delay estimator |
+
+    Sizes: N samples of the encoders per period; p `preview_times` of the law; a report of h
+    periods; packets of n planned torques and r of earlier samples (`law.channel.Packets`).
 
     Args:
         law: the control law.

@@ -61,10 +61,15 @@ _TUNER_INPUTS: Final = {
 class ClosedLoop(Diagram):
     """The closed loop; output ports are named after the signals.
 
-    Subsystems: `reference`, `sensor`, `weights` or `tuner`, `controller`, `saturation`,
-    `delay_chain`, `torque_bias`, `plant`, `density`; with servos `servos`, without `weights` and
-    `saturation`; with a push `push`; with the user's own `own_controller`, `disturbance`,
-    `disturbed_torque`; with a wrench `wrench`, the sum of them.
+    Subsystems, by name: `reference`, `sensor`, `controller`, `delay_chain`, `torque_bias`, `plant`,
+    `density`, and as the scenario needs them:
+
+    - `weights` (constant) or `tuner`, and `saturation`: for torques, not for servos
+    - `servos`
+    - `push`: of `plant.push`
+    - `own_controller`, `disturbance`: systems of the user's own
+    - `disturbed_torque`, `wrench`: sums of the torques and of the wrenches that act on the plant
+
     Output ports: `state`, `reference`, `torque_commanded` (of law or servos, without limit),
     `torque_applied` (limited and delayed, before the bias), `integral`, `weights_used`,
     `parameters`, `parameter_std`, `wrench_estimate`, `wrench_std`, `density`, `measurement` (held,
@@ -72,7 +77,7 @@ class ClosedLoop(Diagram):
     the newest torque), `packets`.
 
     Attributes:
-        experiment: the experiment.
+        experiment: scenario, machines, reference and initial state of the loop.
         catch_up: length of the blend onto the reference, s; 0 without one.
     """
 
