@@ -1,4 +1,12 @@
-"""Parts of a law in Python, as tables of functions that the step in C calls back."""
+"""Parts of a law in Python, as tables of functions that the step in C calls back.
+
+Tables and arguments are those of `stewart_observer` (core/observer.h), `stewart_design`,
+`stewart_planner`, `stewart_channel` and `stewart_sample` (core/law.h) and `stewart_servo`
+(core/servo.h). An argument that Python does not need has the name of the header with an underscore.
+Python keeps the memory of its parts in `Memory.own`, not in the vector that C passes.
+
+Next to each function stand the sizes of its arguments, as `call_back` takes them.
+"""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -17,20 +25,27 @@ from stewart_drake.law.observers import belief_of
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.timeline import Arrivals, Timeline, TorqueSchedule
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
-from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES, POSE, RATES
+from stewart_drake.scenario.signals import (
+    NUM_REFERENCE,
+    NUM_STATE,
+    NUM_TORQUES,
+    POSE,
+    RATES,
+    WEIGHTS,
+)
 from stewart_drake.types import Array
 
 
 @dataclass
 class Step:
-    """Data of the step that is being taken.
+    """Inputs and results of the present step.
 
     Attributes:
-        memory: of the law; C and the parts change it in place.
-        motion: to follow, as the caller gives it.
-        report: of the machine, or None.
+        memory: memory of the law, which C and the parts change in place.
+        motion: the caller's motion.
+        report: the machine's report, or None.
         followed: motion that the planner chose.
-        kept: arrays that C reads until the step is over.
+        kept: arrays that C reads until the end of the step.
     """
 
     memory: Memory
@@ -41,16 +56,16 @@ class Step:
 
 
 class OwnParts:
-    """Tables of the parts of a law that Python has.
+    """Function tables for the parts of a law that are written in Python.
 
     Args:
         law: the law.
-        data: `stewart_law *` of it.
+        data: its `stewart_law *`, in which each method for a part sets the table of that part.
 
     Attributes:
-        raised: errors in the parts.
+        raised: errors of the parts, which C does not see.
         kept: C structures that must outlive `data`.
-        now: the step that is being taken.
+        now: the present step.
     """
 
     now: Step
@@ -64,27 +79,31 @@ class OwnParts:
     def motion(self) -> tuple[Any, Any]:
         """Functions `reference` and `goal` of a `stewart_sample`."""
         sample = core().ffi.new("stewart_sample *")
-        given = None, None, lambda _, number, *__: number, Out(lambda _, n, *__: NUM_REFERENCE * n)
-        functions = {"reference": (self._reference, *given), "goal": (self._goal, *given)}
+        rows = Out(lambda _sample, number, *_: NUM_REFERENCE * number)
+        sizes = None, None, lambda _sample, number, *_: number, rows
+        functions = {"reference": (self._reference, *sizes), "goal": (self._goal, *sizes)}
         reference, goal = call_back(sample, self.raised, **functions)
         return reference, goal
 
-    def _reference(self, _: Any, __: int, times: Array, rows: Array) -> None:
+    def _reference(self, _sample: Any, _number: int, times: Array, rows: Array) -> None:
         rows[:] = np.nan
         rows[:] = self.rows_of(times, self.now.motion)
 
-    def _goal(self, _: Any, __: int, times: Array, rows: Array) -> None:
+    def _goal(self, _sample: Any, _number: int, times: Array, rows: Array) -> None:
         assert isinstance(self.now.motion, KnownMotion)
         rows[:] = np.nan
         rows[:] = np.ravel(self.now.motion.goal(times))
 
     def _table(self, kind: str, **functions: tuple[Any, ...]) -> Any:
-        it = core().ffi.new(f"stewart_{kind} *")
-        self.kept += [it, *call_back(it, self.raised, **functions)]
-        return it
+        table = core().ffi.new(f"stewart_{kind} *")
+        self.kept += [table, *call_back(table, self.raised, **functions)]
+        return table
 
     def rows_of(self, times: Array, motion: Motion | None) -> Array:
-        """Return rows of a motion as one vector.
+        """Return the rows of a motion at times in s from now, as one vector.
+
+        The caller's motion may be known at the law's preview times only, which C computes up to
+        rounding.
 
         Raises:
             ValueError: their shape does not fit.
@@ -94,19 +113,20 @@ class OwnParts:
         anywhere = isinstance(motion, KnownMotion) or motion is not self.now.motion
         if not anywhere and (self._has_observer or not law.finds_delay):
             timeline = self.timeline()
-            own = law.preview_times if timeline == law.timeline else law.times_for(timeline)
-            times = own if len(own) == len(times) else times  # to the last digit
+            exact = law.preview_times if timeline == law.timeline else law.times_for(timeline)
+            times = exact if len(exact) == len(times) else times
         return preview_rows(motion(times), len(times)).ravel()
 
     # -------------------------------------------------------------- observer
 
     def observer(self) -> None:
+        """Set the observer."""
         p, m = len(self.law.plant.dynamics.free), self.law.sensing.size
         self._has_observer, state = True, Out(NUM_STATE)
         self._data.observer = self._table(
             "observer",
-            memory=(lambda _: NUM_STATE, None),
-            scratch=(lambda _: 0, None),
+            memory=(lambda _law: NUM_STATE, None),
+            scratch=(lambda _law: 0, None),
             start=(self._start, None, state),
             observe=(self._observe, None, state, None, _torques, m, None),
             restart=(self._restart, None, state),
@@ -114,33 +134,40 @@ class OwnParts:
             uncertainty=(self._uncertainty, None, None, Out((NUM_STATE + p) ** 2)),
         )
 
-    def _start(self, _: Any, state: Array) -> None:
+    def _start(self, _law: Any, state: Array) -> None:
         law, state[:] = self.law, np.nan
         belief = law.observer.start(law.timeline, law.sensing, law.plant)
         self.now.memory.own["observer"], state[:] = belief, belief.state
 
     def _observe(
-        self, _: Any, state: Array, __: int, torques: Array, values: Array, ___: Any
+        self,
+        _law: Any,
+        state: Array,
+        _number: int,
+        torques: Array,
+        values: Array,
+        _scratch: Any,
     ) -> int:
         law, belief = self.law, self.now.memory.own["observer"]
         if not np.array_equal(state, belief.state, equal_nan=True):
             belief = belief.at(state.copy())
-        given = Measurement.of(values), torques.reshape(-1, NUM_TORQUES), law.sensing, law.plant
-        after = law.observer.observe(belief, *given)
+        in_flight = torques.reshape(-1, NUM_TORQUES)
+        measurement = Measurement.of(values)
+        after = law.observer.observe(belief, measurement, in_flight, law.sensing, law.plant)
         self.now.memory.own["observer"], state[:] = after, after.state
         return sum(1 << Counts._fields.index(cause) for cause in set(after.faults))
 
-    def _restart(self, _: Any, state: Array) -> None:
+    def _restart(self, law: Any, state: Array) -> None:
         belief = self.now.memory.own["observer"]
-        self._start(_, state)
+        self._start(law, state)
         fresh = self.now.memory.own["observer"].assuming(belief.parameters)
         self.now.memory.own["observer"] = replace(fresh, measured=belief.measured)
 
-    def _parameters(self, _: Any, __: Any, theta: Array, std: Array) -> None:
+    def _parameters(self, _law: Any, _memory: Any, theta: Array, std: Array) -> None:
         estimate = self.now.memory.own["observer"].estimate
         theta[:], std[:] = estimate.parameters, estimate.parameter_std
 
-    def _uncertainty(self, _: Any, __: Any, root: Array | None) -> float:
+    def _uncertainty(self, _law: Any, _memory: Any, root: Array | None) -> float:
         belief = self.now.memory.own["observer"]
         if root is not None:
             root[:] = 0.0
@@ -151,16 +178,27 @@ class OwnParts:
     # -------------------------------------------------------------- prediction and gain
 
     def design(self, columns: int, *, predicts: bool, designs: bool) -> None:
-        """Set the outlook and, where wanted, prediction and gain of `columns` at the most."""
+        """Set the outlook and, if asked for, the prediction and the gain.
+
+        Args:
+            columns: largest number of columns of the gain.
+            predicts: whether the prediction is in Python.
+            designs: whether the gain is in Python.
+        """
         functions: dict[str, tuple[Any, ...]] = {"outlook": (self._outlook, None, None, None)}
         if predicts:
             functions["predict"] = (self._predict, None, None, _followed, 6, None)
         if designs:
-            p, torques = len(self.law.plant.dynamics.free), Out(lambda _, o, *__: 6 + 6 * o.pending)
-            nodes = lambda _, o, *__: 2 * NUM_REFERENCE * (3 + o.pending)  # noqa: E731
-            gain = Out(lambda law, o, *_: 6 * core().lib.stewart_order([law.cost], o.pending))
-            given = p, nodes, NUM_STATE, 2, torques, Out(NUM_STATE), gain
-            functions["design"] = (self._design, None, None, *given)
+            sizes = (
+                len(self.law.plant.dynamics.free),
+                _nodes,
+                NUM_STATE,
+                len(WEIGHTS),
+                Out(_feedforward),
+                Out(NUM_STATE),
+                Out(_gain),
+            )
+            functions["design"] = (self._design, None, None, *sizes)
         self._data.design = self._table("design", **functions)
         self._data.design.columns = columns
 
@@ -183,7 +221,7 @@ class OwnParts:
     def _belief(self, outlook: Any) -> Belief:
         return self._observed().at(np.array(list(outlook.state)))
 
-    def _outlook(self, _: Any, lag: int, outlook: Any) -> None:
+    def _outlook(self, _law: Any, lag: int, outlook: Any) -> None:
         law, c, belief = self.law, core(), self._observed()
         timeline, in_flight = belief.timeline, self.now.memory.in_flight.copy()
         if self._has_observer:
@@ -209,21 +247,25 @@ class OwnParts:
         self.now.kept.append(times)
         outlook.samples, outlook.times, outlook.pending = len(times), c.at(times), pending
 
-    def _schedule(self, schedule: TorqueSchedule) -> Any:
+    def _schedule(self, schedule: TorqueSchedule) -> list[Any]:
+        """Return the fields of a `stewart_schedule`; C chooses the substeps."""
         arrays = [numbers(part) for part in schedule]
         self.now.kept += arrays
-        return [len(arrays[0]), *map(core().at, arrays), 0]
+        substeps = 0
+        return [len(arrays[0]), *map(core().at, arrays), substeps]
 
-    def _predict(self, _: Any, outlook: Any, followed: Array, integral: Array, it: Any) -> None:
+    def _predict(
+        self, _law: Any, outlook: Any, followed: Array, integral: Array, ahead: Any
+    ) -> None:
         belief, wanted = self._belief(outlook), followed.reshape(-1, NUM_REFERENCE)[:, :NUM_STATE]
         queue = belief.timeline.queue(self.now.memory.in_flight.copy())
         found = self.law.predictor.predict(belief, integral, queue, wanted, self.law.plant)
-        it.state, it.error, it.integral = (np.ravel(part).tolist() for part in found)
+        ahead.state, ahead.error, ahead.integral = (np.ravel(part).tolist() for part in found)
 
     def _design(
         self,
-        _: Any,
-        outlook: Any,
+        _law: Any,
+        _outlook: Any,
         theta: Array | None,
         nodes: Array,
         state: Array,
@@ -256,13 +298,17 @@ class OwnParts:
         return 0
 
     def command(self, servo: Any, *, computes: bool) -> None:
-        """Set the change of commands of a `stewart_servo`."""
+        """Set the change of commands of a `stewart_servo`.
+
+        Args:
+            servo: `stewart_servo *`.
+            computes: whether Python computes the command; otherwise it only adds what was learned.
+        """
         p, row = len(self.law.plant.dynamics.free), NUM_REFERENCE
-        given = self._command, None, p, row, Out(row)
-        self.kept += call_back(servo, self.raised, command=given)
+        self.kept += call_back(servo, self.raised, command=(self._command, None, p, row, Out(row)))
         self._computes = computes
 
-    def _command(self, _: Any, theta: Array, row: Array, command: Array) -> int:
+    def _command(self, _servo: Any, theta: Array, row: Array, command: Array) -> int:
         law, samples = self.law, self.now.memory.own["samples"]
         if self._computes:
             try:
@@ -277,56 +323,64 @@ class OwnParts:
     # -------------------------------------------------------------- planner and channel
 
     def planner(self) -> None:
+        """Set the planner."""
         self._data.planner = self._table(
             "planner",
-            memory=(lambda _: 0, None),
-            scratch=(lambda _: 0, None),
+            memory=(lambda _law: 0, None),
+            scratch=(lambda _law: 0, None),
             start=(self._start_planner, None, None),
             follow=(self._follow, None, None, None, None, None),
-            rows=(self._rows, None, None, None, None, _times, Out(_row_numbers)),
+            rows=(self._rows, None, None, None, None, _times, Out(_rows_at_times)),
         )
 
-    def _start_planner(self, _: Any, __: Any) -> None:
+    def _start_planner(self, _law: Any, _memory: Any) -> None:
         self.now.memory.own["planner"] = None
 
-    def _follow(self, _: Any, __: Any, outlook: Any, ___: Any, ____: Any) -> int:
+    def _follow(self, _law: Any, _memory: Any, outlook: Any, _sample: Any, _scratch: Any) -> int:
         belief = replace(self._belief(outlook), caution=outlook.caution)
-        given = belief, self.now.memory.in_flight.copy(), self.now.motion, self.law.plant
-        followed = self.law.planner.follow(self.now.memory.own["planner"], *given)
+        in_flight, path = self.now.memory.in_flight.copy(), self.now.memory.own["planner"]
+        followed = self.law.planner.follow(path, belief, in_flight, self.now.motion, self.law.plant)
         self.now.memory.own["planner"], self.now.followed = followed.path, followed.motion
         return int(followed.replanned)
 
-    def _rows(self, _: Any, __: Any, ___: Any, ____: int, times: Array, rows: Array) -> None:
+    def _rows(
+        self, _law: Any, _memory: Any, _sample: Any, _number: int, times: Array, rows: Array
+    ) -> None:
         rows[:] = np.nan
         rows[:] = self.rows_of(times, self.now.followed)
 
     def channel(self) -> None:
+        """Set the channel."""
         lib = core().lib
         self._data.channel = self._table(
             "channel",
-            memory=(lambda _: 0, None),
+            memory=(lambda _law: 0, None),
             scratch=(lib.stewart_planning_scratch, None),
-            torques=(lambda _: self.law.channel.torques, None),
+            torques=(lambda _law: self.law.channel.torques, None),
             start=(self._start_channel, None, None),
-            update=(self._update, None, None, None, Out(_flying), None),
-            send=(self._send, None, None, None, None, _flying, None),
+            update=(self._update, None, None, None, Out(_in_flight), None),
+            send=(self._send, None, None, None, None, _in_flight, None),
         )
 
-    def _start_channel(self, _: Any, __: Any) -> None:
+    def _start_channel(self, _law: Any, _memory: Any) -> None:
         self.now.memory.own["channel"] = self.law.channel.start()
         self.now.memory.own["plan"] = np.zeros((self.law.channel.torques, NUM_TORQUES))
 
-    def _update(self, _: Any, __: Any, ___: Any, in_flight: Array, ____: Any) -> None:
-        given = in_flight.reshape(-1, NUM_TORQUES).copy(), self.timeline(), self.now.report
-        sent, flying = self.law.channel.in_flight(self.now.memory.own["channel"], *given)
-        self.now.memory.own["channel"], in_flight[:] = sent, np.ravel(flying)
+    def _update(
+        self, _law: Any, _memory: Any, _report: Any, in_flight: Array, _scratch: Any
+    ) -> None:
+        own, before = self.now.memory.own, in_flight.reshape(-1, NUM_TORQUES).copy()
+        own["channel"], probable = self.law.channel.in_flight(
+            own["channel"], before, self.timeline(), self.now.report
+        )
+        in_flight[:] = np.ravel(probable)
 
     def _send(
-        self, law: Any, _: Any, outlook: Any, ahead: Any, in_flight: Array, scratch: Any
+        self, law: Any, _memory: Any, outlook: Any, ahead: Any, in_flight: Array, scratch: Any
     ) -> None:
         c, plan = core(), np.empty((self.law.channel.torques, NUM_TORQUES))
-        late = in_flight[len(in_flight) - NUM_TORQUES * outlook.pending :].copy()
-        c.lib.stewart_plan_torques(law, outlook, ahead, c.at(late), c.at(plan), scratch)
+        pending = in_flight[len(in_flight) - NUM_TORQUES * outlook.pending :].copy()
+        c.lib.stewart_plan_torques(law, outlook, ahead, c.at(pending), c.at(plan), scratch)
         sent = self.law.channel.send(
             self.now.memory.own["channel"], plan, in_flight.reshape(-1, NUM_TORQUES)
         )
@@ -345,21 +399,38 @@ def preview_rows(rows: Any, number: int) -> Array:
     return found
 
 
-def _torques(_: Any, __: Any, number: int, *___: Any) -> int:
+# Sizes of arrays, as functions of all arguments of the callback that takes them.
+
+
+def _torques(_law: Any, _memory: Any, number: int, *_: Any) -> int:
     return NUM_TORQUES * number
 
 
-def _followed(_: Any, outlook: Any, *__: Any) -> int:
+def _followed(_law: Any, outlook: Any, *_: Any) -> int:
+    """Size of the rows to follow, now and at the instants of the prediction."""
     return NUM_REFERENCE * (1 + int(outlook.samples))
 
 
-def _times(*given: Any) -> int:
-    return int(given[3])
+def _nodes(_law: Any, outlook: Any, *_: Any) -> int:
+    """Size of the rows at two Gauss nodes in each hold of the feedforward."""
+    return 2 * NUM_REFERENCE * (3 + int(outlook.pending))
 
 
-def _row_numbers(*given: Any) -> int:
-    return NUM_REFERENCE * int(given[3])
+def _feedforward(_law: Any, outlook: Any, *_: Any) -> int:
+    return NUM_TORQUES * (1 + int(outlook.pending))
 
 
-def _flying(law: Any, *_: Any) -> int:
+def _gain(law: Any, outlook: Any, *_: Any) -> int:
+    return NUM_TORQUES * int(core().lib.stewart_order([law.cost], outlook.pending))
+
+
+def _times(_law: Any, _memory: Any, _sample: Any, number: int, *_: Any) -> int:
+    return number
+
+
+def _rows_at_times(_law: Any, _memory: Any, _sample: Any, number: int, *_: Any) -> int:
+    return NUM_REFERENCE * number
+
+
+def _in_flight(law: Any, *_: Any) -> int:
     return NUM_TORQUES * int(law.layout.in_flight.rows)
