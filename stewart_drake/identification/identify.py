@@ -1,4 +1,9 @@
-"""Identification of a machine from its logs: all steps, and the result."""
+"""Identification of a machine from its logs: all steps, and the result.
+
+A fit predicts the motion in segments of the logs. Its start needs a delay that is nearly right, so
+`identify` tries several delays and lengths of segments. For each it first fits the half of the
+segments that the start predicts best, then all of them, and takes the first fit that is not wrong.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,9 +44,9 @@ from stewart_drake.types import Array
 
 WRONG: Final = 1.5  # chi^2 per value above which a fit is wrong and its intervals have no meaning
 USUAL_DELAY: Final = 0.1  # believed delay without any other information, s
-_FEW: Final = 15  # iterations over the segments that are fitted first
-_COARSE: Final = 0.1  # error of the coarse delay, s
-_SHORT: Final = 0.2  # share of a segment's length that is tried last
+_FIRST_ITERATIONS: Final = 15  # largest number of iterations of a first fit
+_COARSE_ERROR: Final = 0.1  # error of the coarse delay, s
+_SHORT_SHARE: Final = 0.2  # length of the segments that are tried last, by the usual length
 
 
 @dataclass(frozen=True)
@@ -49,9 +54,9 @@ class Identification:
     """Machine identified from logs."""
 
     logs: Sequence[Log]  # of the machine
-    unknowns: Unknowns  # before the logs
+    unknowns: Unknowns  # prior
     fit: Solution
-    middle: Array  # median of the measured poses (6,)
+    middle: Array  # (6,) median of the measured poses, rad and m
 
     @cached_property
     def chi2(self) -> dict[str, float]:
@@ -60,12 +65,12 @@ class Identification:
 
     @property
     def right(self) -> bool:
-        """Whether the fit explains the logs, so that its intervals mean something."""
+        """Whether the fit explains the logs; otherwise its intervals have no meaning."""
         return self.chi2["all"] <= WRONG
 
     @cached_property
     def values(self) -> Array:
-        """Values found, with friction not below zero."""
+        """Estimated values; a negative friction is 0."""
         found = self.fit.guess.values.copy()
         found[[*ONE_SIDED]] = np.maximum(0.0, found[[*ONE_SIDED]])
         return found
@@ -84,13 +89,16 @@ class Identification:
 
     @property
     def mechanism(self) -> Mechanism:
-        """Machine found; as drawn if the fit is wrong."""
+        """Estimated machine; the drawing's if the fit is wrong."""
         return self.unknowns.machine(self.values if self.right else self.unknowns.mean)
 
     def calibration(self, mechanism: Mechanism) -> Calibration:
-        """Return all values for a controller but the geometry, for the mechanism as read from file.
+        """Return the values that a controller reads besides the geometry.
 
-        If the fit is wrong, that is the delay alone, as uncertain as before.
+        If the fit is wrong, that is the delay alone, with its prior variance.
+
+        Args:
+            mechanism: as read from its file.
         """
         places = np.r_[DYNAMIC, OFFSETS, DELAY] if self.right else np.array([DELAY])
         names = tuple(NAMES[k] for k in places)
@@ -147,7 +155,14 @@ def identify(
 ) -> Identification:
     """Return the machine that explains its logs best.
 
-    The mechanism is as drawn; the believed delay in s is by default that of the first log.
+    Args:
+        logs: of one machine, with the same gravity.
+        mechanism: as drawn.
+        tolerances: prior standard deviations; the defaults if None.
+        delay: prior mean of the delay, s; by default that of the first log which has one.
+
+    Raises:
+        ConfigError: a plate that does not move, or logs that the mechanism does not fit at all.
     """
     if len({log.gravity for log in logs}) > 1:
         raise ConfigError(
@@ -159,73 +174,82 @@ def identify(
     pairs = [(log, start.measured_poses(log, mechanism)) for log in logs]
     unknowns = _unknowns(pairs, mechanism, tolerances, believed)
     middle = np.nanmedian(np.vstack([poses for _, poses in pairs]), axis=0)
-    lasting = max(float(log.times[-1] - log.times[0]) for log in logs)
-    if tolerances.delay > 0 and lasting < short_logs.length_needed(unknowns):
+    longest_log = max(float(log.times[-1] - log.times[0]) for log in logs)
+    if tolerances.delay > 0 and longest_log < short_logs.length_needed(unknowns):
         return Identification(logs, unknowns, short_logs.fit_short(pairs, unknowns, WRONG), middle)
     starts = [(believed, 1.0)]
     if tolerances.delay > 0:
         longest = max(pairs, key=lambda pair: len(pair[0].times))
         coarse = start.coarse_delay(*longest, mechanism, believed, tolerances.delay)
-        # Long trajectories lead nowhere after a loss of the plate; and the coarse delay may err.
-        starts = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5), (coarse, _SHORT)]
-    tried = list[_Begun]()
+        # Where the plate was lost, long trajectories diverge. The coarse delay may be wrong.
+        starts = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5), (coarse, _SHORT_SHARE)]
+    first_fits = list[_FirstFit]()
     for number, (first_delay, share) in enumerate(starts, start=1):
         progress.phase(f"start {number} of at most {len(starts)}")
-        begun = _begin(unknowns.at_delay(first_delay), share, pairs, unknowns)
-        if share == _SHORT:  # a wrong drawing explains short segments, too
-            begun = _begin(begun.guess.values, 1.0, pairs, unknowns)
-        tried.append(begun)
-        if begun.chi2 <= WRONG and (found := _grown(begun)).chi2 <= WRONG:
+        first_fit = _fit_nearest(unknowns.at_delay(first_delay), share, pairs, unknowns)
+        if share == _SHORT_SHARE:  # a wrong drawing explains short segments, too
+            first_fit = _fit_nearest(first_fit.guess.values, 1.0, pairs, unknowns)
+        first_fits.append(first_fit)
+        if first_fit.chi2 <= WRONG and (found := _fit_all(first_fit)).chi2 <= WRONG:
             break
     else:
-        found = _grown(min(tried, key=lambda one: one.chi2))
+        found = _fit_all(min(first_fits, key=lambda one: one.chi2))
     progress.phase("shorter steps")
     while (halved := with_half_step(found.problem, found.guess)) is not None:
         found = found.refitted(halved)
     return Identification(logs, unknowns, found, middle)
 
 
-class _Begun(NamedTuple):
-    chi2: float  # per value of the segments that were fitted first
-    whole: Problem
-    guess: Guess  # values found, and the measured first states of all segments
+class _FirstFit(NamedTuple):
+    chi2: float  # per value of the fitted segments; infinite if all of them diverge
+    whole: Problem  # all segments
+    guess: Guess  # fitted values, and the measured first states of all segments
 
 
-def _begin(values: Array, share: float, pairs: Sequence[start.Pair], unknowns: Unknowns) -> _Begun:
-    """Fit the nearest segments, from values of the unknowns, with a share of the usual length."""
-    late = _COARSE if unknowns.std[DELAY] > 0 else 0.0
+def _fit_nearest(
+    values: Array, share: float, pairs: Sequence[start.Pair], unknowns: Unknowns
+) -> _FirstFit:
+    """Fit the half of the segments that the start predicts best.
+
+    Args:
+        values: of the unknowns, at the start.
+        share: length of the segments, by the usual length.
+        pairs: logs with their measured poses.
+        unknowns: prior.
+    """
+    late = _COARSE_ERROR if unknowns.std[DELAY] > 0 else 0.0
     whole, first = start.problem_of(pairs, unknowns, values, late, share=share)
     problem, guess = without_diverged(whole, first)
     if not problem.segments:
-        return _Begun(np.inf, whole, first)
+        return _FirstFit(np.inf, whole, first)
     near, guess = nearest_half(problem, guess)
-    fit = solve(near, guess, _FEW)
-    return _Begun(fit.chi2, whole, Guess(fit.guess.values, first.first))
+    fit = solve(near, guess, _FIRST_ITERATIONS)
+    return _FirstFit(fit.chi2, whole, Guess(fit.guess.values, first.first))
 
 
-def _grown(begun: _Begun) -> Solution:
-    """Return the fit of all segments, without those that nothing fits.
+def _fit_all(first_fit: _FirstFit) -> Solution:
+    """Return the fit of all segments, without those that no values explain.
 
-    If the nearest segments are explained and all of them are not, a trajectory may have diverged,
-    such as the last before a plate was lost. Such segments are left out, as long as more than the
-    nearest remain.
+    A trajectory may diverge, such as the last one before the plate was lost. If the first fit is
+    right and that of all segments is wrong, the worst segments are left out one by one, as long as
+    more than half remain.
     """
     progress.phase("whole log")
-    problem, guess = without_diverged(begun.whole, begun.guess)
+    problem, guess = without_diverged(first_fit.whole, first_fit.guess)
     if not problem.segments:
         raise ConfigError(
             "LOG: got no stretch that the mechanism could have moved through under these torques; "
             "expected a log of this machine, torques in N m as they were commanded"
         )
-    if begun.chi2 > WRONG:
-        return solve(problem, guess, whole=begun.whole)
+    if first_fit.chi2 > WRONG:
+        return solve(problem, guess, whole=first_fit.whole)
     fewest = len(problem.segments) // 2 + 1
-    found = solve(problem, guess, _FEW, begun.whole)
+    found = solve(problem, guess, _FIRST_ITERATIONS, first_fit.whole)
     while found.chi2 > WRONG and len(found.problem.segments) > fewest:
         if found.misfit.max() < UNEXPLAINED:
             break
-        found = found.without_worst(_FEW)
-    return found if found.iterations < _FEW else found.refitted(found.problem)
+        found = found.without_worst(_FIRST_ITERATIONS)
+    return found if found.iterations < _FIRST_ITERATIONS else found.refitted(found.problem)
 
 
 def _unknowns(
