@@ -48,13 +48,14 @@ TITLES: Final = {
 SIGNIFICANT: Final = 0.05
 """Adjusted p-value of a significant influence."""
 _GOOD, _FAIR = 0.99, 0.9
-"""Smallest lower bound of the success rate for these tones."""
+"""Smallest lower bound of the success rate for a good and a fair verdict."""
 _WORST: Final = 10
+"""Rows of the table of the worst runs."""
 _FEW: Final = 3
 """Fewest failures that are compared with the other runs, and whose times are drawn."""
 _NAMED: Final = 3
 """Number of quantities, or pairs, in a sentence."""
-_SOFT: Final = "#666666"
+_GREY: Final = "#666666"
 # Colours of points in a bitmap, readable on light and dark pages.
 _SUCCESS, _ABOVE, _FAILED = "#2F86C6", "#E69F00", "#C4502A"
 
@@ -104,7 +105,7 @@ def document(study: RobustnessStudy) -> Document:
 
 
 def title(factor: str) -> str:
-    """Return a factor in words; |factor| is its size."""
+    """Return the name of a varied quantity, in bars if `factor` is its absolute value."""
     name = TITLES[factor.strip("|")]
     return f"|{name}|" if factor.startswith("|") else name
 
@@ -115,11 +116,12 @@ def _percent(share: Interval) -> str:
 
 
 def _failed(error: float) -> str:
+    """Return an E_ac in % s as text; it is infinite for a run that failed."""
     return "failed" if error == math.inf else number(error)
 
 
 def _rank(one: Correlation, p: float) -> tuple[str, str, str]:
-    """Return a rank correlation, marked if significant, its interval, and its p-value."""
+    """Return a rank correlation (with a star if significant), its interval, and p as texts."""
     if math.isnan(one.rho):
         return "-", "-", "-"
     mark = "* " if p < SIGNIFICANT else ""
@@ -127,6 +129,7 @@ def _rank(one: Correlation, p: float) -> tuple[str, str, str]:
 
 
 def _reason(study: RobustnessStudy, reason: str, runs: int) -> dict[str, Any]:
+    """Return one reason of failures: number and share of runs, median time in s, runs by leg."""
     own = [one for one in study.outcomes if study.reason_of(one) == reason]
     times = [one.time for one in own if math.isfinite(one.time)]
     legs = sorted(one.leg for one in own if one.leg is not None)
@@ -140,17 +143,19 @@ def _reason(study: RobustnessStudy, reason: str, runs: int) -> dict[str, Any]:
 
 
 def _third(one: Separation) -> str:
+    """Return the outer third of a quantity's values, on the side of the failing runs."""
     return f"{'from' if one.larger else 'up to'} {number(one.bound)} {unit_of(one.factor)}"
 
 
 def _where(one: Pair) -> str:
+    """Return where two quantities together make runs fail, such as `large a with small b`."""
     a, b = map(title, one.factors)
     text = f"{one.sides[0]} {a} with {one.sides[1]} {b}"
     return f"{text}, or just the opposite" if one.opposite else text
 
 
 def _spans(study: RobustnessStudy) -> dict[str, str]:
-    """Return the range of the drawn values of each factor; empty for sizes."""
+    """Return the range of the drawn values of each quantity; empty for absolute values."""
     values, units = factor_values(study.draws), factors(study.draws)
     return {
         name: f"{_span(float(x.min()), float(x.max()))} {units[name]}" if name in units else ""
@@ -160,7 +165,7 @@ def _spans(study: RobustnessStudy) -> dict[str, str]:
 
 def _span(low: float, high: float) -> str:
     if math.isinf(high):
-        return "no"
+        return "no"  # torque limit
     if low == high:
         return f"always {number(low)}"
     decimals = max(0, 1 - math.floor(math.log10(max(abs(low), abs(high)))))
@@ -221,28 +226,31 @@ def influence_figure(influences: Sequence[Influence]) -> Figure:
             xlim=(-1, 1),
             ylim=(len(names) - 0.5, -0.5),
             height=0.5 + 0.27 * len(names),
-            paint=partial(_dots, found=found, names=names),
+            paint=partial(_draw_correlations, found=found, names=names),
         )
         for label, found in shown.items()
     ]
     return draw(panels, len(panels), sharey=True)
 
 
-def _dots(ax: Axes, found: Sequence[tuple[Correlation, float]], names: Sequence[str]) -> None:
-    ax.axvline(0, color=_SOFT, lw=0.8)
+def _draw_correlations(
+    ax: Axes, found: Sequence[tuple[Correlation, float]], names: Sequence[str]
+) -> None:
+    ax.axvline(0, color=_GREY, lw=0.8)
     for row, (one, p) in enumerate(found):
         if np.isnan(one.rho):
-            ax.text(0.02, row, "not asked", va="center", fontsize=8, color=_SOFT)
+            ax.text(0.02, row, "not asked", va="center", fontsize=8, color=_GREY)
             continue
-        sure = p < SIGNIFICANT
-        color = RUN.color if sure else _SOFT
-        ax.plot([one.low, one.high], [row, row], color=color, lw=1.8 if sure else 1.0)
-        ax.plot(one.rho, row, "o", ms=6, mec=color, mfc=color if sure else "white")
+        significant = p < SIGNIFICANT
+        color = RUN.color if significant else _GREY
+        ax.plot([one.low, one.high], [row, row], color=color, lw=1.8 if significant else 1.0)
+        ax.plot(one.rho, row, "o", ms=6, mec=color, mfc=color if significant else "white")
     ax.set_xticks((-1, -0.5, 0, 0.5, 1))
     ax.set_yticks(range(len(names)), names)
 
 
 def runs_figure(study: RobustnessStudy) -> Figure:
+    """Return E_ac over each varied quantity; runs that did not complete are in a strip above."""
     units, done = factors(study.draws), np.isfinite(study.errors)
     low, high = _log_range(study.errors[done])
     strip, top = high * (high / low) ** 0.06, high * (high / low) ** 0.18
@@ -264,7 +272,7 @@ def runs_figure(study: RobustnessStudy) -> Figure:
         ax.axhspan(strip, top, color="#F1EAE6", zorder=0)
         ax.xaxis.set_major_locator(MaxNLocator(3))
         if not np.isfinite(x).all():
-            ax.text(0.5, 0.5, "none", transform=ax.transAxes, ha="center", color=_SOFT)
+            ax.text(0.5, 0.5, "none", transform=ax.transAxes, ha="center", color=_GREY)
 
     values = factor_values(study.draws)
     panels = [
