@@ -1,8 +1,8 @@
 """The error model, equations (20)-(28), and its sampling with a delayed input, (29)-(39).
 
 About a reference, e_bar = [X - X_d; d(X - X_d)/dt] obeys  e_bar_dot = A e_bar + B T + d,  with d
-the rest: minus the desired acceleration, gravity (21). States are in the order e = [pose error;
-rate error; integral].
+gravity minus the desired acceleration (21). States are in the order e = [pose error; rate error;
+integral].
 
 The torque T_k computed at t = k dt acts during [(k + mu) dt + eta0, (k + 1 + mu) dt + eta0). Over
 one period the old torque acts for eta0, the new one for the rest:
@@ -38,7 +38,10 @@ class ContinuousModel(NamedTuple):
 
 
 def double_integrators(torque_map: Array) -> ContinuousModel:
-    """Return (20)-(23): accelerations = torque_map (6, 6) torque; C selects the pose error."""
+    """Return (20)-(23), a double integrator per coordinate.
+
+    Its accelerations are torque_map (6, 6) times the torques; C selects the pose error.
+    """
     A = np.zeros((NUM_STATE, NUM_STATE))
     A[POSE, RATES] = np.eye(NUM_COORDINATES)
     B = np.zeros((NUM_STATE, torque_map.shape[1]))
@@ -47,7 +50,7 @@ def double_integrators(torque_map: Array) -> ContinuousModel:
 
 
 def linear_model(A: Array, B: Array) -> ContinuousModel:
-    """Return the model of any A (12, 12), B (12, 6) of [pose; rates]."""
+    """Return a model whose cost has the pose error, from A (12, 12), B (12, 6) of [pose; rates]."""
     return ContinuousModel(A, B, np.eye(NUM_COORDINATES, NUM_STATE))
 
 
@@ -83,7 +86,7 @@ class DelayedModel:
 
 @dataclass(frozen=True)
 class ChainModel:
-    """(38)-(39): x_{k+1} = A x_k + B T_k, y = C x, with x = [e; queue, oldest torque first]."""
+    """Chain (38)-(39): x_{k+1} = A x_k + B T_k, y = C x, x = [e; queue, oldest torque first]."""
 
     A: Array
     B: Array
@@ -106,7 +109,7 @@ def sample(A: Array, B: Array, duration: float) -> tuple[Array, Array]:
 
 
 def sample_in_steps(A: Array, B: Array, duration: float, step: float) -> tuple[Array, Array]:
-    """Return `sample` for an engine with fixed steps: semi-implicit Euler, duration/step times.
+    """Return the same as `sample`, for an engine that takes steps of semi-implicit Euler.
 
     With x = [pose error; rate error], A (2k, 2k) and B (2k, m), one step h advances the rates first
     and then the pose with the new rates,
@@ -167,8 +170,8 @@ def delayed_model(
         n, p = A.shape[0], C.shape[0]
         half = period / 2 * C
         # z_{k+1} = z_k + dt/2 C (e_k + A e_k + B_old T_{k-mu-1} + B_new T_{k-mu})
-        motion, A = A, np.eye(n + p)
-        A[:n, :n], A[n:, :n] = motion, half + half @ motion
+        A_without, A = A, np.eye(n + p)
+        A[:n, :n], A[n:, :n] = A_without, half + half @ A_without
         C = np.zeros((2 * p, n + p))
         C[:p, :n], C[p:, n:] = model.C, np.eye(p)
         B_old, B_new = (np.concatenate([B, half @ B]) for B in (B_old, B_new))
@@ -191,9 +194,9 @@ def chain(model: DelayedModel, *, always_extra: bool = False) -> ChainModel:
     B = np.zeros((n + m * length, m))
     A[:n, :n] = model.A
     torques = [*([model.B_old] if extra else []), model.B_new]  # oldest first; the last may be T_k
-    for place, column in enumerate(torques):
-        target = A[:n, n + m * place :] if place < length else B[:n]
-        target[:, :m] += column
+    for place, B_of_torque in enumerate(torques):
+        columns = A[:n, n + m * place :] if place < length else B[:n]
+        columns[:, :m] += B_of_torque
     A[n : n + m * (length - 1), n + m :] = np.eye(m * (length - 1))
     B[n + m * (length - 1) :] = np.eye(m)
     C = np.hstack([model.C, np.zeros((model.C.shape[0], m * length))])

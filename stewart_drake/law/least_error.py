@@ -1,17 +1,21 @@
 """Way of least error onto a moving reference within a torque limit.
 
 The shortest plan along a quintic (`law.catch_up`) reaches the torque limit at one instant only, and
-counts its length instead of its error. With the torques T of N holds free, the least error is
+minimises its length instead of its error. Here N torques T_j are free, each held for a time, the
+*hold* j. The plan of least error solves
 
     minimise   sum_j [ (|e_{j,1}|_Q^2 + |e_{j,2}|_Q^2) / 2 + |T_j - T_ff,j|_R^2 ]
     subject to |T_j| <= limit,  distances kept,  x_N on the reference,                    (least)
 
-with the cost of `law.horizon` and the torques T_ff of the reference. It is solved by a series of
-the quadratic programs of `law.horizon_qp`, each linearised about the motion that the last one
-found, with the end state as a further constraint. A fixed point meets (least) and the equations of
-motion.
+with the pose errors e at the two Gauss nodes of a hold, the torques T_ff of the reference, and the
+distances of `law.clear_space`. The cost is that of `law.horizon`.
+
+Sequential quadratic programming: each program (`law.horizon_qp`) is linearised about the motion
+under the torques of the last one, and has the end state as a further constraint. A fixed point
+meets (least) and the equations of motion.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -37,17 +41,17 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 _LONGER: Final = 1.2
-"""Length over that of the shortest plan; longer ones differ by less than 0.1 %."""
+"""Length, as a share of that of the shortest plan; the error of longer ones is within 0.1 %."""
 _MOST_HOLDS: Final = 40
-"""Torques of a plan; each is held for several periods if there are more."""
+"""Largest number of holds; a longer plan holds each torque for several periods."""
 _PARTS: Final = 4
-"""Pieces of a hold."""
-_ROUNDS: Final = 40
-"""Quadratic programs; some 8 are usual, 24 where the torque limit is tight."""
-_MISSED: Final = 1e-7
-"""By how much a plan may miss the reference, in motions of size 1 by the weights Q."""
-_BEYOND: Final = 0.05
-"""Use of the distances to keep, in cranks, that a step of the series may have."""
+"""Parts of a hold, each a piece of the plan."""
+_MAX_PROGRAMS: Final = 40
+"""Largest number of quadratic programs; 8 are usual, 24 where the torque limit is tight."""
+_END_TOLERANCE: Final = 1e-7
+"""Largest error of the end state, each coordinate times the root of its weight Q."""
+_VIOLATION: Final = 0.05
+"""Largest violation of the distances during the iteration, in lengths of the shortest crank."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +85,8 @@ class LeastError:
         """
         # At least four periods more, in holds of a whole number of periods.
         longer = max(int(_LONGER * periods), periods + 4)
-        each = -(-longer // _MOST_HOLDS)
-        number, hold = -(-longer // each), each * period
+        periods_per_hold = math.ceil(longer / _MOST_HOLDS)
+        number, hold = math.ceil(longer / periods_per_hold), periods_per_hold * period
         edges = begin + hold * np.arange(number + 1)
         torques = mean_torques(self.plant.dynamics, motion, edges[:-1], edges[1:])
         nodes = edges[:-1, None] + hold * GAUSS_NODES
@@ -101,41 +105,42 @@ class LeastError:
         return None if found is None else self._as_pieces(begin, hold, *found)
 
     def _end(self, reference: Trajectory, time: float, period: float) -> Array:
-        """Return the state (12,) at which held torques take the reference over: (rates), holds."""
+        """Return the end state (12,) from which held torques follow the reference.
+
+        It differs from the reference by the offset (rates) of `law.feedforward` for the next hold.
+        """
         dynamics, state = self.plant.dynamics, evaluate(reference, time)[:NUM_STATE].copy()
-        after = np.array([time, time + period])
-        means, changes = means_and_changes(
-            torques_at_nodes(dynamics, reference, after[:1], after[1:])
-        )
+        next_hold = np.array([time]), np.array([time + period])
+        means, changes = means_and_changes(torques_at_nodes(dynamics, reference, *next_hold))
         B = dynamics.linearize(state[POSE], state[RATES], means[0])[1][RATES]
-        timeline, pair = Timeline(period, Delay(0)), np.array([np.zeros(6), changes[0]])
-        return np.asarray(state + InverseDynamicsFeedforward().offset(pair, B, timeline))
+        timeline, two_holds = Timeline(period, Delay(0)), np.array([np.zeros(6), changes[0]])
+        return np.asarray(state + InverseDynamicsFeedforward().offset(two_holds, B, timeline))
 
     def _solved(
         self, start: Array, torques: Array, hold: float, limit: float, cost: HorizonCost
     ) -> tuple[Array, Array] | None:
-        """Return states (N _PARTS + 1, 12) and torques (N, 6) of the last program, or None."""
+        """Return states (N _PARTS + 1, 12) and torques (N, 6) that solve (least), or None."""
         holds = HoldModel(self.plant, self.plant.dynamics.parameters, hold)
         fine, size = self._motion(start, torques, hold), np.sqrt(np.tile(self.Q, 2))
-        for _ in range(_ROUNDS):
+        for _ in range(_MAX_PROGRAMS):
             states = fine[::_PARTS]
             model = holds.linearised(states, torques)
             model = model._replace(defects=np.zeros_like(model.defects))  # a motion has none
             m = condense(model, riccati(model, cost, states, torques), np.zeros(NUM_STATE))
             problem = problem_of(m, states[1:, POSE], torques, limit, self.space)
             missing = cost.end - states[-1] - m.states[-1]
-            problem = _ending(problem, size * m.state_map[-1].T, size * missing)
+            problem = _with_end(problem, size * m.state_map[-1].T, size * missing)
             change = m.torques + m.torque_map @ solve_by_daqp(problem)[problem.slacks :]
-            for share in (1.0, 0.5, 0.25, 0.1):
+            for share in (1.0, 0.5, 0.25, 0.1):  # line search
                 tried = np.clip(torques + share * change, -limit, limit)
                 fine = self._motion(start, tried, hold)
                 room = self.space.room(fine[::_PARTS, POSE])
-                if np.isfinite(fine).all() and room.min() > -_BEYOND:
+                if np.isfinite(fine).all() and room.min() > -_VIOLATION:
                     break
             else:
                 return None
             torques = tried
-            if np.abs(size * (fine[-1] - cost.end)).max() <= _MISSED:
+            if np.abs(size * (fine[-1] - cost.end)).max() <= _END_TOLERANCE:
                 inside = margins(self.plant.mechanism, fine[:, POSE]).min() > 0
                 return (fine, torques) if inside else None
         return None
@@ -147,22 +152,28 @@ class LeastError:
         return np.vstack([start, self.plant.dynamics.predict(start, fine, step, substeps)])
 
     def _as_pieces(self, begin: float, hold: float, states: Array, torques: Array) -> Array:
-        """Return the pieces (N _PARTS, 38) of a motion."""
+        """Return the pieces (N _PARTS, 38) of a motion: two times in s, and a row at each."""
         dynamics, number = self.plant.dynamics, len(states) - 1
         times = begin + hold / _PARTS * np.arange(number + 1)
         pieces = np.empty((number, 2 + 2 * NUM_REFERENCE))
         pieces[:, 0], pieces[:, 1] = times[:-1], times[1:]
         for i in range(number):
-            for x, first in ((states[i], 2), (states[i + 1], 2 + NUM_REFERENCE)):
+            for x, place in ((states[i], 2), (states[i + 1], 2 + NUM_REFERENCE)):
                 torque = torques[i // _PARTS]
                 row = np.append(x, dynamics.accelerations(x[POSE], x[RATES], torque))
-                pieces[i, first : first + NUM_REFERENCE] = row
+                pieces[i, place : place + NUM_REFERENCE] = row
         return pieces
 
 
-def _ending(problem: LeastDistance, by_v: Array, missing: Array) -> LeastDistance:
-    """Return a problem whose end state (12,) changes by `missing`; `by_v` (6 N, 12)."""
-    rows = np.hstack([np.zeros((len(missing), problem.slacks)), by_v.T])
+def _with_end(problem: LeastDistance, end_map: Array, missing: Array) -> LeastDistance:
+    """Return a problem with the end state as equality constraint.
+
+    Args:
+        problem: of variables v (6 N,) after the slacks.
+        end_map: (6 N, 12) whose transpose times v is the change of the end state.
+        missing: (12,) required change.
+    """
+    rows = np.hstack([np.zeros((len(missing), problem.slacks)), end_map.T])
     return problem._replace(
         A=np.vstack([problem.A, rows]),
         lower=np.append(problem.lower, missing),

@@ -1,9 +1,13 @@
 """The measurement y = h(x) + noise: its model, first states from it, and its faults.
 
-The law and its observers know a sensor by `Sensing` alone. A measurement that is *missing* is
-marked so. One that is *frozen* repeats the last one bit for bit, where that cannot be. One that
-the machine cannot have is *rejected*. The filter (core/filter.h), which has a model of the motion,
-finds outliers, and a sensor that froze while the plate was at rest.
+The law and its observers use a sensor through `Sensing` alone, which finds three faults:
+
+- missing: values that are not there.
+- frozen: a repetition of the last measurement, bit for bit, which noise or motion excludes.
+- rejected: values that the machine cannot have.
+
+The filter (core/filter.h) has a model of the motion. It finds outliers, and a sensor that froze
+while the plate was at rest.
 """
 
 from dataclasses import dataclass
@@ -28,8 +32,8 @@ class Measurement:
 
     Attributes:
         values: (m,) in the units of the sensing; meaningless where not valid.
-        valid: (m,) which of them are there.
-        age: s since they were taken.
+        valid: (m,) which values exist.
+        age: time since the values were taken, s.
     """
 
     values: Array
@@ -38,13 +42,13 @@ class Measurement:
 
     @classmethod
     def of(cls, values: Array, age: float = 0.0) -> "Measurement":
-        """Return a measurement from values (m,), with missing ones that are not finite."""
+        """Return a measurement from values (m,); those that are not finite count as missing."""
         values = np.array(values, np.float64)
         return cls(values, np.isfinite(values), age)
 
     @property
     def complete(self) -> bool:
-        """Whether every value is there."""
+        """Whether no value is missing."""
         return bool(np.all(self.valid))
 
     def known(self, size: int) -> Array:
@@ -64,11 +68,11 @@ class Measurement:
 
 
 FAULTS = ("measurements_missing", "measurements_frozen", "measurements_rejected")
-"""Counts by the bits of `STEWART_MISSING` and so on."""
+"""Names of the counts, by bit of the result of `fault` of `stewart_sensing`."""
 
 
 class FirstState(NamedTuple):
-    """State (12,) and covariance (12, 12) from one measurement alone."""
+    """Initial state (12,) and covariance (12, 12) of an observer, from one measurement."""
 
     state: Array
     covariance: Array
@@ -112,7 +116,7 @@ class Sensing(Protocol):
         ...
 
     def start(self, measurement: Measurement, near: Array | None = None) -> FirstState | None:
-        """Return the state from one measurement without a fault, or None where it fixes none.
+        """Return the state from one measurement without a fault, or None if it is undetermined.
 
         Args:
             measurement: of m values.
@@ -122,9 +126,9 @@ class Sensing(Protocol):
 
 
 def _fault(sensor: Any, *given: Any) -> str | None:
-    """Return the first fault that a `stewart_sensing` finds, or None."""
-    found = sensor.fault(core().ffi.addressof(sensor), *given)
-    return next((name for i, name in enumerate(FAULTS) if found >> i & 1), None)
+    """Return the first fault that a `stewart_sensing` finds, for arguments of `fault`, or None."""
+    bits = sensor.fault(core().ffi.addressof(sensor), *given)
+    return next((name for i, name in enumerate(FAULTS) if bits >> i & 1), None)
 
 
 @dataclass(frozen=True)
@@ -133,7 +137,7 @@ class StateSensing:
 
     Attributes:
         noise_std: (12,) rad, m and per s.
-        motion: (6,) expected range of each coordinate, rad and m.
+        motion: (6,) expected range of each coordinate, rad and m: the scale of its faults.
         anywhere: whether poses out of the machine's reach are accepted.
     """
 
@@ -160,8 +164,8 @@ class StateSensing:
     ) -> str | None:
         """Return the fault; one missing value makes the whole measurement missing."""
         c, values, before = core(), measurement.known(self.size), numbers(last, self.size)
-        given = c.at(geometry(mechanism)), period, c.at(values), c.at(before)
-        return _fault(c.lib.stewart_state_sensing(state_sensor(self).it), *given)
+        arguments = c.at(geometry(mechanism)), period, c.at(values), c.at(before)
+        return _fault(c.lib.stewart_state_sensing(state_sensor(self).it), *arguments)
 
     def start(self, measurement: Measurement, near: Array | None = None) -> FirstState:
         """Return the measurement, with the variance of its noise."""
@@ -170,6 +174,7 @@ class StateSensing:
 
 @Once
 def state_sensor(sensing: StateSensing) -> Compiled:
+    """Return the `stewart_state_sensor` of a sensor."""
     sensor = core().ffi.new("stewart_state_sensor *")
     sensor.noise_std = list(numbers(sensing.noise_std, NUM_STATE))
     sensor.motion = list(numbers(sensing.motion, NUM_COORDINATES))
@@ -179,19 +184,29 @@ def state_sensor(sensing: StateSensing) -> Compiled:
 
 @Once
 def described(sensing: Sensing, mechanism: Mechanism) -> Compiled:
-    """Return the `stewart_sensing` of a sensor that is written in Python, which C calls back."""
+    """Return a `stewart_sensing` for C whose functions call those of a sensor in Python.
+
+    Results are NaN before the function of the sensor, so that C finds the ones that it leaves out.
+    """
     c, m, raised = core(), sensing.size, list[BaseException]()
     noise = numbers(sensing.noise_std, m)
 
-    def seen(_: Any, state: Array, values: Array) -> None:
+    def seen(_sensing: Any, state: Array, values: Array) -> None:
         values[:] = np.nan
         values[:] = sensing.seen(state)
 
-    def jacobian(_: Any, state: Array, J: Array) -> None:
+    def jacobian(_sensing: Any, state: Array, J: Array) -> None:
         J[:] = np.nan
         J[:] = np.ravel(sensing.through(state, np.eye(NUM_STATE)))
 
-    def start(_: Any, values: Array, near: Array | None, state: Array, root: Array, __: Any) -> int:
+    def start(
+        _sensing: Any,
+        values: Array,
+        near: Array | None,
+        state: Array,
+        root: Array,
+        _scratch: Any,
+    ) -> int:
         first = sensing.start(Measurement.of(values), near)
         if first is None or not np.isfinite(first.covariance).all():
             return 0
@@ -201,28 +216,28 @@ def described(sensing: Sensing, mechanism: Mechanism) -> Compiled:
         state[:], root[:] = first.state, np.ravel(root_of(first.covariance))
         return 1
 
-    def fault(_: Any, __: Any, period: float, values: Array, last: Array) -> int:
+    def fault(_sensing: Any, _geometry: Any, period: float, values: Array, last: Array) -> int:
         found = sensing.fault(Measurement.of(values), last, period, mechanism)
         return 0 if found is None else 1 << FAULTS.index(found)
 
-    it, n = c.ffi.new("stewart_sensing *", [m, c.at(noise)]), NUM_STATE
+    table, n = c.ffi.new("stewart_sensing *", [m, c.at(noise)]), NUM_STATE
     kept = call_back(
-        it,
+        table,
         raised,
         seen=(seen, None, n, Out(m)),
         jacobian=(jacobian, None, n, Out(m * n)),
         start=(start, None, m, n, Out(n), Out(n * n), None),
         fault=(fault, None, None, None, m, m),
     )
-    return Compiled(it, (noise, *kept), (raised,))
+    return Compiled(table, (noise, *kept), (raised,))
 
 
 ROUNDING = 1e-13
-"""Largest negative variance of a covariance, as a share of its largest one."""
+"""Smallest accepted eigenvalue of a covariance, times -1, as a share of its largest one."""
 NODES = 3
-"""Largest number of nodes per period."""
+"""Largest number of Gauss nodes per period (`node_shares`)."""
 FINEST = 1e-7
-"""Standard deviation of the model's crank angles, rad."""
+"""Smallest standard deviation of an encoder's value, rad: that of the model's crank angles."""
 
 
 @cache
@@ -301,12 +316,13 @@ class EncoderSensing:
         return self._filled(state, np.empty(self.size), "seen")
 
     def through(self, state: Array, changes: Array) -> Array:
-        """Return H X, see `Sensing.through`; NaN out of reach or at a dead centre."""
+        """Return H X, see `Sensing.through`; NaN out of reach or at a dead centre of a leg."""
         return self._filled(state, np.empty((self.size, NUM_STATE)), "jacobian") @ changes
 
     def _filled(self, state: Array, values: Array, function: str) -> Array:
-        at, it = numbers(state), _sensing_of(self).it
-        getattr(it, function)(it, core().at(at), core().at(values))
+        """Return `values` after a function of `stewart_sensing` has written them for a state."""
+        copy, sensing = numbers(state), _sensing_of(self).it
+        getattr(sensing, function)(sensing, core().at(copy), core().at(values))
         return values
 
     def fault(
@@ -314,21 +330,23 @@ class EncoderSensing:
     ) -> str | None:
         """Return the fault: a measurement is of use as long as one leg is."""
         values, c = measurement.known(self.size), core()
-        given = c.ffi.NULL, 0.0, c.at(values), c.ffi.NULL
-        return _fault(c.lib.stewart_encoder_sensing(encoders_of(self).it), *given)
+        arguments = c.ffi.NULL, 0.0, c.at(values), c.ffi.NULL
+        return _fault(c.lib.stewart_encoder_sensing(encoders_of(self).it), *arguments)
 
     def start(self, measurement: Measurement, near: Array | None = None) -> FirstState | None:
         """Return the pose by forward kinematics, with the expected rates."""
-        c, values, it = core(), measurement.known(self.size), _sensing_of(self).it
+        c, values, sensing = core(), measurement.known(self.size), _sensing_of(self).it
         state, root = np.empty(NUM_STATE), np.empty((NUM_STATE, NUM_STATE))
         expected = None if near is None else numbers(near)
         scratch = c.scratch(c.lib.stewart_encoder_scratch(encoders_of(self).it))
-        given = map(c.at, (values, expected, state, root))
-        return FirstState(state, root @ root.T) if it.start(it, *given, scratch) else None
+        arrays = map(c.at, (values, expected, state, root))
+        found = sensing.start(sensing, *arrays, scratch)
+        return FirstState(state, root @ root.T) if found else None
 
 
 @Once
 def _sensing_of(sensing: EncoderSensing) -> Compiled:
+    """Return the `stewart_sensing` of encoders."""
     encoders = encoders_of(sensing)
     it = core().ffi.new("stewart_sensing *", core().lib.stewart_encoder_sensing(encoders.it))
     return Compiled(it, (encoders,))
@@ -336,6 +354,7 @@ def _sensing_of(sensing: EncoderSensing) -> Compiled:
 
 @Once
 def encoders_of(sensing: EncoderSensing) -> Compiled:
+    """Return the `stewart_encoders` of encoders."""
     c, it, shares = core(), core().ffi.new("stewart_encoders *"), node_shares(sensing.samples)
     machine, noise = geometry(sensing.mechanism), sensing.noise_std
     it.geometry, it.noise_std = c.at(machine), c.at(noise)
