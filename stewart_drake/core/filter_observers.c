@@ -70,7 +70,7 @@ static real filtered_uncertainty(const stewart_law *law, const real *memory, rea
     const stewart_posterior e = filtered_at(law, (real *)memory).estimate;
     if (L)
         stewart_copy(n * n, e.root, L);
-    return REAL(sqrt)(e.noise->timing) * settings->filter.timing_std;
+    return REAL(sqrt)(stewart_timing_scatter(e.noise)) * settings->filter.timing_std;
 }
 
 static stewart_filter filter_of(const stewart_law *law, const stewart_sensing *sensing)

@@ -4,7 +4,7 @@
 #include "short.h"
 
 #define ONE_TORQUE ((real)0.5) /* information of one torque at t = 1: 1 / (2 t^2) */
-#define SURE ((real)2.5) /* standard deviations of w by which it must exceed 0 */
+#define SURE ((real)2.5) /* standard deviations by which w and the mean l must exceed 0 */
 #define WIDER 12         /* factor on that excess: W is the change in one period, an effect lasts for many */
 #define ODD 3       /* largest nu_i^2 / S_ii - 1 in the slope of w */
 #define LATEST 1000 /* largest t */
@@ -13,6 +13,12 @@
 void stewart_noise_start(stewart_noise *noise)
 {
     *noise = (stewart_noise){.timing = 1};
+}
+
+real stewart_timing_scatter(const stewart_noise *noise)
+{
+    const real mean = REAL(fabs)(noise->lateness) - SURE / REAL(sqrt)(noise->known_lateness);
+    return REAL(fmax)(0, noise->timing - (mean > 0 ? mean * mean : 0)); /* not for NaN */
 }
 
 /* Return factor + slope / information, at least 0: one step of Fisher scoring. 0 for NaN. */
@@ -29,6 +35,7 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
     real wander_slope = 0, total = 0;
     noise->known_timing *= forgetting;
     noise->known_wander *= forgetting;
+    noise->known_lateness *= forgetting;
     for (int i = 0; i < m; i++) {
         real W = 0, S = variances[i];
         total += innovations[i] * innovations[i] / S;
@@ -42,7 +49,7 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
         wander_slope += W * (excess_ratio < ODD ? excess_ratio : ODD) / (2 * S);
         noise->known_wander += W * W / (2 * S * S);
     }
-    real sum_a2 = 0, sum_b = 0, along_all = 0; /* a, b, r as in noise.h */
+    real sum_a = 0, sum_a2 = 0, sum_b = 0, along_all = 0; /* a, b, r as in noise.h */
     for (int c = 0; c < changes; c++) {
         real a = 0, b = 0;
         for (int i = 0; i < m; i++) {
@@ -50,6 +57,7 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
             a += k * innovations[i] / variances[i];
             b += k * k / variances[i];
         }
+        sum_a += a;
         sum_a2 += a * a;
         sum_b += b;
         along_all += b > 0 ? a * a / b : 0;
@@ -60,6 +68,9 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
     const real t = noise->timing > 1 ? noise->timing : 1;
     const real found = scored(noise->timing, timing_slope, noise->known_timing + ONE_TORQUE / (t * t));
     noise->timing = found < LATEST ? found : LATEST;
+    noise->known_lateness += sum_b;
+    if (noise->known_lateness > 0)
+        noise->lateness += (sum_a - sum_b * noise->lateness) / noise->known_lateness;
     noise->wander = scored(noise->wander, wander_slope, noise->known_wander);
     const real excess = noise->wander - SURE / REAL(sqrt)(noise->known_wander);
     noise->used *= REAL(sqrt)(forgetting);

@@ -15,7 +15,9 @@
    a_c = k_c' S^-1 nu and b_c = k_c' S^-1 k_c, and Fisher scoring is t <- t + g / J, with J the sum of
    the information; each period keeps the share `forgetting` of J. r is the mean square of the innovation
    across all k_c, but at least 1: where the model is wrong in every direction, the timing is not the
-   cause. In the slope of w, nu_i^2 / S_ii - 1 is at most ODD, so that a few values do not decide.
+   cause. In the slope of w, nu_i^2 / S_ii - 1 is at most ODD, so that a few values do not decide. A
+   delay that is off by the same time for all torques raises t, too. The mean l of that time, in assumed
+   standard deviations, has the slope sum_c (a_c - b_c l) and the information sum_c b_c.
 
    Torques begin with t = 1, and with the information of one torque. Parameters begin as constants,
    w = 0. The covariance is widened only by the excess of w over SURE standard deviations J^-1/2:
@@ -27,16 +29,20 @@
 
 #include "machine.h"
 
-enum { STEWART_NOISE = 6 }; /* numbers in a stewart_noise */
+enum { STEWART_NOISE = 8 }; /* numbers in a stewart_noise */
 
 typedef struct {
     real timing, wander;              /* t, w */
     real known_timing, known_wander;  /* J of t and w */
     real used;                        /* factor on W that the filter uses */
+    real lateness, known_lateness;            /* l, and J of it */
     real asked;                       /* number of values while w exceeded SURE deviations, or t UNTIMELY */
 } stewart_noise;
 
 void stewart_noise_start(stewart_noise *noise);
+
+/* Return t without the square of the mean l, as far as it exceeds SURE of its standard deviations. */
+real stewart_timing_scatter(const stewart_noise *noise);
 
 /* Update the factors by values (m) with innovations nu and variances S. H (m, 12 + p) is the derivative of
    the values by state and parameters a period before, `effects` (m, changes) the effects of torques on them
