@@ -43,6 +43,8 @@ OFFSET = float(np.deg2rad(0.1))
 
 ON = ("start=on_reference", "queue=reference")
 NONE = "controller.estimate=[]"
+COULOMB = "controller.estimate=[torque_bias,payload,damping,coulomb]"
+POSITION = "controller.estimate=[torque_bias,payload,payload_position,damping]"
 WRENCH = "controller.estimate=[torque_bias,payload,damping,wrench]"
 PAYLOAD = "plant.payload_mass=0.4"
 THREE = (PAYLOAD, "plant.joint_damping=1e-3")
@@ -180,7 +182,7 @@ def unknown() -> list[Row]:
 
 
 def friction() -> list[Row]:
-    """Coulomb friction and a payload off the centre."""
+    """Coulomb friction and a payload off the centre, also estimated (`-found`)."""
     rows = []
     plants: dict[str, tuple[str, tuple[str, ...]]] = {
         "smooth": ("no friction", ()),
@@ -196,12 +198,27 @@ def friction() -> list[Row]:
         for drawn in ("", "noise"):
             row = Row(f"{name}-{drawn}".strip("-"), words, (*ON, *plant), drawn)
             row = row._replace(words=f"{words}, noise" if drawn else words)
-            look = (*row.settings, "controller.estimate=[torque_bias,payload,damping,coulomb]")
+            look = (*row.settings, POSITION if name == "aside" else COULOMB)
             rows += [
                 row,
                 row._replace(name=f"{row.name}-found", settings=look),
                 row._replace(name=f"{row.name}-known", words=f"{row.words}; known", known=True),
             ]
+    dirty = Row("dirty-position", "noise, bias, payload at the centre; position estimated", ON)
+    dirty = dirty._replace(settings=(*ON, PAYLOAD, POSITION), drawn="noise bias")
+    bare = dirty._replace(name="smooth-noise-position", words="noise; position estimated")
+    rows += [bare._replace(settings=(*ON, POSITION), drawn="noise"), dirty]
+    aside = (PAYLOAD, "plant.payload_position=[0.03,-0.02,0.05]", POSITION)
+    words = "payload 0.4 kg at 30, -20, 50 mm, noise, bias"
+    more = {
+        "adaptive": ("delay estimated", ON, "adaptive_lqi"),
+        "codes": ("14 bit encoders, 1 kHz", (*ON, ENCODERS, "sensor.bits=14", OFTEN), None),
+        "rest": ("from rest", (), None),
+    }
+    for name, (also, settings, controller) in more.items():
+        row = Row(f"aside-{name}-found", f"{words}; {also}", (*settings, *aside), "noise bias")
+        row = row._replace(drawn="codes bias") if name == "codes" else row
+        rows.append(row._replace(controller=controller) if controller else row)
     return rows
 
 

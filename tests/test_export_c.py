@@ -24,6 +24,7 @@ FAULTS = (
 SATURATED = "actuator.torque_limit=0.025"
 DRIFT = ("controller.delay_estimator=drifting", "controller.delay_steps=6", "delay.drift=-0.01")
 PUSH = "plant.push={wrench: [0, 0, 0, 0.05, 0, 0], from: 2}"
+ASIDE = "plant.payload_mass=0.4", "plant.payload_position=[0.03, -0.02, 0.05]", "start=on_reference"
 SHORT = ("plant.kind=exact", "duration=5.0")
 FASTER = "duration=2.0"
 """Of a machine with a period of 20 ms."""
@@ -38,6 +39,7 @@ RUNS = {
     "network of weights": ("desktop", ("tuner.kind=ann", FASTER)),
     "encoders": ("paper", ("sensor.kind=encoders", "sensor.bits=14", "sensor.samples=20")),
     "wrench": ("paper", ("start=on_reference", "controller.estimate=[payload,wrench]", PUSH)),
+    "position": ("paper", (*ASIDE, "controller.estimate=[payload,payload_position]")),
     "measurements that get lost": ("desktop", ("sensor.loss=0.2", FASTER)),
     "network": ("desktop", ("link.kind=network", "link.loss=0.2", "link.burst=3", FASTER)),
 }

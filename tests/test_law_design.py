@@ -162,6 +162,7 @@ def test_the_names_to_estimate_are_those_of_the_options_or_of_the_dynamics():
 
     usual = sd.ControllerConfig().estimate
     assert free([*usual, "coulomb"])[-1] == "coulomb_friction"
+    assert free(["payload", "payload_position"])[1] == "payload_position_x"
     assert free(["payload"]) == ("payload_mass",)
     assert free(usual, free=("payload_mass",)) == ("payload_mass",)
     with pytest.raises(ConfigError, match=r"options.estimate: got torque_bias_1, .* are free"):

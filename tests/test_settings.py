@@ -67,7 +67,7 @@ NUMBERS = {
     "plant.ball_joint_friction",
     0.002: "plant.time_step actuator.armature",
     0.004: "actuator.torque_limit",
-    0.01: "delay.jitter_std controller.prior.payload tuner.slope",
+    0.01: "delay.jitter_std controller.prior.payload controller.prior.payload_position tuner.slope",
     0.02: "controller.timing_std actuator.speed_limit",
     0.03: "delay.swing",
     0.05: "log_period delay.drift delay.jump controller.period controller.model_error "
@@ -146,7 +146,8 @@ def other_values(owner_hint, name, value):
         return [not value]
     if name == "controller.estimate":
         some = [*ESTIMATED]
-        extra = [[*some, one] for one in ("coulomb", "wrench", "offsets")]
+        more = "payload_position", "coulomb", "wrench", "offsets"
+        extra = [[*some, one] for one in more]
         return [one for one in ([], *extra, some) if one != value]
     words = getattr(owner_hint, "__args__", ())
     return [word for word in words if word != value]

@@ -97,6 +97,28 @@ def test_friction_is_found_where_it_is_asked_for(controller):
     assert not without < 5 * found  # or lost
 
 
+@pytest.mark.parametrize("controller", ["predictor_lqi", "adaptive_lqi"])
+def test_the_position_of_a_payload_is_found_where_it_is_asked_for(controller):
+    """It begins 3 standard deviations off; otherwise the plate is lost, or E_ac is above 14."""
+    true = [0.03, -0.02, 0.05]
+    plant = "plant.kind=exact", "plant.payload_mass=0.4", f"plant.payload_position={true}"
+    settings = *plant, "duration=6", *ON_REFERENCE
+    asked = "controller.estimate=[torque_bias,payload,payload_position,damping]"
+    loop = build_closed_loop(sd.load_scenario("paper", controller, (*settings, asked)))
+    simulator = make_simulator(loop)
+    simulator.AdvanceTo(6.0)
+    held = loop.GetSubsystemByName("controller")
+    belief = held.memory(held.GetMyContextFromRoot(simulator.get_context())).belief
+    error = np.abs(belief.parameters[-3:] - true)
+    assert error.max() < 2e-3
+    assert (error < 4 * belief.estimate.parameter_std[-3:]).all()
+    found, without = (
+        run(*settings, *more, controller=controller).accumulated_error for more in ((asked,), ())
+    )
+    assert found < 2.5
+    assert not without < 5 * found  # or lost
+
+
 def test_the_law_sees_a_crank_turn_back():
     """While its rate passes coulomb_speed; the paper's cranks accelerate by about 1 rad/s^2."""
 

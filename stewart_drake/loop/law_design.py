@@ -83,6 +83,8 @@ from stewart_drake.scenario.signals import (
     NUM_STATE,
     PARAMETERS,
     PAYLOAD,
+    PAYLOAD_POSITION,
+    PLANT_PARAMETERS,
     POSE,
     WRENCHES,
 )
@@ -107,6 +109,8 @@ BIAS_SHARE = 0.05
 the motion takes."""
 PAYLOAD_SHARE = 0.1
 """Prior standard deviation of the payload, as a share of the plate's mass."""
+POSITION_SHARE = 0.15
+"""Prior standard deviation of the payload's position, as a share of the plate's radius."""
 GENTLE = 3.0
 """Largest torque for which the default substeps suffice, over the torque scale of the law."""
 _MOST = 0.999
@@ -304,6 +308,7 @@ def estimated_parameters(
         **dict.fromkeys(PARAMETERS[BIAS], BIAS_SHARE * motion_torque),
         PARAMETERS[PAYLOAD]: PAYLOAD_SHARE * machine.plate.mass,
         PARAMETERS[DAMPING]: BIAS_SHARE * motion_torque,
+        **dict.fromkeys(PLANT_PARAMETERS[PAYLOAD_POSITION], POSITION_SHARE * plate_radius(machine)),
     }
     found = replace(found, usual=found.std).trusting(by_motion)
     if experiment.calibration is not None:
@@ -316,6 +321,7 @@ def estimated_parameters(
         **dict.fromkeys(PARAMETERS[BIAS], prior.torque_bias),
         PARAMETERS[PAYLOAD]: prior.payload,
         PARAMETERS[DAMPING]: prior.damping,
+        **dict.fromkeys(PLANT_PARAMETERS[PAYLOAD_POSITION], prior.payload_position),
         **dict.fromkeys(OFFSETS, prior.offsets),
     }
     found = found.trusting({name: std for name, std in stds.items() if std is not None})

@@ -198,6 +198,8 @@ class PriorConfig:
     Attributes:
         torque_bias: of each motor, N m; null is 0.05 of the torque that the motion takes.
         payload: kg; null is a tenth of the plate.
+        payload_position: of the payload from the plate's centre of mass, each coordinate, m; null
+            is 0.15 of the plate's radius.
         damping: N m s/rad; null is 0.05 s/rad times the torque that the motion takes.
         rates: of the plate at the first sample, which encoders do not measure, rad/s and m/s; null
             is half the motion's peak to peak per second.
@@ -211,6 +213,7 @@ class PriorConfig:
 
     torque_bias: Positive | None = None
     payload: Positive | None = None
+    payload_position: Positive | None = None
     damping: Positive | None = None
     rates: Annotated[list[Positive], Field(min_length=6, max_length=6)] | None = None
     offsets: Positive | None = None
@@ -222,9 +225,11 @@ ESTIMATED: Final = ["torque_bias", "payload", "damping"]  # parameters that are 
 
 
 def _check_estimate(names: list[str]) -> list[str]:
-    order = [*ESTIMATED, "coulomb", "wrench", "offsets"]
+    order = [*ESTIMATED, "payload_position", "coulomb", "wrench", "offsets"]
     if not (len({*names}) == len(names) and {*names} <= {*order}):
         raise ValueError(f"[], or some of {', '.join(order)}")
+    if "payload_position" in names and "payload" not in names:
+        raise ValueError("payload_position with payload")
     return sorted(names, key=order.index)
 
 
@@ -258,8 +263,9 @@ class ControllerConfig:
         model: for gain and prediction, `paper` (massless legs) or `multibody`.
         torque_map: of the paper's model, from `virtual_work` or as `printed`.
         estimate: estimated parameters of the machine: `torque_bias`, `payload` and `damping`, with
-            or without `coulomb`, the Coulomb friction of the shafts at the `coulomb_speed` of the
-            calibration, else 0.02 rad/s, `wrench`, a wrench on the plate that changes, and
+            or without `payload_position`, that of the payload's centre of mass, `coulomb`, the
+            Coulomb friction of the shafts at the `coulomb_speed` of the calibration, else 0.02
+            rad/s, `wrench`, a wrench on the plate that changes, and
             `offsets`, the mounting of encoders, for `sensor.kind` encoders and a known delay; empty
             for none.
         w_Q: weight of the errors.

@@ -14,7 +14,9 @@ Accepted = Mapping[str, Any]
 """Accepted value by field, dotted as in files; a tuple holds several; a list has one as an item."""
 
 _DELAYS: Final = ("constant", "drifting")
-_CONSTANTS: Final = ("torque_bias", "payload", "damping", "coulomb", "wrench", "offsets")
+_CONSTANTS: Final = (
+    *("torque_bias", "payload", "payload_position", "damping", "coulomb", "wrench", "offsets"),
+)
 REQUIRES: Final[tuple[tuple[str, Any, Accepted], ...]] = (
     ("controller.delay_steps", None, {"controller.delay_fraction": None}),
     ("controller.prediction", "linear", {"controller.delay_estimator": "none"}),
@@ -116,6 +118,7 @@ NEEDS: Final = (
     Needs("integral_weight", "controller.integral", True),
     Needs("prior.torque_bias", "controller.estimate", "torque_bias"),
     Needs("prior.payload", "controller.estimate", "payload"),
+    Needs("prior.payload_position", "controller.estimate", "payload_position"),
     Needs("prior.damping", "controller.estimate", "damping"),
     Needs("prior.rates model_error timing_std", "controller.estimate", _CONSTANTS),
     Needs("prior.rates", "sensor.kind", "encoders"),
