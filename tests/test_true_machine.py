@@ -16,7 +16,7 @@ from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.loop.preparation import prepare, simulated_machine
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.mechanism.files import mechanism_yaml
-from stewart_drake.scenario.signals import COULOMB, NUM_PARAMETERS, PAYLOAD
+from stewart_drake.scenario.signals import COULOMB, NUM_PARAMETERS, PARAMETERS, PAYLOAD
 from tests.mechanisms import PAPER
 
 ON_REFERENCE = ("start=on_reference", "queue=reference")
@@ -112,11 +112,14 @@ def test_the_position_of_a_payload_is_found_where_it_is_asked_for(controller):
     error = np.abs(belief.parameters[-3:] - true)
     assert error.max() < 2e-3
     assert (error < 4 * belief.estimate.parameter_std[-3:]).all()
-    found, without = (
-        run(*settings, *more, controller=controller).accumulated_error for more in ((asked,), ())
-    )
-    assert found < 2.5
-    assert not without < 5 * found  # or lost
+    found, without = (run(*settings, *more, controller=controller) for more in ((asked,), ()))
+    told = found.summary["estimates"]
+    assert list(told) == [*PARAMETERS, *(f"payload_position_{x}" for x in "xyz")]
+    for value, name in zip(true, [*told][-3:], strict=True):
+        assert abs(told[name]["value"] - value) < min(2e-3, 4 * told[name]["std"])
+    assert "payload position x" in str(found.table()) and "mm (± two" in str(found.table())
+    assert found.accumulated_error < 2.5
+    assert not without.accumulated_error < 5 * found.accumulated_error  # or lost
 
 
 def test_the_law_sees_a_crank_turn_back():

@@ -4,7 +4,8 @@
 #include "short.h"
 
 #define ONE_TORQUE ((real)0.5) /* information of one torque at t = 1: 1 / (2 t^2) */
-#define SURE ((real)2.5) /* standard deviations by which w and the mean l must exceed 0 */
+#define SURE ((real)2.5) /* standard deviations of w by which it must exceed 0 */
+#define LATENESS_SURE ((real)3.5) /* the same of l: friction is taken for a little of it */
 #define WIDER 12         /* factor on that excess: W is the change in one period, an effect lasts for many */
 #define ODD 3       /* largest nu_i^2 / S_ii - 1 in the slope of w */
 #define LATEST 1000 /* largest t */
@@ -17,7 +18,7 @@ void stewart_noise_start(stewart_noise *noise)
 
 real stewart_timing_scatter(const stewart_noise *noise)
 {
-    const real mean = REAL(fabs)(noise->lateness) - SURE / REAL(sqrt)(noise->known_lateness);
+    const real mean = REAL(fabs)(noise->lateness) - LATENESS_SURE / REAL(sqrt)(noise->known_lateness);
     return REAL(fmax)(0, noise->timing - (mean > 0 ? mean * mean : 0)); /* not for NaN */
 }
 
@@ -63,14 +64,15 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
         along_all += b > 0 ? a * a / b : 0;
         noise->known_timing += b * b / 2;
     }
-    const real r = m > changes ? (total - along_all) / (real)(m - changes) : 1;
-    const real timing_slope = (sum_a2 - sum_b * (r > 1 ? r : 1)) / 2;
+    const real across = m > changes ? (total - along_all) / (real)(m - changes) : 1;
+    const real r = across > 1 ? across : 1;
+    const real timing_slope = (sum_a2 - sum_b * r) / 2;
     const real t = noise->timing > 1 ? noise->timing : 1;
     const real found = scored(noise->timing, timing_slope, noise->known_timing + ONE_TORQUE / (t * t));
     noise->timing = found < LATEST ? found : LATEST;
-    noise->known_lateness += sum_b;
+    noise->known_lateness += sum_b / r;
     if (noise->known_lateness > 0)
-        noise->lateness += (sum_a - sum_b * noise->lateness) / noise->known_lateness;
+        noise->lateness += (sum_a - sum_b * noise->lateness) / r / noise->known_lateness;
     noise->wander = scored(noise->wander, wander_slope, noise->known_wander);
     const real excess = noise->wander - SURE / REAL(sqrt)(noise->known_wander);
     noise->used *= REAL(sqrt)(forgetting);

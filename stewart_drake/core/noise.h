@@ -17,7 +17,7 @@
    across all k_c, but at least 1: where the model is wrong in every direction, the timing is not the
    cause. In the slope of w, nu_i^2 / S_ii - 1 is at most ODD, so that a few values do not decide. A
    delay that is off by the same time for all torques raises t, too. The mean l of that time, in assumed
-   standard deviations, has the slope sum_c (a_c - b_c l) and the information sum_c b_c.
+   standard deviations, has the slope sum_c (a_c - b_c l) / r and the information sum_c b_c / r.
 
    Torques begin with t = 1, and with the information of one torque. Parameters begin as constants,
    w = 0. The covariance is widened only by the excess of w over SURE standard deviations J^-1/2:
@@ -41,7 +41,7 @@ typedef struct {
 
 void stewart_noise_start(stewart_noise *noise);
 
-/* Return t without the square of the mean l, as far as it exceeds SURE of its standard deviations. */
+/* Return t without the square of the mean l, as far as it exceeds LATENESS_SURE standard deviations. */
 real stewart_timing_scatter(const stewart_noise *noise);
 
 /* Update the factors by values (m) with innovations nu and variances S. H (m, 12 + p) is the derivative of

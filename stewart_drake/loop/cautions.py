@@ -105,8 +105,9 @@ def overconfidence(summary: RunSummary) -> list[str]:
     return [
         "the estimator is overconfident: the machine does what its model cannot explain, as "
         "friction, a payload off the centre, a push or a wrong delay do. It has widened its "
-        f"uncertainty, to {1 / factor:.2g} times its prediction errors: estimate the cause, or "
-        "raise controller.model_error"
+        f"uncertainty, to {1 / factor:.2g} times its prediction errors: estimate the cause, with "
+        "coulomb, payload_position or wrench in controller.estimate, or raise "
+        "controller.model_error"
     ]
 
 

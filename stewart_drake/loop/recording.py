@@ -10,13 +10,13 @@ from pydrake.systems.framework import Context
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.schema import plain
 from stewart_drake.files.versions import versions
-from stewart_drake.law.belief import Innovations
+from stewart_drake.law.belief import Belief, Innovations
 from stewart_drake.law.counts import Counts
 from stewart_drake.loop import results as metrics
 from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.loop.diagram import ClosedLoop
-from stewart_drake.loop.preparation import Experiment
-from stewart_drake.loop.results import DelaySummary, RunSummary, waits_at_rest
+from stewart_drake.loop.preparation import Experiment, estimated_names
+from stewart_drake.loop.results import DelaySummary, EstimateSummary, RunSummary, waits_at_rest
 from stewart_drake.loop.tuner import AnnTuner, LawTuner
 from stewart_drake.scenario.loading import scenario_to_dict, scenario_yaml
 from stewart_drake.scenario.run_log import RunLog, dataset_of
@@ -64,6 +64,7 @@ class Record:
         self.counts, self.tuner_fallbacks = Counts(), 0
         self.sampled = self.measured = 0
         self.innovations = Innovations()
+        self._belief: Belief | None = None
         nan = float("nan")
         self.delay: DelaySummary = {"true_s": nan, "estimated_s": nan, "std_s": nan}
         self.packets: Array = np.full(len(PACKETS), nan)
@@ -76,13 +77,26 @@ class Record:
         self.mirror(time, seen)
 
     def count(self, memory: Any) -> bool:
-        """Take counts and innovations from the controller's memory; return `has_measured`."""
+        """Take counts and estimates from the controller's memory; return `has_measured`."""
         usable = has_measured(memory, self.counts)
         belief = getattr(memory, "belief", None)  # missing in a controller of the user
+        self._belief = belief
         self.innovations = Innovations() if belief is None else belief.innovations
         self.counts, self.sampled = memory.counts, self.sampled + 1
         self.measured += usable
         return usable
+
+    @property
+    def estimates(self) -> dict[str, EstimateSummary]:
+        """The parameters in `controller.estimate` at the last sample, by name."""
+        names, belief = estimated_names(self._scenario), self._belief
+        if belief is None or not belief.estimate.uncertain or len(belief.parameters) != len(names):
+            return {}
+        each = zip(belief.parameters.tolist(), belief.estimate.parameter_std.tolist(), strict=True)
+        return {
+            name: {"value": value, "std": std}
+            for name, (value, std) in zip(names, each, strict=True)
+        }
 
     def dataset(self) -> xr.Dataset:
         """Return the log, see `SimulationResult.signals`."""
@@ -216,6 +230,7 @@ def summarize(
             "nis_ratio": recorder.innovations.ratio,
             "verdict": recorder.innovations.verdict,
         },
+        "estimates": recorder.estimates,
         "wall_s": wall,
         "counts": recorder.counts.summary() | {"tuner_fallbacks": recorder.tuner_fallbacks},
         "link": plain(sc.assumed_link),

@@ -161,6 +161,14 @@ class ConsistencySummary(TypedDict):
     """`consistent`, `cautious` or `overconfident`; None with too few measurements."""
 
 
+class EstimateSummary(TypedDict):
+    """An estimated parameter at the last sample, in the unit of the scenario's field."""
+
+    value: float
+    std: float
+    """Stated standard deviation; NaN where the observer has none."""
+
+
 LEAST_MEASURED: Final = 0.9
 """Smallest share of measured samples for which a run in real time has E_ac and a cost."""
 
@@ -198,6 +206,8 @@ class RunSummary(TypedDict):
     controller_step_ms: StepTimes
     delay: DelaySummary
     estimator_consistency: ConsistencySummary
+    estimates: dict[str, EstimateSummary]
+    """Estimated parameters by name; empty for none, and for a controller of yours."""
     wall_s: float
     """Computing time of the run, s."""
     counts: dict[str, int]

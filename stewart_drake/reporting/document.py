@@ -75,6 +75,15 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.{max(0, digits - 1 - exponent if value else 0)}f}"
 
 
+def measured(std: float, value: float) -> tuple[str, str]:
+    """Return a standard deviation in two digits, and a value with as many decimals."""
+    interval = number(std, 2)
+    if "e" in interval:
+        return interval, f"{value:.6g}"
+    decimals = len(interval.partition(".")[2])
+    return interval, f"{round(value, decimals) + 0.0:.{decimals}f}"  # without -0
+
+
 def listed(items: Iterable[object], form: str) -> str:
     """Return items in one text, each in a form such as `%s: %g`."""
     return ", ".join(form % one for one in items)

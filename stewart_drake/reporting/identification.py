@@ -13,7 +13,14 @@ from stewart_drake.identification.logs import KINDS, Log
 from stewart_drake.identification.plan import MOTION, Plan
 from stewart_drake.identification.unknowns import DELAY, GEOMETRY, NAMES
 from stewart_drake.identification.unknowns import UNITS as SI_UNITS
-from stewart_drake.reporting.document import Document, Picture, Table, from_template, number
+from stewart_drake.reporting.document import (
+    Document,
+    Picture,
+    Table,
+    from_template,
+    measured,
+    number,
+)
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import FACTORS, LEG_LINES, UNITS
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS
@@ -122,15 +129,6 @@ def _cautions(found: Identification) -> list[str]:
         names = ", ".join(NAMES[k] for k in found.unknowns.free[beyond][:5])
         cautions.append(f"more than four tolerances off: {names}; is the drawing right?")
     return cautions
-
-
-def measured(std: float, value: float) -> tuple[str, str]:
-    """Return a standard deviation in two digits, and a value with as many decimals."""
-    interval = number(std, 2)
-    if "e" in interval:
-        return interval, f"{value:.6g}"
-    decimals = len(interval.partition(".")[2])
-    return interval, f"{round(value, decimals) + 0.0:.{decimals}f}"  # without -0
 
 
 def _weak(found: Identification) -> list[str]:

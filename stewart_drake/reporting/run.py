@@ -10,10 +10,19 @@ from numpy.typing import NDArray
 
 from stewart_drake.loop.preparation import assemble, check_instants
 from stewart_drake.loop.results import LEAST_MEASURED, SimulationResult
-from stewart_drake.reporting.document import Document, counted, from_template, number
-from stewart_drake.reporting.style import FACTORS, UNITS
+from stewart_drake.reporting.document import Document, counted, from_template, measured, number
+from stewart_drake.reporting.style import FACTORS, UNITS, unit_for
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.signals import ANGLES, COORDINATE_NAMES, NUM_COORDINATES, POSITION
+from stewart_drake.scenario.signals import (
+    ANGLES,
+    BIAS,
+    COORDINATE_NAMES,
+    NUM_COORDINATES,
+    PARAMETERS,
+    PLANT_PARAMETER_UNITS,
+    PLANT_PARAMETERS,
+    POSITION,
+)
 from stewart_drake.studies.compare import PAPER_ERRORS, is_papers, label
 from stewart_drake.studies.verdict import loop_word
 from stewart_drake.studies.workspace_map import largest_factor
@@ -38,6 +47,14 @@ _MAY_BE_LATE: Final = (
     "a late measurement is used at the sample at which it comes, unless a newer one has come"
 )
 
+_FINER: Final = {
+    "N m": {"N m": 1.0, "mN m": 1e3, "µN m": 1e6},
+    "N m s/rad": {"N m s/rad": 1.0, "mN m s/rad": 1e3, "µN m s/rad": 1e6},
+    "kg": {"kg": 1.0, "g": 1e3},
+    "m": {"m": 1.0, "mm": 1e3},
+}
+"""Units of a parameter's value, by its SI unit."""
+
 _Runs = Mapping[str, SimulationResult]
 
 
@@ -52,6 +69,7 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
         run=result,
         s=s,
         peaks=", ".join(_peaks(result)),
+        estimates=_estimates(result),
         least=LEAST_MEASURED,
         # the sum of others is left out
         events=[
@@ -63,6 +81,18 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
         packets=[(n, name) for name, n in s["packets"].items()],
         cautions=[text for text in s["warnings"] if text not in said],
     )
+
+
+def _estimates(run: SimulationResult) -> list[str]:
+    """Return the estimated parameters without torque biases and offsets, with two deviations."""
+    shown = []
+    for name, unit in zip(PLANT_PARAMETERS, PLANT_PARAMETER_UNITS, strict=True):
+        found = run.summary["estimates"].get(name)
+        if found is not None and name not in PARAMETERS[BIAS]:
+            unit, factor = unit_for(2 * found["std"], _FINER.get(unit, {unit: 1.0}))
+            width, value = measured(2 * factor * found["std"], factor * found["value"])
+            shown.append(f"{name.replace('_', ' ')} {value} ± {width} {unit}")
+    return shown
 
 
 def _span(run: SimulationResult) -> Array:

@@ -15,8 +15,7 @@ from stewart_drake.identification.servo_fit import (
     ServoIdentification,
 )
 from stewart_drake.identification.servo_plan import SETPOINTS_FILE, ServoPlan
-from stewart_drake.reporting.document import Document, Table, Tone, from_template, number
-from stewart_drake.reporting.identification import measured
+from stewart_drake.reporting.document import Document, Table, Tone, from_template, measured, number
 from stewart_drake.reporting.panels import Panel, draw, leg_curves
 from stewart_drake.reporting.style import unit_for
 from stewart_drake.types import Array
