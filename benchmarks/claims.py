@@ -214,6 +214,7 @@ def friction() -> list[Row]:
         "adaptive": ("delay estimated", ON, "adaptive_lqi"),
         "codes": ("14 bit encoders, 1 kHz", (*ON, ENCODERS, "sensor.bits=14", OFTEN), None),
         "rest": ("from rest", (), None),
+        "rest-slow": ("from rest, catch-up 1.0 s", ("controller.catch_up=1.0",), None),
     }
     for name, (also, settings, controller) in more.items():
         row = Row(f"aside-{name}-found", f"{words}; {also}", (*settings, *aside), "noise bias")
