@@ -343,7 +343,7 @@ def test_the_command_writes_a_data_set_of_disturbed_runs(tmp_path, capsys, monke
     arguments = ["tune", "dataset", "paper", "--controller", "delay_lqi", "--disturbed", "1"]
     monkeypatch.setattr(families, "PAIRS", ((1.0, 1.0),))
     arguments += [part for setting in SMALL for part in ("--set", setting)]
-    assert "1 runs, 100 rows" in said(capsys, *arguments, "--workers", "1", "--out", tmp_path)
+    assert "1 run, 100 rows" in said(capsys, *arguments, "--workers", "1", "--out", tmp_path)
     summary = summary_in(tmp_path)
     assert summary["runs"] == 1 and summary["rows"] == 100
     assert summary["data_sha256"] == data_hash(load_data(tmp_path))
