@@ -296,7 +296,7 @@ def test_the_command_writes_all_files_or_none_and_states_sizes(tmp_path, capsys,
     names = {path.name for path in folder.iterdir()} - {export_c.DIGESTS}
     assert {"law.h", "law.c", "stewart_config.c", "stewart_test.c", "Makefile"} < names
     readme = (folder / "README.md").read_text()
-    assert "`measures[7]` is above -1.48" in readme
+    assert "`measures[7]`, minus the amount of the pitch in rad, is above -1.48" in readme
     text = int(readme.split("(TOTALS)")[0].splitlines()[-1].split()[0])
     state = int(readme.split("state ")[1].split()[0])
     assert 50_000 < text <= 196_000 and 3000 < state <= 16_400

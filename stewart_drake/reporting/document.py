@@ -51,10 +51,18 @@ _SHORT: Final = 36
 
 
 def wrap(text: str, first: str = "", rest: str = "  ") -> str:
-    """Return a paragraph of at most WIDTH columns; `first` and `rest` open its lines."""
+    """Return a paragraph of at most WIDTH columns; `first` and `rest` open its lines.
+
+    A longer word, such as a path, stays whole.
+    """
     together = re.sub(_TOGETHER, _NO_BREAK, text)
     filled = textwrap.fill(
-        together, WIDTH, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False
+        together,
+        WIDTH,
+        initial_indent=first,
+        subsequent_indent=rest,
+        break_long_words=False,
+        break_on_hyphens=False,
     )
     return filled.replace(_NO_BREAK, " ")
 
