@@ -255,17 +255,19 @@ def true_model(experiment: Experiment, truth: StewartDynamics, time: float) -> C
     return linear_model(*truth.derivatives(x[POSE], x[RATES], torque)[:2])
 
 
+def pole_in_motion(experiment: Experiment, truth: StewartDynamics, time: float) -> float:
+    """Return the fastest pole of `true_model`, 1/s; 0 if nothing grows, or out of reach."""
+    if not margin(truth.mechanism, evaluate(experiment.reference, time)[POSE]) > 0:  # or NaN
+        return 0.0
+    return fastest_pole(true_model(experiment, truth, time).A)
+
+
 def fastest_in_motion(
     experiment: Experiment, truth: StewartDynamics, end: float
 ) -> tuple[float, float]:
     """Return the fastest pole of `true_model` in 1/s, 0 without one, and its time in s."""
     times = np.linspace(0.0, end, POLE_INSTANTS)
-    poles = [
-        fastest_pole(true_model(experiment, truth, t).A)
-        if margin(truth.mechanism, evaluate(experiment.reference, t)[POSE]) > 0
-        else 0.0
-        for t in times
-    ]
+    poles = [pole_in_motion(experiment, truth, t) for t in times]
     worst = int(np.argmax(poles))
     return poles[worst], float(times[worst])
 

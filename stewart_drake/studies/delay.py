@@ -16,7 +16,12 @@ from stewart_drake.law.cost import law_gain
 from stewart_drake.law.delay_model import DelayedModel, double_integrators, linear_model
 from stewart_drake.law.riccati import RiccatiError
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.loop.controller_margin import POLE_INSTANTS, ControllerMargin, controller_margin
+from stewart_drake.loop.controller_margin import (
+    POLE_INSTANTS,
+    ControllerMargin,
+    controller_margin,
+    pole_in_motion,
+)
 from stewart_drake.loop.law_design import cost_of
 from stewart_drake.loop.preparation import assemble
 from stewart_drake.loop.results import delay_floor, waits_at_rest
@@ -31,7 +36,7 @@ from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.runs import run_scenarios
 from stewart_drake.studies.study_options import DelayOptions
-from stewart_drake.studies.verdict import Assessment, Verdict, assess, pole_in_motion
+from stewart_drake.studies.verdict import Assessment, Verdict, assess
 from stewart_drake.types import Array
 
 TOLERABLE: Final = (2.0, 10.0, 100.0, 1000.0)
@@ -264,11 +269,11 @@ def simulated_growth(
 
 def _poles(found: Assessment) -> list[PolePoint]:
     experiment, points = found.experiment, []
-    end = found.followed_until
+    end, truth = found.followed_until, experiment.true_dynamics()
     for t in np.linspace(0.0, end, POLE_INSTANTS) if end > 0 else ():
         pose = experiment.reference.value(t)[:, 0]
         held = stability.fastest_pole(experiment.nominal.linearize(pose)[0])
-        points.append(PolePoint(float(t), pole_in_motion(experiment, t), held))
+        points.append(PolePoint(float(t), pole_in_motion(experiment, truth, t), held))
     return points
 
 

@@ -7,9 +7,9 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from stewart_drake.dynamics.workspace import Failure, diagnose
-from stewart_drake.law.stability import amplification, fastest_pole
+from stewart_drake.law.stability import amplification
 from stewart_drake.law.startup import least_torque, reference_torques
-from stewart_drake.loop.controller_margin import ControllerMargin, fastest_in_motion, true_model
+from stewart_drake.loop.controller_margin import ControllerMargin, fastest_in_motion
 from stewart_drake.loop.preparation import REACH_CHECK_PERIOD, Experiment, assemble
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.scenario.config import Scenario
@@ -151,11 +151,6 @@ def delay_verdict(experiment: Experiment) -> Verdict:
     """Judge the scenario's true delay by the open loop's poles along its reference."""
     sc = experiment.scenario
     return Verdict(sc.eta, *fastest_in_motion(experiment, experiment.true_dynamics(), sc.duration))
-
-
-def pole_in_motion(experiment: Experiment, time: float) -> float:
-    """Return the fastest pole of `true_model`, 1/s, 0 if nothing grows; `time` in s."""
-    return fastest_pole(true_model(experiment, experiment.true_dynamics(), time).A)
 
 
 def milliseconds(seconds: float) -> str:
