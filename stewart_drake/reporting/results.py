@@ -48,6 +48,19 @@ class Figures(dict[str, "Figure"]):
         return f"Figures({', '.join(self)})"
 
 
+class Printed:
+    """A result that prints as its table."""
+
+    __slots__ = ()
+
+    def table(self) -> str:
+        """Return the result as text."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return self.table()
+
+
 class Replay:
     """The animation of a run as HTML, shown by a notebook."""
 
@@ -61,15 +74,12 @@ class Replay:
         return _framed(self.html)
 
 
-class SimulationResult(loop_results.SimulationResult):
+class SimulationResult(Printed, loop_results.SimulationResult):
     __doc__ = loop_results.SimulationResult.__doc__
 
     @classmethod
     def of(cls, result: loop_results.SimulationResult) -> "SimulationResult":
         return cls(**vars(result))
-
-    def __str__(self) -> str:
-        return self.table()
 
     def table(self) -> str:
         """Return status, errors and torques as text."""
@@ -126,7 +136,7 @@ class SimulationResult(loop_results.SimulationResult):
         return Path(path)
 
 
-class ComparisonResult(dict[str, SimulationResult]):
+class ComparisonResult(Printed, dict[str, SimulationResult]):
     """Runs of a scenario under several controllers, by controller."""
 
     def __init__(self, runs: Mapping[str, loop_results.SimulationResult]) -> None:
@@ -134,9 +144,6 @@ class ComparisonResult(dict[str, SimulationResult]):
 
     def __repr__(self) -> str:
         return f"ComparisonResult({', '.join(f'{k}: {run.status}' for k, run in self.items())})"
-
-    def __str__(self) -> str:
-        return self.table()
 
     def table(self) -> str:
         """Return a row per controller as text."""
@@ -178,7 +185,7 @@ class ComparisonResult(dict[str, SimulationResult]):
         save_comparison(self, directory)
 
 
-class ControllerMargin(loop_margin.ControllerMargin):
+class ControllerMargin(Printed, loop_margin.ControllerMargin):
     __doc__ = loop_margin.ControllerMargin.__doc__
 
     @classmethod
@@ -187,9 +194,6 @@ class ControllerMargin(loop_margin.ControllerMargin):
 
     def __repr__(self) -> str:
         return f"ControllerMargin({loop_verdict(self)!r})"
-
-    def __str__(self) -> str:
-        return self.table()
 
     def table(self) -> str:
         """Return stability, margins and the growth of prediction errors as text."""
@@ -200,14 +204,11 @@ class ControllerMargin(loop_margin.ControllerMargin):
         return from_template("margin", milliseconds=milliseconds, **given).plain()
 
 
-class MechanismCheck(new_machine.MechanismCheck):
+class MechanismCheck(Printed, new_machine.MechanismCheck):
     """Check of a mechanism at home. Printed it is a table."""
 
     def __repr__(self) -> str:
         return f"MechanismCheck({self.mechanism.name!r}, {self.verdict!r})"
-
-    def __str__(self) -> str:
-        return self.table()
 
     def table(self) -> str:
         """Return the text that the command prints."""
@@ -216,14 +217,11 @@ class MechanismCheck(new_machine.MechanismCheck):
         return document(self).plain()
 
 
-class NewMachine(new_machine.NewMachine):
+class NewMachine(Printed, new_machine.NewMachine):
     """New machine with a first check. Printed it is a table."""
 
     def __repr__(self) -> str:
         return f"NewMachine({self.check.mechanism.name!r}, {self.verdict!r})"
-
-    def __str__(self) -> str:
-        return self.table()
 
     def table(self) -> str:
         """Return the text that the command prints."""
@@ -250,7 +248,7 @@ def _flat(entries: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, An
 
 
 @dataclass(frozen=True, repr=False)
-class AnalysisResult:
+class AnalysisResult(Printed):
     """Result of an analysis or a report. Printed it is text, in a notebook a page.
 
     Attributes:
@@ -278,9 +276,6 @@ class AnalysisResult:
 
     def __repr__(self) -> str:
         return f"AnalysisResult({self.verdict!r})"
-
-    def __str__(self) -> str:
-        return self.table()
 
     def _repr_html_(self) -> str:
         from stewart_drake.reporting.page import html
