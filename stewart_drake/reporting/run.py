@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stewart_drake.loop.preparation import assemble, check_instants
 from stewart_drake.loop.results import LEAST_MEASURED, SimulationResult
 from stewart_drake.reporting.document import Document, counted, from_template, measured, number
-from stewart_drake.reporting.style import FACTORS, UNITS, unit_for
+from stewart_drake.reporting.style import FACTORS, TORQUES, UNITS, unit_for
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import (
     ANGLES,
@@ -48,7 +48,7 @@ _MAY_BE_LATE: Final = (
 )
 
 _FINER: Final = {
-    "N m": {"N m": 1.0, "mN m": 1e3, "µN m": 1e6},
+    "N m": TORQUES,
     "N m s/rad": {"N m s/rad": 1.0, "mN m s/rad": 1e3, "µN m s/rad": 1e6},
     "kg": {"kg": 1.0, "g": 1e3},
     "m": {"m": 1.0, "mm": 1e3},
