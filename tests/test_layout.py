@@ -16,6 +16,7 @@ from stewart_drake.mechanism.files import build_mechanism, load_mechanism, mecha
 from stewart_drake.mechanism.geometry import bar_inertia
 from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.trajectories import poses_along
 from stewart_drake.studies.layout import (
     Found,
     Layout,
@@ -39,7 +40,7 @@ from stewart_drake.studies.layout_space import (
 from stewart_drake.studies.runs import Outcome
 from stewart_drake.studies.study_options import LayoutOptions
 from stewart_drake.studies.workspace import size_motors
-from stewart_drake.studies.workspace_map import margins_along
+from stewart_drake.studies.workspace_map import measure
 from tests.mechanisms import PAPER
 from tests.screen import said, summary_in
 
@@ -63,8 +64,8 @@ def test_measures_are_what_the_workspace_study_says(name):
     time = check_instants(experiment.scenario.duration)[::10]
     mechanism, reference = experiment.mechanism, experiment.reference
     motion = motion_of(mechanism.home, reference, time)
-    found, along = geometry(mechanism, motion), margins_along(mechanism, reference, time)
-    home = margins_along(mechanism, _still(mechanism.home), np.zeros(1))
+    found, along = geometry(mechanism, motion), measure(mechanism, poses_along(reference, time))
+    home = measure(mechanism, poses_along(_still(mechanism.home), np.zeros(1)))
     for key, values, worst in (
         ("reach", [along.reach, home.reach], np.min),
         ("transmission", [along.transmission, home.transmission], np.min),
@@ -210,7 +211,8 @@ def test_reach_counts_before_limits_and_limits_before_the_goal():
 def test_a_judgement_is_of_all_instants_and_a_run_unless_out_of_reach():
     asked = problem(limits={"clearance": -1.0})
     found = json.loads(judge(asked, "paper"))
-    along = margins_along(PAPER, assemble(asked.scenario).reference, check_instants(1.5))
+    reference = assemble(asked.scenario).reference
+    along = measure(PAPER, poses_along(reference, check_instants(1.5)))
     assert found["measures"]["reach"] == pytest.approx(along.reach.min(), abs=1e-4)
     assert found["measures"]["clearance"] == found["nearest"][1] < 0
     assert found["outcome"]["status"] == "completed"
@@ -287,7 +289,7 @@ def test_the_command_writes_machines_that_run_and_goes_on(tmp_path, capsys, in_p
     reference = prepare(
         load_scenario("paper", None, (f"mechanism={tmp_path / 'layout_1.yaml'}", *QUICK))
     ).reference
-    reach = margins_along(machine, reference, check_instants(1.5)).reach.min()
+    reach = measure(machine, poses_along(reference, check_instants(1.5))).reach.min()
     assert best["measures"]["reach"] <= reach < best["measures"]["reach"] + 0.01
     page = (tmp_path / "report.html").read_text()
     assert "layout_1" in page and "stewart-drake layout paper" in page and page.count("<img") == 2

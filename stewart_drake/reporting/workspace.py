@@ -95,7 +95,7 @@ def _crossing(nearest: Nearest) -> str:
 
 def margins_figure(study: WorkspaceStudy) -> Figure:
     margins, left = study.margins, study.exit
-    time, top = margins.time, min(np.nanmax(margins.condition, initial=2.0), 1e4)
+    time, top = study.time, min(np.nanmax(margins.condition, initial=2.0), 1e4)
     sines = leg_curves(time, margins.sines)
     lowest = float(np.nanmin(margins.sines))
     inside = [Curve(time, np.where(np.isnan(margins.condition), np.nan, margins.parallel))]
@@ -218,7 +218,7 @@ def _section(ax: Axes, section: Section, study: WorkspaceStudy, norm: BoundaryNo
     if (border > 0).any():
         ax.contour(x, y, border, [0.0], colors=LIMIT.color, linewidths=1.8)
     ax.plot([], [], color=LIMIT.color, lw=1.8, label="border of the workspace")
-    poses = study.margins.pose
+    poses = study.poses
     ax.plot(
         *(f * poses[:, k] for f, k in zip(factors, pair, strict=True)),
         label="reference, projected",

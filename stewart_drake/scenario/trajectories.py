@@ -105,6 +105,12 @@ def evaluate(trajectory: Trajectory, t: float) -> Array:
     return result
 
 
+def poses_along(trajectory: Trajectory, times: Array) -> Array:
+    """Return the values (n, 6) of a trajectory at times (n,)."""
+    values: Array = np.array(trajectory.vector_values(times.tolist()))
+    return values.T
+
+
 def spread_instants(duration: float, number: int) -> Array:
     """Return instants (number,) to sample a motion of unknown period, one in each equal part.
 

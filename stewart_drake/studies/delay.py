@@ -32,7 +32,7 @@ from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.reference_config import ReferenceConfig
 from stewart_drake.scenario.reference_files import waypoints
 from stewart_drake.scenario.signals import POSE
-from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.scenario.trajectories import evaluate, poses_along
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.runs import run_scenarios
 from stewart_drake.studies.study_options import DelayOptions
@@ -243,7 +243,7 @@ def error_floor(found: Assessment, eta: float) -> float:
     """Return E_ac in % s of a plate at rest at the first pose after `eta` s without any torque."""
     reference, duration = found.experiment.reference, found.experiment.scenario.duration
     time: Array = np.linspace(0.0, min(eta, duration), 2001, dtype=np.float64)
-    poses = np.array([reference.value(t)[:, 0] for t in time])
+    poses = poses_along(reference, time)
     return delay_floor(time, poses, found.experiment.scale, eta)
 
 

@@ -39,6 +39,7 @@ from stewart_drake.mechanism.geometry import Mechanism, with_rotors
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.scenario.loading import scenario_to_dict
+from stewart_drake.scenario.trajectories import poses_along
 from stewart_drake.studies.clearance import Nearest, clearance_along
 from stewart_drake.studies.jobs import Progress, part_of, run_jobs
 from stewart_drake.studies.layout_space import (
@@ -331,7 +332,7 @@ def _instants(experiment: Experiment) -> Array:
     """Return evenly spaced instants, and those at which a coordinate is largest or least."""
     duration = experiment.scenario.duration
     every = check_instants(duration)
-    poses = np.array([experiment.reference.value(t)[:, 0] for t in every])
+    poses = poses_along(experiment.reference, every)
     extreme = every[np.concatenate([poses.argmin(axis=0), poses.argmax(axis=0)])]
     return np.unique(np.concatenate([np.linspace(0.0, duration, INSTANTS), extreme]))
 

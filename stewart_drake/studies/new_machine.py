@@ -35,6 +35,7 @@ from stewart_drake.mechanism.kinematics import leg_geometry, reachable_heights
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COORDINATES
+from stewart_drake.scenario.trajectories import poses_along
 from stewart_drake.studies.clearance import clearance_along
 from stewart_drake.studies.study_options import Measurements
 from stewart_drake.studies.verdict import FRAGILE, Verdict, loop_verdict
@@ -278,7 +279,7 @@ def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
         scenario.write_text(scenario_text(m, mechanism))
         experiment = prepare(load_scenario(scenario))
         time = np.linspace(0.0, _MOTION_PERIOD, _CHECKED_POSES)
-        poses = np.array([experiment.reference.value(t)[:, 0] for t in time])
+        poses = poses_along(experiment.reference, time)
         along = clearance_along(ClearanceScene(mechanism), mechanism, time, poses)
         made = NewMachine(
             check,

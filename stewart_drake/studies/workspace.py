@@ -14,16 +14,15 @@ from stewart_drake.loop.preparation import Experiment, assemble, check_instants,
 from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import COORDINATES, LEGS, POSE, RATES
-from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.scenario.trajectories import evaluate, poses_along
 from stewart_drake.studies.clearance import ClearanceStudy, study_clearance
 from stewart_drake.studies.workspace_map import (
     Factor,
-    Margins,
+    Measures,
     Section,
     Travel,
     first_exit,
     largest_factor,
-    margins_along,
     measure,
     sections,
     travel,
@@ -85,7 +84,9 @@ class WorkspaceStudy:
     experiment: Experiment  # of the scenario, reachable or not
     home: Failure | None  # why the home pose is unusable, or None
     exit: Failure | None  # when and why the reference first leaves the workspace, or None
-    margins: Margins  # along the reference
+    time: Array  # (n,) instants of the reference, s
+    poses: Array  # (n, 6) of the reference
+    margins: Measures  # along the reference
     factor: Factor  # largest amplitude factor that fits
     travel: list[Travel]  # per coordinate from home; empty with a bad home pose
     sections: list[Section]  # through home; empty with a bad home pose
@@ -102,7 +103,7 @@ class WorkspaceStudy:
     def worst(self) -> tuple[float, int, float]:
         """Time in s, leg and margin in m at the least reach margin of all legs and instants."""
         row, leg = np.unravel_index(self.margins.reach.argmin(), self.margins.reach.shape)
-        return float(self.margins.time[row]), LEGS[leg], float(self.margins.reach[row, leg])
+        return float(self.time[row]), LEGS[leg], float(self.margins.reach[row, leg])
 
     @property
     def verdict(self) -> str:
@@ -132,7 +133,7 @@ class WorkspaceStudy:
         if np.isnan(value):
             return "it does not move"
         if value == 0:
-            pose = first_pose_text(self.margins.pose[0], self.experiment.mechanism)
+            pose = first_pose_text(self.poses[0], self.experiment.mechanism)
             return f"not even its first pose is inside: {pose}"
         if not self.factor.limited:
             return f"{value:g} times the amplitude fits, more was not tried"
@@ -155,7 +156,7 @@ class WorkspaceStudy:
                 {
                     "leg": LEGS[i],
                     "least_reach_margin": m.reach[:, i].min(),
-                    "time": m.time[m.reach[:, i].argmin()],
+                    "time": self.time[m.reach[:, i].argmin()],
                     "least_sine": m.sines[:, i].min(),
                     "least_transmission": least(m.transmission[:, i]),
                 }
@@ -182,18 +183,20 @@ def study_workspace(scenario: Scenario) -> WorkspaceStudy:
     mechanism, reference = experiment.mechanism, experiment.reference
     time = check_instants(scenario.duration)
     left = first_exit(mechanism, reference, time)
-    margins = margins_along(mechanism, reference, time)
+    poses = poses_along(reference, time)
     ways, around = travel(mechanism), sections(mechanism)
     return WorkspaceStudy(
         experiment=experiment,
         home=diagnose(mechanism, 0.0, mechanism.home),
         exit=left,
-        margins=margins,
+        time=time,
+        poses=poses,
+        margins=measure(mechanism, poses),
         factor=largest_factor(mechanism, reference, time),
         travel=ways,
         sections=around,
         sizing=size_motors(experiment.nominal, reference, time) if left is None else None,
-        clearance=study_clearance(mechanism, time, margins.pose, ways, around),
+        clearance=study_clearance(mechanism, time, poses, ways, around),
     )
 
 

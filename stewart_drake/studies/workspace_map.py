@@ -19,18 +19,12 @@ from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 from scipy.ndimage import label
 
-from stewart_drake.dynamics.workspace import (
-    Failure,
-    border,
-    diagnose,
-    home_sign,
-    margin,
-    margins,
-    measures_at,
-)
+from stewart_drake.dynamics.native_functions import functions_of
+from stewart_drake.dynamics.workspace import Failure, border, diagnose, home_sign, margin, margins
 from stewart_drake.mechanism.geometry import Mechanism, plate_radius
-from stewart_drake.mechanism.kinematics import LegGeometry, Legs, leg_geometry
-from stewart_drake.scenario.signals import COORDINATES, NUM_COORDINATES
+from stewart_drake.mechanism.kinematics import LegGeometry, Legs, legs_along, reach_margins
+from stewart_drake.scenario.signals import COORDINATES, NUM_COORDINATES, NUM_LEGS
+from stewart_drake.scenario.trajectories import poses_along
 from stewart_drake.types import Array
 
 SECTIONS: Final = ((3, 4), (3, 5), (0, 1), (2, 5))
@@ -51,23 +45,26 @@ _TIME_TOLERANCE: Final = 1e-9
 _FACTOR_TOLERANCE: Final = 1e-6
 
 
-# ---------------------------------------------------------------- one pose
+# ---------------------------------------------------------------- poses
 
 
 class Measures(NamedTuple):
-    """Measures of one pose; NaN from `transmission` on for a pose outside the workspace."""
+    """Measures of poses; NaN from `transmission` on outside the workspace.
 
-    reach: Array  # (6,) reach margin of each leg, m, negative out of reach
-    sines: Array  # (6,) of the cranks' angles off dead centre, negative out of reach
-    parallel: float  # det W, positive at home, 0 at a parallel singularity
-    margin: float  # positive inside the workspace, see `dynamics.workspace.margin`
-    transmission: Array  # (6,) |r . tangent|: share of a crank's push along its rod.
-    # least singular value of W: how firmly the rods hold the plate in their weakest direction
-    held: float
-    # largest over least singular value of A; 1 for a machine that is alike in all directions
-    condition: float
-    # m per rad, 1 / least singular value of A: how far crank errors of norm 1 move the plate
-    play: float
+    Those of one pose are without the first dimension.
+    """
+
+    reach: Array  # (n, 6) reach margin of each leg, m, negative out of reach
+    sines: Array  # (n, 6) of the cranks' angles off dead centre, negative out of reach
+    parallel: Array  # (n,) det W, positive at home, 0 at a parallel singularity
+    margin: Array  # (n,) positive inside the workspace, see `dynamics.workspace.margin`
+    transmission: Array  # (n, 6) |r . tangent|: share of a crank's push along its rod
+    # (n,) least singular value of W: how firmly the rods hold the plate in their weakest direction
+    held: Array
+    # (n,) largest over least singular value of A; 1 for a machine that is alike in all directions
+    condition: Array
+    # (n,) m per rad, 1 / least singular value of A: how far crank errors of norm 1 move the plate
+    play: Array
 
 
 def wrenches(mechanism: Legs, legs: LegGeometry) -> Array:
@@ -82,36 +79,29 @@ def rate_gains(mechanism: Legs, legs: LegGeometry, W: Array) -> Array:
     return np.asarray(np.linalg.svd(A, compute_uv=False), dtype=np.float64)
 
 
-def measure(mechanism: Mechanism, pose: Array) -> Measures:
-    """Return all measures of a pose (6,), which may be out of reach."""
-    pose = np.asarray(pose, dtype=np.float64)
-    now, sign = measures_at(mechanism, pose), home_sign(mechanism)
-    rest = (np.full(6, np.nan), np.nan, np.nan, np.nan)
-    if now.margin > 0:
-        legs = leg_geometry(mechanism, pose)
-        W = wrenches(mechanism, legs)
-        values = rate_gains(mechanism, legs, W)
-        held = float(np.linalg.svd(W, compute_uv=False)[-1])
-        rest = (np.abs(legs.transmission), held, values[0] / values[-1], 1 / values[-1])
-    parallel = (sign or 1.0) * now.parallel
-    return Measures(mechanism.reach_margins(pose), now.sines, parallel, now.margin, *rest)
+def measure(mechanism: Mechanism, poses: Array) -> Measures:
+    """Return all measures of a pose (6,) or of poses (n, 6), which may be out of reach."""
+    poses, one = np.reshape(poses, (-1, NUM_COORDINATES)), np.ndim(poses) == 1
+    boundary = np.array([functions_of(mechanism).measures(pose)[0] for pose in poses])
+    margin, sign = margins(mechanism, poses), home_sign(mechanism) or 1.0
+    inside, rest = margin > 0, np.full((len(poses), NUM_LEGS + 3), np.nan)
+    legs = legs_along(mechanism, poses[inside])
+    W = wrenches(mechanism, legs)
+    gains, held = rate_gains(mechanism, legs, W), np.linalg.svd(W, compute_uv=False)[:, -1]
+    condition, play = gains[:, 0] / gains[:, -1], 1 / gains[:, -1]
+    rest[inside] = np.column_stack([np.abs(legs.transmission), held, condition, play])
+    found = Measures(
+        reach_margins(mechanism, poses),
+        boundary[:, :NUM_LEGS],
+        sign * boundary[:, NUM_LEGS],
+        margin,
+        rest[:, :NUM_LEGS],
+        *rest[:, NUM_LEGS:].T,
+    )
+    return Measures(*(column[0] for column in found)) if one else found
 
 
 # ---------------------------------------------------------------- along a motion
-
-
-class Margins(NamedTuple):
-    """Measures along a motion, arrays (n,) or (n, 6); see `Measures`."""
-
-    time: Array
-    pose: Array
-    reach: Array
-    sines: Array
-    parallel: Array
-    transmission: Array
-    held: Array
-    condition: Array
-    play: Array
 
 
 class Factor(NamedTuple):
@@ -128,18 +118,6 @@ class Factor(NamedTuple):
     def rounded(self) -> str:
         """Value rounded down, so that this motion does fit."""
         return f"{np.floor(1e3 * self.value) / 1e3:g}"
-
-
-def margins_along(mechanism: Mechanism, reference: Trajectory, time: Array) -> Margins:
-    """Return all measures of a reference at the instants (n,) in s."""
-    poses = np.array([reference.value(t)[:, 0] for t in time])
-    rows = [measure(mechanism, pose) for pose in poses]
-    columns = {
-        name: np.array([getattr(row, name) for row in rows])
-        for name in Margins._fields
-        if name not in ("time", "pose")
-    }
-    return Margins(time=time, pose=poses, **columns)
 
 
 def first_exit(mechanism: Mechanism, reference: Trajectory, time: Array) -> Failure | None:
@@ -165,7 +143,7 @@ def largest_factor(mechanism: Mechanism, reference: Trajectory, time: Array) -> 
     fit again when it is larger. So f is the end of the first range that fits, found by a scan in
     steps of `FACTOR_STEP` and bisection; a gap narrower than a step can go unseen.
     """
-    poses = np.array([reference.value(t)[:, 0] for t in time])
+    poses = poses_along(reference, time)
     change = poses - poses[0]
 
     def fits(factor: float) -> bool:
@@ -268,18 +246,16 @@ def _section(
         (home[i] + _WIDER * spans[k][0], home[i] + _WIDER * spans[k][1]) for i, k in enumerate(pair)
     )
 
-    def at(a: float, b: float) -> Array:
-        return pose_in_section(mechanism, pair, a, b)
-
     # Twice: over a window that is surely too large, then over the part that the workspace fills.
     for number in (_ROUGH, points):
         x, y = np.linspace(*x_range, number), np.linspace(*y_range, number)
-        inside = np.array([[margin(mechanism, at(a, b)) for a in x] for b in y])
+        poses = np.tile(mechanism.home, (number, number, 1))
+        poses[..., list(pair)] = np.stack(np.meshgrid(x, y), axis=-1)
+        inside = margins(mechanism, poses.reshape(-1, NUM_COORDINATES)).reshape(number, number)
         connected = _connected(inside > 0, np.hypot(*np.meshgrid(x - home[0], y - home[1])))
         x_range, y_range = _window(x, connected), _window(y, connected.T)
     condition = np.full(connected.shape, np.nan)
-    for j, i in zip(*np.nonzero(connected), strict=True):
-        condition[j, i] = measure(mechanism, at(x[i], y[j])).condition
+    condition[connected] = measure(mechanism, poses[connected]).condition
     return Section(*pair, x, y, condition, np.where(connected, inside, -np.abs(inside)))
 
 
