@@ -23,30 +23,16 @@ from stewart_drake.studies.robustness import (
     unit_of,
 )
 from stewart_drake.studies.statistics import (
+    SIGNIFICANT,
     Correlation,
     Interval,
     Pair,
     Separation,
     wilson_interval,
 )
+from stewart_drake.studies.uncertainty import MACHINE
 from stewart_drake.types import Array
 
-TITLES: Final = {
-    "payload": "payload",
-    "torque_bias": "torque bias (rms)",
-    "noise": "noise of the sensor",
-    "torque_limit": "torque limit",
-    "damping": "joint damping",
-    "delay": "delay error",
-    "lengths": "lengths (rms)",
-    "anchors": "anchors (rms)",
-    "coulomb": "Coulomb friction",
-    "payload_position": "payload's place (rms)",
-    "jitter": "jitter of the delay",
-    "loss": "lost on the way",
-}
-SIGNIFICANT: Final = 0.05
-"""Adjusted p-value of a significant influence."""
 _GOOD, _FAIR = 0.99, 0.9
 """Smallest lower bound of the success rate for a good and a fair verdict."""
 _WORST: Final = 10
@@ -80,14 +66,13 @@ def document(study: RobustnessStudy) -> Document:
         third=_third,
         where=_where,
         spans=_spans(study),
-        titles=TITLES,
         few=_FEW,
         singles=found.failing >= _FEW and found.singles,
         pairs=found.failing >= _FEW and found.pairs,
         kept=lambda one: int(np.sum(~one.failed)),
         strong=[title(one.factor) for one in found.found if found.failing >= _FEW],
         for_error=list(dict.fromkeys(title(one.factor.strip("|")) for one in errors)),
-        others=study.also and list({"as asked": study, **study.others}.items()),
+        others=study.also and {"as asked": study, **study.also}.items(),
         quantiles=[(q, study.quantile(q)) for q in QUANTILES],
         distribution_figure=partial(distribution_figure, study),
         influences=influences,
@@ -95,7 +80,7 @@ def document(study: RobustnessStudy) -> Document:
         runs_figure=partial(runs_figure, study),
         reasons=[_reason(study, *one) for one in study.reasons.items()],
         times_figure=early >= _FEW and partial(times_figure, study),
-        ranges=list(factors(study.draws)),
+        ranges=factors(study.draws),
         vary=", ".join(
             f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}"
             for name, value in dataclasses.asdict(study.ranges).items()
@@ -106,7 +91,7 @@ def document(study: RobustnessStudy) -> Document:
 
 def title(factor: str) -> str:
     """Return the name of a varied quantity, in bars if `factor` is its absolute value."""
-    name = TITLES[factor.strip("|")]
+    name = MACHINE[factor.strip("|")].title
     return f"|{name}|" if factor.startswith("|") else name
 
 
@@ -183,7 +168,7 @@ def _worst_table(study: RobustnessStudy) -> Table:
     def drawn(name: str, i: int) -> str:
         return f"{values[name][i]:.3g}"
 
-    heads = ("run", "E_ac, % s", *(f"{TITLES[name]}, {unit}" for name, unit in units.items()))
+    heads = ("run", "E_ac, % s", *(f"{title(name)}, {unit}" for name, unit in units.items()))
     shown = order[:_WORST].tolist()
     return Table(heads, [(str(i), outcome(i), *(drawn(name, i) for name in units)) for i in shown])
 
@@ -278,7 +263,7 @@ def runs_figure(study: RobustnessStudy) -> Figure:
     panels = [
         Panel(
             "E_ac  [% s]",
-            x=f"{TITLES[name]}  [{unit}]",
+            x=f"{title(name)}  [{unit}]",
             yscale="log",
             ylim=(low, top),
             height=1.9,

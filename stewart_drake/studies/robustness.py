@@ -39,7 +39,6 @@ SIGNED: Final = tuple(name for name, one in MACHINE.items() if one.signed)
 
 class Influence(NamedTuple):
     factor: str  # of the quantity
-    unit: str  # of the quantity
     error: Correlation  # with E_ac among the runs that completed
     error_p: float  # its p-value, adjusted by Holm over all quantities
     failure: Correlation  # with failing (1 or 0) among all runs
@@ -54,7 +53,7 @@ class Influence(NamedTuple):
     def summary(self) -> dict[str, Any]:
         return {
             "factor": self.factor,
-            "unit": self.unit,
+            "unit": unit_of(self.factor),
             "error": self.error._asdict() | {"adjusted_p": self.error_p},
             "failure": self.failure._asdict() | {"adjusted_p": self.failure_p},
         }
@@ -71,20 +70,12 @@ class RobustnessStudy(NamedTuple):
     undisturbed: Outcome  # outcome of the scenario itself
     draws: list[Draw]  # of the machines
     outcomes: list[Outcome]  # of the machines
-    # by name of another controller, its undisturbed outcome and those on the same draws
-    also: dict[str, tuple[Outcome, list[Outcome]]] = {}
+    # the same draws with other controllers, by name
+    also: "dict[str, RobustnessStudy]" = {}
 
     @property
     def files(self) -> list[str]:
         return ["runs.csv", "runs/"]
-
-    @property
-    def others(self) -> "dict[str, RobustnessStudy]":
-        """The same study with each of the other controllers."""
-        return {
-            name: self._replace(undisturbed=undisturbed, outcomes=outcomes, also={})
-            for name, (undisturbed, outcomes) in self.also.items()
-        }
 
     @property
     def failed(self) -> NDArray[np.bool_]:
@@ -131,7 +122,7 @@ class RobustnessStudy(NamedTuple):
         error_p = holm([one.p_value for one in error.values()])
         failure_p = holm([one.p_value for one in failure.values()])
         found = [
-            Influence(name, unit_of(name), error[name], p, failure[name], q)
+            Influence(name, error[name], p, failure[name], q)
             for name, p, q in zip(values, error_p, failure_p, strict=True)
         ]
         return sorted(found, key=lambda one: -one.strength)
@@ -170,7 +161,7 @@ class RobustnessStudy(NamedTuple):
             "influences": [one.summary for one in self.influences()],
             "explanation": self.explanation.summary,
             "loops": self.loops,
-            "beside": {name: one._common_summary for name, one in self.others.items()},
+            "beside": {name: one._common_summary for name, one in self.also.items()},
             "ranges": dataclasses.asdict(self.ranges),
             "scales": self.scales._asdict(),
             "scenario": scenario_to_dict(self.experiment.scenario),
@@ -221,18 +212,12 @@ def study_robustness(
     scales = scales_of(experiment, undisturbed[""].peak_torque)
     draws = [draw(ranges, scales, scenario, seed, index) for index in range(options.runs)]
     named = {f"run{i:06d}": one for i, one in enumerate(draws)}
-    outcomes = {name: run(name, one, named, progress) for name, one in controllers.items()}
-    study = RobustnessStudy(
-        experiment,
-        ranges,
-        scales,
-        seed,
-        options.limit,
-        undisturbed[""],
-        draws,
-        outcomes[""],
-        {name: (undisturbed[name], outcomes[name]) for name in controllers if name},
-    )
+    given = experiment, ranges, scales, seed, options.limit
+    studies = {
+        name: RobustnessStudy(*given, undisturbed[name], draws, run(name, one, named, progress))
+        for name, one in controllers.items()
+    }
+    study = studies.pop("")._replace(also=studies)
     remove_partials(directory)
     write_whole(directory / "runs.csv", table(study))
     return study

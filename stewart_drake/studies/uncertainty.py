@@ -64,6 +64,7 @@ class Quantity(NamedTuple):
     signed: bool = False  # whether the sign matters
     sometimes: bool = False  # whether it is absent, 0, in half of the draws
     optional: bool = False  # whether it is reported only if it is drawn at all
+    title: str = ""  # for readers
 
     def in_unit(self, value: Any) -> float:
         """Return the value in its unit: the rms of several numbers, infinite for None."""
@@ -298,32 +299,41 @@ def _draw_delay(rng: Generator, about: About) -> float:
 
 
 MACHINE: Final[Model] = {
-    "payload": Quantity(_number("payload", "plate_mass", -1), add_payload, "kg", signed=True),
-    "torque_bias": Quantity(
-        _vector("torque_bias", "torque", NUM_TORQUES), add_to("plant", "torque_bias"), "mN m", 1e3
+    "payload": Quantity(
+        _number("payload", "plate_mass", -1), add_payload, "kg", signed=True, title="payload"
     ),
-    "noise": Quantity(_number("noise"), add_noise, "%", 100),
-    "torque_limit": Quantity(_draw_limit, _limit_torque, "N m"),
-    "damping": Quantity(_draw_damping, add_to("plant", "joint_damping"), "mN m s/rad", 1e3),
-    "delay": Quantity(_draw_delay, _add_delay, "ms", 1e3, signed=True),
+    "torque_bias": Quantity(
+        _vector("torque_bias", "torque", NUM_TORQUES), add_to("plant", "torque_bias"), "mN m", 1e3,
+        title="torque bias (rms)",
+    ),
+    "noise": Quantity(_number("noise"), add_noise, "%", 100, title="noise of the sensor"),
+    "torque_limit": Quantity(_draw_limit, _limit_torque, "N m", title="torque limit"),
+    "damping": Quantity(
+        _draw_damping, add_to("plant", "joint_damping"), "mN m s/rad", 1e3, title="joint damping"
+    ),
+    "delay": Quantity(_draw_delay, _add_delay, "ms", 1e3, signed=True, title="delay error"),
     "lengths": Quantity(
-        _vector("lengths", "crank", 2 * NUM_LEGS),
-        _add_to_machine("crank_lengths", "rod_lengths"), "mm", 1e3,
+        _vector("lengths", "crank", 2 * NUM_LEGS), _add_to_machine("crank_lengths", "rod_lengths"),
+        "mm", 1e3, title="lengths (rms)",
     ),
     "anchors": Quantity(
-        _vector("anchors", "crank", 6 * NUM_LEGS), _add_to_machine("p_WS", "p_PQ"), "mm", 1e3
+        _vector("anchors", "crank", 6 * NUM_LEGS), _add_to_machine("p_WS", "p_PQ"), "mm", 1e3,
+        title="anchors (rms)",
     ),
     "seed": Quantity(draw_seed, seed_noise),
     "coulomb": Quantity(
         _number("coulomb", "torque"), add_to("plant", "coulomb_friction"), "mN m", 1e3,
-        optional=True,
+        optional=True, title="Coulomb friction",
     ),
     "payload_position": Quantity(
         _vector("payload_position", "crank", 3), add_to("plant", "payload_position"), "mm", 1e3,
-        optional=True,
+        optional=True, title="payload's place (rms)",
     ),
-    "jitter": Quantity(_number("jitter", "period"), _add_jitter, "ms", 1e3, optional=True),
-    "loss": Quantity(_number("loss"), _lose, "%", 100, optional=True),
+    "jitter": Quantity(
+        _number("jitter", "period"), _add_jitter, "ms", 1e3,
+        optional=True, title="jitter of the delay",
+    ),
+    "loss": Quantity(_number("loss"), _lose, "%", 100, optional=True, title="lost on the way"),
     "link_seed": Quantity(draw_seed, _seed_link),
 }  # fmt: skip
 """True minus believed value of each quantity of `Ranges`."""
