@@ -8,10 +8,10 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from stewart_drake.reporting.document import Document, Paragraph, Table, capital, from_template
+from stewart_drake.reporting.document import Document, Paragraph, capital, from_template
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import Line, line
-from stewart_drake.studies.hautus import QUESTIONS, HautusStudy, System
+from stewart_drake.studies.hautus import HautusStudy, System
 
 _CHAINS: Final = ("minimal chain", "paper's chain", "chain under gravity")
 _SMALLEST: Final = 1e-18
@@ -51,7 +51,6 @@ def document(study: HautusStudy) -> Document:
             for test, outcome in (("input", system.reach), ("output", system.view))
             for mode in outcome.modes
         ],
-        systems=_systems_table(study.systems),
     )
 
 
@@ -89,15 +88,6 @@ def _deficiencies(systems: Sequence[System]) -> list[Paragraph]:
                 )
                 found.append(Paragraph(text, brief=True))
     return found
-
-
-def _systems_table(systems: Sequence[System]) -> Table:
-    rows = [
-        [one.name, str(one.n)]
-        + [f"{'yes' if one.answers[w] else 'no'}, {one.margins[w]:.1e}" for w in QUESTIONS]
-        for one in systems
-    ]
-    return Table(["model", "n", *(f"{word}, margin" for word in QUESTIONS)], rows)
 
 
 def chain_figure(study: HautusStudy) -> Figure:

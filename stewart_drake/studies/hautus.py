@@ -143,8 +143,10 @@ def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool) -> Hautus:
         for value, margin in found:
             decays = abs(value) < 1 - BOUNDARY if discrete else value.real < -BOUNDARY * radius
             directions = np.empty((len(A), 0), dtype=np.complex128)
-            if margin < TOLERANCE:
-                directions = _null_space(A, B, value, TOLERANCE * size)
+            if margin < TOLERANCE:  # w with w' [value I - A, B] = 0, without conjugation
+                pencil = pencils(A, B, np.array([value]))[0]
+                left, singular_values, _ = np.linalg.svd(pencil, full_matrices=False)
+                directions = left[:, singular_values < TOLERANCE * size].conj()
             modes.append(Mode(value, len(members), bool(decays), margin, directions))
     return Hautus(tuple(sorted(modes, key=lambda mode: mode.margin)))
 
@@ -174,12 +176,6 @@ def cluster(values: Complex, distance: float) -> list[Complex]:
     points = np.column_stack([values.real, values.imag])
     groups = fclusterdata(points, distance, "distance", method="single")
     return [values[groups == group] for group in np.unique(groups)]
-
-
-def _null_space(A: Array, B: Array, point: complex, threshold: float) -> Complex:
-    """Return orthonormal w (n, d) with w' [point I - A, B] = 0, without conjugation."""
-    left, values, _ = np.linalg.svd(pencils(A, B, np.array([point]))[0], full_matrices=False)
-    return left[:, values < threshold].conj()
 
 
 # ---------------------------------------------------------------- the models
@@ -256,18 +252,16 @@ class System:
     words: tuple[str, ...]  # a sentence for each mode that fails
 
     @property
-    def answers(self) -> dict[str, bool]:
-        """Ours to QUESTIONS."""
-        tests = (self.reach, self.view)
-        values = [answer for test in tests for answer in (test.complete, test.harmless)]
+    def margins(self) -> dict[str, float]:
+        """Least relative singular value behind each answer, infinite without a relevant mode."""
+        reach, view = self.reach, self.view
+        values = reach.margin, reach.lasting_margin, view.margin, view.lasting_margin
         return dict(zip(QUESTIONS, values, strict=True))
 
     @property
-    def margins(self) -> dict[str, float]:
-        """Least relative singular value behind each answer, infinite without a relevant mode."""
-        tests = (self.reach, self.view)
-        values = [margin for test in tests for margin in (test.margin, test.lasting_margin)]
-        return dict(zip(QUESTIONS, values, strict=True))
+    def answers(self) -> dict[str, bool]:
+        """Ours to QUESTIONS."""
+        return {word: margin >= TOLERANCE for word, margin in self.margins.items()}
 
     @property
     def note(self) -> str:
