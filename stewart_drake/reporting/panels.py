@@ -13,18 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import ScalarFormatter
 
-from stewart_drake.reporting.style import (
-    BAND_ALPHA,
-    LEG_LINES,
-    LIMIT,
-    MARK,
-    RUN,
-    WIDTH,
-    Line,
-    figure_style,
-    plain_log_ticks,
-    powers_of_ten,
-)
+from stewart_drake.reporting import style
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.types import Array, ArrayLike
 
@@ -45,7 +34,7 @@ class Curve:
     x: ArrayLike
     y: ArrayLike
     label: str = ""  # for the legend, or empty
-    line: Line = RUN
+    line: style.Line = style.RUN
     steps: bool = False  # whether a value holds until the next x
     # lower and upper end of an interval, and its label
     band: tuple[ArrayLike, ArrayLike, str] | None = None
@@ -75,11 +64,11 @@ class Panel:
 
 def leg_curves(x: ArrayLike, values: Array, name: str = "leg") -> list[Curve]:
     """Return the curves of six columns (n, 6), a leg each."""
-    legs = zip(LEGS, LEG_LINES, values.T, strict=True)
+    legs = zip(LEGS, style.LEG_LINES, values.T, strict=True)
     return [Curve(x, column, f"{name} {leg}", look) for leg, look, column in legs]
 
 
-@figure_style()
+@style.figure_style()
 def draw(
     panels: Sequence[Panel],
     columns: int = 1,
@@ -110,7 +99,7 @@ def draw(
     in_row = [[one for one, (r, _) in pairs if r == row] for row in range(spots[-1][0] + 1)]
     heights = [max(one.height for one in row) for row in in_row]
     figure, first, named = (
-        Figure(figsize=(WIDTH, 1.0), layout="constrained"),
+        Figure(figsize=(style.WIDTH, 1.0), layout="constrained"),
         dict[int, Axes](),
         set(),
     )
@@ -148,16 +137,16 @@ def _fill(ax: Axes, panel: Panel, last: bool, named: bool) -> None:
         if one.band is not None:
             low, high, label = one.band
             step: Any = "post" if one.steps else None
-            look: Any = {"color": one.line.color, "alpha": BAND_ALPHA, "linewidth": 0}
+            look: Any = {"color": one.line.color, "alpha": style.BAND_ALPHA, "linewidth": 0}
             ax.fill_between(one.x, low, high, step=step, label=label, **look)
     for x, label in panel.marks.items():
-        ax.axvline(x, label=label or None, **MARK._asdict())
+        ax.axvline(x, label=label or None, **style.MARK._asdict())
     for level, text in panel.limits.items():
         limit(ax, level, text)
     for axis, scale in (("x", panel.xscale), ("y", panel.yscale)):
         if scale != "linear":
             ax.set(**{f"{axis}scale": "log"})
-            ticks = plain_log_ticks if scale == "log" else powers_of_ten
+            ticks = style.plain_log_ticks if scale == "log" else style.powers_of_ten
             ticks(getattr(ax, f"{axis}axis"))
     if panel.paint is not None:
         panel.paint(ax)
@@ -179,7 +168,7 @@ def _fill(ax: Axes, panel: Panel, last: bool, named: bool) -> None:
 
 
 def limit(ax: Axes, level: float, text: str, *, below: bool = False) -> None:
-    ax.axhline(level, label=None if text else "limit", **LIMIT._asdict())
+    ax.axhline(level, label=None if text else "limit", **style.LIMIT._asdict())
     ax.annotate(
         text,
         (0.01, level),
@@ -189,7 +178,7 @@ def limit(ax: Axes, level: float, text: str, *, below: bool = False) -> None:
         ha="left",
         va="top" if below else "bottom",
         fontsize=8,
-        color=LIMIT.color,
+        color=style.LIMIT.color,
         bbox={"fc": "white", "ec": "none", "pad": 0.6},  # a curve may pass behind it
         zorder=5,
     )
@@ -208,7 +197,7 @@ def _legend(figure: Figure, panels: Sequence[Panel], title: str) -> int:
     for lines in range(1, len(labels) + 1):
         columns = math.ceil(len(labels) / lines)
         taken = [labels[k : k + lines] for k in range(0, len(labels), lines)]
-        if sum(_HANDLE + _CHARACTER * max(map(len, one)) for one in taken) <= WIDTH:
+        if sum(_HANDLE + _CHARACTER * max(map(len, one)) for one in taken) <= style.WIDTH:
             break
     else:
         return 0
