@@ -269,15 +269,13 @@ def report(*, chosen: Chosen, delivery: Delivery) -> int:
 
     Runs it, compares all shipped controllers on it, and analyses it.
     """
-    from stewart_drake.loop.preparation import simulated_machine
     from stewart_drake.reporting import report as report_document
     from stewart_drake.reporting.page import Provenance
-    from stewart_drake.reporting.report import collect
-    from stewart_drake.reporting.results import AnalysisResult
 
     started, name = time.perf_counter(), chosen.title
     with count_bar("runs, analyses", delivery.silent) as progress:
-        found = collect(chosen.scenario, chosen.settings, progress, chosen.controller)
+        given = chosen.scenario, chosen.settings, progress, chosen.controller
+        found = report_document.collect(*given)
     delivery.discard(REPLAY, PAGE)
     summary = report_document.report_summary(found)
     delivery.write(summary)
@@ -285,17 +283,13 @@ def report(*, chosen: Chosen, delivery: Delivery) -> int:
 
     def film(folder: Path) -> None:
         nonlocal replay
-        from stewart_drake.reporting.replay import replay_html
-
-        assert found.run is not None
-        mechanism = simulated_machine(found.scenario)
-        replay = replay_html(found.run, mechanism, name)
+        replay = report_document.film(found, name)
         write_whole(folder / REPLAY, replay)
 
     def page(folder: Path) -> None:
-        document = report_document.document(found, name, replay)
-        delivery.say(document.plain())
-        AnalysisResult(found, summary, document, made).write_page(folder)
+        shown = report_document.result(found, name, replay, made)
+        delivery.say(str(shown))
+        shown.write_page(folder)
 
     if found.run is not None:
         delivery.draw(REPLAY, film)

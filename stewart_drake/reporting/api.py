@@ -10,7 +10,6 @@ from typing import Any, ParamSpec, TypeVar
 
 from stewart_drake.loop import controller_margin as margins
 from stewart_drake.loop import simulation
-from stewart_drake.loop.preparation import simulated_machine
 from stewart_drake.reporting.analyses import ANALYSES, analyze, options_of, words_of
 from stewart_drake.reporting.results import (
     AnalysisResult,
@@ -58,17 +57,12 @@ def report(
     """
     from stewart_drake.reporting import report as report_document
     from stewart_drake.reporting.page import Provenance
-    from stewart_drake.reporting.replay import replay_html
 
-    settings = tuple(settings)
+    settings, name = tuple(settings), title_of(scenario)
     found = report_document.collect(scenario, settings, controller=controller)
-    film = ""
-    if found.run is not None:
-        film = replay_html(found.run, simulated_machine(found.scenario), title_of(scenario))
     own = "" if controller is None else f", {str(controller)!r}"
     made = Provenance(f"sd.report({str(scenario)!r}, {list(settings)}{own})")
-    document = report_document.document(found, title_of(scenario), film)
-    return AnalysisResult(found, report_document.report_summary(found), document, made)
+    return report_document.result(found, name, report_document.film(found, name), made)
 
 
 def analysis_function(name: str) -> Callable[..., AnalysisResult]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.resources import shipped
-from stewart_drake.loop.preparation import assemble
+from stewart_drake.loop.preparation import assemble, simulated_machine
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
@@ -43,6 +43,8 @@ from stewart_drake.reporting.figures import (
 )
 from stewart_drake.reporting.mechanism import document as describe
 from stewart_drake.reporting.mechanism import mechanism_figure
+from stewart_drake.reporting.page import Provenance
+from stewart_drake.reporting.replay import replay_html
 from stewart_drake.reporting.results import AnalysisResult
 from stewart_drake.reporting.run import comparison_document, moving, run_document, worst
 from stewart_drake.scenario.config import Scenario
@@ -186,6 +188,18 @@ def _analyse(name: str, scenario: Scenario) -> AnalysisResult:
 
 
 # ---------------------------------------------------------------- the document
+
+
+def film(found: ReportData, name: str) -> str:
+    """Return the page of the replay of the scenario's run; empty without a run."""
+    if found.run is None:
+        return ""
+    return replay_html(found.run, simulated_machine(found.scenario), name)
+
+
+def result(found: ReportData, name: str, replay: str, made: Provenance) -> AnalysisResult:
+    """Return the report with all that a page and summary.json have."""
+    return AnalysisResult(found, report_summary(found), document(found, name, replay), made)
 
 
 def document(found: ReportData, name: str, replay: str = "") -> Document:
