@@ -7,10 +7,9 @@ from typing import Final
 import numpy as np
 import xarray as xr
 from pydrake.geometry import Meshcat, MeshcatParams, Rgba
-from pydrake.math import RotationMatrix
+from scipy.spatial.transform import Rotation
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.versions import versions
 from stewart_drake.loop.preparation import simulated_machine
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.scene import TORQUE_COLORS, Scene, crank_paths, full_color, torque_shares
@@ -87,29 +86,24 @@ def _html(signals: xr.Dataset, mechanism: Mechanism, title: str, outcome: str) -
     torque = np.nan_to_num(shown.torque_applied.values)
     largest = np.abs(torque).max(axis=1, initial=0.0)
     full = full_color(largest)
+    off = np.linalg.norm(shown.error.values[:, POSITION], axis=1)
     data = {
         "time": np.round(shown.time.values, 4).tolist(),
-        "position": np.round(
-            1e3 * np.linalg.norm(shown.error.values[:, POSITION], axis=1), 4
-        ).tolist(),
+        "position": np.round(1e3 * off, 4).tolist(),
         "angle": np.round(np.rad2deg(_turns(shown)), 4).tolist(),
         "share": np.round(torque_shares(torque, full), 3).tolist(),
         "cranks": crank_paths(mechanism.name),
     }
-    overlay = (
-        environment()
-        .get_template("replay.html.j2")
-        .render(
-            title=title,
-            outcome=outcome,
-            known=known,
-            full=number(full, 2),
-            peak=number(float(largest.max(initial=0.0)), 2),
-            data=data,
-            legs=LEGS,
-            colors=TORQUE_COLORS,
-            drake=versions()["drake"],
-        )
+    template = environment().get_template("replay.html.j2")
+    overlay = template.render(
+        title=title,
+        outcome=outcome,
+        known=known,
+        full=number(full, 2),
+        peak=number(float(largest.max(initial=0.0)), 2),
+        data=data,
+        legs=LEGS,
+        colors=TORQUE_COLORS,
     )
     return scene_page(meshcat, overlay, "Replay")
 
@@ -153,10 +147,5 @@ def _draw_paths(meshcat: Meshcat, signals: xr.Dataset) -> None:
 
 def _turns(signals: xr.Dataset) -> Array:
     """Return the rotation angles (n,) of the plate against its reference, rad."""
-    pairs = zip(signals.pose.values, signals.reference.values, strict=True)
-    return np.array(
-        [
-            RotationMatrix(rotation(q[ANGLES]).T @ rotation(p[ANGLES])).ToAngleAxis().angle()
-            for p, q in pairs
-        ]
-    )
+    plate, wanted = (rotation(signals[name].values[:, ANGLES]) for name in ("pose", "reference"))
+    return Rotation.from_matrix(wanted.swapaxes(-1, -2) @ plate).magnitude()
