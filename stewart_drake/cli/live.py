@@ -8,7 +8,7 @@ import shlex
 import signal
 import sys
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any, Final
 
@@ -121,7 +121,7 @@ def live(
         how: Any = options.model_dump(include={"armed", "max_missing", "hold"}) | {"viewer": viewer}
         how["log"] = None if delivery.out is None else delivery.out / LOG
         how["logs"] = session.open_logs(ready, options, delivery.say_wrapped)
-        with _Ending() as ending:
+        with _ending() as ending:
             result = session.drive(
                 ready, span, ending=ending, say=delivery.say_wrapped, accept_jitter=True, **how
             )
@@ -150,7 +150,7 @@ def _learn(
         where = machine or running.enter_context(_demo_machine(chosen, loaded.eta))
         delivery.say(f"calling {where}")
         consent = options if machine else options.model_copy(update={"accept_jitter": True})
-        with _Ending() as ending:
+        with _ending() as ending:
             run, study = learn_live(loaded, where, consent, delivery.say_wrapped, ending)
     found = None
     if study is not None:
@@ -277,28 +277,23 @@ def _demo_machine(chosen: Chosen, eta: float) -> Iterator[str]:
         process.join()
 
 
-class _Ending:
-    """Whether Ctrl-C or SIGTERM asks for rest; a second one raises KeyboardInterrupt."""
+@contextlib.contextmanager
+def _ending() -> Iterator[Callable[[], bool]]:
+    """Yield whether Ctrl-C or SIGTERM asks for rest; a second one raises KeyboardInterrupt."""
+    asked = False
 
-    def __init__(self) -> None:
-        self._asked = False
-        self._before: list[Any] = []
-
-    def __call__(self) -> bool:
-        return self._asked
-
-    def __enter__(self) -> "_Ending":
-        self._before = [signal.signal(number, self._ask) for number in _REQUESTS]
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, before in zip(_REQUESTS, self._before, strict=True):
-            signal.signal(number, before)
-
-    def _ask(self, *_: Any) -> None:
-        if self._asked:
+    def ask(*_: Any) -> None:
+        nonlocal asked
+        if asked:
             raise KeyboardInterrupt
-        self._asked = True
+        asked = True
+
+    before = [(number, signal.signal(number, ask)) for number in _REQUESTS]
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)
 
 
 # ---------------------------------------------------------------- the machine
@@ -311,9 +306,6 @@ def machine(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
     Plant, sensor, delay, link and limits are those of the scenario. Ctrl-C ends it.
     """
 
-    def interrupt(*_: Any) -> None:
-        raise KeyboardInterrupt
-
     from stewart_drake.live.reachy import open_chosen
     from stewart_drake.scenario.link import link_text
 
@@ -324,7 +316,7 @@ def machine(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
             delivery.say_wrapped(
                 f"simulated link: {network}; the controller chooses the delay of the loop"
             )
-        before = signal.signal(signal.SIGTERM, interrupt)
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             moved = f"simulated by {running.simulated_by}"
             if options.reachy is not None:

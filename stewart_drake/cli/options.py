@@ -21,22 +21,22 @@ class Given:
     """
 
     def __init__(self, kind: type[Options], typed: Mapping[str, Any]) -> None:
-        self._kind, self._typed = kind, typed
+        self._kind = kind
+        self._typed = [(one, typed[_name(one)]) for one in _offered(kind)]
 
     @property
     def missing(self) -> list[Option]:
-        return [one for one in _offered(self._kind) if one.required and one.name not in self.given]
+        return [one for one, value in self._typed if one.required and value is None]
 
     @property
     def words(self) -> dict[str, Any]:
         """Typed values for the command on a page."""
-        return {one.dashed: self._typed[_name(one)] for one in _offered(self._kind, True)}
+        return {one.dashed: value for one, value in self._typed if one.recorded}
 
     @property
     def given(self) -> dict[str, Any]:
         """Typed values by field, without those that were not given."""
-        offered = ((one, self._typed[_name(one)]) for one in _offered(self._kind))
-        return {one.name: value for one, value in offered if value is not None}
+        return {one.name: value for one, value in self._typed if value is not None}
 
     def options(
         self,
@@ -50,19 +50,16 @@ class Given:
             more: values by field, which replace typed ones.
         """
         with self.named():
-            values = {one.name: self._value(one, load) for one in _offered(self._kind)}
-            values = {name: value for name, value in values.items() if value is not None}
+            values: dict[str, Any] = {
+                one.name: one.read(value, load) if one.read else value  # type: ignore[arg-type]
+                for one, value in self._typed
+                if value is not None and not (one.read and value == [])
+            }
             return self._kind(**(values | dict(more or {})))
 
     def named(self) -> contextlib.AbstractContextManager[None]:
         """Replace the name of a field in an error by the option that sets it."""
-        return named(**{one.name: f"--{one.dashed}" for one in _offered(self._kind)})
-
-    def _value(self, one: Option, load: Any) -> Any:
-        typed = self._typed[_name(one)]
-        if one.read is None:
-            return typed
-        return one.read(typed, load) if typed else one.default
+        return named(**{one.name: f"--{one.dashed}" for one, _ in self._typed})
 
 
 _GROUPS: Final = {"chosen": Chosen, "delivery": Delivery}
@@ -111,10 +108,8 @@ def command(
     return decorate
 
 
-def _offered(kind: type[Options], recorded: bool = False) -> list[Option]:
-    return [
-        one for one in kind.described() if one.flag is not None and (one.recorded or not recorded)
-    ]
+def _offered(kind: type[Options]) -> list[Option]:
+    return [one for one in kind.described() if one.flag is not None]
 
 
 def _parameter(one: Option) -> inspect.Parameter:
