@@ -16,7 +16,7 @@ from stewart_drake.loop.results import SimulationResult
 from stewart_drake.reporting import style
 from stewart_drake.reporting.document import number
 from stewart_drake.reporting.panels import Curve, Panel, Scale, draw
-from stewart_drake.reporting.run import STILL, moving, worst
+from stewart_drake.reporting.run import FINER, STILL, moving, worst
 from stewart_drake.reporting.style import FACTORS, UNITS, Line
 from stewart_drake.scenario.signals import (
     ANGLES,
@@ -25,6 +25,7 @@ from stewart_drake.scenario.signals import (
     NUM_PARAMETERS,
     PACKETS,
     PARAMETERS,
+    PLANT_PARAMETER_UNITS,
     POSITION,
     WEIGHTS,
 )
@@ -36,12 +37,8 @@ TORQUE_CONTROLLERS: Final = ("delay_lqr", "delay_lqi", "predictor_lqi")
 """Delay-aware controllers, with figures of their torques in a comparison."""
 
 _SYMBOLS: Final = dict(zip(COORDINATES, ("roll φ", "pitch θ", "yaw ψ", "x", "y", "z"), strict=True))
-_PARAMETER_GROUPS: Final = (
-    (slice(0, 6), {"mN m": 1e3, "µN m": 1e6}),
-    (slice(6, 7), {"kg": 1.0, "g": 1e3}),
-    (slice(7, 8), {"mN m s/rad": 1e3, "µN m s/rad": 1e6}),
-)
-"""Components of the parameters that share a unit, with the units to choose from."""
+_PARAMETER_GROUPS: Final = (slice(0, 6), slice(6, 7), slice(7, 8))
+"""Components of the parameters that share a unit."""
 _STATE_REACH: Final = 0.3
 _ERROR_REACH: Final = 0.5
 """Largest widening of an axis by a diverging run, as a share of the reference's peak to peak."""
@@ -258,7 +255,8 @@ def _parameters(run: SimulationResult) -> Figure:
     late |= not late.any()
     kept = np.vstack([values[late] - widths[late], values[late] + widths[late], true])
     shown = np.nanmax(np.abs(kept), axis=0)
-    for some, choice in _PARAMETER_GROUPS:
+    for some in _PARAMETER_GROUPS:
+        choice = FINER[PLANT_PARAMETER_UNITS[some.start]]
         unit, factors[some] = style.unit_for(shown[some], choice)
         units[some] = [unit] * len(units[some])
     true, values, widths = factors * true, factors * values, factors * widths
@@ -268,10 +266,7 @@ def _parameters(run: SimulationResult) -> Figure:
         panels.append(
             Panel(
                 f"{name.replace('_', ' ')}  [{units[k]}]",
-                [
-                    Curve(time, np.full(len(time), true[k]), "true value", style.TRUTH),
-                    Curve(time, value, "estimate", band=(value - width, value + width, "± 2 σ")),
-                ],
+                _estimate(time, value, width, np.full(len(time), true[k])),
                 xlim=xlim,
                 ylim=_limits([kept[:, k]], [], 0.0),
             )
@@ -291,16 +286,20 @@ def _delay(run: SimulationResult) -> Figure:
         ("delay  [s]", 0.0, 1.0, None),
         ("delay minus true one  [ms]", true, 1e3, (-last, last)),
     ):
-        low, value, high = (
-            factor * (signals.delay_estimate.values + part * width - origin) for part in (-1, 0, 1)
-        )
-        truth = Curve(time, factor * (true - origin), "true value", style.TRUTH, steps=True)
-        found = Curve(time, value, "estimate", steps=True, band=(low, high, "± 2 σ"))
-        xlim = (0.0, shown_until(run))
-        panels.append(Panel(name, [truth, found], xlim=xlim, ylim=ylim))
+        value, truth = (factor * (one - origin) for one in (signals.delay_estimate.values, true))
+        curves = _estimate(time, value, factor * width, truth, steps=True)
+        panels.append(Panel(name, curves, xlim=(0.0, shown_until(run)), ylim=ylim))
     title = f"Estimated delay: {signals.delay_estimate.values[-1]:.4g} s at the end"
     title += f", true {true[-1]:.4g} s" if np.isfinite(true[-1]) else ""
     return draw(panels, 2, title=title)
+
+
+def _estimate(
+    time: Array, value: Array, width: Array, true: Array, steps: bool = False
+) -> list[Curve]:
+    band = value - width, value + width, "± 2 σ"
+    truth = Curve(time, true, "true value", style.TRUTH, steps)
+    return [truth, Curve(time, value, "estimate", steps=steps, band=band)]
 
 
 def weights_figure(runs: Mapping[str, SimulationResult]) -> Figure:

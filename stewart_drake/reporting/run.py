@@ -47,7 +47,7 @@ _MAY_BE_LATE: Final = (
     "a late measurement is used at the sample at which it comes, unless a newer one has come"
 )
 
-_FINER: Final = {
+FINER: Final = {
     "N m": TORQUES,
     "N m s/rad": {"N m s/rad": 1.0, "mN m s/rad": 1e3, "µN m s/rad": 1e6},
     "kg": {"kg": 1.0, "g": 1e3},
@@ -89,7 +89,7 @@ def _estimates(run: SimulationResult) -> list[str]:
     for name, unit in zip(PLANT_PARAMETERS, PLANT_PARAMETER_UNITS, strict=True):
         found = run.summary["estimates"].get(name)
         if found is not None and name not in PARAMETERS[BIAS]:
-            unit, factor = unit_for(2 * found["std"], _FINER.get(unit, {unit: 1.0}))
+            unit, factor = unit_for(2 * found["std"], FINER.get(unit, {unit: 1.0}))
             width, value = measured(2 * factor * found["std"], factor * found["value"])
             shown.append(f"{name.replace('_', ' ')} {value} ± {width} {unit}")
     return shown
