@@ -43,8 +43,7 @@ def read_signals(path: Path) -> xr.Dataset:
     """Return the signals of a run, which `columns_of` can write; `path` as of `read_log`."""
     try:
         signals = read_log(path)
-        for needed in ("time", "pose", "torque_applied"):
-            signals[needed].values.astype(float)
+        signals[["time", "pose", "torque_applied"]].astype(float)
         signals_csv(signals)
     except ConfigError as error:
         raise ConfigError(f"signals: {error}") from None

@@ -43,8 +43,6 @@ def document(study: DelayStudy) -> Document:
         bandwidth=_BANDWIDTH,
         gives_way=1.0 / stiffness,
         known=known and milliseconds(known.delay_margin),
-        limits=study.poles and study.limits,
-        growths=study.poles and study.growths,
         floors=sorted(study.floors.items()),
         growth_figure=study.poles and partial(growth_figure, study),
         floor=study.floors[steps],

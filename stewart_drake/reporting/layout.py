@@ -49,7 +49,6 @@ def document(study: LayoutStudy) -> Document:
 
 
 def _by_machine(
-    names: Sequence[str],
     head: str,
     rows: Sequence[tuple[str, str, Callable[[Layout], str]]],
     machines: Sequence[Layout],
@@ -57,7 +56,7 @@ def _by_machine(
 ) -> Table:
     """Return a table with a column per machine; a row has a name, a text, and a function."""
     cells = [(name, text, *map(cell, machines)) for name, text, cell in rows]
-    return Table(("", head, *names), cells, brief=brief)
+    return Table(("", head, *(one.name for one in machines)), cells, brief=brief)
 
 
 def _compared(study: LayoutStudy, machines: list[Layout]) -> Table:
@@ -76,7 +75,7 @@ def _compared(study: LayoutStudy, machines: list[Layout]) -> Table:
         ("E_ac [% s]", "", lambda one: number(one.outcome.error)),
         ("largest torque [N\u00a0m]", "", lambda one: number(one.outcome.peak_torque)),
     ]
-    return _by_machine([one.name for one in machines], "limit", rows, machines, brief=True)
+    return _by_machine("limit", rows, machines, brief=True)
 
 
 def _run(one: Layout) -> str:
@@ -102,4 +101,4 @@ def _numbers(study: LayoutStudy, machines: list[Layout]) -> Table:
         rows.append((name, between if low < high else "kept", partial(value, k)))
     signs = ("branches", "", lambda one: "".join("-+"[int(b > 0)] for b in one.mechanism.branches))
     order = ("plate_order", "", lambda one: "".join(map(str, one.order)))
-    return _by_machine([one.name for one in machines], "between", [*rows, signs, order], machines)
+    return _by_machine("between", [*rows, signs, order], machines)

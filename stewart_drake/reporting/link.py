@@ -10,15 +10,11 @@ from matplotlib.figure import Figure
 from stewart_drake.reporting.document import Document, from_template
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import Line, line
-from stewart_drake.studies.link import NEGLIGIBLE, Cell, LinkStudy
+from stewart_drake.studies.link import NEGLIGIBLE, LinkStudy
 from stewart_drake.studies.statistics import CONFIDENCE
 
 _ASSURED: Final = 0.9
 """Share of runs for which the verdict states the number of simulations."""
-
-
-def _mean(cell: Cell) -> float:
-    return float(np.mean(cell.errors)) if cell.errors else math.nan
 
 
 def document(study: LinkStudy) -> Document:
@@ -31,7 +27,6 @@ def document(study: LinkStudy) -> Document:
         "link",
         "bad" if not own else "fair" if undecided or unsure else "good",
         study=study,
-        mean=_mean,
         spread=lambda cell: float(np.std(cell.errors, ddof=1)),
         same=", ".join(same),
         undecided=undecided,
@@ -49,9 +44,7 @@ def bound_figure(study: LinkStudy) -> Figure:
     bounds = [cell.bound for cell in done for _ in cell.errors]
     errors = [error for cell in done for error in cell.errors]
     dots = Line("#9AA3AD", "", 1.0, "o", markersize=3)
-    means = Curve(
-        [cell.bound for cell in done], [_mean(cell) for cell in done], "mean E_ac", line(0)
-    )
+    means = Curve([cell.bound for cell in done], [cell.mean for cell in done], "mean E_ac", line(0))
     late = [100 * cell.late for cell in study.bounds]
     marks = {} if study.best is None else {study.best.bound: "best bound"}
     error = Panel(

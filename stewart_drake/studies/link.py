@@ -58,9 +58,14 @@ class Cell(NamedTuple):
         return least_share(len(self.errors), self.runs) if self.runs else math.nan
 
     @property
+    def mean(self) -> float:
+        """Mean E_ac in % s of the completed runs, NaN without one."""
+        return float(np.mean(self.errors)) if self.errors else math.nan
+
+    @property
     def expected(self) -> float:
-        """Mean E_ac in % s of the completed runs, infinite if one was lost."""
-        return float(np.mean(self.errors)) if self.errors and self.completed == 1 else math.inf
+        """The same, infinite if a run was lost."""
+        return self.mean if self.completed == 1 else math.inf
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -97,15 +102,14 @@ class LinkStudy:
         for cell in self.bounds:
             if best is None or cell is best or len(cell.errors) < len(best.errors):
                 continue
-            mean = np.mean(best.errors)
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore", RuntimeWarning)  # errors that hardly differ
                 paired = cell.completed == best.completed == 1
                 test: Any = stats.ttest_rel if paired else stats.ttest_ind
                 # Each end of the two-sided 90 % interval is a one-sided 95 % bound.
                 interval = test(cell.errors, best.errors).confidence_interval(2 * CONFIDENCE - 1)
-            if np.mean(cell.errors) / mean - 1 < NEGLIGIBLE or not interval.low > 0:
-                found[cell.bound] = float(interval.high / mean)
+            if cell.mean / best.mean - 1 < NEGLIGIBLE or not interval.low > 0:
+                found[cell.bound] = float(interval.high / best.mean)
         return found
 
     @property
@@ -205,7 +209,7 @@ def bounds_for(link: NetworkConfig, period: float) -> list[float]:
 
 def best_of(cells: Iterable[Cell]) -> Cell | None:
     done = [cell for cell in cells if cell.errors]
-    return min(done, key=lambda c: (-c.completed, np.mean(c.errors)), default=None)
+    return min(done, key=lambda c: (-c.completed, c.mean), default=None)
 
 
 def _possible(scenario: Scenario, link: NetworkConfig, bound: float) -> bool:

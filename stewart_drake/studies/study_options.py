@@ -6,7 +6,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
@@ -17,6 +17,12 @@ from stewart_drake.studies.options import JobOptions, Options, option
 
 _TORQUE_SHARE: Final = "share of the reference's largest torque"
 _CRANK_SHARE: Final = "share of the mean crank length"
+
+
+def _rising(pair: list[float] | None) -> list[float] | None:
+    if pair and pair[0] > pair[1]:
+        raise ValueError("the lesser one first")
+    return pair
 
 
 def _share(unit: str, **bounds: Any) -> Any:
@@ -42,6 +48,7 @@ class Ranges:
     torque_limit: Annotated[
         Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=2, max_length=2)] | None,
         Field(description="[least, most] in peak torques of the undisturbed run"),
+        AfterValidator(_rising),
     ] = field(default_factory=lambda: [1.0, 3.0])
     # friction torque of a crank, uniform from 0
     damping: Annotated[float, _share(f"{_TORQUE_SHARE}, at its largest crank speed")] = 0.02
@@ -71,14 +78,7 @@ RANGE_UNITS: Final = units_of(Ranges)
 
 def read_ranges(settings: Iterable[str]) -> Ranges:
     """Return the ranges of `name=value` settings, the value in YAML; others keep their default."""
-    ranges = validate_pairs(Ranges, settings, "--vary", RANGE_UNITS)
-    limit = ranges.torque_limit
-    if limit is not None and limit[0] > limit[1]:
-        raise ConfigError(
-            f"--vary: torque_limit: got {limit!r}; expected the lesser one first"
-            f" (torque_limit: {RANGE_UNITS['torque_limit']})"
-        )
-    return ranges
+    return validate_pairs(Ranges, settings, "--vary", RANGE_UNITS)
 
 
 class DelayOptions(Options):
