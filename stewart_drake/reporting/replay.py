@@ -34,8 +34,12 @@ def replay(signals: xr.Dataset, mechanism: Mechanism, meshcat: Meshcat | None = 
     """
     meshcat = meshcat or _quiet_meshcat()
     scene, shown = Scene(mechanism, meshcat), _thinned(signals)
-    _draw_paths(meshcat, shown)
-    period = _period(shown)
+    for name, signal in (("reference", "reference"), ("plate", "pose")):
+        path = shown[signal].values[:, POSITION].T
+        if path.shape[1] > 1:
+            meshcat.SetLine(f"/paths/{name}", path, 1.5, _PATH_COLORS[name])
+    # The shortest time between two frames: samples may lie between grid steps.
+    period = float(np.min(np.diff(shown.time.values), initial=1.0))
     meshcat.StartRecording(1 / period, set_visualizations_while_recording=False)
     frames = zip(shown.time.values, shown.pose.values, shown.reference.values, strict=True)
     for t, pose, wanted in frames:
@@ -130,19 +134,6 @@ def _quiet_meshcat() -> Meshcat:
 
 def _thinned(signals: xr.Dataset) -> xr.Dataset:
     return signals.isel(time=slice(None, None, -(-signals.sizes["time"] // _MAX_FRAMES) or 1))
-
-
-def _period(signals: xr.Dataset) -> float:
-    """Return the shortest time between two frames, s; samples may lie between grid steps."""
-    steps = np.diff(signals.time.values)
-    return float(steps.min()) if len(steps) else 1.0
-
-
-def _draw_paths(meshcat: Meshcat, signals: xr.Dataset) -> None:
-    for name, signal in (("reference", "reference"), ("plate", "pose")):
-        path = signals[signal].values[:, POSITION].T
-        if path.shape[1] > 1:
-            meshcat.SetLine(f"/paths/{name}", path, 1.5, _PATH_COLORS[name])
 
 
 def _turns(signals: xr.Dataset) -> Array:

@@ -73,6 +73,11 @@ class Mode:
     # for a mode that passes
     directions: Complex
 
+    @property
+    def name(self) -> str:
+        imaginary = f" ± {self.eigenvalue.imag:.3g}j" if self.eigenvalue.imag else ""
+        return f"{self.eigenvalue.real:.3g}{imaginary}"
+
 
 @dataclass(frozen=True)
 class Hautus:
@@ -227,14 +232,6 @@ def describe(directions: NDArray[np.complex128], labels: list[Label]) -> str:
     elif torques:
         named.append(f"torques {torques[0]} to {torques[-1]}")
     return f"{d} direction{'s' if d > 1 else ''} in {' and '.join(named)}"
-
-
-def _mode_text(mode: Mode, labels: list[Label]) -> str:
-    """Return what fails in a mode, and its eigenvalue: `1 direction in pose error (x), mode 0`."""
-    value = f"{mode.eigenvalue.real:.3g}"
-    if mode.eigenvalue.imag:
-        value += f" ± {mode.eigenvalue.imag:.3g}j"
-    return f"{describe(mode.directions, labels)}, mode {value}"
 
 
 @dataclass(frozen=True)
@@ -412,7 +409,7 @@ def _test(
     asked = (IsControllable, IsStabilizable, IsObservable, IsDetectable)
     drake = {word: bool(ask(system)) for word, ask in zip(QUESTIONS, asked, strict=True)}
     words = [
-        f"no {part} {_mode_text(mode, labels)}"
+        f"no {part} {describe(mode.directions, labels)}, mode {mode.name}"
         for part, test in (("torque reaches", reach), ("output shows", view))
         for mode in test.deficient
     ]
