@@ -1,6 +1,5 @@
 """Document of a search for a layout."""
 
-from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
 
@@ -48,34 +47,21 @@ def document(study: LayoutStudy) -> Document:
     return found
 
 
-def _by_machine(
-    head: str,
-    rows: Sequence[tuple[str, str, Callable[[Layout], str]]],
-    machines: Sequence[Layout],
-    brief: bool = False,
-) -> Table:
-    """Return a table with a column per machine; a row has a name, a text, and a function."""
-    cells = [(name, text, *map(cell, machines)) for name, text, cell in rows]
-    return Table(("", head, *(one.name for one in machines)), cells, brief=brief)
-
-
 def _compared(study: LayoutStudy, machines: list[Layout]) -> Table:
-    def measured(name: str, one: Layout) -> str:
-        return number(MEASURES[name].factor * one.measures.get(name, np.nan))
-
-    rows: list[tuple[str, str, Callable[[Layout], str]]] = []
+    rows: list[tuple[str, ...]] = []
     for name, measure in MEASURES.items():
         unit = "" if measure.shown == "-" else f" [{measure.shown}]"
         limit = study.problem.requirements.limits.get(name)
         sign = "≥" if measure.more else "≤"
         asked = "" if limit is None else f"{sign} {limit * measure.factor:g}"
-        rows.append((name.removesuffix("_deg") + unit, asked, partial(measured, name)))
+        found = (number(measure.factor * one.measures.get(name, np.nan)) for one in machines)
+        rows.append((name.removesuffix("_deg") + unit, asked, *found))
     rows += [
-        ("scenario", "", _run),
-        ("E_ac [% s]", "", lambda one: number(one.outcome.error)),
-        ("largest torque [N\u00a0m]", "", lambda one: number(one.outcome.peak_torque)),
+        ("scenario", "", *map(_run, machines)),
+        ("E_ac [% s]", "", *(number(one.outcome.error) for one in machines)),
+        ("largest torque [N\u00a0m]", "", *(number(one.outcome.peak_torque) for one in machines)),
     ]
-    return _by_machine("limit", rows, machines, brief=True)
+    return Table(("", "limit", *(one.name for one in machines)), rows, brief=True)
 
 
 def _run(one: Layout) -> str:
@@ -90,15 +76,14 @@ def _shares(shares: dict[str, float]) -> str:
 
 
 def _numbers(study: LayoutStudy, machines: list[Layout]) -> Table:
-    def value(k: int, one: Layout) -> str:
-        return f"{one.values[k]:.4g}"
-
-    rows: list[tuple[str, str, Callable[[Layout], str]]] = []
+    rows: list[tuple[str, ...]] = []
     for k, name in enumerate(PARAMETERS):
         low, high = study.problem.space.bounds[name]
         centred = name == "plate_offset_deg" and study.problem.space.offset_from_centre
         between = f"{low:g} to {high:g}" + (" from centre" if centred else "")
-        rows.append((name, between if low < high else "kept", partial(value, k)))
-    signs = ("branches", "", lambda one: "".join("-+"[int(b > 0)] for b in one.mechanism.branches))
-    order = ("plate_order", "", lambda one: "".join(map(str, one.order)))
-    return _by_machine("between", [*rows, signs, order], machines)
+        values = (f"{one.values[k]:.4g}" for one in machines)
+        rows.append((name, between if low < high else "kept", *values))
+    signs = ("".join("-+"[int(b > 0)] for b in one.mechanism.branches) for one in machines)
+    orders = ("".join(map(str, one.order)) for one in machines)
+    rows += [("branches", "", *signs), ("plate_order", "", *orders)]
+    return Table(("", "between", *(one.name for one in machines)), rows)
