@@ -112,21 +112,14 @@ def growth_figure(study: DelayStudy) -> Figure:
     longest = max(2.5 * study.eta, 0.1)
     delay = np.linspace(0, longest, 200)
     decades = np.minimum(max(moving) * delay / np.log(10), 30)
-    left = Panel(
-        "fastest unstable pole p  [1/s]",
-        poles,
-        "time on the reference  [s]",
-        ylim=(0, None),
-        height=2.6,
-    )
+    over = "time on the reference  [s]"
+    left = Panel("fastest unstable pole p  [1/s]", poles, over, ylim=(0, None), height=2.6)
+    words = {HARDLY: "hardly", NO: "not"}
     right = Panel(
         "growth $e^{pη}$ at the worst instant",
         [Curve(delay, 10**decades)],
         "delay η  [s]",
-        limits={
-            HARDLY: f"hardly compensated above {HARDLY:g}",
-            NO: f"not compensated above {NO:g}",
-        },
+        limits={level: f"{word} compensated above {level:g}" for level, word in words.items()},
         marks={study.eta: f"this delay, {study.eta:.3g} s"},
         yscale="powers",
         xlim=(0, longest),
@@ -137,34 +130,27 @@ def growth_figure(study: DelayStudy) -> Figure:
 
 def loop_figure(study: DelayStudy) -> Figure:
     loops = [loop for loop in study.loops if loop.radius < 1]
-    single = [100 * _least(m.motor) if m.motor else np.nan for m in loops]
-    curves = {
-        "peak over all frequencies": {
-            "S": [m.S.value for m in loops],
-            "T": [m.T.value for m in loops],
-        },
-        "tolerable error of the gain  [%]": {
-            "one motor": single,
-            "all motors": [100 * _least(m.margins) for m in loops],
-        },
-        "tolerable error of the delay  [ms]": {
-            "longer": [1e3 * m.margins.longer for m in loops],
-            "shorter": [1e3 * m.margins.shorter for m in loops],
-        },
-    }
     steps = [loop.steps for loop in loops]
     own = study.assessment.experiment.scenario.true_delay.steps
+
+    def panel(name: str, curves: dict[str, list[float]]) -> Panel:
+        lines = [Curve(steps, y, label, line(k)) for k, (label, y) in enumerate(curves.items())]
+        how: Any = {"marks": {own: ""}, "yscale": "log", "legend": "inside", "height": 2.4}
+        return Panel(name, lines, "delay μ  [periods]", **how)
+
+    peaks = {"S": [m.S.value for m in loops], "T": [m.T.value for m in loops]}
+    gains = {
+        "one motor": [100 * _least(m.motor) if m.motor else np.nan for m in loops],
+        "all motors": [100 * _least(m.margins) for m in loops],
+    }
+    delays = {
+        "longer": [1e3 * m.margins.longer for m in loops],
+        "shorter": [1e3 * m.margins.shorter for m in loops],
+    }
     panels = [
-        Panel(
-            name,
-            [Curve(steps, y, label, line(k)) for k, (label, y) in enumerate(pair.items())],
-            "delay μ  [periods]",
-            marks={own: ""},
-            yscale="log",
-            legend="inside",
-            height=2.4,
-        )
-        for name, pair in curves.items()
+        panel("peak over all frequencies", peaks),
+        panel("tolerable error of the gain  [%]", gains),
+        panel("tolerable error of the delay  [ms]", delays),
     ]
     return draw(panels, 3)
 

@@ -191,14 +191,12 @@ def _coordinates(
         data = [FACTORS[k] * run.signals[signal].values[:, k] for run, _ in runs.values()]
         behind = wanted[k : k + 1]
         core = [*(np.asarray(curve.y) for curve in behind), *_trusted(runs, data)]
-        panels.append(
-            Panel(
-                f"{_SYMBOLS[COORDINATES[k]]}{word}  [{unit}]",
-                [*behind, *_curves(runs, data)],
-                xlim=_times(runs),
-                ylim=_limits(core, data, reach[k], least[k]),
-            )
+        name, curves = (
+            f"{_SYMBOLS[COORDINATES[k]]}{word}  [{unit}]",
+            [*behind, *_curves(runs, data)],
         )
+        ylim = _limits(core, data, reach[k], least[k])
+        panels.append(Panel(name, curves, xlim=_times(runs), ylim=ylim))
     return draw([*panels, *below], 2, down=True, title=title)
 
 
@@ -262,15 +260,9 @@ def _parameters(run: SimulationResult) -> Figure:
     true, values, widths = factors * true, factors * values, factors * widths
     panels, kept = [], factors * kept
     for k, name in enumerate(PARAMETERS):
-        value, width = values[:, k], widths[:, k]
-        panels.append(
-            Panel(
-                f"{name.replace('_', ' ')}  [{units[k]}]",
-                _estimate(time, value, width, np.full(len(time), true[k])),
-                xlim=xlim,
-                ylim=_limits([kept[:, k]], [], 0.0),
-            )
-        )
+        curves = _estimate(time, values[:, k], widths[:, k], np.full(len(time), true[k]))
+        axis, ylim = f"{name.replace('_', ' ')}  [{units[k]}]", _limits([kept[:, k]], [], 0.0)
+        panels.append(Panel(axis, curves, xlim=xlim, ylim=ylim))
     inside = np.abs(values[-1] - true) <= widths[-1]
     title = f"Estimated parameters: {inside.sum()} of {len(inside)} true values in the final ± 2 σ"
     title += ". Axes fit the second half; the start is cut off"

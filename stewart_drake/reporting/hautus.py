@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import groupby
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from stewart_drake.reporting.document import Document, Paragraph, capital, from_template
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import Line, line
-from stewart_drake.studies.hautus import HautusStudy, System
+from stewart_drake.studies.hautus import TOLERANCE, HautusStudy, System
 
 _CHAINS: Final = ("minimal chain", "paper's chain", "chain under gravity")
 _SMALLEST: Final = 1e-18
@@ -91,49 +91,35 @@ def _deficiencies(systems: Sequence[System]) -> list[Paragraph]:
 
 
 def chain_figure(study: HautusStudy) -> Figure:
-    lines = {
-        name: ([s.steps or 0 for s in study.family(name)], study.family(name), line(k))
-        for k, name in enumerate(_CHAINS)
-    }
-    return draw(_margins(study, lines, "delay μ  [periods]", _envelope(study)), 2)
+    lines = {name: (study.family(name), line(k)) for k, name in enumerate(_CHAINS)}
+    return _margin_figure(lines, "delay μ  [periods]", _envelope(study))
 
 
 def plant_figure(study: HautusStudy) -> Figure:
-    lines = {}
-    for where, look in (("without", line(0)), ("under", line(2))):
-        some = [
-            s
-            for s in study.family("plant")
-            if f"plant {where} gravity" in s.name and s.time is not None
-        ]
-        lines[f"{where} gravity"] = ([s.time or 0.0 for s in some], some, look)
-    return draw(_margins(study, lines, "time on the reference  [s]"), 2)
+    moved = [system for system in study.family("plant") if system.time is not None]
+    lines = {
+        where: ([system for system in moved if where in system.name], look)
+        for where, look in (("without gravity", line(0)), ("under gravity", line(2)))
+    }
+    return _margin_figure(lines, "time on the reference  [s]")
 
 
-def _margins(
-    study: HautusStudy,
-    lines: Mapping[str, tuple[Sequence[float], Sequence[System], Line]],
-    over: str,
-    more: Sequence[Curve] = (),
-) -> list[Panel]:
-    """Return margins of controllability and observability, against the tolerance."""
-    tolerance, panels = study.systems[0].reach.tolerance, []
+def _margin_figure(
+    lines: Mapping[str, tuple[Sequence[System], Line]], over: str, more: Sequence[Curve] = ()
+) -> Figure:
+    """Draw margins of controllability, with more curves, and of observability."""
+    panels = []
     for word, title in {"controllable": "controllability", "observable": "observability"}.items():
-        curves = [
-            Curve(x, np.maximum([one.margins[word] for one in systems], _SMALLEST), label, look)
-            for label, (x, systems, look) in lines.items()
-        ]
-        panels.append(
-            Panel(
-                f"margin of {title}",
-                [*curves, *(more if word == "controllable" else ())],
-                over,
-                limits={tolerance: f"tolerance {tolerance:g}"},
-                yscale="powers",
-                height=2.5,
-            )
-        )
-    return panels
+        curves = []
+        for label, (systems, look) in lines.items():
+            x = [one.steps or one.time or 0.0 for one in systems]
+            margins = np.maximum([one.margins[word] for one in systems], _SMALLEST)
+            curves.append(Curve(x, margins, label, look))
+        curves += more if word == "controllable" else ()
+        limits = {TOLERANCE: f"tolerance {TOLERANCE:g}"}
+        how: Any = {"limits": limits, "yscale": "powers", "height": 2.5}
+        panels.append(Panel(f"margin of {title}", curves, over, **how))
+    return draw(panels, 2)
 
 
 def _envelope(study: HautusStudy) -> list[Curve]:

@@ -56,12 +56,11 @@ def error_figure(study: LearnStudy) -> Figure:
     errors = [one.error for one in study.repetitions]
     curve = Curve(np.arange(1, len(errors) + 1), errors, "", line(0))
     name = "{}  [{}]".format(*study.measure).removeprefix("the ")
-    panel = Panel(name, [curve], "repetition", yscale="log", height=2.5, paint=_count)
-    return draw([panel])
 
+    def paint(ax: Axes) -> None:
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
 
-def _count(ax: Axes) -> None:
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    return draw([Panel(name, [curve], "repetition", yscale="log", height=2.5, paint=paint)])
 
 
 def time_figure(study: LearnStudy) -> Figure:

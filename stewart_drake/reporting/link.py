@@ -2,13 +2,13 @@
 
 import math
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from stewart_drake.reporting.document import Document, from_template
-from stewart_drake.reporting.panels import Curve, Panel, draw
+from stewart_drake.reporting.panels import Curve, Panel, Scale, draw
 from stewart_drake.reporting.style import Line, line
 from stewart_drake.studies.link import NEGLIGIBLE, LinkStudy
 from stewart_drake.studies.statistics import CONFIDENCE
@@ -45,22 +45,10 @@ def bound_figure(study: LinkStudy) -> Figure:
     errors = [error for cell in done for error in cell.errors]
     dots = Line("#9AA3AD", "", 1.0, "o", markersize=3)
     means = Curve([cell.bound for cell in done], [cell.mean for cell in done], "mean E_ac", line(0))
-    late = [100 * cell.late for cell in study.bounds]
+    late = Curve([c.bound for c in study.bounds], [100 * c.late for c in study.bounds], "", line(1))
     marks = {} if study.best is None else {study.best.bound: "best bound"}
-    error = Panel(
-        "E_ac  [% s]",
-        [Curve(bounds, errors, "runs", dots), means],
-        "bound  [s]",
-        marks=marks,
-        yscale="log" if done else "linear",
-        height=2.5,
-    )
-    share = Panel(
-        "late packets  [%]",
-        [Curve([cell.bound for cell in study.bounds], late, "", line(1))],
-        "bound  [s]",
-        marks=marks,
-        ylim=(0, 100),
-        height=2.5,
-    )
-    return draw([error, share], 2)
+    how: Any = {"x": "bound  [s]", "marks": marks, "height": 2.5}
+    runs = Curve(bounds, errors, "runs", dots)
+    yscale: Scale = "log" if done else "linear"
+    left = Panel("E_ac  [% s]", [runs, means], yscale=yscale, **how)
+    return draw([left, Panel("late packets  [%]", [late], ylim=(0, 100), **how)], 2)

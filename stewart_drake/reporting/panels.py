@@ -98,11 +98,8 @@ def draw(
     alike = sharey == "row" or (sharey and len({one.y for one in grid}) == 1)
     in_row = [[one for one, (r, _) in pairs if r == row] for row in range(spots[-1][0] + 1)]
     heights = [max(one.height for one in row) for row in in_row]
-    figure, first, named = (
-        Figure(figsize=(style.WIDTH, 1.0), layout="constrained"),
-        dict[int, Axes](),
-        set(),
-    )
+    figure = Figure(figsize=(style.WIDTH, 1.0), layout="constrained")
+    first, named = dict[int, Axes](), set[int]()
     spec = figure.add_gridspec(len(heights), columns, height_ratios=heights)
     for one, (row, column) in pairs:
         sharex = sharey != "row" and one.x == grid[0].x and not one.wide

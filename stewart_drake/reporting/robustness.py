@@ -160,17 +160,14 @@ def _span(low: float, high: float) -> str:
 def _worst_table(study: RobustnessStudy) -> Table:
     values, units = factor_values(study.draws), factors(study.draws)
     order = np.argsort(np.where(np.isnan(study.errors), np.inf, study.errors), kind="stable")[::-1]
-
-    def outcome(i: int) -> str:
+    rows = []
+    for i in order[:_WORST].tolist():
         one = study.outcomes[i]
-        return number(one.error) if one.status == "completed" else f"ends at {one.time:.2f} s"
-
-    def drawn(name: str, i: int) -> str:
-        return f"{values[name][i]:.3g}"
-
-    heads = ("run", "E_ac, % s", *(f"{title(name)}, {unit}" for name, unit in units.items()))
-    shown = order[:_WORST].tolist()
-    return Table(heads, [(str(i), outcome(i), *(drawn(name, i) for name in units)) for i in shown])
+        done = number(one.error) if one.status == "completed" else f"ends at {one.time:.2f} s"
+        rows.append((str(i), done, *(f"{values[name][i]:.3g}" for name in units)))
+    return Table(
+        ("run", "E_ac, % s", *(f"{title(name)}, {unit}" for name, unit in units.items())), rows
+    )
 
 
 def distribution_figure(study: RobustnessStudy) -> Figure:
@@ -204,17 +201,10 @@ def influence_figure(influences: Sequence[Influence]) -> Figure:
         failures = [(one.failure, one.failure_p) for one in influences]
         shown["rank correlation with failing, all runs"] = failures
     names = [title(one.factor) for one in influences]
-    panels = [
-        Panel(
-            "",
-            x=label,
-            xlim=(-1, 1),
-            ylim=(len(names) - 0.5, -0.5),
-            height=0.5 + 0.27 * len(names),
-            paint=partial(_draw_correlations, found=found, names=names),
-        )
-        for label, found in shown.items()
-    ]
+    rows = len(names)
+    how: Any = {"xlim": (-1, 1), "ylim": (rows - 0.5, -0.5), "height": 0.5 + 0.27 * rows}
+    paint = partial(_draw_correlations, names=names)
+    panels = [Panel("", x=x, paint=partial(paint, found=one), **how) for x, one in shown.items()]
     return draw(panels, len(panels), sharey=True)
 
 
@@ -260,17 +250,12 @@ def runs_figure(study: RobustnessStudy) -> Figure:
             ax.text(0.5, 0.5, "none", transform=ax.transAxes, ha="center", color=_GREY)
 
     values = factor_values(study.draws)
-    panels = [
-        Panel(
-            "E_ac  [% s]",
-            x=f"{title(name)}  [{unit}]",
-            yscale="log",
-            ylim=(low, top),
-            height=1.9,
-            paint=partial(paint, x=values[name]),
+    panels = []
+    for name, unit in units.items():
+        how: Any = {"x": f"{title(name)}  [{unit}]", "ylim": (low, top), "height": 1.9}
+        panels.append(
+            Panel("E_ac  [% s]", yscale="log", paint=partial(paint, x=values[name]), **how)
         )
-        for name, unit in units.items()
-    ]
     return draw(panels, 4, sharey=True)
 
 

@@ -88,15 +88,10 @@ def _regression(training: Training) -> Figure:
     for k, name in enumerate(("w_Q", "w_R")):
         target, output = training.targets[:, k], training.outputs[:, k]
         ends = [target.min(), target.max()] if len(target) else [0.0, 0.0]
-        panels.append(
-            Panel(
-                f"network, {unit}{name}",
-                [Curve(ends, ends, "ideal", REFERENCE)],
-                f"label, {unit}{name}",
-                height=2.6,
-                paint=partial(_outputs, target=target, output=output),
-            )
-        )
+        ideal = Curve(ends, ends, "ideal", REFERENCE)
+        axes = f"network, {unit}{name}", [ideal], f"label, {unit}{name}"
+        paint = partial(_outputs, target=target, output=output)
+        panels.append(Panel(*axes, height=2.6, paint=paint))
     return draw(panels, 2)
 
 

@@ -105,28 +105,19 @@ def margins_figure(study: WorkspaceStudy) -> Figure:
             style: Any = {"color": "#000000", "alpha": 0.07, "lw": 0}
             ax.axvspan(left.time, time[-1], label="after leaving", **style)
 
+    how: Any = {"xlim": (0, time[-1]), "height": 2.8, "paint": shade}
+    of_sines: Any = {"limits": {DEAD_CENTRE_SINE: ""}, "ylim": (max(-0.05, lowest), 1.05)}
+    of_parallel: Any = {"limits": {SINGULARITY_LIMIT: ""}, "ylim": (-0.1, None)}
+    of_condition: Any = {"ylim": (0.95, 1.25 * top), "yscale": "log"}
+    condition = [Curve(time, margins.condition)]
+    reach = leg_curves(time, 1e3 * margins.reach)
     panels = [
-        ("reach margin  [mm]", leg_curves(time, 1e3 * margins.reach), {0.0: ""}, None),
-        ("sine off dead centre  [-]", sines, {DEAD_CENTRE_SINE: ""}, (max(-0.05, lowest), 1.05)),
-        ("parallel measure, det W  [-]", inside, {SINGULARITY_LIMIT: ""}, (-0.1, None)),
-        ("condition number of A  [-]", [Curve(time, margins.condition)], {}, (0.95, 1.25 * top)),
+        Panel("reach margin  [mm]", reach, limits={0.0: ""}, **how),
+        Panel("sine off dead centre  [-]", sines, **of_sines, **how),
+        Panel("parallel measure, det W  [-]", inside, **of_parallel, **how),
+        Panel("condition number of A  [-]", condition, **of_condition, **how),
     ]
-    return draw(
-        [
-            Panel(
-                name,
-                curves,
-                limits=limits,
-                xlim=(0, time[-1]),
-                ylim=ylim,
-                yscale="log" if "condition" in name else "linear",
-                height=2.8,
-                paint=shade,
-            )
-            for name, curves, limits, ylim in panels
-        ],
-        2,
-    )
+    return draw(panels, 2)
 
 
 def motors_figure(sizing: Sizing, torque_limit: float | None) -> Figure:
