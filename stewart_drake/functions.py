@@ -88,7 +88,7 @@ def identify(
     if not paths:
         raise ConfigError("logs: got none; expected one or more")
     if delay is not None and not 0 <= delay <= 100:
-        raise ConfigError(f"delay: got {delay!r}; expected 0 to 100 s")
+        raise ConfigError(f"delay: got {delay:g}; expected 0 to 100 s")
     if all(is_run(Path(path)) for path in paths):
         of_csv = {"precision": precision, "gravity": None if gravity else gravity}
         refuse(of_csv, "with logs of runs, which contain it; expected it with a CSV log only")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from stewart_drake.cli.common import Chosen, Delivery, command_line
+from stewart_drake.cli.common import Chosen, Delivery, command_line, named
 from stewart_drake.cli.options import command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.progress import shown_by
@@ -71,15 +71,8 @@ def identify(
     if (plan is None) == (not logs):
         given = "neither" if plan is None else "both"
         raise ConfigError(f"LOG, --plan: got {given}; expected logs, or --plan SCENARIO")
-    if delay is not None and not 0 <= delay <= 100:
-        raise ConfigError(f"--delay: got {delay:g}; expected 0 to 100 s")
-    typed: dict[str, Any] = {
-        "delay": delay,
-        "tolerance": tolerance,
-        "bits": bits,
-        "pose-std": pose_std,
-    }
-    typed["out"] = delivery.out
+    typed: dict[str, Any] = {"delay": delay, "tolerance": tolerance, "bits": bits}
+    typed |= {"pose-std": pose_std, "out": delivery.out}
     of_csv = {"--bits": bits, "--pose-std": pose_std, "--gravity": gravity}
     if plan is not None:
         of_scenario = {"--mechanism": mechanism, "--delay": delay, "--gravity": gravity}
@@ -109,7 +102,7 @@ def identify(
         words = [*map(str, logs or []), *(["--no-gravity"] if gravity is False else [])]
         options = {"mechanism": mechanism, **typed}
         more["command"] = command_line("identify", *words, options=options)
-        with phase_bar("identify", delivery.quiet) as show, shown_by(show):
+        with named(delay="--delay"), phase_bar("identify", delivery.quiet) as show, shown_by(show):
             found = functions.identify(
                 logs or [], mechanism or "", delay=delay, gravity=gravity is not False, **more
             )

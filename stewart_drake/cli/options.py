@@ -125,12 +125,8 @@ def _parameter(one: Option) -> inspect.Parameter:
         metavar=one.metavar,
         help=one.help + " Repeatable." * bool(one.read),
     )
-    return inspect.Parameter(
-        _name(one),
-        inspect.Parameter.KEYWORD_ONLY,
-        annotation=Annotated[annotation, option],
-        default=default,
-    )
+    kind, shown = inspect.Parameter.KEYWORD_ONLY, Annotated[annotation, option]
+    return inspect.Parameter(_name(one), kind, annotation=shown, default=default)
 
 
 def _name(one: Option) -> str:

@@ -79,14 +79,10 @@ def analysis_function(name: str) -> Callable[..., AnalysisResult]:
         if row.exact:
             loaded = _exact(loaded)
             options = options.model_copy(update=_exact(dict(options)))
+        command = f"sd.{words}({scenario!r}{shown})"
         with TemporaryDirectory() as scratch:
-            return analyze(
-                name,
-                loaded,
-                options,
-                command=f"sd.{words}({scenario!r}{shown})",
-                directory=directory or scratch,
-            )
+            where = directory or scratch
+            return analyze(name, loaded, options, command=command, directory=where)
 
     own = inspect.signature(call)
     kept = [one for one in own.parameters.values() if row.keeps or one.name != "directory"]

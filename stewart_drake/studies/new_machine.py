@@ -281,14 +281,9 @@ def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
         time = np.linspace(0.0, _MOTION_PERIOD, _CHECKED_POSES)
         poses = poses_along(experiment.reference, time)
         along = clearance_along(ClearanceScene(mechanism), mechanism, time, poses)
-        made = NewMachine(
-            check,
-            controller_margin(experiment),
-            reference_torque(
-                experiment.nominal, experiment.reference, experiment.scenario.duration
-            ),
-            along.crossings,
-        )
+        plant, duration = experiment.nominal, experiment.scenario.duration
+        torque = reference_torque(plant, experiment.reference, duration)
+        made = NewMachine(check, controller_margin(experiment), torque, along.crossings)
         for path in (machine, scenario):
             write_whole(folder / path.name, path.read_bytes())
     return made

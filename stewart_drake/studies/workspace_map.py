@@ -23,7 +23,7 @@ from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.workspace import Failure, border, diagnose, home_sign, margin, margins
 from stewart_drake.mechanism.geometry import Mechanism, plate_radius
 from stewart_drake.mechanism.kinematics import LegGeometry, Legs, legs_along, reach_margins
-from stewart_drake.scenario.signals import COORDINATES, NUM_COORDINATES, NUM_LEGS
+from stewart_drake.scenario.signals import COORDINATES, NUM_COORDINATES
 from stewart_drake.scenario.trajectories import poses_along
 from stewart_drake.types import Array
 
@@ -84,21 +84,15 @@ def measure(mechanism: Mechanism, poses: Array) -> Measures:
     poses, one = np.reshape(poses, (-1, NUM_COORDINATES)), np.ndim(poses) == 1
     boundary = np.array([functions_of(mechanism).measures(pose)[0] for pose in poses])
     margin, sign = margins(mechanism, poses), home_sign(mechanism) or 1.0
-    inside, rest = margin > 0, np.full((len(poses), NUM_LEGS + 3), np.nan)
+    inside, rest = margin > 0, np.full((len(poses), 9), np.nan)
     legs = legs_along(mechanism, poses[inside])
     W = wrenches(mechanism, legs)
     gains, held = rate_gains(mechanism, legs, W), np.linalg.svd(W, compute_uv=False)[:, -1]
     condition, play = gains[:, 0] / gains[:, -1], 1 / gains[:, -1]
     rest[inside] = np.column_stack([np.abs(legs.transmission), held, condition, play])
-    found = Measures(
-        reach_margins(mechanism, poses),
-        boundary[:, :NUM_LEGS],
-        sign * boundary[:, NUM_LEGS],
-        margin,
-        rest[:, :NUM_LEGS],
-        *rest[:, NUM_LEGS:].T,
-    )
-    return Measures(*(column[0] for column in found)) if one else found
+    reach, sines, parallel = reach_margins(mechanism, poses), boundary[:, :6], boundary[:, 6]
+    columns = reach, sines, sign * parallel, margin, rest[:, :6], *rest[:, 6:].T
+    return Measures(*(column[0] if one else column for column in columns))
 
 
 # ---------------------------------------------------------------- along a motion
