@@ -90,19 +90,15 @@ def evaluate(
     """
     from stewart_drake import functions
 
-    options, folder = given.options(), delivery.folder
+    options, weights = given.options(), weights or []
     named = {"scenario": None if options.family else scenario, "controller": chosen.controller}
+    words, typed = ("tune", "evaluate", *weights), named | given.words
+    line = command_line(*words, settings=chosen.settings, options=typed)
     with given.named(), stopping(GO_ON), count_bar("conditions", delivery.quiet) as progress:
         found = functions.evaluate_tuner(
-            folder,
-            weights or [],
-            *chosen._replace(scenario=scenario),
+            *(delivery.folder, weights, *chosen._replace(scenario=scenario)),
             progress=progress,
-            command=command_line(
-                *("tune", "evaluate", *(weights or [])),
-                settings=chosen.settings,
-                options=named | given.words,
-            ),
+            command=line,
             options=options,
         )
     return delivery.answer(found, page="worth.html")

@@ -26,11 +26,9 @@ _BEYOND: Final = 1.25
 """Range of the sliders, as a factor on the travel."""
 _NARROW: Final = 0.15
 """Reach margin of a marked leg, as a share of the crank."""
-_GOOD, _CLOSE, _SHORT = (
-    Rgba(0.0, 0.62, 0.45, 1.0),
-    Rgba(0.90, 0.62, 0.0, 1.0),
-    Rgba(0.80, 0.10, 0.10, 1.0),
-)
+_GOOD: Final = Rgba(0.0, 0.62, 0.45, 1.0)
+_CLOSE: Final = Rgba(0.90, 0.62, 0.0, 1.0)
+_SHORT: Final = Rgba(0.80, 0.10, 0.10, 1.0)
 _GHOST: Final = Rgba(0.80, 0.10, 0.10, 0.35)
 
 

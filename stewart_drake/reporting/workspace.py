@@ -209,10 +209,6 @@ def _section(ax: Axes, section: Section, study: WorkspaceStudy, norm: BoundaryNo
     if (border > 0).any():
         ax.contour(x, y, border, [0.0], colors=LIMIT.color, linewidths=1.8)
     ax.plot([], [], color=LIMIT.color, lw=1.8, label="border of the workspace")
-    poses = study.poses
-    ax.plot(
-        *(f * poses[:, k] for f, k in zip(factors, pair, strict=True)),
-        label="reference, projected",
-        **_PATH,
-    )
+    path = (f * study.poses[:, k] for f, k in zip(factors, pair, strict=True))
+    ax.plot(*path, label="reference, projected", **_PATH)
     _home(ax, section, study.experiment.mechanism.home)

@@ -182,12 +182,9 @@ def clearance_along(
         for k, (pair, row) in enumerate(zip(scene.pairs, rows, strict=bool(len(seen))))
     ]
     fixed = np.array([pair.fixed for pair in scene.pairs])
-    return ClearanceAlong(
-        time,
-        distances[:, ~fixed].min(axis=1),
-        distances[:, fixed].min(axis=1, initial=np.inf),
-        sorted(nearest, key=lambda one: one.distance),
-    )
+    links = distances[:, ~fixed].min(axis=1)
+    base = distances[:, fixed].min(axis=1, initial=np.inf)
+    return ClearanceAlong(time, links, base, sorted(nearest, key=lambda one: one.distance))
 
 
 def _nearest(scene: ClearanceScene, pose: Array) -> Nearest:

@@ -59,6 +59,7 @@ from stewart_drake.studies.layout_space import (
     singular,
     space_around,
 )
+from stewart_drake.studies.options import refuse
 from stewart_drake.studies.runs import Outcome, outcome_of, read_kept
 from stewart_drake.studies.study_options import LayoutOptions
 from stewart_drake.types import Array
@@ -145,11 +146,8 @@ class Problem:
         if wanted.missed(found) or singular(found) or not asks_torque:
             return found
         machine = build_mechanism(self.space.machine(values, arrangement, "trial"))
-        plant = StewartDynamics(
-            with_rotors(machine, self.scenario.actuator.reflected_inertia),
-            self.scenario.plant.gravity,
-            plant_parameters(),
-        )
+        whole = with_rotors(machine, self.scenario.actuator.reflected_inertia)
+        plant = StewartDynamics(whole, self.scenario.plant.gravity, plant_parameters())
         return found | {"torque": peak_torque(plant, self.motion)}
 
     def cost(self, found: Mapping[str, float]) -> float:
@@ -309,14 +307,9 @@ def study_layout(
 
 
 def problem_of(scenario: Scenario, options: LayoutOptions) -> Problem:
-    for field, value in (
-        ("plant.mechanism", scenario.plant.mechanism),
-        ("controller.calibration", scenario.controller.calibration),
-    ):
-        if value is not None:
-            raise ConfigError(
-                f"{field}: got {value}; expected null, as the machine is searched for"
-            )
+    calibration = scenario.controller.calibration
+    fixed = {"plant.mechanism": scenario.plant.mechanism, "controller.calibration": calibration}
+    refuse(fixed, "where the machine is searched for; expected null")
     experiment, spec = assemble(scenario), mechanism_spec(resolve("mechanism", scenario.mechanism))
     space = space_around(spec, options.vary or {}, options.keep)
     crank = float(own_values(spec)[PARAMETERS.index("crank")])

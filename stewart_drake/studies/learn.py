@@ -157,11 +157,8 @@ def study_learn(
     lacking = lacking_torques if lessons.lag is None else lacking_angles
     for k in range(options.repetitions):
         sensor = replace(run.sensor, seed=run.sensor.seed + k)
-        result = simulate(
-            replace(run, sensor=sensor),
-            modify_law=partial(with_learned, learned=learned),
-            judge_stability=False,
-        )
+        law = partial(with_learned, learned=learned)
+        result = simulate(replace(run, sensor=sensor), modify_law=law, judge_stability=False)
         if interrupted := result.status == "interrupted":
             break
         lessons.errors.append(last_error(result, experiment.scale, period))
