@@ -6,6 +6,7 @@ Bad input is a ConfigError of one line.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,10 +20,10 @@ from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.yamlio import yaml_text
 from stewart_drake.identification import identify as identification
 from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
-from stewart_drake.identification.plan import MOTION, plan
+from stewart_drake.identification.plan import MOTION, Plan, plan
 from stewart_drake.identification.servo_fit import ServoIdentification, identify_servos
 from stewart_drake.identification.servo_logs import is_servo_log, read_servo_log
-from stewart_drake.identification.servo_plan import SETPOINTS_FILE, plan_servos
+from stewart_drake.identification.servo_plan import SETPOINTS_FILE, ServoPlan, plan_servos
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.live.options import LiveOptions, MachineOptions
 from stewart_drake.loop.preparation import prepare
@@ -101,19 +102,11 @@ def identify(
         log = read_servo_log(Path(paths[0]), machine)
         rounding = _CODE_12_BITS if precision is None else precision.angle
         g = DEFAULT_GRAVITY if gravity else 0.0
-        return analysis_result(
-            lambda: identify_servos(log, machine, rounding, g),
-            servo_identification.document,
-            typed,
-            _write_servos,
-        )
+        fitted = partial(identify_servos, log, machine, rounding, g)
+        return analysis_result(fitted, servo_identification.document, typed, _write_servos)
     read = [read_log(Path(path), machine, precision or Precision(), gravity) for path in paths]
-    return analysis_result(
-        lambda: identification.identify(read, machine, tolerances, delay),
-        document,
-        typed,
-        _write_machine,
-    )
+    found = partial(identification.identify, read, machine, tolerances, delay)
+    return analysis_result(found, document, typed, _write_machine)
 
 
 def plan_identification(
@@ -145,26 +138,24 @@ def plan_identification(
                 "their log has setpoints and crank angles"
             )
         rounding = _CODE_12_BITS if precision is None else precision.angle
-        prepared = prepare(loaded)
-        return analysis_result(
-            lambda: plan_servos(prepared, rounding),
-            servo_identification.plan_document,
-            typed,
-            lambda found, folder: _written(folder, {SETPOINTS_FILE: found.csv}),
-        )
+        planned = partial(plan_servos, prepare(loaded), rounding)
+        shown = servo_identification.plan_document
+        return analysis_result(planned, shown, typed, _write_setpoints)
     measured = (precision or Precision()).std
     std = np.full_like(measured, np.inf)
     for part in (ANGLES, POSE) if poses else (ANGLES,):
         std[part] = measured[part]
-    experiment = prepare(loaded)
-    return analysis_result(
-        lambda: plan(experiment, std, tolerances),
-        plan_document,
-        typed,
-        lambda found, folder: _written(
-            folder, {MOTION: found.motion_csv, SCENARIO: scenario_yaml(found.scenario)}
-        ),
-    )
+    planned_motion = partial(plan, prepare(loaded), std, tolerances)
+    return analysis_result(planned_motion, plan_document, typed, _write_plan)
+
+
+def _write_plan(found: Plan, folder: Path) -> list[str]:
+    texts = {MOTION: found.motion_csv, SCENARIO: scenario_yaml(found.scenario)}
+    return _written(folder, texts)
+
+
+def _write_setpoints(found: ServoPlan, folder: Path) -> list[str]:
+    return _written(folder, {SETPOINTS_FILE: found.csv})
 
 
 def _write_machine(found: identification.Identification, folder: Path) -> list[str]:

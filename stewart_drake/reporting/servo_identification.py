@@ -39,14 +39,9 @@ def document(found: ServoIdentification) -> Document:
 
 
 def plan_document(plan: ServoPlan) -> Document:
-    names, notes = ("sine", "sines", "steps"), []
-    smaller = [
-        f"{name} {100 * share:.0f} %"
-        for name, share in zip(names, plan.shares, strict=True)
-        if share < 1
-    ]
-    if smaller:
-        notes.append(f"reduced to keep the limits: {', '.join(smaller)}")
+    shares = dict(zip(("sine", "sines", "steps"), plan.shares, strict=True))
+    smaller = [f"{name} {100 * share:.0f} %" for name, share in shares.items() if share < 1]
+    notes = [f"reduced to keep the limits: {', '.join(smaller)}"] if smaller else []
     return _document(
         plan.expected,
         "plain",
