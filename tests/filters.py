@@ -44,13 +44,14 @@ class FilterEstimate(Estimate):
     root: Array
     squares: float
     values: float
+    disagreed: float
     noise: Array
 
     @classmethod
     def of(cls, memory: Array, n: int, m: int) -> "FilterEstimate":
         """Return the estimate that a `stewart_posterior` holds."""
         mean, root, outlier, counts = np.split(memory, [n, n + n * n, n + n * n + m])
-        counts, noise = np.split(counts, [5])
+        counts, noise = np.split(counts, [6])
         L, (outliers, unseen, bits) = root.reshape(n, n), counts[:3].astype(int)
         partly = tuple(name for i, name in enumerate(FAULTS) if bits >> i & 1)
         return cls(mean, L @ L.T, outlier, outliers, unseen, partly, L, *counts[3:], noise)
@@ -103,11 +104,12 @@ class Filter:
         c, n, m = core(), len(estimate.mean), self.sensing.size
         if isinstance(estimate, FilterEstimate):
             bits = sum(1 << FAULTS.index(name) for name in estimate.partly)
-            counts = estimate.outliers, estimate.unseen, bits, estimate.squares, estimate.values
+            counts = [estimate.outliers, estimate.unseen, bits]
+            counts += [estimate.squares, estimate.values, estimate.disagreed]
             root, outlier, noise = estimate.root, estimate.outlier, estimate.noise
         else:
             root, outlier = np.linalg.cholesky(estimate.covariance), np.full(m, np.nan)
-            counts, noise = (0, 0, 0, 0, 0), np.eye(1, c.lib.STEWART_NOISE)[0]
+            counts, noise = [0] * 6, np.eye(1, c.lib.STEWART_NOISE)[0]
         memory = np.concatenate([estimate.mean, root.ravel(), outlier, counts, noise])
         torques, durations, following = map(numbers, period[:3])
         schedule = [len(torques), c.at(torques), c.at(durations), period.substeps]

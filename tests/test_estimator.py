@@ -455,6 +455,23 @@ def test_after_patience_the_measurement_is_believed():
     assert np.allclose(estimate.parameter_std, KNOWN.std, rtol=1e-15)
 
 
+@pytest.mark.parametrize(("change", "rejected"), [(8.0, PATIENCE), (-20.0, PATIENCE + 2)])
+def test_parameters_that_change_by_many_deviations_of_their_prior_are_found(change, rejected):
+    """Outliers that the prior does not explain agree once the parameters may change by more."""
+    narrow = dataclasses.replace(KNOWN, std=0.1 * KNOWN.std)
+    assumed = filter_of(0.01 * NOISE, dataclasses.replace(SETTINGS, parameters=narrow))
+    result = run(np.zeros(8), 7, assumed)
+    truth = change * narrow.std * np.repeat([1.0, 0.0], [6, 2])
+    estimate, x = result.estimates[-1], result.states[-1]
+    for k in range(8):
+        torques = np.array([PLANT.inverse_dynamics(x[:6], x[6:], -2 * x[6:], truth)])
+        acting = acted(torques, np.array([PERIOD]))
+        x = PLANT.predict(x, *acting[:2], SUBSTEPS, truth)[-1]
+        estimate = advance(estimate, acting, x, assumed)
+        assert (estimate.outliers == 0) == (k >= rejected)
+    np.testing.assert_allclose(estimate.parameters, truth, atol=0.1 * np.abs(truth).max())
+
+
 @pytest.mark.parametrize("crazy", [1e3, 1e300])
 def test_a_sensor_gone_crazy_and_well_again_leaves_no_trace(crazy):
     """Even after nonsense was believed, every estimate is finite and good data bring it back."""

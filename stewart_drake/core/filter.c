@@ -15,19 +15,21 @@
 #define CHANGED ((real)1e-3)      /* the least */
 #define MOST_CHANGED ((real)0.01) /* the largest for a single outlier */
 #define MOST_AGREEING ((real)0.3) /* the largest if the last outlier agrees, or the prior is untested */
+#define CHANGED_PER_OUTLIER ((real)3) /* more for each outlier that disagrees with the one before */
 #define YOUNG 3                   /* measurements that test the prior */
 #define MAX_DISTANCE 100          /* gates: after a first iteration beyond this an update is given up */
 
 int stewart_posterior_size(int n, int m)
 {
-    return n + n * n + m + 5 + STEWART_NOISE;
+    return n + n * n + m + 6 + STEWART_NOISE;
 }
 
 stewart_posterior stewart_posterior_at(real *numbers, int n, int m)
 {
     real *counts = numbers + n + n * n + m;
     return (stewart_posterior){numbers,    numbers + n, numbers + n + n * n, counts, counts + 1,
-                               counts + 2, counts + 3,  counts + 4,          (stewart_noise *)(counts + 5)};
+                               counts + 2, counts + 3,  counts + 4,          counts + 5,
+                               (stewart_noise *)(counts + 6)};
 }
 
 static int size_of(const stewart_filter *filter) { return X + filter->machine->estimated; }
@@ -228,7 +230,24 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
     }
     stewart_copy(X, state, e.mean);
     stewart_fill(m, (real)NAN, e.outlier);
-    *e.outliers = *e.age = *e.left_out = 0;
+    *e.outliers = *e.age = *e.left_out = *e.disagreed = 0;
+    return 1;
+}
+
+/* Start again from values (m) that did not fit. `change` is the standard deviation, in usual ones, by which
+   parameters may have changed beyond their prior. The offsets of encoders do not change. */
+static int start_again(const stewart_filter *filter, const real *values, const real *theta, const real *near,
+                       real change, real *estimate, stewart_scratch scratch)
+{
+    const int n = size_of(filter);
+    real added[STEWART_MAX_ESTIMATED];
+    if (!stewart_filter_start(filter, values, theta, near, estimate, scratch))
+        return 0;
+    for (int i = 0; i < n - X; i++) {
+        const int is_offset = filter->offsets >= 0 && i >= filter->offsets && i < filter->offsets + LEGS;
+        added[i] = is_offset ? 0 : change * filter->usual_std[i];
+    }
+    stewart_widen_root(n, added, estimate + n, scratch);
     return 1;
 }
 
@@ -264,7 +283,7 @@ static void accept(int n, int m, const stewart_posterior *found, stewart_posteri
     stewart_copy(n, found->mean, now->mean);
     stewart_copy(n * n, found->root, now->root);
     stewart_fill(m, (real)NAN, now->outlier);
-    *now->outliers = *now->age = 0;
+    *now->outliers = *now->age = *now->disagreed = 0;
     *now->left_out = *found->left_out;
     *now->squares = *found->squares;
     *now->values = *found->values;
@@ -333,6 +352,7 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
     stewart_posterior after = stewart_posterior_at(first, n, m);
     stewart_posterior before = stewart_posterior_at(second, n, m);
     const real age = *now.age + 1, *theta = now.mean + X;
+    const real disagreed = *now.disagreed, change = CHANGED_PER_OUTLIER * disagreed;
     real outliers = 1;
     stewart_attempt a = {.filter = filter, .n = n, .period = period, .prior = &now,
                          .values = values, .history = history, .after = &after};
@@ -358,8 +378,8 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
     }
     a.prior = &before;
     stewart_copy(size, now.mean, second); /* a start keeps squares, values and noise */
-    if (values && *now.outliers > 0
-        && stewart_filter_start(filter, now.outlier, theta, now.mean, second, scratch)
+    const int follows = values && *now.outliers > 0; /* an outlier after an outlier */
+    if (follows && start_again(filter, now.outlier, theta, now.mean, change, second, scratch)
         && attempt(&a, scratch))
         outliers += *now.outliers;
     a.prior = &now;
@@ -372,12 +392,13 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
     a.values = NULL;
     const int predicted = attempt(&a, scratch);
     if (values && (!predicted || outliers >= STEWART_PATIENCE)
-        && stewart_filter_start(filter, values, theta, predicted ? after.mean : now.mean, estimate,
-                                scratch))
+        && start_again(filter, values, theta, predicted ? after.mean : now.mean, change, estimate,
+                       scratch))
         return;
     if (predicted)
         accept(n, m, &after, &now);
     *now.age = age;
+    *now.disagreed = disagreed + (follows && outliers == 1);
     if (values) {
         *now.outliers = outliers;
         stewart_copy(m, values, now.outlier);

@@ -27,6 +27,7 @@ typedef struct {
     real *left_out; /* reasons for left-out values of that measurement, bits as of a `fault` */
     real *squares;  /* sum of nu' S^-1 nu of all measurements that were used */
     real *values;   /* number of values in them */
+    real *disagreed; /* outliers since then that did not agree with the one before */
     stewart_noise *noise; /* factors of the assumed noise */
 } stewart_posterior;
 
@@ -85,10 +86,12 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
 
    A measurement that does not fit then either is an outlier: it is left out, and the model predicts.
 
-   If the plate was moved by hand, consecutive outliers agree with each other under the model. After
-   STEWART_PATIENCE of them, or where the model has no finite prediction, the estimate starts again from
-   the measurement. It also does so at the first measurement after as many periods without one, if the
-   parameters are uncertain: the covariance, linearised along a guessed path, is then wrong. */
+   If the plate was moved by hand, consecutive outliers agree with each other under the model. If it was
+   pushed by more than the prior explains, they do not: each that disagrees with the one before allows the
+   parameters three usual deviations more of change. After STEWART_PATIENCE that agree, or where the model
+   has no finite prediction, the estimate starts again from the measurement. It also does so at the first
+   measurement after as many periods without one, if the parameters are uncertain: the covariance,
+   linearised along a guessed path, is then wrong. */
 void stewart_filter_advance(const stewart_filter *filter, const stewart_interval *period,
                             const real *values, const stewart_history *history, real *estimate,
                             stewart_scratch scratch);

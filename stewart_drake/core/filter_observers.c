@@ -39,7 +39,7 @@ static void filtered_restart(const stewart_law *law, real *memory)
     stewart_fill(X, (real)NAN, e.mean);
     stewart_fill(n * n, (real)NAN, e.root);
     stewart_fill(law->measured, (real)NAN, e.outlier);
-    *e.outliers = *e.age = *e.left_out = 0;
+    *e.outliers = *e.age = *e.left_out = *e.disagreed = 0;
     stewart_fill(LEGS, 0, f.still);
 }
 
