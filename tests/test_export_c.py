@@ -366,7 +366,7 @@ def test_the_readme_is_that_of_the_composition(case, tmp_path):
     declared += "extern void drive(const real *), send_packet(const real *);\n"
     report = "stewart_report" if "stewart_report" in rest else "real"
     declared += f"extern int read_report({report} *);\nvoid setup(void), every_period(void);\n"
-    declared += "extern int age_of_measurement(void);\n"
+    declared += "extern int age_of_measurement(void);\nextern void stop_safely(void);\n"
     (tmp_path / "wiring.c").write_text(f"{included}\n{declared}{rest}", encoding="utf-8")
     headers = {"stewart_motion.h", "stewart_board.h", "protocol.h", "udp.h", "meter.h"}
     own = sorted(headers & files.keys())

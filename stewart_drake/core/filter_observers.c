@@ -126,8 +126,10 @@ static int filtered_observe(const stewart_law *law, real *memory, int number, co
         *e.outliers = 0;
         return STEWART_MEASUREMENT_FROZEN;
     }
-    return *e.outliers > 0 ? STEWART_MEASUREMENT_REJECTED
-                           : (fault | (int)*e.left_out) << STEWART_CAUSES_AT;
+    if (*e.outliers > 0)
+        return STEWART_MEASUREMENT_REJECTED;
+    const int partial = !fault && *e.left_out > 0 ? STEWART_MEASUREMENT_PARTIAL : 0;
+    return (fault | (int)*e.left_out) << STEWART_CAUSES_AT | partial;
 }
 
 static int filtered_scratch(const stewart_law *law)

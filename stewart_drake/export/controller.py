@@ -25,15 +25,18 @@ from stewart_drake.dynamics.workspace import LEAST, home_sign
 from stewart_drake.export.recording import TOLERANCE, Recorded, knots, record
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import replacing
+from stewart_drake.law.channel import Packets
 from stewart_drake.law.compiled import Compiled, address_of
 from stewart_drake.law.core_law import CompiledLaw
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.law_design import control_law
-from stewart_drake.loop.peer import FAULTS, identity_of
+from stewart_drake.loop.peer import FAULTS, MOST_ROWS, MOST_SAMPLES, identity_of
 from stewart_drake.loop.preparation import Experiment, prepare
+from stewart_drake.loop.servos import servo_law
 from stewart_drake.loop.tuner import weights_source
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.trajectories import evaluate
@@ -45,20 +48,27 @@ SOURCES: Final = (
     *("matrix", "dynamics", "machine", "reach.c", "riccati", "design", "timeline.c"),
 )
 """Sources of core/ that every law needs; a name without a suffix stands for header and source."""
-MACHINE: Final = ("link.h", "link.c")
-"""Additional sources of core/ for the example of a machine."""
-EXAMPLES: Final = (
+LINK: Final = ("link.h", "link.c")
+"""Additional sources of core/ for the machine."""
+OVER_UDP: Final = (
     *("protocol.c", "protocol.h", "protocol_test.c", "udp.c", "udp.h"),
-    *("stewart_example.c", "stewart_example.h", "stewart_machine.c", "stewart_udp.c", *MACHINE),
-    *("stewart_board.c", "stewart_board.h"),
+    *("stewart_example.c", "stewart_example.h", "stewart_udp.c"),
 )
-"""Sources of the examples over UDP, see `_is_example`."""
+"""Templates of the controller over UDP, see `_not_over_udp`."""
+MACHINE: Final = ("stewart_machine.c", "stewart_board.c", "stewart_board.h")
+"""Templates of the machine, see `_no_machine`."""
 DIGESTS: Final = "exported.sha256"
 """Digests of the written files, for `sha256sum -c`."""
 TEMPLATES: Final = Path(__file__).with_name("templates")
 README: Final = "README.md"
 TOLERANCES: Final = {"double": 1e-9, "float": 1e-3}
 """Tolerance of the replay, as a share of the peak."""
+_MACHINE: Final[Accepted] = {
+    "sensor.kind": "state",
+    "actuator.kind": "torque",
+    "controller.delay_estimator": "none",
+}
+"""Values of the fields that the machine in C supports."""
 _UNMEASURED: Final = "Not compiled here: run `make size` and `make test`.\n"
 
 
@@ -76,13 +86,16 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     if not isinstance(law, ServoPreview):
         source = weights_source(experiment, law)
         tuner = None if source is None else source.compiled
-    over_udp, sources = _is_example(recorded, tuner), _sources(compiled, tuner)
+    not_over_udp = _not_over_udp(scenario, law)
+    no_machine, over_udp = not_over_udp or _no_machine(scenario), not not_over_udp
+    sources = _sources(compiled, tuner)
     names = {path.name for path in TEMPLATES.iterdir()}
-    names -= set() if over_udp else set(EXAMPLES)
+    names -= set() if over_udp else set(OVER_UDP)
+    names -= set(MACHINE) if no_machine else set()
     names -= set() if over_udp or recorded.moves else {"stewart_motion.c", "stewart_motion.h"}
     files = {
         name: (FOLDER / name).read_text("utf-8")
-        for name in (*sources, *(MACHINE if over_udp else ()))
+        for name in (*sources, *(() if no_machine else LINK))
     }
     if single:
         defined = "#define STEWART_FLOAT\n\n#include"
@@ -95,7 +108,13 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "real": "float" if single else "double",
         "tolerance": f"{TOLERANCES['float' if single else 'double']:g}",
         "servos": servos,
+        "encoders": scenario.sensor.kind == "encoders",
+        "network": isinstance(law, PredictiveLqi) and isinstance(law.channel, Packets),
+        "finds_delay": scenario.controller.delay_estimator != "none",
+        "wait": law.longest_wait if isinstance(law, PredictiveLqi) else 0,
         "over_udp": over_udp,
+        "not_over_udp": not_over_udp,
+        "no_machine": no_machine,
         "moves": recorded.moves,
         "steps": recorded.steps,
         "queue": np.atleast_2d(recorded.first),
@@ -116,9 +135,11 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     if tuner is not None:
         values |= _tuner(tuner, compiled, recorded, experiment, suffix)
     if over_udp or recorded.moves:
-        values |= _motion(experiment, recorded)
+        values |= _motion(experiment, recorded, tuner is not None)
     if over_udp:
-        values |= {"identity": identity_of(scenario), "faults": FAULTS.values()}
+        # Samples that are kept: those of a report and of the wait for it.
+        kept = 1 << (2 * values["wait"] + 63).bit_length()
+        values |= {"identity": identity_of(scenario), "faults": FAULTS.values(), "kept": kept}
     texts = _templates(suffix)
     files |= {name: texts.get_template(name).render(values) for name in names - {README}}
     values["measured_sizes"] = _sizes(files) if measured else _UNMEASURED
@@ -144,15 +165,27 @@ def _templates(suffix: str) -> Environment:
     return texts
 
 
-def _is_example(recorded: Recorded, tuner: Compiled | None) -> bool:
-    """Return whether the examples over UDP support this law.
+def _not_over_udp(scenario: Scenario, law: PredictiveLqi | ServoPreview) -> str:
+    """Return the field that the protocol does not cover and why, in words; empty if it does."""
+    samples = scenario.sensor.samples or 1
+    if scenario.actuator.kind == "servo":
+        return "`actuator.kind: servo`: rows of a datagram have six numbers, commands have 18"
+    if isinstance(law, ServoPreview) and scenario.controller.estimate:
+        return "`controller.estimate`: datagrams do not report the torques of servos"
+    if samples > MOST_SAMPLES:
+        return f"`sensor.samples: {samples}`: a datagram has up to {MOST_SAMPLES}"
+    if isinstance(law, PredictiveLqi) and isinstance(law.channel, Packets):
+        rows = law.channel.repeats + law.channel.torques
+        if rows > MOST_ROWS:
+            return f"`controller.packet_torques`: {rows} rows; a datagram has up to {MOST_ROWS}"
+    return ""
 
-    They have a measured state, a known delay, fixed weights, and one torque per sample.
-    """
-    law = recorded.law
-    if not isinstance(law, PredictiveLqi) or tuner is not None or law.finds_delay:
-        return False
-    return law.sensing.size == NUM_STATE and law.channel.torques == 1
+
+def _no_machine(scenario: Scenario) -> str:
+    """Return the field that the machine in C does not support, in words; empty if it does."""
+    if found := differing(scenario, _MACHINE):
+        return f"`{found.field}: {found.got}`"
+    return ""
 
 
 def _sources(compiled: CompiledLaw, tuner: Compiled | None) -> list[str]:
@@ -185,13 +218,16 @@ def _tuner(
     }
 
 
-def _motion(experiment: Experiment, recorded: Recorded) -> dict[str, Any]:
-    """Return the scenario's motion by its knots, and that which a plan returns to."""
-    rows = recorded.motion
+def _motion(experiment: Experiment, recorded: Recorded, tuned: bool) -> dict[str, Any]:
+    """Return the scenario's motion by its knots, and that which plans return to and tuners read."""
+    rows, goal = recorded.motion, recorded.goal
     if rows is None:
-        motion, times = control_law(experiment)[1], recorded.law.preview_times
-        rows = knots(motion, experiment.scenario.duration + max(0.0, float(times.max())))
-    return {"motion": rows, "goal": recorded.goal, "motion_tolerance": TOLERANCE}
+        law = recorded.law
+        planned = servo_law if isinstance(law, ServoPreview) else control_law
+        end = experiment.scenario.duration + max(0.0, float(law.preview_times.max()))
+        rows = knots(planned(experiment)[1], end)
+        goal = knots(experiment.reference, end) if tuned else None
+    return {"motion": rows, "goal": goal, "motion_tolerance": TOLERANCE}
 
 
 def _rows(rows: Iterable[Array], suffix: str) -> str:

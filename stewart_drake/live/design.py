@@ -25,9 +25,10 @@ from stewart_drake.law.nominal import TorqueLimit
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.live.contact import Link
-from stewart_drake.live.protocol import MOST_HISTORY, MOST_ROWS, MachineFlags, MachineMessage
+from stewart_drake.live.protocol import MOST_HISTORY, MachineFlags, MachineMessage
 from stewart_drake.loop.law_design import control_law, first_queue
 from stewart_drake.loop.learned import learned_signal
+from stewart_drake.loop.peer import MOST_ROWS
 from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
 from stewart_drake.loop.servos import commands_in_flight, servo_law
 from stewart_drake.scenario.config import DelayConfig, Scenario

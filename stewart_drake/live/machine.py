@@ -22,7 +22,6 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.endpoint import STALL, Address, Endpoint, Offers, Session, now
 from stewart_drake.live.options import Settings
 from stewart_drake.live.protocol import (
-    MOST_SAMPLES,
     NEVER,
     SECOND,
     VERSION,
@@ -42,7 +41,7 @@ from stewart_drake.live.simulated import (
     body_of,
     first_rows,
 )
-from stewart_drake.loop.peer import FAULTS, Fault, Reason, identity_of, in_words
+from stewart_drake.loop.peer import FAULTS, MOST_SAMPLES, Fault, Reason, identity_of, in_words
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing

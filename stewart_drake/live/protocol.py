@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from stewart_drake.loop.peer import (
     DIGEST,
     MOST_BITS,
+    MOST_ROWS,
+    MOST_SAMPLES,
     NAME,
     NO_FAULT,
     Fault,
@@ -39,12 +41,8 @@ NEVER: Final = 2**64 - 1
 """An unknown time."""
 LONGEST: Final = 1452
 """Longest datagram, bytes: not fragmented by Ethernet and IPv6."""
-MOST_ROWS: Final = 24
-"""Largest number of torques of a plan."""
 MOST_HISTORY: Final = 16
 """Largest number of reported torques."""
-MOST_SAMPLES: Final = 16
-"""Largest number of samples of each encoder in a measurement."""
 MISSING: Final = -(2**31)
 """Code of a missing sample."""
 SECOND: Final = 10**9

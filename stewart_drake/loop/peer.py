@@ -14,6 +14,10 @@ NAME: Final = 32
 """Bytes of a part's name, padded with zeros."""
 MOST_BITS: Final = 30
 """Largest number of bits of a turn in a datagram."""
+MOST_SAMPLES: Final = 16
+"""Largest number of samples of each encoder in a datagram."""
+MOST_ROWS: Final = 24
+"""Largest number of torques in a datagram."""
 SECOND: Final = 10**9
 
 

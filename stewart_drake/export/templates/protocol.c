@@ -352,6 +352,18 @@ int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key, ste
                : STEWART_MALFORMED;
 }
 
+int stewart_values(const stewart_measured *m, double *values)
+{
+    const double quantum = ldexp(6.283185307179586, -m->bits);
+    if (m->kind == STEWART_STATE)
+        memcpy(values, m->state, sizeof m->state);
+    for (int i = 0; m->kind == STEWART_ENCODERS && i < 6 * m->samples; i++) {
+        const int32_t code = m->codes[i / 6][i % 6];
+        values[i] = code == STEWART_UNREAD ? (double)NAN : m->zeros[i % 6] + quantum * code;
+    }
+    return m->kind == STEWART_STATE ? 12 : m->kind == STEWART_ENCODERS ? 6 * m->samples : 0;
+}
+
 /* ---------------------------------------------------------------- controller to machine */
 
 #define CONTROLLER_BODY 28

@@ -17,6 +17,7 @@
 #define STEWART_SAMPLES 16
 #define STEWART_BITS 30
 #define STEWART_UNREAD INT32_MIN /* a code that was not read */
+#define STEWART_VALUES (6 * STEWART_SAMPLES) /* largest size of a measurement */
 #define STEWART_PARTS 4           /* of an identity: mechanism, period, sensor, actuator */
 #define STEWART_DIGEST 8
 #define STEWART_NAME 32
@@ -135,6 +136,10 @@ size_t stewart_write_plan(const stewart_plan *message, stewart_key key, uint8_t 
 int stewart_read_measured(const uint8_t *data, size_t size, stewart_key key,
                           stewart_measured *message);
 int stewart_read_plan(const uint8_t *data, size_t size, stewart_key key, stewart_plan *message);
+
+/* The measurement in a datagram: a state (12), or crank angles (samples, 6), rad, the oldest first; NaN for
+   what was not read. Returns how many numbers, 0 without a measurement. */
+int stewart_values(const stewart_measured *message, double *values);
 
 /* A head alone, which states this version to a controller of another one; `data` is its datagram.
    Returns STEWART_HEAD. */

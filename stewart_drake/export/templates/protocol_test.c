@@ -147,10 +147,16 @@ static void test_reports(void)
               m->reason.leg == 2 && m->before.fault == STEWART_STOOD && m->before.lasted == 330000000u &&
               m->state[5] == 0.375 && isnan(m->state[11]) && m->acted[0][5] == 2,
           "its values");
+    double state[STEWART_VALUES];
+    check(stewart_values(m, state) == 12 && memcmp(state, m->state, sizeof m->state) == 0, "the numbers");
     test_bytes(encoder_bytes, none, "encoders");
     check(m->codes[0][3] == -4096 && m->codes[0][5] == STEWART_UNREAD && m->bits == 14 &&
               m->zeros[5] == -0.5 && m->begin == STEWART_NEVER,
           "their values");
+    double angles[STEWART_VALUES], quantum = 6.283185307179586 / 16384;
+    check(stewart_values(m, angles) == 6 && angles[0] == quantum && angles[1] == 0.5 - quantum &&
+              angles[3] == -4096 * quantum && angles[4] == 0 && isnan(angles[5]),
+          "their angles");
 }
 
 static void test_greeting(void)

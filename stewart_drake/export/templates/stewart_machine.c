@@ -21,6 +21,7 @@
 #define STALL (SECOND / 5)   /* delay of the process that is reported, ns */
 #define RECENT (10ull * SECOND) /* time for which a fault counts as preceding the next one */
 #define LAST_DATAGRAMS 3     /* datagrams at the end: some may be lost */
+#define HOLDS @"0" if network and not law.channel.holds else "1"@              /* a dry buffer holds the last torque, or puts out zero */
 
 enum { LINK = STEWART_LINK_COMMANDS + 7 * STEWART_HISTORY + 9 * WAITING }; /* numbers of its memory */
 
@@ -162,7 +163,7 @@ static void begin(machine *m)
 static void describe(const machine *m, uint64_t sampled, stewart_measured *s)
 {
     memset(s, 0, sizeof *s);
-    s->head.flags = STEWART_HOLDS | board_flags;
+    s->head.flags = (HOLDS ? STEWART_HOLDS : 0u) | board_flags;
     s->head.flags |= (uint32_t)(m->running ? STEWART_RUNNING : STEWART_PARKED);
     s->head.flags |= (uint32_t)((m->safe ? STEWART_SAFE : 0) | (m->left ? STEWART_LEFT : 0));
     s->sampled = sampled;
@@ -378,7 +379,7 @@ int main(int argc, char **argv)
     m.offers.tokens = STEWART_AT_ONCE;
     m.started = udp_now();
     m.period = (uint64_t)((double)stewart_configuration.period * SECOND + 0.5);
-    m.buffer = (stewart_link){6, WAITING, STEWART_HISTORY, 0, 1, (double)m.period, 0,
+    m.buffer = (stewart_link){6, WAITING, STEWART_HISTORY, 0, HOLDS, (double)m.period, 0,
                               stewart_configuration.machine.torque_limit};
     put_back(&m);
     printf("a %s machine at port %s, every %.4g ms; Ctrl-C ends it\n",

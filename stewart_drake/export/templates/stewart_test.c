@@ -38,7 +38,7 @@ int main(void)
             int returned = answer(k, found);
             meter_stop(k);
             after_step(k);
-            different += returned != status[k];
+            different += (returned & ~STEWART_MEASUREMENT_PARTIAL) != status[k];
             for (int i = 0; i < ANSWER; i++) {
                 double off = fabs((double)(found[i] - expected[k][i]));
                 double size = fabs((double)expected[k][i]);

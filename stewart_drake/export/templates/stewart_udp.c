@@ -2,14 +2,16 @@
 
        ./stewart_udp ADDRESS PORT [seconds=S] [key=FILE] [log=FILE] [arm]
 
-   It asks for a session, finds the machine's clock, chooses when to begin, and then steps the
-   controller once a period of the machine. Without a key it talks to this computer only; a machine that
-   does not say that it is a simulation is driven with `arm` only. The log has a row per sample; `age` is
-   the number of periods before the sample at which the state was measured. */
+   It asks for a session, measures the link, chooses when to begin, and then steps the controller once a
+   period of the machine{% if wait %}, with the newest measurement{% else %}: when the measurement of the sample is there, or later than the last ones{% endif %}.
+   It ends after 1 s without a usable measurement. Without a key it talks to this computer only; a machine
+   that does not say that it is a simulation is driven with `arm` only. The log has a row per sample; `age`
+   is the number of periods before the sample at which the measurement was taken. */
 
 #define _POSIX_C_SOURCE 200809L
 
 #include <arpa/inet.h>
+#include <limits.h>
 #include <math.h>
 #include <stdio.h>
 #include <string.h>
@@ -18,16 +20,40 @@
 #include "stewart_example.h"
 #include "udp.h"
 
-#define TRIPS 64
-#define ENOUGH 10 /* round trips for the offset of the clock */
-#define REPEATS 7 /* earlier torques that a datagram repeats, against losses */
-#define PLANNED 8 /* planned torques of a datagram, against later losses */
+#define RECENT 128 /* datagrams by which the link is judged */
+#define ENOUGH 50  /* round trips before the begin */
+#define REQUEST_PERIOD (SECOND / 50) /* ns between two requests */
+#define KEPT @kept@u   /* samples of which measurements and reports are kept, a power of two */
+#define FURTHEST 4096 /* samples that a measurement may be ahead */
+#define SPARE (SECOND / 500) /* ns of waiting for a measurement beyond the usual time */
+{% if network %}
+#define OFF 8 /* torques in a row that are reported a period early or late */
+{% else %}
+#define REPEATS @0 if servos else 7@ /* earlier rows that a datagram repeats, against losses */
+#define PLANNED @15 if servos else 8@ /* later rows of a datagram, against later losses */
+{% endif %}
+/* Periods for which a late measurement is of use. */
+#define LONGEST_WAIT @"((int)KEPT - 1)" if servos else wait@
+#define LONGEST_GAP SECOND /* without a usable measurement, ns */
+#define CONTENT @"STEWART_CRANKS" if servos else "STEWART_TORQUES"@
+#define DESIGN stewart_configuration@".law" if servos@
+#define LAW (&c->law@".law" if servos@)
 
-/* Round trips, and the offset of the machine's clock by each; the shortest one is used. */
+/* Times of the last datagrams, ns of the own clock. */
 typedef struct {
-    double trip[TRIPS], there[TRIPS], rate;
+    double trip[RECENT];  /* there and back */
+    double there[RECENT]; /* offset of the machine's clock */
+    double phase[RECENT]; /* arrival, less the time of the measurement */
+    double rate;          /* of the machine's clock */
     unsigned number;
-} other_clock;
+} link_times;
+
+/* A measurement, by its sample. */
+typedef struct {
+    int there, measured; /* whether a datagram is there, and a measurement in it */
+    unsigned sample;
+    double values[STEWART_MEASURED];
+} kept_measurement;
 
 typedef struct {
     int socket;
@@ -35,46 +61,195 @@ typedef struct {
     stewart_key key;
     stewart_session session;
     int offered, busy, other_version; /* what a machine has answered */
+    uint64_t nonce;                   /* of its last offer, 0 if another controller drives it */
     stewart_identity identity;        /* of the machine */
-    other_clock clock;
-    stewart_measured last; /* the newest by `sampled` */
-    uint64_t begin, used;  /* of the machine's clock; that of the measurement used last, plus 1 */
+    link_times times;
+    double longest;        /* ns by which a measurement may be late and still count as usual */
+    stewart_measured last; /* the newest datagram */
+    uint64_t begin, period; /* ns of the machine's clock */
+    kept_measurement came[KEPT];
+    unsigned next; /* the first sample whose measurement was not used */
+    struct {
+        int period;
+        real torque[STEWART_MOTORS];
+    } acted[KEPT];
+{% if network %}
+    struct {
+        uint32_t sequence;
+        int arrived;
+    } packets[KEPT];
+    int checked, off[2]; /* newest report of torques, and how many in a row were a period early or late */
+{% endif %}
+    int buffered; /* whether the machine has a play-out buffer */
     uint32_t flags;
     unsigned refused[STEWART_REFUSALS];
-    real memory[STEWART_MEMORY], ahead[STEWART_MEMORY], scratch[STEWART_SCRATCH];
-    real said[REPEATS + 1 + PLANNED][STEWART_MOTORS]; /* the last torques, and those that would follow */
+    @"stewart_servo" if servos else "stewart_law"@ law; /* within the machine's torque limit */
+    real memory[STEWART_MEMORY], scratch[STEWART_SCRATCH], measured[STEWART_MEASURED];
+{% if network %}
+    real arrived[KEPT], told[KEPT][STEWART_MOTORS];
+    stewart_report report; /* of these */
+{% else %}
+    real ahead[STEWART_MEMORY], nothing[STEWART_MEASURED]; /* for plans: a copy, and NaN */
+{% endif %}
+{% if tuner %}
+    real tuner[STEWART_TUNER_MEMORY];
+{% endif %}
+    stewart_plan plan;
     unsigned samples, missing, missed;
+    unsigned unusable, causes[3]; /* measurements in a row; of them missing, frozen, rejected */
     double seconds;
     FILE *log;
 } controller;
 
-static void clock_note(other_clock *c, const stewart_head *h, double rate, uint64_t now)
+/* ---------------------------------------------------------------- times */
+
+/* A time, ns, of a number that a datagram may have made huge. */
+static uint64_t whole(double time)
 {
-    if (h->acknowledged == 0)
-        return;
-    unsigned i = c->number++ % TRIPS;
-    c->rate = rate;
-    c->trip[i] = (double)(now - h->echo) - (double)h->held / rate;
-    c->there[i] = (double)h->time + rate * (c->trip[i] > 0 ? c->trip[i] : 0) / 2 - rate * (double)now;
+    return time > 0 ? time < 9e18 ? (uint64_t)time : STEWART_NEVER : 0;
 }
 
-static unsigned shortest(const other_clock *c)
+static void note_times(link_times *t, const stewart_measured *m, uint64_t now)
+{
+    const stewart_head *h = &m->head;
+    if (h->acknowledged == 0)
+        return;
+    unsigned i = t->number++ % RECENT;
+    t->rate = m->rate;
+    t->trip[i] = (double)now - (double)h->echo - (double)h->held / m->rate;
+    t->there[i] = (double)h->time + m->rate * fmax(0, t->trip[i]) / 2 - m->rate * (double)now;
+    t->phase[i] = (double)now - (double)m->sampled / m->rate;
+}
+
+static unsigned number_of(const link_times *t)
+{
+    return t->number < RECENT ? t->number : RECENT;
+}
+
+/* The place of the least value. */
+static unsigned least(const link_times *t, const double *values)
 {
     unsigned best = 0;
-    for (unsigned i = 1; i < c->number && i < TRIPS; i++)
-        best = c->trip[i] < c->trip[best] ? i : best;
+    for (unsigned i = 1; i < number_of(t); i++)
+        best = values[i] < values[best] ? i : best;
     return best;
 }
 
-/* The own clock at a time of the machine's. */
-static uint64_t own_time(const other_clock *c, uint64_t machine)
+static double shortest_trip(const link_times *t)
 {
-    return (uint64_t)(((double)machine - c->there[shortest(c)]) / c->rate);
+    return t->trip[least(t, t->trip)];
 }
 
-static double machine_time(const other_clock *c, uint64_t own)
+static double longest_trip(const link_times *t)
 {
-    return c->rate * (double)own + c->there[shortest(c)];
+    double longest = 0;
+    for (unsigned i = 0; i < number_of(t); i++)
+        longest = fmax(longest, t->trip[i]);
+    return longest;
+}
+
+static double machine_time(const link_times *t, uint64_t own)
+{
+    return t->rate * (double)own + t->there[least(t, t->trip)];
+}
+
+/* The own clock when the step of a sample begins at the latest. */
+static uint64_t latest(const controller *c, uint64_t sampled)
+{
+    const link_times *t = &c->times;
+{% if wait %}
+    return whole(((double)sampled - t->there[least(t, t->trip)]) / t->rate);
+{% else %}
+    double soonest = t->phase[least(t, t->phase)], late = 0;
+    for (unsigned i = 0; i < number_of(t); i++)
+        if (t->phase[i] - soonest <= c->longest)
+            late = fmax(late, t->phase[i] - soonest);
+    return whole(soonest + (double)sampled / t->rate + late + SPARE);
+{% endif %}
+}
+
+/* From a sample to its torque, ns. */
+static uint64_t eta(const controller *c)
+{
+    return whole((LAW->steps + (double)LAW->fraction) * (double)c->period + 0.5);
+}
+
+/* ---------------------------------------------------------------- datagrams */
+{% if network %}
+
+/* Whether a packet had this torque for the period. */
+static int was_sent(const controller *c, int period, const real *torque)
+{
+    const stewart_packets *p = LAW->packets;
+    const int rows = p->repeats + p->torques;
+    const real *packet = stewart_newest_packet(p, c->memory + LAW->layout.channel.at);
+    int row = period - LAW->steps - (int)c->samples + 1 + p->repeats; /* of the newest packet */
+    for (int i = 0; i < p->kept; i++, row++, packet -= rows * STEWART_MOTORS)
+        if (row >= 0 && row < rows &&
+            memcmp(packet + row * STEWART_MOTORS, torque, STEWART_MOTORS * sizeof *torque) == 0)
+            return 1;
+    return 0;
+}
+
+/* Count the torques that are reported a period early or late. */
+static void check(controller *c, int period, const real *torque)
+{
+    if (period <= c->checked)
+        return;
+    c->checked = period;
+    for (int late = 0; late < 2; late++) {
+        int off = !was_sent(c, period, torque) && was_sent(c, period + (late ? -1 : 1), torque);
+        c->off[late] = off ? c->off[late] + 1 : 0;
+    }
+}
+{% endif %}
+
+/* Note the reports of a datagram: torques that have acted@" and packets that have arrived" if network@. */
+static void note_reports(controller *c, const stewart_measured *m)
+{
+    double since = ((double)m->acted_from - (double)c->begin) / (double)c->period;
+    double newest = floor(since - (double)LAW->fraction + 0.5);
+{% if network %}
+    for (unsigned i = 0; i < KEPT; i++) {
+        uint32_t behind = m->head.acknowledged - c->packets[i].sequence;
+        if (c->packets[i].sequence && behind < 64 && m->arrived >> behind & 1)
+            c->packets[i].arrived = 1;
+    }
+{% endif %}
+    if (m->begin != c->begin || m->content != CONTENT || !(fabs(newest) < 1e9))
+        return;
+    for (int row = m->history - 1; row >= 0; row--) {
+        int period = (int)newest - row;
+        unsigned place = (unsigned)period % KEPT;
+        if (period < c->acted[place].period)
+            continue;
+        c->acted[place].period = period;
+        for (int i = 0; i < STEWART_MOTORS; i++)
+            c->acted[place].torque[i] = (real)m->acted[row][i];
+{% if network %}
+        check(c, period, c->acted[place].torque);
+{% endif %}
+    }
+}
+
+/* Keep a measurement until its sample; return why it is refused, or STEWART_TAKEN. */
+static int keep(controller *c, const stewart_measured *m)
+{
+    double values[STEWART_VALUES];
+    int number = stewart_values(m, values);
+    if (c->period == 0 || m->begin != c->begin || m->sampled < m->begin)
+        return STEWART_TAKEN;
+    uint64_t sample = (m->sampled - m->begin + c->period / 2) / c->period;
+    if ((number && number != STEWART_MEASURED) || sample > c->samples + FURTHEST)
+        return STEWART_MALFORMED;
+    kept_measurement *kept = &c->came[sample % KEPT];
+    if (LONGEST_WAIT == 0 && sample < c->samples)
+        return STEWART_LATE;
+    if (kept->there && kept->sample >= sample)
+        return STEWART_TAKEN;
+    *kept = (kept_measurement){.there = 1, .measured = number > 0, .sample = (unsigned)sample};
+    memcpy(kept->values, values, (size_t)number * sizeof values[0]);
+    return STEWART_TAKEN;
 }
 
 static void receive(controller *c)
@@ -99,146 +274,234 @@ static void receive(controller *c)
             c->offered = 1;
             c->busy = (m.head.flags & STEWART_BUSY) != 0;
             c->identity = m.identity;
-            if (!c->busy && c->session.nonce == 0)
-                c->session.nonce = m.head.nonce;
+            c->nonce = c->busy ? 0 : m.head.nonce;
         }
-        clock_note(&c->clock, &m.head, m.rate, now);
-        if (m.sampled >= c->last.sampled)
+        note_times(&c->times, &m, now);
+        note_reports(c, &m);
+        c->refused[keep(c, &m)]++;
+        if (m.head.sequence >= c->last.head.sequence)
             c->last = m;
     }
 }
 
-/* Send torques; the first acts at `playout`. */
-static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playout,
-                real torques[][STEWART_MOTORS], unsigned rows)
+/* Send the first rows of `plan`; the first one acts at `playout`. */
+static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playout, unsigned rows)
 {
     uint8_t data[STEWART_LONGEST];
-    stewart_plan plan;
-    memset(&plan, 0, sizeof plan);
-    plan.head = stewart_next(&c->session, udp_now(), c->flags | flags);
-    plan.sampled = sampled;
-    plan.playout = playout;
-    plan.begin = c->begin;
-    plan.content = c->session.nonce ? STEWART_TORQUES : STEWART_REQUEST;
-    plan.identity = stewart_own_identity;
-    plan.rows = (uint8_t)rows;
-    for (unsigned row = 0; row < rows; row++)
-        for (int i = 0; i < STEWART_MOTORS; i++)
-            plan.torques[row][i] = (double)torques[row][i];
-    udp_put(c->socket, data, stewart_write_plan(&plan, c->key, data), &c->machine);
+    stewart_plan *plan = &c->plan;
+    plan->head = stewart_next(&c->session, udp_now(), c->flags | flags);
+    plan->head.nonce = c->session.nonce ? c->session.nonce : c->nonce;
+    plan->sampled = sampled;
+    plan->playout = playout;
+    plan->begin = c->begin;
+    plan->content = c->session.nonce ? CONTENT : STEWART_REQUEST;
+    plan->identity = stewart_own_identity;
+    plan->rows = (uint8_t)rows;
+    udp_put(c->socket, data, stewart_write_plan(plan, c->key, data), &c->machine);
 }
 
-/* Take the measurement of an instant, NaN without any; return its age in periods. */
-static int take(controller *c, uint64_t sampled, real *measurement)
-{
-    int fresh = c->last.kind == STEWART_STATE && c->last.sampled >= c->used &&
-                c->last.sampled >= c->begin && c->last.sampled <= sampled;
-    uint64_t age = fresh ? (sampled - c->last.sampled + c->last.period / 2) / c->last.period : 0;
-    fresh &= age <= (uint64_t)stewart_configuration.longest_wait;
-    for (int i = 0; i < STEWART_STATES; i++)
-        measurement[i] = fresh ? (real)c->last.state[i] : (real)NAN;
-    c->used = fresh ? c->last.sampled + 1 : c->used;
-    c->missing += !fresh;
-    return fresh ? (int)age : 0;
-}
+/* ---------------------------------------------------------------- the law */
 
-static void note_head(const controller *c)
+/* Take the newest measurement up to sample k into `measured`, NaN without any. Return its age in periods@", or that
+   of the newest datagram, which a report is of; negative without one" if network@. */
+static int take(controller *c, unsigned k)
 {
-    static const char *const names[] = {"roll", "pitch", "yaw", "x", "y", "z"};
-    fprintf(c->log, "time[s]");
-    for (int i = 0; i < 6; i++)
-        fprintf(c->log, ",%s[%s]", names[i], i < 3 ? "rad" : "m");
-    for (int i = 0; i < 6; i++)
-        fprintf(c->log, ",%s_dot[%s/s]", names[i], i < 3 ? "rad" : "m");
-    for (int i = 0; i < STEWART_MOTORS; i++)
-        fprintf(c->log, ",torque_%d[N m]", i + 1);
-    fprintf(c->log, ",age[periods]\n");
+    int age = @-1 if network else 0@, found = 0;
+    for (int i = 0; i < STEWART_MEASURED; i++)
+        c->measured[i] = (real)NAN;
+    for (int a = 0; !found && a <= LONGEST_WAIT && (unsigned)a + c->next <= k; a++) {
+        const kept_measurement *kept = &c->came[(k - (unsigned)a) % KEPT];
+        if (!kept->there || kept->sample != k - (unsigned)a)
+            continue;
+        found = kept->measured;
+        for (int i = 0; found && i < STEWART_MEASURED; i++)
+            c->measured[i] = (real)kept->values[i];
+{% if network %}
+        age = age < 0 || found ? a : age;
+{% else %}
+        age = found ? a : age;
+{% endif %}
+    }
+    c->next = found ? k - (unsigned)age + 1 : c->next;
+    c->missing += !found;
+    return age;
 }
+{% if network %}
 
-static void note(const controller *c, double t, const real *measurement, const real *torque,
-                 int age)
+/* Report of packets and torques up to `age` periods before sample k. */
+static const stewart_report *report_at(controller *c, unsigned k, int age)
 {
-    fprintf(c->log, "%.9g", t);
-    for (int i = 0; i < STEWART_STATES; i++)
-        fprintf(c->log, ",%.17g", (double)measurement[i]);
-    for (int i = 0; i < STEWART_MOTORS; i++)
-        fprintf(c->log, ",%.17g", (double)torque[i]);
-    fprintf(c->log, ",%d\n", age);
+    stewart_report *report = &c->report;
+    *report = (stewart_report){0, c->arrived, 0, c->told[0], age};
+    for (int i = 0; i < LAW->packets->report_periods; i++) {
+        int before = (int)k - age - 1 - i;
+        unsigned place = (unsigned)before % KEPT;
+        c->arrived[report->packets++] = before >= 0 && c->packets[place].arrived;
+        if (report->periods == i && c->acted[place].period == before)
+            memcpy(c->told[report->periods++], c->acted[place].torque, sizeof c->told[0]);
+    }
+    return report;
 }
-
-/* From a sample to its torque, ns. */
-static uint64_t eta(const controller *c)
-{
-    const stewart_law *law = &stewart_configuration;
-    return (uint64_t)((law->steps + (double)law->fraction) * (double)c->last.period + 0.5);
-}
+{% elif not servos %}
 
 /* Correct the memory by the reported torques, which differ from the sent ones if these came late. */
 static void correct(controller *c, unsigned k)
 {
-    real acted[STEWART_HISTORY][STEWART_MOTORS];
-    double period = (double)c->last.period;
-    if (c->last.history == 0)
-        return;
-    for (int row = 0; row < c->last.history; row++)
-        for (int i = 0; i < STEWART_MOTORS; i++)
-            acted[row][i] = (real)c->last.acted[row][i];
-    double since = (double)(c->begin + eta(c)) - (double)c->last.acted_from;
-    stewart_note_acted(&stewart_configuration, c->memory, (int)k + (int)lround(since / period),
-                  c->last.history, acted[0]);
+    for (int ago = 1; ago <= LAW->layout.in_flight.rows; ago++) {
+        int period = (int)k - ago + LAW->steps;
+        unsigned place = (unsigned)period % KEPT;
+        if (c->acted[place].period == period)
+            stewart_note_acted(LAW, c->memory, ago, 1, c->acted[place].torque);
+    }
+}
+{% endif %}
+
+/* Step a memory of the law at sample k. */
+static int compute(controller *c, real *memory, unsigned k, stewart_sample *sample)
+{
+    double now = k * (double)LAW->period;
+    real output[@"STEWART_COMMAND" if servos else "STEWART_MOTORS"@];
+    sample->reference = stewart_look_ahead;
+    sample->goal = stewart_look_back;
+    sample->context = &now;
+{% if servos %}
+    real report[@steps[0].report.size@]; /* of torques, which the protocol does not have */
+    for (int i = 0; i < @steps[0].report.size@; i++)
+        report[i] = (real)NAN;
+    return stewart_servo_step(&c->law, memory, c->scratch, sample, report, output);
+{% elif tuner %}
+    real wanted[STEWART_REFERENCE];
+    stewart_goal(now, wanted);
+    memcpy(sample->weights, memory + LAW->layout.weights.at, sizeof sample->weights);
+    return memory == c->memory ? stewart_tuned_step(LAW, &stewart_own_tuner, memory, c->tuner, c->scratch,
+                                                    sample, wanted, output)
+                               : stewart_step(LAW, memory, c->scratch, sample, output);
+{% else %}
+    memcpy(sample->weights, stewart_weights, sizeof sample->weights);
+    return stewart_step(LAW, memory, c->scratch, sample, output);
+{% endif %}
 }
 
-/* The law at sample k, its torque within the machine's limit. */
-static void compute(controller *c, real *memory, unsigned k, const real *measurement, int age,
-                    real *torque)
+/* The row that was computed last; earlier ones @"and planned ones are next to it" if network else "precede it"@. */
+static const real *newest_row(const controller *c, const real *memory)
 {
-    const stewart_law *law = &stewart_configuration;
-    double now = k * (double)law->period;
-    real limit = (real)fmin(c->last.torque_limit, (double)law->machine.torque_limit);
-    stewart_sample sample = {.measurement = measurement, .age = age, .reference = stewart_look_ahead};
-    sample.goal = stewart_look_back;
-    sample.context = &now;
-    sample.weights[0] = stewart_weights[0];
-    sample.weights[1] = stewart_weights[1];
-    stewart_step(law, memory, c->scratch, &sample, torque);
+{% if network %}
+    const stewart_packets *p = LAW->packets;
+    return stewart_newest_packet(p, memory + LAW->layout.channel.at) + p->repeats * STEWART_MOTORS;
+{% elif servos %}
+    return memory + c->law.layout.command.at;
+{% else %}
+    const stewart_field *in_flight = &LAW->layout.in_flight;
+    return memory + in_flight->at + (in_flight->rows - 1) * STEWART_MOTORS;
+{% endif %}
+}
+
+static void put_row(controller *c, unsigned row, const real *values)
+{
     for (int i = 0; i < STEWART_MOTORS; i++)
-        torque[i] = (real)fmax(-limit, fmin(limit, torque[i]));
-    stewart_note_acted(law, memory, 1, 1, torque);
+        c->plan.torques[row][i] = (double)values[i];
 }
 
-/* Plan the torques that follow without further measurements. */
-static void plan(controller *c, unsigned k)
+/* Fill in the rows of sample k, after those of `repeats` earlier ones; return their number. */
+static unsigned fill_plan(controller *c, unsigned k, unsigned repeats)
 {
-    real nothing[STEWART_STATES];
-    for (int i = 0; i < STEWART_STATES; i++)
-        nothing[i] = (real)NAN;
+    const real *now = newest_row(c, c->memory) - repeats * STEWART_MOTORS;
+    unsigned rows = 0, last = repeats@" + (unsigned)LAW->packets->torques - 1" if network@;
+    for (; rows <= last; rows++)
+        put_row(c, rows, now + rows * STEWART_MOTORS);
+{% if network %}
+    (void)k;
+{% else %}
+    /* Step a copy of the memory without further measurements, if they are for a buffer. */
     memcpy(c->ahead, c->memory, sizeof c->ahead);
-    for (unsigned i = 1; i <= PLANNED; i++)
-        compute(c, c->ahead, k + i, nothing, 0, c->said[REPEATS + i]);
+    for (unsigned i = 1; c->buffered && i <= PLANNED; i++) {
+        stewart_sample nothing = {.measurement = c->nothing};
+{% if servos %}
+        if (compute(c, c->ahead, k + i, &nothing) & STEWART_UNREACHABLE)
+            break;
+{% else %}
+        compute(c, c->ahead, k + i, &nothing);
+{% endif %}
+        put_row(c, rows++, newest_row(c, c->ahead));
+    }
+{% endif %}
+    return rows;
+}
+
+/* ---------------------------------------------------------------- the log */
+
+static void note_head(const controller *c)
+{
+    fprintf(c->log, "time[s]");
+{% if encoders %}
+    for (int i = 0; i < STEWART_MOTORS; i++)
+        fprintf(c->log, ",@"crank" if servos else "angle"@_%d[rad]", i + 1);
+{% else %}
+    static const char *const names[] = {"roll", "pitch", "yaw", "x", "y", "z"};
+    for (int i = 0; i < 6; i++)
+        fprintf(c->log, ",%s[%s]", names[i], i < 3 ? "rad" : "m");
+    for (int i = 0; i < 6; i++)
+        fprintf(c->log, ",%s_dot[%s/s]", names[i], i < 3 ? "rad" : "m");
+{% endif %}
+    for (int i = 0; i < STEWART_MOTORS; i++)
+        fprintf(c->log, ",@"setpoint_%d[rad]" if servos else "torque_%d[N m]"@", i + 1);
+    fprintf(c->log, ",age[periods]\n");
+}
+
+/* Write a row: the values at the sample, and what was sent. */
+static void note(const controller *c, double t, int age)
+{
+    const real *sent = newest_row(c, c->memory);
+    fprintf(c->log, "%.9g", t);
+    for (int i = @"STEWART_MEASURED - STEWART_MOTORS" if encoders else "0"@; i < STEWART_MEASURED; i++)
+        fprintf(c->log, ",%.17g", (double)c->measured[i]);
+    for (int i = 0; i < STEWART_MOTORS; i++)
+        fprintf(c->log, ",%.17g", (double)sent[i]);
+    fprintf(c->log, ",%d\n", age);
+}
+
+/* ---------------------------------------------------------------- a sample */
+
+/* Count measurements in a row of which the law used no part. */
+static void judge(controller *c, int status)
+{
+    const int unusable = stewart_unmeasured(status);
+    c->unusable = unusable ? c->unusable + 1 : 0;
+    for (int i = 0; i < 3; i++)
+        c->causes[i] = unusable ? c->causes[i] + (status >> (STEWART_CAUSES_AT + i) & 1) : 0;
 }
 
 static void step(controller *c, unsigned k)
 {
-    uint64_t period = c->last.period, sampled = c->begin + k * period;
-    real measurement[STEWART_STATES], *torque = c->said[REPEATS];
-    /* Repetitions and plans need a buffer; only torques of future periods are repeated. */
-    int waits = !(c->last.head.flags & STEWART_WIRE);
-    unsigned steps = (unsigned)stewart_configuration.steps, repeats = steps < k ? steps : k;
-    repeats = !waits ? 0 : repeats < REPEATS ? repeats : REPEATS;
-    int age = take(c, sampled, measurement);
-    memmove(c->said[0], c->said[1], REPEATS * sizeof c->said[0]);
-    if (waits)
+    uint64_t sampled = c->begin + k * c->period;
+    stewart_sample sample = {.measurement = c->measured, .age = take(c, k)};
+    LAW->machine.torque_limit = (real)fmin(c->last.torque_limit, (double)DESIGN.machine.torque_limit);
+{% if network %}
+    unsigned repeats = (unsigned)LAW->packets->repeats;
+    sample.report = sample.age < 0 ? NULL : report_at(c, k, sample.age);
+{% elif servos %}
+    unsigned repeats = 0;
+{% else %}
+    /* Only torques of future periods are repeated. */
+    unsigned steps = (unsigned)LAW->steps, repeats = steps < k ? steps : k;
+    repeats = !c->buffered ? 0 : repeats < REPEATS ? repeats : REPEATS;
+    if (c->buffered)
         correct(c, k);
-    compute(c, c->memory, k, measurement, age, torque);
-    if (waits)
-        plan(c, k);
-    say(c, 0, sampled, sampled + eta(c) - repeats * period, c->said + REPEATS - repeats,
-        repeats + 1 + (waits ? PLANNED : 0));
+{% endif %}
+    judge(c, compute(c, c->memory, k, &sample));
+{% if network %}
+    c->packets[k % KEPT].sequence = c->session.sent + 1;
+    c->packets[k % KEPT].arrived = 0;
+{% endif %}
+    unsigned rows = fill_plan(c, k, repeats);
+    say(c, 0, sampled, sampled + eta(c) - repeats * c->period, rows);
     if (c->log)
-        note(c, k * (double)stewart_configuration.period, measurement, torque, age);
+        note(c, k * (double)LAW->period, sample.age);
     c->samples++;
-    c->missed += udp_now() > own_time(&c->clock, sampled + period);
+    c->missed += udp_now() > latest(c, sampled + c->period);
 }
+
+/* ---------------------------------------------------------------- a run */
 
 /* Return why a machine is not driven, or NULL. */
 static const char *objection(const controller *c)
@@ -257,6 +520,19 @@ static const char *objection(const controller *c)
         snprintf(text, sizeof text, "the machine has %s; this controller is designed for %s", other, own);
         return text;
     }
+    if (fabs((double)c->last.period - SECOND * (double)DESIGN.period) > 1e-6 * (double)c->last.period) {
+        snprintf(text, sizeof text, "the machine's datagrams say a period of %g s; expected %g s",
+                 1e-9 * (double)c->last.period, (double)DESIGN.period);
+        return text;
+    }
+{% if network %}
+    if (!c->buffered)
+        return "the machine has no play-out buffer, which packets need: export with link.kind: wire";
+{% elif finds_delay %}
+    if (c->buffered)
+        return "the machine keeps to play-out times, so that its delay is known: export with "
+               "controller.delay_estimator: none";
+{% endif %}
     if (!(c->last.head.flags & STEWART_SIMULATION) && !(c->flags & STEWART_ARMED))
         return "this is a real machine: say `arm` to drive it";
     return NULL;
@@ -273,17 +549,34 @@ static const char *in_use(const controller *c)
     return text;
 }
 
-/* Return why the machine does not continue, or NULL. */
+/* Return why the run does not go on, or NULL. */
 static const char *fault(const controller *c)
 {
     static char text[200];
     const stewart_measured *m = &c->last;
+    const uint64_t gap = c->unusable * c->period;
     size_t used = 0;
-    if (!(m->head.flags & STEWART_LEFT) && m->reason.fault != STEWART_ENDED)
-        return NULL;
     if (m->head.flags & STEWART_LEFT)
         used = (size_t)snprintf(text, sizeof text, "left workspace: ");
-    udp_reason(&m->reason, &m->before, text + used, sizeof text - used);
+    if (used || m->reason.fault == STEWART_ENDED) {
+        udp_reason(&m->reason, &m->before, text + used, sizeof text - used);
+        return text;
+    }
+{% if network %}
+    for (int late = 0; late < 2; late++)
+        if (c->off[late] >= OFF) {
+            snprintf(text, sizeof text,
+                     "acted_from in the machine's datagrams is one period %s: its last %d rows of torques "
+                     "were sent for the period %s", late ? "late" : "early", OFF, late ? "before" : "after");
+            return text;
+        }
+{% endif %}
+    if (gap <= LONGEST_GAP)
+        return NULL;
+    if (c->times.rate * (double)(udp_now() - c->session.heard) >= (double)(gap - c->period))
+        return "the machine has fallen silent";
+    snprintf(text, sizeof text, "no usable measurement for %g s (%u missing, %u frozen, %u rejected)",
+             1e-9 * (double)gap, c->causes[0], c->causes[1], c->causes[2]);
     return text;
 }
 
@@ -291,74 +584,62 @@ static const char *fault(const controller *c)
 static const char *greet(controller *c)
 {
     uint64_t patience = udp_now() + 10ull * SECOND;
-    while (c->last.begin == STEWART_NEVER || c->begin == STEWART_NEVER || c->last.period == 0) {
+    while (c->last.begin == STEWART_NEVER || c->begin == STEWART_NEVER || c->period == 0) {
         if (udp_interrupted() || udp_now() > patience)
             return c->busy ? in_use(c) : "the machine does not answer";
-        say(c, 0, 0, 0, NULL, 0);
-        uint64_t next = udp_now() + (c->last.period ? c->last.period : SECOND / 10);
+        say(c, 0, 0, 0, 0);
+        uint64_t next = udp_now() + REQUEST_PERIOD;
         while (udp_now() < next) {
             udp_wait(c->socket, next);
             receive(c);
         }
+        c->buffered = !(c->last.head.flags & STEWART_WIRE);
         const char *problem = objection(c);
         if (problem)
             return problem;
-        if (c->session.nonce == 0)
-            continue;
-        if (c->begin == STEWART_NEVER && c->clock.number >= ENOUGH) {
-            double trip = c->clock.trip[shortest(&c->clock)], ahead = 5 * (double)c->last.period;
-            double wanted = machine_time(&c->clock, udp_now()) + ahead + 2 * c->clock.rate * trip;
-            c->begin = ((uint64_t)wanted / c->last.period + 1) * c->last.period;
+        c->period = c->offered ? c->last.period : 0;
+        if (c->session.nonce == 0 && c->nonce && c->times.number >= ENOUGH) {
+            c->session.nonce = c->nonce;
+            double ahead = 5 * (double)c->period + 2 * c->times.rate * shortest_trip(&c->times);
+            c->begin = (whole(machine_time(&c->times, udp_now()) + ahead) / c->period + 1) * c->period;
         }
     }
     c->begin = c->last.begin; /* as the machine says */
+    double jitter = longest_trip(&c->times) - shortest_trip(&c->times);
+    c->longest = fmax((double)c->period / c->times.rate, c->buffered ? 1.25 * jitter : 0);
     return NULL;
-}
-
-/* Longest time to wait for the measurement of a sample, own ns; 0: late ones are used later. */
-static uint64_t longest_patience(const controller *c)
-{
-    if (stewart_configuration.longest_wait)
-        return 0;
-    return c->last.period / (eta(c) > c->last.period ? 2 : 4);
 }
 
 /* Print a warning if the link is too slow for this controller. */
 static void warn_of_link(const controller *c)
 {
-    double trip = c->clock.trip[shortest(&c->clock)];
-    uint64_t patience = longest_patience(c);
-    if (!(c->last.head.flags & STEWART_WIRE) && trip > (double)eta(c))
-        printf("warning: a round trip takes %.3g ms, but torques are to act %.3g ms after their sample: they "
-               "are late; export with a longer delay (delay.steps)\n", 1e-6 * trip, 1e-6 * (double)eta(c));
-    if (patience && trip / 2 > (double)patience)
-        printf("warning: measurements take about %.3g ms, but are waited for only %.3g ms: they are missing; "
-               "export with their delay (sensor.delay, s)\n", 5e-7 * trip, 1e-6 * (double)patience);
+    double trip = shortest_trip(&c->times);
+    if (c->buffered && trip > (double)eta(c))
+        printf("warning: a round trip takes %.3g ms, but @"setpoints" if servos else "torques"@ are to act %.3g ms after their sample: they "
+               "are late; export with a longer delay (@"link.playout" if network else "delay.steps"@)\n", 1e-6 * trip, 1e-6 * (double)eta(c));
 }
 
 /* Run all samples; return why the run ended early, or NULL. */
 static const char *drive(controller *c)
 {
-    unsigned number = (unsigned)(c->seconds / (double)stewart_configuration.period + 0.5);
-    int waits = stewart_configuration.longest_wait == 0;
-    uint64_t longest = longest_patience(c);
-    for (uint64_t t = own_time(&c->clock, c->begin); udp_now() + SECOND / 20 < t;) {
-        say(c, 0, 0, 0, NULL, 0); /* still here */
+    unsigned number = (unsigned)(c->seconds / (double)DESIGN.period + 0.5);
+    for (uint64_t t = latest(c, c->begin); udp_now() + SECOND / 20 < t && !udp_interrupted();) {
+        say(c, 0, 0, 0, 0); /* still here */
         udp_wait(c->socket, udp_now() + SECOND / 20);
         receive(c);
     }
     for (unsigned k = 0; k < number; k++) {
-        uint64_t sampled = c->begin + k * c->last.period;
-        uint64_t patience = own_time(&c->clock, sampled + longest);
-        for (receive(c); udp_now() < patience && !(waits && c->last.sampled >= sampled); receive(c))
-            udp_wait(c->socket, patience);
+        uint64_t until = latest(c, c->begin + k * c->period);
+{% if not wait %}
+        const kept_measurement *kept = &c->came[k % KEPT];
+{% endif %}
+        for (receive(c); udp_now() < until && !udp_interrupted()@" && !(kept->there && kept->sample == k)" if not wait@; receive(c))
+            udp_wait(c->socket, until);
         if (udp_interrupted())
             return "interrupted";
         const char *problem = fault(c);
         if (problem)
             return problem;
-        if (udp_now() > c->session.heard + 2 * c->last.watchdog)
-            return "the machine has fallen silent";
         step(c, k);
     }
     return NULL;
@@ -412,17 +693,33 @@ int main(int argc, char **argv)
         return 2;
     c.session.number += c.session.number == 0;
     c.begin = c.last.begin = STEWART_NEVER;
-    stewart_start(&stewart_configuration, c.memory, stewart_queue_rows, stewart_queue);
+    c.law = stewart_configuration;
+{% if servos %}
+    stewart_servo_start(&c.law, c.memory, stewart_queue);
+{% else %}
+    stewart_start(&c.law, c.memory, stewart_queue_rows, stewart_queue);
+{% endif %}
+{% if tuner %}
+    stewart_tuner_start(&stewart_own_tuner, c.tuner);
+{% endif %}
+{% if network %}
+    c.checked = -1;
+{% else %}
+    for (int i = 0; i < STEWART_MEASURED; i++)
+        c.nothing[i] = (real)NAN;
+{% endif %}
+    for (unsigned i = 0; i < KEPT; i++)
+        c.acted[i].period = INT_MIN;
     const char *problem = c.socket < 0 ? "no socket" : greet(&c);
     if (!problem) {
         printf("begins at %.3f s of the machine, round trip %.2f ms\n", 1e-9 * (double)c.begin,
-               1e-6 * c.clock.trip[shortest(&c.clock)]);
+               1e-6 * shortest_trip(&c.times));
         warn_of_link(&c);
         fflush(stdout);
         problem = drive(&c);
     }
     for (int i = 0; i < 3 && c.session.nonce; i++)
-        say(&c, STEWART_STOP, 0, 0, NULL, 0);
+        say(&c, STEWART_STOP, 0, 0, 0);
     printf("%s after %u samples, %u of them without a measurement, %u late\n",
            problem ? problem : "completed", c.samples, c.missing, c.missed);
     udp_tell(c.refused);
