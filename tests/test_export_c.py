@@ -210,6 +210,41 @@ def test_odd_inputs_are_survived(name, settings, tmp_path, compiler):
     assert (done.stdout, done.stderr, done.returncode) == ("odd inputs: survived\n", "", 0)
 
 
+STATUSES = """
+#define main replay
+#include "stewart_test.c"
+#undef main
+int main(void) {
+    begin();
+    for (int k = 0; k < STEPS; k++) {
+        real found[ANSWER];
+        const int returned = answer(k, found);
+        after_step(k);
+        printf("%d %d\\n", returned & 0x138, stewart_unmeasured(returned));
+    }
+    return 0;
+}
+"""
+"""Prints the bits of a measurement, and whether no part of it was used."""
+
+
+@pytest.mark.slow
+def test_a_status_distinguishes_single_values_from_a_whole_measurement(tmp_path, compiler):
+    """One leg is missing, or all are: the board stops for the second only."""
+    faults = "sensor.faults=[{kind: missing, leg: 2, from: 0.5, to: 0.8}, "
+    faults += "{kind: missing, from: 1.0, to: 1.2}]"
+    settings = ("sensor.kind=encoders", "start=on_reference", "duration=1.5", faults)
+    folder = exported(tmp_path, "paper", settings)
+    (folder / "statuses.c").write_text(STATUSES)
+    make(folder, "stewart_motion.o")
+    own = [*objects(folder), "stewart_motion.o", "meter.c", "statuses.c", "-lm", "-o", "statuses"]
+    subprocess.run([*compiler, "-O1", *own], cwd=folder, check=True)
+    said = subprocess.run(["./statuses"], cwd=folder, capture_output=True, text=True, check=True)
+    rows = [tuple(map(int, line.split())) for line in said.stdout.splitlines()]
+    assert set(rows) == {(0, 0), (8 + 256, 0), (8, 1)}
+    assert rows.count((8, 1)) == 2
+
+
 PAINTED = """
 #include <pthread.h>
 #include <stdio.h>
@@ -327,18 +362,37 @@ def test_the_command_writes_all_files_or_none_and_states_sizes(tmp_path, capsys,
 
 BODY = "{ (void)context, (void)number, (void)times, (void)rows; }"
 ENCODERS = ("sensor.kind=encoders", "sensor.samples=20")
+FEW = ("sensor.kind=encoders", "sensor.samples=8", "link.kind=network")
 DESCRIBED = {
     "torques": ("paper", None, (), ("= 8 periods after", "(here 9)")),
     "late measurements": ("paper", None, ("sensor.delay=0.2",), ("up to 12 (`.longest_",)),
-    "encoders": ("paper", None, ENCODERS, ("has 120 numbers: 20 rows", "All rows are used")),
+    "encoders": (
+        "paper",
+        None,
+        ENCODERS,
+        ("has 120 numbers: 20 rows", "All rows are used", "of `sensor.samples: 20`"),
+    ),
     "encoders without estimator": (
         *("paper", None, (*ENCODERS, "controller.estimate=[]"), ("Only the last row is used",)),
     ),
     "network": ("paper", None, ("link.kind=network",), ("packets of 17 rows", "holds the last")),
+    "encoders over a network": (
+        "paper",
+        None,
+        FEW,
+        ("not here because of `sensor.kind: encoders`",),
+    ),
     "unknown delay": ("paper", "adaptive_lqi", (), ("It is assumed to be 8 periods",)),
     "weights": ("desktop", None, ("tuner.kind=ann",), ("stewart_tuned_step(", "= 3 periods")),
-    "servos": ("paper", "servo_preview", ("actuator.kind=servo",), ("angles, rates and torques",)),
-    "setpoints": ("reachy_mini", "servo_feedforward", (), ("1216 numbers", "20 rows of mean")),
+    "servos": (
+        *("paper", "servo_preview", ("actuator.kind=servo",)),
+        ("angles, rates and torques", "because of `actuator.kind: servo`"),
+    ),
+    "setpoints": (
+        *("reachy_mini", "servo_feedforward", ()),
+        ("1216 numbers", "20 rows of mean", "because of `controller.estimate`"),
+    ),
+    "setpoints without estimator": ("reachy_mini", None, (), ("adds fifteen planned setpoints",)),
 }
 
 
@@ -370,6 +424,7 @@ def test_the_readme_is_that_of_the_composition(case, tmp_path):
     (tmp_path / "wiring.c").write_text(f"{included}\n{declared}{rest}", encoding="utf-8")
     headers = {"stewart_motion.h", "stewart_board.h", "protocol.h", "udp.h", "meter.h"}
     own = sorted(headers & files.keys())
+    assert ("stewart_machine.c" in files) == ("./stewart_machine" in readme)
     all_headers = "\n".join([included, *(f'#include "{name}"' for name in own)])
     other = f'extern "C" {{\n{all_headers}\n{declared}}}\n{rest}'
     (tmp_path / "wiring.cpp").write_text(other, encoding="utf-8")

@@ -34,6 +34,7 @@
 {% endif %}
 /* Periods for which a late measurement is of use. */
 #define LONGEST_WAIT @"((int)KEPT - 1)" if servos else wait@
+#define PATIENCE (10ull * SECOND) /* for an answer, and for the begin, ns */
 #define LONGEST_GAP SECOND /* without a usable measurement, ns */
 #define CONTENT @"STEWART_CRANKS" if servos else "STEWART_TORQUES"@
 #define DESIGN stewart_configuration@".law" if servos@
@@ -583,7 +584,7 @@ static const char *fault(const controller *c)
 /* Agree on a session and a begin; return why not, or NULL. */
 static const char *greet(controller *c)
 {
-    uint64_t patience = udp_now() + 10ull * SECOND;
+    uint64_t patience = udp_now() + PATIENCE;
     while (c->last.begin == STEWART_NEVER || c->begin == STEWART_NEVER || c->period == 0) {
         if (udp_interrupted() || udp_now() > patience)
             return c->busy ? in_use(c) : "the machine does not answer";
@@ -623,13 +624,17 @@ static void warn_of_link(const controller *c)
 static const char *drive(controller *c)
 {
     unsigned number = (unsigned)(c->seconds / (double)DESIGN.period + 0.5);
-    for (uint64_t t = latest(c, c->begin); udp_now() + SECOND / 20 < t && !udp_interrupted();) {
+    uint64_t t = latest(c, c->begin);
+    if (t > udp_now() + PATIENCE)
+        return "the machine begins too late";
+    while (udp_now() + SECOND / 20 < t && !udp_interrupted()) {
         say(c, 0, 0, 0, 0); /* still here */
         udp_wait(c->socket, udp_now() + SECOND / 20);
         receive(c);
     }
     for (unsigned k = 0; k < number; k++) {
-        uint64_t until = latest(c, c->begin + k * c->period);
+        uint64_t until = latest(c, c->begin + k * c->period), furthest = udp_now() + whole(3 * c->longest);
+        until = until < furthest ? until : furthest; /* odd times of a machine do not stop the controller */
 {% if not wait %}
         const kept_measurement *kept = &c->came[k % KEPT];
 {% endif %}
