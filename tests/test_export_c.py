@@ -347,7 +347,7 @@ def test_the_command_writes_all_files_or_none_and_states_sizes(tmp_path, capsys,
     (folder / "stewart_board.c").write_text("mine")
     assert main([*command, "--set", "sensor.kind=encoders"]) == 0
     assert "last export: stewart_board.c; delete" in capsys.readouterr().out
-    assert not (folder / "protocol.c").exists()
+    assert not (folder / "stewart_machine.c").exists()
     assert main(command) == 0
     assert "last export: stewart_board.c; delete" in capsys.readouterr().out
     assert (folder / "stewart_board.c").read_text() == "mine"
