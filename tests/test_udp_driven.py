@@ -117,7 +117,7 @@ def drive(folder, port, *options):
 )
 @in_real_time
 def test_the_controller_in_c_follows_as_live_does(case, folder_of):
-    """By the poses of the machine: half as far again off as `live`, and 0.05 % of the motion."""
+    """Its mean error is within 1.5 times that of `live` and 0.05 % of the motion."""
     buffer, errors = [BUFFERS[case]] if case in BUFFERS else [], []
     with machine_of(case, *buffer) as (address, log):
         done = drive(folder_of(case), address[1])
@@ -128,6 +128,25 @@ def test_the_controller_in_c_follows_as_live_does(case, folder_of):
         assert run.status == "completed"
     errors.append(error_of(case, log))
     assert errors[0] < 1.5 * errors[1] + 0.05
+
+
+@pytest.mark.slow
+@in_real_time
+@pytest.mark.parametrize(
+    ("faults", "end"),
+    [
+        (
+            "{kind: missing, from: 0.55, to: 9}",
+            "no usable measurement for 1.1 s (11 missing, 0 froz",
+        ),
+        ("{kind: missing, leg: 2, from: 0.55, to: 9}", "completed after 30 samples, 0 of them"),
+    ],
+)
+def test_a_second_without_a_usable_measurement_ends_the_run(faults, end, folder_of):
+    """The loss of a single encoder does not end it."""
+    with machine_of("encoders", f"sensor.faults=[{faults}]") as ((_, port), _):
+        done = drive(folder_of("encoders"), port)
+    assert end in done.stdout and done.returncode == end.startswith("no"), done
 
 
 # ---------------------------------------------------------------- damaged datagrams
@@ -191,7 +210,7 @@ def disturbed(rng):
 @pytest.mark.parametrize("case", ["state", "encoders, network", "setpoints"])
 @in_real_time
 def test_damaged_replayed_and_reordered_datagrams_change_nothing(case, folder_of, tmp_path):
-    """With a key. What is overtaken by a period counts as late, or is used later."""
+    """Both sides have a key. A measurement that is overtaken counts as late, or is used later."""
     key = tmp_path / "key"
     key.write_bytes(KEY)
     buffer = [BUFFERS[case]] if case in BUFFERS else []

@@ -15,7 +15,7 @@ enum stewart_status {
     STEWART_MEASUREMENT_REJECTED = 32, /* does not fit the machine or the estimate; replaced as well */
     STEWART_SATURATED = 64,           /* a torque is at the limit */
     STEWART_REFERENCE_MISSING = 128,  /* NaN or infinity in the preview: the reference continued */
-    STEWART_MEASUREMENT_PARTIAL = 256 /* with the three of a measurement: the rest of it was used; not counted */
+    STEWART_MEASUREMENT_PARTIAL = 256 /* with the three of a measurement: only in part; not counted */
 };
 #define STEWART_CAUSES 8 /* number of these bits */
 #define STEWART_CAUSES_AT 3 /* shift of a `fault` of `stewart_sensing` to its bits */
@@ -23,7 +23,8 @@ enum stewart_status {
 /* Whether a step used no part of its measurement, by its result. */
 static inline int stewart_unmeasured(int status)
 {
-    const int causes = STEWART_MEASUREMENT_MISSING | STEWART_MEASUREMENT_FROZEN | STEWART_MEASUREMENT_REJECTED;
+    const int causes =
+        STEWART_MEASUREMENT_MISSING | STEWART_MEASUREMENT_FROZEN | STEWART_MEASUREMENT_REJECTED;
     return (status & causes) != 0 && !(status & STEWART_MEASUREMENT_PARTIAL);
 }
 

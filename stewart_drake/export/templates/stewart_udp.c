@@ -23,7 +23,7 @@
 #define RECENT 128 /* datagrams by which the link is judged */
 #define ENOUGH 50  /* round trips before the begin */
 #define REQUEST_PERIOD (SECOND / 50) /* ns between two requests */
-#define KEPT @kept@u   /* samples of which measurements and reports are kept, a power of two */
+#define KEPT @kept@u  /* number of the last samples that are kept, a power of two */
 #define FURTHEST 4096 /* samples that a measurement may be ahead */
 #define SPARE (SECOND / 500) /* ns of waiting for a measurement beyond the usual time */
 {% if network %}
@@ -97,7 +97,7 @@ typedef struct {
 {% endif %}
     stewart_plan plan;
     unsigned samples, missing, missed;
-    unsigned unusable, causes[3]; /* measurements in a row; of them missing, frozen, rejected */
+    unsigned unusable, causes[3]; /* measurements in a row; those missing, frozen, rejected */
     double seconds;
     FILE *log;
 } controller;
@@ -463,7 +463,7 @@ static void note(const controller *c, double t, int age)
 
 /* ---------------------------------------------------------------- a sample */
 
-/* Count measurements in a row of which the law used no part. */
+/* Count measurements in a row that the law did not use, not even in part. */
 static void judge(controller *c, int status)
 {
     const int unusable = stewart_unmeasured(status);
