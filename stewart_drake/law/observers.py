@@ -312,7 +312,8 @@ def belief_of(
         status: of the last sample, bits of `stewart_status`.
     """
     c, p = core(), law.machine.estimated
-    faults = tuple(name for i, name in enumerate(Counts._fields) if status >> i & 1)
+    counted = Counts._fields[: c.lib.STEWART_CAUSES]
+    faults = tuple(name for i, name in enumerate(counted) if status >> i & 1)
     if observer.delay is not None:
         return _delay_belief(law, memory, timeline, faults)
     n, m, last = NUM_STATE + p, law.measured, _last_values(observer, law)
