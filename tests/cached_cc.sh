@@ -14,7 +14,11 @@ read -d "" -a files <"$names" # OBJECT: SOURCE HEADERS, on lines that end with a
 kept=$(key "${files[@]:1}")
 kept=$STEWART_OBJECTS/${kept%% *}.o
 if [ ! -f "$kept" ]; then
-    $REAL_CC "${command[@]}" -o "$kept.$$" || exit 1
-    mv "$kept.$$" "$kept"
+    exec {lock}>"$kept.lock"
+    flock "$lock" # of two workers one compiles
+    if [ ! -f "$kept" ]; then
+        $REAL_CC "${command[@]}" -o "$kept.$$" || exit 1
+        mv "$kept.$$" "$kept"
+    fi
 fi
 cp "$kept" "${!#}"
