@@ -318,16 +318,21 @@ def test_a_motion_that_cannot_be_is_refused_each_time():
 START = {"rest": ("controller.replan=0",), "reference": (*FOLLOWS, "controller.replan=0")}
 
 
+@functools.cache
+def prepared_from(start):
+    """Return what the runs from a start have in common, and a prepared run."""
+    one = scenario("paper", *START[start])
+    preparation = preparation_of(one)
+    return preparation, preparation.prepared(preparation.experiment(one))
+
+
 def error_without(start, missing):
     """E_ac with NaN in parts of the previews, by sample, and how often that was counted."""
-    experiment = scenario("paper", *START[start])
-    prepared = preparation_of(experiment).prepared(
-        preparation_of(experiment).experiment(experiment)
-    )
+    preparation, prepared = prepared_from(start)
     previews = prepared.previews.copy()
     for sample, part in missing.items():
         previews[sample][part] = np.nan
-    ending = run_prepared(preparation_of(experiment), prepared._replace(previews=previews))
+    ending = run_prepared(preparation, prepared._replace(previews=previews))
     assert ending.status == "completed" and ending.figures is not None
     return ending.figures.accumulated_error, ending.counts["references_missing"]
 
