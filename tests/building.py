@@ -31,13 +31,15 @@ def c_compiler():
     return found
 
 
+def keeping_objects():
+    """Return variables of the environment for a compiler that compiles no object again."""
+    kept = shlex.quote(str(Path(__file__).with_name("cached_cc.sh")))
+    return {"REAL_CC": " ".join(c_compiler()), "CC": kept}
+
+
 def make(folder, *arguments, fails=False):
     """Return what `make` prints; it must succeed, or fail. Runs are replayed twice."""
-    surroundings = os.environ | {
-        "CFLAGS": "-O2 -DREPEATS=2",
-        "REAL_CC": " ".join(c_compiler()),
-        "CC": shlex.quote(str(Path(__file__).with_name("cached_cc.sh"))),
-    }
+    surroundings = os.environ | keeping_objects() | {"CFLAGS": "-O2 -DREPEATS=2"}
     command = ["make", "-s", *arguments]
     done = subprocess.run(command, cwd=folder, env=surroundings, capture_output=True, text=True)
     assert (done.returncode != 0) == fails, done.stdout + done.stderr

@@ -1,17 +1,15 @@
 #!/bin/bash
-# Compile as $REAL_CC does; keep objects in $STEWART_OBJECTS by options, source and included headers.
-# make ends a command with "SOURCE -o OBJECT". The names of the headers are kept by options and source.
+# Compile as $REAL_CC does; keep objects in $STEWART_OBJECTS by options and preprocessed source.
+# make ends a command with "SOURCE -o OBJECT".
 case " $* " in *" -c "*) ;; *) exec $REAL_CC "$@" ;; esac
+set -o pipefail
 command=("${@:1:$#-2}")
-key() { { echo "${command[@]}"; cat "$@"; } | sha256sum; }
-names=$(key "${command[-1]}")
-names=$STEWART_OBJECTS/${names%% *}.names
-if [ ! -f "$names" ]; then
-    $REAL_CC "${command[@]}" -MM -MF "$names.$$" || exit 1
-    mv "$names.$$" "$names"
-fi
-read -d "" -a files <"$names" # OBJECT: SOURCE HEADERS, on lines that end with a backslash
-kept=$(key "${files[@]:1}")
+options=("$REAL_CC") read=()
+for one in "${command[@]}"; do
+    case $one in -D*) ;; *) options+=("$one") ;; esac # counts where the source uses it
+    case $one in -g*) ;; *) read+=("$one") ;; esac # would write the folder into the source
+done
+kept=$({ echo "${options[@]}" && $REAL_CC "${read[@]}" -E; } | sha256sum) || exit 1
 kept=$STEWART_OBJECTS/${kept%% *}.o
 if [ ! -f "$kept" ]; then
     exec {lock}>"$kept.lock"

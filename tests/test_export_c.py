@@ -14,7 +14,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import SERVOS
-from tests.building import SANITIZED, c_compiler, make
+from tests.building import SANITIZED, c_compiler, keeping_objects, make
 
 NOISE = "sensor.noise_std=[1e-5,1e-5,1e-5,1e-6,1e-6,1e-6,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
 FAULTS = (
@@ -326,7 +326,10 @@ def test_the_command_writes_all_files_or_none_and_states_sizes(tmp_path, capsys,
     """The text of `paper` is at most 196 kB, its state 16.4 kB."""
     folder = tmp_path / "board"
     command = ["export-c", "paper", "--out", str(folder), "--set", "duration=0.5"]
-    assert main(command) == 0
+    with monkeypatch.context() as patch:
+        for name, value in keeping_objects().items():
+            patch.setenv(name, value)
+        assert main(command) == 0
     assert "make test" in capsys.readouterr().out
     names = {path.name for path in folder.iterdir()} - {export_c.DIGESTS}
     assert {"law.h", "law.c", "stewart_config.c", "stewart_test.c", "Makefile"} < names

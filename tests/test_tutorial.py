@@ -12,9 +12,11 @@ import pytest
 import xarray as xr
 
 from stewart_drake.cli import main
+from stewart_drake.core.build import system_compiler
 from stewart_drake.reporting import report
 from stewart_drake.studies import delay
 from tests import test_docs
+from tests.building import keeping_objects
 from tests.shorter import judge_few_delays, leave_blank, map_few_poses
 from tests.test_report import BLANK
 
@@ -41,6 +43,9 @@ def do(tmp_path, monkeypatch, capsys):
     map_few_poses(monkeypatch)
     # Commands before it print these analyses.
     monkeypatch.setattr(report, "_analyse", lambda name, scenario: BLANK)
+    if system_compiler() is not None:
+        for name, value in keeping_objects().items():
+            monkeypatch.setenv(name, value)
 
     def done(part):
         told = {}
