@@ -16,6 +16,7 @@ p-values are Holm's, over all questions.
 """
 
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from itertools import combinations, product
 from typing import Any, Final, NamedTuple
 
@@ -88,12 +89,25 @@ def quantile_interval(values: ArrayLike, probability: float) -> Interval:
     x = np.asarray(values, dtype=np.float64)
     if len(x) == 0 or np.isnan(x).any():
         raise ValueError(f"got {len(x)} values, or NaN among them; expected at least one, none NaN")
-    ends: Any = stats.quantile_test(x, p=probability).confidence_interval(CONFIDENCE)
+    low, high = _enclosing(len(x), probability)
+    ordered = np.sort(x)
     return Interval(
         float(np.quantile(x, probability, method="inverted_cdf")),
-        -np.inf if np.isnan(ends.low) else float(ends.low),
-        np.inf if np.isnan(ends.high) else float(ends.high),
+        -np.inf if low is None else float(ordered[low]),
+        np.inf if high is None else float(ordered[high]),
     )
+
+
+@lru_cache(maxsize=256)
+def _enclosing(number: int, probability: float) -> tuple[int | None, int | None]:
+    """Return the places in order of the values that enclose a quantile; None where there is none.
+
+    They depend on the size of a sample only, so the sample here is its own order.
+    """
+    order = np.arange(number)
+    ends: Any = stats.quantile_test(order, p=probability).confidence_interval(CONFIDENCE)
+    low, high = (None if np.isnan(end) else round(end) for end in (ends.low, ends.high))
+    return low, high
 
 
 def rank_correlation(x: ArrayLike, y: ArrayLike) -> Correlation:
