@@ -30,6 +30,11 @@ contact._ENOUGH_TRIPS = 25
 joblib.cpu_count = lambda: 1
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest test: at the end all others would be done, and wait for it."""
+    items.sort(key=lambda item: item.path.name != "test_tutorial.py")
+
+
 @pytest.fixture(scope="session")
 def one_browser() -> Iterator[Browser]:
     """Return the browser of a session, which takes seconds to start."""
