@@ -19,6 +19,7 @@
 
 #define LEAD 7       /* log of the odds that ends the search */
 #define FORGOTTEN 14 /* log of the odds that drops a cell */
+#define YOUNG 3      /* measurements for which a cell is kept: until then a bias may look like another arrival */
 #define NEAR ((real)0.2) /* periods; nearer delays are one hypothesis */
 #define LEAST_SHARE ((real)1e-4) /* least part of the master's weight for a new cell, and for the master */
 #define SUSPICIOUS 2 /* outliers in a row that start the search for a jump */
@@ -232,7 +233,8 @@ static void search(Search *s, const real *y, stewart_scratch scratch)
     guess_at(s, 0)->weight -= top;
     for (int i = 1; i <= cells; i++) {
         stewart_guess *cell = guess_at(s, i);
-        if (!(cell->weight > top - FORGOTTEN))
+        const int young = cell->heard <= YOUNG && cell->fits > 0;
+        if (!young && !(cell->weight > top - FORGOTTEN))
             continue;
         cell->weight -= top;
         kept++;
