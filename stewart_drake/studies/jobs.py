@@ -23,7 +23,7 @@ from contextlib import closing, contextmanager, suppress
 from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cloudpickle
 import joblib
@@ -200,22 +200,33 @@ def _difference(theirs: Any, mine: Any, name: str = "") -> str:
 # ---------------------------------------------------------------- this machine
 
 
+class _Unreadable(NamedTuple):
+    """Job that a worker could not read."""
+
+    number: int
+    reason: str
+
+
 # cloudpickle sends a class of a script or notebook by value. A class that derives from one of
 # pydrake cannot be rebuilt from that. The attempt would end the worker if the executor made it, so
 # `_call_packed` makes it.
-def _pack(call: _Call) -> bytes:
-    """Return a call as bytes, none if it cannot be sent."""
-    with suppress(Exception):
-        return bytes(cloudpickle.dumps(call))
-    return b""
+def _pack(call: _Call) -> bytes | str:
+    """Return a call as bytes, or the reason why it cannot be sent."""
+    try:
+        packed: bytes = cloudpickle.dumps(call)
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return packed
 
 
-def _call_packed(number: int, packed: bytes) -> tuple[str, bytes] | int:
-    """Unpack and run a call in a worker; return its number if it cannot be read there."""
+def _call_packed(number: int, packed: bytes | str) -> tuple[str, bytes] | _Unreadable:
+    """Unpack and run a call in a worker."""
+    if isinstance(packed, str):
+        return _Unreadable(number, packed)
     try:
         call: _Call = pickle.loads(packed)
-    except Exception:
-        return number
+    except Exception as error:
+        return _Unreadable(number, f"{type(error).__name__}: {error}")
     try:
         return call()
     except Exception as error:
@@ -248,8 +259,10 @@ def _on_this_machine(workers: int | None, calls: Sequence[_Call]) -> Generator[t
         try:
             with closing(outcomes):
                 for outcome in outcomes:
-                    # A job that no worker could read runs here.
-                    yield calls[outcome]() if isinstance(outcome, int) else outcome
+                    if isinstance(outcome, _Unreadable):
+                        _log.debug("a job runs here: no process could read it (%s)", outcome.reason)
+                        outcome = calls[outcome.number]()
+                    yield outcome
         except BrokenProcessPool as error:
             codes = re.search(r"exit codes of the workers are \{(.*)\}", str(error))
             raise ChildProcessError(
