@@ -4,8 +4,8 @@ Bad input is a ConfigError of one line.
 """
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+import time
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -33,6 +33,7 @@ from stewart_drake.mechanism.sdformat import to_sdformat
 from stewart_drake.reporting import servo_identification
 from stewart_drake.reporting.csv_file import read_signals, signals_csv
 from stewart_drake.reporting.identification import document, plan_document
+from stewart_drake.reporting.page import Provenance
 from stewart_drake.reporting.results import (
     AnalysisResult,
     MechanismCheck,
@@ -394,13 +395,10 @@ def make_tuner_data(
     from stewart_drake.reporting.tuner import data_document
     from stewart_drake.tuning.data import make_data, summarize
 
-    family = options.conditions(scenario, controller, settings)
-    return _timed(
-        lambda: make_data(family, directory, progress=progress, **options.jobs),
-        data_document,
-        f"sd.make_tuner_data({str(directory)!r}, {scenario!r})",
-        summary=summarize,
-    )
+    family, started = options.conditions(scenario, controller, settings), time.perf_counter()
+    data = make_data(family, directory, progress=progress, **options.jobs)
+    command = f"sd.make_tuner_data({str(directory)!r}, {scenario!r})"
+    return _timed(data, summarize(data), data_document, command, started)
 
 
 @takes(TrainingOptions)
@@ -430,19 +428,18 @@ def train_tuner(
     options.check()
     read, out = load_data(data), Path(out)
 
-    def trained() -> Any:
-        if options.regret:
-            given = options.model_dump(include={"seed", "start", "workers"})
-            runs = out.with_name(f"{out.stem}-runs")
-            return training.train_by_regret(read, runs, progress=progress, **given)
+    given: dict[str, Any]
+    if options.regret:
+        given = options.model_dump(include={"seed", "start", "workers"})
+        runs = out.with_name(f"{out.stem}-runs")
+        found = training.train_by_regret(read, runs, progress=progress, **given)
+    else:
         given = {"kind": options.labels, "split": options.split, "density": options.density}
         chosen = {name: one for name, one in given.items() if one is not None}
-        return training.train(read, seed=options.seed, **chosen)
-
-    command = f"sd.train_tuner({str(data)!r}, {str(out)!r})"
-    found = analysis_result(trained, training_document, command, summary=training.summarize)
-    save_network(found.study.network, out)
-    return found
+        found = training.train(read, seed=options.seed, **chosen)
+    save_network(found.network, out)
+    summary, made = training.summarize(found), f"sd.train_tuner({str(data)!r}, {str(out)!r})"
+    return AnalysisResult(found, summary, training_document(summary), Provenance(made))
 
 
 @takes(EvaluationOptions)
@@ -472,16 +469,22 @@ def evaluate_tuner(
     from stewart_drake.reporting.tuner import evaluation_document
     from stewart_drake.tuning.evaluation import evaluate
 
-    family = options.conditions(scenario, controller, settings)
+    family, started = options.conditions(scenario, controller, settings), time.perf_counter()
     networks = [networks] if isinstance(networks, str | Path) else networks
+    found = evaluate(family, networks, directory, progress=progress, **options.jobs)
+    command = command or f"sd.evaluate_tuner({str(directory)!r}, {list(networks)!r})"
     return _timed(
-        lambda: evaluate(family, networks, directory, progress=progress, **options.jobs),
-        evaluation_document,
-        command or f"sd.evaluate_tuner({str(directory)!r}, {list(networks)!r})",
+        found, found.summary, lambda found, _: evaluation_document(found), command, started
     )
 
 
-def _timed(*given: Any, **named: Any) -> AnalysisResult:
-    """Return an `analysis_result` with the computing time in its summary."""
-    found = analysis_result(*given, **named)
-    return replace(found, summary=found.summary | {"wall_s": found.made.seconds})
+def _timed(
+    study: Any,
+    summary: dict[str, Any],
+    document: Callable[[Any, dict[str, Any]], Any],
+    command: str,
+    started: float,
+) -> AnalysisResult:
+    seconds = time.perf_counter() - started
+    made = Provenance(command, seconds=seconds)
+    return AnalysisResult(study, summary | {"wall_s": seconds}, document(study, summary), made)

@@ -311,18 +311,17 @@ def analysis_result(
     document: Callable[[Any], Document],
     command: str,
     write: Callable[[Any, Path], list[str]] | None = None,
-    summary: Callable[[Any], dict[str, Any]] = lambda found: dict(found.summary),
 ) -> AnalysisResult:
     """Do a study and describe its result.
 
-    `study` returns the numbers, `summary` plain data of them. `command` repeats it, as typed.
+    `study` returns the numbers, with a `summary` of plain data. `command` repeats it, as typed.
     """
     from stewart_drake.reporting.page import Provenance
 
     started = time.perf_counter()
     found = study()
     made = Provenance(command, seconds=time.perf_counter() - started)
-    return AnalysisResult(found, summary(found), document(found), made, write)
+    return AnalysisResult(found, found.summary, document(found), made, write)
 
 
 def _framed(page: str) -> str:

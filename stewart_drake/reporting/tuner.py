@@ -1,8 +1,8 @@
 """Documents and figures of the tuner: its data, its training and its evaluation."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -13,11 +13,9 @@ from stewart_drake.reporting.document import Document, Table, Tone, from_templat
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import REFERENCE, RUN, TRUTH, Line, line
 from stewart_drake.tuner.source import ratio_of
-from stewart_drake.tuning.data import summarize as summarize_data
 from stewart_drake.tuning.evaluation import HINDSIGHT, RULE, Evaluation
 from stewart_drake.tuning.families import FAULTS, fault_of
 from stewart_drake.tuning.training import Training
-from stewart_drake.tuning.training import summarize as summarize_training
 from stewart_drake.types import Array
 
 _BASELINE: Final = Line("#888888", ":", 1.4)
@@ -25,12 +23,11 @@ _MAX_BOXES: Final = 12
 """Largest number of target values, each a box; with more every row is a dot."""
 
 
-def data_document(data: xr.Dataset) -> Document:
+def data_document(data: xr.Dataset, summary: Mapping[str, Any]) -> Document:
     """Return how many runs completed, and how well.
 
     The table of the paper's grid is by delay and frequency, that of drawn conditions by gain.
     """
-    summary = summarize_data(data)
     grid = bool((data.disturbance.values < 0).all())  # -1: the condition was not drawn
     gains = [] if grid else list(summary["g"])
     return from_template(
@@ -44,18 +41,19 @@ def data_document(data: xr.Dataset) -> Document:
 
 
 def _grid_table(data: xr.Dataset) -> Table:
-    columns = ["delay_steps", "frequency", "accumulated_error"]
-    runs = data.where(data.status == "completed")["accumulated_error"]
-    frame = data[columns].assign(accumulated_error=runs).to_dataframe()[columns]
-    errors = frame.groupby(columns[:2])["accumulated_error"]
-    cells = errors.agg(lambda some: f"{some.count()}, {number(some.min())}").unstack()
-    rows = [(str(steps), *row) for steps, *row in cells.itertuples()]
-    return Table(("delay", *(f"{f:g}" for f in cells.columns)), rows, brief=True)
+    done, delays = data.status.values == "completed", data.delay_steps.values
+    frequencies, rows = np.unique(data.frequency.values), []
+    for steps in np.unique(delays):
+        rows.append([str(steps)])
+        for frequency in frequencies:
+            here = done & (delays == steps) & (data.frequency.values == frequency)
+            errors = data.accumulated_error.values[here]
+            rows[-1].append(f"{here.sum()}, {number(errors.min(initial=np.inf))}")
+    return Table(("delay", *(f"{f:g}" for f in frequencies)), rows, brief=True)
 
 
-def training_document(training: Training) -> Document:
+def training_document(summary: Mapping[str, Any]) -> Document:
     """Return the document of a training; its template shows the part of the loss that was used."""
-    summary = summarize_training(training)
     regret = summary.get("loss") == "regret"
     return from_template("tuner_training", regret=regret and summary, labels=not regret and summary)
 
