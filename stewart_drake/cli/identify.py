@@ -71,8 +71,13 @@ def identify(
     if (plan is None) == (not logs):
         given = "neither" if plan is None else "both"
         raise ConfigError(f"LOG, --plan: got {given}; expected logs, or --plan SCENARIO")
-    typed: dict[str, Any] = {"delay": delay, "tolerance": tolerance, "bits": bits}
-    typed |= {"pose-std": pose_std, "out": delivery.out}
+    typed: dict[str, Any] = {
+        "delay": delay,
+        "tolerance": tolerance,
+        "bits": bits,
+        "pose-std": pose_std,
+        "out": delivery.out,
+    }
     of_csv = {"--bits": bits, "--pose-std": pose_std, "--gravity": gravity}
     if plan is not None:
         of_scenario = {"--mechanism": mechanism, "--delay": delay, "--gravity": gravity}

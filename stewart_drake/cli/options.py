@@ -125,8 +125,12 @@ def _parameter(one: Option) -> inspect.Parameter:
         metavar=one.metavar,
         help=one.help + " Repeatable." * bool(one.read),
     )
-    kind, shown = inspect.Parameter.KEYWORD_ONLY, Annotated[annotation, option]
-    return inspect.Parameter(_name(one), kind, annotation=shown, default=default)
+    return inspect.Parameter(
+        _name(one),
+        inspect.Parameter.KEYWORD_ONLY,
+        annotation=Annotated[annotation, option],
+        default=default,
+    )
 
 
 def _name(one: Option) -> str:

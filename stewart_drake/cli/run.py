@@ -274,8 +274,9 @@ def report(*, chosen: Chosen, delivery: Delivery) -> int:
 
     started, name = time.perf_counter(), chosen.title
     with count_bar("runs, analyses", delivery.silent) as progress:
-        given = chosen.scenario, chosen.settings, progress, chosen.controller
-        found = report_document.collect(*given)
+        found = report_document.collect(
+            chosen.scenario, chosen.settings, progress, chosen.controller
+        )
     delivery.discard(REPLAY, PAGE)
     summary = report_document.report_summary(found)
     delivery.write(summary)

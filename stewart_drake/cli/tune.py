@@ -96,7 +96,9 @@ def evaluate(
     line = command_line(*words, settings=chosen.settings, options=typed)
     with given.named(), stopping(GO_ON), count_bar("conditions", delivery.quiet) as progress:
         found = functions.evaluate_tuner(
-            *(delivery.folder, weights, *chosen._replace(scenario=scenario)),
+            delivery.folder,
+            weights,
+            *chosen._replace(scenario=scenario),
             progress=progress,
             command=line,
             options=options,

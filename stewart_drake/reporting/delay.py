@@ -114,12 +114,14 @@ def growth_figure(study: DelayStudy) -> Figure:
     decades = np.minimum(max(moving) * delay / np.log(10), 30)
     over = "time on the reference  [s]"
     left = Panel("fastest unstable pole p  [1/s]", poles, over, ylim=(0, None), height=2.6)
-    words = {HARDLY: "hardly", NO: "not"}
     right = Panel(
         "growth $e^{pη}$ at the worst instant",
         [Curve(delay, 10**decades)],
         "delay η  [s]",
-        limits={level: f"{word} compensated above {level:g}" for level, word in words.items()},
+        limits={
+            HARDLY: f"hardly compensated above {HARDLY:g}",
+            NO: f"not compensated above {NO:g}",
+        },
         marks={study.eta: f"this delay, {study.eta:.3g} s"},
         yscale="powers",
         xlim=(0, longest),
@@ -135,8 +137,15 @@ def loop_figure(study: DelayStudy) -> Figure:
 
     def panel(name: str, curves: dict[str, list[float]]) -> Panel:
         lines = [Curve(steps, y, label, line(k)) for k, (label, y) in enumerate(curves.items())]
-        how: Any = {"marks": {own: ""}, "yscale": "log", "legend": "inside", "height": 2.4}
-        return Panel(name, lines, "delay μ  [periods]", **how)
+        return Panel(
+            name,
+            lines,
+            "delay μ  [periods]",
+            marks={own: ""},
+            yscale="log",
+            legend="inside",
+            height=2.4,
+        )
 
     peaks = {"S": [m.S.value for m in loops], "T": [m.T.value for m in loops]}
     gains = {

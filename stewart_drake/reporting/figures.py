@@ -191,12 +191,14 @@ def _coordinates(
         data = [FACTORS[k] * run.signals[signal].values[:, k] for run, _ in runs.values()]
         behind = wanted[k : k + 1]
         core = [*(np.asarray(curve.y) for curve in behind), *_trusted(runs, data)]
-        name, curves = (
-            f"{_SYMBOLS[COORDINATES[k]]}{word}  [{unit}]",
-            [*behind, *_curves(runs, data)],
+        panels.append(
+            Panel(
+                f"{_SYMBOLS[COORDINATES[k]]}{word}  [{unit}]",
+                [*behind, *_curves(runs, data)],
+                xlim=_times(runs),
+                ylim=_limits(core, data, reach[k], least[k]),
+            )
         )
-        ylim = _limits(core, data, reach[k], least[k])
-        panels.append(Panel(name, curves, xlim=_times(runs), ylim=ylim))
     return draw([*panels, *below], 2, down=True, title=title)
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import groupby
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -116,9 +116,16 @@ def _margin_figure(
             margins = np.maximum([one.margins[word] for one in systems], _SMALLEST)
             curves.append(Curve(x, margins, label, look))
         curves += more if word == "controllable" else ()
-        limits = {TOLERANCE: f"tolerance {TOLERANCE:g}"}
-        how: Any = {"limits": limits, "yscale": "powers", "height": 2.5}
-        panels.append(Panel(f"margin of {title}", curves, over, **how))
+        panels.append(
+            Panel(
+                f"margin of {title}",
+                curves,
+                over,
+                limits={TOLERANCE: f"tolerance {TOLERANCE:g}"},
+                yscale="powers",
+                height=2.5,
+            )
+        )
     return draw(panels, 2)
 
 

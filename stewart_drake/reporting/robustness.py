@@ -201,10 +201,17 @@ def influence_figure(influences: Sequence[Influence]) -> Figure:
         failures = [(one.failure, one.failure_p) for one in influences]
         shown["rank correlation with failing, all runs"] = failures
     names = [title(one.factor) for one in influences]
-    rows = len(names)
-    how: Any = {"xlim": (-1, 1), "ylim": (rows - 0.5, -0.5), "height": 0.5 + 0.27 * rows}
-    paint = partial(_draw_correlations, names=names)
-    panels = [Panel("", x=x, paint=partial(paint, found=one), **how) for x, one in shown.items()]
+    panels = [
+        Panel(
+            "",
+            x=label,
+            xlim=(-1, 1),
+            ylim=(len(names) - 0.5, -0.5),
+            height=0.5 + 0.27 * len(names),
+            paint=partial(_draw_correlations, found=found, names=names),
+        )
+        for label, found in shown.items()
+    ]
     return draw(panels, len(panels), sharey=True)
 
 
@@ -250,12 +257,17 @@ def runs_figure(study: RobustnessStudy) -> Figure:
             ax.text(0.5, 0.5, "none", transform=ax.transAxes, ha="center", color=_GREY)
 
     values = factor_values(study.draws)
-    panels = []
-    for name, unit in units.items():
-        how: Any = {"x": f"{title(name)}  [{unit}]", "ylim": (low, top), "height": 1.9}
-        panels.append(
-            Panel("E_ac  [% s]", yscale="log", paint=partial(paint, x=values[name]), **how)
+    panels = [
+        Panel(
+            "E_ac  [% s]",
+            x=f"{title(name)}  [{unit}]",
+            yscale="log",
+            ylim=(low, top),
+            height=1.9,
+            paint=partial(paint, x=values[name]),
         )
+        for name, unit in units.items()
+    ]
     return draw(panels, 4, sharey=True)
 
 

@@ -86,10 +86,15 @@ def _regression(training: Training) -> Figure:
     for k, name in enumerate(("w_Q", "w_R")):
         target, output = training.targets[:, k], training.outputs[:, k]
         ends = [target.min(), target.max()] if len(target) else [0.0, 0.0]
-        ideal = Curve(ends, ends, "ideal", REFERENCE)
-        axes = f"network, {unit}{name}", [ideal], f"label, {unit}{name}"
-        paint = partial(_outputs, target=target, output=output)
-        panels.append(Panel(*axes, height=2.6, paint=paint))
+        panels.append(
+            Panel(
+                f"network, {unit}{name}",
+                [Curve(ends, ends, "ideal", REFERENCE)],
+                f"label, {unit}{name}",
+                height=2.6,
+                paint=partial(_outputs, target=target, output=output),
+            )
+        )
     return draw(panels, 2)
 
 

@@ -106,16 +106,31 @@ def margins_figure(study: WorkspaceStudy) -> Figure:
             ax.axvspan(left.time, time[-1], label="after leaving", **style)
 
     how: Any = {"xlim": (0, time[-1]), "height": 2.8, "paint": shade}
-    of_sines: Any = {"limits": {DEAD_CENTRE_SINE: ""}, "ylim": (max(-0.05, lowest), 1.05)}
-    of_parallel: Any = {"limits": {SINGULARITY_LIMIT: ""}, "ylim": (-0.1, None)}
-    of_condition: Any = {"ylim": (0.95, 1.25 * top), "yscale": "log"}
     condition = [Curve(time, margins.condition)]
     reach = leg_curves(time, 1e3 * margins.reach)
     panels = [
         Panel("reach margin  [mm]", reach, limits={0.0: ""}, **how),
-        Panel("sine off dead centre  [-]", sines, **of_sines, **how),
-        Panel("parallel measure, det W  [-]", inside, **of_parallel, **how),
-        Panel("condition number of A  [-]", condition, **of_condition, **how),
+        Panel(
+            "sine off dead centre  [-]",
+            sines,
+            limits={DEAD_CENTRE_SINE: ""},
+            ylim=(max(-0.05, lowest), 1.05),
+            **how,
+        ),
+        Panel(
+            "parallel measure, det W  [-]",
+            inside,
+            limits={SINGULARITY_LIMIT: ""},
+            ylim=(-0.1, None),
+            **how,
+        ),
+        Panel(
+            "condition number of A  [-]",
+            condition,
+            ylim=(0.95, 1.25 * top),
+            yscale="log",
+            **how,
+        ),
     ]
     return draw(panels, 2)
 

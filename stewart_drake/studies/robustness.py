@@ -212,9 +212,17 @@ def study_robustness(
     scales = scales_of(experiment, undisturbed[""].peak_torque)
     draws = [draw(ranges, scales, scenario, seed, index) for index in range(options.runs)]
     named = {f"run{i:06d}": one for i, one in enumerate(draws)}
-    given = experiment, ranges, scales, seed, options.limit
     studies = {
-        name: RobustnessStudy(*given, undisturbed[name], draws, run(name, one, named, progress))
+        name: RobustnessStudy(
+            experiment,
+            ranges,
+            scales,
+            seed,
+            options.limit,
+            undisturbed[name],
+            draws,
+            run(name, one, named, progress),
+        )
         for name, one in controllers.items()
     }
     study = studies.pop("")._replace(also=studies)
