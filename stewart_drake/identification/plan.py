@@ -47,7 +47,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.reference_config import CsvConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES, COORDINATE_UNITS, NUM_STATE
-from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.scenario.trajectories import evaluate, poses_along
 from stewart_drake.types import Array
 
 MOTION: Final = "motion.csv"
@@ -188,7 +188,7 @@ def plan(experiment: Experiment, std: Array, tolerances: Tolerances | None = Non
     """
     sc, mechanism = experiment.scenario, experiment.mechanism
     instants = np.linspace(0, sc.duration, 200)
-    seen = np.array([experiment.reference.value(t)[:, 0] for t in instants])
+    seen = poses_along(experiment.reference, instants)
     middle = (seen.min(axis=0) + seen.max(axis=0)) / 2
     peak = _AMPLITUDE * experiment.motion_scale
     times, poses, share = fitted_multisine(mechanism, middle, peak, _DURATION)

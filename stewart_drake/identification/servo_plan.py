@@ -31,6 +31,7 @@ from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.servos import known_stiffness
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import BALL_JOINTS, POSE, RATES
+from stewart_drake.scenario.trajectories import poses_along
 from stewart_drake.types import Array
 
 SETPOINTS_FILE: Final = "setpoints.csv"
@@ -113,7 +114,7 @@ def plan_servos(
     `rounding` is the standard deviation of the rounding of a measured angle, rad.
     """
     sc = experiment.scenario
-    seen = np.array([experiment.reference.value(t)[POSE, 0] for t in np.linspace(0, sc.duration)])
+    seen = poses_along(experiment.reference, np.linspace(0, sc.duration))
     middle = (seen.min(axis=0) + seen.max(axis=0)) / 2
     planner = _Planner(experiment, middle)
     motions = mixed_motion(experiment.motion_scale, duration, sc.controller.period, seed)

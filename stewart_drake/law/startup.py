@@ -25,7 +25,7 @@ from stewart_drake.scenario.signals import (
     PLANT_PARAMETERS,
     POSE,
 )
-from stewart_drake.scenario.trajectories import evaluate, spread_instants
+from stewart_drake.scenario.trajectories import evaluate, poses_along, spread_instants
 from stewart_drake.types import Array
 
 PREDICTION_BUDGET = 2e-5
@@ -209,7 +209,7 @@ def filter_substeps(
     begin = spread_instants(duration, FILTER_INSTANTS)
     torques = mean_torques(dynamics, reference, begin, begin + period)
     states = [evaluate(reference, t)[:NUM_STATE] for t in begin]
-    ends = np.array([reference.value(t)[:, 0] for t in begin + period])
+    ends = poses_along(reference, begin + period)
 
     def after(substeps: int) -> Array:
         """States (FILTER_INSTANTS, 12) a period after each instant."""

@@ -88,7 +88,7 @@ from stewart_drake.scenario.signals import (
     POSE,
     WRENCHES,
 )
-from stewart_drake.scenario.trajectories import evaluate, motion_range, spread_instants
+from stewart_drake.scenario.trajectories import evaluate, motion_range, poses_along, spread_instants
 from stewart_drake.types import Array, ArrayLike
 
 LONGEST_REPLAN = 0.4
@@ -277,7 +277,7 @@ def clear_space(experiment: Experiment) -> ClearSpace:
     ahead = believed_delay(sc).eta(period) + sc.controller.horizon * period
     instants = check_instants(sc.duration + ahead)
     few = instants[:: max(1, len(instants) // _POSES)]
-    poses = np.array([experiment.reference.value(t)[:, 0] for t in few])
+    poses = poses_along(experiment.reference, few)
     return ClearSpace.along(experiment.mechanism, poses)
 
 

@@ -60,7 +60,7 @@ from stewart_drake.scenario.signals import (
     SETPOINT,
 )
 from stewart_drake.scenario.timing import servo_ticks, servo_time
-from stewart_drake.scenario.trajectories import catch_up, evaluate, spread_instants
+from stewart_drake.scenario.trajectories import catch_up, evaluate, poses_along, spread_instants
 from stewart_drake.types import Array
 
 
@@ -315,8 +315,7 @@ def quickest_crank(dynamics: StewartDynamics, experiment: Experiment) -> float:
     It is the largest eigenvalue of `crank_mobility`: one over the least inertia of a mode.
     """
     instants = spread_instants(experiment.scenario.duration, INSTANTS)
-    along = (experiment.reference.value(t)[:, 0] for t in instants)
-    poses = (dynamics.mechanism.home, *along)
+    poses = (dynamics.mechanism.home, *poses_along(experiment.reference, instants))
     return max(float(np.linalg.eigvalsh(crank_mobility(dynamics, pose)).max()) for pose in poses)
 
 

@@ -19,8 +19,15 @@ from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 from scipy.ndimage import label
 
-from stewart_drake.dynamics.native_functions import functions_of
-from stewart_drake.dynamics.workspace import Failure, border, diagnose, home_sign, margin, margins
+from stewart_drake.dynamics.workspace import (
+    Failure,
+    border,
+    diagnose,
+    home_sign,
+    margin,
+    margins,
+    measures_at,
+)
 from stewart_drake.mechanism.geometry import Mechanism, plate_radius
 from stewart_drake.mechanism.kinematics import LegGeometry, Legs, legs_along, reach_margins
 from stewart_drake.scenario.signals import COORDINATES, NUM_COORDINATES
@@ -82,16 +89,23 @@ def rate_gains(mechanism: Legs, legs: LegGeometry, W: Array) -> Array:
 def measure(mechanism: Mechanism, poses: Array) -> Measures:
     """Return all measures of a pose (6,) or of poses (n, 6), which may be out of reach."""
     poses, one = np.reshape(poses, (-1, NUM_COORDINATES)), np.ndim(poses) == 1
-    boundary = np.array([functions_of(mechanism).measures(pose)[0] for pose in poses])
-    margin, sign = margins(mechanism, poses), home_sign(mechanism) or 1.0
+    now = [measures_at(mechanism, pose) for pose in poses]
+    sines, parallel = np.array([at.sines for at in now]), np.array([at.parallel for at in now])
+    margin, sign = np.array([at.margin for at in now]), home_sign(mechanism) or 1.0
     inside, rest = margin > 0, np.full((len(poses), 9), np.nan)
     legs = legs_along(mechanism, poses[inside])
     W = wrenches(mechanism, legs)
     gains, held = rate_gains(mechanism, legs, W), np.linalg.svd(W, compute_uv=False)[:, -1]
     condition, play = gains[:, 0] / gains[:, -1], 1 / gains[:, -1]
     rest[inside] = np.column_stack([np.abs(legs.transmission), held, condition, play])
-    reach, sines, parallel = reach_margins(mechanism, poses), boundary[:, :6], boundary[:, 6]
-    columns = reach, sines, sign * parallel, margin, rest[:, :6], *rest[:, 6:].T
+    columns = (
+        reach_margins(mechanism, poses),
+        sines,
+        sign * parallel,
+        margin,
+        rest[:, :6],
+        *rest[:, 6:].T,
+    )
     return Measures(*(column[0] if one else column for column in columns))
 
 
