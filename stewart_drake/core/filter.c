@@ -243,6 +243,8 @@ static int start_again(const stewart_filter *filter, const real *values, const r
     real added[STEWART_MAX_ESTIMATED];
     if (!stewart_filter_start(filter, values, theta, near, estimate, scratch))
         return 0;
+    if (!(change > 0))
+        return 1;
     for (int i = 0; i < n - X; i++) {
         const int is_offset = filter->offsets >= 0 && i >= filter->offsets && i < filter->offsets + LEGS;
         added[i] = is_offset ? 0 : change * filter->usual_std[i];

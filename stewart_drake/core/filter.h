@@ -27,7 +27,7 @@ typedef struct {
     real *left_out; /* reasons for left-out values of that measurement, bits as of a `fault` */
     real *squares;  /* sum of nu' S^-1 nu of all measurements that were used */
     real *values;   /* number of values in them */
-    real *disagreed; /* outliers since then that did not agree with the one before */
+    real *disagreed; /* outliers since a measurement was last used that disagree with the one before */
     stewart_noise *noise; /* factors of the assumed noise */
 } stewart_posterior;
 

@@ -21,7 +21,7 @@
 #define STALL (SECOND / 5)   /* delay of the process that is reported, ns */
 #define RECENT (10ull * SECOND) /* time for which a fault counts as preceding the next one */
 #define LAST_DATAGRAMS 3     /* datagrams at the end: some may be lost */
-#define HOLDS @"0" if network and not law.channel.holds else "1"@              /* a dry buffer holds the last torque, or puts out zero */
+#define HOLDS @"0" if network and not law.channel.holds else "1"@ /* a dry buffer holds the last torque, or puts out zero */
 
 enum { LINK = STEWART_LINK_COMMANDS + 7 * STEWART_HISTORY + 9 * WAITING }; /* numbers of its memory */
 

@@ -413,9 +413,11 @@ static unsigned fill_plan(controller *c, unsigned k, unsigned repeats)
 {% if network %}
     (void)k;
 {% else %}
-    /* Step a copy of the memory without further measurements, if they are for a buffer. */
+    if (!c->buffered)
+        return rows;
+    /* Step a copy of the memory without further measurements. */
     memcpy(c->ahead, c->memory, sizeof c->ahead);
-    for (unsigned i = 1; c->buffered && i <= PLANNED; i++) {
+    for (unsigned i = 1; i <= PLANNED; i++) {
         stewart_sample nothing = {.measurement = c->nothing};
 {% if servos %}
         if (compute(c, c->ahead, k + i, &nothing) & STEWART_UNREACHABLE)
