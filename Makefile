@@ -50,7 +50,7 @@ test: $(INSTALLED)  ## the tests but for the slow ones; ARGS="..." is handed to 
 
 # Many wait for machines and browsers in real time: two workers a core.
 slow: $(INSTALLED)  ## the slow ones: whole commands, documents and processes
-	$(BIN)/pytest $(WORKERS) -n $$((2 * $$(nproc))) -m "slow and not soak" $(ARGS)
+	$(BIN)/pytest $(WORKERS) -n $$((2 * $$(nproc --all))) -m "slow and not soak" $(ARGS)
 
 board: $(INSTALLED)  ## exported controllers on emulated Cortex-M processors; their table in docs/howto/board.md
 	$(BIN)/python -m tests.board.run

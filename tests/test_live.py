@@ -916,10 +916,11 @@ def test_a_gamepad_moves_the_reference(viewer):
     ends, results = threading.Event(), []
     with paper_machine() as running, browser() as tab:
         how = {"viewer": viewer, "ending": ends.is_set}
+        url = viewer.opened()  # before the loop, which reads from the page, too
         driving = threading.Thread(target=lambda: results.append(driven(running, math.inf, **how)))
         driving.start()
         try:
-            tab.call("Page.navigate", url=viewer.opened())
+            tab.call("Page.navigate", url=url)
             tab.wait("window.live !== undefined && window.live.time > 1")
             assert not tab.evaluate("window.live.byHand")
             yaw = "+document.getElementById('s2').value"
