@@ -64,10 +64,13 @@ def test_the_usual_bound_knows_bursts():
     assert default_bound(network(12), 1, PERIOD) == pytest.approx(0.5)
 
 
-def test_the_first_packets_are_lost_as_often_as_later_ones():
+def test_no_burst_is_under_way_at_the_first_packet():
+    """Packet k is lost unless no burst began at it and the k before: 1 - (1 - p)^min(k + 1, b)."""
     runs = [losses(30, 0.2, 20, np.random.default_rng(seed)) for seed in range(4000)]
-    share = np.mean(runs, axis=0)
-    assert np.all(np.abs(share - 0.2) < 4.5 * np.sqrt(0.2 * 0.8 / 4000))
+    length = np.minimum(np.arange(30) + 1, 20)
+    expected = 1 - (1 - BurstChain(0.2, 20).begins) ** length
+    error = np.abs(np.mean(runs, axis=0) - expected)
+    assert np.all(error < 4.5 * np.sqrt(expected * (1 - expected) / 4000))
 
 
 def chances(channel, arrived, since, last):

@@ -12,6 +12,7 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.law.catch_up import CatchUp
+from stewart_drake.law.motion import between
 from stewart_drake.loop import bulk
 from stewart_drake.loop.bulk import (
     PythonController,
@@ -167,6 +168,28 @@ def test_drawn_machines_end_as_in_drake():
 @pytest.mark.parametrize("part", range(5))
 def test_many_drawn_machines_end_as_in_drake(part):
     assert_drawn(range(4 + 20 * part, 24 + 20 * part), 10.0)
+
+
+def test_a_motion_in_pieces_is_the_motion_at_its_joints_and_between_them():
+    """A joint of the way onto the reference may differ from an instant of the grid by rounding."""
+    one = scenario("paper", "duration=0.6")
+    preparation = preparation_of(one)
+    prepared = preparation.prepared(preparation.experiment(one))
+    joints = np.array(prepared.planned.get_segment_times()[1:-1])
+    grid = np.round(joints / 0.025) * 0.025
+    assert len(joints) > 10 and np.any((joints != grid) & (np.abs(joints - grid) < 1e-12))
+    rng = np.random.default_rng(7)
+    for motion, (times, pieces) in zip(
+        (prepared.planned, prepared.experiment.reference), prepared.motions, strict=True
+    ):
+        for t in (*joints, *grid, *rng.uniform(0, 5, 300)):
+            k = int(np.searchsorted(times, t, side="right")) - 1
+            h = times[k + 1] - times[k]
+            row = between(*pieces[k], h, (t - times[k]) / h)
+            wanted = evaluate(motion, t)
+            assert np.abs(row - wanted)[:12].max() < 1e-9, t
+            if np.abs(joints - t).min() > 1e-9:
+                assert np.abs(row - wanted).max() < 1e-6, t
 
 
 def test_states_torques_and_measurements_are_drakes():

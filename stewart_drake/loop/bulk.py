@@ -57,12 +57,14 @@ from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.link import (
+    SIMULTANEOUS,
     forward_times,
     measurement_times,
     torque_delays,
 )
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import (
+    ACCELERATIONS,
     NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
@@ -101,8 +103,8 @@ _PREPARATIONS: Final = 16
 _NODES: Final = 5e-3
 """Time between the nodes of a motion, s. For a 1 Hz sine, quintics between them have errors of
 1e-10 in accelerations."""
-_BEFORE: Final = 1e-12
-"""Time before a node at which its values on the left are taken, s."""
+_BESIDE: Final = 1e-12
+"""Time from a joint at which the accelerations of either side are taken, s."""
 
 Made = TypeVar("Made")
 MakeTuner = Callable[[Experiment, PredictiveLqi], WeightsSource | None]
@@ -248,17 +250,22 @@ def pieces_of(
 ) -> tuple[Array, Array]:
     """Return a motion in quintic pieces: nodes (n + 1,) in s, rows (n, 2, 18) at their ends.
 
-    The joints of piecewise trajectories are nodes, with the accelerations of either side.
+    The joints of piecewise trajectories are nodes, with the accelerations of either side. No other
+    node is near one: in a very short piece rounding would determine the accelerations.
     """
     ends = [
         t for one in joints if hasattr(one, "get_segment_times") for t in one.get_segment_times()
     ]
-    inner = [t for t in ends if 0 < t < until]
-    times = np.unique([*np.linspace(0.0, until, int(until / _NODES) + 2), *inner])
+    inner = np.unique([t for t in ends if 0 < t < until])
+    inner = inner[np.diff(inner, prepend=-np.inf) > SIMULTANEOUS]
+    grid = np.linspace(0.0, until, int(until / _NODES) + 2)
+    nearest = np.abs(grid[:, None] - inner).min(axis=1, initial=np.inf)
+    times = np.sort(np.append(grid[nearest > _NODES / 10], inner))
     rows = np.array([evaluate(motion, t) for t in times])
     pieces = np.stack([rows[:-1], rows[1:]], axis=1)
     for k in np.searchsorted(times, inner):
-        pieces[k - 1, 1] = evaluate(motion, times[k] - _BEFORE)
+        pieces[k - 1, 1, ACCELERATIONS] = evaluate(motion, times[k] - _BESIDE)[ACCELERATIONS]
+        pieces[k, 0, ACCELERATIONS] = evaluate(motion, times[k] + _BESIDE)[ACCELERATIONS]
     return times, pieces
 
 

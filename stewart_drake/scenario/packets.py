@@ -87,11 +87,12 @@ NO_LOSSES: Final = BurstChain(0.0, 1)
 
 
 def losses(number: int, loss: float, burst: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Draw which of `number` packets are lost: a `BurstChain` from its stationary state."""
-    # Bursts that began before the first packet come from another stream of random numbers.
-    earlier = np.random.Generator(rng.bit_generator.jumped()).random(burst - 1)  # type: ignore[attr-defined]
-    begins = np.append(earlier, rng.random(number)) < BurstChain(loss, burst).begins
-    return np.convolve(begins, np.ones(burst), "valid") > 0.5
+    """Draw which of `number` packets are lost: a `BurstChain` that begins outside of a burst.
+
+    The packets before the first one arrived: their torques are in the queue of the start.
+    """
+    begins = rng.random(number) < BurstChain(loss, burst).begins
+    return np.convolve(begins, np.ones(burst))[:number] > 0.5
 
 
 def packet_times(config: PacketsConfig, number: int, seed: int, stream: int = FORWARD) -> Array:
