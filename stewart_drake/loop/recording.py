@@ -42,7 +42,7 @@ class Record:
         logs: to be written while the run goes on.
 
     Attributes:
-        on_grid: rows (13,) of time, pose error and reference on the metric's grid and at the end.
+        on_grid: rows (7,) of time and pose error on the metric's grid and at the end.
         samples: rows (19,) at the controller's samples: pose error, torque of the law, the same
             within the limit, computing time.
         peak_applied: largest torque that acted, N m.
@@ -162,8 +162,7 @@ class Recorder(Record):
             held = (port for port, system in self._systems.items() if system in _HELD_BY)
             self._held = {port: self._port(context, port) for port in held}
         if instant.on_grid:
-            of_grid = [self._instant], self._error, self._wanted[POSE]
-            self.on_grid.append(np.concatenate(of_grid))
+            self.on_grid.append(np.append(self._instant, self._error))
         if instant.logged:
             # Plant and reference as of `look`: the plant may have moved since.
             seen = self._held | {"state": self._state, "reference": self._wanted}
@@ -198,9 +197,9 @@ def summarize(
 ) -> RunSummary:
     """Return the summary of a run, without its warnings."""
     sc, nan = experiment.scenario, float("nan")
-    on_grid = np.reshape(recorder.on_grid, (-1, 13))
+    on_grid = np.reshape(recorder.on_grid, (-1, 7))
     samples = np.reshape(recorder.samples, (-1, 19))
-    time, (error, reference) = on_grid[:, 0], np.split(on_grid[:, 1:], 2, axis=1)
+    time, error = on_grid[:, 0], on_grid[:, 1:]
     errors, torques, sent, rest = np.split(samples, [6, 12, 18], axis=1)
     seconds, some, scale = rest[:, 0], len(samples) > 0, experiment.scale
     completed = status == "completed"
@@ -208,7 +207,7 @@ def summarize(
     peaks = metrics.peak_error(error, scale).tolist() if len(error) else [nan] * 6
     floor = 0.0
     if waits_at_rest(sc) and len(time):
-        floor = metrics.delay_floor(time, reference, scale, sc.eta)
+        floor = metrics.delay_floor(experiment.reference, scale, min(sc.eta, time[-1]))
     return {
         "status": status,
         "accumulated_error": found.accumulated_error,

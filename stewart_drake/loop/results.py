@@ -6,12 +6,14 @@ from typing import Any, Final, NamedTuple, TypedDict
 
 import numpy as np
 import xarray as xr
+from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.arrayio import write_netcdf
 from stewart_drake.files.fileio import remove_partials
 from stewart_drake.files.jsonio import write_json
 from stewart_drake.scenario.config import ControllerConfig, Scenario
+from stewart_drake.scenario.trajectories import poses_along
 from stewart_drake.types import Array
 
 
@@ -99,17 +101,17 @@ def peak_error(error: Array, scale: Array) -> Array:
     return 100 * np.abs(error).max(axis=0) / scale
 
 
-def delay_floor(time: Array, reference: Array, scale: Array, eta: float) -> float:
-    """Return E_ac in % s of a plate that waits at rest until a torque acts.
+def delay_floor(reference: Trajectory, scale: Array, wait: float) -> float:
+    """Return E_ac in % s of a plate that rests at the first pose of a reference for `wait` s.
 
     Args:
-        time: (n,) s.
-        reference: (n, 6) poses; the plate stays at the first one until eta.
+        reference: trajectory (6, 1) of the pose.
         scale: (6,) as in `accumulated_error`.
-        eta: total delay in s.
+        wait: the total delay eta, or the duration of a shorter run.
     """
-    waiting = time <= eta + 1e-9
-    return accumulated_error(time[waiting], (reference - reference[0])[waiting], scale)
+    time: Array = np.linspace(0.0, wait, 2001, dtype=np.float64)
+    poses = poses_along(reference, time)
+    return accumulated_error(time, poses - poses[0], scale)
 
 
 def waits_at_rest(scenario: Scenario) -> bool:

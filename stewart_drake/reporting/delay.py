@@ -80,7 +80,7 @@ def _map_table(study: DelayStudy) -> Table:
     rows = [(f"{100 * f:.0f} %", *(_cell_word(cells[s, f]) for s in steps)) for f in factors]
     if study.floor_applies:
         rows.append(("floor", *(number(study.floors[s]) for s in steps)))
-    return Table(("amplitude", *(f"mu = {s}" for s in steps)), rows, brief=True)
+    return Table(("amplitude", *(f"{_eta(study, s):.3g} s" for s in steps)), rows, brief=True)
 
 
 def _cell_word(cell: Cell, at: str = " {:.2f}") -> str:
@@ -172,7 +172,7 @@ def map_figure(study: DelayStudy) -> Figure:
         for cell in study.cells:
             floor = study.floors[cell.steps] if study.floor_applies else 0.0
             _draw_cell(ax, cell, steps.index(cell.steps), factors.index(cell.factor), floor)
-        ax.set_xticks(range(len(steps)), [f"{_eta(study, s):.3g} s\nμ = {s}" for s in steps])
+        ax.set_xticks(range(len(steps)), [f"{_eta(study, s):.3g} s" for s in steps])
         ax.set_yticks(range(len(factors)), [f"{100 * factor:.0f} %" for factor in factors])
         ax.grid(False)
         ax.spines[:].set_visible(False)

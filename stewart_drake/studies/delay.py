@@ -32,7 +32,7 @@ from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.reference_config import ReferenceConfig
 from stewart_drake.scenario.reference_files import waypoints
 from stewart_drake.scenario.signals import POSE
-from stewart_drake.scenario.trajectories import evaluate, poses_along
+from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.runs import run_scenarios
 from stewart_drake.studies.study_options import DelayOptions
@@ -219,7 +219,11 @@ def study_delay(
         simulated = options.simulations and not problem
         cells, interrupted = delay_map(scenario, progress) if simulated else ([], False)
         floors = {
-            steps: error_floor(found, Delay(steps, delay.fraction).eta(period))
+            steps: delay_floor(
+                found.experiment.reference,
+                found.experiment.scale,
+                min(Delay(steps, delay.fraction).eta(period), scenario.duration),
+            )
             for steps in {delay.steps, *map_delays(delay.steps)}
         }
         return DelayStudy(
@@ -237,14 +241,6 @@ def study_delay(
 
 
 # ---------------------------------------------------------------- open loop
-
-
-def error_floor(found: Assessment, eta: float) -> float:
-    """Return E_ac in % s of a plate at rest at the first pose after `eta` s without any torque."""
-    reference, duration = found.experiment.reference, found.experiment.scenario.duration
-    time: Array = np.linspace(0.0, min(eta, duration), 2001, dtype=np.float64)
-    poses = poses_along(reference, time)
-    return delay_floor(time, poses, found.experiment.scale, eta)
 
 
 def simulated_growth(
