@@ -1,10 +1,11 @@
 """The parts of the control law, each alone, and parts of a user."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pytest
 
+import stewart_drake as sd
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.belief import Belief
@@ -508,3 +509,47 @@ def test_motors_and_a_plant_of_your_own_are_those_of_the_law():
     )
     loops = [Loop(one, reference, queue=np.zeros((2, 6))).run(8) for one in (law, same)]
     assert loops[0].memory.torque == pytest.approx(loops[1].memory.torque, abs=1e-12)
+
+
+class Mine:
+    """A part of a user's own that does what a shipped one does."""
+
+    def __init__(self, part):
+        self._part = part
+
+    def __getattr__(self, name):
+        return getattr(self._part, name)
+
+
+def run_with(part=None, wrap=Mine, controller="adaptive_lqi"):
+    """Return a run whose part of the law is wrapped."""
+
+    def modified(law):
+        return law if part is None else replace(law, **{part: wrap(getattr(law, part))})
+
+    settings = ("plant.kind=exact", "duration=3", "start=on_reference", "queue=reference")
+    believed = "controller.delay_steps=7"
+    scenario = sd.load_scenario("paper", controller, (*settings, believed))
+    return sd.simulate(scenario, modify_law=modified, judge_stability=False)
+
+
+class Derived(CoreObserver):
+    """An observer in Python: of another class than the core's."""
+
+
+def derived(observer):
+    return Derived(**{one.name: getattr(observer, one.name) for one in fields(CoreObserver)})
+
+
+@pytest.mark.parametrize(("part", "wrap"), [("predictor", Mine), ("observer", derived)])
+def test_a_wrapped_part_of_the_adaptive_law_changes_nothing(part, wrap):
+    """It also plans again as before."""
+    torques, found = (
+        run.signals.torque_commanded.values for run in (run_with(), run_with(part, wrap))
+    )
+    assert np.abs(found - torques).max() < 1e-9 * np.abs(torques).max()
+
+
+def test_an_observer_that_does_not_find_the_delay_needs_another_predictor():
+    with pytest.raises(ValueError, match="observer: got Mine with a predictor for a delay"):
+        run_with("observer")

@@ -3,7 +3,7 @@
 #include "servo.h"
 #include "short.h"
 
-#define SATURATED 6 /* place of this cause among the counts */
+#define SATURATED 6 /* place among the counts of periods with a servo at its limit */
 
 static int width(const stewart_servo *servo) { return U * servo->law.parts + 1; }
 
@@ -87,7 +87,8 @@ static int observe(const stewart_servo *servo, real *memory, const stewart_sampl
     if (number > 0) {
         const real *asked = report + stewart_servo_report(servo) - U;
         stewart_copy(U, asked, memory + l->torque.at);
-        memory[l->counts.at + SATURATED] += (real)saturated;
+        if (saturated > 0) /* the step counts one of them, by the status */
+            memory[l->counts.at + SATURATED] += (real)(saturated - 1);
     } else {
         if (stewart_all_finite(X, memory + l->state.at))
             law->observer->restart(law, observer);
@@ -96,7 +97,7 @@ static int observe(const stewart_servo *servo, real *memory, const stewart_sampl
     }
     int status = law->observer->observe(law, observer, number, torques, sample->measurement, scratch);
     take_estimate(servo, memory);
-    return status;
+    return saturated > 0 ? status | STEWART_SATURATED : status;
 }
 
 /* The setpoint within range and speed, a period after `last`. */

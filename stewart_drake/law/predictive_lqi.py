@@ -28,7 +28,7 @@ from stewart_drake.law.motion import Motion
 from stewart_drake.law.nominal import DesignModel, NominalPlant
 from stewart_drake.law.observers import CoreObserver, Observer
 from stewart_drake.law.planner import NoPlanner, Planner, Replan
-from stewart_drake.law.predictors import NonlinearPredictor, Predictor
+from stewart_drake.law.predictors import ArrivalPredictor, NonlinearPredictor, Predictor
 from stewart_drake.law.sensing import Measurement, Sensing
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.signals import NUM_TORQUES
@@ -74,6 +74,13 @@ class PredictiveLqi:
     planner: Planner | NoPlanner | Replan = field(default_factory=NoPlanner)
     silence: int = 0
     tolerated_timing: float = math.inf
+
+    def __post_init__(self) -> None:
+        if isinstance(self.predictor, ArrivalPredictor) and not self.finds_delay:
+            raise ValueError(
+                f"observer: got {type(self.observer).__name__} with a predictor for a delay that "
+                "the observer finds; expected one derived from CoreObserver, or NonlinearPredictor"
+            )
 
     @property
     def parts(self) -> dict[str, Any]:

@@ -394,8 +394,7 @@ def _replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> Pr
     catch-up (0 s).
     """
     sc, replan = experiment.scenario, experiment.scenario.controller.replan
-    nonlinear = isinstance(law.predictor, NonlinearPredictor)
-    if replan == 0 or not (law.estimates and nonlinear):
+    if replan == 0 or not law.estimates or isinstance(law.predictor, LinearPredictor):
         return law
     prompt = isinstance(law.channel, Wire) and law.longest_wait == 0
     if not law.finds_delay and not (prompt and (length or sc.start != "rest")):
