@@ -119,7 +119,7 @@ def test_its_prior_is_of_the_motion_and_can_be_set():
     known = compose_law(experiment).observer.settings.parameters
     assert known.names[8:] == WRENCHES
     np.testing.assert_allclose(known.jump[8:], 0.4 * scale)
-    np.testing.assert_allclose([known.std[8:], known.walk[8:]], [1e-3 * scale] * 2)
+    np.testing.assert_allclose([known.std[8:], known.walk[8:]], [2e-4 * scale] * 2)
     assert not known.walk[:8].any() and not known.jump[:8].any()
     scenario.controller.prior.wrench, scenario.controller.prior.wrench_walk = [1e-3, 0.1], [1, 2]
     known = compose_law(prepare(scenario)).observer.settings.parameters

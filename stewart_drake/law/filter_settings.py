@@ -147,7 +147,7 @@ MOUNTING = float(np.deg2rad(0.1))
 """Standard deviation of the mounting angle of an encoder, rad."""
 JUMP_SHARE = 0.4
 """Standard deviation of a sudden wrench, as a share of the motion's."""
-WALK_SHARE = 0.001
+WALK_SHARE = 2e-4
 """Standard deviation of a wrench's change in a second, as the same share."""
 CHANCE = 3.0
 """Largest distance of a calibrated mean beyond a bound, in standard deviations."""

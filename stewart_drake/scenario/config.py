@@ -207,8 +207,8 @@ class PriorConfig:
         wrench: sudden wrench on the plate, [moment in N m, force in N]; null is 0.4 of the torque
             that the motion takes, and 0.4 of that torque's force at the tip of the shortest crank.
             A number given here also holds at the start, where null is `wrench_walk`.
-        wrench_walk: its slow change per root second, in the same units; null is a thousandth of
-            that torque and force.
+        wrench_walk: its slow change per root second, in the same units; null is 0.0002 of that
+            torque and force.
     """
 
     torque_bias: Positive | None = None
