@@ -164,11 +164,10 @@ class LiveRecord(Record):
         at, columns = 1, {}
         for signal in self._recorded:
             columns[signal.name], at = logged[:, at : at + signal.size], at + signal.size
-        reference, asked = columns["reference"], columns["torque_commanded"]
-        error = columns["pose"] - reference
+        asked, error = columns["torque_commanded"], columns["pose"] - columns["reference"]
         sent = np.clip(asked, -self._limit, self._limit)
         self._log = list(logged)
-        self.on_grid = list(np.column_stack([logged[:, 0], error, reference]))
+        self.on_grid = list(np.column_stack([logged[:, 0], error]))
         self.samples = list(np.column_stack([error, asked, sent, seconds]))
         return late
 

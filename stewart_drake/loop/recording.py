@@ -197,8 +197,8 @@ def summarize(
 ) -> RunSummary:
     """Return the summary of a run, without its warnings."""
     sc, nan = experiment.scenario, float("nan")
-    on_grid = np.reshape(recorder.on_grid, (-1, 7))
-    samples = np.reshape(recorder.samples, (-1, 19))
+    on_grid = np.vstack([np.empty((0, 7)), *recorder.on_grid])
+    samples = np.vstack([np.empty((0, 19)), *recorder.samples])
     time, error = on_grid[:, 0], on_grid[:, 1:]
     errors, torques, sent, rest = np.split(samples, [6, 12, 18], axis=1)
     seconds, some, scale = rest[:, 0], len(samples) > 0, experiment.scale
