@@ -249,6 +249,24 @@ def test_torques_of_a_machine_with_friction_and_payload_are_learned(tmp_path, wa
 
 @pytest.mark.slow
 @in_real_time
+def test_feedback_acts_between_two_recoveries(tmp_path):
+    """Friction keeps the small motion 10 % off. Led back at every sample, it would be lost."""
+    small = "reference.amplitude=[0.08,0.08,0.08,0.008,0.008,0.02]"
+    common = ("plant.kind=exact", "delay.steps=3", small, "reference.frequency=1.7")
+    machine = sd.load_scenario("paper", settings=(*common, "plant.coulomb_friction=2e-4"))
+    law = ("controller.estimate=[]", "controller.integral=false", "controller.w_R=100")
+    options = LiveOptions(learn=2, learned=tmp_path / "learned.npz", accept_jitter=True)
+    with running_machine(machine, rate=5.0) as running:
+        host, port = running.address
+        wanted = sd.load_scenario("paper", settings=(*common, *law))
+        result, study = learn_live(wanted, f"{host}:{port}", options, print)
+    first, second = (one.error for one in study.repetitions)
+    assert second < 0.2 * first < 1
+    assert result.status == "completed" and result.summary["live"]["recoveries"] > 2
+
+
+@pytest.mark.slow
+@in_real_time
 def test_setpoints_of_a_machine_with_other_servos_are_learned(monkeypatch, tmp_path):
     """Twice the friction and 0.8 of the stiffness, over a network that loses packets."""
     monkeypatch.setattr(learning, "_SETTLING", 4.0)  # the soft starts here take a second
