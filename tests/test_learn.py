@@ -13,7 +13,7 @@ from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.learned import LearnedLqi, LearnedSignal, with_learned
 from stewart_drake.loop.bulk import run_in_bulk
-from stewart_drake.loop.learned import HARMONICS, save_learned
+from stewart_drake.loop.learned import HARMONICS, harmonics_below, save_learned
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.studies.learn import Anderson, Fit, corrected_setpoints, fit, study_learn
 from stewart_drake.studies.study_options import LearnOptions
@@ -333,3 +333,13 @@ def test_learned_setpoints_remove_what_plain_setpoints_lack():
     found = study_learn(sc, LearnOptions(repetitions=4))
     errors = [one.error for one in found.repetitions]
     assert found.best.error < 0.05 * errors[0]
+
+
+def test_a_motion_of_few_samples_is_learned():
+    """Of 20 samples a period four harmonics are fitted, of which each number is known twice."""
+    assert [harmonics_below(n * 0.1, 0.1) for n in (4.5, 6.5, 20.5, 34.5, 90)] == [0, 1, 4, 8, 8]
+    fast = ("reference.amplitude=[0.02,0.02,0.02,0.002,0.002,0.005]", "reference.frequency=3")
+    friction = ("plant.coulomb_friction=2e-4", "delay.steps=3", "plant.kind=exact")
+    wanted = sd.load_scenario("paper", settings=(*LAW, *fast, *friction))
+    first, *_, last = sd.learn(wanted, repetitions=3).study.repetitions
+    assert last.error < 0.1 * first.error < 1

@@ -49,8 +49,8 @@ def motion_period(scenario: Scenario) -> float:
 
 
 def harmonics_below(period: float, dt: float) -> int:
-    """Return the number of harmonics of a motion that torques or setpoints every dt s can have."""
-    return min(HARMONICS, int((period / dt - 1) / 2))
+    """Return the number of harmonics that samples every dt s of one period determine twice over."""
+    return min(HARMONICS, (int(period / dt) - 2) // 4)
 
 
 def save_learned(path: Path, learned: LearnedSignal, experiment: Experiment) -> None:
