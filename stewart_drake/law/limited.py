@@ -42,7 +42,7 @@ from stewart_drake.law.horizon import (
 from stewart_drake.law.horizon_qp import QpError, Solver, problem_of, solve_by_daqp
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.motion import Motion, Preview
-from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.predictive_lqi import OuterLqi, OuterMemory
 from stewart_drake.law.riccati import lqr_by_doubling
 from stewart_drake.law.sensing import Measurement
@@ -279,7 +279,7 @@ class LimitedLqi(OuterLqi):
         torques = after.plan
         if plan is not None:  # which may be shorter than a packet
             torques = np.vstack([plan.torques[: len(torques)], torques[len(plan.torques) :]])
-        return memory.limited(_sending(after, torques, before.integral), plan, cause)
+        return memory.limited(_sending(after, torques, before, self.plant.motors), plan, cause)
 
     def _ahead(self, further: Array, belief: Belief) -> _Ahead:
         n, space, dynamics = self.limits.horizon, self.limits.space, self.plant.dynamics
@@ -341,11 +341,17 @@ class LimitedLqi(OuterLqi):
         return Plan(ahead.states(self.limits.space), torques, gains)
 
 
-def _sending(memory: Memory, torques: Array, integral: Array) -> Memory:
-    """Return the memory of the free law with other torques (n, 6) sent, and its last integral."""
+def _sending(memory: Memory, torques: Array, before: Memory, motors: TorqueLimit) -> Memory:
+    """Return the memory of the free law with other torques (n, 6) sent.
+
+    Its integral is that of the memory `before` the sample, and so is what the free law's own torque
+    counted as at the limit.
+    """
     after = memory.copy()
+    reached = before.counts.saturated_steps + motors.reached(torques[0])
+    after.field("counts")[Counts._fields.index("saturated_steps")] = reached
     after.field("torque")[:], after.in_flight[-1] = torques[0], torques[0]
-    after.field("integral")[:] = integral
+    after.field("integral")[:] = before.integral
     after.plan[:] = torques
     packets = after.sent.packets
     if len(packets):
