@@ -59,7 +59,7 @@ def identify(
 ) -> int:
     """Find delay, friction and geometry in a log.
 
-    A log of 10 s takes 10 to 30 s. The run may have ended early. Writes mechanism.yaml and
+    A log of 10 s takes 10 to 30 s, of servos with sticking joints a minute. The run may have ended early. Writes mechanism.yaml and
     calibration.yaml for simulate, and a page. A CSV log has the columns time[s], torque_1[N m] to
     torque_6 (commanded), angle_1[rad] to angle_6 and, if measured, roll[rad] to z[m].
 
