@@ -59,9 +59,10 @@ def identify(
 ) -> int:
     """Find delay, friction and geometry in a log.
 
-    A log of 10 s takes 10 to 30 s, of servos with sticking joints a minute. The run may have ended early. Writes mechanism.yaml and
-    calibration.yaml for simulate, and a page. A CSV log has the columns time[s], torque_1[N m] to
-    torque_6 (commanded), angle_1[rad] to angle_6 and, if measured, roll[rad] to z[m].
+    A log of 10 s takes 10 to 30 s, of servos with sticking joints a minute. The run may have ended
+    early. Writes mechanism.yaml and calibration.yaml for simulate, and a page. A CSV log has the
+    columns time[s], torque_1[N m] to torque_6 (commanded), angle_1[rad] to angle_6 and, if
+    measured, roll[rad] to z[m].
 
     A CSV log with time[s], setpoint_1[rad] to setpoint_6 and crank_1[rad] to crank_6 shows the
     numbers of position servos. Writes servos.yaml, for --set overlay=FILE.
