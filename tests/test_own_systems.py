@@ -12,7 +12,7 @@ from pydrake.trajectories import FunctionHandleTrajectory, PiecewisePolynomial
 
 import stewart_drake as sd
 from stewart_drake.loop.own import take
-from stewart_drake.loop.preparation import prepare
+from stewart_drake.loop.preparation import concrete, prepare
 
 ROOT = Path(__file__).resolve().parents[1]
 FAST = ("plant.kind=exact", "delay.steps=0", "controller.period=0.01", "start=on_reference")
@@ -279,3 +279,10 @@ def test_systems_beside_an_experiment_are_refused_by_everybody():
     for build in (sd.build_closed_loop, sd.simulate):
         with pytest.raises(TypeError, match="controller: got one with an Experiment"):
             build(prepared, controller=Constant)
+
+
+def test_an_unknown_argument_is_refused_by_everybody():
+    for build in (sd.build_closed_loop, concrete):
+        for name in ("truth", "law", "foo"):
+            with pytest.raises(TypeError, match=f"unexpected keyword argument '{name}'"):
+                build(scenario("duration=0.05"), **{name: None})

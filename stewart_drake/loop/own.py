@@ -142,6 +142,8 @@ def take(given: Mapping[str, Any]) -> Own:
     Args:
         given: values by the names of the arguments of `simulate`, None if not given.
     """
+    if unknown := given.keys() - {*ROLES, "reference", "modify_law"}:
+        raise TypeError(f"got an unexpected keyword argument {min(unknown)!r}")
     given = {name: thing for name, thing in given.items() if thing is not None}
     systems = {role: _make(role, given[role], System) for role in ROLES if role in given}
     for role, system in systems.items():
