@@ -246,6 +246,16 @@ def test_the_form_gives_the_measurements_and_shows_the_report(form):
     shown.result(timeout=30)
 
 
+def test_the_line_ends_with_the_address_of_the_form(tmp_path):
+    process = Command("new", str(tmp_path / "mine"), "--form")
+    with process.stdout:
+        try:
+            with urlopen(process.stdout.readline().split()[-1]) as page:
+                assert page.status == 200
+        finally:
+            process.kill()
+
+
 @pytest.mark.slow
 @needs_chromium
 def test_the_form_in_a_browser_by_keyboard(tab, tmp_path):
@@ -253,7 +263,7 @@ def test_the_form_in_a_browser_by_keyboard(tab, tmp_path):
     process = Command("new", str(tmp_path / "mine"), "--form")
     with process.stdout:
         try:
-            url = re.search(r"http://\S+", process.stdout.readline())[0].rstrip(",")
+            url = re.search(r"http://\S+", process.stdout.readline())[0]
             for width in (1280, 400):
                 tab.open(url, width, 900)
                 assert tab.evaluate("document.documentElement.scrollWidth") == width

@@ -70,7 +70,7 @@ def view(*, mechanism: MechanismName, delivery: Delivery) -> int:
         delivery.wrote("view.html")
         return delivery.end({})
     # The address is printed also with --quiet.
-    echo(f"showing it at {viewer.meshcat.web_url()}, ends with {STOP!r} there or Ctrl-C")
+    echo(f"{STOP!r} or Ctrl-C ends it; showing it at {viewer.meshcat.web_url()}")
     viewer.run(delivery.say)
     return 0
 
@@ -103,7 +103,7 @@ def new(
             closing(MachineForm(given.given, "new machine")) as page,
         ):
             # The address is printed also with --quiet.
-            echo(f"fill in the form at {page.url}, Ctrl-C ends it", error=delivery.as_json)
+            echo(f"Ctrl-C ends it; fill in the form at {page.url}", error=delivery.as_json)
             measurements = page.wait()
             status, text = _new(delivery, given, measurements, folder)
             page.show(text)

@@ -107,15 +107,15 @@ def simulate(
     if viewer is not None:
         result.replay(meshcat=viewer, mechanism=experiment.truth)
         if sys.stdin.isatty():
-            input(f"replay at {viewer.web_url()}, Enter ends")
+            input(f"Enter ends the replay at {viewer.web_url()} ")
     return status
 
 
 def _await_viewer(viewer: "Meshcat") -> None:
     """Print the address, also with --quiet; at a terminal wait until it is opened."""
     interactive = sys.stdin.isatty()
-    start = ", starts when it is opened there, or with Enter" if interactive else ""
-    echo(f"showing it live at {viewer.web_url()}{start}", error=True)
+    start = "starts when it is opened, or with Enter; " if interactive else ""
+    echo(f"{start}showing it live at {viewer.web_url()}", error=True)
     while interactive and viewer.GetNumActiveConnections() == 0:
         if select.select([sys.stdin], [], [], 0.1)[0]:
             sys.stdin.readline()
