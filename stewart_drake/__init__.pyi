@@ -173,10 +173,15 @@ def analyze_robustness(
     runs: int = 200,
     *,
     directory: str | pathlib.Path | None = None,
-    ranges: stewart_drake.studies.study_options.Ranges | None = None,
+    ranges: collections.abc.Sequence[str]
+    | stewart_drake.studies.study_options.Ranges
+    | collections.abc.Mapping[str, typing.Any]
+    | None = None,
     seed: int = 0,
     limit: float | None = None,
-    also: collections.abc.Mapping[str, stewart_drake.scenario.config.Scenario] | None = None,
+    also: collections.abc.Sequence[str]
+    | collections.abc.Mapping[str, stewart_drake.scenario.config.Scenario]
+    | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> stewart_drake.reporting.results.AnalysisResult: ...
@@ -188,8 +193,10 @@ def layout(
     directory: str | pathlib.Path | None = None,
     *,
     goal: str = "condition",
-    limits: collections.abc.Mapping[str, float] | None = None,
-    vary: collections.abc.Mapping[str, tuple[float, float]] | None = None,
+    limits: collections.abc.Sequence[str] | collections.abc.Mapping[str, float] | None = None,
+    vary: collections.abc.Sequence[str]
+    | collections.abc.Mapping[str, tuple[float, float]]
+    | None = None,
     keep: collections.abc.Sequence[str] = (),
     best: int = 3,
     starts: int = 1,

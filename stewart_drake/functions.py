@@ -5,7 +5,7 @@ Bad input is a ConfigError of one line.
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +17,7 @@ from stewart_drake.export.controller import exported, write
 from stewart_drake.export.setpoints import Setpoints, load_units, make_setpoints
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
-from stewart_drake.files.yamlio import yaml_text
+from stewart_drake.files.yamlio import validate, yaml_text
 from stewart_drake.identification import identify as identification
 from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
 from stewart_drake.identification.plan import MOTION, Plan, plan
@@ -64,8 +64,8 @@ def identify(
     mechanism: Mechanism | str | Path,
     *,
     delay: float | None = None,
-    tolerances: Tolerances | None = None,
-    precision: Precision | None = None,
+    tolerances: Tolerances | Mapping[str, float] | None = None,
+    precision: Precision | Mapping[str, float] | None = None,
     gravity: bool = True,
     command: str = "",
 ) -> AnalysisResult:
@@ -79,11 +79,14 @@ def identify(
         logs: signals.nc of a run, or CSV; one CSV log of setpoints.
         mechanism: as drawn; a shipped name or a path.
         delay: believed, s; None is that of the log, or 0.1 s.
-        tolerances: prior standard deviations of the machine; the defaults if None.
-        precision: of a CSV log; the defaults if None, with 12 bits for one of setpoints.
+        tolerances: prior standard deviations of the machine, such as `{"lengths": 1e-4}`; the
+            defaults for others.
+        precision: of a CSV log, such as `{"angle": 1e-4}`; the defaults for others, with 12 bits
+            for one of setpoints.
         gravity: whether gravity acted in a CSV log.
         command: that the page names; by default the call of this function.
     """
+    tolerances, precision = _expected(tolerances, precision)
     paths = [logs] if isinstance(logs, str | Path) else list(logs)
     machine = as_mechanism(mechanism)
     typed = command or f"sd.identify({[str(path) for path in paths]!r}, {mechanism!r})"
@@ -114,8 +117,8 @@ def plan_identification(
     scenario: Scenario | str | Path,
     *,
     poses: bool = False,
-    tolerances: Tolerances | None = None,
-    precision: Precision | None = None,
+    tolerances: Tolerances | Mapping[str, float] | None = None,
+    precision: Precision | Mapping[str, float] | None = None,
     command: str = "",
 ) -> AnalysisResult:
     """Plan a motion to log, and predict what its log shows of the machine.
@@ -126,10 +129,10 @@ def plan_identification(
     Args:
         scenario: of the machine; a shipped name or a path.
         poses: whether poses are measured, not only crank angles.
-        tolerances: prior standard deviations of the machine; the defaults if None.
-        precision: of the measurements; the defaults if None.
+        tolerances, precision: as of `identify`.
         command: that the page names; by default the call of this function.
     """
+    tolerances, precision = _expected(tolerances, precision)
     loaded = as_scenario(scenario)
     typed = command or f"sd.plan_identification({scenario!r})"
     if loaded.actuator.kind == "position_servo":
@@ -148,6 +151,14 @@ def plan_identification(
         std[part] = measured[part]
     planned_motion = partial(plan, prepare(loaded), std, tolerances)
     return analysis_result(planned_motion, plan_document, typed, _write_plan)
+
+
+def _expected(tolerances: Any, precision: Any) -> tuple[Tolerances | None, Precision | None]:
+    if not isinstance(tolerances, Tolerances | None):
+        tolerances = validate(Tolerances, tolerances, "tolerances")
+    if not isinstance(precision, Precision | None):
+        precision = validate(Precision, precision, "precision")
+    return tolerances, precision
 
 
 def _write_plan(found: Plan, folder: Path) -> list[str]:

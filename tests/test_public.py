@@ -19,7 +19,10 @@ from pydrake.trajectories import FunctionHandleTrajectory
 import stewart_drake as sd
 from stewart_drake.cli.examples import EXAMPLES
 from stewart_drake.files.jsonio import jsonable
+from stewart_drake.identification.logs import Precision
+from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.reporting.results import Figures, Replay
+from stewart_drake.studies.study_options import Ranges
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -59,6 +62,15 @@ def test_a_name_and_an_option_of_0_2_lead_to_todays():
             lambda: sd.layout("paper", keep=["crank"], vary={"crank": (0.1, 0.2)}),
             "keep: got crank, which vary varies",
         ),
+        (
+            lambda: sd.layout("paper", keep="crank", vary={"crank": 0.1}),
+            "keep: got crank, which vary varies",
+        ),
+        (
+            lambda: sd.layout("paper", vary={"crank": "long"}),
+            "vary.crank: got 'long'; expected a list of numbers",
+        ),
+        (lambda: sd.layout("paper", vary=3), "vary: got 3; expected a mapping"),
         (lambda: sd.layout("paper", limits={"reach": np.nan}), "limits reach: got nan"),
         (lambda: sd.make_tuner_data("none", draws=10), "draws: got 10 without family"),
         (lambda: sd.make_tuner_data("none", "gravity", family="T"), "scenario: got gravity with"),
@@ -75,6 +87,24 @@ def test_a_name_and_an_option_of_0_2_lead_to_todays():
             "plan: got measured poses or tolerances with position servos",
         ),
         (lambda: sd.identify([], "paper"), "logs: got none"),
+        (
+            lambda: sd.identify("x", "paper", tolerances={"length": 1.0}),
+            "tolerances: length: unknown key; did you mean lengths?",
+        ),
+        (
+            lambda: sd.identify("x", "paper", precision={"angel": 1.0}),
+            "precision: angel: unknown key; did you mean angle?",
+        ),
+        (lambda: sd.plan_identification("paper", tolerances=3), "tolerances: got 3; expected"),
+        (
+            lambda: sd.analyze_robustness("paper", ranges={"payload": 2.0}),
+            "ranges: payload: got 2.0; expected less than 1",
+        ),
+        (lambda: sd.analyze_robustness("paper", also=["adaptive"]), "controller: got 'adaptive'"),
+        (
+            lambda: sd.analyze_robustness(sd.Scenario(), also=["lqi"]),
+            "scenario: got a Scenario with the controller 'lqi'; expected a name",
+        ),
         (lambda: sd.identify("log.csv", "paper", delay=np.nan), "delay: got nan"),
         (lambda: sd.identify("run.nc", "paper", gravity=False), "gravity: got False with logs of"),
         (lambda: sd.setpoints("reachy_mini", units="u.yaml"), "units: got u.yaml without out"),
@@ -95,6 +125,23 @@ def test_an_error_names_the_argument(call, message):
     with pytest.raises(sd.ConfigError) as refused:
         call()
     assert str(refused.value).startswith(message) and "--" not in str(refused.value)
+
+
+def test_options_are_taken_as_names_and_mappings():
+    """As on the command line, where nobody imports their classes."""
+    found = sd.analyze_robustness(
+        "paper", 1, ranges={"payload": 0.2}, also=["adaptive_lqi"], workers=1
+    )
+    assert found.study.ranges == Ranges(payload=0.2)
+    assert list(found.study.also) == ["adaptive_lqi"]
+    given, named = (
+        sd.plan_identification("paper", tolerances=one, precision=other).summary
+        for one, other in (
+            (Tolerances(lengths=1e-4), Precision(1e-3)),
+            ({"lengths": 1e-4}, {"angle": 1e-3}),
+        )
+    )
+    assert given == named
 
 
 def test_scenarios_and_results_tell_what_is_not_as_usual():

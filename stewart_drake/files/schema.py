@@ -71,7 +71,7 @@ def plain(value: Any) -> Any:
 
 def dotted_names(hint: Any) -> Iterator[tuple[str, Any]]:
     """Yield dotted name and owner of every field below a section, without places in lists."""
-    if not (dataclasses.is_dataclass(hint) or is_typeddict(hint)):
+    if not (dataclasses.is_dataclass(hint) or is_typeddict(hint) or hasattr(hint, "_fields")):
         for argument in typing.get_args(hint):
             yield from dotted_names(argument)
         return

@@ -264,6 +264,8 @@ _PLAIN: Final = {
     "a valid number": "a number",
     "a valid string": "text",
     "an object": "a mapping of fields",
+    "a valid dictionary": "a mapping",
+    "a valid tuple": "a list of numbers",
     "greater than or equal to": "at least",
     "less than or equal to": "at most",
     "greater than": "more than",

@@ -7,7 +7,8 @@ import functools
 import inspect
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -91,6 +92,11 @@ class Option(NamedTuple):
         return self.default is inspect.Parameter.empty
 
     @property
+    def accepted(self) -> Any:
+        """Type of the Python argument, which also takes texts as of the command line."""
+        return Sequence[str] | self.annotation if self.read else self.annotation
+
+    @property
     def dashed(self) -> str:
         """Name on the command line, without the dashes before it."""
         return (self.flag or self.name).replace("_", "-")
@@ -131,7 +137,7 @@ class Options(BaseModel):
         """Return the keyword arguments of a Python function with these options."""
         kind = inspect.Parameter.KEYWORD_ONLY
         return [
-            inspect.Parameter(one.name, kind, default=one.default, annotation=one.annotation)
+            inspect.Parameter(one.name, kind, default=one.default, annotation=one.accepted)
             for one in cls.described()
         ]
 
@@ -173,7 +179,13 @@ def takes(
                 )
             given = shown.bind(*args, **kwargs).arguments
             values = {name: given.pop(name) for name in kind.model_fields if name in given}
+            load = functools.partial(_load, given.get("scenario"))
             try:
+                for one in kind.described():
+                    texts = values.get(one.name)
+                    if one.read and isinstance(texts, str | list | tuple):
+                        texts = [texts] if isinstance(texts, str) else map(str, texts)
+                        values[one.name] = one.read(list(texts), load)
                 return function(**given, options=kind(**values))
             except ConfigError as error:
                 raise ConfigError(in_python(str(error), kind, shown)) from None
@@ -186,6 +198,17 @@ def takes(
         return call
 
     return decorate
+
+
+def _load(scenario: Any, controller: str) -> "Scenario":
+    from stewart_drake.scenario.loading import load_compatible
+
+    if not isinstance(scenario, str | Path):
+        raise ConfigError(
+            f"scenario: got a {type(scenario).__name__} with the controller {controller!r}; "
+            "expected a name or a path, or the controller as a scenario too"
+        )
+    return load_compatible(scenario, controller)
 
 
 def refuse(options: Mapping[str, object], why: str) -> None:

@@ -181,7 +181,7 @@ def study_robustness(
     a later call may ask for more runs. Names in `also` become names of folders. An undisturbed run
     that does not complete is an error, also with another controller.
     """
-    ranges, seed = options.ranges or Ranges(), options.seed
+    ranges, seed = options.sizes, options.seed
     experiment, directory = prepare(scenario), Path(directory)
     drawn_with = {"ranges": dataclasses.asdict(ranges), "seed": seed}
 

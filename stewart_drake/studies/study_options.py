@@ -6,11 +6,11 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.yamlio import units_of, validate_pairs
+from stewart_drake.files.yamlio import one_message, units_of, validate, validate_pairs
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.studies.options import JobOptions, Options, option
@@ -112,7 +112,9 @@ def _read_also(names: list[str], load: Callable[[str], Scenario]) -> dict[str, S
 
 
 class RobustnessOptions(JobOptions):
-    ranges: Ranges | None = option(
+    ranges: Annotated[
+        Ranges | Mapping[str, Any] | None, one_message("a mapping of sizes by name")
+    ] = option(
         None,
         "Size of a variation, 0: none. "
         + "; ".join(f"{name}: {unit}" for name, unit in RANGE_UNITS.items())
@@ -133,6 +135,11 @@ class RobustnessOptions(JobOptions):
         "CONTROLLER",
         read=_read_also,
     )
+
+    @property
+    def sizes(self) -> Ranges:
+        given = self.ranges or {}
+        return validate(Ranges, given, "ranges") if isinstance(given, Mapping) else given
 
 
 def _numbers(option: str, form: str, texts: list[str], most: int) -> dict[str, list[float]]:
@@ -156,6 +163,13 @@ def _read_bounds(texts: list[str], _: object) -> dict[str, tuple[float, float]]:
     return {name: (ends[0], ends[-1]) for name, ends in found.items()}
 
 
+def _pairs(bounds: Any) -> Any:
+    """Return bounds with a pair in place of each number."""
+    if not isinstance(bounds, Mapping):
+        return bounds
+    return {k: (v, v) if isinstance(v, int | float) else v for k, v in bounds.items()}
+
+
 class LayoutOptions(JobOptions):
     goal: str = option(
         "condition",
@@ -170,7 +184,7 @@ class LayoutOptions(JobOptions):
         name="limit",
         read=_read_limits,
     )
-    vary: Mapping[str, tuple[float, float]] | None = option(
+    vary: Annotated[Mapping[str, tuple[float, float]] | None, BeforeValidator(_pairs)] = option(
         None,
         "Bounds of a number of the pattern, or of crank or rod; one value fixes it.",
         "NAME=LOW:HIGH",
