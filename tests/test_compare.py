@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from dataclasses import replace
 
 import joblib
 import numpy as np
@@ -14,6 +15,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import data_root, shipped
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
+from stewart_drake.reporting.run import _shared_warnings
 from stewart_drake.scenario.loading import load_comparison, load_scenario
 from stewart_drake.studies.compare import (
     ADAPTIVE,
@@ -51,6 +53,14 @@ def test_the_order_is_kept_and_each_run_is_that_of_its_controller_alone(results)
         assert result.status == "completed"
     alone = simulate(load_scenario("paper", "delay_lqi", SHORT), judge_stability=False)
     xr.testing.assert_identical(alone.signals, results["delay_lqi"].signals)
+
+
+def test_a_warning_names_its_controllers_by_one_word_each(results):
+    about = {name: ["one"] * (name != "lqr") + ["all"] for name in ("lqr", "lqi", "delay_lqi")}
+    runs = {
+        name: replace(results["lqr"], summary={"warnings": texts}) for name, texts in about.items()
+    }
+    assert _shared_warnings(runs) == ["all", "lqi, delay_lqi: one"]
 
 
 def test_saved_files_are_complete(results, tmp_path):

@@ -200,7 +200,7 @@ def _shared_warnings(results: _Runs) -> list[str]:
     about: dict[str, list[str]] = {}
     for name, result in results.items():
         for text in result.summary["warnings"]:
-            about.setdefault(text, []).append(label(name))
+            about.setdefault(text, []).append(name)
     return [
         text if len(names) == len(results) else f"{', '.join(names)}: {text}"
         for text, names in about.items()
