@@ -524,13 +524,14 @@ def test_the_tighter_torque_limit_counts(offer):
 def test_a_law_that_is_too_slow_for_its_period_says_so_before_it_starts():
     with paper_machine(OVER_A_NETWORK) as running:
         ready = prepare_session(scenario_of(), running.address)
-        took, backend = ready.design.step
-        assert 1e-5 < took < 1.0 and backend == "native"
+        took, in_python = ready.design.step
+        assert 1e-5 < took < 1.0 and in_python is None
         ready.endpoint.close()
     for seconds in (0.004, 0.0512):
-        slow = ready._replace(design=ready.design._replace(step=(seconds, "python")))
+        slow = ready._replace(design=ready.design._replace(step=(seconds, "controller.replan")))
         (told,) = [line for line in plans(slow, 1.0, "paper") if line.startswith("law: ")]
-        assert f"python, a step takes {1e3 * seconds:.1f} ms of a period of 100 ms" in told
+        assert told.startswith(f"law: a step takes {1e3 * seconds:.1f} ms of a period of 100 ms")
+        assert "controller.replan is in Python" in told
         assert ("more than 50%: expect missed deadlines" in told) == (seconds > 0.05)
     # One slow round trip, which decides the delay, is named as an exception.
     link = ready.contact.link

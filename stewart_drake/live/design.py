@@ -17,7 +17,7 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.channel import Packets
-from stewart_drake.law.coverage import backend
+from stewart_drake.law.coverage import uncovered
 from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.limited import LimitedLqi
 from stewart_drake.law.motion import KnownMotion
@@ -64,7 +64,8 @@ class Design(NamedTuple):
     queue: Array  # torques (L, 6) in flight at the begin
     repeats: int  # number of torques that a packet repeats
     torque_limit: float  # tighter limit of the scenario and the machine, N m
-    step: tuple[float, str]  # time of a step of the law here, s, and the name of its implementation
+    # time of a step of the law here, s, and the field of a part in Python, or None
+    step: tuple[float, str | None]
     rows: int = 1  # number of setpoints of a plan for servos
     learned: Learned = None
 
@@ -178,7 +179,7 @@ def design(scenario: Scenario, machine: MachineMessage, learned: Learned = None)
     queue = first_queue(experiment, law)
     assert law.kept < MOST_HISTORY
     took = _step_times(replace(law, silence=0), planned, queue, _TRIED, np.ones(2))
-    step = min(took), backend(law)
+    step = min(took), uncovered(law)
     return Design(experiment, law, planned, queue, repeats, limit, step, learned=learned)
 
 
@@ -194,7 +195,7 @@ def _of_cranks(experiment: Experiment, machine: MachineMessage, learned: Learned
     first, _ = commands_in_flight(experiment, law, experiment.scenario.true_delay)
     rows = 1 if MachineFlags.WIRE in machine.flags else _PLAN
     took = _step_times(law, planned, first, rows, np.full(law.reports.size, np.nan))
-    step = sum(took), backend(law)
+    step = sum(took), uncovered(law)
     return Design(experiment, law, planned, first, 0, limit, step, rows, learned)
 
 
