@@ -199,7 +199,7 @@ def _delivered(
         if s["samples"]
         else "no sample, nothing was sent",
         f"the machine had torques for {counted(s['periods_played'], 'periods')}, for "
-        f"{s['periods_dry']} it had none (dry)",
+        f"{s['periods_dry']} it had none (dry), with those of coming to rest",
     )
     if result.stopped is not None and s["periods_dry"] > _MANY_DRY * s["periods_played"]:
         delivery.say_wrapped(
