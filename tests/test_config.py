@@ -213,6 +213,15 @@ BAD_FILES = {
 }
 
 
+def test_a_setting_below_a_sections_field_keeps_the_other_fields(tmp_path):
+    path = write(tmp_path, "plant: {push: {wrench: [0, 0, 0, 1, 0, 0], from: 2, to: 3}}")
+    push = load_scenario(path, settings=("plant.push.to=4", "plant.push.from=1")).plant.push
+    assert (push.wrench[3], push.start, push.to) == (1, 1, 4)
+    new = "plant.push={wrench: [0, 0, 0, 2, 0, 0]}"
+    push = load_scenario(path, settings=(new, "plant.push.to=4")).plant.push
+    assert (push.wrench[3], push.start, push.to) == (2, 0, 4)
+
+
 @pytest.mark.parametrize("case", BAD_FILES)
 def test_a_bad_file_is_refused_in_one_line(case, tmp_path):
     text, parts = BAD_FILES[case]
@@ -230,7 +239,10 @@ WRENCH = "controller.estimate=[torque_bias,payload,damping,wrench]"
 REFUSED = [
     ("duration", "got 'duration'; expected section.field=value"),
     ("=1", "got '=1'; expected section.field=value"),
-    ("a.b.c=1", "got 'a.b.c=1'; expected section.field=value"),
+    ("plant..mass=1", "got 'plant..mass=1'; expected section.field=value"),
+    ("a.b.c=1", "settings: a: unknown key; expected one of mechanism"),
+    ("plant.push.wrensh=1", "plant.push.wrensh: unknown key; did you mean plant.push.wrench?"),
+    ("plant.gravity.x=1", "plant.gravity: got {'x': 1}; expected true or false"),
     ("duration=", "duration: got None; expected a number"),
     ("duration=[1", "duration: line 1"),
     ("controller.perid=1", "controller.perid: unknown key; did you mean controller.period?"),
@@ -323,6 +335,10 @@ REFUSED = [
             (
                 "{kind: frozen, frm: 1, to: 4}",
                 ".frm: unknown key; did you mean sensor.faults[0].fr",
+            ),
+            (
+                "{kind: frozen, start: 1, to: 4}",
+                ".start: unknown key; did you mean sensor.faults[0].from",
             ),
             ("{kind: spike, from: 1, to: 4, size: 0}", ".size: got 0"),
             ("{kind: frozen, to: 4}", ".from: is missing"),

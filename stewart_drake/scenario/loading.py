@@ -41,7 +41,7 @@ def load_scenario(
         name_or_path: a shipped name or a YAML file. Paths inside the file start from its folder;
             missing fields keep their defaults.
         controller: a shipped name or a YAML file, laid over the scenario's own.
-        settings: `section.field=value` or `field=value`, the value in YAML, e.g.
+        settings: `section.field=value`, `field=value` or deeper, the value in YAML, e.g.
             `plant.gravity=true`; paths start from the working directory. A setting of a section's
             kind also drops the file's fields of another kind. `overlay=dirty` lays the fields of a
             shipped overlay or a YAML file over the scenario.
@@ -299,14 +299,17 @@ def _parse_setting(setting: str) -> dict[str, Any]:
         _make_paths_absolute(overlay, path.parent)
         return overlay
     parts = key.strip().split(".")
-    if not equals or not all(parts) or len(parts) > 2:
+    if not equals or not all(parts):
         raise ConfigError(
             f"{_SETTINGS}: got {brief(setting)}; expected section.field=value or field=value, "
             "where a value may be {name: value, ...}"
         )
-    value = parse_yaml(text, f"{_SETTINGS}: {key}")
-    change: dict[str, Any] = {parts[-1]: value}
-    return {parts[0]: change} if len(parts) == 2 else change
+    change = parse_yaml(text, f"{_SETTINGS}: {key}")
+    for part in reversed(parts[2:]):
+        change = _Within({part: change})
+    for part in reversed(parts[:2]):
+        change = {part: change}
+    return dict(change)
 
 
 def _laid_over(name: str, below: Any, above: Any) -> Any:
@@ -317,7 +320,17 @@ def _laid_over(name: str, below: Any, above: Any) -> Any:
     if name in _KINDS:
         known = field_names(_KINDS[name][above["kind"]])
         kept = {field: value for field, value in kept.items() if field in known}
-    return {**kept, **above}
+    return {**kept, **{field: _within(kept.get(field), part) for field, part in above.items()}}
+
+
+class _Within(dict[str, Any]):
+    """Fields of a value below a section's fields; its others stay as they are."""
+
+
+def _within(below: Any, above: Any) -> Any:
+    if not isinstance(above, _Within) or not isinstance(below, dict):
+        return above
+    return type(below)({**below, **{k: _within(below.get(k), v) for k, v in above.items()}})
 
 
 def _drop_foreign_nulls(data: dict[str, Any]) -> None:
