@@ -32,6 +32,8 @@ _MAX_DEPTH: Final = 20
 _MOST_PROBLEMS: Final = 5  # largest number of problems in one message
 _UNKNOWN: Final = ("extra_forbidden", "unexpected_keyword_argument")
 
+_ALIKE: Final = {"start": "from", "begin": "from", "end": "to", "until": "to"}  # in meaning only
+
 _T = TypeVar("_T")
 
 
@@ -308,7 +310,8 @@ def _explain_unknown(type_: type, data: Any, error: Any) -> str:
     for one in full:
         if new := getattr(known[one], "renamed", {}).get(name):
             return f"{start}unknown key; it is called {section}{new} since 0.3"
-    meant = [section + one for one in resembling(name, siblings)]
+    alike = [_ALIKE[name]] if _ALIKE.get(name) in siblings else resembling(name, siblings)
+    meant = [section + one for one in alike]
     # A field may have been named without its section.
     deeper = [one for one in known if one.endswith(f".{name}")]
     if meant or len(deeper) == 1:
