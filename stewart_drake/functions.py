@@ -16,7 +16,7 @@ from stewart_drake.core.layout import DEFAULT_GRAVITY
 from stewart_drake.export.controller import exported, write
 from stewart_drake.export.setpoints import Setpoints, load_units, make_setpoints
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import write_whole
+from stewart_drake.files.fileio import make_folder, write_whole
 from stewart_drake.files.yamlio import validate, yaml_text
 from stewart_drake.identification import identify as identification
 from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
@@ -289,7 +289,7 @@ def export_c(
         ConfigError: a law that has no C, or a file in the folder that no export has written.
     """
     loaded, folder = as_scenario(scenario, controller, settings), Path(directory)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder("directory", folder)
     return write(exported(loaded, single), folder)
 
 
@@ -306,7 +306,7 @@ def new(directory: str | Path, name: str, *, options: Measurements) -> NewMachin
         ConfigError: measurements that fit no machine, or files that are there already.
     """
     folder = Path(directory)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder("directory", folder)
     return NewMachine(*new_machine(options, name, folder))
 
 

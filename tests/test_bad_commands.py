@@ -103,6 +103,14 @@ def test_a_place_that_cannot_be_written_is_refused_at_once(command, tmp_path, ca
     assert tree(tmp_path) == before
 
 
+def test_the_option_or_argument_that_cannot_be_written_is_named(capsys):
+    for given, name in (
+        (("simulate", "paper", "--log", "/proc/new/log.csv"), "--log"),
+        (("new", "/proc/new"), "DIR"),
+    ):
+        assert refusal([*given], capsys).startswith(f"error: {name}: got '/proc/new'; expected")
+
+
 @pytest.mark.parametrize("command", WITH_OUT)
 def test_bad_input_leaves_the_results_of_an_earlier_run_alone(command, tmp_path, capsys):
     """Neither a folder that is there nor one that is not is touched."""

@@ -86,6 +86,11 @@ def test_a_name_and_an_option_of_0_2_lead_to_todays():
             lambda: sd.plan_identification("reachy_mini", poses=True),
             "plan: got measured poses or tolerances with position servos",
         ),
+        (lambda: sd.shipped("foo"), "kind: got 'foo'; expected one of mechanism, scenario,"),
+        (
+            lambda: sd.export_c("paper", "/proc/x"),
+            "directory: got '/proc/x'; expected a directory that can be written",
+        ),
         (lambda: sd.identify([], "paper"), "logs: got none"),
         (
             lambda: sd.identify("x", "paper", tolerances={"length": 1.0}),

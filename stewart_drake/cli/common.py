@@ -160,7 +160,8 @@ def check_file(path: Path | None, option: str = "--out") -> None:
     if path.exists() and not path.is_file():
         kind = "a directory" if path.is_dir() else "no regular file"
         raise ConfigError(f"{option}: got {str(path)!r}, {kind}; expected a file")
-    check_writable(path.parent, alone=False)
+    with named(**{"--out": option}):
+        check_writable(path.parent, alone=False)
 
 
 def write_or_print(text: Callable[[], str], out: Path | None) -> None:
@@ -216,9 +217,10 @@ class Delivery:
         self.out, self.quiet, self.as_json, self.silent = out, quiet, as_json, quiet or as_json
         self._written: list[str] = []
 
-    def into(self, out: Path) -> "Delivery":
-        """Return the same output, into a directory."""
-        return Delivery(out, self.quiet, self.as_json)
+    def into(self, out: Path, name: str = "--out") -> "Delivery":
+        """Return the same output, into a directory; `name` is that of its parameter in errors."""
+        with named(**{"--out": name}):
+            return Delivery(out, self.quiet, self.as_json)
 
     @property
     def folder(self) -> Path:

@@ -93,7 +93,7 @@ def new(
     """
     from stewart_drake.studies import new_machine as study
 
-    delivery = delivery.into(folder)
+    delivery = delivery.into(folder, "DIR")
     study.refuse_existing(folder)
     if form:
         from stewart_drake.reporting.machine_form import MachineForm

@@ -65,6 +65,21 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
 
 
+def make_folder(name: str, path: Path) -> None:
+    """Make a folder and those above it.
+
+    Raises:
+        ConfigError: that is not possible; `name`, of an argument, opens the message.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(
+            f"{name}: got {str(path)!r}; expected a directory that can be written "
+            f"({error.strerror})"
+        ) from None
+
+
 def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file by `replacing`; text as UTF-8."""
     with replacing(path) as partial:

@@ -35,6 +35,8 @@ def data_root() -> Path:
 
 def shipped(kind: Kind) -> list[str]:
     """Return the sorted names that `resolve` accepts as a bare word for this kind."""
+    if kind not in KINDS:
+        raise ConfigError(f"kind: got {kind!r}; expected one of {', '.join(KINDS)}")
     _, folder, suffix = KINDS[kind]
     return sorted(path.stem for path in (data_root() / folder).glob(f"*{suffix}"))
 
