@@ -129,8 +129,9 @@ def test_a_log_is_replayed(run, tmp_path):
 @pytest.mark.parametrize(
     ("name", "data", "words"),
     [
-        ("log.mcap", b"not MCAP" * 9, "cannot be read"),
-        ("log.mcap", b"", "cannot be read"),
+        ("log.mcap", b"not MCAP" * 9, "no MCAP file"),
+        ("log.mcap", b"hello", "no MCAP file"),
+        ("log.mcap", b"", "no MCAP file"),
         ("log.csv", b"a,b\n1,2\n", "column 'a'"),
         ("log.csv", b"", "cannot be read"),
         ("log.csv", b"\xff\xfe\n", "cannot be read"),

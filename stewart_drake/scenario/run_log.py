@@ -404,9 +404,9 @@ def _read_mcap(path: Path) -> xr.Dataset:
                     found = json.loads(record.data)
                     times[record.sequence] = float(found["time"])
                     messages.setdefault(topics[record.channel_id], {})[record.sequence] = found
-        except (errors.McapError, struct.error, EOFError, OSError) as error:  # cut in a record
+        except (errors.McapError, struct.error, EOFError, OSError):  # cut in a record
             if not times:
-                raise ValueError(str(error) or "no MCAP file") from None
+                raise ValueError("no MCAP file, or one cut before its messages") from None
     if not times:
         raise ValueError("no messages")
     if scenario is None:
