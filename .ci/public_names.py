@@ -19,7 +19,9 @@ def text():
     lines, functions, modules = [], [], set()
     for name, module in sorted(sd._HOMES.items(), key=lambda pair: pair[::-1]):
         value = getattr(sd, name)
-        if not (inspect.isfunction(value) and "__signature__" in vars(value)):
+        made = inspect.isfunction(value) and "__signature__" in vars(value)
+        # Those of another module only have another result, which type checkers see.
+        if not made or value.__module__ != f"stewart_drake.{module}":
             lines.append(f"from stewart_drake.{module} import {name} as {name}")
             continue
         shown = f"def {name}{inspect.signature(value)}: ..."

@@ -37,6 +37,15 @@ def test_only_public_names_are_listed():
     assert sorted(dir(sd)) == sorted(sd.__all__), "more of them after they were used"
 
 
+def test_help_shows_the_result_of_a_function():
+    for function, kind in (
+        (sd.simulate, sd.SimulationResult),
+        (sd.compare, sd.ComparisonResult),
+        (sd.controller_margin, sd.ControllerMargin),
+    ):
+        assert inspect.signature(function).return_annotation is kind
+
+
 def test_type_checkers_see_the_public_names():
     """`python .ci/public_names.py` writes the file again."""
     namespace = runpy.run_path(str(ROOT / ".ci" / "public_names.py"))

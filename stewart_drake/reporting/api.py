@@ -27,19 +27,21 @@ R = TypeVar("R")
 S = TypeVar("S")
 
 
-def _with(shown: Callable[[S], R], function: Callable[P, S]) -> Callable[P, R]:
-    """Return the function with its result converted, with the same signature and docstring."""
+def _with(kind: type[R], shown: Callable[[S], R], function: Callable[P, S]) -> Callable[P, R]:
+    """Return the function with its result converted to a kind, with the same docstring."""
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         return shown(function(*args, **kwargs))
 
+    own = inspect.signature(function).replace(return_annotation=kind)
+    call.__signature__ = own  # type: ignore[attr-defined]
     return call
 
 
-simulate = _with(SimulationResult.of, simulation.simulate)
-compare = _with(ComparisonResult, comparison.compare)
-controller_margin = _with(ControllerMargin.of, margins.controller_margin)
+simulate = _with(SimulationResult, SimulationResult.of, simulation.simulate)
+compare = _with(ComparisonResult, ComparisonResult, comparison.compare)
+controller_margin = _with(ControllerMargin, ControllerMargin.of, margins.controller_margin)
 
 
 def report(
