@@ -79,7 +79,8 @@ WIDE: Final = "The stated deviation is 1.6 to 2.6 times too large."
 _CAPTIONS: Final = {
     "states": "The plate's six coordinates.",
     "errors": "Their errors. Below: their mean in % of peak to peak, whose integral is E_ac.",
-    "torques": "Torques as commanded, and as applied: within the motors' limit, after the delay.",
+    "torques": "Torques as commanded, and as applied: within the motors' limit, after the delay; "
+    "of servos their own.",
     "torques_delay_lqr": "Applied torques of the delay-aware LQR, without integral action.",
     "torques_delay_lqi": "Applied torques of the delay-aware LQI, with integral action.",
     "torques_predictor_lqi": "Applied torques of the LQI with nonlinear prediction.",
