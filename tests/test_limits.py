@@ -27,9 +27,10 @@ from stewart_drake.law.stability import (
     spectral_radius,
 )
 from stewart_drake.loop.exact import ExactPlant
+from stewart_drake.loop.results import delay_floor
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.scenario.trajectories import evaluate
-from stewart_drake.studies.delay import error_floor, loop_margins, simulated_growth
+from stewart_drake.studies.delay import loop_margins, simulated_growth
 from stewart_drake.studies.verdict import assess
 from tests.mechanisms import PAPER
 from tests.oracles import augmented_gain
@@ -105,7 +106,8 @@ def test_amplification_and_largest_delay_undo_each_other():
 def test_floor_of_a_sine_is_the_closed_form(eta, frequency):
     """50 (1 - cos(w eta)) / w: 15.16 % s for the paper's delay."""
     expected = 50 * (1 - math.cos(frequency * eta)) / frequency
-    floor = error_floor(found(f"reference.frequency={frequency}"), eta)
+    experiment = found(f"reference.frequency={frequency}").experiment
+    floor = delay_floor(experiment.reference, experiment.scale, eta)
     assert floor == pytest.approx(expected, rel=1e-6)
 
 

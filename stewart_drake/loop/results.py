@@ -244,8 +244,8 @@ class SimulationResult:
 
     Attributes:
         scenario: as run.
-        status: as of `RunSummary`: `completed`, `left_workspace`, `solver_failed`, `interrupted`, in
-            real time also `lost_machine`, `lost_contact` or `refused`.
+        status: as of `RunSummary`: `completed`, `left_workspace`, `solver_failed`, `interrupted`;
+            in real time also `lost_machine`, `lost_contact` or `refused`.
         stopped: when and why a run did not complete, or None.
         signals: over `time` (every 20 ms and every sample of the controller, or the scenario's
             `log_period`): pose, rates, reference, reference_rates, error, integral,
