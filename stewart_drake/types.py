@@ -8,4 +8,5 @@ from typing_extensions import TypeAliasType
 # Named, so that `help` shows the names and not the unions behind them.
 Array = TypeAliasType("Array", NDArray[np.float64])
 ArrayLike = TypeAliasType("ArrayLike", _ArrayLike)
+Flags = TypeAliasType("Flags", NDArray[np.bool_])
 Complex = NDArray[np.complex128]

@@ -34,7 +34,7 @@ from stewart_drake.identification.model import (
 )
 from stewart_drake.identification.unknowns import DELAY, GEOMETRY, NUM_UNKNOWNS, OFFSETS, Unknowns
 from stewart_drake.scenario.signals import NUM_STATE
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Flags
 
 MAX_DELAY_CHANGE: Final = 0.1  # in one iteration, s
 CONVERGED: Final = 0.01  # gain of chi^2 below which an iteration is the last
@@ -113,7 +113,7 @@ class Problem:
         return values
 
     @cached_property
-    def there(self) -> NDArray[np.bool_]:
+    def there(self) -> Flags:
         """(m, n, 18) of those that are not missing."""
         return np.isfinite(self.values)
 

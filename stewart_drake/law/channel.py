@@ -10,15 +10,12 @@ import sys
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from stewart_drake.core.library import core
 from stewart_drake.law.compiled import Compiled, Once, numbers
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.scenario.packets import NO_LOSSES, BurstChain
 from stewart_drake.scenario.signals import NUM_TORQUES
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Flags
 
 
 @dataclass(frozen=True)
@@ -31,7 +28,7 @@ class Report:
         age: periods since the report's sample.
     """
 
-    arrived: NDArray[np.bool_]
+    arrived: Flags
     acted: Array
     age: int = 0
 

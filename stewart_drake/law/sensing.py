@@ -15,7 +15,6 @@ from functools import cache
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.core.library import core
 from stewart_drake.files.arguments import fixed, whole
@@ -23,7 +22,7 @@ from stewart_drake.law.belief import root_of
 from stewart_drake.law.compiled import Compiled, Once, Out, call_back, geometry, numbers
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_LEGS, NUM_STATE
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Flags
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class Measurement:
     """
 
     values: Array
-    valid: NDArray[np.bool_]
+    valid: Flags
     age: float = 0.0
 
     @classmethod

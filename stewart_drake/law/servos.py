@@ -33,7 +33,6 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
@@ -46,7 +45,7 @@ from stewart_drake.scenario.signals import (
     RATES,
     SETPOINT,
 )
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Flags
 
 
 def crank_mobility(dynamics: StewartDynamics, pose: Array) -> Array:
@@ -241,7 +240,7 @@ class ReportLayout:
         at_limit = np.array([motors.reached(part) for part in np.split(put_out, self.periods)])
         return self.of_means(means, np.repeat(at_limit, self.parts), asked)
 
-    def of_means(self, means: Array, at_limit: NDArray[np.bool_], asked: Array) -> Array:
+    def of_means(self, means: Array, at_limit: Flags, asked: Array) -> Array:
         """Return the report (size,) of mean torques (n, 6) of all parts, oldest first.
 
         `at_limit` (n,) is whether a torque was at its limit within a part.

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.live.contact import Contact, await_free
@@ -28,7 +27,7 @@ from stewart_drake.live.protocol import (
 )
 from stewart_drake.live.viewer import End
 from stewart_drake.loop.peer import Fault
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Flags
 
 SILENT: Final = 1.0
 """Silence of the machine that is reported, s; at least ten periods."""
@@ -184,7 +183,7 @@ class Exchange:
         """Send a datagram without torques, which shows presence."""
         self.contact.send(begin=self._began, flags=self._flags)
 
-    def arrived(self, k: int, number: int) -> NDArray[np.bool_]:
+    def arrived(self, k: int, number: int) -> Flags:
         """Return which of the last datagrams (number,) have arrived, from that of k - 1 back."""
         sequences = [self._sequences.get(k - 1 - i) for i in range(number)]
         return np.array([n is not None and self.contact.has_arrived(n) for n in sequences])

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.core.library import core
@@ -76,7 +75,7 @@ from stewart_drake.scenario.timing import event_time, instants, look_time
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.tuner.network import WINDOW
 from stewart_drake.tuner.source import Decision, WeightsSource
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Flags
 
 SHARE: Final = 0.1
 """Tolerance of an integration step over the scenario's accuracy. With steps of order 8, one more
@@ -116,8 +115,8 @@ class Instants(NamedTuple):
 
     nominal: Array  # (n,) s, times in the record
     looks: Array  # (n,) s, times at which the state is recorded
-    on_grid: NDArray[np.bool_]  # (n,) whether the metric counts each
-    sampled: NDArray[np.bool_]  # (n,) whether the controller samples at each
+    on_grid: Flags  # (n,) whether the metric counts each
+    sampled: Flags  # (n,) whether the controller samples at each
     samples: Array  # (k,) s, of the controller's samples
 
 

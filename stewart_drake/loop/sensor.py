@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from stewart_drake.dynamics.native_functions import functions_of
@@ -13,7 +12,7 @@ from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.field_types import SPIKE
 from stewart_drake.scenario.signals import LEGS, NUM_COORDINATES, NUM_LEGS, NUM_STATE, POSE
-from stewart_drake.types import Array, ArrayLike
+from stewart_drake.types import Array, ArrayLike, Flags
 
 _EARLY = 1e-9
 """Tolerance of the instants of a fault, s."""
@@ -33,7 +32,7 @@ def acts(fault: Any, time: float) -> bool:
     return bool(fault["from"] <= time + _EARLY < fault["to"])
 
 
-def strikes(fault: Any, seed: int, place: int, k: int, size: int) -> NDArray[np.bool_]:
+def strikes(fault: Any, seed: int, place: int, k: int, size: int) -> Flags:
     """Return whether fault number `place` affects each value (size,) of sample k."""
     share = fault.get("share")
     if share is None:

@@ -6,7 +6,6 @@ from dataclasses import fields
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.loop.preparation import assemble, check_instants
 from stewart_drake.loop.results import LEAST_MEASURED, SimulationResult
@@ -26,7 +25,7 @@ from stewart_drake.scenario.signals import (
 from stewart_drake.studies.compare import PAPER_ERRORS, is_papers, label
 from stewart_drake.studies.verdict import loop_word
 from stewart_drake.studies.workspace_map import largest_factor
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Flags
 
 STILL: Final = 1e-9
 """Motion below which a coordinate counts as still, rad or m."""
@@ -101,7 +100,7 @@ def _span(run: SimulationResult) -> Array:
     return np.ptp(poses, axis=0) if len(poses) else np.zeros(NUM_COORDINATES)
 
 
-def moving(run: SimulationResult) -> NDArray[np.bool_]:
+def moving(run: SimulationResult) -> Flags:
     """Return which coordinates (6,) the reference moves."""
     return _span(run) > STILL
 

@@ -12,7 +12,7 @@ from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link_config import ASSUMED_TIMES, PacketsConfig
 from stewart_drake.scenario.packets import BACK, SENSOR, packet_times
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Flags
 
 SIMULTANEOUS: Final = 1e-9  # of a period; events closer to each other have no order
 
@@ -51,7 +51,7 @@ def torque_delays(scenario: Scenario) -> Array:
     return eta
 
 
-def takes_effect(arrivals: Array, together: float = 0.0) -> NDArray[np.bool_]:
+def takes_effect(arrivals: Array, together: float = 0.0) -> Flags:
     """Return which of (n,) torques ever act: those that arrive before every newer one.
 
     The motors apply the newest torque that has arrived; one that was overtaken is out of date. Of

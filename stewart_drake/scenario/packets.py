@@ -9,11 +9,10 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.scenario.field_types import MOST_PERIODS
 from stewart_drake.scenario.link_config import PacketsConfig
-from stewart_drake.types import Array, ArrayLike
+from stewart_drake.types import Array, ArrayLike, Flags
 
 FORWARD, BACK, SENSOR = range(3)  # streams of random numbers of one seed
 RARE: Final = 1.5  # accepted share of missing torques, relative to that without late packets
@@ -86,7 +85,7 @@ class BurstChain:
 NO_LOSSES: Final = BurstChain(0.0, 1)
 
 
-def losses(number: int, loss: float, burst: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+def losses(number: int, loss: float, burst: int, rng: np.random.Generator) -> Flags:
     """Draw which of `number` packets are lost: a `BurstChain` that begins outside of a burst.
 
     The packets before the first one arrived: their torques are in the queue of the start.

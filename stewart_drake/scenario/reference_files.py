@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
@@ -19,7 +18,7 @@ from stewart_drake.files.yamlio import load_yaml, validate
 from stewart_drake.scenario.field_types import STRICT, Row, Seconds
 from stewart_drake.scenario.reference_config import WaypointsConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Flags
 
 _POSE: Final = "pose_"  # prefix of a coordinate's name in the files that `export` writes
 _UNITS: Final = {
@@ -140,9 +139,7 @@ def check_motion(
 def _check_samples(times: Array, poses: Array, place: Place, scales: Mapping[str, float]) -> None:
     """Check that times (n,) increase, poses (n, 6) are unique and do not jump by a turn."""
 
-    def check(
-        bad: NDArray[np.bool_], problem: str, limit: float = 0.0, before: bool = False
-    ) -> None:
+    def check(bad: Flags, problem: str, limit: float = 0.0, before: bool = False) -> None:
         for row, axis in np.argwhere(bad)[:1]:
             row, name = int(row) + before, COORDINATE_NAMES[axis]
             scale = scales[name]

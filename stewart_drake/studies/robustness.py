@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials, write_whole
@@ -30,7 +29,7 @@ from stewart_drake.studies.statistics import (
 )
 from stewart_drake.studies.study_options import Ranges, RobustnessOptions
 from stewart_drake.studies.uncertainty import MACHINE, Draw, Scales, draw, run_draw, scales_of
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Flags
 
 QUANTILES: Final = (0.5, 0.75, 0.9, 0.95, 0.99)
 SIGNED: Final = tuple(name for name, one in MACHINE.items() if one.signed)
@@ -78,7 +77,7 @@ class RobustnessStudy(NamedTuple):
         return ["runs.csv", "runs/"]
 
     @property
-    def failed(self) -> NDArray[np.bool_]:
+    def failed(self) -> Flags:
         """(n,) whether a run left the workspace, or ended above the limit."""
         return np.array([self.reason_of(one) != "" for one in self.outcomes], dtype=bool)
 

@@ -21,11 +21,10 @@ from itertools import combinations, product
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import brentq
 
-from stewart_drake.types import Array, ArrayLike
+from stewart_drake.types import Array, ArrayLike, Flags
 
 CONFIDENCE: Final = 0.95
 _DEVIATIONS: Final = float(stats.norm.ppf((1 + CONFIDENCE) / 2))
@@ -145,7 +144,6 @@ def holm(p_values: ArrayLike) -> Array:
 
 # ---------------------------------------------------------------- how failing runs differ
 
-Flags = NDArray[np.bool_]
 
 SIGNIFICANT: Final = 0.05
 """Adjusted p-value below which a difference counts as found."""

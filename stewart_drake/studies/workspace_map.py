@@ -15,7 +15,6 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.trajectories import Trajectory
 from scipy.ndimage import label
 
@@ -32,7 +31,7 @@ from stewart_drake.mechanism.geometry import Mechanism, plate_radius
 from stewart_drake.mechanism.kinematics import LegGeometry, Legs, legs_along, reach_margins
 from stewart_drake.scenario.signals import COORDINATES, NUM_COORDINATES
 from stewart_drake.scenario.trajectories import poses_along
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Flags
 
 SECTIONS: Final = ((3, 4), (3, 5), (0, 1), (2, 5))
 """Pairs of coordinates: x-y, x-z, roll-pitch, yaw-z; the other four stay as at home."""
@@ -267,7 +266,7 @@ def _section(
     return Section(*pair, x, y, condition, np.where(connected, inside, -np.abs(inside)))
 
 
-def _connected(inside: NDArray[np.bool_], distance: Array) -> NDArray[np.bool_]:
+def _connected(inside: Flags, distance: Array) -> Flags:
     """Return the part of `inside` that holds the point nearest to home."""
     if not inside.any():
         return inside
@@ -276,7 +275,7 @@ def _connected(inside: NDArray[np.bool_], distance: Array) -> NDArray[np.bool_]:
     return np.asarray(parts == parts[nearest])
 
 
-def _window(axis: Array, inside: NDArray[np.bool_]) -> tuple[float, float]:
+def _window(axis: Array, inside: Flags) -> tuple[float, float]:
     """Return the part of an axis over the inside, with a rim; all of it if nothing is inside."""
     used = np.asarray(inside.any(axis=0))
     ends = axis[used][[0, -1]] if used.any() else axis[[0, -1]]

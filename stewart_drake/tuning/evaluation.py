@@ -34,7 +34,7 @@ from stewart_drake.tuner.network import DEFAULT, EXPECTED, MAX_BYTES, load_netwo
 from stewart_drake.tuner.source import ratio_of
 from stewart_drake.tuning.data import log_cost, read_condition, run_condition
 from stewart_drake.tuning.families import FAMILIES, FAULTS, Family, fault_of
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Flags
 
 TUNER: Final = "tuner"
 """Name of the only network of a family without faults."""
@@ -249,7 +249,7 @@ def compare_costs(
     names: Sequence[str],
     fixed: int,
     J: Array,
-    completed: NDArray[np.bool_],
+    completed: Flags,
     faults: NDArray[np.str_],
     seed: int,
 ) -> dict[str, Any]:

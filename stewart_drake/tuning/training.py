@@ -56,7 +56,7 @@ from stewart_drake.tuning.data import (
 )
 from stewart_drake.tuning.families import FAULTY, RATIOS, vary
 from stewart_drake.tuning.options import Labels, Split
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Flags
 
 FeatureName = Literal["densities", "health"]
 Indices = NDArray[np.intp]
@@ -247,7 +247,7 @@ def labelled_rows(data: xr.Dataset, kind: Labels, density: Kind) -> Rows:
     return Rows(rho[use], targets, run, cell[run])
 
 
-def split_rows(rows: Rows, split: Split, rng: np.random.Generator) -> NDArray[np.bool_]:
+def split_rows(rows: Rows, split: Split, rng: np.random.Generator) -> Flags:
     """Choose the training rows, 70 % of the samples, runs or cells."""
     group = {"sample": np.arange(len(rows.inputs)), "run": rows.runs, "cell": rows.cells}[split]
     groups = rng.permutation(np.unique(group))
