@@ -29,7 +29,7 @@ PAYLOAD = 0.02
 """kg, half a percent of the plate."""
 SAMPLES = size("SAMPLES", 12)
 """Problems per case for the solvers."""
-TAU = {(1.0, 1.0): 0.013267, (0.7, 1.0): 0.010172, (0.5, 2.0): 0.03022}
+TAU = {(1.0, 1.0): 0.0132683, (0.7, 1.0): 0.0101716, (0.5, 2.0): 0.0302161}
 """Largest torque by share of the motion and its frequency in rad/s, N m."""
 
 
