@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 import typer
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import remove_partials, write_whole
+from stewart_drake.files.fileio import remove_partials, unwritable, write_whole
 from stewart_drake.files.resources import Kind, shipped
 from stewart_drake.reporting.document import PAGE, WIDTH, counted, wrap
 from stewart_drake.reporting.terminal import echo
@@ -137,10 +137,7 @@ def check_writable(directory: Path | None, *, alone: bool = True) -> None:
             "or choose another directory"
         ) from None
     except (OSError, ValueError) as error:  # a ValueError for a zero byte in the name
-        raise ConfigError(
-            f"--out: got {str(directory)!r}; expected a directory that can be written "
-            f"({getattr(error, 'strerror', None) or error})"
-        ) from None
+        raise unwritable("--out", directory, error) from None
 
 
 @contextlib.contextmanager

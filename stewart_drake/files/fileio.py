@@ -73,11 +73,16 @@ def make_folder(name: str, path: Path) -> None:
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(
-            f"{name}: got {str(path)!r}; expected a directory that can be written "
-            f"({error.strerror})"
-        ) from None
+    except (OSError, ValueError) as error:  # a ValueError for a zero byte in the name
+        raise unwritable(name, path, error) from None
+
+
+def unwritable(name: str, path: Path, error: Exception) -> ConfigError:
+    """Return the error about a folder, given by the argument or option `name`, for its cause."""
+    return ConfigError(
+        f"{name}: got {str(path)!r}; expected a directory that can be written "
+        f"({getattr(error, 'strerror', None) or error})"
+    )
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

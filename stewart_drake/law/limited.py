@@ -344,8 +344,8 @@ class LimitedLqi(OuterLqi):
 def _sending(memory: Memory, torques: Array, before: Memory, motors: TorqueLimit) -> Memory:
     """Return the memory of the free law with other torques (n, 6) sent.
 
-    Its integral is that of the memory `before` the sample, and so is what the free law's own torque
-    counted as at the limit.
+    Its integral is that of the memory `before` the sample. Of the torques at the limit it counts
+    the one that is sent, not the free law's.
     """
     after = memory.copy()
     reached = before.counts.saturated_steps + motors.reached(torques[0])

@@ -108,7 +108,8 @@ class LiveLoop:
         self._measured, self._known = -1, self.memory  # last usable measurement: sample, memory
         self._late = 0  # number of overtaken measurements before it
         self._learned: Any = None if design.learned is None else self._learned_part(design)
-        self.recoveries, self.taken_over, self._feedback_acted = 0, False, 0.0
+        self.recoveries, self.taken_over = 0, False
+        self._feedback_acted = 0.0  # s, from when on the plate may be led back again
         self.missed, self.resting = 0, list[float]()
 
     def _ahead(self) -> float:

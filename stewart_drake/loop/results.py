@@ -151,7 +151,7 @@ class DelaySummary(TypedDict):
     estimated_s: float
     """Delay assumed by the law."""
     std_s: float
-    """Standard deviation, 1.6 to 2.6 times too large in tests; NaN without an estimator."""
+    """Standard deviation, 1.0 to 1.4 times too large in tests; NaN without an estimator."""
 
 
 class ConsistencySummary(TypedDict):

@@ -75,7 +75,7 @@ _QUESTIONS: Final = {
     "hautus": "Can the models be controlled and observed?",
     "workspace": "Does the motion fit the machine?",
 }
-WIDE: Final = "The stated deviation is 1.6 to 2.6 times too large."
+WIDE: Final = "The stated deviation is 1.0 to 1.4 times too large."
 _CAPTIONS: Final = {
     "states": "The plate's six coordinates.",
     "errors": "Their errors. Below: their mean in % of peak to peak, whose integral is E_ac.",

@@ -191,7 +191,7 @@ _TABLE: Final = (
     Signal(
         "delay_std",
         _SECONDS,
-        "standard deviation of that estimate, measured 1.6 to 2.6 times too large",
+        "standard deviation of that estimate, measured 1.0 to 1.4 times too large",
         "controller",
     ),
     Signal("delay_true", _SECONDS, "true delay of the torque sent last", "delay_chain.delay"),
