@@ -24,6 +24,7 @@ from stewart_drake.loop.learned import motion_period, save_learned
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.reporting.learn import document
 from stewart_drake.reporting.page import Provenance, html
+from stewart_drake.scenario.signals import NUM_PARAMETERS
 from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.learn import LearnStudy, Repetition
 from tests import test_learn
@@ -248,6 +249,40 @@ def test_torques_of_a_machine_with_friction_and_payload_are_learned(tmp_path, wa
     assert np.abs(after / AMPLITUDE).max() < 0.01
 
 
+@pytest.mark.parametrize(
+    ("measured", "ends"),
+    [
+        ([0.95, 0.95], ["E", "E"]),
+        ([0.5, 0.95, 0.95], ["again", "E", "E"]),
+        ([0.5, 0.5, 0.5, 0.95, 0.95], ["again", "again", "again", "E", "E"]),
+        ([0.5] * 9, ["again", "again", "again", "learning ends"]),
+    ],
+)
+def test_a_repetition_of_which_too_little_was_measured_is_done_again(measured, ends):
+    """The shares are those of each motion; 37 samples are one of its periods."""
+    settings = ("plant.kind=exact", "delay.steps=3", "reference.frequency=1.7")
+    experiment, said = prepare(sd.load_scenario("paper", settings=settings)), []
+    lessons, rng = learning.TorqueLessons(experiment, 2, said.append), np.random.default_rng(5)
+    rest, number, returned = experiment.start, 0, False
+    blank = dict.fromkeys(learning.Snapshot._fields, 0.0) | {"by_hand": False, "limit": None}
+    blank["wanted"] = np.append(rest, np.zeros(6))
+    row = {"pose": rest[:6], "reference": rest[:6] + 1e-3}
+    row |= {"parameters": np.zeros(NUM_PARAMETERS), "torque_applied": np.zeros(6)}
+    for k in range(1000):
+        if lessons.done:
+            break
+        number += returned and lessons.request().target is None
+        returned = lessons.request().target is not None
+        state = rest if rng.random() < measured[number] else np.full(12, np.nan)
+        lessons.show(learning.Snapshot(**blank | {"time": 0.1 * k}))
+        lessons.write(0.1 * k, row | {"measurement": state})
+    assert lessons.done and len(said) == len(ends)
+    for line, end in zip(said, ends, strict=True):
+        assert {"E": "E of one period", "again": "it is done again"}.get(end, end) in line
+    assert len(lessons.tried) == max(1, ends.count("E"))
+    assert np.isfinite(lessons.tried[-1].coefficients).all()
+
+
 @pytest.mark.slow
 @in_real_time
 def test_feedback_acts_between_two_recoveries(tmp_path):
@@ -261,6 +296,7 @@ def test_feedback_acts_between_two_recoveries(tmp_path):
         host, port = running.address
         wanted = sd.load_scenario("paper", settings=(*common, *law))
         result, study = learn_live(wanted, f"{host}:{port}", options, print)
+    assert len(study.repetitions) == 2
     first, second = (one.error for one in study.repetitions)
     assert second < 0.2 * first < 1
     assert result.status == "completed" and result.summary["live"]["recoveries"] > 2

@@ -66,6 +66,8 @@ _INSTANTS: Final = 200
 """Instants of a period at which its slowest one is sought."""
 _EACH: Final = 4
 """Number of lacking torques that are computed at a sample; one takes about 0.7 ms."""
+_AGAIN: Final = 3
+"""Largest number of repetitions in a row of which too few measurements may arrive."""
 
 
 class _Asked(NamedTuple):
@@ -135,6 +137,30 @@ def learn_live(
     return _learn_setpoints(asked) if cranks else _learn_torques(asked)
 
 
+class _Arrivals:
+    """Decides whether a repetition of which too few measurements arrived is done again.
+
+    Attributes:
+        failed: whether that was so too often.
+    """
+
+    def __init__(self, least: int, say: Callable[[str], None]) -> None:
+        self._least, self._say, self._lost = least, say, 0
+        self.failed = False
+
+    def suffice(self, number: int, measurements: int) -> bool:
+        """Return whether repetition `number` has enough; print what follows if not."""
+        if measurements >= self._least:
+            self._lost = 0
+            return True
+        self._lost += 1
+        self.failed = self._lost > _AGAIN
+        found = f"repetition {number}: {measurements} measurements to learn from"
+        then = "learning ends" if self.failed else "it is done again"
+        self._say(f"{found}; expected at least {self._least}; {then}")
+        return False
+
+
 # ---------------------------------------------------------------- torques
 
 
@@ -172,6 +198,7 @@ class TorqueLessons(Viewer):
         self._dt, self._period = sc.controller.period, self.learning.period
         none = LearnedSignal(self._period, np.zeros((1 + 2 * HARMONICS, 6)))
         self.tried, self.done = [none], False
+        self._arrivals = _Arrivals(self.learning.least, say)
         self._span = _SETTLING + _DELAYS * sc.eta + self._period
         self._size = 2 * experiment.motion_scale
         times = np.linspace(0.0, self._period, _INSTANTS, endpoint=False)
@@ -261,6 +288,11 @@ class TorqueLessons(Viewer):
         return least + (self._slowest - least) % self._period
 
     def _judge(self) -> None:
+        """Take the error of the last period, unless too much of it was not measured."""
+        measured = sum(1 for _ in self._measured())
+        if not self._arrivals.suffice(len(self.learning.errors) + 1, measured):
+            self.done, self._lacking = self._arrivals.failed, iter(())
+            return
         times = np.array([time for time, _ in self._rows])
         errors = np.array([row["pose"] - row["reference"] for _, row in self._rows])
         error = accumulated_error(times, errors, self.experiment.scale)
@@ -271,19 +303,23 @@ class TorqueLessons(Viewer):
         self.done = k == self._number or self.learning.ended
         self._lacking = self._lacking_torques()
 
+    def _measured(self) -> Iterator[tuple[float, Array, Array]]:
+        """Yield the times, s, states (2, 12) and applied torques (2, 6) around measured periods."""
+        measures = self.experiment.scenario.sensor.measures_state
+        state = "measurement" if measures else "state_estimate"
+        for (time, row), (_, after) in pairwise(list(self._rows)):
+            states = np.array([row[state], after[state]])
+            if np.all(np.isfinite(states)):
+                yield time, states, np.array([row["torque_applied"], after["torque_applied"]])
+
     def _lacking_torques(self) -> Iterator[tuple[float, Array]]:
         """Yield the middles of periods, s, and the torques (6,) that the model lacks there."""
-        sc, rows = self.experiment.scenario, list(self._rows)
-        parameters = np.array([row["parameters"] for _, row in rows])
+        parameters = np.array([row["parameters"] for _, row in self._rows])
         dynamics = estimated(self.experiment, parameters)
-        timeline = Timeline(self._dt, sc.true_delay)
-        state = "measurement" if sc.sensor.measures_state else "state_estimate"
-        for (time, row), (_, after) in pairwise(rows):
-            begin, end = row[state], after[state]
-            if np.all(np.isfinite([begin, end])):
-                acted = np.array([row["torque_applied"], after["torque_applied"]])
-                schedule = timeline.next_period(acted)
-                yield time + self._dt / 2, lacking_torque(dynamics, begin, end, schedule)
+        timeline = Timeline(self._dt, self.experiment.scenario.true_delay)
+        for time, (begin, end), acted in self._measured():
+            schedule = timeline.next_period(acted)
+            yield time + self._dt / 2, lacking_torque(dynamics, begin, end, schedule)
 
     def _rests(self, snapshot: Snapshot) -> bool:
         """Return whether the plate rests at the start, or as near to it as a limit permits."""
@@ -294,13 +330,10 @@ class TorqueLessons(Viewer):
 
     def _begin(self, t: float) -> None:
         """Begin the next repetition, with torques fitted to those that the last one lacked."""
-        least = self.learning.least
-        if len(self._found) < least:
-            self._end(f"{len(self._found)} measurements of a period; expected at least {least}")
-            return
-        times, lacking = (np.array(column) for column in zip(*self._found, strict=True))
         self._before = self.tried[-1]
-        self.tried.append(self.learning.learned(times, lacking))
+        if self._found:  # else the last one is done again
+            times, lacking = (np.array(column) for column in zip(*self._found, strict=True))
+            self.tried.append(self.learning.learned(times, lacking))
         self._until, self._asked, self._returns = self._end_of_motion(t), t, False
         self._share = 0.0
         self._whole, self._lacking, self._found = False, None, []
@@ -321,19 +354,18 @@ def _learn_setpoints(asked: _Asked) -> LiveLessons:
     last = lessons.period * math.ceil(_LEARNED_FROM / lessons.period)
     duration = dt * math.ceil((_SETTLING + last) / dt + 1)
     done, own = list[Repetition](), prepare(scenario)
-    for k in range(1, asked.options.learn + 1):
-        ready = asked.call(always(learned), duration, plan=k == 1)
+    arrivals = _Arrivals(lessons.least, say)
+    while (k := len(done) + 1) <= asked.options.learn:
+        ready = asked.call(always(learned), duration, plan=not done)
         result = asked.drive(ready, duration)
         if result.status != "completed":
             say(f"repetition {k}: {End(result.status, result.stopped).words}; learning ends")
             break
         times, missed = lacking_angles(ready.design.experiment, result, last)
-        if len(times) < lessons.least:
-            say(
-                f"repetition {k}: {len(times)} measurements in the last {last:.3g} s; expected at "
-                f"least {lessons.least}; learning ends"
-            )
-            break
+        if not arrivals.suffice(k, len(times)):
+            if arrivals.failed:
+                break
+            continue
         lessons.errors.append(float(np.sqrt(np.mean(missed**2))))  # rad
         done.append(Repetition(learned, result, float(np.degrees(lessons.errors[-1]))))
         say(f"repetition {k}: the cranks lack {np.degrees(lessons.errors[-1]):.3f} degrees rms")

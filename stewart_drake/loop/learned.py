@@ -50,7 +50,12 @@ def motion_period(scenario: Scenario) -> float:
 
 def harmonics_below(period: float, dt: float) -> int:
     """Return the number of harmonics that samples every dt s of one period determine twice over."""
-    return min(HARMONICS, (int(period / dt) - 2) // 4)
+    return determined_by(int(period / dt))
+
+
+def determined_by(samples: int) -> int:
+    """Return the largest H whose 1 + 2 H coefficients a number of samples determines twice over."""
+    return min(HARMONICS, (samples - 2) // 4)
 
 
 def save_learned(path: Path, learned: LearnedSignal, experiment: Experiment) -> None:

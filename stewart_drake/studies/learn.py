@@ -33,7 +33,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.learned import LearnedSignal, harmonics, with_learned
 from stewart_drake.law.timeline import Timeline, TorqueSchedule
-from stewart_drake.loop.learned import HARMONICS, harmonics_below, motion_period
+from stewart_drake.loop.learned import HARMONICS, determined_by, harmonics_below, motion_period
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import SimulationResult, accumulated_error
 from stewart_drake.loop.simulation import simulate
@@ -340,7 +340,7 @@ class Lessons:
     def __init__(self, scenario: Scenario) -> None:
         self.period, servo = motion_period(scenario), scenario.actuator
         self._harmonics = harmonics_below(self.period, scenario.controller.period)
-        self.least = 2 * (1 + 2 * self._harmonics)  # twice the number of coefficients
+        self.least = math.ceil(1.5 * (1 + 2 * self._harmonics))
         self.lag = servo.lag if servo.kind == "position_servo" else None
         self.errors: list[float] = []
         self._steps = Anderson()
@@ -357,9 +357,10 @@ class Lessons:
 
     def learned(self, times: Array, lacking: Array) -> LearnedSignal:
         """Return the signal of the next repetition, from what the last one lacked at times (n,)."""
+        number = min(self._harmonics, determined_by(len(times)))  # fewer if samples were lost
         if self.lag is None:
-            fitted = fit(times, -lacking, self.period, self._harmonics)
+            fitted = fit(times, -lacking, self.period, number)
         else:
-            missed = fit(times, lacking, self.period, self._harmonics)
+            missed = fit(times, lacking, self.period, number)
             fitted = corrected_setpoints(self._steps.used, missed, self.period, self.lag)
         return LearnedSignal(self.period, self._steps.after(fitted))
