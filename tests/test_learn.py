@@ -341,5 +341,14 @@ def test_a_motion_of_few_samples_is_learned():
     fast = ("reference.amplitude=[0.02,0.02,0.02,0.002,0.002,0.005]", "reference.frequency=3")
     friction = ("plant.coulomb_friction=2e-4", "delay.steps=3", "plant.kind=exact")
     wanted = sd.load_scenario("paper", settings=(*LAW, *fast, *friction))
-    first, *_, last = sd.learn(wanted, repetitions=3).study.repetitions
+    found = sd.learn(wanted, repetitions=3)
+    first, *_, last = found.study.repetitions
     assert last.error < 0.1 * first.error < 1
+    assert "More is learned" not in str(found)
+
+
+def test_what_takes_a_part_of_the_missing_torque_is_named():
+    period = ("reference.frequency=3", "delay.steps=3", "plant.coulomb_friction=1e-4")
+    found = sd.learn(scenario("duration=3", *period), repetitions=2)
+    said = " ".join(str(found).split())
+    assert "--set controller.estimate=[] --set controller.integral=false" in said

@@ -102,6 +102,14 @@ class LearnStudy:
         return self.experiment.scenario.controller.command == "cranks"
 
     @property
+    def competing(self) -> list[str]:
+        """Settings of the controller that keep it from explaining a part of the lacking torque."""
+        controller = self.experiment.scenario.controller
+        estimator = ["controller.estimate=[]"] if controller.estimate else []
+        integral = ["controller.integral=false"] if controller.integral else []
+        return [] if self.setpoints else estimator + integral
+
+    @property
     def stopped(self) -> bool:
         """Whether it ended because the error no longer fell."""
         return len(self.repetitions) < self.asked and not self.interrupted
