@@ -28,8 +28,8 @@ EXPORTED: Final = (
     *("adaptive_lqi", "lqr_gravity", "predictor_lqi", "servo_feedforward", "servo_preview"),
 )
 """Shipped controllers that are exported."""
-MOST_SAMPLES: Final = 100
-"""Largest number of samples that the test replays."""
+REPLAYED: Final = 10.0
+"""Longest part of a run that the test replays, s."""
 TOLERANCE: Final = 1e-7
 """Tolerance of knots, as a share of the largest value of a coordinate, rate or acceleration."""
 LONGEST: Final = 0.5
@@ -97,7 +97,7 @@ class Step(NamedTuple):
 class Recorded:
     law: PredictiveLqi | ServoPreview  # the law itself, not the one that records
     duration: float  # of the run, s
-    steps: list[Step] = field(default_factory=list)  # at most MOST_SAMPLES
+    steps: list[Step] = field(default_factory=list)  # of the first REPLAYED s
     # (n, 6) torques in flight at t = 0, or (18,) the command before the first sample
     first: Array = field(default_factory=lambda: np.empty(0))
     motion: Array | None = None  # (k, 19) its knots, if the law chooses the instants to read
@@ -119,9 +119,9 @@ class Recorded:
         given: tuple[Any, ...],
     ) -> None:
         """Keep a step by its memories; `given` are weights and report, or the report of servos."""
-        if len(self.steps) >= MOST_SAMPLES:
-            return
         law, size = self.law, self.law.sensing.size
+        if len(self.steps) * law.timeline.period > REPLAYED * (1 - 1e-9):
+            return
         new = np.subtract(after.counts, before.counts) > 0
         status = int(new @ 2 ** np.arange(len(new)))
         age = round(measurement.age / law.timeline.period)
