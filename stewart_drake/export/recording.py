@@ -120,7 +120,7 @@ class Recorded:
     ) -> None:
         """Keep a step by its memories; `given` are weights and report, or the report of servos."""
         law, size = self.law, self.law.sensing.size
-        if len(self.steps) * law.timeline.period > REPLAYED * (1 - 1e-9):
+        if len(self.steps) >= round(REPLAYED / law.timeline.period):
             return
         new = np.subtract(after.counts, before.counts) > 0
         status = int(new @ 2 ** np.arange(len(new)))

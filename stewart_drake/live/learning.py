@@ -11,7 +11,7 @@ that the cranks lack in the last periods correct the setpoints of the next one.
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
@@ -67,7 +67,7 @@ _INSTANTS: Final = 200
 _EACH: Final = 4
 """Number of lacking torques that are computed at a sample; one takes about 0.7 ms."""
 _AGAIN: Final = 3
-"""Largest number of repetitions in a row of which too few measurements may arrive."""
+"""Largest number of repetitions in a row that are done again for lack of measurements."""
 
 
 class _Asked(NamedTuple):
@@ -124,7 +124,7 @@ def learn_live(
     """Repeat a motion on a machine, learn from each repetition, and write what was learned.
 
     Learning ends early after two repetitions without a smaller error, or if one does not complete,
-    or once `ending` returns True.
+    or four in a row lack measurements, or once `ending` returns True.
 
     Raises:
         ConfigError: see `studies.learn.check_learning` and `live.session`.
@@ -138,23 +138,21 @@ def learn_live(
 
 
 class _Arrivals:
-    """Decides whether a repetition of which too few measurements arrived is done again.
-
-    Attributes:
-        failed: whether that was so too often.
-    """
+    """Decides whether a repetition that lacks measurements is done again."""
 
     def __init__(self, least: int, say: Callable[[str], None]) -> None:
         self._least, self._say, self._lost = least, say, 0
-        self.failed = False
+
+    @property
+    def failed(self) -> bool:
+        """Whether too many repetitions in a row lacked measurements."""
+        return self._lost > _AGAIN
 
     def suffice(self, number: int, measurements: int) -> bool:
         """Return whether repetition `number` has enough; print what follows if not."""
-        if measurements >= self._least:
-            self._lost = 0
+        self._lost = 0 if measurements >= self._least else self._lost + 1
+        if not self._lost:
             return True
-        self._lost += 1
-        self.failed = self._lost > _AGAIN
         found = f"repetition {number}: {measurements} measurements to learn from"
         then = "learning ends" if self.failed else "it is done again"
         self._say(f"{found}; expected at least {self._least}; {then}")
@@ -176,6 +174,14 @@ def _learn_torques(asked: _Asked) -> LiveLessons:
         save_learned(asked.file, lessons.tried[best], lessons.experiment)
     done = lessons.repetitions(result)
     return LiveLessons(result, asked.end(lessons.learning, lessons.experiment, done))
+
+
+class _Step(NamedTuple):
+    """One of the controller's periods."""
+
+    time: float  # of its begin, s
+    states: Array  # (2, 12) at its begin and end
+    acted: Array  # (2, 6) torques that acted at its begin and end, N m
 
 
 class TorqueLessons(Viewer):
@@ -289,8 +295,8 @@ class TorqueLessons(Viewer):
 
     def _judge(self) -> None:
         """Take the error of the last period, unless too much of it was not measured."""
-        measured = sum(1 for _ in self._measured())
-        if not self._arrivals.suffice(len(self.learning.errors) + 1, measured):
+        measured = list(self._measured())
+        if not self._arrivals.suffice(len(self.learning.errors) + 1, len(measured)):
             self.done, self._lacking = self._arrivals.failed, iter(())
             return
         times = np.array([time for time, _ in self._rows])
@@ -301,23 +307,24 @@ class TorqueLessons(Viewer):
         k = len(self.learning.errors)
         self._say(f"repetition {k}: E of one period is {error:.3g} % s")
         self.done = k == self._number or self.learning.ended
-        self._lacking = self._lacking_torques()
+        self._lacking = self._lacking_torques(measured)
 
-    def _measured(self) -> Iterator[tuple[float, Array, Array]]:
-        """Yield the times, s, states (2, 12) and applied torques (2, 6) around measured periods."""
+    def _measured(self) -> Iterator[_Step]:
+        """Yield the controller's periods with a measurement at both ends."""
         measures = self.experiment.scenario.sensor.measures_state
         state = "measurement" if measures else "state_estimate"
-        for (time, row), (_, after) in pairwise(list(self._rows)):
+        for (time, row), (_, after) in pairwise(self._rows):
             states = np.array([row[state], after[state]])
             if np.all(np.isfinite(states)):
-                yield time, states, np.array([row["torque_applied"], after["torque_applied"]])
+                acted = np.array([row["torque_applied"], after["torque_applied"]])
+                yield _Step(time, states, acted)
 
-    def _lacking_torques(self) -> Iterator[tuple[float, Array]]:
+    def _lacking_torques(self, measured: Iterable[_Step]) -> Iterator[tuple[float, Array]]:
         """Yield the middles of periods, s, and the torques (6,) that the model lacks there."""
         parameters = np.array([row["parameters"] for _, row in self._rows])
         dynamics = estimated(self.experiment, parameters)
         timeline = Timeline(self._dt, self.experiment.scenario.true_delay)
-        for time, (begin, end), acted in self._measured():
+        for time, (begin, end), acted in measured:
             schedule = timeline.next_period(acted)
             yield time + self._dt / 2, lacking_torque(dynamics, begin, end, schedule)
 

@@ -103,7 +103,7 @@ class LearnStudy:
 
     @property
     def competing(self) -> list[str]:
-        """Settings of the controller that keep it from explaining a part of the lacking torque."""
+        """Settings that keep the controller from taking a part of the lacking torque."""
         controller = self.experiment.scenario.controller
         estimator = ["controller.estimate=[]"] if controller.estimate else []
         integral = ["controller.integral=false"] if controller.integral else []
