@@ -15,7 +15,14 @@ from stewart_drake.law.learned import LearnedLqi, LearnedSignal, with_learned
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.learned import HARMONICS, harmonics_below, save_learned
 from stewart_drake.loop.preparation import prepare
-from stewart_drake.studies.learn import Anderson, Fit, corrected_setpoints, fit, study_learn
+from stewart_drake.studies.learn import (
+    Anderson,
+    Fit,
+    Lessons,
+    corrected_setpoints,
+    fit,
+    study_learn,
+)
 from stewart_drake.studies.study_options import LearnOptions
 
 EXACT = ("plant.kind=exact", "start=on_reference", "queue=reference")
@@ -335,16 +342,48 @@ def test_learned_setpoints_remove_what_plain_setpoints_lack():
     assert found.best.error < 0.05 * errors[0]
 
 
-def test_a_motion_of_few_samples_is_learned():
+FAST = (
+    *LAW,
+    *("reference.amplitude=[0.02,0.02,0.02,0.002,0.002,0.005]", "reference.frequency=3"),
+    *("plant.coulomb_friction=2e-4", "delay.steps=3", "plant.kind=exact"),
+)
+"""A motion of 20 samples a period."""
+
+
+def test_a_motion_of_few_samples_is_learned(tmp_path):
     """Of 20 samples a period four harmonics are fitted, of which each number is known twice."""
     assert [harmonics_below(n * 0.1, 0.1) for n in (4.5, 6.5, 20.5, 34.5, 90)] == [0, 1, 4, 8, 8]
-    fast = ("reference.amplitude=[0.02,0.02,0.02,0.002,0.002,0.005]", "reference.frequency=3")
-    friction = ("plant.coulomb_friction=2e-4", "delay.steps=3", "plant.kind=exact")
-    wanted = sd.load_scenario("paper", settings=(*LAW, *fast, *friction))
-    found = sd.learn(wanted, repetitions=3)
+    found = sd.learn(sd.load_scenario("paper", settings=FAST), repetitions=3)
     first, *_, last = found.study.repetitions
     assert last.error < 0.1 * first.error < 1
     assert "More is learned" not in str(found)
+    films = found.replay(tmp_path)
+    assert list(films) == ["replay_1", "replay_2"]
+    numbers = (1, found.summary["best"])
+    for path, number in zip(films.values(), numbers, strict=True):
+        assert f"repetition {number}" in path.read_text()
+
+
+@pytest.mark.parametrize(("share", "repetitions"), [(0.1, 3), (0.3, 2), (0.7, 1)])
+def test_learning_ends_with_a_word_where_too_much_is_not_measured(share, repetitions):
+    lost = f"sensor.faults=[{{kind: missing, from: 0, to: 1000, share: {share}}}]"
+    found = sd.learn(sd.load_scenario("paper", settings=(*FAST, lost)), repetitions=3)
+    errors, said = found.summary["errors"], " ".join(str(found).split())
+    early = repetitions < 3
+    assert len(errors) == repetitions and found.summary["lacking_measurements"] == early
+    assert (f"repetition {repetitions} had too few measurements" in said) == early
+    assert ("Nothing is learned" in said) == (repetitions == 1)
+    assert repetitions == 1 or errors[-1] < 0.2 * errors[0]
+    assert not found.summary["stopped"]
+
+
+@pytest.mark.parametrize("samples", [5, 6])
+def test_a_lost_sample_of_few_does_not_cost_the_only_harmonic(samples):
+    lessons = Lessons(sd.load_scenario("paper", settings=(*FAST, "reference.frequency=10")))
+    assert lessons.least == 5
+    times = 0.1 * np.arange(samples)
+    learned = lessons.learned(times, np.outer(np.cos(10 * times), np.ones(6)))
+    assert np.abs(learned.coefficients[1]).min() > 0.5
 
 
 def test_what_takes_a_part_of_the_missing_torque_is_named():

@@ -268,6 +268,7 @@ _PLAIN: Final = {
     "an object": "a mapping of fields",
     "a valid dictionary": "a mapping",
     "a valid tuple": "a list of numbers",
+    "a valid array": "a list",
     "greater than or equal to": "at least",
     "less than or equal to": "at most",
     "greater than": "more than",

@@ -106,7 +106,7 @@ class _Asked(NamedTuple):
         early = len(done) < asked and not lessons.ended
         cranks = self.scenario.controller.command == "cranks"
         measure = Measure("the rms error of the cranks", "deg") if cranks else PERIOD_ERROR
-        return LearnStudy(own, lessons.period, done, asked, early, measure, file)
+        return LearnStudy(own, lessons.period, done, asked, early, measure=measure, file=file)
 
 
 class LiveLessons(NamedTuple):

@@ -275,6 +275,9 @@ class Document:
     # names and values below the verdict of a page, with units
     facts: Mapping[str, str] = field(default_factory=dict)
 
+    def all(self, kind: type[_Kind]) -> list[_Kind]:
+        return [block for section in self.sections for block in section.all(kind)]
+
     def plain(self) -> str:
         """Return the document for a terminal, in at most 80 columns."""
         text = wrap(self.verdict) if self.verdict else ""

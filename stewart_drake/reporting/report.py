@@ -237,9 +237,8 @@ def document(found: ReportData, name: str, replay: str = "") -> Document:
     )
     answers = {_QUESTIONS[key]: found.analyses[key].document for key in ANALYSES}
     for question, answer in answers.items():
-        pictures = [one for part in answer.sections for one in part.all(Picture)]
         conclusion = Paragraph(sentence(answer.verdict), brief=True)
-        made.sections.append(Section(question, conclusion, *pictures))
+        made.sections.append(Section(question, conclusion, *answer.all(Picture)))
     for question, answer in answers.items():
         details = [
             f"{section.heading}. {block.text}" if isinstance(block, Paragraph) else block

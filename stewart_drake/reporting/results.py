@@ -20,7 +20,15 @@ from stewart_drake.loop import results as loop_results
 from stewart_drake.loop.preparation import simulated_machine
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.reporting.csv_file import columns_of
-from stewart_drake.reporting.document import PAGE, Caution, Document, Picture, from_template, wrap
+from stewart_drake.reporting.document import (
+    PAGE,
+    Caution,
+    Document,
+    Frame,
+    Picture,
+    from_template,
+    wrap,
+)
 from stewart_drake.reporting.run import comparison_document, run_document
 from stewart_drake.studies import new_machine
 from stewart_drake.studies.compare import save_comparison
@@ -128,12 +136,7 @@ class SimulationResult(Printed, loop_results.SimulationResult):
         machine = simulated_machine(self.scenario) if mechanism is None else mechanism
         if meshcat is not None:
             return replay(self.signals, machine, meshcat)
-        text = replay_html(self, machine, title)
-        if path is None:
-            return Replay(text)
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        write_whole(Path(path), text)
-        return Path(path)
+        return _kept(replay_html(self, machine, title), path)
 
 
 class ComparisonResult(Printed, dict[str, SimulationResult]):
@@ -288,8 +291,17 @@ class AnalysisResult(Printed):
 
     def plot(self, directory: str | Path | None = None) -> Figures:
         """Return the figures of the page; see `SimulationResult.plot`."""
-        pictures = [one for section in self.document.sections for one in section.all(Picture)]
-        return drawn({f"figure_{k}": one.drawn for k, one in enumerate(pictures, 1)}, directory)
+        pictures = enumerate(self.document.all(Picture), 1)
+        return drawn({f"figure_{k}": one.drawn for k, one in pictures}, directory)
+
+    def replay(self, directory: str | Path | None = None) -> "dict[str, Replay | Path]":
+        """Return the animations of the page by name, empty for a page without.
+
+        Args:
+            directory: folder to write them into as NAME.html, if not None; it is made.
+        """
+        frames = enumerate(self.document.all(Frame), 1)
+        return {f"replay_{k}": _kept(one.html, directory, f"replay_{k}.html") for k, one in frames}
 
     def write_page(self, directory: Path, name: str = PAGE) -> Path:
         """Write the page into a directory and return its path."""
@@ -330,6 +342,16 @@ def _framed(page: str) -> str:
         f'<iframe srcdoc="{escaping.escape(page)}" sandbox="allow-scripts" '
         'style="width: 100%; height: 600px; border: 0"></iframe>'
     )
+
+
+def _kept(text: str, place: str | Path | None, *name: str) -> Replay | Path:
+    """Return an animation, or its path if it has a place, where it is written."""
+    if place is None:
+        return Replay(text)
+    path = Path(place, *name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, text)
+    return path
 
 
 def drawn(figures: "Mapping[str, Figure]", directory: str | Path | None) -> Figures:

@@ -89,6 +89,7 @@ class LearnStudy:
     repetitions: Sequence[Repetition]  # in order
     asked: int  # number of repetitions that were asked for
     interrupted: bool  # whether it ended early for another reason than its errors
+    lacking: bool = False  # whether the last repetition had too few measurements to learn from
     measure: Measure = PERIOD_ERROR
     file: str = "learned.npz"  # with the learned torque or angles
 
@@ -112,7 +113,8 @@ class LearnStudy:
     @property
     def stopped(self) -> bool:
         """Whether it ended because the error no longer fell."""
-        return len(self.repetitions) < self.asked and not self.interrupted
+        early = len(self.repetitions) < self.asked
+        return early and not (self.interrupted or self.lacking)
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -123,6 +125,7 @@ class LearnStudy:
             "best": 1 + list(self.repetitions).index(self.best),
             "stopped": self.stopped,
             "interrupted": self.interrupted,
+            "lacking_measurements": self.lacking,
         }
 
 
@@ -149,8 +152,9 @@ def study_learn(
 ) -> LearnStudy:
     """Repeat the motion of a scenario, and learn from each repetition.
 
-    Learning ends early after two repetitions without a smaller error. Each repetition has
-    other noise. The motion is periodic, the link a wire of known delay.
+    Learning ends early after two repetitions without a smaller error, or one with too few
+    measurements. Each repetition has other noise. The motion is periodic, the link a wire of known
+    delay.
     """
     check_learning(scenario)
     lessons = Lessons(scenario)
@@ -161,7 +165,7 @@ def study_learn(
     experiment = prepare(run)
     done: list[Repetition] = []
     learned: LearnedSignal | None = None
-    interrupted = False
+    interrupted = few = False
     lacking = lacking_torques if lessons.lag is None else lacking_angles
     for k in range(options.repetitions):
         sensor = replace(run.sensor, seed=run.sensor.seed + k)
@@ -174,12 +178,14 @@ def study_learn(
         if progress is not None:
             progress(k + 1, options.repetitions)
         times, values = lacking(experiment, result, period)
-        if lessons.ended or len(times) < lessons.least:
+        if lessons.ended or len(done) == options.repetitions:
+            break
+        if few := len(times) < lessons.least:
             break
         learned = lessons.learned(times, values)
     if not done:
         raise KeyboardInterrupt
-    return LearnStudy(experiment, period, done, options.repetitions, interrupted)
+    return LearnStudy(experiment, period, done, options.repetitions, interrupted, few)
 
 
 def last_error(result: SimulationResult, scale: Array, period: float) -> float:
@@ -365,7 +371,7 @@ class Lessons:
 
     def learned(self, times: Array, lacking: Array) -> LearnedSignal:
         """Return the signal of the next repetition, from what the last one lacked at times (n,)."""
-        number = min(self._harmonics, determined_by(len(times)))  # fewer if samples were lost
+        number = min(self._harmonics, max(1, determined_by(len(times))))  # fewer if some were lost
         if self.lag is None:
             fitted = fit(times, -lacking, self.period, number)
         else:
