@@ -16,7 +16,7 @@ from stewart_drake.core.layout import DEFAULT_GRAVITY
 from stewart_drake.export.controller import exported, write
 from stewart_drake.export.setpoints import Setpoints, load_units, make_setpoints
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import make_folder, write_whole
+from stewart_drake.files.fileio import make_folder, write_asked, write_whole
 from stewart_drake.files.yamlio import validate, yaml_text
 from stewart_drake.identification import identify as identification
 from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
@@ -196,14 +196,14 @@ def export_csv(signals: str | Path, out: str | Path | None = None) -> str:
 
     Args:
         signals: signals.nc, a log (.mcap, .csv) or the folder of a run.
-        out: file to write, if not None.
+        out: file to write, if not None; its folder is made.
 
     Raises:
         ConfigError: there is no such file, or it holds no signals.
     """
     text = signals_csv(read_signals(Path(signals)))
     if out is not None:
-        write_whole(Path(out), text)
+        write_asked("out", out, text)
     return text
 
 
@@ -221,7 +221,7 @@ def replay_log(log: str | Path, out: str | Path | None = None) -> str:
 
     text = log_html(Path(log))
     if out is not None:
-        write_whole(Path(out), text)
+        write_asked("out", out, text)
     return text
 
 

@@ -122,11 +122,26 @@ def test_units_are_those_of_the_servos(tmp_path):
     path = tmp_path / "units.yaml"
     path.write_text("unit: ticks\noffset: 2048.0\n")
     assert load_units(path) == ServoUnits(unit="ticks", offset=2048.0)
-    for wrong in ("unit: turns", "sign: 2", "offset: [1.0, 2.0]", "ticks: 3", "sign: .nan"):
+    turns = "unit: deg\nticks_per_turn: 4096"
+    for wrong in ("unit: turns", "sign: 2", "offset: [1.0, 2.0]", "ticks: 3", "sign: .nan", turns):
         path.write_text(wrong + "\n")
         with pytest.raises(ConfigError, match=r"^[^\n]*units\.yaml: [^\n]*$") as said:
             load_units(path)
         assert str(said.value).count("; expected") <= 1  # one complaint about one field
+
+
+def test_a_motion_shorter_than_its_soft_start_is_refused():
+    with pytest.raises(ConfigError, match="duration: got 0.9 s; expected at least 1 s"):
+        made("duration=0.9")
+    assert made("duration=0.9", ON).blend == 0
+
+
+def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_text("x")
+    for wanted in (log / "a.csv", tmp_path):
+        with pytest.raises(ConfigError, match=r"^out: got [^\n]*can be written [^\n]*$"):
+            made(ON, out=wanted)
 
 
 def test_the_command_writes_the_file(tmp_path, capsys):

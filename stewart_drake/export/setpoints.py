@@ -12,7 +12,7 @@ from pydantic import Field
 from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.arguments import fixed
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import write_whole
+from stewart_drake.files.fileio import write_asked
 from stewart_drake.files.yamlio import load_yaml, one_message, validate
 from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.servos import Stiffness, rise, turned
@@ -37,7 +37,7 @@ class ServoUnits:
 
     Attributes:
         unit: `rad`, `deg` or `ticks`; ticks are rounded.
-        ticks_per_turn: of a crank.
+        ticks_per_turn: of a crank, with `ticks`.
         offset: at a crank angle of 0, in the unit, one or six.
         sign: 1 or -1, one or six.
     """
@@ -63,7 +63,11 @@ class ServoUnits:
 
 def load_units(path: str | Path) -> ServoUnits:
     """Read a YAML file with the fields of `ServoUnits`."""
-    return validate(ServoUnits, load_yaml(Path(path)), str(path))
+    data = load_yaml(Path(path))
+    units = validate(ServoUnits, data, str(path))
+    if "ticks_per_turn" in data and units.unit != "ticks":
+        raise ConfigError(f"{path}: ticks_per_turn: got one in {units.unit}; expected unit: ticks")
+    return units
 
 
 @dataclass(frozen=True)
@@ -104,7 +108,8 @@ class Setpoints:
         return "\n".join([",".join(header), *lines]) + "\n"
 
     def save(self, path: str | Path, units: ServoUnits | None = None) -> None:
-        write_whole(Path(path), self.csv(units))
+        """Write the CSV file `path`; its folder is made."""
+        write_asked("out", path, self.csv(units))
 
 
 def make_setpoints(
@@ -158,6 +163,11 @@ def make_setpoints(
         return _along(experiment, None, 0.0, rate, plain, learned)
     pose = experiment.start[POSE] if start is None else _checked(start, experiment)
     blend = SHORTEST_BLEND
+    if scenario.duration < blend:
+        raise ConfigError(
+            f"duration: got {scenario.duration:g} s; expected at least {blend:g} s, the length of "
+            "the soft start, or a start on the reference"
+        )
     while True:
         try:
             return _along(experiment, pose, blend, rate, plain, learned)

@@ -77,12 +77,25 @@ def make_folder(name: str, path: Path) -> None:
         raise unwritable(name, path, error) from None
 
 
-def unwritable(name: str, path: Path, error: Exception) -> ConfigError:
-    """Return the error about a folder, given by the argument or option `name`, for its cause."""
+def unwritable(name: str, path: Path, error: Exception, kind: str = "directory") -> ConfigError:
+    """Return the error about a path, given by the argument or option `name`, for its cause."""
     return ConfigError(
-        f"{name}: got {str(path)!r}; expected a directory that can be written "
+        f"{name}: got {str(path)!r}; expected a {kind} that can be written "
         f"({getattr(error, 'strerror', None) or error})"
     )
+
+
+def write_asked(name: str, path: str | Path, text: str) -> None:
+    """Write the file that the argument `name` asks for, and make its folder.
+
+    Raises:
+        ConfigError: that is not possible.
+    """
+    make_folder(name, Path(path).parent)
+    try:
+        write_whole(Path(path), text)
+    except (OSError, ValueError) as error:
+        raise unwritable(name, Path(path), error, "file") from None
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
