@@ -18,7 +18,6 @@ from socket import AF_INET, SOCK_DGRAM, socket
 import numpy as np
 
 import stewart_drake as sd
-from stewart_drake.loop.peer import identity_of
 
 NEVER, WATCHDOG = 2**64 - 1, 10**9  # ns
 SIMULATION, PARKED, RUNNING, SAFE, BUSY, RESETS = 1, 2, 4, 8, 64, 256
@@ -57,8 +56,7 @@ class Machine:
 
     def __init__(self, scenario: sd.Scenario, port: int) -> None:
         self.period = round(scenario.controller.period * 1e9)
-        parts = identity_of(scenario)
-        self.identity = b"".join(p.digest + p.name.encode().ljust(32, b"\0") for p in parts)
+        self.identity = sd.machine_identity(scenario)
         self.dynamics = sd.StewartDynamics(
             sd.load_mechanism(scenario.mechanism), scenario.plant.gravity
         )
@@ -106,7 +104,8 @@ class Machine:
                 newest = max(there)
                 wanted = self.plans[newest][1][rows[newest]]
                 self.torque = np.clip(wanted, -self.limit, self.limit)
-            self.played, self.dry = self.played + (not dry), self.dry + dry
+            self.played += not dry
+            self.dry += dry and self.played > 0  # counted from the first play-out on
             self.acted = [self.torque, *self.acted[:7]]
             self.plans = {n: plan for n, plan in self.plans.items() if n in there or rows[n] < 0}
         if self.address is not None:

@@ -15,6 +15,7 @@ _PUBLIC: Final = {
     "loop.diagram": "ClosedLoop build_closed_loop",
     "loop.exact": "ExactPlant set_accuracy",
     "loop.law_design": "DesignedLaw design_law",
+    "loop.peer": "machine_identity",
     "loop.platforms": "AddStewartPlatform StewartPlatform",
     "loop.controller_margin": "linear_models",
     "mechanism.files": "load_mechanism",

@@ -27,6 +27,7 @@ from stewart_drake.loop.exact import ExactPlant as ExactPlant
 from stewart_drake.loop.exact import set_accuracy as set_accuracy
 from stewart_drake.loop.law_design import DesignedLaw as DesignedLaw
 from stewart_drake.loop.law_design import design_law as design_law
+from stewart_drake.loop.peer import machine_identity as machine_identity
 from stewart_drake.loop.platforms import AddStewartPlatform as AddStewartPlatform
 from stewart_drake.loop.platforms import StewartPlatform as StewartPlatform
 from stewart_drake.mechanism.files import load_mechanism as load_mechanism

@@ -52,6 +52,16 @@ def test_live_drives_it_along_the_motion(machine):
     assert np.abs(sent.values - same.values).max() < 0.05 * np.abs(same).max()
 
 
+def test_periods_are_dry_from_the_first_torque_on():
+    made = own_machine.Machine(sd.load_scenario("paper"), 0)
+    made.begin = made.heard = 0
+    for k in range(6):
+        made.plans = {1: (3 * made.period, np.full((1, 6), 0.1))} if k == 3 else {}
+        made.step(k * made.period)
+        assert (made.played, made.dry) == (k >= 3, max(0, k - 3))
+    made.socket.close()
+
+
 class Controller:
     """A controller of single datagrams."""
 
@@ -76,8 +86,11 @@ class Controller:
 
 def greeted(port):
     one = Controller(port)
-    one.send(identity=identity_of(sd.load_scenario("paper")))
-    return one, one.answer()
+    scenario = sd.load_scenario("paper")
+    one.send(identity=identity_of(scenario))
+    offer = one.answer()
+    assert offer.identity.packed == sd.machine_identity(scenario)
+    return one, offer
 
 
 def test_its_bytes_are_those_of_the_protocol(machine):

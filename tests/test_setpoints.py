@@ -131,7 +131,7 @@ def test_units_are_those_of_the_servos(tmp_path):
 
 
 def test_a_motion_shorter_than_its_soft_start_is_refused():
-    with pytest.raises(ConfigError, match="duration: got 0.9 s; expected at least 1 s"):
+    with pytest.raises(ConfigError, match=r"duration: got 0\.9 s; expected at least 1 s"):
         made("duration=0.9")
     assert made("duration=0.9", ON).blend == 0
 

@@ -244,7 +244,7 @@ def _machine_body(m: MachineMessage) -> bytes:
         zeros, codes = np.asarray(m.zeros, "<f8"), np.asarray(m.codes, "<i4")
         measured = zeros.tobytes() + codes.tobytes()
     elif m.identity is not None:
-        kind, measured = _OFFERS, _identity_bytes(m.identity)
+        kind, measured = _OFFERS, m.identity.packed
     numbers = vars(m) | {"kind": kind, "samples": samples, "history": len(m.acted)}
     numbers |= {"fault": m.reason.fault, "leg": m.reason.leg, "lasted": m.reason.lasted}
     numbers |= {"before": m.before.fault, "before_lasted": m.before.lasted}
@@ -260,12 +260,8 @@ def _controller_body(m: ControllerMessage) -> bytes:
     if m.identity is not None:
         if len(m.torques):
             raise ValueError("torques: got some in a request; expected none")
-        return packed + _identity_bytes(m.identity) + _PADDING
+        return packed + m.identity.packed + _PADDING
     return packed + np.asarray(m.torques, "<f8").tobytes()
-
-
-def _identity_bytes(identity: Identity) -> bytes:
-    return b"".join(_PART.pack(part.digest, part.name.encode("ascii")) for part in identity)
 
 
 def version_refusal(session: int, acknowledged: int) -> bytes:

@@ -87,6 +87,11 @@ class Identity(NamedTuple):
     sensor: Part
     actuator: Part
 
+    @property
+    def packed(self) -> bytes:
+        """The 160 bytes of an identity in a datagram."""
+        return b"".join(part.digest + part.name.encode("ascii").ljust(NAME, b"\0") for part in self)
+
     def differing(self, other: "Identity") -> tuple[str, str] | None:
         """Return the parts that differ, of this side and of the other; None if all agree."""
         pairs = zip(self._fields, self, other, strict=True)
@@ -120,6 +125,14 @@ def identity_of(scenario: Scenario) -> Identity:
         _part(f"sensor {read}", read),
         _part(f"actuator {scenario.actuator.kind}", scenario.actuator.kind),
     )
+
+
+def machine_identity(scenario: Scenario) -> bytes:
+    """Return the 160 bytes by which a scenario's machine and its controller know each other.
+
+    docs/protocol.md has their meaning. A machine end of your own sends them in its offer.
+    """
+    return identity_of(scenario).packed
 
 
 def code_bits(sensor: StateSensorConfig | EncoderSensorConfig) -> int:
