@@ -72,7 +72,7 @@ def test_a_file_is_read_back_to_the_last_digit(tmp_path_factory, names, seed):
         ({"covariance": [[1e-8, 2e-6], [2e-6, 1e-4]]}, "an eigenvalue of -1, in units"),
         ({"covariance": [[-1.0, 0.0], [0.0, 1.0]]}, "a variance of -1 for payload_mass"),
         ({"covariance": [[0.0, 0.1], [0.1, 1.0]]}, "an eigenvalue of"),
-        ({"covariance": "none"}, "covariance: got 'none'; expected a valid array"),
+        ({"covariance": "none"}, "covariance: got 'none'; expected a list"),
         ({"means": [1.0]}, "means: unknown key; did you mean mean"),
         ({"mechanism": 3}, "mechanism: got 3; expected text"),
     ],

@@ -58,7 +58,8 @@ class CatchUp:
         period: float,
         least: Callable[[], LeastError] | None = None,
     ) -> None:
-        self._least, self._reference, self._period = least, reference, period
+        self._least = None if least is None else cache(least)
+        self._reference, self._period = reference, period
         self._begin = reference, start, t_start, period
         self._planned = cache(partial(Model(dynamics).plan, *self._begin))
         self._motion, self._improved = cache(self._follow), cache(self._improve)

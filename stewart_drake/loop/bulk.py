@@ -6,7 +6,9 @@ tuner with parts in Python is called by the loop in C at each sample.
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
@@ -192,9 +194,10 @@ class Preparation:
     def __init__(self, scenario: Scenario) -> None:
         self._base = prepare(scenario)
         self._made: dict[tuple[Any, ...], Any] = {}
+        self._on_reference = cache(partial(evaluate, self._base.reference))
         self.when: Instants = instants_of(scenario.duration, scenario.controller.period)
-        reference = self._base.reference
-        self.references = np.array([evaluate(reference, t)[:NUM_STATE] for t in self.when.looks])
+        rows = [self._on_reference(t)[:NUM_STATE] for t in self.when.looks]
+        self.references = np.array(rows)
 
     def experiment(self, scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
         scenario.check()
@@ -204,21 +207,23 @@ class Preparation:
     def prepared(self, experiment: Experiment, tuner: MakeTuner | None = None) -> Prepared:
         """Compose law, motion and tuner of a run; `tuner` replaces the scenario's."""
         if experiment.scenario.controller.command == "cranks":
-            servos, motion, _ = servo_law(experiment)
-            return Prepared(experiment, servos, motion, self._preview(motion, servos), None)
+            servos, motion, length = servo_law(experiment)
+            along = self._along(motion, servos, length)
+            return Prepared(experiment, servos, motion, self._preview(along, servos), None)
         white = white_errors(experiment.scenario)
         law = compose_law(experiment, self._once(sizing_of, experiment, key=white))
         queue = experiment.torques_in_flight(law.timeline.delay).tobytes()
         way = self._once(way_onto, experiment, law, key=queue)
-        law, motion, _ = on_its_way(law, experiment, way)
+        law, motion, length = on_its_way(law, experiment, way)
         source = (tuner or weights_source)(experiment, law)
-        previews = self._preview(motion, law)
+        along = self._along(motion, law, length)
         followed = followed_motion(law, motion, experiment.reference) or ()
         until = self._read_until(law.longest_plan)
         motions = tuple(
-            self._once(pieces_of, one, followed, until, key=(one, until)) for one in followed
+            self._once(pieces_of, row, followed, until, key=(one, until))
+            for one, row in zip(followed, (along, self._on_reference), strict=False)
         )
-        return Prepared(experiment, law, motion, previews, source, motions)
+        return Prepared(experiment, law, motion, self._preview(along, law), source, motions)
 
     def _once(self, make: Callable[..., Made], *arguments: Any, key: Any) -> Made:
         """Return a result that is made once for all runs with the same key."""
@@ -227,10 +232,18 @@ class Preparation:
         made: Made = self._made[make.__name__, key]
         return made
 
-    def _preview(self, motion: Trajectory, law: PredictiveLqi | ServoPreview) -> Array:
+    def _along(
+        self, motion: Trajectory, law: PredictiveLqi | ServoPreview, length: float
+    ) -> Callable[[float], Array]:
+        """Return the rows of a motion that after `length` s of catch-up is the reference."""
+        joined = law.timeline.eta + length + SIMULTANEOUS
+        known = self._on_reference
+        return lambda t: known(t) if t > joined else evaluate(motion, t)
+
+    def _preview(self, along: Callable[[float], Array], law: PredictiveLqi | ServoPreview) -> Array:
         """Return the rows (k, p, 18) of `loop.controller.Reference` at all samples."""
         times = np.maximum(0.0, self.when.samples[:, None] + law.preview_times)
-        return self._once(_rows_at, motion, times, key=motion)
+        return np.array([[along(t) for t in preview] for preview in times])
 
     def _read_until(self, longest: float) -> float:
         """Return the instant up to which laws with plans of at most `longest` s read motions."""
@@ -240,31 +253,28 @@ class Preparation:
         return sc.duration + 2 * (delay + longest + 20 * c.period)
 
 
-def _rows_at(motion: Trajectory, times: Array) -> Array:
-    return np.array([[evaluate(motion, t) for t in preview] for preview in times])
-
-
 def pieces_of(
-    motion: Trajectory, joints: tuple[Trajectory, ...], until: float
+    row: Callable[[float], Array], joints: tuple[Trajectory, ...], until: float
 ) -> tuple[Array, Array]:
     """Return a motion in quintic pieces: nodes (n + 1,) in s, rows (n, 2, 18) at their ends.
 
-    The joints of piecewise trajectories are nodes, with the accelerations of either side. No other
-    node is near one: in a very short piece rounding would determine the accelerations.
+    `row` returns its row (18,) at an instant. The joints of piecewise trajectories are nodes, with
+    the accelerations of either side. No other node is near one: in a very short piece rounding
+    would determine the accelerations.
     """
     ends = [
         t for one in joints if hasattr(one, "get_segment_times") for t in one.get_segment_times()
     ]
     inner = np.unique([t for t in ends if 0 < t < until])
     inner = inner[np.diff(inner, prepend=-np.inf) > SIMULTANEOUS]
-    grid = np.linspace(0.0, until, int(until / _NODES) + 2)
+    grid = _NODES * np.arange(math.ceil(until / _NODES) + 1)
     nearest = np.abs(grid[:, None] - inner).min(axis=1, initial=np.inf)
     times = np.sort(np.append(grid[nearest > _NODES / 10], inner))
-    rows = np.array([evaluate(motion, t) for t in times])
+    rows = np.array([row(t) for t in times])
     pieces = np.stack([rows[:-1], rows[1:]], axis=1)
     for k in np.searchsorted(times, inner):
-        pieces[k - 1, 1, ACCELERATIONS] = evaluate(motion, times[k] - _BESIDE)[ACCELERATIONS]
-        pieces[k, 0, ACCELERATIONS] = evaluate(motion, times[k] + _BESIDE)[ACCELERATIONS]
+        pieces[k - 1, 1, ACCELERATIONS] = row(times[k] - _BESIDE)[ACCELERATIONS]
+        pieces[k, 0, ACCELERATIONS] = row(times[k] + _BESIDE)[ACCELERATIONS]
     return times, pieces
 
 

@@ -161,6 +161,7 @@ class Sizing(NamedTuple):
     # the same where the plate can follow it: at the end of a leg's reach torques have no bound
     reachable_torque: float
     machine_torque: float  # see `law.startup.machine_torque`, N m
+    frequency: float  # that the motion's accelerations ask of the loop, rad/s (`motion_frequency`)
 
 
 def one_step_sizing(experiment: Experiment) -> Sizing:
@@ -170,7 +171,8 @@ def one_step_sizing(experiment: Experiment) -> Sizing:
     if sc.controller.limits == "qp":
         space = clear_space(experiment)
         reachable = reference_torque(nominal, reference, sc.duration, space)
-    return Sizing(1, largest, reachable, machine_torque(nominal))
+    frequency = motion_frequency(experiment)
+    return Sizing(1, largest, reachable, machine_torque(nominal), frequency)
 
 
 def sizing_of(experiment: Experiment) -> Sizing:
@@ -216,12 +218,12 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     c, motion = sc.controller, experiment.motion_scale
     sensor, link = SENSORS[type(sc.sensor)], LINKS[type(sc.link)]
     timeline = Timeline(c.period, believed_delay(sc))
-    substeps, peak_torque, reachable, machine_scale = sizing or sizing_of(experiment)
+    substeps, peak_torque, reachable, machine_scale, frequency = sizing or sizing_of(experiment)
     torque_scale = max(machine_scale, reachable)
     motion_torque = max(STILL * machine_scale, reachable)
     parameters = estimated_parameters(experiment, torque_scale, motion_torque)
     noise = sc.sensor.noise_std if isinstance(sc.sensor, StateSensorConfig) else None
-    tolerated, (white, noisy) = tolerated_timing(experiment), white_errors(sc)
+    tolerated, (white, noisy) = tolerated_timing(experiment, frequency), white_errors(sc)
     settings = filter_settings(
         motion,
         c.period,
@@ -421,13 +423,23 @@ def white_errors(scenario: Scenario) -> tuple[bool, bool]:
     return white, isinstance(sensor, StateSensorConfig) and white and all(sensor.noise_std)
 
 
-def tolerated_timing(experiment: Experiment) -> float:
+def motion_frequency(experiment: Experiment) -> float:
+    """Return the root of the reference's largest acceleration, in amplitudes and of TOLERANCE."""
+    times = spread_instants(experiment.scenario.duration, _POSES)
+    accelerations = np.array([evaluate(experiment.reference, t)[ACCELERATIONS] for t in times])
+    amplitudes = np.where(experiment.peak_to_peak > 0, experiment.peak_to_peak / 2, np.inf)
+    largest = np.abs(accelerations).max(axis=0)
+    return math.sqrt(float((largest / amplitudes).max() / TOLERANCE))
+
+
+def tolerated_timing(experiment: Experiment, frequency: float) -> float:
     """Return the standard deviation of single torques' timing that the loop tolerates, s.
 
     It is a share of the time constant of the loop that falls with the delay: a longer one carries
-    late torques further. The time constant is 1 / bandwidth of theory.md, section 13, and at least
-    a period. It is infinite for weights that are given or set by a tuner, where the timing is only
-    assumed, and for the paper's laws and baselines: they predict linearly or not at all.
+    late torques further. The time constant is 1 / bandwidth of theory.md, section 13, with the
+    `motion_frequency`, and at least a period. It is infinite for weights that are given or set by a
+    tuner, where the timing is only assumed, and for the paper's laws and baselines: they predict
+    linearly or not at all.
     """
     sc, c = experiment.scenario, experiment.scenario.controller
     predicts = c.prediction == "nonlinear" and believed_delay(sc).eta(c.period) > 0
@@ -436,11 +448,7 @@ def tolerated_timing(experiment: Experiment) -> float:
     learnt = _learns(sc) or c.delay_estimator != "none"
     if not learnt and c.timing_std is None:
         return math.inf
-    times = spread_instants(sc.duration, _POSES)
-    accelerations = np.array([evaluate(experiment.reference, t)[ACCELERATIONS] for t in times])
-    amplitudes = np.where(experiment.peak_to_peak > 0, experiment.peak_to_peak / 2, np.inf)
-    largest = np.abs(accelerations).max(axis=0)
-    bandwidth = min(math.sqrt(float((largest / amplitudes).max() / TOLERANCE)), 1 / c.period)
+    bandwidth = min(frequency, 1 / c.period)
     late = bandwidth * believed_delay(sc).eta(c.period)
     return TOLERATED / (bandwidth * (1 + late)) if bandwidth else math.inf
 
