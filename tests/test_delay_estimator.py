@@ -549,3 +549,13 @@ def test_a_bias_that_looks_like_an_early_torque_does_not_end_the_right_hypothesi
     exact = ("plant.kind=exact", f"sensor.noise_std={[0.0] * 12}")
     scenario = load_scenario("desktop", "adaptive_lqi", (*exact, *delay, *believed, bias))
     assert run_in_bulk(scenario).figures.accumulated_error < 0.2
+
+
+@pytest.mark.parametrize("seed", [0, 1, 5])
+def test_friction_that_looks_like_an_early_arrival_is_taken_back(seed):
+    """E up to 6 s: 52, 42, 60 % s. All are lost if such a delay is kept while nothing fits it."""
+    bias = f"plant.torque_bias={(3e-4 * np.random.default_rng(seed).standard_normal(6)).tolist()}"
+    half = f"reference.amplitude={(AMPLITUDES / 2).tolist()}"
+    delay = ("delay.steps=9", "delay.fraction=0.3")  # 0.8 s are believed
+    settings = ("plant.kind=exact", "plant.coulomb_friction=2e-4", "duration=6", half, bias, *delay)
+    assert run_in_bulk(load_scenario("paper", "adaptive_lqi", settings)).status == "completed"

@@ -422,7 +422,8 @@ static int jump(Search *s, const real *y, stewart_scratch scratch)
     return 1;
 }
 
-/* Restart from the last measurement, after outliers that nothing explains. */
+/* Restart from the last measurement, after outliers that nothing explains. A delay that was found before
+   most of its prior is over was found wrongly then: friction may look like an arrival. */
 static void restart(Search *s, const real *y, const real *near, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
@@ -430,7 +431,8 @@ static void restart(Search *s, const real *y, const real *near, stewart_scratch 
     stewart_guess *guess = guess_at(s, 0);
     stewart_guess *anew = (stewart_guess *)stewart_take(&scratch, stewart_guess_size(n - X - 2));
     real state[X], root[X * X];
-    if (s->memory->searching > 0) {
+    const int early = s->memory->sent * d->period < d->believed + d->delay_std;
+    if (s->memory->searching > 0 || early) {
         begin(s, y, near, scratch);
         return;
     }
