@@ -228,6 +228,7 @@ def test_machine_and_controller_log_a_live_run(tmp_path):
     assert first["pose"]["z"] == read.pose[0, 5]
     true = sd.read_log(tmp_path / "machine.csv")
     assert len(true.time) >= len(read.time) and np.isfinite(true.pose).all()
+    assert "log of " in sd.replay_log(tmp_path / "machine.csv")  # which has no reference
     with pytest.raises(ConfigError, match=r"not those sent.*expected that of its controller"):
         sd.identify(tmp_path / "machine.csv", "paper")
     # The controller measures without noise what the machine's log has as true.

@@ -65,14 +65,15 @@ def replay_html(result: SimulationResult, mechanism: Mechanism, title: str) -> s
 def log_html(path: Path) -> str:
     """Return a log as a page like that of `replay_html`; it needs the scenario of the run.
 
-    A row without a pose is left out, and without a reference the pose counts as it.
+    A row without a pose is left out. Without a reference, as in a log of `machine`, the pose counts
+    as it.
     """
     signals = read_log(path)
     scenario = scenario_of(signals, path)
     for name in ("pose", "torque_applied"):
         if name not in signals:
             raise ConfigError(f"{path}: has no {name}; expected {EXPECTED}")
-    if "reference" not in signals:
+    if "reference" not in signals or signals.reference.isnull().all():
         signals["reference"] = signals.pose
     poses = np.hstack([signals.pose.values, signals.reference.values])
     signals = signals.isel(time=np.isfinite(poses).all(axis=1))
