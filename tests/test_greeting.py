@@ -360,8 +360,7 @@ def test_a_machine_that_is_ended_ends_the_run_with_its_words():
     with paper_machine() as running:
         machine = running.machine
         ready = prepare_session(scenario_of(), running.address)
-        ends = threading.Timer(1.0, lambda: Machine.stop(machine))
-        ends.start()
+        machine._at(machine.time() + SECOND, 4, lambda _: Machine.stop(machine))  # in its thread
         began = time.monotonic()
         result = drive(ready, 8.0, accept_jitter=True, say=said.append)
         took = time.monotonic() - began
