@@ -19,6 +19,7 @@ from stewart_drake.live.protocol import (
 from stewart_drake.live.session import drive, plans, prepare_session
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import servo_law
+from stewart_drake.reporting.run import run_document
 from stewart_drake.scenario.run_log import open_log, read_log
 from stewart_drake.scenario.signals import POSE
 from stewart_drake.scenario.trajectories import evaluate
@@ -147,6 +148,7 @@ def test_live_drives_servos_over_a_network_that_loses_packets(tmp_path):
         result = drive(ready, 3.0, accept_jitter=True, say=lambda line: None)
     assert result.status == "completed"
     assert result.summary["live"]["periods_dry"] < 20
+    assert "not reported by servos" in run_document(result).plain()
     true = read_log(tmp_path / "true.csv")
     motion = servo_law(prepare(wanted))[1]
     began = running.machine.begin / 1e9

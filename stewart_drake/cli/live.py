@@ -191,19 +191,20 @@ def _delivered(
     if result.status == "completed":
         delivery.say(run_document(result).plain())
     late = s["sent_after_due_ms"]
+    commands = "setpoints" if result.scenario.controller.command == "cranks" else "torques"
     delivery.say_wrapped(
         f"{counted(s['samples'], 'samples')} with those of coming to rest, "
-        f"{counted(s['deadlines_missed'], 'deadlines missed')}; torques were sent "
+        f"{counted(s['deadlines_missed'], 'deadlines missed')}; {commands} were sent "
         f"{late['median']:.0f} ms (99 %: {late['p99']:.0f}, worst {late['worst']:.0f}) after the "
         "earliest arrival of their measurement"
         if s["samples"]
         else "no sample, nothing was sent",
-        f"the machine had torques for {counted(s['periods_played'], 'periods')}, for "
+        f"the machine had {commands} for {counted(s['periods_played'], 'periods')}, for "
         f"{s['periods_dry']} it had none (dry), with those of coming to rest",
     )
     if result.stopped is not None and s["periods_dry"] > _MANY_DRY * s["periods_played"]:
         delivery.say_wrapped(
-            "torques came too late or not at all for many periods: a larger link.playout or "
+            f"{commands} came too late or not at all for many periods: a larger link.playout or "
             "controller.packet_repeats bridges more; stewart-drake analyze link compares bounds"
         )
     if s["recoveries"]:
