@@ -424,7 +424,7 @@ def white_errors(scenario: Scenario) -> tuple[bool, bool]:
 
 
 def motion_frequency(experiment: Experiment) -> float:
-    """Return the root of the reference's largest acceleration, in amplitudes and of TOLERANCE."""
+    """Return sqrt(a / TOLERANCE), a the largest acceleration of a coordinate over its amplitude."""
     times = spread_instants(experiment.scenario.duration, _POSES)
     accelerations = np.array([evaluate(experiment.reference, t)[ACCELERATIONS] for t in times])
     amplitudes = np.where(experiment.peak_to_peak > 0, experiment.peak_to_peak / 2, np.inf)
