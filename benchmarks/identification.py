@@ -184,7 +184,7 @@ class Found(NamedTuple):
     """Identification of one machine.
 
     Attributes:
-        status: of the logged run.
+        status: of the logged run; `refused` where its log is too short, with NaN in all others.
         late: s, error of the delay.
         chi2: per measurement.
         seconds: CPU time.
@@ -207,7 +207,11 @@ def find(kind: str, seed: int, motion: Path, calm: float, poses: bool) -> Found:
     truth = of_ranges(seed, motion, calm) if kind == "ranges" else of_drawing(seed, motion)
     run = simulate(truth.scenario, true_mechanism=truth.mechanism, judge_stability=False)
     log, offsets = log_of(run, truth.mechanism, FRESH + seed, poses)
-    found, seconds = identified(log, kind, poses)
+    try:
+        found, seconds = identified(log, kind, poses)
+    except sd.ConfigError:
+        nothing = np.full(len(NAMES), np.nan)
+        return Found("refused", *(np.nan,) * 3, nothing, nothing, np.full((3, 2), np.nan))
     true = truth.values.copy()
     true[OFFSETS] = offsets
     values, std = found.fit.guess.values, found.std
@@ -309,10 +313,11 @@ def summary(title: str, found: list[Found]) -> str:
     late = 1e3 * np.abs([one.late for one in found])
     chi2, seconds = [one.chi2 for one in found], [one.seconds for one in found]
     lost = sum(one.status != "completed" for one in found)
+    refused = sum(one.status == "refused" for one in found)
     words = (
-        f"error of the delay: rms {np.sqrt(np.mean(late**2)):.3g} ms, largest {late.max():.3g} ms; "
-        f"chi2/n {min(chi2):.3g} to {max(chi2):.3g}; CPU {np.mean(seconds):.3g} s, at most "
-        f"{max(seconds):.3g} s"
+        f"error of the delay: rms {np.sqrt(np.nanmean(late**2)):.3g} ms, largest "
+        f"{np.nanmax(late):.3g} ms; chi2/n {np.nanmin(chi2):.3g} to {np.nanmax(chi2):.3g}; CPU "
+        f"{np.nanmean(seconds):.3g} s, at most {np.nanmax(seconds):.3g} s"
     )
     inside, away = (np.array([getattr(one, name) for one in found]) for name in ("inside", "away"))
     rows = []
@@ -322,7 +327,7 @@ def summary(title: str, found: list[Found]) -> str:
             rows.append((name, rms, f"{100 * np.nanmean(inside[:, part]):.1f} %"))
     heads = ("unknown", "rms error", "95 % intervals that hold the truth")
     return section(
-        f"{title}: {len(found)} machines, {lost} of the runs lost",
+        f"{title}: {len(found)} machines, {lost} of the runs lost, {refused} logs too short",
         words,
         table(heads, rows),
         *next_table(np.array([one.next_runs for one in found])),
