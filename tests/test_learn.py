@@ -351,7 +351,7 @@ FAST = (
 
 
 def test_a_motion_of_few_samples_is_learned(tmp_path):
-    """Of 20 samples a period four harmonics are fitted, of which each number is known twice."""
+    """A period of 20 samples determines four harmonics twice over."""
     assert [harmonics_below(n * 0.1, 0.1) for n in (4.5, 6.5, 20.5, 34.5, 90)] == [0, 1, 4, 8, 8]
     found = sd.learn(sd.load_scenario("paper", settings=FAST), repetitions=3)
     first, *_, last = found.study.repetitions

@@ -161,7 +161,8 @@ class Sizing(NamedTuple):
     # the same where the plate can follow it: at the end of a leg's reach torques have no bound
     reachable_torque: float
     machine_torque: float  # see `law.startup.machine_torque`, N m
-    frequency: float  # that the motion's accelerations ask of the loop, rad/s (`motion_frequency`)
+    # that the motion's accelerations ask of the loop, rad/s (`motion_frequency`); 0 with servos
+    frequency: float = 0.0
 
 
 def one_step_sizing(experiment: Experiment) -> Sizing:
@@ -171,8 +172,7 @@ def one_step_sizing(experiment: Experiment) -> Sizing:
     if sc.controller.limits == "qp":
         space = clear_space(experiment)
         reachable = reference_torque(nominal, reference, sc.duration, space)
-    frequency = motion_frequency(experiment)
-    return Sizing(1, largest, reachable, machine_torque(nominal), frequency)
+    return Sizing(1, largest, reachable, machine_torque(nominal))
 
 
 def sizing_of(experiment: Experiment) -> Sizing:
@@ -188,7 +188,7 @@ def sizing_of(experiment: Experiment) -> Sizing:
         assumed = filter_substeps(nominal, reference, period, sc.duration, model_std)
         substeps = max(substeps, assumed)
     substeps = max(substeps, turning_substeps(nominal, reference, period, sc.duration))
-    return sizing._replace(substeps=substeps)
+    return sizing._replace(substeps=substeps, frequency=motion_frequency(experiment))
 
 
 _PREDICTORS: Final[Mapping[str, Predictor | NonlinearPredictor]] = {

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pandas
 import xarray
 
-from stewart_drake.files.fileio import write_whole
+from stewart_drake.files.fileio import write_asked
 from stewart_drake.files.jsonio import write_json
 from stewart_drake.loop import controller_margin as loop_margin
 from stewart_drake.loop import results as loop_results
@@ -349,8 +349,7 @@ def _kept(text: str, place: str | Path | None, *name: str) -> Replay | Path:
     if place is None:
         return Replay(text)
     path = Path(place, *name)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, text)
+    write_asked("directory" if name else "path", path, text)
     return path
 
 
