@@ -29,8 +29,8 @@ from _bench import AMPLITUDE, EXACT, QUICK, RESULTS, section, size, table
 import stewart_drake as sd
 from stewart_drake.files.versions import versions
 from stewart_drake.loop.preparation import prepare
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.signals import POSE
-from stewart_drake.scenario.trajectories import evaluate
 
 ROOT = Path(__file__).parents[1]
 MINUTES = float(os.environ.get("MINUTES", "1" if QUICK else "10"))

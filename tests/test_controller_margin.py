@@ -21,9 +21,9 @@ from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import mechanism_yaml
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.reporting.run import comparison_document
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.compare import CONTROLLERS
 from stewart_drake.studies.delay import loop_margins
 from stewart_drake.studies.verdict import assess, fold

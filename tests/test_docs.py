@@ -38,11 +38,11 @@ from stewart_drake.loop.diagram import ClosedLoop
 from stewart_drake.loop.results import accumulated_error
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.mechanism.kinematics import leg_geometry, rotation
+from stewart_drake.mechanism.trajectories import evaluate, make_reference
 from stewart_drake.scenario.config import ControllerConfig, Scenario
 from stewart_drake.scenario.loading import load_compatible, load_controller, setting_choices
 from stewart_drake.scenario.reference_files import read_waypoints
 from stewart_drake.scenario.signals import SIGNALS, exported_ports, ports_of
-from stewart_drake.scenario.trajectories import evaluate, make_reference
 from tests.mechanisms import PAPER
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -12,12 +12,12 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.sensor import Encoders
 from stewart_drake.loop.simulation import make_simulator, simulate
+from stewart_drake.mechanism.trajectories import make_reference
 from stewart_drake.reporting.csv_file import read_signals, signals_csv
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.scenario.timing import look_time
-from stewart_drake.scenario.trajectories import make_reference
 from tests.mechanisms import PAPER
 
 ENCODERS = ("plant.kind=exact", "sensor.kind=encoders")

@@ -25,6 +25,7 @@ SATURATED = "actuator.torque_limit=0.025"
 DRIFT = ("controller.delay_estimator=drifting", "controller.delay_steps=6", "delay.drift=-0.01")
 PUSH = "plant.push={wrench: [0, 0, 0, 0.05, 0, 0], from: 2}"
 ASIDE = "plant.payload_mass=0.4", "plant.payload_position=[0.03, -0.02, 0.05]", "start=on_reference"
+MOTION = ("stewart_motion.o", "motion.o")
 SHORT = ("plant.kind=exact", "duration=5.0")
 FASTER = "duration=2.0"
 """Of a machine with a period of 20 ms."""
@@ -217,7 +218,8 @@ def test_odd_inputs_are_survived(name, settings, tmp_path, compiler):
     """NaN, infinity, huge numbers, INT_MIN and INT_MAX, under both sanitizers."""
     folder = exported(tmp_path, name, (*settings, "duration=0.5"))
     shutil.copy(Path(__file__).with_name("odd_inputs.c"), folder)
-    own = [*objects(folder, f"CFLAGS={' '.join(SANITIZED)}"), "odd_inputs.c", "stewart_motion.c"]
+    own = [*objects(folder, f"CFLAGS={' '.join(SANITIZED)}"), "odd_inputs.c"]
+    own += ["stewart_motion.c", "motion.c"]
     command = [*compiler, "-std=c99", *SANITIZED, *own, "-lm", "-o", "odd_inputs"]
     subprocess.run(command, cwd=folder, check=True)
     done = subprocess.run(["./odd_inputs"], cwd=folder, capture_output=True, text=True)
@@ -250,8 +252,8 @@ def test_a_status_distinguishes_single_values_from_a_whole_measurement(tmp_path,
     settings = ("sensor.kind=encoders", "start=on_reference", "duration=1.5", faults)
     folder = exported(tmp_path, "paper", settings)
     (folder / "statuses.c").write_text(STATUSES)
-    make(folder, "stewart_motion.o")
-    own = [*objects(folder), "stewart_motion.o", "meter.c", "statuses.c", "-lm", "-o", "statuses"]
+    make(folder, *MOTION)
+    own = [*objects(folder), *MOTION, "meter.c", "statuses.c", "-lm", "-o", "statuses"]
     subprocess.run([*compiler, "-O1", *own], cwd=folder, check=True)
     said = subprocess.run(["./statuses"], cwd=folder, capture_output=True, text=True, check=True)
     rows = [tuple(map(int, line.split())) for line in said.stdout.splitlines()]
@@ -292,8 +294,8 @@ def test_the_stack_is_not_deeper_than_stated(tmp_path, compiler):
     (folder / "painted.c").write_text(PAINTED)
     command = [*compiler, "-O2", "-Dmain=replay", "-c", "stewart_test.c"]
     subprocess.run(command, cwd=folder, check=True)
-    make(folder, "stewart_motion.o")
-    own = [*objects(folder), "stewart_motion.o", "meter.c", "painted.c", "stewart_test.o"]
+    make(folder, *MOTION)
+    own = [*objects(folder), *MOTION, "meter.c", "painted.c", "stewart_test.o"]
     command = [*compiler, "-O2", *own, "-lm", "-pthread", "-o", "painted"]
     subprocess.run(command, cwd=folder, check=True)
     said = subprocess.run(["./painted"], cwd=folder, capture_output=True, text=True, check=True)
@@ -439,7 +441,7 @@ def test_the_readme_is_that_of_the_composition(case, tmp_path):
     declared += f"extern int read_report({report} *);\nvoid setup(void), every_period(void);\n"
     declared += "extern int age_of_measurement(void);\nextern void stop_safely(void);\n"
     (tmp_path / "wiring.c").write_text(f"{included}\n{declared}{rest}", encoding="utf-8")
-    headers = {"stewart_motion.h", "stewart_board.h", "protocol.h", "udp.h", "meter.h"}
+    headers = {"stewart_motion.h", "motion.h", "stewart_board.h", "protocol.h", "udp.h", "meter.h"}
     own = sorted(headers & files.keys())
     assert ("stewart_machine.c" in files) == ("./stewart_machine" in readme)
     all_headers = "\n".join([included, *(f'#include "{name}"' for name in own)])

@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.trajectories import evaluate, make_reference
 from stewart_drake.reporting.csv_file import read_signals, signals_csv
 from stewart_drake.scenario.loading import load_controller, load_scenario
 from stewart_drake.scenario.reference_config import CsvConfig, WaypointsConfig
-from stewart_drake.scenario.trajectories import evaluate, make_reference
 from stewart_drake.studies.robustness import study_robustness
 from stewart_drake.studies.runs import read_outcome
 from stewart_drake.studies.study_options import RobustnessOptions

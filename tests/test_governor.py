@@ -17,9 +17,9 @@ from stewart_drake.live.governor import (
     stop_pose,
 )
 from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.trajectories import evaluate, make_reference
 from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
-from stewart_drake.scenario.trajectories import evaluate, make_reference
 
 PERIOD = 0.1
 FINE = np.arange(0.0, PERIOD, 1e-3)

@@ -10,9 +10,9 @@ import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.link import DelayChain
 from stewart_drake.mechanism.geometry import fingerprint
+from stewart_drake.mechanism.trajectories import make_reference
 from stewart_drake.scenario.calibration import Calibration, save_calibration
 from stewart_drake.scenario.signals import POSE
-from stewart_drake.scenario.trajectories import make_reference
 
 PAPER = sd.load_mechanism("paper")
 

@@ -15,8 +15,8 @@ from stewart_drake.mechanism.assembly import assemble as placed
 from stewart_drake.mechanism.files import build_mechanism, load_mechanism, mechanism_spec
 from stewart_drake.mechanism.geometry import bar_inertia
 from stewart_drake.mechanism.kinematics import rotation
+from stewart_drake.mechanism.trajectories import poses_along
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.scenario.trajectories import poses_along
 from stewart_drake.studies.layout import (
     Found,
     Layout,

@@ -25,10 +25,10 @@ from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.clearance import LINK_PAIRS
 from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.reporting.run import run_document
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.scenario.trajectories import evaluate
 from tests.oracles import central_difference
 
 ON = ("plant.kind=exact", "start=on_reference", "queue=reference")

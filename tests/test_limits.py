@@ -29,7 +29,7 @@ from stewart_drake.law.stability import (
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.results import delay_floor
 from stewart_drake.mechanism.assembly import torque_map
-from stewart_drake.scenario.trajectories import evaluate
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.studies.delay import loop_margins, simulated_growth
 from stewart_drake.studies.verdict import assess
 from tests.mechanisms import PAPER

@@ -48,13 +48,13 @@ from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.trajectories import make_reference
 from stewart_drake.reporting.run import run_document
 from stewart_drake.reporting.style import FACTORS
 from stewart_drake.reporting.viewer import slider_range
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
-from stewart_drake.scenario.trajectories import make_reference
 from tests.browser import browser, needs_chromium
 from tests.live_driver import in_real_time, running_machine
 

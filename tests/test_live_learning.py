@@ -22,10 +22,10 @@ from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.protocol import MachineFlags
 from stewart_drake.loop.learned import motion_period, save_learned
 from stewart_drake.loop.preparation import prepare
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.reporting.learn import document
 from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.scenario.signals import NUM_PARAMETERS
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.learn import LearnStudy, Repetition
 from tests import test_learn
 from tests.live_driver import in_real_time, running_machine

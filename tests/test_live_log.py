@@ -20,9 +20,9 @@ from stewart_drake.live.session import drive, prepare_session
 from stewart_drake.loop import results as metrics
 from stewart_drake.loop.law_design import control_law, first_queue
 from stewart_drake.loop.preparation import prepare
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.reporting.csv_file import signals_csv
 from stewart_drake.scenario.signals import POSE
-from stewart_drake.scenario.trajectories import evaluate
 from tests.copies import Command, status_of
 from tests.test_live import FROM_REST, OVER_A_NETWORK, SETTINGS, paper_machine, scenario_of
 

@@ -19,10 +19,10 @@ from stewart_drake.live.protocol import (
 from stewart_drake.live.session import drive, plans, prepare_session
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import servo_law
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.reporting.run import run_document
 from stewart_drake.scenario.run_log import open_log, read_log
 from stewart_drake.scenario.signals import POSE
-from stewart_drake.scenario.trajectories import evaluate
 from tests.live_driver import Clock, Wire, in_real_time, running_machine
 
 NETWORK = "link={kind: network, low: 0, high: 0, loss: 0, playout: 0.1}"

@@ -11,8 +11,8 @@ from stewart_drake.law.catch_up import CatchUp, Model
 from stewart_drake.law.feedforward import mean_torques
 from stewart_drake.law.startup import BLOCK, choose_substeps, filter_substeps
 from stewart_drake.loop.preparation import prepare
+from stewart_drake.mechanism.trajectories import evaluate, through_states
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.scenario.trajectories import evaluate, through_states
 
 MOST_HOLDS = 100
 

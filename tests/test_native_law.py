@@ -20,8 +20,8 @@ from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.law_design import compose_law, control_law
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import compose_servo_law
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 from tests.backends import Predicted, with_own
 from tests.mechanisms import PAPER, random_mechanism

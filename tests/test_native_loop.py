@@ -5,6 +5,7 @@ import functools
 import math
 import os
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.dynamics.open_loop import IntegrationError
 from stewart_drake.law.catch_up import CatchUp
-from stewart_drake.law.motion import between
+from stewart_drake.law.motion import KnownMotion, Preview
 from stewart_drake.loop import bulk
 from stewart_drake.loop.bulk import (
+    Prepared,
     PythonController,
     ending_of,
     preparation_of,
@@ -29,7 +31,6 @@ from stewart_drake.loop.sensor import Sensor, white_noise, white_noises
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.mechanism.geometry import Body
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.study_options import Ranges
 from stewart_drake.studies.uncertainty import MACHINE, apply_draw, draw, scales_of
 from tests.mechanisms import PAPER
@@ -170,28 +171,6 @@ def test_many_drawn_machines_end_as_in_drake(part):
     assert_drawn(range(4 + 20 * part, 24 + 20 * part), 10.0)
 
 
-def test_a_motion_in_pieces_is_the_motion_at_its_joints_and_between_them():
-    """A joint of the way onto the reference may differ from an instant of the grid by rounding."""
-    one = scenario("paper", "duration=0.6")
-    preparation = preparation_of(one)
-    prepared = preparation.prepared(preparation.experiment(one))
-    joints = np.array(prepared.planned.get_segment_times()[1:-1])
-    grid = np.round(joints / 0.025) * 0.025
-    assert len(joints) > 10 and np.any((joints != grid) & (np.abs(joints - grid) < 1e-12))
-    rng = np.random.default_rng(7)
-    for motion, (times, pieces) in zip(
-        (prepared.planned, prepared.experiment.reference), prepared.motions, strict=True
-    ):
-        for t in (*joints, *grid, *rng.uniform(0, 5, 300)):
-            k = int(np.searchsorted(times, t, side="right")) - 1
-            h = times[k + 1] - times[k]
-            row = between(*pieces[k], h, (t - times[k]) / h)
-            wanted = evaluate(motion, t)
-            assert np.abs(row - wanted)[:12].max() < 1e-9, t
-            if np.abs(joints - t).min() > 1e-9:
-                assert np.abs(row - wanted).max() < 1e-6, t
-
-
 def test_states_torques_and_measurements_are_drakes():
     one = LOOPS["gravity"]
     preparation = preparation_of(one)
@@ -285,9 +264,9 @@ def test_a_prepared_run_is_that_of_the_scenario_alone(limit):
     prepared, alone = preparation.prepared(preparation.experiment(one)), prepare(one)
     law, planned, _ = control_law(alone)
     assert repr(prepared.law) == repr(law)
-    times = np.maximum(0.0, preparation.when.samples[:, None] + law.preview_times)
-    expected = [[evaluate(planned, t) for t in ahead] for ahead in times]
-    assert np.array_equal(prepared.previews, expected)
+    for sample in preparation.when.samples:
+        followed, expected = prepared.motion(sample), KnownMotion(planned, alone.reference, sample)
+        assert np.array_equal(followed(law.preview_times), expected(law.preview_times))
     assert np.array_equal(prepared.experiment.start, alone.start)
     assert prepared.experiment.torque_limit == alone.torque_limit
 
@@ -349,13 +328,26 @@ def prepared_from(start):
     return preparation, preparation.prepared(preparation.experiment(one))
 
 
+def ending_along(previews, preparation, prepared):
+    """Run along rows (k, p, 18) of the reference at each sample."""
+    period = prepared.law.timeline.period
+
+    class Given(Prepared):
+        def motion(self, time):
+            return Preview(self.law.preview_times, previews[round(time / period)])
+
+    with mock.patch.object(bulk, "uncovered_part", return_value="reference"):
+        return run_prepared(preparation, Given(*prepared))
+
+
 def error_without(start, missing):
     """E_ac with NaN in parts of the previews, by sample, and how often that was counted."""
     preparation, prepared = prepared_from(start)
-    previews = prepared.previews.copy()
+    times = prepared.law.preview_times
+    previews = np.array([prepared.motion(t)(times) for t in preparation.when.samples])
     for sample, part in missing.items():
         previews[sample][part] = np.nan
-    ending = run_prepared(preparation, prepared._replace(previews=previews))
+    ending = ending_along(previews, preparation, prepared)
     assert ending.status == "completed" and ending.figures is not None
     return ending.figures.accumulated_error, ending.counts["references_missing"]
 
@@ -394,10 +386,10 @@ def error_of_a_later_start(samples_late):
         *(experiment.nominal, experiment.reference, experiment.start),
         *(law.timeline.eta + late, law.timeline.period),
     ).plan(None, None)
-    times = np.maximum(0.0, preparation.when.samples[:, None] + law.preview_times)
-    previews = np.array([[evaluate(planned, t) for t in ahead] for ahead in times])
+    motion, times = prepared._replace(planned=planned).motion, law.preview_times
+    previews = np.array([motion(t)(times) for t in preparation.when.samples])
     previews[:samples_late] = np.concatenate([experiment.start[:6], np.zeros(12)])
-    ending = run_prepared(preparation, prepared._replace(previews=previews))
+    ending = ending_along(previews, preparation, prepared)
     assert ending.figures is not None
     return ending.figures.accumulated_error
 

@@ -18,6 +18,7 @@ from stewart_drake.loop.servos import commands_in_flight, compose_servo_law, ser
 from stewart_drake.mechanism import kinematics
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import fingerprint, with_rotors
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.signals import (
     BALL_JOINTS,
     NUM_PLANT_PARAMETERS,
@@ -26,7 +27,6 @@ from stewart_drake.scenario.signals import (
     POSE,
     RATES,
 )
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.compare import shown
 from tests.backends import with_own
 

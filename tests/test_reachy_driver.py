@@ -26,8 +26,8 @@ from stewart_drake.live.session import drive, prepare_session
 from stewart_drake.loop.peer import Fault
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import servo_law
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.signals import POSE
-from stewart_drake.scenario.trajectories import evaluate
 from tests.live_driver import Clock, Wire, in_a_thread, in_real_time
 
 server = pytest.importorskip("websockets.sync.server")

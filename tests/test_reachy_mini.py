@@ -16,7 +16,7 @@ from stewart_drake.law.servos import turned
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.machines.reachy_mini import HEAD_HEIGHT, head_of_pose, pose_of_head, read_move
 from stewart_drake.mechanism.kinematics import legs_along, reach_margins, rotation
-from stewart_drake.scenario.trajectories import make_reference
+from stewart_drake.mechanism.trajectories import make_reference
 
 ROBOT = sd.load_mechanism("reachy_mini")
 POSES = 10_000

@@ -29,8 +29,8 @@ from stewart_drake.law.servos import PositionServo, crank_mobility
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import servo_law
 from stewart_drake.mechanism.geometry import geometry_of
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.reporting.servo_identification import document
-from stewart_drake.scenario.trajectories import evaluate
 from tests.screen import too_long
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

@@ -30,11 +30,11 @@ from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import compose_servo_law, servo_loop
 from stewart_drake.loop.simulation import make_simulator
 from stewart_drake.mechanism.geometry import with_rotors
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.config import ServoActuatorConfig, TorqueActuatorConfig
 from stewart_drake.scenario.loading import load_comparison
 from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
 from stewart_drake.scenario.timing import look_time, servo_ticks
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.compare import CONTROLLERS, SERVOS, shown
 from tests.backends import with_own
 

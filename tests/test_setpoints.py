@@ -11,8 +11,8 @@ from stewart_drake.law.motion import Preview
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import compose_servo_law
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.signals import POSE, RATES
-from stewart_drake.scenario.trajectories import evaluate
 
 ROBOT = sd.load_mechanism("reachy_mini")
 ON = "start=on_reference"

@@ -6,9 +6,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydrake.polynomial import Polynomial
 from pydrake.trajectories import PiecewisePolynomial
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.mechanism.trajectories import (
+    PlateTrajectory,
+    catch_up,
+    evaluate,
+    make_reference,
+    peak_to_peak,
+    spread_instants,
+)
 from stewart_drake.scenario.reference_config import (
     CsvConfig,
     HoldConfig,
@@ -16,13 +25,6 @@ from stewart_drake.scenario.reference_config import (
     WaypointsConfig,
 )
 from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
-from stewart_drake.scenario.trajectories import (
-    catch_up,
-    evaluate,
-    make_reference,
-    peak_to_peak,
-    spread_instants,
-)
 
 HOME = [0.0, 0.0, 0.0, 0.0, 0.0, 0.38]
 HEADER = "time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m]"
@@ -92,6 +94,39 @@ def test_the_derivatives_of_a_sine_are_exact(frequency, unit, amplitude, t):
     np.testing.assert_allclose(
         third, -(omega**2) * evaluate(trajectory, t)[RATES], atol=1e-9 * (1 + omega.max() ** 3)
     )
+
+
+# Motions in C
+
+
+@given(
+    ends=st.lists(st.floats(0.05, 2), min_size=1, max_size=5),
+    degree=st.integers(1, 6),
+    seed=st.integers(0, 1000),
+)
+@settings(deadline=None)
+def test_pieces_then_another_motion_are_drakes_polynomials_then_waves(ends, degree, seed):
+    """A joint belongs to the later piece; before t = 0 the motion is that at 0."""
+    rng, times = np.random.default_rng(seed), np.append(0.0, np.cumsum(ends))
+    powers = rng.normal(size=(degree + 1, len(ends), 6))
+    pieces = [[[Polynomial(powers[::-1, k, i])] for i in range(6)] for k in range(len(ends))]
+    drakes = PiecewisePolynomial(np.array(pieces), times.tolist())
+    sine = SineConfig(frequency=rng.uniform(0.1, 3, 6).tolist())
+    motion = PlateTrajectory(times, powers, make_reference(sine, 1.0))
+    size = 1e-13 * 2.0**degree * math.factorial(degree)
+    for t in (*times[:-1], *rng.uniform(0, times[-1], 20)):
+        for order in range(4):
+            expected = drakes.EvalDerivative(t, order)
+            np.testing.assert_allclose(motion.EvalDerivative(t, order), expected, atol=size)
+    omega = np.array(sine.angular_frequency)
+    for t in (times[-1], *(times[-1] + rng.uniform(0, 100, 20))):
+        waves = [omega**k * np.sin(omega * t + k * np.pi / 2) for k in range(3)]
+        expected = np.concatenate([np.array(sine.amplitude) * wave for wave in waves])
+        expected[:6] += sine.offset
+        np.testing.assert_allclose(evaluate(motion, t), expected, atol=1e-12)
+    for early in (-1.0, -1e-300, math.nan):
+        assert np.array_equal(motion.along([early]), motion.along([0.0]))
+    assert np.isfinite(motion.along([math.inf, 1e308])).all()
 
 
 # Waypoints

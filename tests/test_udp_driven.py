@@ -18,8 +18,8 @@ from stewart_drake.live.machine import Machine
 from stewart_drake.live.options import Settings
 from stewart_drake.live.protocol import ControllerMessage
 from stewart_drake.loop.preparation import prepare
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.loading import load_scenario
-from stewart_drake.scenario.trajectories import evaluate
 from tests.building import SANITIZED, c_compiler, make
 from tests.live_driver import in_a_thread, in_real_time
 from tests.test_machine_process import c_controller

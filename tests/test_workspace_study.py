@@ -19,9 +19,9 @@ from stewart_drake.loop.preparation import assemble, check_instants, prepare
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rotation
+from stewart_drake.mechanism.trajectories import make_reference, poses_along
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import HoldConfig, SineConfig
-from stewart_drake.scenario.trajectories import make_reference, poses_along
 from stewart_drake.studies.workspace import size_motors, study_workspace
 from stewart_drake.studies.workspace_map import (
     LARGEST_FACTOR,

@@ -257,45 +257,14 @@ int stewart_closed_loop(stewart_run *r, stewart_loop *o, stewart_controller law,
     }
 }
 
-/* Row of a motion; before its first and after its last time that of there. */
-static void row_at(const stewart_motion *motion, double time, double *row)
-{
-    const double *times = motion->times;
-    long piece = 0, after = motion->number;
-    while (after - piece > 1) {
-        long middle = (piece + after) / 2;
-        *(times[middle] <= time ? &piece : &after) = middle;
-    }
-    const double *rows = motion->rows + 2 * STEWART_REFERENCE * piece;
-    double h = times[piece + 1] - times[piece], share = (time - times[piece]) / h;
-    stewart_between(rows, rows + STEWART_REFERENCE, h, fmin(fmax(share, 0.), 1.), row);
-}
-
-static void rows_of_plan(void *context, int number, const double *times, double *rows)
-{
-    const stewart_law_in_loop *in = context;
-    for (int i = 0; i < number; i++)
-        row_at(&in->planned, in->now + times[i], rows + STEWART_REFERENCE * i);
-}
-
-static void rows_of_goal(void *context, int number, const double *times, double *rows)
-{
-    const stewart_law_in_loop *in = context;
-    for (int i = 0; i < number; i++)
-        row_at(&in->goal, in->now + times[i], rows + STEWART_REFERENCE * i);
-}
-
 static int step(void *context, long k, const stewart_sample *measured, double *torque, double *command)
 {
     stewart_law_in_loop *in = context;
     const double *sent = torque;
     stewart_sample sample = *measured;
-    sample.reference = rows_of_plan, sample.goal = rows_of_goal, sample.context = in;
-    in->now = in->period * (double)k;
-    if (in->previews) {
-        sample.reference = stewart_given_rows;
-        sample.context = (void *)(in->previews + STEWART_REFERENCE * in->preview_rows * k);
-    }
+    sample.reference = stewart_planned_rows, sample.goal = stewart_goal_rows;
+    sample.context = &in->motion;
+    in->motion.now = in->period * (double)k;
     if (in->servos) {
         stewart_fill(U, 0, torque); /* replaced by that of the servos */
         stewart_servo_step(in->servos, in->memory, in->scratch, &sample, in->report, command);

@@ -8,6 +8,7 @@
 
 #include "kinematics.h"
 #include "link.h"
+#include "motion.h"
 #include "position_servo.h"
 #include "servo.h"
 #include "tuner.h"
@@ -73,26 +74,18 @@ typedef struct {
 
 int stewart_closed_loop(stewart_run *run, stewart_loop *loop, stewart_controller law, void *context);
 
-/* A motion in pieces: quintics between rows of 18 numbers. */
-typedef struct {
-    long number;         /* pieces */
-    const double *times; /* (number + 1) ascending, s */
-    const double *rows;  /* (number, 2, 18) at both ends of each piece */
-} stewart_motion;
-
 /* The law of law.h, or of servo.h without reports, as the controller; its memories have been started. */
 typedef struct {
     const stewart_law *law;
     const stewart_servo *servos; /* or NULL */
     const stewart_tuner *tuner; /* NULL for fixed weights */
     double *memory, *tuner_memory, *scratch;
-    const double *previews; /* (samples, preview_rows, 18), or NULL for the motions */
-    stewart_motion planned, goal;
-    double period, now; /* s; `now` is set at each sample */
+    stewart_known_motion motion; /* its `now` is set at each sample */
+    double period;               /* s */
     const double *wanted; /* (samples, 12) reference, for a tuner */
     double *weights;      /* (samples, 2) given, or result of the tuner */
     double *kept;         /* (samples, columns) result: rows of the tuner's window */
-    long preview_rows, columns;
+    long columns;
     int rows; /* torques of a command */
     const double *report; /* of servos, of NaN */
 } stewart_law_in_loop;

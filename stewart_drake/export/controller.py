@@ -22,12 +22,13 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from stewart_drake.core.build import FOLDER, compiler
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.workspace import LEAST, home_sign
-from stewart_drake.export.recording import TOLERANCE, Recorded, knots, record
+from stewart_drake.export.recording import Recorded, record
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import replacing
 from stewart_drake.law.channel import Packets
 from stewart_drake.law.compiled import Compiled, address_of
 from stewart_drake.law.core_law import CompiledLaw
+from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.law_design import control_law
@@ -35,11 +36,11 @@ from stewart_drake.loop.peer import FAULTS, MOST_ROWS, MOST_SAMPLES, identity_of
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.servos import servo_law
 from stewart_drake.loop.tuner import weights_source
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.scenario.signals import NUM_STATE
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array, ArrayLike
 
 SOURCES: Final = (
@@ -50,6 +51,8 @@ SOURCES: Final = (
 """Sources of core/ that every law needs; a name without a suffix stands for header and source."""
 LINK: Final = ("link.h", "link.c")
 """Additional sources of core/ for the machine."""
+MOTION: Final = ("motion.h", "motion.c")
+"""Additional sources of core/ for the scenario's motion."""
 OVER_UDP: Final = (
     *("protocol.c", "protocol.h", "protocol_test.c", "udp.c", "udp.h"),
     *("stewart_example.c", "stewart_example.h", "stewart_udp.c"),
@@ -97,11 +100,10 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     names = {path.name for path in TEMPLATES.iterdir()}
     names -= set() if over_udp else set(OVER_UDP)
     names -= set(MACHINE) if no_machine else set()
-    names -= set() if over_udp or recorded.moves else {"stewart_motion.c", "stewart_motion.h"}
-    files = {
-        name: (FOLDER / name).read_text("utf-8")
-        for name in (*sources, *(() if no_machine else LINK))
-    }
+    moves = over_udp or recorded.moves
+    names -= set() if moves else {"stewart_motion.c", "stewart_motion.h"}
+    copied = *sources, *(() if no_machine else LINK), *(MOTION if moves else ())
+    files = {name: (FOLDER / name).read_text("utf-8") for name in copied}
     if single:
         del recorded.steps[MOST_IN_SINGLE:]
         defined = "#define STEWART_FLOAT\n\n#include"
@@ -140,8 +142,8 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     }
     if tuner is not None:
         values |= _tuner(tuner, compiled, recorded, experiment, suffix)
-    if over_udp or recorded.moves:
-        values |= _motion(experiment, recorded, tuner is not None)
+    if moves:
+        values["motion"] = _motion(experiment, law, suffix)
     if over_udp:
         # Samples that are kept: those of a report and of the wait for it.
         kept = 1 << (2 * values["wait"] + 63).bit_length()
@@ -224,16 +226,13 @@ def _tuner(
     }
 
 
-def _motion(experiment: Experiment, recorded: Recorded, tuned: bool) -> dict[str, Any]:
-    """Return the scenario's motion by its knots, and that which plans return to and tuners read."""
-    rows, goal = recorded.motion, recorded.goal
-    if rows is None:
-        law = recorded.law
-        planned = servo_law if isinstance(law, ServoPreview) else control_law
-        end = experiment.scenario.duration + max(0.0, float(law.preview_times.max()))
-        rows = knots(planned(experiment)[1], end)
-        goal = knots(experiment.reference, end) if tuned else None
-    return {"motion": rows, "goal": goal, "motion_tolerance": TOLERANCE}
+def _motion(experiment: Experiment, law: Any, suffix: str) -> "Constants":
+    """Return the scenario's motion and its reference, a `stewart_known_motion`."""
+    planned = (servo_law if isinstance(law, ServoPreview) else control_law)(experiment)[1]
+    motions = planned, experiment.reference
+    known = KnownMotion(*motions, 0.0).compiled()
+    keep = [kept for one in motions for kept in one.keep]  # type: ignore[attr-defined]
+    return Constants(keep, {}, suffix, known[0], "motion")
 
 
 def _rows(rows: Iterable[Array], suffix: str) -> str:
@@ -330,7 +329,7 @@ class Constants:
         self, keep: Iterable[Any], tables: dict[int, str], suffix: str, data: Any, about: str
     ) -> None:
         self._tables, self._suffix = tables, suffix
-        self._arrays, self._structures = {}, {}
+        self._arrays, self._structures, self._names = {}, {}, dict[int, str]()
         for kept in keep:
             if isinstance(kept, np.ndarray):
                 self._arrays[kept.ctypes.data] = kept
@@ -363,15 +362,17 @@ class Constants:
             return "0"
         if address in self._tables:
             return f"&{self._tables[address]}"
+        if address in self._names:
+            return self._names[address]
         if address in self._arrays:
             values = numbers(self._arrays[address].ravel(), self._suffix)
             self.before.append(f"static const real {about}[] = {values};")
-            return about
+            return self._names.setdefault(address, about)
         pointer = self._structures[address]
         kind = core().ffi.typeof(pointer).item.cname
         text = self._struct(pointer[0], about)
         self.before.append(f"static const {kind} {about} = {text};")
-        return f"&{about}"
+        return self._names.setdefault(address, f"&{about}")
 
 
 def numbers(values: ArrayLike, suffix: str) -> str:

@@ -1,27 +1,23 @@
-"""Recording of a law's inputs and results, and of motions as knots, for a replay in C."""
+"""Recording of a law's inputs and results, for a replay in C."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from pydrake.trajectories import Trajectory
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
 from stewart_drake.files.schema import plain
 from stewart_drake.law.channel import Report
 from stewart_drake.law.coverage import uncovered
-from stewart_drake.law.motion import KnownMotion, Motion, between
-from stewart_drake.law.observers import CoreObserver
+from stewart_drake.law.motion import Motion
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import load_controller
-from stewart_drake.scenario.trajectories import evaluate, through_states
 from stewart_drake.types import Array
 
 EXPORTED: Final = (
@@ -30,54 +26,6 @@ EXPORTED: Final = (
 """Shipped controllers that are exported."""
 REPLAYED: Final = 10.0
 """Longest part of a run that the test replays, s."""
-TOLERANCE: Final = 1e-7
-"""Tolerance of knots, as a share of the largest value of a coordinate, rate or acceleration."""
-LONGEST: Final = 0.5
-"""Longest time between two knots, s."""
-_HALVES: Final = 16
-"""Largest number of halvings of LONGEST, reached at a jump of the motion."""
-_COMPARED: Final = (0.21, 0.5, 0.79)
-"""Shares of the time between two knots at which polynomial and motion are compared."""
-
-
-def knots(motion: Trajectory, end: float) -> Array:
-    """Return times and motion (n, 19) at the knots of a piecewise quintic polynomial, for C.
-
-    Each piece has pose, rates and accelerations of the motion at both ends. Between knots h apart
-    its error is O(h^6) where the motion is smooth. Knots are added until the error is within
-    TOLERANCE.
-    """
-    number = max(1, int(np.ceil(end / LONGEST)))
-    coarse = np.linspace(0.0, end, number + 1)
-    rows = [_row(motion, t) for t in coarse]
-    size = np.abs(np.array(rows)[:, 1:]).max(axis=0)
-    # A coordinate that hardly moves counts as 1e-3 of the largest in pose, rates or accelerations.
-    size = np.maximum(size, 1e-3 * size.reshape(3, 6).max(axis=1).repeat(6) + 1e-9)
-    found = [rows[0]]
-    for before, after in pairwise(rows):
-        _refine(motion, before, after, size, found, _HALVES)
-    return np.array(found)
-
-
-def _row(motion: Trajectory, time: float) -> Array:
-    return np.append(time, evaluate(motion, time))
-
-
-def _refine(
-    motion: Trajectory, a: Array, b: Array, size: Array, found: list[Array], halves: int
-) -> None:
-    """Append the knots after `a`, up to `b`."""
-    span = b[0] - a[0]
-    off = [
-        np.abs(between(a[1:], b[1:], span, share) - evaluate(motion, a[0] + share * span)) / size
-        for share in _COMPARED
-    ]
-    if np.max(off) > TOLERANCE and halves > 0:
-        middle = _row(motion, a[0] + span / 2)
-        _refine(motion, a, middle, size, found, halves - 1)
-        _refine(motion, middle, b, size, found, halves - 1)
-    else:
-        found.append(b)
 
 
 class Step(NamedTuple):
@@ -100,9 +48,6 @@ class Recorded:
     steps: list[Step] = field(default_factory=list)  # of the first REPLAYED s
     # (n, 6) torques in flight at t = 0, or (18,) the command before the first sample
     first: Array = field(default_factory=lambda: np.empty(0))
-    motion: Array | None = None  # (k, 19) its knots, if the law chooses the instants to read
-    goal: Array | None = None  # (k, 19) knots of the reference that a plan returns to
-    _along: tuple[Trajectory, Trajectory] | None = None
 
     @property
     def moves(self) -> bool:
@@ -134,34 +79,6 @@ class Recorded:
         else:
             self.steps.append(Step(*seen, after.command, status, np.array(given[0])))
 
-    def tabulated(self, motion: Motion) -> Motion:
-        """Return the motion interpolated between its knots, as C follows it."""
-        if not (self.moves and isinstance(motion, KnownMotion)):
-            return motion
-        if self._along is None:
-            end = self.duration + self._furthest
-            self.motion, self.goal = knots(motion.planned, end), knots(motion.reference, end)
-            pairs = (self.motion, motion.planned), (self.goal, motion.reference)
-            self._along = tuple(_trajectory(rows, then) for rows, then in pairs)  # type: ignore[assignment]
-        planned, reference = self._along  # type: ignore[misc]
-        return replace(motion, planned=planned, reference=reference)
-
-    @property
-    def _furthest(self) -> float:
-        """Longest time ahead of a sample at which the law reads the reference, s."""
-        law, period = self.law, self.law.timeline.period
-        assert isinstance(law, PredictiveLqi)
-        most = law.timeline.queue_length
-        if law.finds_delay:
-            assert isinstance(law.observer, CoreObserver)
-            most = law.observer.max_schedule_length(period)
-        return law.longest_plan + (most + 4) * period
-
-
-def _trajectory(rows: Array, then: Trajectory) -> Trajectory:
-    pieces = [(float(a[0]), a[1:], float(b[0]), b[1:]) for a, b in pairwise(rows)]
-    return through_states(pieces, then)
-
 
 def _recording(law: Any, record: Recorded) -> Any:
     """Return a law that records its steps since its memory was last initialised."""
@@ -175,7 +92,6 @@ def _recording(law: Any, record: Recorded) -> Any:
             return super().initial_memory(first)
 
         def step(self, memory: Any, measurement: Measurement, motion: Motion, *given: Any) -> Any:
-            motion = record.tabulated(motion)
             after = super().step(memory, measurement, motion, *given)
             record.note(measurement, memory, after, motion, given)
             return after

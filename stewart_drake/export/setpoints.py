@@ -19,10 +19,10 @@ from stewart_drake.law.servos import Stiffness, rise, turned
 from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
 from stewart_drake.loop.servos import known_stiffness
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.field_types import Row, section
 from stewart_drake.scenario.signals import ACCELERATIONS, LEGS, NUM_TORQUES, POSE, RATES
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 SHORTEST_BLEND: Final = 1.0

@@ -44,10 +44,10 @@ from stewart_drake.law.feedforward import mean_torques
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.trajectories import evaluate, poses_along
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.reference_config import CsvConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES, COORDINATE_UNITS, NUM_STATE
-from stewart_drake.scenario.trajectories import evaluate, poses_along
 from stewart_drake.types import Array
 
 MOTION: Final = "motion.csv"

@@ -30,8 +30,8 @@ from stewart_drake.law.servos import Stiffness, rise
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.servos import known_stiffness
 from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.trajectories import poses_along
 from stewart_drake.scenario.signals import BALL_JOINTS, POSE, RATES
-from stewart_drake.scenario.trajectories import poses_along
 from stewart_drake.types import Array
 
 SETPOINTS_FILE: Final = "setpoints.csv"

@@ -15,8 +15,8 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.compiled import machine_of
 from stewart_drake.law.least_error import LeastError
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
+from stewart_drake.mechanism.trajectories import evaluate, through_states
 from stewart_drake.scenario.signals import NUM_REFERENCE
-from stewart_drake.scenario.trajectories import evaluate, through_states
 from stewart_drake.types import Array
 
 DEFAULT_CATCH_UP = 0.3

@@ -233,12 +233,7 @@ class CompiledLaw:
         sample.age = round(measurement.age / law.timeline.period)
         after.own["samples"] = after.own.get("samples", -1) + 1
         self._own.now = Step(after, motion, report)
-        if self._servos or not (law.moves or "observer" in self._python):  # known instants
-            rows = preview_rows(motion(law.preview_times), len(law.preview_times))
-            sample.reference, sample.context = c.lib.stewart_given_rows, c.at(rows)
-        else:
-            sample.reference, goal = self._own.motion
-            sample.goal = goal if isinstance(motion, KnownMotion) else c.ffi.NULL
+        keep = self._give(sample, motion)  # noqa: F841
         given = self.data, c.at(after.data), c.at(scratch), sample
         if weights is None:
             said, command = numbers(report), np.empty(NUM_REFERENCE)
@@ -258,9 +253,24 @@ class CompiledLaw:
         if planner == c.ffi.NULL:
             return motion(times)
         sample, rows = c.ffi.new("stewart_sample *"), np.empty((len(times), NUM_REFERENCE))
-        sample.reference, goal = self._own.motion
-        sample.goal = goal if isinstance(motion, KnownMotion) else c.ffi.NULL
+        keep = self._give(sample, motion)  # noqa: F841
         given = c.at(memory.field("planner")), sample, len(times), c.at(times), c.at(rows)
         planner.rows(self.data, *given)
         raise_first(self._raised)
         return rows
+
+    def _give(self, sample: Any, motion: Motion) -> Any:
+        """Let a sample read a motion; return what must outlive it."""
+        c, law = core(), self.law
+        known = motion.compiled() if isinstance(motion, KnownMotion) else None
+        if known is not None:
+            sample.reference, sample.goal = c.lib.stewart_planned_rows, c.lib.stewart_goal_rows
+            sample.context = known
+            return known
+        if self._servos or not (law.moves or "observer" in self._python):  # known instants
+            rows = preview_rows(motion(law.preview_times), len(law.preview_times))
+            sample.reference, sample.context = c.lib.stewart_given_rows, c.at(rows)
+            return rows
+        sample.reference, goal = self._own.motion
+        sample.goal = goal if isinstance(motion, KnownMotion) else c.ffi.NULL
+        return None

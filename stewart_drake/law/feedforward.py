@@ -31,6 +31,7 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.compiled import numbers
 from stewart_drake.law.timeline import Timeline
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     NUM_COORDINATES,
@@ -40,7 +41,6 @@ from stewart_drake.scenario.signals import (
     POSE,
     RATES,
 )
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 GAUSS_NODES = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3)

@@ -35,9 +35,9 @@ from stewart_drake.law.horizon import HoldModel, HorizonCost, condense, riccati
 from stewart_drake.law.horizon_qp import LeastDistance, problem_of, solve_by_daqp
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.timeline import Timeline
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, POSE, RATES
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 _LONGER: Final = 1.2

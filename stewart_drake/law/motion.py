@@ -2,13 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.trajectories import Trajectory
 
 from stewart_drake.core.library import core
+from stewart_drake.mechanism.trajectories import PlateTrajectory, rows_along
 from stewart_drake.scenario.signals import NUM_REFERENCE
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 Motion = Callable[[Array], Array]
@@ -55,11 +56,19 @@ class KnownMotion:
 
     def __call__(self, times: Array) -> Array:
         """Return the motion at all of `times`."""
-        return np.array([evaluate(self.planned, max(0.0, self.now + t)) for t in times])
+        return rows_along(self.planned, np.maximum(0.0, np.add(self.now, times)))
 
     def goal(self, times: Array) -> Array:
         """Return the reference at all of `times`."""
-        return np.array([evaluate(self.reference, max(0.0, self.now + t)) for t in times])
+        return rows_along(self.reference, np.maximum(0.0, np.add(self.now, times)))
+
+    def compiled(self) -> Any:
+        """Return `stewart_known_motion *`, valid as long as this, or None for motions in Python."""
+        motions = self.planned, self.reference
+        if not all(isinstance(one, PlateTrajectory) for one in motions):
+            return None
+        given = *(one.data for one in motions), self.now  # type: ignore[attr-defined]
+        return core().ffi.new("stewart_known_motion *", given)
 
 
 def between(a: Array, b: Array, h: float, s: float) -> Array:

@@ -31,11 +31,11 @@ from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.peer import MOST_ROWS
 from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
 from stewart_drake.loop.servos import commands_in_flight, servo_law
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.link_config import NetworkConfig, WireConfig
 from stewart_drake.scenario.signals import NUM_STATE
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 ROOM: Final = 0.25

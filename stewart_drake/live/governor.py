@@ -40,6 +40,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import PITCH_LIMIT, border, home_sign, margins, measures_at
 from stewart_drake.law.motion import between
 from stewart_drake.law.startup import sizes
+from stewart_drake.mechanism.trajectories import Piece, evaluate, through_states
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     LEGS,
@@ -48,7 +49,6 @@ from stewart_drake.scenario.signals import (
     POSE,
     RATES,
 )
-from stewart_drake.scenario.trajectories import Piece, evaluate, through_states
 from stewart_drake.types import Array
 
 PACE: Final = 4.0

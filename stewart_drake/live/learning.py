@@ -34,9 +34,9 @@ from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.loop.learned import HARMONICS, save_learned
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import SimulationResult, accumulated_error
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import POSE, RATES
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.learn import (
     PERIOD_ERROR,
     LearnStudy,

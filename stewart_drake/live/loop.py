@@ -36,6 +36,7 @@ from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.loop.controller import reported
 from stewart_drake.loop.recording import has_measured
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
+from stewart_drake.mechanism.trajectories import catch_up, evaluate
 from stewart_drake.scenario.run_log import RunLog
 from stewart_drake.scenario.signals import (
     MODEL_TORQUE,
@@ -46,7 +47,6 @@ from stewart_drake.scenario.signals import (
     POSE,
     RATES,
 )
-from stewart_drake.scenario.trajectories import catch_up, evaluate
 from stewart_drake.types import Array
 
 START_ERROR: Final = 0.02

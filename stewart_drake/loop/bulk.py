@@ -6,9 +6,7 @@ tuner with parts in Python is called by the loop in C at each sample.
 
 import dataclasses
 import json
-import math
 from collections.abc import Callable
-from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
@@ -27,7 +25,7 @@ from stewart_drake.law.compiled import Compiled
 from stewart_drake.law.counts import Counts
 from stewart_drake.law.coverage import backend
 from stewart_drake.law.coverage import uncovered as uncovered_part
-from stewart_drake.law.motion import KnownMotion, Motion, Preview
+from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
@@ -35,7 +33,6 @@ from stewart_drake.loop.controller import reported
 from stewart_drake.loop.law_design import (
     compose_law,
     first_queue,
-    followed_motion,
     on_its_way,
     sizing_of,
     way_onto,
@@ -54,18 +51,17 @@ from stewart_drake.loop.servos import (
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.loop.tuner import weights_source
 from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.trajectories import rows_along
 from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.link import (
-    SIMULTANEOUS,
     forward_times,
     measurement_times,
     torque_delays,
 )
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import (
-    ACCELERATIONS,
     NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
@@ -74,7 +70,6 @@ from stewart_drake.scenario.signals import (
     WEIGHTS,
 )
 from stewart_drake.scenario.timing import event_time, instants, look_time
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.tuner.network import WINDOW
 from stewart_drake.tuner.source import Decision, WeightsSource
 from stewart_drake.types import Array, Flags
@@ -101,11 +96,6 @@ _DRAWN: Final = (
 """Fields of a scenario without effect on a `Preparation`, apart from the believed delay."""
 _PREPARATIONS: Final = 16
 """Largest number of preparations that a process keeps."""
-_NODES: Final = 5e-3
-"""Time between the nodes of a motion, s. For a 1 Hz sine, quintics between them have errors of
-1e-10 in accelerations."""
-_BESIDE: Final = 1e-12
-"""Time from a joint at which the accelerations of either side are taken, s."""
 
 Made = TypeVar("Made")
 MakeTuner = Callable[[Experiment, PredictiveLqi], WeightsSource | None]
@@ -177,10 +167,11 @@ class Prepared(NamedTuple):
     experiment: Experiment
     law: PredictiveLqi | ServoPreview
     planned: Trajectory  # motion that the law follows
-    previews: Array  # (k, p, 18) rows of that motion at each sample
     tuner: WeightsSource | None  # tuner of the weights, None for fixed ones
-    # `pieces_of` the planned motion and of the reference, if the law reads them at any instant
-    motions: tuple[tuple[Array, Array], ...] = ()
+
+    def motion(self, time: float) -> KnownMotion:
+        """Return what the law follows and leads back to, at a sample at `time` s."""
+        return KnownMotion(self.planned, self.experiment.reference, time)
 
 
 class Preparation:
@@ -194,10 +185,8 @@ class Preparation:
     def __init__(self, scenario: Scenario) -> None:
         self._base = prepare(scenario)
         self._made: dict[tuple[Any, ...], Any] = {}
-        self._on_reference = cache(partial(evaluate, self._base.reference))
         self.when: Instants = instants_of(scenario.duration, scenario.controller.period)
-        rows = [self._on_reference(t)[:NUM_STATE] for t in self.when.looks]
-        self.references = np.array(rows)
+        self.references = rows_along(self._base.reference, self.when.looks)[:, :NUM_STATE]
 
     def experiment(self, scenario: Scenario, truth: Mechanism | None = None) -> Experiment:
         scenario.check()
@@ -207,23 +196,15 @@ class Preparation:
     def prepared(self, experiment: Experiment, tuner: MakeTuner | None = None) -> Prepared:
         """Compose law, motion and tuner of a run; `tuner` replaces the scenario's."""
         if experiment.scenario.controller.command == "cranks":
-            servos, motion, length = servo_law(experiment)
-            along = self._along(motion, servos, length)
-            return Prepared(experiment, servos, motion, self._preview(along, servos), None)
+            servos, motion, _ = servo_law(experiment)
+            return Prepared(experiment, servos, motion, None)
         white = white_errors(experiment.scenario)
         law = compose_law(experiment, self._once(sizing_of, experiment, key=white))
         queue = experiment.torques_in_flight(law.timeline.delay).tobytes()
         way = self._once(way_onto, experiment, law, key=queue)
-        law, motion, length = on_its_way(law, experiment, way)
+        law, motion, _ = on_its_way(law, experiment, way)
         source = (tuner or weights_source)(experiment, law)
-        along = self._along(motion, law, length)
-        followed = followed_motion(law, motion, experiment.reference) or ()
-        until = self._read_until(law.longest_plan)
-        motions = tuple(
-            self._once(pieces_of, row, followed, until, key=(one, until))
-            for one, row in zip(followed, (along, self._on_reference), strict=False)
-        )
-        return Prepared(experiment, law, motion, self._preview(along, law), source, motions)
+        return Prepared(experiment, law, motion, source)
 
     def _once(self, make: Callable[..., Made], *arguments: Any, key: Any) -> Made:
         """Return a result that is made once for all runs with the same key."""
@@ -231,51 +212,6 @@ class Preparation:
             self._made[make.__name__, key] = make(*arguments)
         made: Made = self._made[make.__name__, key]
         return made
-
-    def _along(
-        self, motion: Trajectory, law: PredictiveLqi | ServoPreview, length: float
-    ) -> Callable[[float], Array]:
-        """Return the rows of a motion that after `length` s of catch-up is the reference."""
-        joined = law.timeline.eta + length + SIMULTANEOUS
-        known = self._on_reference
-        return lambda t: known(t) if t > joined else evaluate(motion, t)
-
-    def _preview(self, along: Callable[[float], Array], law: PredictiveLqi | ServoPreview) -> Array:
-        """Return the rows (k, p, 18) of `loop.controller.Reference` at all samples."""
-        times = np.maximum(0.0, self.when.samples[:, None] + law.preview_times)
-        return np.array([[along(t) for t in preview] for preview in times])
-
-    def _read_until(self, longest: float) -> float:
-        """Return the instant up to which laws with plans of at most `longest` s read motions."""
-        sc, c = self._base.scenario, self._base.scenario.controller
-        delay = (c.delay_max or 0.0) + believed_delay(sc).eta(c.period)
-        # Delay, plan and horizon are read beyond the end; estimates of the delay may be longer.
-        return sc.duration + 2 * (delay + longest + 20 * c.period)
-
-
-def pieces_of(
-    row: Callable[[float], Array], joints: tuple[Trajectory, ...], until: float
-) -> tuple[Array, Array]:
-    """Return a motion in quintic pieces: nodes (n + 1,) in s, rows (n, 2, 18) at their ends.
-
-    `row` returns its row (18,) at an instant. The joints of piecewise trajectories are nodes, with
-    the accelerations of either side. No other node is near one: in a very short piece rounding
-    would determine the accelerations.
-    """
-    ends = [
-        t for one in joints if hasattr(one, "get_segment_times") for t in one.get_segment_times()
-    ]
-    inner = np.unique([t for t in ends if 0 < t < until])
-    inner = inner[np.diff(inner, prepend=-np.inf) > SIMULTANEOUS]
-    grid = _NODES * np.arange(math.ceil(until / _NODES) + 1)
-    nearest = np.abs(grid[:, None] - inner).min(axis=1, initial=np.inf)
-    times = np.sort(np.append(grid[nearest > _NODES / 10], inner))
-    rows = np.array([row(t) for t in times])
-    pieces = np.stack([rows[:-1], rows[1:]], axis=1)
-    for k in np.searchsorted(times, inner):
-        pieces[k - 1, 1, ACCELERATIONS] = row(times[k] - _BESIDE)[ACCELERATIONS]
-        pieces[k, 0, ACCELERATIONS] = row(times[k] + _BESIDE)[ACCELERATIONS]
-    return times, pieces
 
 
 _prepared: dict[tuple[Any, ...], Preparation] = {}
@@ -353,7 +289,7 @@ class CompiledController:
             self._memory = law.initial_memory(first_queue(experiment, law))
             report, weights = None, experiment.scenario.controller.weights
         compiled = self._memory.compiled
-        samples, scratch = len(prepared.previews), compiled.scratch
+        samples, scratch = len(wanted), compiled.scratch
         self.weights, self.rows = np.tile(weights, (samples, 1)), np.empty((samples, 0))
         self._tuned = np.zeros(3)  # two weights, fallbacks
         if tuner is not None:
@@ -361,11 +297,9 @@ class CompiledController:
             c.lib.stewart_tuner_start(tuner.it, c.at(self._tuned))
             self.rows = np.empty((samples, (len(self._tuned) - 3) // WINDOW))
             scratch = c.lib.stewart_tuned_step_scratch(compiled.data)
-        previews = np.ascontiguousarray(prepared.previews)
-        self._kept = prepared, tuner, previews, np.ascontiguousarray(wanted), np.empty(scratch)
+        motion = prepared.motion(0.0).compiled()
+        self._kept = prepared, tuner, motion, np.ascontiguousarray(wanted), np.empty(scratch)
         self._report = report
-        motions = [(len(rows), c.at(times), c.at(rows)) for times, rows in prepared.motions]
-        planned, goal = motions or [(0, c.ffi.NULL, c.ffi.NULL)] * 2
         self.data = c.ffi.new(
             "stewart_law_in_loop *",
             {
@@ -374,14 +308,11 @@ class CompiledController:
                 "memory": c.at(self._memory.data),
                 "tuner_memory": c.at(self._tuned),
                 "scratch": c.at(self._kept[4]),
-                "previews": c.ffi.NULL if prepared.motions else c.at(previews),
-                "planned": planned,
-                "goal": goal,
+                "motion": motion[0],
                 "period": law.timeline.period,
                 "wanted": c.at(self._kept[3]),
                 "weights": c.at(self.weights),
                 "kept": c.at(self.rows),
-                "preview_rows": previews.shape[1],
                 "columns": self.rows.shape[1],
                 "report": c.at(report),
             },
@@ -414,7 +345,6 @@ class PythonController:
         assert isinstance(law, PredictiveLqi)
         c = experiment.scenario.controller
         self._prepared, self._law, self._when, self._wanted = prepared, law, when, wanted
-        self._followed = followed_motion(law, prepared.planned, experiment.reference)
         self._memory: Any = law.initial_memory(first_queue(experiment, law))
         self._fixed = Decision(np.array(c.weights), False)
         source = prepared.tuner
@@ -426,9 +356,7 @@ class PythonController:
         self, sample: int, measured: Measurement, report: Report | None
     ) -> tuple[Array, Array]:
         law, source = self._law, self._prepared.tuner
-        motion: Motion = Preview(law.preview_times, self._prepared.previews[sample])
-        if self._followed is not None:
-            motion = KnownMotion(*self._followed, self._when.samples[sample])
+        motion = self._prepared.motion(self._when.samples[sample])
         decision = self._fixed if source is None else source.decide(self._tuned)
         after = law.step(self._memory, measured, motion, decision.weights, report)
         if source is not None:

@@ -18,6 +18,7 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.sampling import Sample, SteppedLaw, declare_constant, weak
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.signals import (
     NUM_PARAMETERS,
     NUM_REFERENCE,
@@ -28,7 +29,6 @@ from stewart_drake.scenario.signals import (
     WRENCHES,
     ports_of,
 )
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 

@@ -54,6 +54,7 @@ from stewart_drake.law.stability import (
 from stewart_drake.loop.law_design import DesignedLaw, compose_law, longest_wait
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import MarginSummary
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import as_scenario
 from stewart_drake.scenario.signals import (
@@ -65,7 +66,6 @@ from stewart_drake.scenario.signals import (
     RATES,
     STATE,
 )
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 INSTANTS: Final = 30

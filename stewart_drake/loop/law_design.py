@@ -70,6 +70,12 @@ from stewart_drake.loop.preparation import (
     estimated_names,
 )
 from stewart_drake.mechanism.geometry import plate_radius
+from stewart_drake.mechanism.trajectories import (
+    evaluate,
+    motion_range,
+    poses_along,
+    spread_instants,
+)
 from stewart_drake.scenario.calibration import OFFSETS, believed_delay
 from stewart_drake.scenario.config import ControllerConfig, Scenario, StateSensorConfig
 from stewart_drake.scenario.delay import Delay
@@ -88,7 +94,6 @@ from stewart_drake.scenario.signals import (
     POSE,
     WRENCHES,
 )
-from stewart_drake.scenario.trajectories import evaluate, motion_range, poses_along, spread_instants
 from stewart_drake.types import Array, ArrayLike
 
 LONGEST_REPLAN = 0.4

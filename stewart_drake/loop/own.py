@@ -13,6 +13,7 @@ from pydrake.trajectories import FunctionHandleTrajectory, Trajectory
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ServoPreview
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.signals import (
@@ -26,7 +27,6 @@ from stewart_drake.scenario.signals import (
     TUNER_INPUTS,
     WEIGHTS,
 )
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.types import Array
 
 _REST: Final = 1e-6

@@ -17,6 +17,12 @@ from stewart_drake.loop.own import NOTHING, Own, own_motion, take
 from stewart_drake.machines import reachy_mini  # noqa: F401 registers its kind of reference
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint, with_rotors
+from stewart_drake.mechanism.trajectories import (
+    evaluate,
+    make_reference,
+    motion_range,
+    peak_to_peak,
+)
 from stewart_drake.scenario.calibration import (
     OFFSETS,
     Calibration,
@@ -39,7 +45,6 @@ from stewart_drake.scenario.signals import (
     SHAFTS,
     WRENCHES,
 )
-from stewart_drake.scenario.trajectories import evaluate, make_reference, motion_range, peak_to_peak
 from stewart_drake.tuner.network import DEFAULT, Network, load_network
 from stewart_drake.types import Array
 

@@ -12,8 +12,8 @@ from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.arrayio import write_netcdf
 from stewart_drake.files.fileio import remove_partials
 from stewart_drake.files.jsonio import write_json
+from stewart_drake.mechanism.trajectories import poses_along
 from stewart_drake.scenario.config import ControllerConfig, Scenario
-from stewart_drake.scenario.trajectories import poses_along
 from stewart_drake.types import Array
 
 

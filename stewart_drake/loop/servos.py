@@ -47,6 +47,7 @@ from stewart_drake.loop.own import NOTHING
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sampling import SteppedLaw, update_every, weak
 from stewart_drake.mechanism.geometry import geometry_of
+from stewart_drake.mechanism.trajectories import catch_up, evaluate, poses_along, spread_instants
 from stewart_drake.scenario.config import Scenario, compatible_actuator
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
@@ -60,7 +61,6 @@ from stewart_drake.scenario.signals import (
     SETPOINT,
 )
 from stewart_drake.scenario.timing import servo_ticks, servo_time
-from stewart_drake.scenario.trajectories import catch_up, evaluate, poses_along, spread_instants
 from stewart_drake.types import Array
 
 

@@ -16,8 +16,8 @@ from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.startup import INSTANTS, TOLERANCE, least_torque, reference_torque
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sampling import Sample, SteppedLaw
+from stewart_drake.mechanism.trajectories import evaluate, spread_instants
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES, RATES, WEIGHTS
-from stewart_drake.scenario.trajectories import evaluate, spread_instants
 from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Kind, Network
 from stewart_drake.tuner.source import (
     DensityFeatures,

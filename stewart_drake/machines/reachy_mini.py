@@ -27,10 +27,10 @@ from stewart_drake.files.jsonio import load_json
 from stewart_drake.files.yamlio import brief
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.kinematics import rotation
+from stewart_drake.mechanism.trajectories import make_reference, through_samples
 from stewart_drake.scenario.reference_config import ReachyMoveConfig
 from stewart_drake.scenario.reference_files import check_motion
 from stewart_drake.scenario.signals import ANGLES, COORDINATE_NAMES, POSITION
-from stewart_drake.scenario.trajectories import make_reference, through_samples
 from stewart_drake.types import Array
 
 HEAD_HEIGHT = 0.177

@@ -1,6 +1,6 @@
 """The reference motion, as a scenario describes it, by kind.
 
-`scenario.trajectories.make_reference` makes the motion itself.
+`mechanism.trajectories.make_reference` makes the motion itself.
 """
 
 import math

@@ -36,10 +36,10 @@ from stewart_drake.mechanism.files import (
     mechanism_spec,
 )
 from stewart_drake.mechanism.geometry import Mechanism, with_rotors
+from stewart_drake.mechanism.trajectories import poses_along
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.scenario.loading import scenario_to_dict
-from stewart_drake.scenario.trajectories import poses_along
 from stewart_drake.studies.clearance import Nearest, clearance_along
 from stewart_drake.studies.jobs import Progress, part_of, run_jobs
 from stewart_drake.studies.layout_space import (

@@ -29,8 +29,8 @@ from stewart_drake.mechanism.files import (
     pattern_legs,
 )
 from stewart_drake.mechanism.kinematics import Legs, legs_along, reach_margins, rotation
+from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.signals import ANGLES, POSE
-from stewart_drake.scenario.trajectories import evaluate
 from stewart_drake.studies.workspace_map import rate_gains, wrenches
 from stewart_drake.types import Array
 

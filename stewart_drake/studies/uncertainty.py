@@ -23,10 +23,10 @@ from stewart_drake.loop.preparation import Experiment, motion_scale, simulated_m
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Body, Mechanism
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
+from stewart_drake.mechanism.trajectories import make_reference, peak_to_peak, spread_instants
 from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import NUM_LEGS, NUM_TORQUES
-from stewart_drake.scenario.trajectories import make_reference, peak_to_peak, spread_instants
 from stewart_drake.studies.runs import Outcome, outcome_of, run_file
 from stewart_drake.studies.study_options import Ranges
 from stewart_drake.studies.workspace import rms, size_motors

@@ -12,9 +12,9 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.loop.preparation import Experiment, assemble, check_instants, first_pose_text
 from stewart_drake.mechanism.geometry import plate_radius
+from stewart_drake.mechanism.trajectories import evaluate, poses_along
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import COORDINATES, LEGS, POSE, RATES
-from stewart_drake.scenario.trajectories import evaluate, poses_along
 from stewart_drake.studies.clearance import ClearanceStudy, study_clearance
 from stewart_drake.studies.workspace_map import (
     Factor,

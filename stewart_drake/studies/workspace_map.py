@@ -29,8 +29,8 @@ from stewart_drake.dynamics.workspace import (
 )
 from stewart_drake.mechanism.geometry import Mechanism, plate_radius
 from stewart_drake.mechanism.kinematics import LegGeometry, Legs, legs_along, reach_margins
+from stewart_drake.mechanism.trajectories import poses_along
 from stewart_drake.scenario.signals import COORDINATES, NUM_COORDINATES
-from stewart_drake.scenario.trajectories import poses_along
 from stewart_drake.types import Array, Flags
 
 SECTIONS: Final = ((3, 4), (3, 5), (0, 1), (2, 5))

@@ -158,7 +158,8 @@ def counted(row: Row, folder: Path) -> Counted:
     listed = subprocess.check_output(["arm-none-eabi-nm", "-u", *objects], cwd=folder, text=True)
     if processor.single and "__aeabi_d" in listed:
         sys.exit(f"{row.name}: computes a double in software\n{listed}")
-    examples = [f"{name}.o" for name in ("stewart_motion",) if (folder / f"{name}.c").exists()]
+    motion = [folder / f"{name}.c" for name in ("stewart_motion", "motion")]
+    examples = [path.with_suffix(".o").name for path in motion if path.exists()]
     made(folder, " ".join(["board_startup.o", *examples]), CC=compiler, CFLAGS=OPTIMISED)
     said = made(
         folder,

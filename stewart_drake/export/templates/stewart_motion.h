@@ -1,4 +1,4 @@
-/* The motion of the scenario, as a table. */
+/* The motion of the scenario. */
 
 #ifndef STEWART_MOTION_H
 #define STEWART_MOTION_H

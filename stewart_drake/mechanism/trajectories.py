@@ -1,4 +1,4 @@
-"""References as pydrake trajectories of the pose (6x1), with exact first and second derivatives.
+"""References as pydrake trajectories of the pose (6x1), with exact derivatives.
 
 Every trajectory can be evaluated at any t >= 0: the controller looks ahead, beyond the duration.
 """
@@ -6,18 +6,13 @@ Every trajectory can be evaluated at any t >= 0: the controller looks ahead, bey
 import itertools
 import math
 from collections.abc import Sequence
-from functools import singledispatch
-from typing import Final
+from functools import partial, singledispatch
+from typing import Any, Final
 
 import numpy as np
-from pydrake.trajectories import (
-    BezierCurve,
-    CompositeTrajectory,
-    FunctionHandleTrajectory,
-    PiecewisePolynomial,
-    Trajectory,
-)
+from pydrake.trajectories import CompositeTrajectory, FunctionHandleTrajectory, Trajectory
 
+from stewart_drake.core.library import core
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.reference_config import (
     CsvConfig,
@@ -48,6 +43,60 @@ _STOP_SHARE: Final = 0.05  # of the coordinate's largest speed at a sample
 _GOLDEN: Final = (math.sqrt(5) - 1) / 2
 
 
+class PlateTrajectory(FunctionHandleTrajectory):
+    """Polynomials in pieces, then `then` or waves, computed in C (core/motion.h).
+
+    Args:
+        times: (n + 1,) begin of each piece and end of the last one, s.
+        coefficients: (degree + 1, n, 6), that of the highest power of the time in the piece first,
+            as of `scipy.interpolate.PPoly`.
+        then: the motion after the last piece, or None for offset + amplitude sin(frequency t).
+        offset, amplitude: (6,) rad, m.
+        frequency: (6,) rad/s.
+
+    Attributes:
+        times: as given.
+        data: `stewart_motion *` for C, valid as long as this object.
+        keep: arrays and structures that it points to.
+    """
+
+    def __init__(
+        self,
+        times: ArrayLike = (),
+        coefficients: ArrayLike = (),
+        then: "PlateTrajectory | None" = None,
+        offset: ArrayLike = (0.0,) * 6,
+        amplitude: ArrayLike = (0.0,) * 6,
+        frequency: ArrayLike = (0.0,) * 6,
+    ) -> None:
+        c, self.times = core(), np.array(times, np.float64)
+        powers = np.ascontiguousarray(coefficients, np.float64)
+        after, kept = (c.ffi.NULL, ()) if then is None else (then.data, then.keep)
+        waves = (np.array(one, np.float64).tolist() for one in (offset, amplitude, frequency))
+        pieces, degree = max(0, len(self.times) - 1), len(powers) - 1
+        tables = (c.at(self.times), c.at(powers)) if pieces else (c.ffi.NULL, c.ffi.NULL)
+        given = pieces, degree, *tables, after, *waves
+        self.data: Any = c.ffi.new("stewart_motion *", given)
+        self.keep: list[Any] = [self.times, powers, self.data, *kept]
+        derivative = partial(_derivative, self.data, self.keep)
+        super().__init__(partial(derivative, order=0), 6, 1, 0.0, math.inf)
+        self.set_derivative(derivative)
+
+    def along(self, times: ArrayLike) -> Array:
+        """Return pose, rates and accelerations (n, 18) at times (n,) in s."""
+        c, instants = core(), np.array(times, np.float64)
+        rows = np.empty((len(instants), NUM_REFERENCE))
+        c.lib.stewart_rows_of_motion(self.data, len(rows), c.at(instants), c.at(rows))
+        return rows
+
+
+def _derivative(data: Any, keep: list[Any], time: float, order: int) -> Array:
+    """Return a derivative (6, 1) of a motion in C; `keep` is what that points to."""
+    c, values = core(), np.empty((order + 1, 6))
+    c.lib.stewart_derivatives_of_motion(data, time, order + 1, c.at(values))
+    return values[order].reshape(6, 1)
+
+
 @singledispatch
 def make_reference(config: ReferenceConfig, duration: float) -> Trajectory:
     """Return the motion of a section `reference`; each kind registers its own function.
@@ -69,24 +118,13 @@ def make_reference(config: ReferenceConfig, duration: float) -> Trajectory:
 
 @make_reference.register
 def _sine(config: SineConfig, duration: float) -> Trajectory:
-    amplitude = np.reshape(config.amplitude, (6, 1))
-    offset = np.reshape(config.offset, (6, 1))
-    omega = config.angular_frequency
-
-    def derivative(t: float, order: int) -> Array:
-        # d/dt sin = cos, then -sin, -cos, sin
-        wave = (math.sin, math.cos)[order % 2]
-        sign = -1.0 if order % 4 in (2, 3) else 1.0
-        return np.array([[sign * w**order * wave(w * t)] for w in omega]) * amplitude
-
-    trajectory = FunctionHandleTrajectory(lambda t: offset + derivative(t, 0), 6, 1, 0.0, math.inf)
-    trajectory.set_derivative(derivative)
-    return trajectory
+    waves = {"amplitude": config.amplitude, "frequency": config.angular_frequency}
+    return PlateTrajectory(offset=config.offset, **waves)
 
 
 @make_reference.register
 def _constant(config: HoldConfig, duration: float) -> Trajectory:
-    return PiecewisePolynomial(np.reshape(config.offset, (6, 1)))
+    return PlateTrajectory(offset=config.offset)
 
 
 @make_reference.register
@@ -98,15 +136,26 @@ def _sampled(config: CsvConfig, duration: float) -> Trajectory:
 
 def evaluate(trajectory: Trajectory, t: float) -> Array:
     """Return [pose; rates; accelerations] (18,) at a time in s."""
-    result = np.empty(NUM_REFERENCE)
-    result[POSE] = trajectory.value(t)[:, 0]
-    result[RATES] = trajectory.EvalDerivative(t, 1)[:, 0]
-    result[ACCELERATIONS] = trajectory.EvalDerivative(t, 2)[:, 0]
-    return result
+    return rows_along(trajectory, [t])[0]
+
+
+def rows_along(trajectory: Trajectory, times: ArrayLike) -> Array:
+    """Return [pose; rates; accelerations] (n, 18) at times (n,) in s."""
+    if isinstance(trajectory, PlateTrajectory):
+        return trajectory.along(times)
+    instants = np.array(times, np.float64)
+    rows = np.empty((len(instants), NUM_REFERENCE))
+    for row, t in zip(rows, instants.tolist(), strict=True):
+        row[POSE] = trajectory.value(t)[:, 0]
+        row[RATES] = trajectory.EvalDerivative(t, 1)[:, 0]
+        row[ACCELERATIONS] = trajectory.EvalDerivative(t, 2)[:, 0]
+    return rows
 
 
 def poses_along(trajectory: Trajectory, times: Array) -> Array:
     """Return the values (n, 6) of a trajectory at times (n,)."""
+    if isinstance(trajectory, PlateTrajectory):
+        return trajectory.along(times)[:, POSE]
     values: Array = np.array(trajectory.vector_values(times.tolist()))
     return values.T
 
@@ -136,7 +185,7 @@ def motion_range(trajectory: Trajectory, duration: float, span: Array | None = N
     """Return the range (6,) of any motion within [0, duration], 0 where constant; rad and m."""
     if span is None:
         samples = int(np.clip(math.ceil(duration / _GRID), 1000, 1_000_000)) + 1
-        span = np.ptp(trajectory.vector_values(np.linspace(0.0, duration, samples)), axis=1)
+        span = np.ptp(poses_along(trajectory, np.linspace(0.0, duration, samples)), axis=0)
     furthest = np.abs(trajectory.value(0.0)[POSITION, 0]).max() + span[POSITION].max()
     return np.where(span < _CONSTANT * np.repeat([1.0, furthest], 3), 0.0, span)
 
@@ -184,14 +233,23 @@ def through_states(pieces: Sequence[Piece], reference: Trajectory) -> Trajectory
     Before the first piece the pose is on the straight line with its first rates. Accelerations may
     jump between two pieces.
     """
-    t_start, leave, t_end = pieces[0][0], pieces[0][1], pieces[-1][2]
-    after = FunctionHandleTrajectory(reference.value, 6, 1, t_end, math.inf)
-    after.set_derivative(reference.EvalDerivative)
-    quintics = [_quintic(t0, t1, start, end) for t0, start, t1, end in pieces]
-    segments: list[Trajectory] = [*quintics, after]
+    t_start, leave = pieces[0][:2]
+    quintics = [_quintic(*piece) for piece in pieces]
+    times = [t_start, *(piece[2] for piece in pieces)]
     if t_start > 0:
-        line = np.column_stack([leave[POSE] - leave[RATES] * t_start, leave[POSE]])
-        segments.insert(0, PiecewisePolynomial.FirstOrderHold([0.0, t_start], line))
+        line = np.zeros((6, 6))
+        line[-1], line[-2] = leave[POSE] - leave[RATES] * t_start, leave[RATES]
+        times, quintics = [0.0, *times], [line, *quintics]
+    powers = np.stack(quintics, axis=1)
+    if isinstance(reference, PlateTrajectory):
+        return PlateTrajectory(times, powers, reference)
+    segments = []
+    for one, begin, end in (
+        (PlateTrajectory(times, powers), 0.0, times[-1]),
+        (reference, times[-1], math.inf),
+    ):
+        segments.append(FunctionHandleTrajectory(one.value, 6, 1, begin, end))
+        segments[-1].set_derivative(one.EvalDerivative)
     return CompositeTrajectory(segments)
 
 
@@ -216,12 +274,10 @@ def _through_waypoints(config: WaypointsConfig, duration: float) -> Trajectory:
         knots[inner, RATES] = spline(times[inner], 1)
         # A cubic would jump in acceleration at a stop; a quintic can start and end with none.
         knots[inner, ACCELERATIONS] = spline(times[inner], 2)
-    segments: list[Trajectory] = [
-        _quintic(times[k], times[k + 1], knots[k], knots[k + 1]) for k in range(len(times) - 1)
+    pieces = [
+        _quintic(times[k], knots[k], times[k + 1], knots[k + 1]) for k in range(len(times) - 1)
     ]
-    if times[0] > _INSTANT:
-        segments.insert(0, _hold(poses[0], 0.0, times[0]))
-    return CompositeTrajectory([*segments, _hold(poses[-1], times[-1], math.inf)])
+    return PlateTrajectory(times, np.stack(pieces, axis=1), offset=poses[-1])
 
 
 def through_samples(times: Array, poses: Array, duration: float, file: str) -> Trajectory:
@@ -229,8 +285,7 @@ def through_samples(times: Array, poses: Array, duration: float, file: str) -> T
     from scipy.interpolate import CubicSpline  # slow to import
 
     # The free ends follow the samples; prescribed rest would bend the first and last interval of
-    # a motion that was recorded on the move. A PiecewisePolynomial would be the same cubic, but
-    # takes 35 s and 4 GB of a million samples, where this takes 1 s and 0.3 GB.
+    # a motion that was recorded on the move.
     cubic = CubicSpline(times, poses, bc_type="not-a-knot")
     end = float(times[-1])
     if end < duration:
@@ -244,25 +299,20 @@ def through_samples(times: Array, poses: Array, duration: float, file: str) -> T
                 f"{file}: last row: got {speeds[-1, column]:.3g} {unit} in {name} "
                 f"at {end:.6g} s; expected samples that come to rest, or duration <= {end!r}"
             )
-    spline = FunctionHandleTrajectory(lambda t: cubic(t)[:, None], 6, 1, 0.0, end)
-    spline.set_derivative(lambda t, order: cubic(t, order)[:, None])
-    return CompositeTrajectory([spline, _hold(poses[-1], end, math.inf)])
+    return PlateTrajectory(times, cubic.c, offset=poses[-1])
 
 
-def _hold(pose: Array, start: float, end: float) -> Trajectory:
-    return PiecewisePolynomial.ZeroOrderHold([start, end], np.column_stack([pose, pose]))
+def _quintic(t0: float, start: Array, t1: float, end: Array) -> Array:
+    """Return the coefficients (6, 6) of the quintic between two [pose; rates; accelerations].
 
-
-def _quintic(t0: float, t1: float, start: Array, end: Array) -> BezierCurve:
-    """Return the quintic between two [pose; rates; accelerations].
-
-    A Bezier curve of degree 5 over h = t1 - t0 has c' = 5 (c1 - c0) / h and
-    c'' = 20 (c2 - 2 c1 + c0) / h^2 at its start, and the mirror image at its end.
+    With its Taylor series at the start up to the second power, and what that misses of the pose,
+    the rates and the accelerations at the end, p, v and a over h = t1 - t0:
+    c_3 = (10 p - 4 v h + a h^2 / 2) / h^3, and so on.
     """
     h = t1 - t0
-    c0, c5 = start[POSE], end[POSE]
-    c1 = c0 + h / 5 * start[RATES]
-    c4 = c5 - h / 5 * end[RATES]
-    c2 = 2 * c1 - c0 + h**2 / 20 * start[ACCELERATIONS]
-    c3 = 2 * c4 - c5 + h**2 / 20 * end[ACCELERATIONS]
-    return BezierCurve(t0, t1, np.column_stack([c0, c1, c2, c3, c4, c5]))
+    c0, c1, c2 = start[POSE], start[RATES], start[ACCELERATIONS] / 2
+    p = end[POSE] - c0 - h * (c1 + h * c2)
+    v = h * (end[RATES] - c1 - 2 * h * c2)
+    a = h**2 * (end[ACCELERATIONS] - 2 * c2)
+    c3, c4, c5 = 10 * p - 4 * v + a / 2, -15 * p + 7 * v - a, 6 * p - 3 * v + a / 2
+    return np.array([c5 / h**5, c4 / h**4, c3 / h**3, c2, c1, c0])

@@ -1,0 +1,32 @@
+/* Motions of the plate that are known at all times: polynomials in pieces, then waves. */
+
+#pragma once
+
+#include "real.h"
+
+typedef struct stewart_motion stewart_motion;
+
+/* In piece i the pose is  sum_k c_k (t - t_i)^k,  after the last one that of `then`, or without it
+   offset + amplitude sin(frequency t). Before the first piece it stands. */
+struct stewart_motion {
+    int pieces, degree;
+    const real *times;        /* (pieces + 1) ascending, s */
+    const real *coefficients; /* (degree + 1, pieces, 6), that of the highest power first */
+    const stewart_motion *then;
+    real offset[6], amplitude[6], frequency[6]; /* of the waves; rad/s */
+};
+
+/* The pose and its first derivatives (orders, 6) at a time in s. Times below 0, and NaN, count as 0. */
+void stewart_derivatives_of_motion(const stewart_motion *motion, double time, int orders, real *values);
+
+/* The rows (number, 18) at times (number) in s. */
+void stewart_rows_of_motion(const stewart_motion *motion, int number, const double *times, real *rows);
+
+/* Motions of a sample, as the `context` of its `reference` and `goal`. */
+typedef struct {
+    const stewart_motion *planned, *goal;
+    double now; /* of the sample, s */
+} stewart_known_motion;
+
+void stewart_planned_rows(void *context, int number, const real *times, real *rows);
+void stewart_goal_rows(void *context, int number, const real *times, real *rows);
