@@ -29,7 +29,7 @@ from _bench import AMPLITUDE, EXACT, QUICK, RESULTS, section, size, table
 import stewart_drake as sd
 from stewart_drake.files.versions import versions
 from stewart_drake.loop.preparation import prepare
-from stewart_drake.mechanism.trajectories import evaluate
+from stewart_drake.mechanism.trajectories import rows_along
 from stewart_drake.scenario.signals import POSE
 
 ROOT = Path(__file__).parents[1]
@@ -261,7 +261,7 @@ def minutes_in_c() -> str:
     # The last column is the age of the measurement in periods; missing ones are NaN.
     measured = rows[np.isfinite(rows[:, 1:7]).all(axis=1)]
     times = measured[:, 0] - PERIOD * measured[:, -1]
-    wanted = np.array([evaluate(reference, time)[POSE] for time in times])
+    wanted = rows_along(reference, times)[:, POSE]
     status, as_injected = simulated(LINK)
     found = {
         "C over the link": windows(times, measured[:, 1:7] - wanted),

@@ -25,7 +25,7 @@ from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.clearance import LINK_PAIRS
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.mechanism.trajectories import evaluate
+from stewart_drake.mechanism.trajectories import evaluate, rows_along
 from stewart_drake.reporting.run import run_document
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import load_scenario
@@ -483,7 +483,7 @@ def test_no_other_torques_within_the_limit_have_less_error():
     motion, span = way.plan(None, experiment.planned_limit)
     edges = law.timeline.eta + 0.1 * np.arange(round(span / 0.1) + 1)
     torques = mean_torques(experiment.nominal, motion, edges[:-1], edges[1:])
-    states = np.array([evaluate(motion, t)[:12] for t in edges])
+    states = rows_along(motion, edges)[:, :12]
     nodes = edges[:-1, None] + 0.1 * GAUSS_NODES
     Q, R = law.cost.matrices(np.ones(2))
     wanted = np.array([[evaluate(experiment.reference, t)[:6] for t in pair] for pair in nodes])

@@ -36,7 +36,7 @@ from stewart_drake.loop.peer import FAULTS, MOST_ROWS, MOST_SAMPLES, identity_of
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.servos import servo_law
 from stewart_drake.loop.tuner import weights_source
-from stewart_drake.mechanism.trajectories import evaluate
+from stewart_drake.mechanism.trajectories import rows_along
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.loading import scenario_yaml
@@ -217,12 +217,12 @@ def _tuner(
     """Return the constants of a tuner in C, sizes of memory, and the reference of each sample."""
     c, period = core(), recorded.law.timeline.period
     kept = [array for array in tuner.keeps if isinstance(array, np.ndarray)]
-    samples = range(len(recorded.steps))
+    times = period * np.arange(len(recorded.steps))
     return {
         "tuner": Constants(kept, {}, suffix, tuner.it[0], "tuner"),
         "tuner_memory": c.lib.stewart_tuner_memory(tuner.it),
         "scratch": c.lib.stewart_tuned_step_scratch(compiled.data),
-        "wanted": [evaluate(experiment.reference, k * period)[:NUM_STATE] for k in samples],
+        "wanted": rows_along(experiment.reference, times)[:, :NUM_STATE],
     }
 
 

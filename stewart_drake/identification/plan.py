@@ -44,7 +44,7 @@ from stewart_drake.law.feedforward import mean_torques
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.trajectories import evaluate, poses_along
+from stewart_drake.mechanism.trajectories import poses_along, rows_along
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.reference_config import CsvConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES, COORDINATE_UNITS, NUM_STATE
@@ -235,7 +235,7 @@ def _predicted(
     starts = np.minimum(sent + eta, end)
     torques = mean_torques(dynamics, motion, starts, np.minimum(starts + period, end))
     times = np.arange(0, end + _EVERY / 2, _EVERY)
-    states = np.array([evaluate(motion, min(t, end))[:NUM_STATE] for t in times])
+    states = rows_along(motion, np.minimum(times, end))[:, :NUM_STATE]
     values = np.full((len(times), NUM_MEASURED), np.nan)
     values[:, ANGLES] = [mechanism.crank_angles(pose) for pose in states[:, :6]]
     values[:, POSE.start :] = states

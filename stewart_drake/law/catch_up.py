@@ -15,7 +15,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.compiled import machine_of
 from stewart_drake.law.least_error import LeastError
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
-from stewart_drake.mechanism.trajectories import evaluate, through_states
+from stewart_drake.mechanism.trajectories import rows_along, through_states
 from stewart_drake.scenario.signals import NUM_REFERENCE
 from stewart_drake.types import Array
 
@@ -175,7 +175,7 @@ class Model:
         """
         c, times, peak = core(), np.empty(3), np.empty(1)
         c.lib.stewart_plan_times(begin, period, periods, c.at(times))
-        rows = np.array([evaluate(reference, t) for t in times])
+        rows = rows_along(reference, times)
         pieces = np.empty((c.lib.stewart_plan_pieces(period, periods), c.lib.STEWART_PIECE))
         scratch = c.scratch(c.lib.stewart_plan_scratch(period, periods))
         given = c.at(np.array(start, np.float64)), begin, period, periods, c.at(rows)

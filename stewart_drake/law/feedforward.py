@@ -31,11 +31,10 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.compiled import numbers
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.mechanism.trajectories import evaluate
+from stewart_drake.mechanism.trajectories import rows_along
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     NUM_COORDINATES,
-    NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
     POSE,
@@ -52,7 +51,7 @@ def torques_at_nodes(
 ) -> Array:
     """Return inverse-dynamics torques (n, 2, 6) in N m along `motion` at the nodes of each hold."""
     times = starts[:, None] + (ends - starts)[:, None] * GAUSS_NODES
-    rows = np.reshape([evaluate(motion, t) for t in times.flat], (-1, NUM_REFERENCE))
+    rows = rows_along(motion, times.ravel())
     return dynamics.torques_along(rows).reshape(-1, 2, NUM_TORQUES)
 
 

@@ -35,7 +35,7 @@ from stewart_drake.law.horizon import HoldModel, HorizonCost, condense, riccati
 from stewart_drake.law.horizon_qp import LeastDistance, problem_of, solve_by_daqp
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.mechanism.trajectories import evaluate
+from stewart_drake.mechanism.trajectories import evaluate, poses_along
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, POSE, RATES
 from stewart_drake.types import Array
@@ -91,7 +91,7 @@ class LeastError:
         torques = mean_torques(self.plant.dynamics, motion, edges[:-1], edges[1:])
         nodes = edges[:-1, None] + hold * GAUSS_NODES
         cost = HorizonCost(
-            wanted=np.array([[evaluate(reference, t)[POSE] for t in pair] for pair in nodes]),
+            wanted=poses_along(reference, nodes.ravel()).reshape(*nodes.shape, 6),
             end=self._end(reference, edges[-1], period),
             torques=mean_torques(self.plant.dynamics, reference, edges[:-1], edges[1:]),
             Q=self.Q,

@@ -16,7 +16,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.clear_space import ClearSpace
 from stewart_drake.law.feedforward import mean_torques
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.trajectories import evaluate, poses_along, spread_instants
+from stewart_drake.mechanism.trajectories import evaluate, poses_along, rows_along, spread_instants
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
     COULOMB,
@@ -123,7 +123,7 @@ def reference_torques(
 
     With a space it is that along the reference shrunk into reach.
     """
-    rows = np.array([evaluate(reference, t) for t in spread_instants(duration, INSTANTS)])
+    rows = rows_along(reference, spread_instants(duration, INSTANTS))
     return np.abs(dynamics.torques_along(space.shrunk(rows) if space else rows)).max(axis=1)
 
 
@@ -208,7 +208,7 @@ def filter_substeps(
     """
     begin = spread_instants(duration, FILTER_INSTANTS)
     torques = mean_torques(dynamics, reference, begin, begin + period)
-    states = [evaluate(reference, t)[:NUM_STATE] for t in begin]
+    states = rows_along(reference, begin)[:, :NUM_STATE]
     ends = poses_along(reference, begin + period)
 
     def after(substeps: int) -> Array:

@@ -34,7 +34,7 @@ from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.loop.learned import HARMONICS, save_learned
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import SimulationResult, accumulated_error
-from stewart_drake.mechanism.trajectories import evaluate
+from stewart_drake.mechanism.trajectories import rows_along
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import POSE, RATES
 from stewart_drake.studies.learn import (
@@ -208,7 +208,7 @@ class TorqueLessons(Viewer):
         self._span = _SETTLING + _DELAYS * sc.eta + self._period
         self._size = 2 * experiment.motion_scale
         times = np.linspace(0.0, self._period, _INSTANTS, endpoint=False)
-        rates = [evaluate(experiment.reference, t)[RATES] / self._size for t in times]
+        rates = rows_along(experiment.reference, times)[:, RATES] / self._size
         self.pace = min(PACE, _PACE * 2 * np.pi / self._period)
         self._slowest = float(times[np.argmin(np.abs(rates).max(axis=1))])
         self._until, self._asked, self._returns = self._end_of_motion(0.0), 0.0, False

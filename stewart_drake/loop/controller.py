@@ -18,7 +18,7 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.sampling import Sample, SteppedLaw, declare_constant, weak
-from stewart_drake.mechanism.trajectories import evaluate
+from stewart_drake.mechanism.trajectories import evaluate, rows_along
 from stewart_drake.scenario.signals import (
     NUM_PARAMETERS,
     NUM_REFERENCE,
@@ -66,9 +66,8 @@ class Reference(LeafSystem):
         output.SetFromVector(evaluate(self._true, context.get_time()))
 
     def _ahead(self, context: Context, output: BasicVector) -> None:
-        t = context.get_time()
-        values = [evaluate(self._planned, max(0.0, t + ahead)) for ahead in self._times]
-        output.SetFromVector(np.concatenate(values))
+        times = np.maximum(0.0, context.get_time() + self._times)
+        output.SetFromVector(rows_along(self._planned, times).ravel())
 
 
 HELD: Final[dict[str, Callable[[Memory], Array]]] = {

@@ -54,7 +54,7 @@ from stewart_drake.law.stability import (
 from stewart_drake.loop.law_design import DesignedLaw, compose_law, longest_wait
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import MarginSummary
-from stewart_drake.mechanism.trajectories import evaluate
+from stewart_drake.mechanism.trajectories import evaluate, poses_along
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import as_scenario
 from stewart_drake.scenario.signals import (
@@ -192,7 +192,7 @@ def controller_margin(loop: Judged, until: float | None = None) -> ControllerMar
         return ControllerMargin(sc.controller.period, sc.eta, problem=problem, span=end)
     truth, law = _parts(loop, experiment)
     times = np.linspace(0.0, end, INSTANTS)
-    poses = [evaluate(experiment.reference, t)[POSE] for t in times]
+    poses = poses_along(experiment.reference, times)
     inside = [margin(truth.mechanism, pose) > 0 for pose in poses]
     pole, pole_time = fastest_in_motion(experiment, truth, end)
     queue = max(sc.true_delay.steps + 1, law.timeline.queue_length)

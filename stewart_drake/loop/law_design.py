@@ -74,6 +74,7 @@ from stewart_drake.mechanism.trajectories import (
     evaluate,
     motion_range,
     poses_along,
+    rows_along,
     spread_instants,
 )
 from stewart_drake.scenario.calibration import OFFSETS, believed_delay
@@ -431,7 +432,7 @@ def white_errors(scenario: Scenario) -> tuple[bool, bool]:
 def motion_frequency(experiment: Experiment) -> float:
     """Return sqrt(a / TOLERANCE), a the largest acceleration of a coordinate over its amplitude."""
     times = spread_instants(experiment.scenario.duration, _POSES)
-    accelerations = np.array([evaluate(experiment.reference, t)[ACCELERATIONS] for t in times])
+    accelerations = rows_along(experiment.reference, times)[:, ACCELERATIONS]
     amplitudes = np.where(experiment.peak_to_peak > 0, experiment.peak_to_peak / 2, np.inf)
     largest = np.abs(accelerations).max(axis=0)
     return math.sqrt(float((largest / amplitudes).max() / TOLERANCE))

@@ -241,6 +241,7 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
     calibration = calibration_of(scenario, drawn)
     rotors = scenario.actuator.reflected_inertia
     mechanism = with_rotors(drawn, rotors)
+    reference: Trajectory
     if own.reference is None:
         reference = make_reference(scenario.reference, scenario.duration)
         span = peak_to_peak(scenario.reference, reference, scenario.duration)

@@ -16,7 +16,7 @@ from stewart_drake.law.sensing import StateSensing
 from stewart_drake.law.startup import INSTANTS, TOLERANCE, least_torque, reference_torque
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sampling import Sample, SteppedLaw
-from stewart_drake.mechanism.trajectories import evaluate, spread_instants
+from stewart_drake.mechanism.trajectories import rows_along, spread_instants
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES, RATES, WEIGHTS
 from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Kind, Network
 from stewart_drake.tuner.source import (
@@ -231,5 +231,5 @@ def health_of(experiment: Experiment, law: PredictiveLqi) -> HealthFeatures:
 def angular_frequency(experiment: Experiment) -> float:
     """Return the largest rate of the reference over half its peak to peak, rad/s."""
     times = spread_instants(experiment.scenario.duration, INSTANTS)
-    rates = np.array([evaluate(experiment.reference, t)[RATES] for t in times])
+    rates = rows_along(experiment.reference, times)[:, RATES]
     return float((np.abs(rates).max(axis=0) / experiment.motion_scale).max())

@@ -20,14 +20,13 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.trajectories import Trajectory
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import load_json
 from stewart_drake.files.yamlio import brief
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.kinematics import rotation
-from stewart_drake.mechanism.trajectories import make_reference, through_samples
+from stewart_drake.mechanism.trajectories import PlateTrajectory, make_reference, through_samples
 from stewart_drake.scenario.reference_config import ReachyMoveConfig
 from stewart_drake.scenario.reference_files import check_motion
 from stewart_drake.scenario.signals import ANGLES, COORDINATE_NAMES, POSITION
@@ -137,7 +136,7 @@ def _pose(target: Any, where: str) -> Array:
 
 
 @make_reference.register
-def _recorded(config: ReachyMoveConfig, duration: float) -> Trajectory:
+def _recorded(config: ReachyMoveConfig, duration: float) -> PlateTrajectory:
     if config.file is None:
         raise ConfigError(config.problem() or "")
     return through_samples(*read_move(config.file), duration, config.file)

@@ -98,16 +98,13 @@ def _derivative(data: Any, keep: list[Any], time: float, order: int) -> Array:
 
 
 @singledispatch
-def make_reference(config: ReferenceConfig, duration: float) -> Trajectory:
+def make_reference(config: ReferenceConfig, duration: float) -> PlateTrajectory:
     """Return the motion of a section `reference`; each kind registers its own function.
 
     Waypoints are left and reached at rest in the first, the last, and wherever two neighbours are
     the same pose; in between the pose is twice continuously differentiable. A CSV motion is the
     cubic spline through its samples, with third derivatives continuous next to its ends. Before
     the first and after the last sample of either the pose is constant.
-
-    Returns:
-        A 6x1 trajectory, defined for t >= 0, with derivatives of order 1 and 2.
 
     Raises:
         ConfigError: the samples or their file break a rule of `reference_files`, or a CSV motion
@@ -117,18 +114,18 @@ def make_reference(config: ReferenceConfig, duration: float) -> Trajectory:
 
 
 @make_reference.register
-def _sine(config: SineConfig, duration: float) -> Trajectory:
+def _sine(config: SineConfig, duration: float) -> PlateTrajectory:
     waves = {"amplitude": config.amplitude, "frequency": config.angular_frequency}
     return PlateTrajectory(offset=config.offset, **waves)
 
 
 @make_reference.register
-def _constant(config: HoldConfig, duration: float) -> Trajectory:
+def _constant(config: HoldConfig, duration: float) -> PlateTrajectory:
     return PlateTrajectory(offset=config.offset)
 
 
 @make_reference.register
-def _sampled(config: CsvConfig, duration: float) -> Trajectory:
+def _sampled(config: CsvConfig, duration: float) -> PlateTrajectory:
     if config.file is None:
         raise ConfigError(config.problem() or "")
     return through_samples(*read_csv(config.file), duration, config.file)
@@ -254,7 +251,7 @@ def through_states(pieces: Sequence[Piece], reference: Trajectory) -> Trajectory
 
 
 @make_reference.register
-def _through_waypoints(config: WaypointsConfig, duration: float) -> Trajectory:
+def _through_waypoints(config: WaypointsConfig, duration: float) -> PlateTrajectory:
     """Return quintics with the knot rates and accelerations of a clamped cubic spline."""
     from scipy.interpolate import CubicSpline  # slow to import
 
@@ -280,7 +277,7 @@ def _through_waypoints(config: WaypointsConfig, duration: float) -> Trajectory:
     return PlateTrajectory(times, np.stack(pieces, axis=1), offset=poses[-1])
 
 
-def through_samples(times: Array, poses: Array, duration: float, file: str) -> Trajectory:
+def through_samples(times: Array, poses: Array, duration: float, file: str) -> PlateTrajectory:
     """Return the cubic spline through samples (n,), (n, 6), followed by the last pose."""
     from scipy.interpolate import CubicSpline  # slow to import
 

@@ -29,7 +29,7 @@ from stewart_drake.mechanism.files import (
     pattern_legs,
 )
 from stewart_drake.mechanism.kinematics import Legs, legs_along, reach_margins, rotation
-from stewart_drake.mechanism.trajectories import evaluate
+from stewart_drake.mechanism.trajectories import rows_along
 from stewart_drake.scenario.signals import ANGLES, POSE
 from stewart_drake.studies.workspace_map import rate_gains, wrenches
 from stewart_drake.types import Array
@@ -72,7 +72,7 @@ class Motion(NamedTuple):
 
 def motion_of(home: Array, reference: Trajectory, time: Array) -> Motion:
     """Return the motion at the instants (m,) in s, after home (6,)."""
-    wanted = np.array([evaluate(reference, t) for t in time])
+    wanted = rows_along(reference, time)
     return Motion(np.vstack([home, wanted[:, POSE]]), wanted)
 
 

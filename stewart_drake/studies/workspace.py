@@ -12,7 +12,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.loop.preparation import Experiment, assemble, check_instants, first_pose_text
 from stewart_drake.mechanism.geometry import plate_radius
-from stewart_drake.mechanism.trajectories import evaluate, poses_along
+from stewart_drake.mechanism.trajectories import poses_along, rows_along
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import COORDINATES, LEGS, POSE, RATES
 from stewart_drake.studies.clearance import ClearanceStudy, study_clearance
@@ -74,7 +74,7 @@ def size_motors(dynamics: StewartDynamics, reference: Trajectory, time: Array) -
 
     T = inverse dynamics of (X, X', X''), crank rates = J X'.
     """
-    wanted = np.array([evaluate(reference, t) for t in time])
+    wanted = rows_along(reference, time)
     speed = [dynamics.mechanism.jacobian(x[POSE]) @ x[RATES] for x in wanted]
     return Sizing(np.asarray(time), dynamics.torques_along(wanted), np.array(speed))
 
