@@ -9,7 +9,6 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.core.library import core
 from stewart_drake.mechanism.trajectories import PlateTrajectory, rows_along
-from stewart_drake.scenario.signals import NUM_REFERENCE
 from stewart_drake.types import Array
 
 Motion = Callable[[Array], Array]
@@ -69,13 +68,3 @@ class KnownMotion:
             return None
         given = *(one.data for one in motions), self.now  # type: ignore[attr-defined]
         return core().ffi.new("stewart_known_motion *", given)
-
-
-def between(a: Array, b: Array, h: float, s: float) -> Array:
-    """Return the reference (18,) at the share s of the way between two rows that are h s apart.
-
-    The polynomial of fifth order with their poses, rates and accelerations.
-    """
-    c, row = core(), np.empty(NUM_REFERENCE)
-    c.lib.stewart_between(c.at(a), c.at(b), h, s, c.at(row))
-    return row

@@ -102,12 +102,6 @@ class PredictiveLqi:
         """Whether the law reads the motion at instants that it chooses itself."""
         return self.finds_delay or not isinstance(self.planner, NoPlanner)
 
-    @property
-    def longest_plan(self) -> float:
-        """Length of a plan back onto the reference, s; 0 without one."""
-        period = self.timeline.period
-        return self.planner.lengths(period)[1] * period if isinstance(self.planner, Replan) else 0.0
-
     def require_age(self, measurement: Measurement) -> None:
         """Check that a measurement is of the present, unless the law waits for late ones.
 

@@ -30,17 +30,22 @@ stay right, and a moving target causes no tracking error. A hand waits for h.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Final, NamedTuple
 
 import numpy as np
-from pydrake.trajectories import PiecewisePolynomial, Trajectory
+from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import PITCH_LIMIT, border, home_sign, margins, measures_at
-from stewart_drake.law.motion import between
 from stewart_drake.law.startup import sizes
-from stewart_drake.mechanism.trajectories import Piece, evaluate, through_states
+from stewart_drake.mechanism.trajectories import (
+    Piece,
+    PlateTrajectory,
+    evaluate,
+    rows_along,
+    through_states,
+)
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     LEGS,
@@ -279,11 +284,11 @@ class Governor:
         """
         states, least = np.empty((0, NUM_REFERENCE)), min(4 / self.slowest, _BLENDS[-1])
         for duration in (one for one in _BLENDS if one >= least):
-            goal = evaluate(motion, time + duration)
-            shares = np.arange(0.0, 1.0, _BLEND_STEP / duration)
-            states = np.array([between(state, goal, duration, share) for share in shares])
+            end = time + duration
+            blend = through_states([(time, state, end, evaluate(motion, end))], motion)
+            states = rows_along(blend, np.arange(time, end, _BLEND_STEP))
             if self._within(states):
-                return through_states([(time, state, time + duration, goal)], motion)
+                return blend
         return self.problem(states) or ""
 
 
@@ -315,7 +320,7 @@ class Way:
     @classmethod
     def along(cls, motion: Trajectory) -> "Way":
         """Return the reference of a trajectory, constant before t = 0."""
-        return cls((Segment(0.0, lambda t: evaluate(motion, max(0.0, t))),))
+        return cls((Segment(0.0, _along(motion)),))
 
     def at(self, time: float) -> Array:
         """Return pose, rates and accelerations (18,) at a time in s."""
@@ -395,7 +400,7 @@ class Steering:
 
 
 def _along(motion: Trajectory) -> Callable[[float], Array]:
-    return lambda t: evaluate(motion, t)
+    return partial(evaluate, motion)
 
 
 def _future(governor: Governor, governed: GovernorState, begin: float) -> Callable[[float], Array]:
@@ -411,4 +416,4 @@ def _through(times: Array, states: Array) -> Callable[[float], Array]:
     ]
     if not pieces:  # no delay
         return lambda t: states[-1]
-    return _along(through_states(pieces, PiecewisePolynomial(states[-1][POSE].reshape(6, 1))))
+    return _along(through_states(pieces, PlateTrajectory(offset=states[-1][POSE])))
