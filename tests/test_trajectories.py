@@ -129,6 +129,20 @@ def test_pieces_then_another_motion_are_drakes_polynomials_then_waves(ends, degr
     assert np.isfinite(motion.along([math.inf, 1e308])).all()
 
 
+@pytest.mark.parametrize(
+    ("times", "shape", "message"),
+    [
+        ([0.0, 1.0], (2, 2, 6), "coefficients: got shape"),
+        ([0.0, 1.0, 2.0], (6, 6), "coefficients: got shape"),
+        ([0.0, 1.0, 1.0], (2, 2, 6), "expected ascending numbers"),
+        ([0.0, math.nan], (2, 1, 6), "expected ascending numbers"),
+    ],
+)
+def test_pieces_that_do_not_fit_their_times_are_refused(times, shape, message):
+    with pytest.raises(ValueError, match=message):
+        PlateTrajectory(times, np.zeros(shape))
+
+
 # Waypoints
 
 

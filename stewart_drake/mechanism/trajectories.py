@@ -54,6 +54,9 @@ class PlateTrajectory(FunctionHandleTrajectory):
         offset, amplitude: (6,) rad, m.
         frequency: (6,) rad/s.
 
+    Raises:
+        ValueError: `times` do not ascend, or `coefficients` have another shape.
+
     Attributes:
         times: as given.
         data: `stewart_motion *` for C, valid as long as this object.
@@ -71,9 +74,15 @@ class PlateTrajectory(FunctionHandleTrajectory):
     ) -> None:
         c, self.times = core(), np.array(times, np.float64)
         powers = np.ascontiguousarray(coefficients, np.float64)
+        pieces, degree = max(0, len(self.times) - 1), max(0, len(powers) - 1)
+        if pieces and powers.shape[1:] != (pieces, 6):
+            raise ValueError(
+                f"coefficients: got shape {powers.shape}; expected (degree + 1, {pieces}, 6)"
+            )
+        if not np.all(np.diff(self.times) > 0):
+            raise ValueError(f"times: got {self.times}; expected ascending numbers, s")
         after, kept = (c.ffi.NULL, ()) if then is None else (then.data, then.keep)
         waves = (np.array(one, np.float64).tolist() for one in (offset, amplitude, frequency))
-        pieces, degree = max(0, len(self.times) - 1), len(powers) - 1
         tables = (c.at(self.times), c.at(powers)) if pieces else (c.ffi.NULL, c.ffi.NULL)
         given = pieces, degree, *tables, after, *waves
         self.data: Any = c.ffi.new("stewart_motion *", given)
