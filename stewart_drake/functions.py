@@ -96,7 +96,7 @@ def identify(
         raise ConfigError(f"delay: got {delay:g}; expected 0 to 100 s")
     if all(is_run(Path(path)) for path in paths):
         of_csv = {"precision": precision, "gravity": None if gravity else gravity}
-        refuse(of_csv, "with logs of runs, which contain it; expected it with a CSV log only")
+        refuse(of_csv, "with logs of runs, which contain it; expected it with an own CSV log")
     if any(is_servo_log(Path(path)) for path in paths):
         if len(paths) > 1 or delay is not None or tolerances is not None:
             raise ConfigError(

@@ -4,6 +4,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from stewart_drake.cli import main
@@ -92,6 +93,18 @@ def test_the_replay_is_exact(case, tmp_path):
     make(folder, "check")
     for bit in BITS.get(case, ()):
         assert any(status & bit for status in statuses(folder))
+
+
+@pytest.mark.slow
+def test_a_motion_that_jumps_where_a_torque_acts_is_repeated(tmp_path):
+    """Samples are at rounded times, and the motion is another one on either side."""
+    rows = ["time[s],roll[rad],pitch[rad],yaw[rad],x[m],y[m],z[m]"]
+    rows += [f"{t:.2f},{0.02 * t * t},0,0,0,0,0.38" for t in np.arange(0, 5.005, 0.05)]
+    (tmp_path / "motion.csv").write_text("\n".join(rows))
+    reference = f"reference={{kind: csv, file: {tmp_path}/motion.csv}}"
+    (tmp_path / "board").mkdir()
+    said = make(exported(tmp_path / "board", "paper", (reference,)), "test")
+    assert said.startswith("passed: 51 steps")
 
 
 @pytest.mark.slow

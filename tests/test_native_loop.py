@@ -55,6 +55,8 @@ def scenario(name="paper", *settings, controller=None):
 
 LOOPS = {
     "from rest": scenario("paper", "duration=3"),
+    # Its samples are where pieces of the way meet, with other accelerations on either side.
+    "late measurements, joints": scenario("motion_base", "duration=12", "sensor.delay=0.02"),
     "dirty": scenario("paper", "duration=2", *FOLLOWS, *DIRTY),
     "late": scenario(
         "paper", "duration=2", "delay.fraction=0.37", *FOLLOWS, *DIRTY, "sensor.seed=4"

@@ -118,6 +118,14 @@ def test_a_csv_log_without_its_scenario_is_read_but_not_identified(run, tmp_path
 
 
 @pytest.mark.slow
+def test_a_csv_log_does_not_replace_a_scenario_beside_it(run, tmp_path, capsys):
+    own = tmp_path / "mine.yaml"
+    own.write_text("mechanism: paper  # mine\n")
+    assert main(["simulate", str(own), "--log", str(tmp_path / "mine.csv")]) == 2
+    assert "would replace mine.yaml" in capsys.readouterr().err
+    assert own.read_text() == "mechanism: paper  # mine\n" and not (tmp_path / "mine.csv").exists()
+
+
 def test_a_log_is_replayed(run, tmp_path):
     _, folder = run
     for name in ("run.mcap", "run.csv", ""):

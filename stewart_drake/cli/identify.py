@@ -59,13 +59,13 @@ def identify(
 ) -> int:
     """Find delay, friction and geometry in a log.
 
-    A log of 10 s takes 10 to 30 s, of servos with sticking joints a minute. The run may have ended
-    early. Writes mechanism.yaml and calibration.yaml for simulate, and a page. A CSV log has the
-    columns time[s], torque_1[N m] to torque_6 (commanded), angle_1[rad] to angle_6 and, if
-    measured, roll[rad] to z[m].
+    A log of 10 s takes 3 to 30 s, of servos with sticking joints a minute. The run may have ended
+    early. With --out, writes mechanism.yaml and calibration.yaml for simulate, and a page. A CSV
+    log has the columns time[s], torque_1[N m] to torque_6 (commanded), and angle_1[rad] to angle_6,
+    roll[rad] to z[m], or both.
 
     A CSV log with time[s], setpoint_1[rad] to setpoint_6 and crank_1[rad] to crank_6 shows the
-    numbers of position servos. Writes servos.yaml, for --set overlay=FILE.
+    numbers of position servos. With --out, writes servos.yaml, for --set overlay=FILE.
     """
     tolerances = read_tolerances(tolerance) if tolerance else None
     precision = _precision(bits, pose_std) if bits is not None or pose_std else None
@@ -88,7 +88,10 @@ def identify(
 
         refuse({"--set": chosen.settings}, "without --plan; expected it with --plan")
         if all(map(is_run, logs or ())):
-            refuse(of_csv, "with logs of runs, which contain it; expected it with a CSV log only")
+            refuse(
+                of_csv,
+                "with logs of runs, which contain it; expected it with an own CSV log",
+            )
     if plan is None and mechanism is None:
         raise ConfigError("--mechanism: is missing; expected a shipped name or a file, as drawn")
     from stewart_drake import functions

@@ -44,7 +44,7 @@ static stewart_arrivals arrivals_of(const stewart_law *law, const real *memory)
     const stewart_delay_memory *m = (const stewart_delay_memory *)(memory + X);
     Sizes s;
     sizes_of(law, &s);
-    return (stewart_arrivals){law->period, m->eta, m->rate, (int)m->sent,
+    return (stewart_arrivals){law->period, m->eta, m->rate, m->sent > 0 ? (int)m->sent : 0,
                               s.flights > 1 ? s.flights - 1 : 1, m->numbers};
 }
 

@@ -81,8 +81,8 @@ static void jacobian_of_encoders(const stewart_sensing *sensing, const real *sta
         stewart_copy(6, one + 6 * (row % LEGS), J + X * row);
 }
 
-/* Angle (rad) of a leg at the last sample; NaN for none. With more than M of them by the line through
-   the last few whose slope and height are medians (Theil and Sen), robust to a few wrong ones. */
+/* Angle (rad) of a leg at the last sample; NaN for none. With more than MAX_NODES of them from a line
+   through the last few (Theil and Sen), robust to outliers. */
 static real last_angle(int N, const real *values, int leg)
 {
     real t[LAST_FEW], y[LAST_FEW], slopes[PAIRS];

@@ -25,39 +25,39 @@ typedef struct {
 
 typedef struct {
     stewart_field in_flight;   /* limited torques, the oldest first */
-    stewart_field observer;    /* of the observer, at its last measurement */
-    stewart_field lag;         /* periods since that was taken */
-    stewart_field state;       /* now */
-    stewart_field parameters;  /* estimated, or as they are known beforehand */
-    stewart_field measurement; /* the last, as it came */
+    stewart_field observer;    /* memory of the observer after its last measurement */
+    stewart_field lag;         /* age of that measurement, periods */
+    stewart_field state;       /* estimate at this sample */
+    stewart_field parameters;  /* estimated, else assumed */
+    stewart_field measurement; /* the last one, unchanged */
     stewart_field error;       /* of the pose */
     stewart_field integral;
-    stewart_field gain;        /* the last good one; NaN before there is any */
-    stewart_field torque;      /* the last, as asked for */
+    stewart_field gain;        /* the last finite one; NaN before the first */
+    stewart_field torque;      /* the last one, before the limit */
     stewart_field feedforward; /* share of `torque` without feedback */
     stewart_field weights;
     stewart_field silence;     /* samples left without feedback */
     stewart_field times;       /* of the last preview, s from its sample */
     stewart_field reference;   /* the last preview, with missing numbers filled in */
-    stewart_field followed;    /* the same with the way back after a gap */
+    stewart_field followed;    /* `reference` and the way back onto it after a gap */
     stewart_field gap;         /* whether the last row of the last preview was missing */
     stewart_field offset;      /* from the reference where the next torque acts, after a gap in it */
     stewart_field way_back;    /* holds until the offset is zero; then samples until it has acted */
     stewart_field channel;     /* packets that were sent */
-    stewart_field planner;
-    stewart_field counts;
+    stewart_field planner;     /* memory of the planner */
+    stewart_field counts;      /* samples with each bit of `stewart_status` */
 } stewart_layout;
 
 /* Prediction at the instant from which the next torque acts; a channel plans further torques from it. */
 typedef struct {
     real state[STEWART_STATES], error[STEWART_STATES], integral[6];
-    real limited[STEWART_MOTORS]; /* the torque, as limited */
-    const real *theta;            /* parameters that it is computed with, NULL: as known beforehand */
+    real limited[STEWART_MOTORS]; /* the torque within the motors' limit, N m */
+    const real *theta;            /* parameters that it is computed with; NULL: the assumed ones */
     const real *gain;             /* or NULL without feedback */
     const real *rows;             /* of the reference, at further instants of the preview */
 } stewart_predicted;
 
-/* Parts of a law that are not of the core; a function is NULL where the core's is used. */
+/* Functions in place of the core's; NULL: that of the core. */
 typedef struct {
     int columns; /* of the gain, at the most */
     /* Change the outlook, which is that of the core under the assumed delay; the state is `lag` periods
@@ -108,25 +108,25 @@ struct stewart_law {
     stewart_machine machine;
     stewart_cost cost;
     real period;       /* s */
-    real fraction;     /* of a period, that the assumed delay is beyond `steps` */
-    int steps;         /* of the assumed delay, whole periods */
-    int kept;          /* torques that are remembered beyond the delay's */
+    real fraction;     /* of the assumed delay: its rest, periods */
+    int steps;         /* of the assumed delay: whole periods */
+    int kept;          /* torques in memory besides those in flight */
     int longest_wait;  /* periods: the greatest age of a measurement */
-    int silence;       /* samples at the start at which nothing is fed back */
-    real tolerated_timing; /* s, deviation of single torques from which on their weight grows; 0: it is given */
-    int measured;      /* numbers of a measurement */
-    int parts;         /* torques that a machine reports of each period; 0: they are the law's own */
-    int rows;          /* of a preview, at the most */
+    int silence;       /* samples at the start without feedback */
+    real tolerated_timing; /* s; the weight of torques grows if their timing deviates more; 0: weights as given */
+    int measured;      /* size of a measurement */
+    int parts;         /* torques of a period that a machine reports; 0: the law's own act */
+    int rows;          /* largest number of rows in a preview */
     int memory;        /* numbers of the memory, and the place of each field: `stewart_prepare` */
     stewart_layout layout;
     const stewart_observer *observer;
     const stewart_design *design;     /* NULL: prediction and gain of the core */
     const void *sensing, *estimation; /* assumptions of the observer */
     stewart_sensing (*read)(const void *sensing); /* the model of the sensor */
-    const stewart_sensing *described; /* a sensor given by its functions, in the place of `sensing`; or NULL */
+    const stewart_sensing *described; /* replaces `sensing`; or NULL */
     const stewart_channel *channel;   /* NULL: every torque arrives, after the delay */
     const stewart_packets *packets;   /* assumptions of the channel */
-    const stewart_planner *planner;   /* NULL: what the caller asks for is followed */
+    const stewart_planner *planner;   /* NULL: the law follows the caller's reference */
     const void *planning;             /* assumptions of the planner */
 };
 
@@ -172,12 +172,12 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch, const stew
    last step). Torques that are older than the memory, or not finite, change nothing. */
 void stewart_note_acted(const stewart_law *law, real *memory, int ago, int number, const real *torques);
 
-/* A `stewart_preview_function`: `context` points to all rows that are asked for. */
+/* A `stewart_preview_function` that copies its rows from `context`. */
 void stewart_given_rows(void *context, int number, const real *times, real *rows);
 
-/* Compute the feedforward `torques` (1 + pending, 6), of those that are still to act and of the next, from
-   the reference at two `nodes` of each of 3 + pending holds. Unless `error` (12) is NULL, subtract from it
-   the offset that held torques cause in a state (12). Unless `weights` are NULL, compute the gain K
+/* Compute the feedforward `torques` (1 + pending, 6): of the pending ones, then of the next. The
+   reference is given at two `nodes` of each of 3 + pending holds. If `error` (12) is given, subtract from
+   it the offset that held torques cause in a state (12). If `weights` are given, compute the gain K
    (6, `stewart_order`). Returns 0, or the cause of failure, of `stewart_status`. */
 int stewart_design_feedback(const stewart_law *law, const stewart_outlook *outlook, const real *theta,
                             const real *nodes, const real *state, const real *weights, real *torques,
@@ -193,11 +193,11 @@ int stewart_planning_scratch(const stewart_law *law);
 /* Limit a torque. Returns whether that changed it. */
 int stewart_limit(const stewart_machine *machine, const real *torque, real *limited);
 
-/* What acts in whole periods that begin with the oldest of `periods` + 1 torques; that one acts for another
-   `fraction` of a period. */
+/* Return the schedule of `periods` periods. In each the older torque acts for `fraction` of it, then the
+   next one. `torques` (periods + 1, 6), the oldest first. */
 stewart_schedule stewart_schedule_of(real period, real fraction, int periods, const real *torques,
                                      stewart_scratch *scratch);
 
-/* For observers of a fixed delay: what acted in the last `periods` of torques (number, 6). */
+/* For observers of a fixed delay: torques of the last `periods` of those sent (number, 6). */
 stewart_interval stewart_last_periods(const stewart_law *law, int number, const real *torques, int periods,
                                       stewart_scratch *scratch);

@@ -61,7 +61,10 @@ class Core:
             return self.ffi.NULL
         kind = self._kinds.get(array.dtype)
         if kind is None or not array.flags.c_contiguous:
-            raise ValueError(f"array: got {array.dtype}; expected contiguous doubles or C ints")
+            raise ValueError(
+                f"array: got {array.dtype}, strides {array.strides}; expected contiguous doubles or "
+                "C ints"
+            )
         return self.ffi.from_buffer(kind, array)
 
     def call(self, name: str, *given: Any) -> Any:

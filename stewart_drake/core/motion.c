@@ -5,14 +5,14 @@
 
 #define LATEST 1e15 /* s; keeps the phase of a wave finite */
 
-static void wave(const stewart_motion *motion, double time, int orders, real *values)
+static void wave(const stewart_motion *motion, double time, int orders, double *values)
 {
-    real waves[2] = {0}; /* sine and cosine, in most motions the same for all coordinates */
+    double waves[2] = {0}; /* sine and cosine, in most motions the same for all coordinates */
     for (int i = 0; i < 6; i++) {
-        real size = motion->amplitude[i];
+        double size = motion->amplitude[i];
         if (i == 0 || motion->frequency[i] != motion->frequency[i - 1]) {
-            double phase = (double)motion->frequency[i] * time;
-            waves[0] = (real)sin(phase), waves[1] = (real)cos(phase);
+            double phase = motion->frequency[i] * time;
+            waves[0] = sin(phase), waves[1] = cos(phase);
         }
         for (int k = 0; k < orders; k++, size *= motion->frequency[i])
             values[6 * k + i] = (k & 2 ? -size : size) * waves[k & 1];
@@ -21,9 +21,9 @@ static void wave(const stewart_motion *motion, double time, int orders, real *va
 }
 
 /* Horner's rule for the polynomial and its derivatives over k!:  p <- p s + c,  p' <- p' s + p. */
-static void polynomial(const stewart_motion *motion, int piece, real s, int orders, real *values)
+static void polynomial(const stewart_motion *motion, int piece, double s, int orders, double *values)
 {
-    const real *c = motion->coefficients + 6 * piece;
+    const double *c = motion->coefficients + 6 * piece;
     for (int n = 0; n < 6 * orders; n++)
         values[n] = 0;
     for (int k = 0; k <= motion->degree; k++, c += 6 * motion->pieces)
@@ -32,42 +32,50 @@ static void polynomial(const stewart_motion *motion, int piece, real s, int orde
                 values[6 * n + i] = values[6 * n + i] * s + values[6 * (n - 1) + i];
             values[i] = values[i] * s + c[i];
         }
-    real factorial = 1;
+    double factorial = 1;
     for (int n = 2; n < orders; n++) {
-        factorial *= (real)n;
+        factorial *= n;
         for (int i = 0; i < 6; i++)
             values[6 * n + i] *= factorial;
     }
 }
 
-void stewart_derivatives_of_motion(const stewart_motion *motion, double time, int orders, real *values)
+void stewart_derivatives_of_motion(const stewart_motion *motion, double time, int orders, double *values)
 {
     time = time > 0 ? fmin(time, LATEST) : 0; /* and for NaN */
-    while (motion->then && time >= (double)motion->times[motion->pieces])
+    while (motion->then && time >= motion->times[motion->pieces])
         motion = motion->then;
     int low = 0, high = motion->pieces;
-    if (high == 0 || time >= (double)motion->times[high]) {
+    if (high == 0 || time >= motion->times[high]) {
         wave(motion, time, orders, values);
         return;
     }
     while (high - low > 1) {
         int middle = (low + high) / 2;
-        *((double)motion->times[middle] <= time ? &low : &high) = middle;
+        *(motion->times[middle] <= time ? &low : &high) = middle;
     }
-    double from = (double)motion->times[low];
-    polynomial(motion, low, (real)(time > from ? time - from : 0), orders, values);
+    double s = time - motion->times[low];
+    polynomial(motion, low, s > 0 ? s : 0, orders, values);
+}
+
+static void row_at(const stewart_motion *motion, double time, real *row)
+{
+    double values[ROW];
+    stewart_derivatives_of_motion(motion, time, 3, values);
+    for (int i = 0; i < ROW; i++)
+        row[i] = (real)values[i];
 }
 
 void stewart_rows_of_motion(const stewart_motion *motion, int number, const double *times, real *rows)
 {
     for (int i = 0; i < number; i++)
-        stewart_derivatives_of_motion(motion, times[i], 3, rows + ROW * i);
+        row_at(motion, times[i], rows + ROW * i);
 }
 
 static void ahead(const stewart_motion *motion, double now, int number, const real *times, real *rows)
 {
     for (int i = 0; i < number; i++)
-        stewart_derivatives_of_motion(motion, now + (double)times[i], 3, rows + ROW * i);
+        row_at(motion, now + (double)times[i], rows + ROW * i);
 }
 
 void stewart_planned_rows(void *context, int number, const real *times, real *rows)

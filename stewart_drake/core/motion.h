@@ -1,4 +1,5 @@
-/* Motions of the plate that are known at all times: polynomials in pieces, then waves. */
+/* Motions of the plate that are known at all times: polynomials in pieces, then waves. They have double
+   precision in a build with single precision, too, where they last long. */
 
 #pragma once
 
@@ -7,17 +8,18 @@
 typedef struct stewart_motion stewart_motion;
 
 /* In piece i the pose is  sum_k c_k (t - t_i)^k,  after the last one that of `then`, or without it
-   offset + amplitude sin(frequency t). Before the first piece it stands. */
+   offset + amplitude sin(frequency t). Before the first piece it stands. A joint
+   belongs to the later piece. */
 struct stewart_motion {
     int pieces, degree;
-    const real *times;        /* (pieces + 1) ascending, s */
-    const real *coefficients; /* (degree + 1, pieces, 6), that of the highest power first */
+    const double *times;        /* (pieces + 1) ascending, s */
+    const double *coefficients; /* (degree + 1, pieces, 6), that of the highest power first */
     const stewart_motion *then;
-    real offset[6], amplitude[6], frequency[6]; /* of the waves; rad/s */
+    double offset[6], amplitude[6], frequency[6]; /* of the waves; rad/s */
 };
 
 /* The pose and its first derivatives (orders, 6) at a time in s. Times below 0, and NaN, count as 0. */
-void stewart_derivatives_of_motion(const stewart_motion *motion, double time, int orders, real *values);
+void stewart_derivatives_of_motion(const stewart_motion *motion, double time, int orders, double *values);
 
 /* The rows (number, 18) at times (number) in s. */
 void stewart_rows_of_motion(const stewart_motion *motion, int number, const double *times, real *rows);

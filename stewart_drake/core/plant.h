@@ -81,7 +81,7 @@ typedef struct {
     const stewart_tuner *tuner; /* NULL for fixed weights */
     double *memory, *tuner_memory, *scratch;
     stewart_known_motion motion; /* its `now` is set at each sample */
-    double period;               /* s */
+    double period;               /* of the samples, s, see `event_time` of Drake's loop */
     const double *wanted; /* (samples, 12) reference, for a tuner */
     double *weights;      /* (samples, 2) given, or result of the tuner */
     double *kept;         /* (samples, columns) result: rows of the tuner's window */

@@ -41,6 +41,7 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.scenario.signals import NUM_STATE
+from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array, ArrayLike
 
 SOURCES: Final = (
@@ -124,6 +125,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "not_over_udp": not_over_udp,
         "no_machine": no_machine,
         "moves": recorded.moves,
+        "sampled": event_time(law.timeline.period),
         "steps": recorded.steps,
         "queue": np.atleast_2d(recorded.first),
         "headers": [name for name in sources if name.endswith(".h") and name != "equations.h"],
@@ -143,7 +145,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     if tuner is not None:
         values |= _tuner(tuner, compiled, recorded, experiment, suffix)
     if moves:
-        values["motion"] = _motion(experiment, law, suffix)
+        values["motion"] = _motion(experiment, law)
     if over_udp:
         # Samples that are kept: those of a report and of the wait for it.
         kept = 1 << (2 * values["wait"] + 63).bit_length()
@@ -226,13 +228,13 @@ def _tuner(
     }
 
 
-def _motion(experiment: Experiment, law: Any, suffix: str) -> "Constants":
+def _motion(experiment: Experiment, law: Any) -> "Constants":
     """Return the scenario's motion and its reference, a `stewart_known_motion`."""
     planned = (servo_law if isinstance(law, ServoPreview) else control_law)(experiment)[1]
     motions = planned, experiment.reference
     known = KnownMotion(*motions, 0.0).compiled()
     keep = [kept for one in motions for kept in one.keep]  # type: ignore[attr-defined]
-    return Constants(keep, {}, suffix, known[0], "motion")
+    return Constants(keep, {}, "", known[0], "motion", "double")
 
 
 def _rows(rows: Iterable[Array], suffix: str) -> str:
@@ -303,7 +305,8 @@ def _make(folder: str, command: Iterable[str], target: str) -> str:
         arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False
     )
     if done.returncode != 0:
-        raise ConfigError(f"export-c: make {target} failed: {done.stdout}{done.stderr}".strip())
+        said = "; ".join((done.stdout + done.stderr).splitlines())
+        raise ConfigError(f"export-c: make {target} failed: {said}")
     return done.stdout.rstrip().lstrip("\n")
 
 
@@ -319,6 +322,7 @@ class Constants:
         suffix: of a number, `f` in single precision.
         data: the structure.
         about: beginning of the names of its targets.
+        kind: type of the numbers that it points to.
 
     Attributes:
         text: initialiser of the structure.
@@ -326,9 +330,15 @@ class Constants:
     """
 
     def __init__(
-        self, keep: Iterable[Any], tables: dict[int, str], suffix: str, data: Any, about: str
+        self,
+        keep: Iterable[Any],
+        tables: dict[int, str],
+        suffix: str,
+        data: Any,
+        about: str,
+        kind: str = "real",
     ) -> None:
-        self._tables, self._suffix = tables, suffix
+        self._tables, self._suffix, self._type = tables, suffix, kind
         self._arrays, self._structures, self._names = {}, {}, dict[int, str]()
         for kept in keep:
             if isinstance(kept, np.ndarray):
@@ -366,7 +376,7 @@ class Constants:
             return self._names[address]
         if address in self._arrays:
             values = numbers(self._arrays[address].ravel(), self._suffix)
-            self.before.append(f"static const real {about}[] = {values};")
+            self.before.append(f"static const {self._type} {about}[] = {values};")
             return self._names.setdefault(address, about)
         pointer = self._structures[address]
         kind = core().ffi.typeof(pointer).item.cname

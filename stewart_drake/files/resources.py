@@ -42,7 +42,7 @@ def shipped(kind: Kind) -> list[str]:
 
 
 def is_path(name_or_path: str | Path) -> bool:
-    """Return whether this is a path; otherwise it is a shipped name."""
+    """Return whether the argument is a path, not a shipped name."""
     text = str(name_or_path)
     return (
         isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml", ".json"))

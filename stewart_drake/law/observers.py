@@ -348,9 +348,10 @@ def _delay_belief(law: Any, memory: Array, timeline: Timeline, faults: tuple[str
         belief = replace(belief, estimate=Estimate(mean, root @ root.T), innovations=seen)
     others = max(flights - 1, 1)
     before = memory[first : first + NUM_TORQUES * others].reshape(others, NUM_TORQUES)
+    sent = max(0, int(it.sent))  # -1 before the first sample
     return replace(
         belief.at(state),
-        timeline=Arrivals(timeline.period, Delay(0), it.eta, it.rate, int(it.sent), before),
+        timeline=Arrivals(timeline.period, Delay(0), it.eta, it.rate, sent, before),
         measured=last,
         faults=faults,
         feeds_back=bool(it.feeds_back),

@@ -309,7 +309,7 @@ class CompiledController:
                 "tuner_memory": c.at(self._tuned),
                 "scratch": c.at(self._kept[4]),
                 "motion": motion[0],
-                "period": law.timeline.period,
+                "period": event_time(law.timeline.period),
                 "wanted": c.at(self._kept[3]),
                 "weights": c.at(self.weights),
                 "kept": c.at(self.rows),

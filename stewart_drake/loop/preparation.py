@@ -18,6 +18,7 @@ from stewart_drake.machines import reachy_mini  # noqa: F401 registers its kind 
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint, with_rotors
 from stewart_drake.mechanism.trajectories import (
+    PlateTrajectory,
     evaluate,
     make_reference,
     motion_range,
@@ -244,6 +245,9 @@ def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTH
     reference: Trajectory
     if own.reference is None:
         reference = make_reference(scenario.reference, scenario.duration)
+        if not isinstance(reference, PlateTrajectory):
+            kind = f"{scenario.reference.kind}: got a {type(reference).__name__}"
+            raise TypeError(f"make_reference for {kind}; expected a PlateTrajectory")
         span = peak_to_peak(scenario.reference, reference, scenario.duration)
     else:
         reference = own_motion(own.reference, scenario.duration)
@@ -314,7 +318,8 @@ def calibration_of(scenario: Scenario, mechanism: Mechanism) -> Calibration | No
     if calibration.mechanism != own:
         raise ConfigError(
             f"controller.calibration: got {scenario.controller.calibration}, of another machine "
-            f"({calibration.mechanism}); expected one of {mechanism.name} ({own})"
+            f"({calibration.mechanism}); expected one of {mechanism.name} ({own}), or the "
+            "mechanism.yaml that identify wrote with it as `mechanism`"
         )
     if problem := scenario.delay_max_problem(believed_delay(scenario)):
         raise ConfigError(problem)

@@ -73,7 +73,7 @@ class PlateTrajectory(FunctionHandleTrajectory):
         frequency: ArrayLike = (0.0,) * 6,
     ) -> None:
         c, self.times = core(), np.array(times, np.float64)
-        powers = np.ascontiguousarray(coefficients, np.float64)
+        powers = np.array(coefficients, np.float64, order="C")
         pieces, degree = max(0, len(self.times) - 1), max(0, len(powers) - 1)
         if pieces and powers.shape[1:] != (pieces, 6):
             raise ValueError(
@@ -81,6 +81,8 @@ class PlateTrajectory(FunctionHandleTrajectory):
             )
         if not np.all(np.diff(self.times) > 0):
             raise ValueError(f"times: got {self.times}; expected ascending numbers, s")
+        if then is not None and not pieces:
+            raise ValueError("then: got a motion; expected one after pieces only")
         after, kept = (c.ffi.NULL, ()) if then is None else (then.data, then.keep)
         waves = (np.array(one, np.float64).tolist() for one in (offset, amplitude, frequency))
         tables = (c.at(self.times), c.at(powers)) if pieces else (c.ffi.NULL, c.ffi.NULL)

@@ -204,8 +204,13 @@ class CsvLog:
     """A CSV file, which is replaced, with a line per instant; its scenario is in a .yaml."""
 
     def __init__(self, path: Path, scenario: Scenario) -> None:
-        self._channels = channels_of(scenario.sensor.samples)
-        write_whole(path.with_suffix(".yaml"), scenario_yaml(scenario))
+        self._channels, companion = channels_of(scenario.sensor.samples), path.with_suffix(".yaml")
+        if companion.exists() and not path.exists():
+            raise ConfigError(
+                f"{path}: its scenario would replace {companion.name}, which is of no log; expected "
+                "another name"
+            )
+        write_whole(companion, scenario_yaml(scenario))
         self._file = CsvFile(path, csv_heads(self._channels))
 
     def write(self, time: float, values: Mapping[str, Array]) -> None:

@@ -62,7 +62,7 @@ static int answer(int k, real *found)
 {
     stewart_sample sample = {.measurement = measurement[k], .age = age[k]};
 {% if moves %}
-    double now = k * (double)stewart_configuration.period;
+    double now = k * @sampled|float@;
     sample.reference = stewart_look_ahead;
     sample.goal = stewart_look_back;
     sample.context = &now;

@@ -49,7 +49,7 @@ int main(void)
     }
     int passed = error <= TOLERANCE * peak && different == 0;
     printf("%s: %d steps, largest error %.1e of the peak of %.3g @"rad, rad/s or N m" if servos else "N m"@, tolerance %.0e\n",
-           passed ? "passed" : "failed", STEPS, error / peak, peak, TOLERANCE);
+           passed ? "passed" : "failed", STEPS, error / (peak > 0 ? peak : 1), peak, TOLERANCE);
     printf("statuses that differ: %d\n", different);
     meter_report(STEPS);
     printf("state %u B, configuration %u B, workspace %u B\n", (unsigned)sizeof memory,
