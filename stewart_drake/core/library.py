@@ -62,8 +62,8 @@ class Core:
         kind = self._kinds.get(array.dtype)
         if kind is None or not array.flags.c_contiguous:
             raise ValueError(
-                f"array: got {array.dtype}, strides {array.strides}; expected contiguous doubles or "
-                "C ints"
+                f"array: got {array.dtype}, strides {array.strides}; expected contiguous doubles "
+                "or C ints"
             )
         return self.ffi.from_buffer(kind, array)
 

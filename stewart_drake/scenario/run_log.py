@@ -207,8 +207,8 @@ class CsvLog:
         self._channels, companion = channels_of(scenario.sensor.samples), path.with_suffix(".yaml")
         if companion.exists() and not path.exists():
             raise ConfigError(
-                f"{path}: its scenario would replace {companion.name}, which is of no log; expected "
-                "another name"
+                f"{path}: its scenario would replace {companion.name}, which is of no log; "
+                "expected another name"
             )
         write_whole(companion, scenario_yaml(scenario))
         self._file = CsvFile(path, csv_heads(self._channels))
