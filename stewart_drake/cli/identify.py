@@ -88,10 +88,7 @@ def identify(
 
         refuse({"--set": chosen.settings}, "without --plan; expected it with --plan")
         if all(map(is_run, logs or ())):
-            refuse(
-                of_csv,
-                "with logs of runs, which contain it; expected it with an own CSV log",
-            )
+            refuse(of_csv, "with logs of runs, which contain it; expected it with an own CSV log")
     if plan is None and mechanism is None:
         raise ConfigError("--mechanism: is missing; expected a shipped name or a file, as drawn")
     from stewart_drake import functions

@@ -157,7 +157,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
 
 
 def _templates(suffix: str) -> Environment:
-    """Return the templates, with filters for arrays; `exact_rows` are in double precision."""
+    """Return the templates, with filters for arrays."""
     texts = Environment(
         loader=FileSystemLoader(TEMPLATES),
         variable_start_string="@",
@@ -170,7 +170,6 @@ def _templates(suffix: str) -> Environment:
     texts.filters |= {
         "c": partial(numbers, suffix=suffix),
         "rows": partial(_rows, suffix=suffix),
-        "exact_rows": partial(_rows, suffix=""),
     }
     return texts
 

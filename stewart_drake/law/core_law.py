@@ -228,12 +228,11 @@ class CompiledLaw:
         c, law = core(), self.law
         after = Memory(memory.data.copy(), self, dict(memory.own))
         values, scratch = measurement.known(law.sensing.size), np.empty(self.scratch)
-        sample = c.ffi.new("stewart_sample *")
-        sample.measurement = c.at(values)
-        sample.age = round(measurement.age / law.timeline.period)
         after.own["samples"] = after.own.get("samples", -1) + 1
         self._own.now = Step(after, motion, report)
-        keep = self._give(sample, motion)  # noqa: F841
+        sample, _read = self._sample(motion)
+        sample.measurement = c.at(values)
+        sample.age = round(measurement.age / law.timeline.period)
         given = self.data, c.at(after.data), c.at(scratch), sample
         if weights is None:
             said, command = numbers(report), np.empty(NUM_REFERENCE)
@@ -252,25 +251,25 @@ class CompiledLaw:
         c, planner = core(), self.data.planner
         if planner == c.ffi.NULL:
             return motion(times)
-        sample, rows = c.ffi.new("stewart_sample *"), np.empty((len(times), NUM_REFERENCE))
-        keep = self._give(sample, motion)  # noqa: F841
+        rows, (sample, _read) = np.empty((len(times), NUM_REFERENCE)), self._sample(motion)
         given = c.at(memory.field("planner")), sample, len(times), c.at(times), c.at(rows)
         planner.rows(self.data, *given)
         raise_first(self._raised)
         return rows
 
-    def _give(self, sample: Any, motion: Motion) -> Any:
-        """Let a sample read a motion; return what must outlive it."""
+    def _sample(self, motion: Motion) -> tuple[Any, Any]:
+        """Return a `stewart_sample *` that reads a motion, and what must outlive it."""
         c, law = core(), self.law
+        sample = c.ffi.new("stewart_sample *")
         known = motion.compiled() if isinstance(motion, KnownMotion) else None
         if known is not None:
             sample.reference, sample.goal = c.lib.stewart_planned_rows, c.lib.stewart_goal_rows
             sample.context = known
-            return known
+            return sample, known
         if self._servos or not (law.moves or "observer" in self._python):  # known instants
             rows = preview_rows(motion(law.preview_times), len(law.preview_times))
             sample.reference, sample.context = c.lib.stewart_given_rows, c.at(rows)
-            return rows
+            return sample, rows
         sample.reference, goal = self._own.motion
         sample.goal = goal if isinstance(motion, KnownMotion) else c.ffi.NULL
-        return None
+        return sample, None
