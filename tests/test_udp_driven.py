@@ -6,6 +6,7 @@ import socket
 import struct
 import subprocess
 import threading
+import time
 from contextlib import closing, contextmanager
 
 import numpy as np
@@ -16,7 +17,7 @@ from stewart_drake.export import controller as export_c
 from stewart_drake.live.endpoint import Endpoint
 from stewart_drake.live.machine import Machine
 from stewart_drake.live.options import Settings
-from stewart_drake.live.protocol import ControllerMessage
+from stewart_drake.live.protocol import ControllerMessage, decode
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.loading import load_scenario
@@ -230,6 +231,27 @@ def test_damaged_replayed_and_reordered_datagrams_change_nothing(case, folder_of
 
 
 OFFER = 3
+
+
+def slower(data):
+    """Delay what the machine sends by 10 ms, from the first sample of the run on."""
+    message = decode(data)
+    time.sleep(0.01 if message.begin <= message.sampled else 0.0)
+    return [data]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["state", "setpoints"])
+@in_real_time
+def test_a_machine_that_answers_later_in_a_run_than_before_it_is_waited_for(case, folder_of):
+    """A measurement is not lost before its torque must leave."""
+    quiet = BUFFERS[case].replace("loss: 0.2", "loss: 0.0")
+    with machine_of(case, quiet) as (address, log), Relay(address, slower) as relay:
+        done = drive(folder_of(case), relay.port)
+    assert " 0 of them without a measurement, 0 late" in done.stdout
+    assert error_of(case, log) < 1
+
+
 NUMBERS = {4: "<I", 8: "<Q"}
 FIELDS = [(28, 4), *((place, 8) for place in (32, 40, 48)), (56, 4)]
 FIELDS += [*((place, 8) for place in range(64, 128, 8)), (136, 4), (144, 8), (152, 8)]

@@ -3,7 +3,7 @@
        ./stewart_udp ADDRESS PORT [seconds=S] [key=FILE] [log=FILE] [arm]
 
    It asks for a session, measures the link, chooses when to begin, and then steps the controller once a
-   period of the machine{% if wait %}, with the newest measurement{% else %}: when the measurement of the sample is there, or later than the last ones{% endif %}.
+   period of the machine{% if wait %}, with the newest measurement{% else %}: when the measurement of the sample is there, or is taken as lost{% endif %}.
    It ends after 1 s without a usable measurement. Without a key it talks to this computer only; a machine
    that does not say that it is a simulation is driven with `arm` only. The log has a row per sample; `age`
    is the number of periods before the sample at which the measurement was taken. */
@@ -173,6 +173,16 @@ static uint64_t latest(const controller *c, uint64_t sampled)
 static uint64_t eta(const controller *c)
 {
     return whole((LAW->steps + (double)LAW->fraction) * (double)c->period + 0.5);
+}
+
+/* The own clock at which the torque of a sample must be at the machine: when it acts, or, without a
+   play-out buffer, before the next step. */
+static double acts(const controller *c, uint64_t sampled)
+{
+    const link_times *t = &c->times;
+    if (!c->buffered)
+        return (double)latest(c, sampled + c->period);
+    return ((double)(sampled + eta(c)) - t->there[least(t, t->trip)]) / t->rate;
 }
 
 /* ---------------------------------------------------------------- datagrams */
@@ -501,7 +511,7 @@ static void step(controller *c, unsigned k)
     if (c->log)
         note(c, k * (double)LAW->period, sample.age);
     c->samples++;
-    c->missed += udp_now() > latest(c, sampled + c->period);
+    c->missed += (double)udp_now() > acts(c, sampled);
 }
 
 /* ---------------------------------------------------------------- a run */
@@ -635,13 +645,25 @@ static const char *drive(controller *c)
         receive(c);
     }
     for (unsigned k = 0; k < number; k++) {
-        uint64_t until = latest(c, c->begin + k * c->period), furthest = udp_now() + whole(3 * c->longest);
+        uint64_t sampled = c->begin + k * c->period;
+        uint64_t until = latest(c, sampled), furthest = udp_now() + whole(3 * c->longest);
         until = until < furthest ? until : furthest; /* odd times of a machine do not stop the controller */
-{% if not wait %}
-        const kept_measurement *kept = &c->came[k % KEPT];
-{% endif %}
-        for (receive(c); udp_now() < until && !udp_interrupted()@" && !(kept->there && kept->sample == k)" if not wait@; receive(c))
+{% if wait %}
+        for (receive(c); udp_now() < until && !udp_interrupted(); receive(c))
             udp_wait(c->socket, until);
+{% else %}
+        /* A measurement later than usual is lost once the next one is there, or once half of the time
+           has passed in which the torque can still leave. */
+        const kept_measurement *kept = &c->came[k % KEPT];
+        double left = acts(c, sampled) - longest_trip(&c->times) - (double)until;
+        uint64_t last = c->buffered ? until + whole(left / 2) : until;
+        for (receive(c); udp_now() < last && !udp_interrupted(); receive(c)) {
+            int usual = udp_now() < until;
+            if ((kept->there && kept->sample == k) || (!usual && c->last.sampled > sampled))
+                break;
+            udp_wait(c->socket, usual ? until : last);
+        }
+{% endif %}
         if (udp_interrupted())
             return "interrupted";
         const char *problem = fault(c);
