@@ -76,7 +76,7 @@ class Filter:
             encoders = encoders_of(self.sensing)
             sensing: Any = c.lib.stewart_encoder_sensing(encoders.it)
             kept = encoders, c.ffi.new("stewart_sensing *", sensing)
-            it.legs = c.ffi.addressof(c.lib, "stewart_encoder_legs")
+            it.encoder_step = c.ffi.addressof(c.lib, "stewart_encoder_filter_step")
         else:
             kept = self._state_sensing()
         it.machine, it.sensing = machine.it, kept[1]

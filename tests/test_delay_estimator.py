@@ -37,7 +37,7 @@ PLANT = NominalPlant(DYNAMICS, 2, 1.0, TorqueLimit())
 SETTINGS = filter_settings(AMPLITUDES, DT, usual_parameters(4.0, 0.06, None))
 NOISE = 1e-4 * np.tile(AMPLITUDES, 2)
 SENSING = StateSensing(NOISE, AMPLITUDES)
-DELAY = DelaySettings.of("constant", 0.45, 0.3, 1.5, quiet=False)
+DELAY = DelaySettings.of("constant", 0.45, 0.3, 1.5, open_loop_start=False)
 HOME = np.concatenate([PAPER.home, np.zeros(6)])
 OBSERVER = CoreObserver(SETTINGS, DELAY)
 THETA = np.concatenate([1e-3 * np.array([1, -1, 2, 0, -2, 1.0]), [0.5, 0.002]])
@@ -50,12 +50,12 @@ def acting_at(arrivals, torques, t, newest):
     """Return the own torque that arrived last, else the torque of `before`, by definition."""
     arrived = [
         i
-        for i in range(newest - arrivals.sent + 1, newest + 1)
+        for i in range(newest - arrivals.num_own + 1, newest + 1)
         if (i * DT + arrivals.arrival) * (1 + arrivals.rate) <= t
     ]
     if arrived:
         return float(torques[len(torques) - 1 + max(arrived) - newest, 0])
-    return float(arrivals.before[min(int(t / DT), len(arrivals.before) - 1), 0])
+    return float(arrivals.other_torques[min(int(t / DT), len(arrivals.other_torques) - 1), 0])
 
 
 @pytest.mark.parametrize("newest", [-1, 0])
@@ -189,7 +189,7 @@ def record(eta, samples, seed, rate=0.0, jitter=0.0):
 
 
 class Guess(NamedTuple):
-    """A hypothesis of the delay: eta in s, and more as of `stewart_guess`."""
+    """A hypothesis of the delay: eta in s, and more as of `stewart_hypothesis`."""
 
     eta: float
     std: float
@@ -205,10 +205,10 @@ def guesses_of(belief):
     """Hypotheses: that nothing has arrived, then the cells; or the only one."""
     c, n, found = core(), 22, []
     memory = c.ffi.cast("stewart_delay_memory *", c.at(belief.memory[12:]))
-    flights = OBSERVER.kept(DT) + 1
+    flights = OBSERVER.extra_torques(DT) + 1
     for place in range(1 + int(memory.cells)):
-        g, root = c.lib.stewart_delay_guess(8, 12, flights, memory, place), np.zeros((n, n))
-        c.lib.stewart_guess_root(g, n, c.at(root))
+        g, root = c.lib.stewart_delay_hypothesis(8, 12, flights, memory, place), np.zeros((n, n))
+        c.lib.stewart_hypothesis_root(g, n, c.at(root))
         said = g.low, g.high, bool(g.fits), int(g.outliers), g.timing, g.weight
         found.append(Guess(g.numbers[n - 2], float(np.linalg.norm(root[-2])), *said))
     return found
@@ -218,7 +218,7 @@ def observed(torques, measured, believed, **changes):
     """Return the beliefs at all samples."""
     observer = CoreObserver(SETTINGS, replace(DELAY, mean=believed, **changes))
     belief = observer.start(Timeline(DT, Delay(0)), SENSING, PLANT)
-    in_flight = np.zeros((observer.kept(DT) + 1, 6))
+    in_flight = np.zeros((observer.extra_torques(DT) + 1, 6))
     found = []
     for torque, values in zip(torques, measured, strict=True):
         belief = observer.observe(belief, Measurement.of(values), in_flight, SENSING, PLANT)
@@ -335,7 +335,7 @@ def small_record(torques, eta, samples):
     x, states = HOME, [HOME]
     view = Arrivals(DT, Delay(0), eta, 0.0, 0, np.zeros((1, 6)))
     for k in range(samples - 1):
-        sent = replace(view, sent=k + 1)
+        sent = replace(view, num_own=k + 1)
         x = DYNAMICS.predict(x, *sent.within(torques[: k + 1], 0.0, DT, newest=0), 8)[-1]
         states.append(x)
     noise = np.random.default_rng(5).normal(0, 1, (samples, 12)) * NOISE
@@ -345,13 +345,13 @@ def small_record(torques, eta, samples):
 def known_delay_likelihood(torques, measured, eta):
     """Return the log-likelihood of the measurements by a filter that knows the delay."""
     c, prior = core(), SETTINGS.parameters
-    size = c.lib.stewart_guess_size(8)
+    size = c.lib.stewart_hypothesis_size(8)
     guess, after = np.zeros(size), np.zeros(size)
-    before, later = (c.ffi.cast("stewart_guess *", c.at(array)) for array in (guess, after))
+    before, later = (c.ffi.cast("stewart_hypothesis *", c.at(array)) for array in (guess, after))
     before.high, before.fits, before.torques = 1.5, 1, 1
     before.numbers = list(np.concatenate([measured[0], prior.prior, [eta, 0.0]]))
     root = np.diag(np.concatenate([NOISE, prior.std, [0.0, 0.0]]))
-    c.lib.stewart_guess_keep_root(22, c.at(root), before)
+    c.lib.stewart_hypothesis_set_root(22, c.at(root), before)
     total = 0.0
     for k in range(1, len(measured)):
         period, y = Period(torques[:k].copy()), measured[k].copy()
@@ -513,7 +513,7 @@ def test_what_does_not_fit_is_refused():
 def test_the_stated_band_covers(kind):
     """95 % +- 5 % of 200 noisy records of random delays."""
     rng, ratios = np.random.default_rng(0), []
-    settings = dataclasses.asdict(DelaySettings.of(kind, 0.45, 0.3, 1.5, quiet=False))
+    settings = dataclasses.asdict(DelaySettings.of(kind, 0.45, 0.3, 1.5, open_loop_start=False))
     del settings["mean"]
     for seed in range(200):
         eta = rng.uniform(0.1, 0.7)

@@ -13,7 +13,7 @@ from stewart_drake.law.belief import Estimate
 from stewart_drake.law.filter_settings import filter_settings, usual_parameters
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.observers import CoreObserver
-from stewart_drake.law.sensing import EncoderSensing, Measurement, encoders_of, node_shares
+from stewart_drake.law.sensing import EncoderSensing, Measurement, encoders_of, node_times
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.mechanism.kinematics import legs_along
 from stewart_drake.scenario.calibration import OFFSETS
@@ -46,19 +46,19 @@ def settings(free=PARAMETERS):
 
 def angles_of(state, theta, samples):
     """(N, 6) of the cranks within PERIOD, by many small steps of the dynamics."""
-    t, shown = np.arange(1, samples + 1) * DT / samples, []
+    t, predicted = np.arange(1, samples + 1) * DT / samples, []
     for end in t:
         first = min(end, 0.03)
         held = np.array([first, end - first])
         states = DYNAMICS.predict(state, PERIOD.torques, np.maximum(held, 1e-12), 60, theta)
-        shown.append(PAPER.crank_angles(states[-1, POSE]))
-    return np.array(shown)
+        predicted.append(PAPER.crank_angles(states[-1, POSE]))
+    return np.array(predicted)
 
 
 # Projections.
 
 
-def onto(nodes, t):
+def fit(nodes, t):
     """G (M, N) from residuals at t (N,) to values at nodes (M,), both in [-1, 1]."""
     degree = len(nodes) - 1
     return legvander(nodes, degree) @ np.linalg.pinv(legvander(t, degree))
@@ -66,8 +66,8 @@ def onto(nodes, t):
 
 def projection(samples):
     """Shares (M,) of the period where the nodes are, and G (M, N) of all samples."""
-    shares = node_shares(samples)
-    return shares, onto(2 * shares - 1, 2 * np.arange(1, samples + 1) / samples - 1)
+    shares = node_times(samples)
+    return shares, fit(2 * shares - 1, 2 * np.arange(1, samples + 1) / samples - 1)
 
 
 def test_the_nodes_of_many_samples_are_gauss_nodes():
@@ -108,22 +108,22 @@ class Reading(NamedTuple):
     """(N, 6) rad, NaN where they are left out."""
     variance: Array
     """(M, 6) rad^2."""
-    odd: list[int]
+    has_outliers: list[int]
     """(6,) whether samples of a leg stand out of their period."""
     residuals: Array
     """(M, 6) at the nodes."""
 
 
-def reading(sensing, said, shown, last, still):
+def reading(sensing, said, predicted, last, unchanged):
     """Return the reading of 6 N values near the angles (N, 6) of a motion."""
-    c, encoders, nodes = core(), encoders_of(sensing), len(node_shares(sensing.samples))
-    angles, onto = np.empty((sensing.samples, 6)), np.empty((6, nodes, nodes))
+    c, encoders, nodes = core(), encoders_of(sensing), len(node_times(sensing.samples))
+    angles, fit = np.empty((sensing.samples, 6)), np.empty((6, nodes, nodes))
     variance, residuals = np.empty((nodes, 6)), np.empty((nodes, 6))
-    it = c.ffi.new("stewart_reading *", list(map(c.at, (angles, onto, variance))))
-    given = map(c.at, (said.known(sensing.size), shown, last, still))
+    it = c.ffi.new("stewart_reading *", list(map(c.at, (angles, fit, variance))))
+    given = map(c.at, (said.known(sensing.size), predicted, last, unchanged))
     c.lib.stewart_read(encoders.it, *given, it, c.scratch(sensing.samples))
-    c.lib.stewart_node_residuals(encoders.it, it, c.at(shown), c.at(residuals))
-    return Reading(angles, variance, list(it.odd), residuals)
+    c.lib.stewart_node_residuals(encoders.it, it, c.at(predicted), c.at(residuals))
+    return Reading(angles, variance, list(it.has_outliers), residuals)
 
 
 def test_angles_along_a_path_are_those_of_each_pose():
@@ -184,33 +184,35 @@ def test_angles_that_no_pose_has_start_nothing():
 
 def test_a_code_that_stands_still_is_worth_less_and_less():
     ten = sensing(10, bits=12)
-    shown = np.tile(PAPER.crank_angles(START[POSE]), (10, 1))
-    codes = ten.quantum * np.round(shown / ten.quantum)
+    predicted = np.tile(PAPER.crank_angles(START[POSE]), (10, 1))
+    codes = ten.quantum * np.round(predicted / ten.quantum)
     codes[5:, 0] += ten.quantum
     codes[2:, 1] += ten.quantum
     codes[7:, 1] += ten.quantum
     said, last = Measurement.of(codes.ravel()), np.tile(codes[0], 10)
-    still, c = np.zeros(6), core()
+    unchanged, c = np.zeros(6), core()
     sensor = c.ffi.new("stewart_sensing *", c.lib.stewart_encoder_sensing(encoders_of(ten).it))
     for periods in range(1, 4):
-        c.lib.stewart_count_still(sensor, *map(c.at, (said.values, last, still)))
-        assert np.array_equal(still, [0, 0, *[periods] * 4])
-        variance = reading(ten, said, shown, last, still).variance[0]
+        c.lib.stewart_count_unchanged(sensor, *map(c.at, (said.values, last, unchanged)))
+        assert np.array_equal(unchanged, [0, 0, *[periods] * 4])
+        variance = reading(ten, said, predicted, last, unchanged).variance[0]
         white = variance[1] * 2  # that of one sample, projected
         assert variance == pytest.approx(white * np.array([1, 0.5, *[(1 + periods) ** 2] * 4]))
 
 
 def test_samples_that_stand_out_of_their_period_are_left_out():
     ten = sensing(20, bits=14)
-    shown = angles_of(START, THETA, 20)
+    predicted = angles_of(START, THETA, 20)
     t = np.arange(1, 21) / 20
-    read = shown + 3e-4 * t[:, None] ** 2  # what a wrong model leaves
+    read = predicted + 3e-4 * t[:, None] ** 2  # what a wrong model leaves
     read[[3, 17], 2] += [0.01, -0.5]
     read[7, 1] = np.nan
-    found = reading(ten, Measurement.of(read.ravel()), shown, read.ravel() * np.nan, np.zeros(6))
+    found = reading(
+        ten, Measurement.of(read.ravel()), predicted, read.ravel() * np.nan, np.zeros(6)
+    )
     assert np.array_equal(np.argwhere(np.isnan(found.angles)), [[3, 2], [7, 1], [17, 2]])
-    assert found.odd == [0, 0, 1, 0, 0, 0]
-    expected = 3e-4 * node_shares(20)[:, None] ** 2
+    assert found.has_outliers == [0, 0, 1, 0, 0, 0]
+    expected = 3e-4 * node_times(20)[:, None] ** 2
     assert found.residuals == pytest.approx(np.tile(expected, 6), abs=1e-9)
 
 
@@ -266,10 +268,10 @@ def test_a_step_is_what_batch_least_squares_finds(samples, free):
     C = np.linalg.cholesky(noise(mean))
 
     def misfit(xi):
-        shown = angles_of(xi[:12], xi[12:20], samples)
+        predicted = angles_of(xi[:12], xi[12:20], samples)
         if len(free) > len(PARAMETERS):
-            shown = shown + xi[20:]
-        beside = (G @ (read - shown)).ravel()
+            predicted = predicted + xi[20:]
+        beside = (G @ (read - predicted)).ravel()
         return np.concatenate([np.linalg.solve(L, xi - mean), np.linalg.solve(C, beside)])
 
     scale = np.sqrt(np.diag(P))

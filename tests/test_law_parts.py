@@ -412,7 +412,7 @@ def test_a_delay_longer_than_what_is_kept_is_refused():
 
 
 class ReturnPath:
-    """A `stewart_way_back`."""
+    """A `stewart_blend`."""
 
     def __init__(self, way):
         self._way = way
@@ -423,8 +423,8 @@ class ReturnPath:
         return self.holds + self.samples > 0
 
     def after(self, h):
-        way = core().ffi.new("stewart_way_back *", self._way[0])
-        core().lib.stewart_go_on_way_back(way, h)
+        way = core().ffi.new("stewart_blend *", self._way[0])
+        core().lib.stewart_advance_blend(way, h)
         return ReturnPath(way)
 
     def at(self, time, h):
@@ -435,8 +435,8 @@ class ReturnPath:
 
 def path(period, seed=1):
     offset = np.random.default_rng(seed).normal(0, 1, NUM_STATE)
-    way = core().ffi.new("stewart_way_back *")
-    core().lib.stewart_begin_way_back(core().at(offset), period, 8, way)
+    way = core().ffi.new("stewart_blend *")
+    core().lib.stewart_begin_blend(core().at(offset), period, 8, way)
     return ReturnPath(way)
 
 

@@ -85,7 +85,7 @@ def test_a_way_planned_in_flight_is_what_drake_makes_of_its_pieces():
     times = np.concatenate([[0.0, 0.5], edges, (edges[1:] + edges[:-1]) / 2, [1.2, 2.0]])
     for at in times:
         expected = evaluate(early if at < pieces[3, 1] else late, at)
-        if not c.lib.stewart_along(len(pieces), c.at(pieces), at, c.at(row)):
+        if not c.lib.stewart_path_row(len(pieces), c.at(pieces), at, c.at(row)):
             row[:] = evaluate(reference, at)
         assert row == pytest.approx(expected, rel=1e-9, abs=1e-9)
 

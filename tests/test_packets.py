@@ -393,7 +393,7 @@ def test_packets_that_come_later_than_reports_tell_of_are_borne():
     believed = sent.of(longer).believed(np.zeros((6, 6)), timeline, nothing)
     assert believed[-4, 0] == 0
     law = compose_law(prepare(scenario(*NETWORK)))
-    assert isinstance(law.channel, Packets) and law.channel.told == reported(law.kept)
+    assert isinstance(law.channel, Packets) and law.channel.told == reported(law.extra_torques)
     slow = run(*NETWORK, "link.loss=0", "link.high=2.5", "link.playout=2.3", *LONG)
     assert slow.status == "completed"
 

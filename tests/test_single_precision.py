@@ -45,9 +45,13 @@ class Single:
         }
         law = self._copy(made.it, known)
         table, read = (
-            library.core().symbols[address_of(one)] for one in (made.it.observer, made.it.read)
+            library.core().symbols[address_of(one)]
+            for one in (made.it.observer, made.it.make_sensing)
         )
-        law.observer, law.read = self.ffi.addressof(self.lib, table), getattr(self.lib, read)
+        law.observer, law.make_sensing = (
+            self.ffi.addressof(self.lib, table),
+            getattr(self.lib, read),
+        )
         return law
 
     def _copy(self, pointer, known):
@@ -79,7 +83,7 @@ class Single:
         if memory is None:
             memory = np.empty(observer.memory(law), np.float32)
             observer.start(law, ffi.from_buffer("float[]", memory))
-        values = self.at(measurement.known(law.measured))
+        values = self.at(measurement.known(law.num_values))
         given = ffi.from_buffer("float[]", memory), len(in_flight), self.at(in_flight), values
         observer.observe(law, *given, [ffi.new("float[]", observer.scratch(law))])
         return memory

@@ -5,9 +5,9 @@
 #include "machine.h"
 
 #ifdef STEWART_FLOAT
-#define STEWART_INSTANT 1e-6f /* s; arrivals closer than this are one */
+#define STEWART_TIME_TOLERANCE 1e-6f /* s; arrivals closer than this are one */
 #else
-#define STEWART_INSTANT 1e-9
+#define STEWART_TIME_TOLERANCE 1e-9
 #endif
 
 /* Time 0 is now. A torque that arrives now has the delay eta, which changes at the rate r. A torque sent
@@ -35,7 +35,7 @@ int stewart_max_torques(const stewart_arrivals *arrivals, real end);
 int stewart_switch_times(const stewart_arrivals *arrivals, real begin, real end, int newest, real *at);
 
 /* Torque schedule from `begin` to `end`: torques (n, 6) and durations (n); returns n. Both have places
-   for n = stewart_max_torques(arrivals, end). `in_flight` (flights, 6) has the oldest torque first;
+   for n = stewart_max_torques(arrivals, end). `in_flight` (num_in_flight, 6) has the oldest torque first;
    only the last `num_own` count. */
-int stewart_torque_schedule(const stewart_arrivals *arrivals, int flights, const real *in_flight, real begin,
+int stewart_torque_schedule(const stewart_arrivals *arrivals, int num_in_flight, const real *in_flight, real begin,
                    real end, int newest, real *torques, real *durations);

@@ -21,8 +21,8 @@
 #define MAX_ITERATIONS_KNOWN 4 /* the same once it is known */
 #define DELAYS_TRIED 15        /* first values of the delay for the iterations, while it is hardly known */
 #define DIFFERENCE ((real)1e-3) /* s, step of the central difference by the delay */
-#define KNOWN_SHARE ((real)0.01) /* of its usual standard deviation, at which a constant counts as known */
-#define HEARD_BEFORE_JUMP 10    /* measurements after which a misfit may be a jump of parameters */
+#define KNOWN_PART ((real)0.01) /* part of its usual standard deviation at which a constant counts as known */
+#define MEASURED_BEFORE_JUMP 10    /* measurements after which a misfit may be a jump of parameters */
 #define TIMING_MEMORY 5         /* s over which the timing of single torques is estimated */
 #define MAX_TIMING_STD ((real)0.1) /* periods, largest standard deviation of the timing */
 #define STEP_STD ((real)0.02)   /* periods, standard deviation of a step of the delay after a misfit */
@@ -33,32 +33,32 @@
 
 static int size_of(const stewart_delay *d) { return X + d->filter.machine->estimated + 2; }
 
-int stewart_guess_size(int p)
+int stewart_hypothesis_size(int p)
 {
     const int n = X + p + 2;
-    return STEWART_GUESS + n + n * (n + 1) / 2;
+    return STEWART_HYPOTHESIS + n + n * (n + 1) / 2;
 }
 
-void stewart_guess_root(const stewart_guess *guess, int n, real *L)
+void stewart_hypothesis_root(const stewart_hypothesis *hypothesis, int n, real *L)
 {
-    const real *packed = guess->numbers + n;
+    const real *packed = hypothesis->numbers + n;
     for (int i = 0; i < n; packed += ++i) {
         stewart_copy(i + 1, packed, L + n * i);
         stewart_fill(n - i - 1, 0, L + n * i + i + 1);
     }
 }
 
-void stewart_guess_keep_root(int n, const real *L, stewart_guess *guess)
+void stewart_hypothesis_set_root(int n, const real *L, stewart_hypothesis *hypothesis)
 {
-    real *packed = guess->numbers + n;
+    real *packed = hypothesis->numbers + n;
     for (int i = 0; i < n; packed += ++i)
         stewart_copy(i + 1, L + n * i, packed);
 }
 
-real stewart_guess_std(const stewart_guess *guess, int n)
+real stewart_hypothesis_std(const stewart_hypothesis *hypothesis, int n)
 {
     const int row = STEWART_ETA(n); /* of the packed lower triangle */
-    return stewart_norm(row + 1, guess->numbers + n + row * (row + 1) / 2);
+    return stewart_norm(row + 1, hypothesis->numbers + n + row * (row + 1) / 2);
 }
 
 /* ---- one period ------------------------------------------------------------------------------- */
@@ -81,17 +81,17 @@ typedef struct {
 
 static Path take_path(const stewart_period *t, stewart_scratch *scratch)
 {
-    const int most = t->flights + 3;
+    const int most = t->num_in_flight + 3;
     Path path = {.torques = stewart_take(scratch, U * most)};
     path.durations = stewart_take(scratch, most);
     return path;
 }
 
-/* Compute the schedule between two instants. Returns 0 for too many torques. */
+/* Compute the schedule between two times. Returns 0 for too many torques. */
 static int schedule_between(const stewart_period *t, const real *xi, real begin, real end, Path *path)
 {
     const stewart_arrivals view = arriving(t, xi);
-    path->number = stewart_torque_schedule(&view, t->flights, t->in_flight, begin, end, t->newest,
+    path->number = stewart_torque_schedule(&view, t->num_in_flight, t->in_flight, begin, end, t->newest,
                                            path->torques, path->durations);
     return path->number <= MOST;
 }
@@ -107,18 +107,18 @@ static int predict(const stewart_period *t, const real *xi, Path *path, real *st
     return 1;
 }
 
-int stewart_period_scratch(int p, int flights)
+int stewart_period_scratch(int p, int num_in_flight)
 {
-    return 2 * (U + 1) * (flights + 3) + X * (X + p) + X + p + 2 + stewart_transitions_scratch(p);
+    return 2 * (U + 1) * (num_in_flight + 3) + X * (X + p) + X + p + 2 + stewart_transitions_scratch(p);
 }
 
-int stewart_delay_advance_scratch(int p, int m, int flights)
+int stewart_delay_advance_scratch(int p, int m, int num_in_flight)
 {
     const int n = X + p + 2, own = (2 * n + 2 * X + 1 + m) * n + (m + X + 1 + MOST) * m
-        + 2 * X + (U + 1) * (flights + 3); /* L, the model and `attempt` */
+        + 2 * X + (U + 1) * (num_in_flight + 3); /* L, the model and `attempt` */
     const int tried = (X + 1) * n + (X + 1 + n) * m, judged = (n + m + MOST) * m;
     const int update = stewart_kalman_scratch(n, m);
-    const int more = (tried > update ? tried : update) + stewart_period_scratch(p, flights);
+    const int more = (tried > update ? tried : update) + stewart_period_scratch(p, num_in_flight);
     const int predicted = (2 * n + MOST) * n, most = more > judged ? more : judged;
     return own + 2 * n + (most > predicted ? most : predicted);
 }
@@ -175,11 +175,11 @@ static real probability_between(real low, real high, real std)
     return (real)0.5 * (REAL(erfc)(low * part) - REAL(erfc)(high * part));
 }
 
-/* A change of torque dT leaves B dT in the rates at the period's end, per second that it comes early, and
-   moves the pose by that for the rest of the period. A change at c with the error j does so in this
-   period if c + j lies within it; the variance is that of j times the probability of this.
+/* A change of torque dT that comes early adds B dT to the rates at the period's end, per second, and moves
+   the pose by that for the rest of the period. A change at c with the timing error j acts in this period if
+   c + j lies within it; the variance is that of j times the probability of this.
 
-   The torques that were in flight at t = 0 changed at unknown instants, phi dt after the samples. Mean
+   The torques that were in flight at t = 0 changed at unknown times, phi dt after the samples. Mean
    torques of the periods, with a change dT per period, leave the rates off by B dT dt phi (1 - phi) / 2
    at the samples. For phi uniform in [0, 1] the mean square is UNKNOWN_PHASE (B dT dt)^2. */
 int stewart_period_late(const stewart_period *t, const real *xi, const real *state, real std,
@@ -191,21 +191,21 @@ int stewart_period_late(const stewart_period *t, const real *xi, const real *sta
     Path path = take_path(t, &scratch);
     /* Arrival of the controller's first torque, see arrivals.h. */
     const real first_own = ((real)(t->newest + 1 - view.num_own) * dt + view.eta) * (1 + view.rate);
-    stewart_belief belief;
-    stewart_believe(t->delay->filter.machine, xi + X, &belief);
+    stewart_model model;
+    stewart_set_model(t->delay->filter.machine, xi + X, &model);
     *others = 0;
     if (!schedule_between(t, xi, at, dt - at, &path))
         return -1;
-    stewart_accelerate(&belief, state, path.torques, before);
+    stewart_accelerate(&model, state, path.torques, before);
     for (int k = 0; k + 1 < path.number; k++, K += X) {
-        real left, late = REAL(sqrt)(UNKNOWN_PHASE) * dt; /* s, to the end; s, standard deviation */
+        real left, late = REAL(sqrt)(UNKNOWN_PHASE) * dt; /* s: time to the end; timing's deviation */
         at += path.durations[k];
         left = dt - at < 0 ? 0 : dt - at < dt ? dt - at : dt;
-        if (view.num_own > 0 && at >= first_own - STEWART_INSTANT)
+        if (view.num_own > 0 && at >= first_own - STEWART_TIME_TOLERANCE)
             late = std * REAL(sqrt)(REAL(fmax)(probability_between(-at, dt - at, std), 0));
         else
             ++*others;
-        stewart_accelerate(&belief, state, path.torques + U * (k + 1), after);
+        stewart_accelerate(&model, state, path.torques + U * (k + 1), after);
         for (int i = 0; i < 6; i++) {
             K[6 + i] = late * (after[i] - before[i]);
             K[i] = left * K[6 + i];
@@ -219,16 +219,16 @@ int stewart_period_late(const stewart_period *t, const real *xi, const real *sta
 
 /* A period linearised at xi, and the measurement at its end. */
 typedef struct {
-    stewart_instant instant;
+    stewart_measurement measurement;
     const stewart_period *period;
     const real *mean;    /* (n) prior */
     Path path;           /* of the last prediction */
     int m, n, fourth_order;
     int rows, others;    /* of K: number of all rows, and of those before the controller's own */
-    real *first;         /* state and H about the prior, for all attempts */
+    real *at_prior;      /* state and H about the prior, for all attempts */
     real K[X * MOST];    /* (rows, 12), see stewart_period_late */
     real drift[X];       /* standard deviations of the model's other errors */
-    real *seen;          /* (m, rows) J K', effect of K on the measurement */
+    real *late_effects;  /* (m, rows) J K', effect of K on the measurement */
     real *white, *nu;    /* (m, n) C^-1 J H, and (m) C^-1 nu, nu the innovation about the prior */
 } Model;
 
@@ -247,7 +247,7 @@ static int linearize_model(void *context, const real *xi, real *H, stewart_scrat
 static int whitened_rows(void *context, const real *xi, real *e, real *H, stewart_scratch scratch)
 {
     Model *a = context;
-    stewart_instant_residuals(&a->instant, xi, e, H, scratch);
+    stewart_measurement_residuals(&a->measurement, xi, e, H, scratch);
     stewart_copy(a->m * a->n, H, a->white);
     for (int i = 0; i < a->m; i++) {
         a->nu[i] = e[i];
@@ -257,10 +257,11 @@ static int whitened_rows(void *context, const real *xi, real *e, real *H, stewar
     return a->m;
 }
 
-static real timing_of(const stewart_delay *d, const stewart_guess *guess)
+/* Return the variance of the timing, s^2. */
+static real timing_of(const stewart_delay *d, const stewart_hypothesis *hypothesis)
 {
     const real least = d->timing_std * d->timing_std;
-    return guess->timing > least ? guess->timing : least;
+    return hypothesis->timing > least ? hypothesis->timing : least;
 }
 
 /* Compute the noise of the model and of the torques' timing, of variance `used`, about xi and the state
@@ -268,7 +269,7 @@ static real timing_of(const stewart_delay *d, const stewart_guess *guess)
 static int set_noise(Model *a, const real *xi, real used, stewart_scratch scratch)
 {
     const stewart_delay *d = a->period->delay;
-    a->rows = stewart_period_late(a->period, xi, a->instant.state, REAL(sqrt)(used), a->K,
+    a->rows = stewart_period_late(a->period, xi, a->measurement.state, REAL(sqrt)(used), a->K,
                                   &a->others, scratch);
     if (a->rows < 0)
         return 0;
@@ -281,28 +282,28 @@ static int set_noise(Model *a, const real *xi, real used, stewart_scratch scratc
     return 1;
 }
 
-/* xi <- the prior with the eta, out of DELAYS_TRIED values, that has the least nu' S^-1 nu, with S the
-   covariance without the delay's. A torque that has not arrived yet has no linearised effect, so
-   iterations from there would never find that it has arrived. */
-static int best_of_many(Model *a, const stewart_guess *guess, const real *L, real std, real *xi,
+/* xi <- the prior with the eta, out of DELAYS_TRIED values, that has the least nu' S^-1 nu; S leaves out the
+   variance of the delay. The derivative by eta is 0 where a torque has not arrived yet, so iterations from
+   there would never find its arrival. */
+static int choose_delay(Model *a, const stewart_hypothesis *hypothesis, const real *L, real std, real *xi,
                         stewart_scratch scratch)
 {
     const stewart_delay *d = a->period->delay;
     const int n = a->n, m = a->m, known = n - 2;
     const real reach = (real)2.5 * std, eta = a->mean[STEWART_ETA(n)];
-    const real low = guess->low > eta - reach ? guess->low : eta - reach;
-    const real high = guess->high < eta + reach ? guess->high : eta + reach;
-    real *A = stewart_take(&scratch, known * X), *miss = stewart_take(&scratch, m), end[X];
+    const real low = hypothesis->low > eta - reach ? hypothesis->low : eta - reach;
+    const real high = hypothesis->high < eta + reach ? hypothesis->high : eta + reach;
+    real *A = stewart_take(&scratch, known * X), *nu = stewart_take(&scratch, m), end[X];
     real *trial = stewart_take(&scratch, n), least = (real)INFINITY;
     for (int i = 0; i < X; i++) /* rows of (H L)' */
         for (int j = 0; j < known; j++) {
             A[X * j + i] = 0;
             for (int k = j; k < known; k++)
-                A[X * j + i] += a->instant.H[n * i + k] * L[n * k + j];
+                A[X * j + i] += a->measurement.H[n * i + k] * L[n * k + j];
         }
-    /* With dh/dx at the beginning of the period. */
+    /* J is that at the beginning of the period. */
     if (!stewart_innovation_root(d->filter.sensing, a->mean, known, A, d->filter.model_std,
-                                 a->instant.C, scratch))
+                                 a->measurement.C, scratch))
         return 0;
     stewart_copy(n, a->mean, trial);
     for (int k = 0; k < DELAYS_TRIED; k++) {
@@ -311,12 +312,12 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
             k < DELAYS_TRIED - 1 ? low + (high - low) / (DELAYS_TRIED - 1) * (real)k : high;
         if (!stewart_period_end(a->period, trial, end, scratch))
             return 0;
-        stewart_predict_measurement(d->filter.sensing, end, miss);
+        stewart_predict_measurement(d->filter.sensing, end, nu);
         for (int i = 0; i < m; i++)
-            miss[i] = a->instant.values[i] - miss[i];
-        stewart_whiten(m, 1, a->instant.C, miss);
+            nu[i] = a->measurement.values[i] - nu[i];
+        stewart_whiten(m, 1, a->measurement.C, nu);
         for (int i = 0; i < m; i++)
-            cost += miss[i] * miss[i];
+            cost += nu[i] * nu[i];
         if (cost < least) {
             least = cost;
             xi[STEWART_ETA(n)] = trial[STEWART_ETA(n)];
@@ -333,12 +334,12 @@ static int best_of_many(Model *a, const stewart_guess *guess, const real *L, rea
 
    so that s + (dL/ds) / I is the estimate of this measurement alone (Fisher scoring). One torque with
    nothing else uncertain has I = 1 / (2 s^2): a measurement counts as 2 s^2 I torques. The estimate is
-   the mean over those; with a weight of 1 / s^4 the first punctual torques would dominate for ever.
+   the mean over those. (Weighted by 1 / s^4 the first punctual torques would dominate for ever.)
 
    Whitened by C, S is 1 + W W' with W = C^-1 H L, and s M is B B' with B = C^-1 J K' of the own rows
    of K. With T = B' S^-1 B the traces are those of T and of T T. Returns 0 if S is not positive
    definite, 2 if this measurement alone gives more than twice the largest variance, else 1. */
-static int judge_timing(Model *a, const real *L, real used, stewart_guess *after,
+static int update_timing(Model *a, const real *L, real used, stewart_hypothesis *after,
                         stewart_scratch scratch)
 {
     const real dt = a->period->delay->period, most = MAX_TIMING_STD * dt * (MAX_TIMING_STD * dt);
@@ -353,8 +354,8 @@ static int judge_timing(Model *a, const real *L, real used, stewart_guess *after
         return 0;
     stewart_fill(m * k, 0, B);
     for (int i = 0; i < m; i++)
-        stewart_copy(k - 1, a->seen + a->rows * i + a->others, B + k * i);
-    stewart_whiten(m, k, a->instant.C, B);
+        stewart_copy(k - 1, a->late_effects + a->rows * i + a->others, B + k * i);
+    stewart_whiten(m, k, a->measurement.C, B);
     for (int i = 0; i < m; i++)
         B[k * i + k - 1] = a->nu[i];
     stewart_whiten(m, k, S, B); /* T = B' B, its last column B' S^-1 nu */
@@ -372,50 +373,50 @@ static int judge_timing(Model *a, const real *L, real used, stewart_guess *after
         }
     if (!(square > 0)) /* no torque has changed */
         return 1;
-    const real alone = used * (1 + (pull - trace) / square); /* of this measurement */
-    const real kept = after->torques < TIMING_MEMORY / dt ? after->torques : TIMING_MEMORY / dt;
-    const real timing = (kept * after->timing + square * alone) / (kept + square);
+    const real alone = used * (1 + (pull - trace) / square); /* estimate by this measurement */
+    const real torques = REAL(fmin)(after->torques, TIMING_MEMORY / dt);
+    const real timing = (torques * after->timing + square * alone) / (torques + square);
     after->timing = timing < 0 ? 0 : timing < most ? timing : most;
-    after->torques = kept + square;
+    after->torques = torques + square;
     return 1 + (alone > 2 * most);
 }
 
 /* Whether the effect of a single torque can be separated from that of the delay. */
-static int is_precise(const stewart_delay *d, const stewart_guess *guess, int n, real std)
+static int is_precise(const stewart_delay *d, const stewart_hypothesis *hypothesis, int n, real std)
 {
-    return std < d->period / 50 && guess->numbers[STEWART_ETA(n)] < STEWART_NEVER;
+    return std < d->period / 50 && hypothesis->numbers[STEWART_ETA(n)] < STEWART_NEVER;
 }
 
 /* Correct xi and the root of its covariance by a measurement; 0 where it does not fit. */
-static int correct(Model *a, const stewart_guess *guess, const real *L, real std, real used, real *xi,
-                   real *root, stewart_guess *after, stewart_scratch scratch)
+static int correct(Model *a, const stewart_hypothesis *hypothesis, const real *L, real std, real used, real *xi,
+                   real *root, stewart_hypothesis *after, stewart_scratch scratch)
 {
     const stewart_delay *d = a->period->delay;
     const int n = a->n, m = a->m;
     const int free_eta = stewart_norm(n, L + n * STEWART_ETA(n)) > 0;
     const int free_rate = stewart_norm(n, L + n * STEWART_RATE(n)) > 0;
     real *lower = stewart_take(&scratch, n), *upper = stewart_take(&scratch, n);
-    real *C = a->instant.C, distance, log_ratio;
+    real *C = a->measurement.C, distance, log_ratio;
     if (std > d->period / 10) {
-        if (!best_of_many(a, guess, L, std, xi, scratch)
-            || !predict(a->period, xi, &a->path, a->instant.state)
-            || !linearize_along(a->period, xi, &a->path, a->fourth_order, a->instant.H, scratch)
+        if (!choose_delay(a, hypothesis, L, std, xi, scratch)
+            || !predict(a->period, xi, &a->path, a->measurement.state)
+            || !linearize_along(a->period, xi, &a->path, a->fourth_order, a->measurement.H, scratch)
             || !set_noise(a, xi, used, scratch))
             return 0;
     }
-    stewart_measurement_jacobian(d->filter.sensing, a->instant.state, a->instant.J);
-    stewart_apply_jacobian(d->filter.sensing, a->instant.J, a->rows, a->K, a->seen);
-    if (!stewart_innovation_root(d->filter.sensing, a->instant.state, a->rows, a->K, a->drift, C, scratch))
+    stewart_measurement_jacobian(d->filter.sensing, a->measurement.state, a->measurement.J);
+    stewart_apply_jacobian(d->filter.sensing, a->measurement.J, a->rows, a->K, a->late_effects);
+    if (!stewart_innovation_root(d->filter.sensing, a->measurement.state, a->rows, a->K, a->drift, C, scratch))
         return 0;
     stewart_copy(n - 2, d->filter.lower, lower);
     stewart_copy(n - 2, d->filter.upper, upper);
-    lower[STEWART_ETA(n)] = free_eta ? guess->low : -(real)INFINITY;
-    upper[STEWART_ETA(n)] = free_eta ? guess->high : (real)INFINITY;
+    lower[STEWART_ETA(n)] = free_eta ? hypothesis->low : -(real)INFINITY;
+    upper[STEWART_ETA(n)] = free_eta ? hypothesis->high : (real)INFINITY;
     lower[STEWART_RATE(n)] = free_rate ? -LARGEST_RATE : -(real)INFINITY;
     upper[STEWART_RATE(n)] = free_rate ? LARGEST_RATE : (real)INFINITY;
     const stewart_kalman filter = {
         n, m, std > d->period / 100 ? MAX_ITERATIONS : MAX_ITERATIONS_KNOWN, a->mean, L, lower, upper, a,
-        whitened_rows, stewart_instant_step, 0, NULL, NULL};
+        whitened_rows, stewart_measurement_relinearize, 0, NULL, NULL};
     if (!stewart_kalman_update(&filter, xi, root, &distance, &log_ratio, scratch))
         return 0;
     if (!(distance <= d->filter.gate)) /* or NaN */
@@ -424,71 +425,69 @@ static int correct(Model *a, const stewart_guess *guess, const real *L, real std
         log_ratio += 2 * REAL(log)(C[(m + 1) * i]);
     after->log_likelihood = -(distance + log_ratio) / 2;
     after->outliers = 0;
-    after->squares += distance;
-    after->values += (real)m;
-    after->heard += guess->numbers[STEWART_ETA(n)] < STEWART_NEVER;
-    if (is_precise(d, guess, n, std)) {
-        const int judged = judge_timing(a, L, used, after, scratch);
-        if (!judged)
+    after->chi2 += distance;
+    after->chi2_values += (real)m;
+    after->measurements += hypothesis->numbers[STEWART_ETA(n)] < STEWART_NEVER;
+    if (is_precise(d, hypothesis, n, std)) {
+        const int result = update_timing(a, L, used, after, scratch);
+        if (!result)
             return 0;
-        after->outliers = judged == 2 ? guess->outliers + 1 : 0;
+        after->outliers = result == 2 ? hypothesis->outliers + 1 : 0;
     }
     return 1;
 }
 
 /* Compute `after`, one period after a hypothesis, with L (n, n) in place of its root. The variance of the
    timing is at least `least` (s^2); y may be NULL. Returns 0 if y does not fit. */
-static int attempt(Model *a, const stewart_guess *guess, const real *L, const real *y, real least,
-                   stewart_guess *after, stewart_scratch scratch)
+static int attempt(Model *a, const stewart_hypothesis *hypothesis, const real *L, const real *y, real least,
+                   stewart_hypothesis *after, stewart_scratch scratch)
 {
     const stewart_delay *d = a->period->delay;
     const int n = a->n;
-    const real dt = d->period, std = stewart_norm(n, L + n * STEWART_ETA(n)), timing = timing_of(d, guess);
+    const real dt = d->period, std = stewart_norm(n, L + n * STEWART_ETA(n)), timing = timing_of(d, hypothesis);
     const real used = timing > least ? timing : least;
     real *xi = stewart_take(&scratch, n), *root = stewart_take(&scratch, n * n);
     real *eta = root + n * STEWART_ETA(n), *rate = root + n * STEWART_RATE(n);
     real walk[STEWART_MAX_ESTIMATED + 2] = {0};
-    a->instant.values = y;
-    stewart_copy(n, guess->numbers, xi);
-    stewart_copy(X, a->first, a->instant.state);
-    stewart_copy(X * n, a->first + X, a->instant.H);
+    a->measurement.values = y;
+    stewart_copy(n, hypothesis->numbers, xi);
+    stewart_copy(X, a->at_prior, a->measurement.state);
+    stewart_copy(X * n, a->at_prior + X, a->measurement.H);
     if (!set_noise(a, xi, used, scratch))
         return 0;
-    for (int i = 0; i < STEWART_GUESS; i++)
-        ((real *)after)[i] = ((const real *)guess)[i];
+    for (int i = 0; i < STEWART_HYPOTHESIS; i++)
+        ((real *)after)[i] = ((const real *)hypothesis)[i];
     after->log_likelihood = 0;
     after->fits = 1;
     if (!y)
         stewart_copy(n * n, L, root);
-    else if (!correct(a, guess, L, std, used, xi, root, after, scratch))
+    else if (!correct(a, hypothesis, L, std, used, xi, root, after, scratch))
         return 0;
-    /* The mean delay cannot be known better than the timing of the torques that it is the mean of: a
-       larger variance of the timing adds to that of eta. */
-    real less_sure = 0;
-    if (after->heard > 0)
-        less_sure = (timing_of(d, after) - timing) / after->heard;
-    if (!(less_sure > 0))
-        less_sure = 0;
+    /* eta is the mean over torques, whose timing bounds its accuracy: a growing variance of the timing adds
+       to that of eta. */
+    real added = 0;
+    if (after->measurements > 0)
+        added = REAL(fmax)(0, (timing_of(d, after) - timing) / after->measurements);
     stewart_copy(n - X - 2, d->filter.walk_std, walk);
-    if (guess->numbers[STEWART_ETA(n)] < STEWART_NEVER) {
-        walk[STEWART_ETA(n) - X] = REAL(sqrt)(less_sure + d->walk * d->walk * dt);
+    if (hypothesis->numbers[STEWART_ETA(n)] < STEWART_NEVER) {
+        walk[STEWART_ETA(n) - X] = REAL(sqrt)(added + d->walk * d->walk * dt);
         walk[STEWART_RATE(n) - X] = d->rate_walk * REAL(sqrt)(dt);
     }
-    /* The rate moves eta first, and H is that by the eta before. */
+    /* The rate changes eta first, and H is the derivative by the eta before. */
     for (int j = 0; j < n; j++)
         eta[j] += dt * rate[j];
     for (int i = 0; i < X; i++)
-        a->instant.H[n * i + STEWART_RATE(n)] -= dt * a->instant.H[n * i + STEWART_ETA(n)];
-    stewart_root_of_prediction(n, a->instant.H, a->drift, walk, a->rows, a->K, root, scratch);
-    stewart_guess_keep_root(n, root, after);
-    stewart_copy(X, a->instant.state, after->numbers);
+        a->measurement.H[n * i + STEWART_RATE(n)] -= dt * a->measurement.H[n * i + STEWART_ETA(n)];
+    stewart_root_of_prediction(n, a->measurement.H, a->drift, walk, a->rows, a->K, root, scratch);
+    stewart_hypothesis_set_root(n, root, after);
+    stewart_copy(X, a->measurement.state, after->numbers);
     stewart_copy(n - X, xi + X, after->numbers + X);
     after->numbers[STEWART_ETA(n)] += dt * xi[STEWART_RATE(n)];
     return stewart_all_finite(n + n * (n + 1) / 2, after->numbers);
 }
 
-/* L <- root of the covariance with std^2 added to the variance of eta, which may have stepped. Only the
-   last two rows change. */
+/* L <- root of the covariance with std^2 added to the variance of eta, which may have changed. Only the
+   last two rows of L change. */
 static void widen_delay(int n, real std, real *L)
 {
     real *eta = L + n * STEWART_ETA(n) + STEWART_ETA(n), *rate = L + n * STEWART_RATE(n) + STEWART_ETA(n);
@@ -500,74 +499,74 @@ static void widen_delay(int n, real std, real *L)
     rate[1] = REAL(hypot)(rate[1], along * std / *eta);
 }
 
-/* Compute `after` with a measurement that a jump of parameters explains. The delay may have jumped
-   instead, which further misfits will show. Returns 0 if none does; L is restored. */
-static int jumped(Model *a, const stewart_guess *guess, real *L, const real *y, stewart_guess *after,
+/* Compute `after` with a measurement that a jump of parameters explains. Further outliers would show that
+   the delay has jumped instead. Returns 0 if no jump explains it; L is restored. */
+static int jumped(Model *a, const stewart_hypothesis *hypothesis, real *L, const real *y, stewart_hypothesis *after,
                   stewart_scratch scratch)
 {
     const stewart_delay *d = a->period->delay;
     const int n = a->n, p = n - X - 2;
     real jump[STEWART_MAX_ESTIMATED + 2];
-    for (real share = 1; share <= STEWART_MAX_JUMP; share *= 10) {
+    for (real factor = 1; factor <= STEWART_MAX_JUMP; factor *= 10) {
         for (int i = 0; i < n - X; i++)
-            jump[i] = i < p ? share * d->filter.jump_std[i] : 0;
+            jump[i] = i < p ? factor * d->filter.jump_std[i] : 0;
         stewart_widen_root(n, jump, L, scratch);
-        const int fits = attempt(a, guess, L, y, 0, after, scratch);
-        stewart_guess_root(guess, n, L);
+        const int fits = attempt(a, hypothesis, L, y, 0, after, scratch);
+        stewart_hypothesis_root(hypothesis, n, L);
         if (fits) {
-            after->outliers = guess->outliers + 1;
+            after->outliers = hypothesis->outliers + 1;
             return 1;
         }
     }
     return 0;
 }
 
-void stewart_delay_advance(const stewart_period *t, const stewart_guess *guess, const real *y,
-                           stewart_guess *after, stewart_scratch scratch)
+void stewart_delay_advance(const stewart_period *t, const stewart_hypothesis *hypothesis, const real *y,
+                           stewart_hypothesis *after, stewart_scratch scratch)
 {
     const stewart_delay *d = t->delay;
     const int n = size_of(d), p = n - X - 2, m = d->filter.sensing->size;
-    Model a = {.period = t, .mean = guess->numbers, .m = m, .n = n};
+    Model a = {.period = t, .mean = hypothesis->numbers, .m = m, .n = n};
     real *L = stewart_take(&scratch, n * n);
     a.path = take_path(t, &scratch);
-    a.first = stewart_take(&scratch, X + X * n);
-    a.seen = stewart_take(&scratch, m * MOST);
+    a.at_prior = stewart_take(&scratch, X + X * n);
+    a.late_effects = stewart_take(&scratch, m * MOST);
     a.white = stewart_take(&scratch, m * n);
     a.nu = stewart_take(&scratch, m);
-    a.instant = (stewart_instant){.sensing = d->filter.sensing, .n = n, .period = &a,
+    a.measurement = (stewart_measurement){.sensing = d->filter.sensing, .n = n, .context = &a,
                                   .predict = predict_model, .linearize = linearize_model};
-    a.instant.state = stewart_take(&scratch, X);
-    a.instant.H = stewart_take(&scratch, X * n);
-    a.instant.C = stewart_take(&scratch, m * m);
-    a.instant.J = stewart_take(&scratch, m * X);
-    stewart_guess_root(guess, n, L);
+    a.measurement.state = stewart_take(&scratch, X);
+    a.measurement.H = stewart_take(&scratch, X * n);
+    a.measurement.C = stewart_take(&scratch, m * m);
+    a.measurement.J = stewart_take(&scratch, m * X);
+    stewart_hypothesis_root(hypothesis, n, L);
     for (int i = 0; i < p; i++)
         if (!(d->filter.walk_std[i] > 0)
-            && !(stewart_norm(n, L + n * (X + i)) <= KNOWN_SHARE * d->filter.usual_std[i])) /* or NaN */
+            && !(stewart_norm(n, L + n * (X + i)) <= KNOWN_PART * d->filter.usual_std[i])) /* or NaN */
             a.fourth_order = 1;
     const int exists =
-        stewart_period_at(t, guess->numbers, a.fourth_order, a.first, a.first + X, scratch);
+        stewart_period_at(t, hypothesis->numbers, a.fourth_order, a.at_prior, a.at_prior + X, scratch);
     if (y && exists) {
-        if (attempt(&a, guess, L, y, 0, after, scratch))
+        if (attempt(&a, hypothesis, L, y, 0, after, scratch))
             return;
-        if (is_precise(d, guess, n, stewart_guess_std(guess, n))) {
+        if (is_precise(d, hypothesis, n, stewart_hypothesis_std(hypothesis, n))) {
             const real most = MAX_TIMING_STD * d->period;
             widen_delay(n, STEP_STD * d->period, L);
-            if (attempt(&a, guess, L, y, most * most, after, scratch)) {
-                after->outliers = guess->outliers + 1; /* one more of these may be a jump */
+            if (attempt(&a, hypothesis, L, y, most * most, after, scratch)) {
+                after->outliers = hypothesis->outliers + 1; /* another one may be a jump of the delay */
                 return;
             }
-            stewart_guess_root(guess, n, L);
+            stewart_hypothesis_root(hypothesis, n, L);
         }
-        if (d->filter.jump_std && guess->heard >= HEARD_BEFORE_JUMP && guess->outliers == 0
-            && jumped(&a, guess, L, y, after, scratch))
+        if (d->filter.jump_std && hypothesis->measurements >= MEASURED_BEFORE_JUMP && hypothesis->outliers == 0
+            && jumped(&a, hypothesis, L, y, after, scratch))
             return;
     }
-    if (!exists || !attempt(&a, guess, L, NULL, 0, after, scratch)) /* the hypothesis has failed */
-        stewart_copy(stewart_guess_size(p), (const real *)guess, (real *)after);
+    if (!exists || !attempt(&a, hypothesis, L, NULL, 0, after, scratch)) /* the hypothesis has failed */
+        stewart_copy(stewart_hypothesis_size(p), (const real *)hypothesis, (real *)after);
     if (y) {
         after->fits = 0;
-        after->outliers = guess->outliers + 1;
+        after->outliers = hypothesis->outliers + 1;
         after->log_likelihood = UNLIKELY;
     }
 }

@@ -1,4 +1,5 @@
-/* State, parameters and an unknown delay: the filter of one hypothesis, and the search among them. */
+/* Estimation of state, parameters and an unknown delay: the filter of one hypothesis of the delay, and the
+   search among hypotheses. */
 
 #pragma once
 
@@ -8,7 +9,7 @@
 #define STEWART_NEVER 1000000 /* s; the delay of torques that do not arrive */
 
 enum {
-    STEWART_GUESS = 11,        /* numbers of a hypothesis without its mean and root */
+    STEWART_HYPOTHESIS = 11,    /* numbers of a hypothesis without its mean and root */
     STEWART_DELAY_NUMBERS = 16, /* numbers of the memory without its arrays */
     STEWART_MAX_SCHEDULE = 8,  /* torques that act in a period, at a rate of the delay within bounds */
 };
@@ -19,50 +20,50 @@ enum {
 
 /* Assumptions about the state, the parameters theta (p) and the delay. */
 typedef struct {
-    stewart_filter filter;           /* of state and theta; `timing_std` is that of the first torques */
+    stewart_filter filter;           /* of state and theta; its `timing_std` is the initial one */
     const real *prior, *std;         /* (p) mean and standard deviation of theta */
     real period;                     /* dt, s */
-    real believed, delay_std;        /* s, mean and standard deviation of the delay's prior */
-    real longest;                    /* s */
+    real delay_mean, delay_std;      /* s, prior of the delay */
+    real longest;                    /* s, largest delay */
     real timing_std;                 /* s, least standard deviation of the timing of torques */
     real walk;                       /* s per root s, change of the delay */
     real rate_std, rate_walk;        /* s/s, and s/s per root s; 0 for a delay without a rate */
-    int quiet;                       /* whether nothing is fed back before the delay is found */
+    int open_loop_start;             /* whether nothing is fed back before the delay is found */
 } stewart_delay;
 
 /* A hypothesis of the delay with its filter, in one flat vector. */
 typedef struct {
-    real low, high;      /* s, between which eta is */
+    real low, high;      /* s, bounds of eta */
     real log_likelihood; /* of the last measurement */
     real fits;           /* whether the last measurement was not an outlier */
     real outliers;       /* consecutive ones, also those that a torque's timing or a jump explains */
     real timing;         /* s^2, variance of the timing of single torques */
     real torques;        /* number of torques in that estimate */
-    real heard;          /* number of measurements since an own torque has arrived */
+    real measurements;   /* number of measurements since an own torque has arrived */
     real weight;         /* log of the probability, relative to the best hypothesis */
-    real squares;        /* sum of nu' S^-1 nu of the measurements that were used */
-    real values;         /* number of values in them */
+    real chi2;           /* sum of nu' S^-1 nu of the measurements that were used */
+    real chi2_values;    /* number of values in them */
     real numbers[];      /* mean of xi = [x; theta; eta; eta_dot] (n), then the lower triangle of the
                             root of its covariance, by rows; its last two rows are 0, and eta is
-                            NEVER, where nothing has arrived */
-} stewart_guess;
+                            STEWART_NEVER, where no own torque has arrived */
+} stewart_hypothesis;
 
-int stewart_guess_size(int p);
+int stewart_hypothesis_size(int p);
 
-/* The root of its covariance, lower triangular (n, n), and back; the standard deviation of eta. */
-void stewart_guess_root(const stewart_guess *guess, int n, real *L);
-void stewart_guess_keep_root(int n, const real *L, stewart_guess *guess);
-real stewart_guess_std(const stewart_guess *guess, int n);
+/* Unpack and pack the lower triangular root (n, n) of the covariance; return the standard deviation of eta. */
+void stewart_hypothesis_root(const stewart_hypothesis *hypothesis, int n, real *L);
+void stewart_hypothesis_set_root(int n, const real *L, stewart_hypothesis *hypothesis);
+real stewart_hypothesis_std(const stewart_hypothesis *hypothesis, int n);
 
 /* One period as a function of xi. */
 typedef struct {
     const stewart_delay *delay;
-    stewart_arrivals view; /* at its beginning; eta and rate are replaced by those of xi */
-    int flights, newest;   /* see stewart_torque_schedule */
-    const real *in_flight; /* (flights, 6) */
+    stewart_arrivals view;     /* at its beginning; eta and rate are replaced by those of xi */
+    int num_in_flight, newest; /* see stewart_torque_schedule */
+    const real *in_flight;     /* (num_in_flight, 6) */
 } stewart_period;
 
-int stewart_period_scratch(int p, int flights); /* of each of these */
+int stewart_period_scratch(int p, int num_in_flight); /* of each function of a period */
 
 /* Compute the state at the end. Returns 0 for too many torques. */
 int stewart_period_end(const stewart_period *period, const real *xi, real *state,
@@ -73,53 +74,53 @@ int stewart_period_end(const stewart_period *period, const real *xi, real *state
 int stewart_period_at(const stewart_period *period, const real *xi, int fourth_order, real *state,
                       real *H, stewart_scratch scratch);
 
-/* Compute rows K (k, 12): changes of the state at the end if a single torque is early or late by one
+/* Compute rows K (k, 12): changes of the state at the end if the timing of a single torque is off by one
    standard deviation. The first `others` rows are of torques before the controller's own. The rest are of
    own torques, with the standard deviation `std` in s. K'K is the covariance. Returns k, at most
    STEWART_MAX_SCHEDULE, or -1 for too many torques. */
 int stewart_period_late(const stewart_period *period, const real *xi, const real *state, real std,
                         real *K, int *others, stewart_scratch scratch);
 
-/* Advance a hypothesis by a period, and correct it by a measurement y (m) at its end, if not NULL. */
-void stewart_delay_advance(const stewart_period *period, const stewart_guess *guess, const real *y,
-                           stewart_guess *after, stewart_scratch scratch);
+/* Advance a hypothesis by a period, and correct it by a measurement y (m) at its end unless NULL. */
+void stewart_delay_advance(const stewart_period *period, const stewart_hypothesis *hypothesis, const real *y,
+                           stewart_hypothesis *after, stewart_scratch scratch);
 
-int stewart_delay_advance_scratch(int p, int m, int flights);
+int stewart_delay_advance_scratch(int p, int m, int num_in_flight);
 
-/* The belief, in one flat vector. */
+/* Memory of the search, in one flat vector. */
 typedef struct {
-    real eta, rate, sent;        /* the delay to use, s and s/s, see stewart_arrivals */
+    real eta, rate, num_own;     /* of the `stewart_arrivals` that the law uses; num_own -1 before the first
+                                    sample */
     real known;                  /* whether there has been a measurement */
     real searching;              /* whether there are several hypotheses */
-    real cells;                  /* number of hypotheses in which a torque has arrived */
-    real best;                   /* place of the most probable one */
+    real cells;                  /* number of hypotheses in which an own torque has arrived */
+    real best;                   /* place of the most probable hypothesis */
     real rejected;               /* whether the last measurement was an outlier */
-    real found;                  /* whether the delay has just been found, or is another than before */
-    real fresh;                  /* whether that was at this sample, and took so long that planning waits
-                                    for the next one */
-    real silent;                 /* whether nothing is fed back until the delay is found */
+    real found;                  /* whether the delay was found at this sample, or at the last one if deferred */
+    real deferred;               /* whether it was found at this sample with no time left for a plan: it counts
+                                    as settled at the next one */
+    real open_loop;              /* whether nothing is fed back until the delay is found */
     real feeds_back;             /* whether the estimate is good enough for feedback */
     real caution;                /* factor on the weight of torques */
     real settled;                /* whether the delay is known */
     real mean, std;              /* s, of the delay; NaN before the first measurement */
-    real numbers[];              /* torques that act until an own one arrives (flights - 1 or 1, 6), the
-                                    last two measurements (2, m), then hypotheses: first the master,
-                                    or the only one */
+    real numbers[];              /* torques that act until an own one arrives (num_in_flight - 1 or 1, 6),
+                                    the last two measurements (2, m), then the hypotheses */
 } stewart_delay_memory;
 
 /* Numbers of the memory for p parameters, m values and a number of torques in flight at a sample. */
-int stewart_delay_size(int p, int m, int flights);
+int stewart_delay_size(int p, int m, int num_in_flight);
 
-int stewart_delay_scratch(int p, int m, int flights);
+int stewart_delay_scratch(int p, int m, int num_in_flight);
 
-/* The hypothesis at a place: 0 is the master or the only one, 1 to `cells` are cells. */
-stewart_guess *stewart_delay_guess(int p, int m, int flights, stewart_delay_memory *memory,
+/* Return the hypothesis at a place: 0 is the master (delay_search.c) or the only one, 1 to `cells` are cells. */
+stewart_hypothesis *stewart_delay_hypothesis(int p, int m, int num_in_flight, stewart_delay_memory *memory,
                                    int place);
 
-void stewart_delay_start(const stewart_delay *delay, int flights, stewart_delay_memory *memory);
+void stewart_delay_start(const stewart_delay *delay, int num_in_flight, stewart_delay_memory *memory);
 
-/* Advance by a period, and correct by a measurement y (m) at its end, if not NULL. `in_flight` (flights,
-   6) are the torques sent before this sample; `near` (12) is the expected state. */
-void stewart_delay_observe(const stewart_delay *delay, int flights, const real *in_flight,
+/* Advance by a period, and correct by a measurement y (m) at its end unless NULL. `in_flight`
+   (num_in_flight, 6) are the torques sent before this sample; `near` (12) is the expected state. */
+void stewart_delay_observe(const stewart_delay *delay, int num_in_flight, const real *in_flight,
                            const real *y, const real *near, stewart_delay_memory *memory,
                            stewart_scratch scratch);

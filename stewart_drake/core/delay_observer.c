@@ -9,7 +9,7 @@
 typedef struct {
     stewart_delay delay; /* with machine and sensing */
     stewart_sensing sensing;
-    int p, m, flights, numbers; /* parameters, values, torques in flight, numbers of the belief */
+    int p, m, num_in_flight, numbers; /* parameters, values, torques in flight, numbers of the belief */
 } Sizes;
 
 static void sizes_of(const stewart_law *law, Sizes *s)
@@ -20,8 +20,8 @@ static void sizes_of(const stewart_law *law, Sizes *s)
     s->delay.filter.sensing = &s->sensing;
     s->p = law->machine.estimated;
     s->m = s->sensing.size;
-    s->flights = 1 + law->kept + stewart_queue_length(law);
-    s->numbers = stewart_delay_size(s->p, s->m, s->flights);
+    s->num_in_flight = 1 + law->extra_torques + stewart_queue_length(law);
+    s->numbers = stewart_delay_size(s->p, s->m, s->num_in_flight);
 }
 
 static int delayed_memory(const stewart_law *law)
@@ -35,7 +35,7 @@ static int delayed_scratch(const stewart_law *law)
 {
     Sizes s;
     sizes_of(law, &s);
-    return stewart_delay_scratch(s.p, s.m, s.flights) + s.m;
+    return stewart_delay_scratch(s.p, s.m, s.num_in_flight) + s.m;
 }
 
 /* Arrivals as estimated at the last sample. */
@@ -44,8 +44,8 @@ static stewart_arrivals arrivals_of(const stewart_law *law, const real *memory)
     const stewart_delay_memory *m = (const stewart_delay_memory *)(memory + X);
     Sizes s;
     sizes_of(law, &s);
-    return (stewart_arrivals){law->period, m->eta, m->rate, m->sent > 0 ? (int)m->sent : 0,
-                              s.flights > 1 ? s.flights - 1 : 1, m->numbers};
+    return (stewart_arrivals){law->period, m->eta, m->rate, m->num_own > 0 ? (int)m->num_own : 0,
+                              s.num_in_flight > 1 ? s.num_in_flight - 1 : 1, m->numbers};
 }
 
 static void delayed_start(const stewart_law *law, real *memory)
@@ -53,7 +53,7 @@ static void delayed_start(const stewart_law *law, real *memory)
     Sizes s;
     sizes_of(law, &s);
     stewart_fill(s.numbers + s.m + X, (real)NAN, memory);
-    stewart_delay_start(&s.delay, s.flights, (stewart_delay_memory *)(memory + X));
+    stewart_delay_start(&s.delay, s.num_in_flight, (stewart_delay_memory *)(memory + X));
 }
 
 /* Mean of the most probable hypothesis, followed by the root; NULL before the first measurement. */
@@ -62,7 +62,7 @@ static const real *best_of(const Sizes *s, const real *memory)
     stewart_delay_memory *m = (stewart_delay_memory *)(uintptr_t)(memory + X);
     if (!(m->known > 0))
         return NULL;
-    return stewart_delay_guess(s->p, s->m, s->flights, m, (int)m->best)->numbers;
+    return stewart_delay_hypothesis(s->p, s->m, s->num_in_flight, m, (int)m->best)->numbers;
 }
 
 static int delayed_observe(const stewart_law *law, real *memory, int number, const real *torques,
@@ -71,19 +71,19 @@ static int delayed_observe(const stewart_law *law, real *memory, int number, con
     Sizes s;
     sizes_of(law, &s);
     real *state = memory, *last = memory + X + s.numbers;
-    stewart_delay_memory *believed = (stewart_delay_memory *)(memory + X);
-    values += law->measured - s.m;
+    stewart_delay_memory *delay = (stewart_delay_memory *)(memory + X);
+    values += law->num_values - s.m;
     int fault = s.sensing.fault(&s.sensing, law->machine.geometry, law->period, values, last);
     if (!fault && !stewart_all_finite(s.m, values))
         fault = STEWART_MISSING;
     for (int i = 0; i < s.m; i++)
         if (isfinite(values[i]))
             last[i] = values[i];
-    stewart_delay_observe(&s.delay, number, torques, fault ? NULL : values, state, believed, scratch);
+    stewart_delay_observe(&s.delay, number, torques, fault ? NULL : values, state, delay, scratch);
     const real *best = best_of(&s, memory);
     if (best)
         stewart_copy(X, best, state);
-    return believed->rejected > 0 ? STEWART_MEASUREMENT_REJECTED : fault << STEWART_CAUSES_AT;
+    return delay->rejected > 0 ? STEWART_MEASUREMENT_REJECTED : fault << STEWART_CAUSES_AT;
 }
 
 static void delayed_parameters(const stewart_law *law, const real *memory, real *theta, real *std)
@@ -105,7 +105,8 @@ static real delayed_uncertainty(const stewart_law *law, const real *memory, real
     sizes_of(law, &s);
     const int n = X + s.p;
     stewart_delay_memory *m = (stewart_delay_memory *)(uintptr_t)(memory + X);
-    const stewart_guess *best = stewart_delay_guess(s.p, s.m, s.flights, m, m->known > 0 ? (int)m->best : 0);
+    const int place = m->known > 0 ? (int)m->best : 0;
+    const stewart_hypothesis *best = stewart_delay_hypothesis(s.p, s.m, s.num_in_flight, m, place);
     const real *row = best->numbers + n + 2; /* lower triangle, by rows; the last two are of the delay */
     for (int i = 0; L && i < n; row += ++i) {
         stewart_fill(n, m->known > 0 ? 0 : (real)NAN, L + n * i);

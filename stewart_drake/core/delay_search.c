@@ -1,87 +1,87 @@
-/* State, parameters and an unknown delay: a Gaussian sum over its arrival, see delay.h.
+/* Search for an unknown delay by a Gaussian sum over the first arrival, see delay.h.
 
-   The *master* filter assumes that no torque of the controller has arrived. At t_k a *cell* is copied
+   The *master* hypothesis assumes that no torque of the controller has arrived. At t_k a *cell* is copied
    from it, as it was at t_{k-1}, for a first arrival in between: eta uniform in (t_{k-1}, t_k]. With Phi
-   the distribution of the prior,
+   the distribution of the prior, the part
 
        p = [Phi(t_k) - Phi(t_{k-1})] / [1 - Phi(t_{k-1})]
 
-   of the master's weight goes to the cell, 1 - p stays. Each measurement multiplies all weights by its
-   likelihood. The search ends with a cell as the only filter when its delay is known to NEAR, and every
-   hypothesis farther than NEAR from it has less than e^-LEAD of its weight.
+   of the master's weight goes to the cell. Each measurement multiplies all weights by its likelihood. The
+   search ends with a cell as the only hypothesis when the standard deviation of its delay is below NEAR,
+   and every hypothesis farther than NEAR from it has less than e^-LEAD of its weight.
 
    Two outliers in a row may be a jump of the delay. State and parameters are known by then, so the last
-   measurements are compared with the prediction for every delay of a grid. Filters start from the best
-   few; the best of them takes over if no other explains the measurements about as well. */
+   measurements are compared with the prediction for every delay of a grid. Hypotheses start from the best
+   few; the best of them is accepted if no other explains the measurements about as well. */
 
 #include "delay.h"
 #include "short.h"
 
 #define LEAD 7       /* log of the odds that ends the search */
 #define FORGOTTEN 14 /* log of the odds that drops a cell */
-#define YOUNG 3      /* measurements for which a cell is kept: until then a bias may look like another arrival */
+#define YOUNG 3      /* measurements before which no cell is dropped: a bias may look like another arrival */
 #define NEAR ((real)0.2) /* periods; nearer delays are one hypothesis */
-#define LEAST_SHARE ((real)1e-4) /* least part of the master's weight for a new cell, and for the master */
+#define LEAST_PROBABILITY ((real)1e-4) /* of a new cell, and of the master then */
 #define SUSPICIOUS 2 /* outliers in a row that start the search for a jump */
 #define PATIENCE 3   /* outliers in a row after which the filter restarts */
 #define GRID ((real)0.5) /* periods between the delays of the grid after a jump */
-#define BEST 2       /* filters that are started from the grid */
-#define HOPELESS 100 /* largest squared distance of a second one, besides ten times the least */
-#define SETTLED 5    /* log of the odds at which one of two takes over */
-#define AT_ONCE 2    /* largest number of cells with which there is time to plan at the same sample */
+#define STARTS 2     /* hypotheses that start from the grid */
+#define HOPELESS 100 /* squared distance up to which a second one starts, besides ten times the least one */
+#define ACCEPTED 5   /* log of the odds at which one of two is accepted */
+#define MOST_TO_PLAN 2 /* largest number of cells that leaves time for a plan at the same sample */
 #define CAUTION 10   /* factor on the weight of torques during the search */
-#define LOOSENED ((real)0.05) /* standard deviation added to parameters at a restart, share of the prior's */
+#define LOOSENED ((real)0.05) /* deviation added to parameters at a restart, over that of the prior */
 #define LOOSENED_BY_JUMP ((real)0.01) /* the same at a jump of the delay */
-#define TORQUES 1 /* prior weight of `first_timing`, in torques. Without it the first late torques
-                     would be outliers, and the next ones would change payload and bias. */
+#define FIRST_TORQUES 1 /* number of torques in the initial estimate of the timing. Without it the first late
+                           torques would be outliers, and the next ones would change payload and bias. */
 #define SQRT_12 ((real)3.4641016151377546)
 #define SQRT_2_PI ((real)2.5066282746310005)
 
 /* The memory during one sample. */
 typedef struct {
     const stewart_delay *delay;
-    int n, m, flights;
+    int n, m, num_in_flight;
     stewart_period since; /* the period before this sample */
     stewart_delay_memory *memory;
     real *before, *past;
 } Search;
 
-static int periods_before(int flights) { return flights > 1 ? flights - 1 : 1; }
+static int periods_before(int num_in_flight) { return num_in_flight > 1 ? num_in_flight - 1 : 1; }
 
-int stewart_delay_size(int p, int m, int flights)
+int stewart_delay_size(int p, int m, int num_in_flight)
 {
-    return STEWART_DELAY_NUMBERS + U * periods_before(flights) + 2 * m
-        + (flights + 1) * stewart_guess_size(p);
+    return STEWART_DELAY_NUMBERS + U * periods_before(num_in_flight) + 2 * m
+        + (num_in_flight + 1) * stewart_hypothesis_size(p);
 }
 
-int stewart_delay_scratch(int p, int m, int flights)
+int stewart_delay_scratch(int p, int m, int num_in_flight)
 {
-    const int n = X + p + 2, advance = stewart_delay_advance_scratch(p, m, flights);
+    const int n = X + p + 2, advance = stewart_delay_advance_scratch(p, m, num_in_flight);
     const int compared = n * n + (2 * X + 1 + m) * n + 2 * X * X + (m + 1 + X) * m
-        + stewart_period_scratch(p, flights);
+        + stewart_period_scratch(p, num_in_flight);
     const int more = advance > 3 * n * n ? advance : 3 * n * n; /* a new start */
-    return (BEST + 1) * stewart_guess_size(p) + (2 + U) * flights + U
+    return (STARTS + 1) * stewart_hypothesis_size(p) + (2 + U) * num_in_flight + U
         + (more > compared ? more : compared);
 }
 
-stewart_guess *stewart_delay_guess(int p, int m, int flights, stewart_delay_memory *memory,
+stewart_hypothesis *stewart_delay_hypothesis(int p, int m, int num_in_flight, stewart_delay_memory *memory,
                                    int place)
 {
-    real *first = memory->numbers + U * periods_before(flights) + 2 * m;
-    return (stewart_guess *)(first + place * stewart_guess_size(p));
+    real *first = memory->numbers + U * periods_before(num_in_flight) + 2 * m;
+    return (stewart_hypothesis *)(first + place * stewart_hypothesis_size(p));
 }
 
-static stewart_guess *guess_at(const Search *s, int place)
+static stewart_hypothesis *hypothesis_at(const Search *s, int place)
 {
-    return stewart_delay_guess(s->n - X - 2, s->m, s->flights, s->memory, place);
+    return stewart_delay_hypothesis(s->n - X - 2, s->m, s->num_in_flight, s->memory, place);
 }
 
-static void copy_guess(int n, const stewart_guess *from, stewart_guess *to)
+static void copy_hypothesis(int n, const stewart_hypothesis *from, stewart_hypothesis *to)
 {
-    stewart_copy(stewart_guess_size(n - X - 2), (const real *)from, (real *)to);
+    stewart_copy(stewart_hypothesis_size(n - X - 2), (const real *)from, (real *)to);
 }
 
-static real distance_of(int n, const stewart_guess *a, const stewart_guess *b)
+static real distance_of(int n, const stewart_hypothesis *a, const stewart_hypothesis *b)
 {
     return REAL(fabs)(a->numbers[STEWART_ETA(n)] - b->numbers[STEWART_ETA(n)]);
 }
@@ -101,21 +101,21 @@ static real density(real x) { return REAL(exp)(-x * x / 2) / SQRT_2_PI; }
 /* Prior probability of a delay longer than t, up to the longest. */
 static real left_of_prior(const stewart_delay *d, real t)
 {
-    const real left = probability((t - d->believed) / d->delay_std,
-                                  (d->longest - d->believed) / d->delay_std);
+    const real left = probability((t - d->delay_mean) / d->delay_std,
+                                  (d->longest - d->delay_mean) / d->delay_std);
     return left > 0 ? left : 0;
 }
 
 /* Mean and standard deviation of the prior between t and the longest delay. With a and b the bounds
    in standard deviations, Z the probability between them, phi the density,
 
-       mean = believed + std r,   variance = std^2 (1 + (a phi(a) - b phi(b)) / Z - r^2),
+       mean = delay_mean + delay_std r,   variance = delay_std^2 (1 + (a phi(a) - b phi(b)) / Z - r^2),
        r = (phi(a) - phi(b)) / Z. */
 static void rest_of_prior(const stewart_delay *d, real t, real *mean, real *std)
 {
     const real from = t < d->longest ? t : d->longest;
-    const real a = (from - d->believed) / d->delay_std;
-    const real b = (d->longest - d->believed) / d->delay_std, Z = probability(a, b);
+    const real a = (from - d->delay_mean) / d->delay_std;
+    const real b = (d->longest - d->delay_mean) / d->delay_std, Z = probability(a, b);
     if (Z < (real)1e-12) {
         *mean = (from + d->longest) / 2;
         *std = (d->longest - from) / SQRT_12;
@@ -123,7 +123,7 @@ static void rest_of_prior(const stewart_delay *d, real t, real *mean, real *std)
     }
     const real r = (density(a) - density(b)) / Z;
     const real variance = 1 + (a * density(a) - b * density(b)) / Z - r * r;
-    *mean = d->believed + d->delay_std * r;
+    *mean = d->delay_mean + d->delay_std * r;
     *std = d->delay_std * REAL(sqrt)(variance > 0 ? variance : 0);
 }
 
@@ -134,25 +134,25 @@ static void spawn(Search *s, int k, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
     const int n = s->n;
-    stewart_guess *master = guess_at(s, 0), *cell;
+    stewart_hypothesis *master = hypothesis_at(s, 0), *cell;
     const real low = (real)(k - 1) * d->period, high = (real)k * d->period;
     const real left = left_of_prior(d, low);
-    real share = left > 0 ? 1 - left_of_prior(d, high) / left : 1;
+    real p = left > 0 ? 1 - left_of_prior(d, high) / left : 1;
     real *L = stewart_take(&scratch, n * n);
-    share = share < LEAST_SHARE ? LEAST_SHARE : share < 1 - LEAST_SHARE ? share : 1 - LEAST_SHARE;
+    p = p < LEAST_PROBABILITY ? LEAST_PROBABILITY : p < 1 - LEAST_PROBABILITY ? p : 1 - LEAST_PROBABILITY;
     s->memory->cells += 1;
-    cell = guess_at(s, (int)s->memory->cells);
-    copy_guess(n, master, cell);
+    cell = hypothesis_at(s, (int)s->memory->cells);
+    copy_hypothesis(n, master, cell);
     cell->low = low;
     cell->high = high;
-    cell->weight += REAL(log)(share);
-    master->weight += REAL(log1p)(-share);
+    cell->weight += REAL(log)(p);
+    master->weight += REAL(log1p)(-p);
     cell->numbers[STEWART_ETA(n)] = (low + high) / 2;
     cell->numbers[STEWART_RATE(n)] = 0;
-    stewart_guess_root(cell, n, L); /* its last two rows are 0 */
+    stewart_hypothesis_root(cell, n, L); /* its last two rows are 0 */
     L[(n + 1) * STEWART_ETA(n)] = d->period / SQRT_12;
     L[(n + 1) * STEWART_RATE(n)] = d->rate_std;
-    stewart_guess_keep_root(n, L, cell);
+    stewart_hypothesis_set_root(n, L, cell);
 }
 
 /* Compute the state (12) from one measurement, and the lower triangular root (12, 12) of its covariance. */
@@ -174,15 +174,15 @@ static void begin(Search *s, const real *y, const real *near, stewart_scratch sc
 {
     const stewart_delay *d = s->delay;
     const int n = s->n, p = n - X - 2;
-    stewart_guess *master = guess_at(s, 0);
+    stewart_hypothesis *master = hypothesis_at(s, 0);
     real *L = stewart_take(&scratch, n * n), root[X * X], state[X];
     if (!start_of(d->filter.sensing, y, near, state, root, scratch))
         return;
-    stewart_fill(STEWART_GUESS, 0, (real *)master);
+    stewart_fill(STEWART_HYPOTHESIS, 0, (real *)master);
     master->high = d->longest;
     master->fits = 1;
     master->timing = d->filter.timing_std * d->filter.timing_std;
-    master->torques = TORQUES;
+    master->torques = FIRST_TORQUES;
     stewart_copy(X, state, master->numbers);
     stewart_copy(p, d->prior, master->numbers + X);
     master->numbers[STEWART_ETA(n)] = STEWART_NEVER;
@@ -192,7 +192,7 @@ static void begin(Search *s, const real *y, const real *near, stewart_scratch sc
         stewart_copy(X, root + X * i, L + n * i);
     for (int i = 0; i < p; i++)
         stewart_copy(p, d->filter.prior_root + p * i, L + n * (X + i) + X);
-    stewart_guess_keep_root(n, L, master);
+    stewart_hypothesis_set_root(n, L, master);
     s->memory->known = s->memory->searching = 1;
     s->memory->cells = s->memory->best = 0;
     for (int k = 1; k <= s->since.view.num_own; k++)
@@ -203,16 +203,17 @@ static void begin(Search *s, const real *y, const real *near, stewart_scratch sc
 /* Advance the hypothesis at a place by one period and a measurement, or NULL. */
 static void update(Search *s, int place, const real *y, stewart_scratch scratch)
 {
-    stewart_guess *guess = guess_at(s, place);
-    stewart_guess *after =
-        (stewart_guess *)stewart_take(&scratch, stewart_guess_size(s->n - X - 2));
-    stewart_delay_advance(&s->since, guess, y, after, scratch);
+    stewart_hypothesis *hypothesis = hypothesis_at(s, place);
+    stewart_hypothesis *after =
+        (stewart_hypothesis *)stewart_take(&scratch, stewart_hypothesis_size(s->n - X - 2));
+    stewart_delay_advance(&s->since, hypothesis, y, after, scratch);
     if (y && s->memory->searching > 0)
         after->weight += after->log_likelihood;
-    copy_guess(s->n, after, guess);
+    copy_hypothesis(s->n, after, hypothesis);
 }
 
-/* Advance master and cells by a measurement, or NULL; drop unlikely cells; end the search if it is over. */
+/* Advance master and cells by a period and a measurement, or NULL; drop unlikely cells; end the search if one
+   hypothesis is left. */
 static void search(Search *s, const real *y, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
@@ -220,63 +221,63 @@ static void search(Search *s, const real *y, stewart_scratch scratch)
     const int n = s->n, k = s->since.view.num_own;
     const real near = NEAR * d->period;
     real top, rival;
-    int best = 0, kept = 0;
-    if (k < s->flights && (real)(k - 1) * d->period < d->longest)
+    int best = 0, remaining = 0;
+    if (k < s->num_in_flight && (real)(k - 1) * d->period < d->longest)
         spawn(s, k, scratch);
     const int cells = (int)memory->cells;
-    const int many = cells > AT_ONCE;
+    const int many = cells > MOST_TO_PLAN;
     for (int i = 0; i <= cells; i++)
         update(s, i, y, scratch);
-    top = guess_at(s, 0)->weight;
+    top = hypothesis_at(s, 0)->weight;
     for (int i = 1; i <= cells; i++)
-        top = guess_at(s, i)->weight > top ? guess_at(s, i)->weight : top;
-    guess_at(s, 0)->weight -= top;
+        top = hypothesis_at(s, i)->weight > top ? hypothesis_at(s, i)->weight : top;
+    hypothesis_at(s, 0)->weight -= top;
     for (int i = 1; i <= cells; i++) {
-        stewart_guess *cell = guess_at(s, i);
-        const int young = cell->heard <= YOUNG && cell->fits > 0;
+        stewart_hypothesis *cell = hypothesis_at(s, i);
+        const int young = cell->measurements <= YOUNG && cell->fits > 0;
         if (!young && !(cell->weight > top - FORGOTTEN))
             continue;
         cell->weight -= top;
-        kept++;
-        if (kept < i)
-            copy_guess(n, cell, guess_at(s, kept));
-        if (guess_at(s, kept)->weight > guess_at(s, best)->weight)
-            best = kept;
+        remaining++;
+        if (remaining < i)
+            copy_hypothesis(n, cell, hypothesis_at(s, remaining));
+        if (hypothesis_at(s, remaining)->weight > hypothesis_at(s, best)->weight)
+            best = remaining;
     }
-    memory->cells = (real)kept;
+    memory->cells = (real)remaining;
     memory->best = (real)best;
-    stewart_guess *found = guess_at(s, best);
-    rival = guess_at(s, 0)->weight;
-    for (int i = 1; i <= kept; i++) {
-        const stewart_guess *cell = guess_at(s, i);
+    stewart_hypothesis *found = hypothesis_at(s, best);
+    rival = hypothesis_at(s, 0)->weight;
+    for (int i = 1; i <= remaining; i++) {
+        const stewart_hypothesis *cell = hypothesis_at(s, i);
         if (distance_of(n, cell, found) > near && cell->weight > rival)
             rival = cell->weight;
     }
     if (best == 0 || !(found->fits > 0) || !y || !(rival < -LEAD)
-        || !(stewart_guess_std(found, n) < near))
+        || !(stewart_hypothesis_std(found, n) < near))
         return;
     found->low = 0;
     found->high = d->longest;
     found->weight = 0;
-    copy_guess(n, found, guess_at(s, 0));
+    copy_hypothesis(n, found, hypothesis_at(s, 0));
     memory->searching = memory->cells = memory->best = 0;
     memory->found = 1;
-    memory->fresh = (real)many;
+    memory->deferred = (real)many;
 }
 
 /* ---- jumps and new starts --------------------------------------------------------------------- */
 
-/* Begin `guess` from a state (12) with the root of its covariance (12, 12), and an eta of variance std^2.
-   Parameters are those of `from`, with `loosened` standard deviations of the prior added. */
-static void begin_at(const Search *s, const stewart_guess *from, real eta, real std, real loosened,
-                     const real *state, const real *root, stewart_guess *guess,
+/* Begin `hypothesis` from a state (12) with the root of its covariance (12, 12), and an eta of variance std^2.
+   Parameters are those of `from`, with `loosened` times the standard deviations of the prior added. */
+static void begin_at(const Search *s, const stewart_hypothesis *from, real eta, real std, real loosened,
+                     const real *state, const real *root, stewart_hypothesis *hypothesis,
                      stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
     const int n = s->n, p = n - X - 2;
     real *L = stewart_take(&scratch, n * n), *R = stewart_take(&scratch, p * p);
     real *W = stewart_take(&scratch, (X + p) * p);
-    stewart_guess_root(from, n, L);
+    stewart_hypothesis_root(from, n, L);
     stewart_fill(p * p, 0, R);
     for (int i = 0; i < p; i++)
         R[(p + 1) * i] = loosened * d->std[i];
@@ -284,10 +285,10 @@ static void begin_at(const Search *s, const stewart_guess *from, real eta, real 
         for (int j = 0; j < p; j++)
             W[p * i + j] = L[n * (X + j) + i];
     stewart_add_root(p, X + p, R, W);
-    copy_guess(n, from, guess);
-    stewart_copy(X, state, guess->numbers);
-    guess->numbers[STEWART_ETA(n)] = eta;
-    guess->numbers[STEWART_RATE(n)] = 0;
+    copy_hypothesis(n, from, hypothesis);
+    stewart_copy(X, state, hypothesis->numbers);
+    hypothesis->numbers[STEWART_ETA(n)] = eta;
+    hypothesis->numbers[STEWART_RATE(n)] = 0;
     stewart_fill(n * n, 0, L);
     for (int i = 0; i < X; i++)
         stewart_copy(X, root + X * i, L + n * i);
@@ -296,13 +297,13 @@ static void begin_at(const Search *s, const stewart_guess *from, real eta, real 
             L[n * (X + i) + X + j] = R[p * j + i];
     L[(n + 1) * STEWART_ETA(n)] = std;
     L[(n + 1) * STEWART_RATE(n)] = d->rate_std;
-    stewart_guess_keep_root(n, L, guess);
-    guess->outliers = 0;
+    stewart_hypothesis_set_root(n, L, hypothesis);
+    hypothesis->outliers = 0;
 }
 
 /* Add to `cost` the squared distance of a measurement after a period from the prediction for every
    delay of a grid. The period begins in a state with the root of its covariance. */
-static int compare(const Search *s, const stewart_period *t, const stewart_guess *guess,
+static int compare(const Search *s, const stewart_period *t, const stewart_hypothesis *hypothesis,
                    const real *state, const real *root, const real *y, int number, real *cost,
                    stewart_scratch scratch)
 {
@@ -311,18 +312,18 @@ static int compare(const Search *s, const stewart_period *t, const stewart_guess
     const int n = s->n, m = s->m, known = n - 2;
     real *L = stewart_take(&scratch, n * n), *H = stewart_take(&scratch, X * n);
     real *xi = stewart_take(&scratch, n), *A = stewart_take(&scratch, X * (n + X));
-    real *C = stewart_take(&scratch, m * m), *miss = stewart_take(&scratch, m), end[X];
-    stewart_copy(n, guess->numbers, xi);
+    real *C = stewart_take(&scratch, m * m), *nu = stewart_take(&scratch, m), end[X];
+    stewart_copy(n, hypothesis->numbers, xi);
     stewart_copy(X, state, xi);
     xi[STEWART_RATE(n)] = 0;
     if (!stewart_period_at(t, xi, 0, end, H, scratch))
         return 0;
-    stewart_guess_root(guess, n, L);
+    stewart_hypothesis_root(hypothesis, n, L);
     for (int i = 0; i < X; i++) {
         stewart_copy(X, root + X * i, L + n * i);
         stewart_fill(n - X, 0, L + n * i + X);
     }
-    /* Columns of the state's root and of the parameters': they are not taken to be correlated. */
+    /* Columns of the root of the state, then of the parameters, which count as uncorrelated. */
     stewart_fill((known + X) * X, 0, A);
     for (int k = 0; k < known; k++)
         for (int j = 0; j <= k; j++)
@@ -334,18 +335,18 @@ static int compare(const Search *s, const stewart_period *t, const stewart_guess
         xi[STEWART_ETA(n)] = (real)(k + 1) * GRID * d->period;
         if (!stewart_period_end(t, xi, end, scratch))
             return 0;
-        stewart_predict_measurement(sensing, end, miss);
+        stewart_predict_measurement(sensing, end, nu);
         for (int i = 0; i < m; i++)
-            miss[i] = y[i] - miss[i];
-        stewart_whiten(m, 1, C, miss);
+            nu[i] = y[i] - nu[i];
+        stewart_whiten(m, 1, C, nu);
         for (int i = 0; i < m; i++)
-            cost[k] += miss[i] * miss[i];
+            cost[k] += nu[i] * nu[i];
     }
     return 1;
 }
 
-/* Return the place of the lowest local minimum, other than `excluded` (-1 for none), or -1. */
-static int valley(int number, const real *cost, int excluded)
+/* Return the place of the lowest local minimum other than `excluded` (-1 for none), or -1. */
+static int lowest_minimum(int number, const real *cost, int excluded)
 {
     int best = -1;
     for (int i = 0; i < number; i++) {
@@ -362,111 +363,111 @@ static int valley(int number, const real *cost, int excluded)
 static int jump(Search *s, const real *y, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
-    const int n = s->n, m = s->m, size = stewart_guess_size(n - X - 2);
+    const int n = s->n, m = s->m, size = stewart_hypothesis_size(n - X - 2);
     const real near = NEAR * d->period;
-    const real *seen[3] = {s->past, s->past + m, y};
+    const real *measured[3] = {s->past, s->past + m, y};
     const int wanted = (int)REAL(ceil)((d->longest / d->period - GRID) / GRID);
-    const int number = wanted < 2 * s->flights ? wanted : 2 * s->flights;
-    stewart_guess *guess = guess_at(s, 0);
-    stewart_guess *tried[BEST], *moved = (stewart_guess *)stewart_take(&scratch, size);
-    real *cost = stewart_take(&scratch, number), states[2][X], roots[2][X * X], total[BEST];
+    const int number = wanted < 2 * s->num_in_flight ? wanted : 2 * s->num_in_flight;
+    stewart_hypothesis *hypothesis = hypothesis_at(s, 0);
+    stewart_hypothesis *tried[STARTS], *moved = (stewart_hypothesis *)stewart_take(&scratch, size);
+    real *cost = stewart_take(&scratch, number), states[2][X], roots[2][X * X], total[STARTS];
     real *before = stewart_take(&scratch, U * (s->since.view.num_others + 1));
     stewart_period periods[2] = {s->since, s->since};
     if (!stewart_all_finite(2 * m, s->past) || !stewart_all_finite(m, y))
         return 0;
-    stewart_copy(U, s->before, before); /* the torque before is unknown: assume the same */
+    stewart_copy(U, s->before, before); /* the torque before the first is unknown: assume the same */
     stewart_copy(U * s->since.view.num_others, s->before, before + U);
     periods[0].view.other_torques = before;
     periods[0].view.num_others++;
     periods[0].newest = 1;
     stewart_fill(number, 0, cost);
     for (int i = 0; i < 2; i++)
-        if (!start_of(d->filter.sensing, seen[i], guess->numbers, states[i], roots[i], scratch))
+        if (!start_of(d->filter.sensing, measured[i], hypothesis->numbers, states[i], roots[i], scratch))
             return 0;
     for (int i = 0; i < 2; i++)
-        if (!compare(s, periods + i, guess, states[i], roots[i], seen[i + 1], number, cost, scratch))
+        if (!compare(s, periods + i, hypothesis, states[i], roots[i], measured[i + 1], number, cost, scratch))
             return 0;
     int tries = 0, lowest = -1;
-    for (; tries < BEST; tries++) {
-        const int place = valley(number, cost, lowest);
+    for (; tries < STARTS; tries++) {
+        const int place = lowest_minimum(number, cost, lowest);
         if (place < 0 || (tries > 0 && !(cost[place] <= HOPELESS + 10 * cost[lowest])))
             break;
         lowest = tries > 0 ? lowest : place;
         const real eta = (real)(place + 1) * GRID * d->period;
-        tried[tries] = (stewart_guess *)stewart_take(&scratch, size);
-        begin_at(s, guess, eta, d->period / SQRT_12, LOOSENED_BY_JUMP, states[0], roots[0],
+        tried[tries] = (stewart_hypothesis *)stewart_take(&scratch, size);
+        begin_at(s, hypothesis, eta, d->period / SQRT_12, LOOSENED_BY_JUMP, states[0], roots[0],
                  tried[tries], scratch);
         tried[tries]->low = eta > d->period ? eta - d->period : 0;
         tried[tries]->high = eta + d->period < d->longest ? eta + d->period : d->longest;
         total[tries] = 0;
         for (int i = 0; i < 2; i++) {
-            stewart_delay_advance(periods + i, tried[tries], seen[i + 1], moved, scratch);
-            copy_guess(n, moved, tried[tries]);
+            stewart_delay_advance(periods + i, tried[tries], measured[i + 1], moved, scratch);
+            copy_hypothesis(n, moved, tried[tries]);
             total[tries] += moved->log_likelihood;
         }
     }
     if (!tries) /* not finite */
         return 0;
     const int second = tries > 1, best = second && total[1] > total[0];
-    stewart_guess *found = tried[best];
+    stewart_hypothesis *found = tried[best];
     if (second && distance_of(n, tried[0], tried[1]) > near
-        && !(total[best] - total[1 - best] >= SETTLED))
+        && !(total[best] - total[1 - best] >= ACCEPTED))
         return 0;
-    if (!(found->fits > 0) || !(stewart_guess_std(found, n) < near)
-        || !(distance_of(n, found, guess) > near)) /* less than that is not a jump */
+    if (!(found->fits > 0) || !(stewart_hypothesis_std(found, n) < near)
+        || !(distance_of(n, found, hypothesis) > near)) /* less than that is not a jump */
         return 0;
     found->low = 0;
     found->high = d->longest;
     found->outliers = 0;
-    copy_guess(n, found, guess);
+    copy_hypothesis(n, found, hypothesis);
     return 1;
 }
 
-/* Restart from the last measurement, after outliers that nothing explains. A delay that was found before
-   most of its prior is over was found wrongly then: friction may look like an arrival. */
+/* Restart from the last measurement, after outliers that nothing explains. If they come while the prior of
+   the delay is hardly over, the delay was found wrongly: friction may look like an arrival. */
 static void restart(Search *s, const real *y, const real *near, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
     const int n = s->n;
-    stewart_guess *guess = guess_at(s, 0);
-    stewart_guess *anew = (stewart_guess *)stewart_take(&scratch, stewart_guess_size(n - X - 2));
+    stewart_hypothesis *hypothesis = hypothesis_at(s, 0);
+    stewart_hypothesis *anew = (stewart_hypothesis *)stewart_take(&scratch, stewart_hypothesis_size(n - X - 2));
     real state[X], root[X * X];
-    const int early = s->memory->sent * d->period < d->believed + d->delay_std;
+    const int early = s->memory->num_own * d->period < d->delay_mean + d->delay_std;
     if (s->memory->searching > 0 || early) {
         begin(s, y, near, scratch);
         return;
     }
-    if (!start_of(d->filter.sensing, y, guess->numbers, state, root, scratch))
+    if (!start_of(d->filter.sensing, y, hypothesis->numbers, state, root, scratch))
         return;
-    const real std = stewart_guess_std(guess, n), least = d->period / 10;
-    begin_at(s, guess, guess->numbers[STEWART_ETA(n)], std > least ? std : least, LOOSENED, state, root, anew,
-             scratch);
-    anew->numbers[STEWART_RATE(n)] = guess->numbers[STEWART_RATE(n)];
-    copy_guess(n, anew, guess);
+    const real std = stewart_hypothesis_std(hypothesis, n), least = d->period / 10;
+    begin_at(s, hypothesis, hypothesis->numbers[STEWART_ETA(n)], std > least ? std : least, LOOSENED, state,
+             root, anew, scratch);
+    anew->numbers[STEWART_RATE(n)] = hypothesis->numbers[STEWART_RATE(n)];
+    copy_hypothesis(n, anew, hypothesis);
 }
 
 /* ---- one sample ------------------------------------------------------------------------------- */
 
-/* Mean and standard deviation of the delay while it is sought. */
+/* Compute mean and standard deviation of the delay during the search. */
 static void mix(Search *s)
 {
     stewart_delay_memory *memory = s->memory;
     const int n = s->n, cells = (int)memory->cells;
-    real total = 0, mean = 0, square = 0, rest, spread, top = guess_at(s, 0)->weight;
-    rest_of_prior(s->delay, memory->sent * s->delay->period, &rest, &spread);
+    real total = 0, mean = 0, square = 0, rest, spread, top = hypothesis_at(s, 0)->weight;
+    rest_of_prior(s->delay, memory->num_own * s->delay->period, &rest, &spread);
     for (int i = 1; i <= cells; i++)
-        top = guess_at(s, i)->weight > top ? guess_at(s, i)->weight : top;
+        top = hypothesis_at(s, i)->weight > top ? hypothesis_at(s, i)->weight : top;
     for (int pass = 0; pass < 2; pass++)
         for (int i = 0; i <= cells; i++) {
-            const stewart_guess *cell = guess_at(s, i);
-            const real share = REAL(exp)(cell->weight - top);
+            const stewart_hypothesis *cell = hypothesis_at(s, i);
+            const real weight = REAL(exp)(cell->weight - top);
             const real eta = i > 0 ? cell->numbers[STEWART_ETA(n)] : rest;
-            const real std = i > 0 ? stewart_guess_std(cell, n) : spread;
+            const real std = i > 0 ? stewart_hypothesis_std(cell, n) : spread;
             if (pass == 0) {
-                total += share;
-                mean += share * eta;
+                total += weight;
+                mean += weight * eta;
             } else {
-                square += share * (std * std + (eta - memory->mean) * (eta - memory->mean));
+                square += weight * (std * std + (eta - memory->mean) * (eta - memory->mean));
             }
             if (pass == 0 && i == cells)
                 memory->mean = mean / total;
@@ -479,57 +480,57 @@ static void report(Search *s, int measured)
 {
     const stewart_delay *d = s->delay;
     stewart_delay_memory *memory = s->memory;
-    const stewart_guess *guess = guess_at(s, (int)memory->best);
-    const real eta = guess->numbers[STEWART_ETA(s->n)];
-    const int settled = !(memory->searching > 0) && !(memory->fresh > 0);
-    const int silent = memory->silent > 0 && !settled, waiting = !(eta < STEWART_NEVER);
-    memory->rejected = measured && !(guess->fits > 0);
+    const stewart_hypothesis *hypothesis = hypothesis_at(s, (int)memory->best);
+    const real eta = hypothesis->numbers[STEWART_ETA(s->n)];
+    const int settled = !(memory->searching > 0) && !(memory->deferred > 0);
+    const int open_loop = memory->open_loop > 0 && !settled, waiting = !(eta < STEWART_NEVER);
+    memory->rejected = measured && !(hypothesis->fits > 0);
     memory->settled = (real)settled;
-    memory->silent = (real)silent;
+    memory->open_loop = (real)open_loop;
     memory->caution = settled ? 1 : CAUTION;
     memory->eta = eta > 0 ? eta : 0;
-    memory->rate = guess->numbers[STEWART_RATE(s->n)];
+    memory->rate = hypothesis->numbers[STEWART_RATE(s->n)];
     memory->feeds_back = 1;
-    if (!settled && (waiting || silent)) {
-        const int late = memory->sent * d->period >= d->believed;
-        memory->feeds_back = !(silent || (waiting && late));
-        memory->eta = d->believed > 0 ? d->believed : 0;
+    if (!settled && (waiting || open_loop)) {
+        const int late = memory->num_own * d->period >= d->delay_mean;
+        memory->feeds_back = !(open_loop || (waiting && late));
+        memory->eta = d->delay_mean > 0 ? d->delay_mean : 0;
         memory->rate = 0;
     }
     memory->mean = eta;
-    memory->std = stewart_guess_std(guess, s->n);
+    memory->std = stewart_hypothesis_std(hypothesis, s->n);
     if (memory->searching > 0)
         mix(s);
 }
 
-void stewart_delay_start(const stewart_delay *d, int flights, stewart_delay_memory *memory)
+void stewart_delay_start(const stewart_delay *d, int num_in_flight, stewart_delay_memory *memory)
 {
     const int p = d->filter.machine->estimated, m = d->filter.sensing->size;
-    stewart_fill(stewart_delay_size(p, m, flights), 0, (real *)memory);
-    memory->eta = d->believed;
-    memory->sent = -1; /* before the first sample */
-    memory->silent = d->quiet ? 1 : 0;
+    stewart_fill(stewart_delay_size(p, m, num_in_flight), 0, (real *)memory);
+    memory->eta = d->delay_mean;
+    memory->num_own = -1; /* before the first sample */
+    memory->open_loop = d->open_loop_start ? 1 : 0;
     memory->settled = memory->feeds_back = memory->caution = 1;
     memory->mean = memory->std = (real)NAN;
-    stewart_fill(2 * m, (real)NAN, memory->numbers + U * periods_before(flights));
+    stewart_fill(2 * m, (real)NAN, memory->numbers + U * periods_before(num_in_flight));
 }
 
-void stewart_delay_observe(const stewart_delay *d, int flights, const real *in_flight,
+void stewart_delay_observe(const stewart_delay *d, int num_in_flight, const real *in_flight,
                            const real *y, const real *near, stewart_delay_memory *memory,
                            stewart_scratch scratch)
 {
-    const int n = X + d->filter.machine->estimated + 2, m = d->filter.sensing->size, first = memory->sent < 0;
-    const int others = periods_before(flights);
-    Search s = {.delay = d, .n = n, .m = m, .flights = flights, .memory = memory};
+    const int n = X + d->filter.machine->estimated + 2, m = d->filter.sensing->size, first = memory->num_own < 0;
+    const int others = periods_before(num_in_flight);
+    Search s = {.delay = d, .n = n, .m = m, .num_in_flight = num_in_flight, .memory = memory};
     s.before = memory->numbers;
     s.past = memory->numbers + U * others;
-    if (first) /* no own torque in flight yet; without a queue the torque of the last period goes on */
-        stewart_copy(U * others, in_flight + U * (flights - others), s.before);
-    memory->sent = first ? 0 : memory->sent < (real)flights ? memory->sent + 1 : (real)flights;
-    memory->found = memory->fresh;
-    memory->fresh = memory->rejected = 0;
-    s.since = (stewart_period){d, {d->period, 0, 0, (int)memory->sent, others, s.before},
-                               flights, 0, in_flight};
+    if (first) /* no own torque in flight yet; without a queue the torque of the last period continues */
+        stewart_copy(U * others, in_flight + U * (num_in_flight - others), s.before);
+    memory->num_own = first ? 0 : memory->num_own < (real)num_in_flight ? memory->num_own + 1 : (real)num_in_flight;
+    memory->found = memory->deferred;
+    memory->deferred = memory->rejected = 0;
+    s.since = (stewart_period){d, {d->period, 0, 0, (int)memory->num_own, others, s.before},
+                               num_in_flight, 0, in_flight};
     if (!(memory->known > 0)) {
         if (y)
             begin(&s, y, near, scratch);
@@ -537,10 +538,10 @@ void stewart_delay_observe(const stewart_delay *d, int flights, const real *in_f
         search(&s, y, scratch);
     } else {
         update(&s, 0, y, scratch);
-        if (y && guess_at(&s, 0)->outliers >= SUSPICIOUS && jump(&s, y, scratch))
-            memory->fresh = 1;
+        if (y && hypothesis_at(&s, 0)->outliers >= SUSPICIOUS && jump(&s, y, scratch))
+            memory->deferred = 1;
     }
-    if (y && memory->known > 0 && guess_at(&s, (int)memory->best)->outliers >= PATIENCE)
+    if (y && memory->known > 0 && hypothesis_at(&s, (int)memory->best)->outliers >= PATIENCE)
         restart(&s, y, near, scratch);
     stewart_copy(m, s.past + m, s.past);
     for (int i = 0; i < m; i++)

@@ -18,18 +18,18 @@ int stewart_order(const stewart_cost *cost, int pending)
 
    and the rates there differ by -dt/24 B (s_{k-1} + s_k), which feedback must not correct. Torques that
    do not move the plate along the reference have no such difference: s = 0. */
-void stewart_hold(const stewart_machine *machine, const stewart_cost *cost, const real *theta,
-                  int pending, const real *nodes, stewart_held *held)
+void stewart_hold_feedforward(const stewart_machine *machine, const stewart_cost *cost, const real *theta,
+                              int pending, const real *nodes, stewart_feedforward *held)
 {
     const int holds = 3 + pending, moves = cost->feedforward == STEWART_INVERSE_DYNAMICS;
     real mean[4][U], at[2][U] = {{0}};
-    stewart_belief belief;
-    stewart_believe(machine, theta, &belief);
+    stewart_model model;
+    stewart_set_model(machine, theta, &model);
     for (int k = 0; k < holds; k++) {
         for (int node = 0; node < 2 && cost->feedforward != STEWART_NO_FEEDFORWARD; node++) {
             real row[ROW] = {0};
             stewart_copy(moves ? ROW : 6, nodes + ROW * (2 * k + node), row);
-            stewart_required_torque(&belief, row, at[node]);
+            stewart_required_torque(&model, row, at[node]);
         }
         for (int i = 0; i < U; i++) {
             mean[k][i] = (at[0][i] + at[1][i]) / 2;
@@ -44,8 +44,8 @@ void stewart_hold(const stewart_machine *machine, const stewart_cost *cost, cons
         }
 }
 
-/* From -dt B s / 12 at the beginning of a hold on, when the share x of it has passed: rates
-   -dt B s (1/12 - x (1 - x) / 2), pose -dt^2 B s x (1 - x) (1 - 2 x) / 12. */
+/* The offset of the rates is -dt B s / 12 at the beginning of a hold. After the part x of it the offset is
+   -dt B s (1/12 - x (1 - x) / 2) of the rates, and -dt^2 B s x (1 - x) (1 - 2 x) / 12 of the pose. */
 void stewart_subtract_offset(real period, real fraction, const real *changes, const real *B,
                              real *error)
 {
@@ -65,16 +65,16 @@ void stewart_subtract_offset(real period, real fraction, const real *changes, co
     }
 }
 
-/* The model A (n, n), B (n, 6) of error, integral and the torque that is still to act, sampled, and the
-   diagonals of Q (n, n) and R (6, 6). */
+/* Sampled model A (n, n), B (n, 6) of error, integral and pending torque, and the diagonal Q (n, n) and
+   R (6, 6). */
 typedef struct {
     int n;
     real *A, *B, *Q, *R;
-} sampled;
+} SampledModel;
 
-/* e+ = Phi e + S_old T_old + S_new T,  z+ = z + dt/2 (e + e+). */
+/* e+ = Phi e + S_old T_old + S_new T,  z+ = z + dt/2 (e + e+), with the pending torque T_old. */
 static void sample(const stewart_cost *cost, real period, real fraction, const real *weights,
-                   const real *A, const real *B, sampled *m, stewart_scratch scratch)
+                   const real *A, const real *B, SampledModel *m, stewart_scratch scratch)
 {
     const int pending = fraction > 0, n = m->n, first = X + 6 * (cost->integrates != 0);
     const real half = period / 2;
@@ -128,9 +128,9 @@ static void sample(const stewart_cost *cost, real period, real fraction, const r
     }
 }
 
-/* The gain (6, n). Each state is measured in the size that costs one now and at the next sample
-   together, each torque in that which costs one, so that no unit makes a matrix look singular. */
-static int solve_gain(sampled *m, int torques, real *K, stewart_scratch scratch)
+/* Compute the gain (6, n). States and torques are scaled so that each has unit cost (of a state: now and
+   at the next sample together). Then no choice of units makes a matrix look singular. */
+static int solve_gain(SampledModel *m, int pending, real *K, stewart_scratch scratch)
 {
     const int n = m->n;
     real x[STEWART_MAX_ORDER], u[U], *A = m->A, *B = m->B, *Q = m->Q, *R = m->R;
@@ -147,7 +147,7 @@ static int solve_gain(sampled *m, int torques, real *K, stewart_scratch scratch)
             cost += A[n * j + i] * Q[(n + 1) * j] * A[n * j + i];
         x[i] = cost > 0 && isfinite(cost) ? 1 / REAL(sqrt)(cost) : 1;
     }
-    if (torques)
+    if (pending)
         stewart_copy(U, u, x + n - U);
     for (int i = 0; i < n; i++) {
         for (int j = 0; j < n; j++)
@@ -172,14 +172,14 @@ static int solve_gain(sampled *m, int torques, real *K, stewart_scratch scratch)
 int stewart_linearize_scratch(void) { return 6 * (X + STEWART_PARAMETERS + X + U); }
 
 int stewart_linearize(const stewart_machine *machine, const real *theta, real period, real fraction,
-                      const real *state, const stewart_held *held, real *A, real *B, real *error,
+                      const real *state, const stewart_feedforward *held, real *A, real *B, real *error,
                       stewart_scratch scratch)
 {
-    stewart_belief belief;
+    stewart_model model;
     if (!machine->acceleration_per_torque && !stewart_is_workable(machine->geometry, state))
         return STEWART_UNREACHABLE;
-    stewart_believe(machine, theta, &belief);
-    if (!stewart_derivatives(machine, &belief, state, held->torque[fraction > 0], A, B, NULL, scratch))
+    stewart_set_model(machine, theta, &model);
+    if (!stewart_derivatives(machine, &model, state, held->torque[fraction > 0], A, B, NULL, scratch))
         return STEWART_RICCATI_FAILURE;
     stewart_subtract_offset(period, fraction, held->change[0], B + 6 * U, error);
     return 0;
@@ -196,7 +196,7 @@ int stewart_gain(const stewart_cost *cost, real period, real fraction, const rea
                  const real *weights, real *K, stewart_scratch scratch)
 {
     const int n = stewart_order(cost, fraction > 0);
-    sampled m = {.n = n};
+    SampledModel m = {.n = n};
     m.A = stewart_take(&scratch, n * n);
     m.B = stewart_take(&scratch, n * U);
     m.Q = stewart_take(&scratch, n * n);
@@ -206,7 +206,7 @@ int stewart_gain(const stewart_cost *cost, real period, real fraction, const rea
 }
 
 void stewart_feed_back(const stewart_cost *cost, const real *K, const real *error,
-                       const real *integral, int pending, const real *late, const real *feedforward,
+                       const real *integral, int pending, const real *pending_torques, const real *feedforward,
                        real *torque)
 {
     for (int i = 0; i < U; i++) {
@@ -215,6 +215,6 @@ void stewart_feed_back(const stewart_cost *cost, const real *K, const real *erro
         for (int j = 0; cost->integrates && j < 6; j++)
             torque[i] -= *K++ * integral[j];
         for (int j = 0; j < U * pending; j++)
-            torque[i] -= *K++ * (late[j] - feedforward[j]);
+            torque[i] -= *K++ * (pending_torques[j] - feedforward[j]);
     }
 }

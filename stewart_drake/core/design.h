@@ -1,4 +1,4 @@
-/* The gain: a linear model of the error where the next torque acts, its cost, and the feedforward. */
+/* Feedforward and gain, from a linear model of the error where the next torque acts. */
 
 #pragma once
 
@@ -7,7 +7,7 @@
 
 #define STEWART_REFERENCE 18 /* pose, rates and accelerations */
 
-/* Ways to find the torque that the reference takes. */
+/* Kinds of feedforward. */
 enum { STEWART_NO_FEEDFORWARD, STEWART_EQUILIBRIUM, STEWART_INVERSE_DYNAMICS };
 
 /* w_Q [e; z]' Q [e; z] + w_R T' R T with diagonal Q and R. */
@@ -17,39 +17,40 @@ typedef struct {
     int feedforward;
 } stewart_cost;
 
-/* Torques of the holds: of the pending one, if any, and of the next. */
+/* Held feedforward torques of the pending hold, if there is one, and of the next hold; and the change of
+   the exact torque over these holds and their two neighbours. */
 typedef struct {
-    real torque[2][6], change[4][6]; /* changes over the same holds and a neighbour each */
-} stewart_held;
+    real torque[2][6], change[4][6];
+} stewart_feedforward;
 
-/* Numbers of the state that the gain multiplies: error, integral, torque that is still to act. */
+/* Number of states that the gain multiplies: error, integral, pending torques. */
 int stewart_order(const stewart_cost *cost, int pending);
 
-/* Feedforward (hold), with its changes, from the reference at two nodes of each of 3 + pending holds:
-   `nodes` (2 (3 + pending), 18). */
-void stewart_hold(const stewart_machine *machine, const stewart_cost *cost, const real *theta,
-                  int pending, const real *nodes, stewart_held *held);
+/* Compute the feedforward from the reference at the two Gauss nodes of each of 3 + pending holds:
+   `nodes` (2 (3 + pending), 18). See equation (hold) in design.c. */
+void stewart_hold_feedforward(const stewart_machine *machine, const stewart_cost *cost, const real *theta,
+                              int pending, const real *nodes, stewart_feedforward *held);
 
 /* Subtract from an error (12) the offset that held torques cause at the sample whose error is regulated,
-   for the first two changes (2, 6) of `stewart_held` and B (6, 6), accelerations per torque. */
+   for the first two changes (2, 6) of a feedforward and B (6, 6), accelerations per torque. */
 void stewart_subtract_offset(real period, real fraction, const real *changes, const real *B,
                              real *error);
 
-/* Linear model where a torque acts: A (12, 12), B (12, 6) of the error. The offset that held torques
-   cause is subtracted from `error` (12); the pending torque acts for another `fraction` of a period.
-   Returns 0, or the cause of failure, of `stewart_status`. */
+/* Compute the continuous model A (12, 12), B (12, 6) of the error at a state where a torque begins to act.
+   Subtract the offset that held torques cause from `error` (12). The pending torque acts for another
+   `fraction` of a period. Returns 0, or the cause of failure, of `stewart_status`. */
 int stewart_linearize(const stewart_machine *machine, const real *theta, real period, real fraction,
-                      const real *state, const stewart_held *held, real *A, real *B, real *error,
+                      const real *state, const stewart_feedforward *held, real *A, real *B, real *error,
                       stewart_scratch scratch);
 
 /* Gain K (6, order) of a linear model, for weights w_Q and w_R. Returns 0 where there is none. */
 int stewart_gain(const stewart_cost *cost, real period, real fraction, const real *A, const real *B,
                  const real *weights, real *K, stewart_scratch scratch);
 
-/* T = T_ff - K [error; integral; late - its feedforward], in the place of T (6), which is T_ff. `late`
-   (pending, 6) are the torques that are still to act, `feedforward` (pending, 6) theirs. */
+/* T <- T - K [error; integral; pending_torques - feedforward], for T (6), which holds the feedforward of
+   the next hold. `pending_torques` and `feedforward` are (pending, 6). */
 void stewart_feed_back(const stewart_cost *cost, const real *K, const real *error,
-                       const real *integral, int pending, const real *late, const real *feedforward,
+                       const real *integral, int pending, const real *pending_torques, const real *feedforward,
                        real *torque);
 
 int stewart_linearize_scratch(void);

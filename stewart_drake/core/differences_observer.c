@@ -9,11 +9,11 @@
 static int differences_observe(const stewart_law *law, real *memory, int number,
                                const real *torques, const real *values, stewart_scratch scratch)
 {
-    const stewart_sensing newest = stewart_newest_encoders(law->sensing);
-    const real *now = values + law->measured - LEGS;
+    const stewart_sensing newest = stewart_newest_encoder_sensing(law->sensing);
+    const real *now = values + law->num_values - LEGS;
     real *state = memory, *last = memory + X, found[X], *root = stewart_take(&scratch, X * X);
     const int had_state = stewart_all_finite(X, state), complete = stewart_all_finite(LEGS, now);
-    stewart_keep_last(law->measured, values, last);
+    stewart_keep_last(law->num_values, values, last);
     if (complete && newest.start(&newest, now, had_state ? state : NULL, found, root, scratch)) {
         for (int i = 0; i < 6 && had_state; i++)
             found[6 + i] = (found[i] - state[i]) / law->period;

@@ -121,7 +121,7 @@ void stewart_measures(const real *geometry, const real *pose, const real *angles
     all_measures(pose, sines, wrenches, measures);
 }
 
-void stewart_move(const stewart_plant *plant, const real *torque, real h, real *x)
+void stewart_runge_kutta_step(const stewart_plant *plant, const real *torque, real h, real *x)
 {
     static const real part[3] = {(real)0.5, (real)0.5, 1};
     real y[12], k[4][12];

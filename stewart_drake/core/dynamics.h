@@ -57,4 +57,4 @@ void stewart_residual_derivatives(const stewart_plant *plant, const real *pose, 
 void stewart_measures(const real *geometry, const real *pose, const real *angles, real *measures);
 
 /* Advance a state (12) by one step of h seconds of the classical Runge-Kutta method. */
-void stewart_move(const stewart_plant *plant, const real *torque, real h, real *state);
+void stewart_runge_kutta_step(const stewart_plant *plant, const real *torque, real h, real *state);

@@ -1,4 +1,4 @@
-/* The filter for encoders: legs at several instants of a period, see filter_attempt.h. */
+/* The filter for encoders, which are read at several times of a period: see filter_attempt.h. */
 
 #include "encoders.h"
 #include "filter_attempt.h"
@@ -9,14 +9,14 @@
 #define MAX_ITERATIONS 6
 #define SMALL ((real)0.1) /* standard deviations; a smaller correction ends the iterations */
 #ifdef STEWART_FLOAT
-#define ROUNDING ((real)1e-5) /* of a time, as a share of the period */
+#define ROUNDING ((real)1e-5) /* of a time, periods */
 #else
 #define ROUNDING 1e-9
 #endif
 
-/* Cut a schedule (number) at instants (n), ascending, in s. There is place for number + n torques and
-   durations; `places` (n) are the pieces that end at the instants. */
-static stewart_schedule cut(const stewart_schedule *schedule, int n, const real *instants,
+/* Cut a schedule (number) at times (n), ascending, in s. There is place for number + n torques and
+   durations; `places` (n) are the pieces that end at the times. */
+static stewart_schedule cut(const stewart_schedule *schedule, int n, const real *times,
                           real *torques, real *durations, real *places)
 {
     stewart_schedule pieces = {0, torques, durations, 0};
@@ -31,11 +31,11 @@ static stewart_schedule cut(const stewart_schedule *schedule, int n, const real 
         end += schedule->durations[k];
         while (end - passed > apart) {
             int piece = pieces.number++;
-            real until = next < n && instants[next] < end - apart ? instants[next] : end;
+            real until = next < n && times[next] < end - apart ? times[next] : end;
             stewart_copy(U, schedule->torques + U * k, torques + U * piece);
             durations[piece] = until - passed;
             longest = durations[piece] > longest ? durations[piece] : longest;
-            for (; next < n && instants[next] <= until + apart; next++)
+            for (; next < n && times[next] <= until + apart; next++)
                 places[next] = (real)piece;
             passed = until;
         }
@@ -46,20 +46,20 @@ static stewart_schedule cut(const stewart_schedule *schedule, int n, const real 
     return pieces;
 }
 
-/* Legs at several instants of a period.
+/* Update by the encoders of a period.
 
    xi = [x_{k-1}; theta] is corrected by the residuals e_j (`stewart_node_residuals`) at the M nodes s_j of the
-   period. With F_j from xi to the state there and J = dh/dq,
+   period. With F_j from xi to the state present and J = dh/dq,
 
        H_j = J(q_j) F_j[pose],   R_j = diag(var_j) + diag(s_j^2 J Q J'),
 
-   Q the covariance of `end_std`, over a period, which counts as noise here as it does there. A torque that
-   changes at t_c by that of an acceleration a_c, late by sigma, adds k_c k_c' to the covariance,
+   with Q the covariance of `end_std`. A change of torque at t_c that changes the acceleration by a_c, and
+   has the timing error sigma, adds k_c k_c' to the covariance,
 
        k_c = sigma (s_j - t_c) J(q_j) a_c   at nodes after it.
 
-   Each leg is judged by itself at each node: one with e^2 > 30 S, S = H P H' + R, is left out, and the
-   step goes on with the rest; if that is less than half, the measurement is an outlier. */
+   Each leg is tested at each node: a value with e^2 > 30 S, S = H P H' + R, is left out. If more than half
+   of the values are left out, the measurement is an outlier. */
 
 typedef struct {
     stewart_attempt *attempt;
@@ -68,20 +68,20 @@ typedef struct {
     stewart_schedule coarse, fine; /* cut at nodes and at samples */
     real places[3];
     real *samples;    /* (N) pieces of `fine` */
-    real *shown;      /* (N, 6) predicted angles, rad, with the estimated offsets */
-    real *seen;       /* (number, 12) states of `fine` */
+    real *predicted;  /* (N, 6) predicted angles, rad, with the estimated offsets */
+    real *fine_states; /* (number, 12) states of `fine` */
     stewart_reading reading;
-    int round;           /* number of residuals computed so far: legs are judged in round 0 */
-    int number;          /* of the rows kept */
-    int kept[MAX_ROWS];  /* whether each row of leg and node is used */
+    int round;           /* number of calls of `residuals_of_encoders`: values are tested in round 0 */
+    int number;          /* of the rows used */
+    int is_used[MAX_ROWS]; /* whether each row of leg and node is used */
     real *since;      /* (M, changes) s from a change of torque to a node, 0 before it */
-    real *effects;    /* (number, changes) effects of the torques' timing, whitened, of the rows kept */
+    real *effects;    /* (number, changes) effects of the torques' timing, whitened, of the rows used */
     real *C;          /* (number, number) Cholesky factor of their covariance */
-    const real *rows; /* (number, n) whitened, of those kept */
-} Legs;
+    const real *rows; /* (number, n) H, whitened, of the rows used */
+} EncoderUpdate;
 
 /* Predict states, transitions and angles from xi. Returns 0 where they do not exist. */
-static int predict_readings(Legs *s, const real *xi, stewart_scratch scratch)
+static int predict_readings(EncoderUpdate *s, const real *xi, stewart_scratch scratch)
 {
     stewart_attempt *a = s->attempt;
     const stewart_filter *f = a->filter;
@@ -95,57 +95,57 @@ static int predict_readings(Legs *s, const real *xi, stewart_scratch scratch)
     a->transition = s->H + X * n * last;
     if (!a->values)
         return 1;
-    stewart_predict(f->machine, xi + X, &s->fine, xi, s->seen);
+    stewart_predict(f->machine, xi + X, &s->fine, xi, s->fine_states);
     for (int k = 0; k < encoders->samples; k++) {
-        real *angles = s->shown + LEGS * k;
-        stewart_crank_angles(encoders->geometry, s->seen + X * (int)s->samples[k], angles);
+        real *angles = s->predicted + LEGS * k;
+        stewart_crank_angles(encoders->geometry, s->fine_states + X * (int)s->samples[k], angles);
         for (int leg = 0; leg < LEGS && f->offsets >= 0; leg++)
             angles[leg] += xi[X + f->offsets + leg];
     }
     return 1;
 }
 
-/* Reasons for which values of legs were left out; counts the legs that do not fit. */
-static int causes_of(const Legs *s, const int *there)
+/* Return the causes of left-out values, and count the legs that do not fit. `present` as below. */
+static int causes_of(const EncoderUpdate *s, const int *present)
 {
     int causes = s->reading.missing ? STEWART_MISSING : 0;
     s->attempt->gated_legs = 0;
     for (int leg = 0; leg < LEGS; leg++) {
         int gated = 0;
         for (int row = leg; row < LEGS * s->encoders->nodes; row += LEGS)
-            gated = gated || (there[row] && !s->kept[row]);
-        s->attempt->gated_legs += gated && !s->reading.odd[leg];
-        const int stuck = gated && s->attempt->history->still[leg] > 0 && !s->reading.odd[leg];
+            gated = gated || (present[row] && !s->is_used[row]);
+        s->attempt->gated_legs += gated && !s->reading.has_outliers[leg];
+        const int stuck = gated && s->attempt->history->unchanged[leg] > 0 && !s->reading.has_outliers[leg];
         if (stuck)
             causes |= STEWART_FROZEN;
-        if (s->reading.odd[leg] || (gated && !stuck))
+        if (s->reading.has_outliers[leg] || (gated && !stuck))
             causes |= STEWART_REJECTED;
     }
     return causes;
 }
 
-/* Residuals e of the rows kept, and their H, whitened. Returns their number, or -1 for an outlier. */
-static int residuals_of_legs(void *model, const real *xi, real *e, real *H, stewart_scratch scratch)
+/* Residuals e of the rows used, and their H, whitened. Returns their number, or -1 for an outlier. */
+static int residuals_of_encoders(void *context, const real *xi, real *e, real *H, stewart_scratch scratch)
 {
-    Legs *s = model;
+    EncoderUpdate *s = context;
     stewart_attempt *a = s->attempt;
     const stewart_encoders *encoders = s->encoders;
     const int n = a->n, rows = LEGS * encoders->nodes, offsets = a->filter->offsets;
     real variance[MAX_ROWS], residual[MAX_ROWS], J[LEGS * 6];
-    int there[MAX_ROWS], number = 0, kept = 0, given = 0;
+    int present[MAX_ROWS], number = 0, used = 0, given = 0;
     (void)xi;
     (void)scratch;
-    stewart_node_residuals(encoders, &s->reading, s->shown, residual);
+    stewart_node_residuals(encoders, &s->reading, s->predicted, residual);
     for (int node = 0; node < encoders->nodes; node++) {
         const int place = (int)s->places[node];
-        const real *F = s->H + X * n * place, share = encoders->shares[node];
+        const real *F = s->H + X * n * place, time = encoders->node_times[node];
         stewart_crank_jacobian(encoders->geometry, s->states + X * place, J);
         stewart_multiply(LEGS, 6, n, J, F, H + LEGS * n * node);
         for (int leg = 0; leg < LEGS; leg++) {
             const int row = LEGS * node + leg;
             variance[row] = s->reading.variance[row];
             for (int i = 0; i < 6; i++) {
-                const real moved = share * J[6 * leg + i] * a->end_std[i];
+                const real moved = time * J[6 * leg + i] * a->end_std[i];
                 variance[row] += moved * moved;
             }
             for (int c = 0; c < a->changes; c++)
@@ -160,22 +160,22 @@ static int residuals_of_legs(void *model, const real *xi, real *e, real *H, stew
             const real *effects = s->effects + a->changes * row;
             real S = variance[row] + a->timing_factor * stewart_dot(a->changes, effects, effects);
             for (int j = 0; j < n; j++) {
-                real seen = 0;
+                real part = 0;
                 for (int i = 0; i < n; i++)
-                    seen += H[n * row + i] * a->prior->root[n * i + j];
-                S += seen * seen;
+                    part += H[n * row + i] * a->prior->root[n * i + j];
+                S += part * part;
             }
-            there[row] = isfinite(variance[row]) != 0;
-            s->kept[row] = there[row] && residual[row] * residual[row] <= STEWART_LEG_GATE * S;
-            kept += s->kept[row];
-            given += there[row];
+            present[row] = isfinite(variance[row]) != 0;
+            s->is_used[row] = present[row] && residual[row] * residual[row] <= STEWART_LEG_GATE * S;
+            used += s->is_used[row];
+            given += present[row];
         }
-        if (!(2 * kept > given))
+        if (!(2 * used > given))
             return -1;
-        a->left_out = causes_of(s, there);
+        a->left_out = causes_of(s, present);
     }
     for (int row = 0; row < rows; row++) {
-        if (!s->kept[row])
+        if (!s->is_used[row])
             continue;
         e[number] = residual[row];
         variance[number] = variance[row];
@@ -198,52 +198,52 @@ static int residuals_of_legs(void *model, const real *xi, real *e, real *H, stew
     return s->number = number;
 }
 
-/* Predict from a better xi. Returns 1 if the change is small, 0 to go on, -1 without a prediction. */
-static int step_legs(void *model, const real *xi, const real *better, stewart_scratch scratch)
+/* Predict from an updated xi. Returns 1 if the change is small, 0 to go on, -1 without a prediction. */
+static int relinearize(void *context, const real *xi, const real *updated, stewart_scratch scratch)
 {
-    Legs *s = model;
+    EncoderUpdate *s = context;
     const int n = s->attempt->n;
     int small = 1;
     for (int row = 0; row < s->number; row++) {
         real change = 0;
         for (int j = 0; j < n; j++)
-            change += s->rows[n * row + j] * (better[j] - xi[j]);
+            change += s->rows[n * row + j] * (updated[j] - xi[j]);
         small = small && REAL(fabs)(change) <= SMALL;
     }
     if (small)
         return 1;
-    return predict_readings(s, better, scratch) ? 0 : -1;
+    return predict_readings(s, updated, scratch) ? 0 : -1;
 }
 
 /* Take the scratch memory of an attempt, and cut the period. */
-static stewart_scratch prepare(Legs *s, stewart_scratch scratch)
+static stewart_scratch prepare(EncoderUpdate *s, stewart_scratch scratch)
 {
     const stewart_schedule *schedule = &s->attempt->period->schedule;
     const stewart_encoders *encoders = s->encoders;
     const int n = s->attempt->n, N = encoders->samples, M = encoders->nodes;
     const int fine = schedule->number + N, changes = s->attempt->changes;
-    real total = 0, *instants = stewart_take(&scratch, N);
+    real total = 0, *times = stewart_take(&scratch, N);
     real *torques = stewart_take(&scratch, U * (schedule->number + M));
     real *durations = stewart_take(&scratch, schedule->number + M);
     for (int k = 0; k < schedule->number; k++)
         total += schedule->durations[k];
     for (int j = 0; j < M; j++)
-        instants[j] = total * encoders->shares[j];
-    s->coarse = cut(schedule, M, instants, torques, durations, s->places);
+        times[j] = total * encoders->node_times[j];
+    s->coarse = cut(schedule, M, times, torques, durations, s->places);
     torques = stewart_take(&scratch, U * fine);
     durations = stewart_take(&scratch, fine);
     s->samples = stewart_take(&scratch, N);
     for (int k = 0; k < N; k++)
-        instants[k] = total * (real)(k + 1) / (real)N;
-    s->fine = cut(schedule, N, instants, torques, durations, s->samples);
-    s->shown = stewart_take(&scratch, LEGS * N);
-    s->seen = stewart_take(&scratch, X * fine);
+        times[k] = total * (real)(k + 1) / (real)N;
+    s->fine = cut(schedule, N, times, torques, durations, s->samples);
+    s->predicted = stewart_take(&scratch, LEGS * N);
+    s->fine_states = stewart_take(&scratch, X * fine);
     s->reading.angles = stewart_take(&scratch, LEGS * N);
-    s->reading.onto = stewart_take(&scratch, LEGS * M * M);
+    s->reading.fit = stewart_take(&scratch, LEGS * M * M);
     s->reading.variance = stewart_take(&scratch, LEGS * M);
     s->since = stewart_take(&scratch, M * changes);
     for (int j = 0; j < M; j++) {
-        real since = total * encoders->shares[j];
+        real since = total * encoders->node_times[j];
         for (int c = 0; c < changes; c++) {
             s->since[changes * j + c] = since > 0 ? since : 0;
             since -= c + 1 < changes ? schedule->durations[c] : 0;
@@ -261,7 +261,7 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
     const stewart_filter *f = a->filter;
     const stewart_schedule *schedule = &a->period->schedule;
     const stewart_history *history = a->history;
-    Legs s = {.attempt = a, .encoders = f->sensing->kind};
+    EncoderUpdate s = {.attempt = a, .encoders = f->sensing->kind};
     real *xi = a->after->mean, distance = 0, log_ratio;
     real innovations[MAX_ROWS], variances[MAX_ROWS];
     scratch = prepare(&s, scratch);
@@ -270,17 +270,17 @@ static int attempt(stewart_attempt *a, stewart_scratch scratch)
     stewart_attempt_noise(a);
     if (!a->values)
         return stewart_attempt_finish(a, scratch);
-    stewart_read(s.encoders, a->values, s.shown, history->last, history->still, &s.reading, scratch);
+    stewart_read(s.encoders, a->values, s.predicted, history->last, history->unchanged, &s.reading, scratch);
     const stewart_kalman update = {a->n,     LEGS * s.encoders->nodes, MAX_ITERATIONS, a->prior->mean,
-                                   a->prior->root, f->lower, f->upper, &s, residuals_of_legs, step_legs,
+                                   a->prior->root, f->lower, f->upper, &s, residuals_of_encoders, relinearize,
                                    0, innovations, variances};
     if (!stewart_kalman_update(&update, xi, a->after->root, &distance, &log_ratio, scratch))
         return 0;
-    *a->after->squares += distance;
-    *a->after->values += (real)s.number;
+    *a->after->chi2 += distance;
+    *a->after->chi2_values += (real)s.number;
     stewart_attempt_learn(a, s.number, innovations, variances, s.rows, s.effects);
-    stewart_predict(f->machine, xi + X, schedule, xi, s.seen);
-    stewart_copy(X, s.seen + X * (schedule->number - 1), a->end_state);
+    stewart_predict(f->machine, xi + X, schedule, xi, s.fine_states);
+    stewart_copy(X, s.fine_states + X * (schedule->number - 1), a->end_state);
     return stewart_attempt_finish(a, scratch);
 }
 
@@ -302,11 +302,12 @@ static int pose_changes(const stewart_filter *filter, const real *state, real *B
            && stewart_solve(LEGS, filter->machine->estimated, J, B);
 }
 
-const stewart_legs stewart_encoder_legs = {attempt, attempt_scratch, pose_changes, stewart_count_still};
+const stewart_encoder_step stewart_encoder_filter_step = {attempt, attempt_scratch, pose_changes,
+                                                         stewart_count_unchanged};
 
-stewart_sensing stewart_encoder_instants(const void *sensor)
+stewart_sensing stewart_encoder_filter_sensing(const void *sensor)
 {
     stewart_sensing sensing = stewart_encoder_sensing(sensor);
-    sensing.legs = &stewart_encoder_legs;
+    sensing.encoder_step = &stewart_encoder_filter_step;
     return sensing;
 }

@@ -4,23 +4,23 @@
 #include "short.h"
 
 #define MAX_NODES 3
-#define ENOUGH ((real)0.3)  /* least share of a leg's samples that must be there for it to count */
+#define LEAST_PRESENT ((real)0.3) /* least part of a leg's samples that must be present for it to count */
 /* An outlier is off the median by more than each of these (Hampel): */
 #define OUTLIER_DEVIATIONS 8   /* median absolute deviations */
 #define OUTLIER_SPANS 3        /* spans from the 10th to the 90th percentile: residuals may be curved */
 #define OUTLIER_QUANTA 3       /* widths of a code */
-#define LEAST_QUANTUM ((real)3e-7) /* rad, least width of a code there, for errors of the model's angles */
-#define LAST_FEW 9          /* samples for the line whose end is the angle at the last sample */
+#define LEAST_QUANTUM ((real)3e-7) /* rad, least width of a code in that test, for errors of the model's angles */
+#define LAST_FEW 9          /* last samples that the line of `last_angle` fits */
 #define PAIRS (LAST_FEW * (LAST_FEW - 1) / 2)
 
 /* Whether `number` of N samples are enough for a leg. */
 static int is_enough(const stewart_encoders *encoders, int N, int number)
 {
-    return number >= (N > 1 ? encoders->nodes : 1) && (real)number >= ENOUGH * (real)N;
+    return number >= (N > 1 ? encoders->nodes : 1) && (real)number >= LEAST_PRESENT * (real)N;
 }
 
-/* Instant of sample n within the period, the interval [-1, 1] of the Legendre polynomials. */
-static real instant(const stewart_encoders *encoders, int n)
+/* Time of sample n, with the period as the interval [-1, 1] of the Legendre polynomials. */
+static real legendre_time(const stewart_encoders *encoders, int n)
 {
     return 2 * (real)(n + 1) / (real)encoders->samples - 1;
 }
@@ -45,10 +45,10 @@ static void sort(int n, real *x)
         }
 }
 
-/* Quantile of sorted numbers (n), interpolated. */
-static real quantile(int n, const real *sorted, real share)
+/* Interpolated quantile of sorted numbers (n) for a probability p. */
+static real quantile(int n, const real *sorted, real p)
 {
-    const real place = share * (real)(n - 1);
+    const real place = p * (real)(n - 1);
     int below = (int)place;
     if (below > n - 2)
         below = n > 1 ? n - 2 : 0;
@@ -61,7 +61,7 @@ static real median(int n, const real *sorted)
     return n % 2 ? sorted[n / 2] : (sorted[n / 2 - 1] + sorted[n / 2]) / 2;
 }
 
-static void seen_of_encoders(const stewart_sensing *sensing, const real *state, real *values)
+static void predict_encoders(const stewart_sensing *sensing, const real *state, real *values)
 {
     const stewart_encoders *encoders = sensing->kind;
     stewart_crank_angles(encoders->geometry, state, values);
@@ -81,8 +81,8 @@ static void jacobian_of_encoders(const stewart_sensing *sensing, const real *sta
         stewart_copy(6, one + 6 * (row % LEGS), J + X * row);
 }
 
-/* Angle (rad) of a leg at the last sample; NaN for none. With more than MAX_NODES of them from a line
-   through the last few (Theil and Sen), robust to outliers. */
+/* Angle (rad) of a leg at the last sample, NaN where it is unknown. With more than MAX_NODES samples it is
+   the end of a line through the last few, robust to outliers (Theil and Sen). */
 static real last_angle(int N, const real *values, int leg)
 {
     real t[LAST_FEW], y[LAST_FEW], slopes[PAIRS];
@@ -105,7 +105,7 @@ static real last_angle(int N, const real *values, int leg)
 }
 
 /* Pose by forward kinematics, with the expected rates. To first order its covariance is P = J^-1 R J^-T.
-   A silent leg has its expected angle, with the size of the motion as standard deviation. */
+   A leg without values has its expected angle, with the size of the motion as standard deviation. */
 static int start_of_encoders(const stewart_sensing *sensing, const real *values, const real *near,
                              real *state, real *root, stewart_scratch scratch)
 {
@@ -113,7 +113,7 @@ static int start_of_encoders(const stewart_sensing *sensing, const real *values,
     real *J = stewart_take(&scratch, LEGS * 6), *inverse = stewart_take(&scratch, LEGS * 6);
     real angles[LEGS], std[LEGS];
     int known[LEGS];
-    const real *expected = near && stewart_all_finite(X, near) ? near : encoders->declared;
+    const real *expected = near && stewart_all_finite(X, near) ? near : encoders->initial_state;
     stewart_crank_angles(encoders->geometry, expected, angles);
     for (int leg = 0; leg < LEGS; leg++) {
         const real angle = last_angle(sensing->size / LEGS, values, leg);
@@ -162,11 +162,11 @@ static int fault_of_encoders(const stewart_sensing *sensing, const real *geometr
 stewart_sensing stewart_encoder_sensing(const void *sensor)
 {
     const stewart_encoders *encoders = sensor;
-    return (stewart_sensing){LEGS * encoders->samples, encoders->noise_std, encoders, seen_of_encoders,
+    return (stewart_sensing){LEGS * encoders->samples, encoders->noise_std, encoders, predict_encoders,
                              jacobian_of_encoders, start_of_encoders, fault_of_encoders, NULL};
 }
 
-stewart_sensing stewart_newest_encoders(const void *sensor)
+stewart_sensing stewart_newest_encoder_sensing(const void *sensor)
 {
     stewart_sensing sensing = stewart_encoder_sensing(sensor);
     sensing.size = LEGS;
@@ -188,79 +188,78 @@ static int changes_of(const stewart_encoders *encoders, const real *values, cons
     return changes;
 }
 
-void stewart_count_still(const stewart_sensing *sensing, const real *values, const real *last,
-                         real *still)
+void stewart_count_unchanged(const stewart_sensing *sensing, const real *values, const real *last,
+                         real *unchanged)
 {
     const stewart_encoders *encoders = sensing->kind;
     for (int leg = 0; leg < LEGS; leg++) {
-        int silent = 1;
+        int present = 0;
         for (int n = 0; n < encoders->samples; n++)
-            silent = silent && !isfinite(values[LEGS * n + leg]);
-        if (!silent)
-            still[leg] = changes_of(encoders, values, last, leg) ? 0 : still[leg] + 1;
+            present |= isfinite(values[LEGS * n + leg]) != 0;
+        if (present)
+            unchanged[leg] = changes_of(encoders, values, last, leg) ? 0 : unchanged[leg] + 1;
     }
 }
 
 /* Replace outliers of a leg within a period (Hampel) by NaN. Returns whether there are any. */
-static int reject(const stewart_encoders *encoders, const real *shown, int leg, real *values,
-                  stewart_scratch scratch)
+static int reject_outliers(const stewart_encoders *encoders, const real *predicted, int leg, real *values,
+                           stewart_scratch scratch)
 {
-    real *sorted = stewart_take(&scratch, encoders->samples), middle, bound, least;
-    int number = 0, odd = 0;
+    real *sorted = stewart_take(&scratch, encoders->samples);
+    int number = 0, found = 0;
     for (int n = 0; n < encoders->samples; n++) {
         real *value = values + LEGS * n + leg;
-        const real residual = *value - encoders->offset[leg] - shown[LEGS * n + leg];
+        const real residual = *value - encoders->offset[leg] - predicted[LEGS * n + leg];
         if (isfinite(residual))
             sorted[number++] = residual;
         else if (isfinite(*value)) { /* the model is out of reach */
             *value = (real)NAN;
-            odd = 1;
+            found = 1;
         }
     }
     if (!number)
-        return odd;
+        return found;
     sort(number, sorted);
-    middle = median(number, sorted);
-    bound = OUTLIER_SPANS * (quantile(number, sorted, (real)0.9) - quantile(number, sorted, (real)0.1));
+    const real middle = median(number, sorted);
+    const real span = quantile(number, sorted, (real)0.9) - quantile(number, sorted, (real)0.1);
     for (int i = 0; i < number; i++)
         sorted[i] = REAL(fabs)(sorted[i] - middle);
     sort(number, sorted);
-    least = OUTLIER_QUANTA * (encoders->quantum > LEAST_QUANTUM ? encoders->quantum : LEAST_QUANTUM);
-    if (!(bound >= least))
-        bound = least;
-    if (OUTLIER_DEVIATIONS * median(number, sorted) > bound)
-        bound = OUTLIER_DEVIATIONS * median(number, sorted);
+    const real least = OUTLIER_QUANTA * REAL(fmax)(encoders->quantum, LEAST_QUANTUM);
+    const real bound =
+        REAL(fmax)(REAL(fmax)(OUTLIER_SPANS * span, least), OUTLIER_DEVIATIONS * median(number, sorted));
     for (int n = 0; n < encoders->samples; n++) {
         real *value = values + LEGS * n + leg;
-        const real residual = *value - encoders->offset[leg] - shown[LEGS * n + leg];
+        const real residual = *value - encoders->offset[leg] - predicted[LEGS * n + leg];
         if (isfinite(*value) && !(REAL(fabs)(residual - middle) <= bound)) {
             *value = (real)NAN;
-            odd = 1;
+            found = 1;
         }
     }
-    return odd;
+    return found;
 }
 
-/* K (M, M) = V(s) (V'V)^-1 of the samples of a leg that are there, and sum_n G_jn^2 (M) of G = K V'. */
-static int project(const stewart_encoders *encoders, const real *values, int leg, real *K,
-                   real *squares)
+/* Fit the samples of a leg that are present: compute K (M, M) = V(s) (V'V)^-1, and sum_n G_jn^2 (M) with
+   G = K V'. Returns 0 if V'V is singular. */
+static int fit_at_nodes(const stewart_encoders *encoders, const real *values, int leg, real *K,
+                        real *squares)
 {
     const int M = encoders->nodes;
     real gram[MAX_NODES * MAX_NODES] = {0}, v[MAX_NODES], nodes[MAX_NODES * MAX_NODES];
     for (int n = 0; n < encoders->samples; n++) {
         if (!isfinite(values[LEGS * n + leg]))
             continue;
-        legendre(instant(encoders, n), v);
+        legendre(legendre_time(encoders, n), v);
         for (int a = 0; a < M; a++)
             for (int b = 0; b < M; b++)
                 gram[M * a + b] += v[a] * v[b];
     }
     for (int j = 0; j < M; j++) {
-        legendre(2 * encoders->shares[j] - 1, v);
+        legendre(2 * encoders->node_times[j] - 1, v);
         for (int a = 0; a < M; a++)
             nodes[M * a + j] = v[a];
     }
-    real at_nodes[MAX_NODES * MAX_NODES]; /* V(s)', which the solution replaces */
+    real at_nodes[MAX_NODES * MAX_NODES]; /* V(s)'; the solution overwrites `nodes` */
     stewart_copy(M * M, nodes, at_nodes);
     if (!stewart_solve(M, M, gram, nodes))
         return 0;
@@ -274,8 +273,8 @@ static int project(const stewart_encoders *encoders, const real *values, int leg
     return 1;
 }
 
-void stewart_read(const stewart_encoders *encoders, const real *values, const real *shown,
-                  const real *last, const real *still, stewart_reading *reading,
+void stewart_read(const stewart_encoders *encoders, const real *values, const real *predicted,
+                  const real *last, const real *unchanged, stewart_reading *reading,
                   stewart_scratch scratch)
 {
     const int N = encoders->samples, M = encoders->nodes;
@@ -283,41 +282,42 @@ void stewart_read(const stewart_encoders *encoders, const real *values, const re
     reading->missing = !stewart_all_finite(LEGS * N, values);
     stewart_copy(LEGS * N, values, angles);
     for (int leg = 0; leg < LEGS; leg++) {
-        real *K = reading->onto + M * M * leg, share = 1;
-        int number = 0, changes;
-        reading->odd[leg] = N > MAX_NODES && reject(encoders, shown, leg, angles, scratch);
+        real *K = reading->fit + M * M * leg, information = 1; /* independent samples over samples */
+        int number = 0;
+        reading->has_outliers[leg] =
+            N > MAX_NODES && reject_outliers(encoders, predicted, leg, angles, scratch);
         for (int n = 0; n < N; n++)
             number += isfinite(angles[LEGS * n + leg]) != 0;
-        const int counts = is_enough(encoders, N, number) && project(encoders, angles, leg, K, squares);
-        changes = changes_of(encoders, angles, last, leg);
+        const int counts = is_enough(encoders, N, number) && fit_at_nodes(encoders, angles, leg, K, squares);
+        const int changes = changes_of(encoders, angles, last, leg);
         if (encoders->quantum > 0 && number) {
-            share = (real)changes / (real)number; /* independent samples over samples */
+            information = (real)changes / (real)number;
             if (!changes)
-                share = 1 / ((1 + still[leg]) * (1 + still[leg]) * (real)number);
-            share = share < 1 ? share : 1;
+                information = 1 / ((1 + unchanged[leg]) * (1 + unchanged[leg]) * (real)number);
+            information = information < 1 ? information : 1;
         }
         for (int j = 0; j < M; j++)
             reading->variance[LEGS * j + leg]
-                = counts ? encoders->std * encoders->std * squares[j] / share : (real)INFINITY;
+                = counts ? encoders->std * encoders->std * squares[j] / information : (real)INFINITY;
         for (int n = 0; n < N; n++)
             angles[LEGS * n + leg] -= encoders->offset[leg];
     }
 }
 
 void stewart_node_residuals(const stewart_encoders *encoders, const stewart_reading *reading,
-                    const real *shown, real *e)
+                    const real *predicted, real *e)
 {
     const int N = encoders->samples, M = encoders->nodes;
     for (int leg = 0; leg < LEGS; leg++) {
-        const real *K = reading->onto + M * M * leg;
+        const real *K = reading->fit + M * M * leg;
         real sums[MAX_NODES] = {0}, v[MAX_NODES];
         for (int n = 0; n < N; n++) {
             const real angle = reading->angles[LEGS * n + leg];
             if (!isfinite(angle))
                 continue;
-            legendre(instant(encoders, n), v);
+            legendre(legendre_time(encoders, n), v);
             for (int a = 0; a < M; a++)
-                sums[a] += v[a] * (angle - shown[LEGS * n + leg]);
+                sums[a] += v[a] * (angle - predicted[LEGS * n + leg]);
         }
         for (int j = 0; j < M; j++) {
             e[LEGS * j + leg] = 0;

@@ -3,21 +3,24 @@
 #include "filter_attempt.h"
 #include "short.h"
 
-#define ITERATIONS 4       /* at the most; one is enough when the parameters are roughly known */
-#define KNOWN ((real)0.01) /* share of the usual standard deviation at which a constant is known: for F, */
-#define LEARNT ((real)0.3) /* for a prediction over a few periods, */
+#define ITERATIONS 4 /* at most; one is enough when the parameters are roughly known */
+/* Parts of the usual standard deviation at which a constant is known well enough */
+#define KNOWN ((real)0.01)   /* for an F of second order, */
+#define LEARNT ((real)0.3)   /* for a prediction over a few periods, */
 #define DIRECTED ((real)0.1) /* for the direction in which a late torque moves the plate */
-#define UNTIMELY 70        /* factor t of noise.h that is tried for a torque far too early or late, */
-#define LATEST 700         /* up to this */
-#define ONCE ((real)0.05)  /* after such a torque t becomes at most GROWTH times this, or t if that is larger */
+/* Factor t of noise.h for a torque far too early or late: tried from UNTIMELY up to MOST_UNTIMELY. After it
+   t is at most GROWTH times the former one, which counts as ONCE or more. */
+#define UNTIMELY 70
+#define MOST_UNTIMELY 700
+#define ONCE ((real)0.05)
 #define GROWTH 30
-/* Shares of `usual_std` by which parameters may have changed. */
+/* Factors on `usual_std` by which parameters may have changed */
 #define CHANGED ((real)1e-3)      /* the least */
 #define MOST_CHANGED ((real)0.01) /* the largest for a single outlier */
 #define MOST_AGREEING ((real)0.3) /* the largest if the last outlier agrees, or the prior is untested */
 #define CHANGED_PER_OUTLIER ((real)3) /* more for each outlier that disagrees with the one before */
-#define YOUNG 3                   /* measurements that test the prior */
-#define MAX_DISTANCE 100          /* gates: after a first iteration beyond this an update is given up */
+#define YOUNG 3          /* measurements after which a prior counts as tested */
+#define MAX_DISTANCE 100 /* gates: an update is given up if its first iteration is beyond this */
 
 int stewart_posterior_size(int n, int m)
 {
@@ -34,12 +37,12 @@ stewart_posterior stewart_posterior_at(real *numbers, int n, int m)
 
 static int size_of(const stewart_filter *filter) { return X + filter->machine->estimated; }
 
-static int is_known(const stewart_filter *filter, const real *root, real share)
+static int is_known(const stewart_filter *filter, const real *root, real part)
 {
     const int n = size_of(filter);
     for (int i = X; i < n; i++)
         if (!(filter->walk_std[i - X] > 0)
-            && !(stewart_norm(n, root + n * i) <= share * filter->usual_std[i - X])) /* or NaN */
+            && !(stewart_norm(n, root + n * i) <= part * filter->usual_std[i - X])) /* or NaN */
             return 0;
     return 1;
 }
@@ -72,7 +75,7 @@ int stewart_attempt_finish(stewart_attempt *a, stewart_scratch scratch)
     real walk[STEWART_MAX_ESTIMATED];
     for (int i = 0; i < n - X; i++) {
         const real own = a->filter->walk_std[i], wander = a->filter->wander_std[i];
-        walk[i] = REAL(sqrt)(own * own + after->noise->used * wander * wander);
+        walk[i] = REAL(sqrt)(own * own + after->noise->wander_in_use * wander * wander);
     }
     stewart_root_of_prediction(n, a->transition, a->end_std, walk, a->changes, a->timing_root, after->root,
                                scratch);
@@ -81,33 +84,33 @@ int stewart_attempt_finish(stewart_attempt *a, stewart_scratch scratch)
     return stewart_all_finite(n, after->mean) && stewart_all_finite(n * n, after->root);
 }
 
-/* An attempt with a measurement of the sample alone, not of instants within the period. */
+/* An attempt with a measurement of the state at the period's end. */
 typedef struct {
-    stewart_instant instant;
+    stewart_measurement measurement;
     const stewart_attempt *attempt;
     int fourth_order;
     real *states; /* (number, 12) */
-} Sample;
+} EndUpdate;
 
 static int predict(void *context, const real *xi, real *end)
 {
-    Sample *s = context;
+    EndUpdate *s = context;
     const stewart_schedule *schedule = &s->attempt->period->schedule;
     stewart_predict(s->attempt->filter->machine, xi + X, schedule, xi, s->states);
     stewart_copy(X, s->states + X * (schedule->number - 1), end);
     return 1;
 }
 
-/* H along the states of `predict`. */
+/* Compute H along the states of `predict`. */
 static int linearize(void *context, const real *xi, real *H, stewart_scratch scratch)
 {
-    Sample *s = context;
+    EndUpdate *s = context;
     return stewart_transitions(s->attempt->filter->machine, xi, &s->attempt->period->schedule,
                                s->fourth_order, s->states, 0, H, scratch);
 }
 
 /* Predict and linearise from the prior's mean, or take the result from `cache` if the mean is the same. */
-static int begin(Sample *s, const real *xi, real *end, stewart_scratch scratch)
+static int begin(EndUpdate *s, const real *xi, real *end, stewart_scratch scratch)
 {
     const int n = s->attempt->n;
     real *cache = s->attempt->cache, *mean = cache + 1, *last = mean + n, *H = last + X;
@@ -116,15 +119,15 @@ static int begin(Sample *s, const real *xi, real *end, stewart_scratch scratch)
         same = mean[i] == xi[i];
     if (same) {
         stewart_copy(X, last, end);
-        stewart_copy(X * n, H, s->instant.H);
+        stewart_copy(X * n, H, s->measurement.H);
         return 1;
     }
-    if (!predict(s, xi, end) || !linearize(s, xi, s->instant.H, scratch))
+    if (!predict(s, xi, end) || !linearize(s, xi, s->measurement.H, scratch))
         return 0;
     cache[0] = (real)s->fourth_order;
     stewart_copy(n, xi, mean);
     stewart_copy(X, end, last);
-    stewart_copy(X * n, s->instant.H, H);
+    stewart_copy(X * n, s->measurement.H, H);
     return 1;
 }
 
@@ -138,12 +141,12 @@ void stewart_attempt_learn(const stewart_attempt *a, int m, const real *innovati
                         f->learns_timing ? a->changes : 0, effects, f->forgetting, a->after->noise);
 }
 
-static void learn(const Sample *s, const real *innovations, const real *variances, stewart_scratch scratch)
+static void learn(const EndUpdate *s, const real *innovations, const real *variances, stewart_scratch scratch)
 {
-    const stewart_instant *at = &s->instant;
+    const stewart_measurement *at = &s->measurement;
     const int m = at->sensing->size, changes = s->attempt->changes;
     real *H = stewart_take(&scratch, m * at->n), *effects = stewart_take(&scratch, m * changes);
-    stewart_instant_derivative(at, H);
+    stewart_whitened_derivative(at, H);
     stewart_apply_jacobian(at->sensing, at->J, changes, s->attempt->effects, effects);
     stewart_whiten(m, changes, at->C, effects);
     stewart_attempt_learn(s->attempt, m, innovations, variances, H, effects);
@@ -155,35 +158,35 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
     const stewart_posterior *prior = a->prior;
     const int n = a->n, m = f->sensing->size, pieces = a->period->schedule.number;
     /* Corrections of known parameters are too small to need F to fourth order. */
-    Sample s = {.attempt = a, .fourth_order = !is_known(f, prior->root, KNOWN)};
+    EndUpdate s = {.attempt = a, .fourth_order = !is_known(f, prior->root, KNOWN)};
     real *xi = a->after->mean, log_ratio;
     real *innovations = stewart_take(&scratch, m), *variances = stewart_take(&scratch, m);
-    s.instant = (stewart_instant){f->sensing, a->values, n,  a->end_state,  NULL,
+    s.measurement = (stewart_measurement){f->sensing, a->values, n,  a->end_state,  NULL,
                                   NULL,       NULL,      &s, predict, linearize};
-    s.instant.C = stewart_take(&scratch, m * m);
-    s.instant.J = stewart_take(&scratch, m * X);
+    s.measurement.C = stewart_take(&scratch, m * m);
+    s.measurement.J = stewart_take(&scratch, m * X);
     s.states = stewart_take(&scratch, X * pieces);
-    a->transition = s.instant.H = stewart_take(&scratch, X * n);
+    a->transition = s.measurement.H = stewart_take(&scratch, X * n);
     if (!begin(&s, xi, a->end_state, scratch))
         return 0;
     stewart_attempt_noise(a);
     if (!a->values)
         return stewart_attempt_finish(a, scratch);
     if (!stewart_innovation_root(f->sensing, a->end_state, a->changes, a->timing_root, a->end_std,
-                                 s.instant.C, scratch))
+                                 s.measurement.C, scratch))
         return 0;
     const stewart_kalman update = {n, m, ITERATIONS, prior->mean, prior->root, f->lower, f->upper, &s,
-                                   stewart_instant_residuals, stewart_instant_step, a->max_distance,
+                                   stewart_measurement_residuals, stewart_measurement_relinearize, a->max_distance,
                                    innovations, variances};
     if (!stewart_kalman_update(&update, xi, a->after->root, &a->distance, &log_ratio, scratch))
         return 0;
-    a->likelihood = -(a->distance + log_ratio) / 2;
+    a->log_likelihood = -(a->distance + log_ratio) / 2;
     for (int i = 0; i < m; i++)
-        a->likelihood -= REAL(log)(s.instant.C[(m + 1) * i]);
+        a->log_likelihood -= REAL(log)(s.measurement.C[(m + 1) * i]);
     if (!(a->distance <= f->gate)) /* or NaN */
         return 0;
-    *a->after->squares += a->distance;
-    *a->after->values += (real)m;
+    *a->after->chi2 += a->distance;
+    *a->after->chi2_values += (real)m;
     learn(&s, innovations, variances, scratch);
     return stewart_attempt_finish(a, scratch);
 }
@@ -193,12 +196,12 @@ static int attempt_sample(stewart_attempt *a, stewart_scratch scratch)
 static int attempt(stewart_attempt *a, stewart_scratch scratch)
 {
     a->left_out = a->gated_legs = 0;
-    a->likelihood = -(real)INFINITY;
+    a->log_likelihood = -(real)INFINITY;
     stewart_copy(a->n, a->prior->mean, a->after->mean);
-    *a->after->squares = *a->prior->squares;
-    *a->after->values = *a->prior->values;
+    *a->after->chi2 = *a->prior->chi2;
+    *a->after->chi2_values = *a->prior->chi2_values;
     *a->after->noise = *a->prior->noise;
-    return a->filter->legs ? a->filter->legs->attempt(a, scratch) : attempt_sample(a, scratch);
+    return a->filter->encoder_step ? a->filter->encoder_step->attempt(a, scratch) : attempt_sample(a, scratch);
 }
 
 int stewart_filter_start(const stewart_filter *filter, const real *values, const real *theta,
@@ -216,7 +219,7 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
         return 0;
     if (offsets >= 0) { /* an error d of the offsets makes an error -J^-1 d of the pose */
         stewart_copy(LEGS * p, filter->prior_root + p * offsets, back);
-        if (!filter->legs->pose_changes(filter, state, back, scratch))
+        if (!filter->encoder_step->pose_changes(filter, state, back, scratch))
             return 0;
     }
     stewart_fill(n * n, 0, e.root);
@@ -253,14 +256,14 @@ static int start_again(const stewart_filter *filter, const real *values, const r
     return 1;
 }
 
-/* Compute `after` from `now`, in `before` with a share of `std` (p) added. */
+/* Compute `after` from `before`, which is `now` with `factor` times `std` (p) added to the deviations. */
 static int attempt_changed(stewart_attempt *a, const stewart_posterior *now,
-                           const stewart_posterior *before, const real *std, real share,
+                           const stewart_posterior *before, const real *std, real factor,
                            stewart_scratch scratch)
 {
     real added[STEWART_MAX_ESTIMATED];
     for (int i = 0; i < a->n - X; i++)
-        added[i] = share * std[i];
+        added[i] = factor * std[i];
     stewart_copy(stewart_posterior_size(a->n, a->filter->sensing->size), now->mean, before->mean);
     stewart_widen_root(a->n, added, before->root, scratch);
     return attempt(a, scratch);
@@ -273,13 +276,14 @@ static int jump(stewart_attempt *a, const stewart_posterior *now, const stewart_
 {
     const real largest = a->gated_legs == 1 ? 1 : STEWART_MAX_JUMP;
     a->prior = before;
-    for (real share = 1; share <= largest; share *= 10)
-        if (attempt_changed(a, now, before, a->filter->jump_std, share, scratch) && !a->gated_legs)
+    for (real factor = 1; factor <= largest; factor *= 10)
+        if (attempt_changed(a, now, before, a->filter->jump_std, factor, scratch) && !a->gated_legs)
             return 1;
     a->prior = now;
     return 0;
 }
 
+/* Replace the estimate by that of an attempt. */
 static void accept(int n, int m, const stewart_posterior *found, stewart_posterior *now)
 {
     stewart_copy(n, found->mean, now->mean);
@@ -287,8 +291,8 @@ static void accept(int n, int m, const stewart_posterior *found, stewart_posteri
     stewart_fill(m, (real)NAN, now->outlier);
     *now->outliers = *now->age = *now->disagreed = 0;
     *now->left_out = *found->left_out;
-    *now->squares = *found->squares;
-    *now->values = *found->values;
+    *now->chi2 = *found->chi2;
+    *now->chi2_values = *found->chi2_values;
     *now->noise = *found->noise;
 }
 
@@ -298,13 +302,13 @@ static void accept(int n, int m, const stewart_posterior *found, stewart_posteri
 static real without_cause(const stewart_attempt *a)
 {
     const real m = (real)a->filter->sensing->size;
-    if (!isfinite(a->likelihood))
+    if (!isfinite(a->log_likelihood))
         return -(real)INFINITY;
-    return a->likelihood + (a->distance - m - m * REAL(log)(a->distance / m)) / 2;
+    return a->log_likelihood + (a->distance - m - m * REAL(log)(a->distance / m)) / 2;
 }
 
 /* Compute `after` for an outlier that has a cause, from `now` with more noise or widened variances in
-   `before`: a torque came far too early or late, or parameters changed by the least share that explains the
+   `before`: a torque came far too early or late, or parameters changed by the least factor that explains the
    values. The log-density with a late torque must exceed `without`. Returns 0 without a cause. */
 static int explain(stewart_attempt *a, const stewart_posterior *now, const stewart_posterior *before,
                    real most, real without, stewart_scratch scratch)
@@ -316,28 +320,28 @@ static int explain(stewart_attempt *a, const stewart_posterior *now, const stewa
     a->prior = before;
     a->max_distance = MAX_DISTANCE * filter->gate;
     stewart_copy(size, now->mean, before->mean);
-    for (real t = UNTIMELY; filter->learns_timing && t <= LATEST; t *= 10) {
+    for (real t = UNTIMELY; filter->learns_timing && t <= MOST_UNTIMELY; t *= 10) {
         if (now->noise->timing >= t)
             continue;
         before->noise->timing = t;
-        if (attempt(a, scratch) && a->likelihood > late) {
-            late = a->likelihood;
+        if (attempt(a, scratch) && a->log_likelihood > late) {
+            late = a->log_likelihood;
             untimely = t;
         }
     }
-    /* The largest share has the least distance: if the update gives up there, it does for all. */
+    /* The largest factor has the least distance: if the update is given up with it, it is with all. */
     const real *std = filter->usual_std;
     if (attempt_changed(a, now, before, std, most, scratch) || a->distance <= a->max_distance)
-        for (real share = CHANGED; !found && share <= most; share *= REAL(sqrt)(10))
-            found = attempt_changed(a, now, before, std, share, scratch);
-    if (untimely > 0 && !(found && a->likelihood >= late)) {
+        for (real factor = CHANGED; !found && factor <= most; factor *= REAL(sqrt)(10))
+            found = attempt_changed(a, now, before, std, factor, scratch);
+    if (untimely > 0 && !(found && a->log_likelihood >= late)) {
         stewart_copy(size, now->mean, before->mean);
         before->noise->timing = untimely;
         found = attempt(a, scratch);
         *a->after->noise = *now->noise; /* one late torque does not make all of them late */
         const real once = now->noise->timing > ONCE ? now->noise->timing : ONCE;
         a->after->noise->timing = REAL(fmin)(GROWTH * once, untimely);
-        a->after->noise->known_timing = 0; /* what is known of it holds near its former value only */
+        a->after->noise->timing_information = 0; /* it holds near the former t only */
     }
     a->prior = now;
     a->max_distance = 0;
@@ -385,8 +389,8 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
         && attempt(&a, scratch))
         outliers += *now.outliers;
     a.prior = &now;
-    const real most = outliers > 1 || *now.values <= YOUNG * (real)m ? MOST_AGREEING : MOST_CHANGED;
-    if (values && !filter->legs
+    const real most = outliers > 1 || *now.chi2_values <= YOUNG * (real)m ? MOST_AGREEING : MOST_CHANGED;
+    if (values && !filter->encoder_step
         && explain(&a, &now, &before, most * (real)1.1, without, scratch)) {
         accept(n, m, &after, &now);
         return;
@@ -409,10 +413,10 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
 
 int stewart_filter_scratch(const stewart_filter *filter, int torques)
 {
-    const stewart_legs *legs = filter->legs;
+    const stewart_encoder_step *encoder_step = filter->encoder_step;
     const int n = size_of(filter), p = n - X, m = filter->sensing->size;
     const int sample = m * (m + 3 + X) + m * (torques + 1) + X * (n + torques) + stewart_kalman_scratch(n, m);
-    const int step = legs ? legs->scratch(filter, torques) : sample;
+    const int step = encoder_step ? encoder_step->scratch(filter, torques) : sample;
     const int within = step + stewart_transitions_scratch(p) + 2 * n * n + (X + 3 + torques) * n;
     return 2 * stewart_posterior_size(n, m) + cache_size(n) + 2 * X * (torques + 1) + within;
 }

@@ -11,10 +11,11 @@
 
 #pragma once
 
-#include "instant.h"
+#include "measurement.h"
 #include "noise.h"
 
-#define STEWART_PATIENCE 3 /* consecutive outliers that agree with each other and are then believed */
+#define STEWART_PATIENCE 3 /* consecutive outliers that agree with each other and restart the estimate */
+#define STEWART_MAX_JUMP ((real)100) /* largest factor on the `jump_std` of parameters that is tried */
 
 /* An estimate of xi = [x; theta] (n = 12 + p), from measurements (m): views of one vector of
    `stewart_posterior_size` numbers, in this order. */
@@ -24,9 +25,9 @@ typedef struct {
     real *outlier;  /* (m) the last outlier, NaN without one */
     real *outliers; /* consecutive ones that agree with each other, up to the last measurement */
     real *age;      /* periods since a measurement was last used */
-    real *left_out; /* reasons for left-out values of that measurement, bits as of a `fault` */
-    real *squares;  /* sum of nu' S^-1 nu of all measurements that were used */
-    real *values;   /* number of values in them */
+    real *left_out; /* causes of left-out values of that measurement, bits as of a `fault` */
+    real *chi2;     /* sum of nu' S^-1 nu of all measurements that were used */
+    real *chi2_values; /* number of values in them */
     real *disagreed; /* outliers since a measurement was last used that disagree with the one before */
     stewart_noise *noise; /* factors of the assumed noise */
 } stewart_posterior;
@@ -34,17 +35,17 @@ typedef struct {
 int stewart_posterior_size(int n, int m);
 stewart_posterior stewart_posterior_at(real *numbers, int n, int m);
 
-/* Encoders read at several instants of a period, see filter_attempt.h. */
-typedef struct stewart_legs stewart_legs;
+/* Filter step for encoders, which are read at several times of a period: see filter_attempt.h. */
+typedef struct stewart_encoder_step stewart_encoder_step;
 
-/* What the filter assumes; standard deviations in SI units. */
+/* Assumptions of the filter; standard deviations in SI units. */
 typedef struct {
     const stewart_machine *machine; /* its p estimated parameters are theta */
     const stewart_sensing *sensing;
-    const stewart_legs *legs; /* of encoders; NULL for a measurement of the sample alone */
+    const stewart_encoder_step *encoder_step; /* of encoders; NULL for a measurement of the sample alone */
     int offsets;            /* place in theta of the first of six encoders' offsets; -1 for none */
     real gate;              /* largest nu' S^-1 nu of m values that are not an outlier */
-    real timing_std;        /* s, of a torque's instant, before innovations correct it */
+    real timing_std;        /* s, of the timing of a torque, before innovations correct it */
     int learns_timing;      /* whether innovations correct it */
     const real *model_std;  /* (12) error of one step of the model */
     const real *prior_root; /* (p, p) */
@@ -60,15 +61,15 @@ typedef struct {
 /* Codes of encoders before a measurement. */
 typedef struct {
     const real *last;  /* (m) the last measurement, NaN without one */
-    const real *still; /* (6) periods for which each leg's code is constant, this one included */
+    const real *unchanged; /* (6) periods for which each leg's code is constant, this one included */
 } stewart_history;
 
 /* Start an estimate from values (m) alone, with initial parameters theta (p). `near` (12) or NULL is
-   passed to `start` of the sensing. Returns 0, and leaves the estimate, if no state follows. */
+   passed to `start` of the sensing. Returns 0 and keeps the estimate if the values determine no state. */
 int stewart_filter_start(const stewart_filter *filter, const real *values, const real *theta,
                          const real *near, real *estimate, stewart_scratch scratch);
 
-/* Advance by one period, and correct by values (m) at its end, if not NULL.
+/* Advance by one period, and correct by values (m) at its end unless NULL.
 
    The first measurements move the parameters far, so linearising once is not enough. The mean xi of
    [previous state; parameters] is found by Gauss-Newton iterations of
@@ -82,19 +83,19 @@ int stewart_filter_start(const stewart_filter *filter, const real *values, const
    1. A parameter that walks has jumped. The update is repeated with jump_std^2 added to its variance,
       and, unless a single leg does not fit, with 10 and 100 times jump_std.
    2. For a sensor of the state: a torque came far too early or late, or all parameters have changed by a
-      share of `usual_std`, which grows. The likelier of the two counts.
+      factor on `usual_std`, the least that explains the values. The likelier of the two counts.
 
-   A measurement that does not fit then either is an outlier: it is left out, and the model predicts.
+   A measurement that nothing explains is an outlier: it is left out, and the model predicts.
 
    If the plate was moved by hand, consecutive outliers agree with each other under the model. If it was
-   pushed by more than the prior explains, they do not: each that disagrees with the one before allows the
-   parameters three usual deviations more of change. After STEWART_PATIENCE that agree, or where the model
-   has no finite prediction, the estimate starts again from the measurement. It also does so at the first
-   measurement after as many periods without one, if the parameters are uncertain: the covariance,
-   linearised along a guessed path, is then wrong. */
+   pushed by more than the prior explains, they do not: each outlier that disagrees with the one before
+   allows the parameters three usual deviations more of change. The estimate starts again from the
+   measurement after STEWART_PATIENCE outliers that agree, or where the model has no finite prediction. It
+   also does so at the first measurement after as many periods without one, if the parameters are
+   uncertain: the covariance, linearised along a guessed path, is then wrong. */
 void stewart_filter_advance(const stewart_filter *filter, const stewart_interval *period,
                             const real *values, const stewart_history *history, real *estimate,
                             stewart_scratch scratch);
 
-/* Numbers of scratch memory for both, with `torques` in a period at the most. */
+/* Numbers of scratch memory for both, with at most `torques` in a period. */
 int stewart_filter_scratch(const stewart_filter *filter, int torques);

@@ -9,26 +9,26 @@ static int estimated(const stewart_law *law) { return law->machine.estimated; }
 
 static int posterior_size(const stewart_law *law)
 {
-    return stewart_posterior_size(X + estimated(law), law->measured);
+    return stewart_posterior_size(X + estimated(law), law->num_values);
 }
 
 static int filtered_memory(const stewart_law *law)
 {
-    return posterior_size(law) + law->measured + LEGS;
+    return posterior_size(law) + law->num_values + LEGS;
 }
 
 /* Views of the memory, in its order. */
 typedef struct {
     stewart_posterior estimate;
     real *values; /* (m) last valid value of each measured quantity */
-    real *still;  /* (LEGS) periods for which each encoder code has been constant */
+    real *unchanged;  /* (LEGS) periods for which each encoder code has been constant */
 } Filtered;
 
 static Filtered filtered_at(const stewart_law *law, real *memory)
 {
     real *values = memory + posterior_size(law);
-    return (Filtered){stewart_posterior_at(memory, X + estimated(law), law->measured), values,
-                      values + law->measured};
+    return (Filtered){stewart_posterior_at(memory, X + estimated(law), law->num_values), values,
+                      values + law->num_values};
 }
 
 static void filtered_restart(const stewart_law *law, real *memory)
@@ -38,9 +38,9 @@ static void filtered_restart(const stewart_law *law, real *memory)
     const stewart_posterior e = f.estimate;
     stewart_fill(X, (real)NAN, e.mean);
     stewart_fill(n * n, (real)NAN, e.root);
-    stewart_fill(law->measured, (real)NAN, e.outlier);
+    stewart_fill(law->num_values, (real)NAN, e.outlier);
     *e.outliers = *e.age = *e.left_out = *e.disagreed = 0;
-    stewart_fill(LEGS, 0, f.still);
+    stewart_fill(LEGS, 0, f.unchanged);
 }
 
 static void filtered_start(const stewart_law *law, real *memory)
@@ -49,7 +49,7 @@ static void filtered_start(const stewart_law *law, real *memory)
     stewart_fill(filtered_memory(law), (real)NAN, memory);
     filtered_restart(law, memory);
     const stewart_posterior e = filtered_at(law, memory).estimate;
-    *e.squares = *e.values = 0;
+    *e.chi2 = *e.chi2_values = 0;
     stewart_noise_start(e.noise);
     stewart_copy(estimated(law), settings->prior, e.mean + X);
 }
@@ -78,7 +78,7 @@ static stewart_filter filter_of(const stewart_law *law, const stewart_sensing *s
     stewart_filter filter = ((const stewart_filter_settings *)law->estimation)->filter;
     filter.machine = &law->machine;
     filter.sensing = sensing;
-    filter.legs = sensing->legs;
+    filter.encoder_step = sensing->encoder_step;
     return filter;
 }
 
@@ -94,7 +94,7 @@ static stewart_interval last_interval(const stewart_law *law, int number, const 
 static int filtered_observe(const stewart_law *law, real *memory, int number, const real *torques,
                             const real *values, stewart_scratch scratch)
 {
-    const int n = X + estimated(law), m = law->measured;
+    const int n = X + estimated(law), m = law->num_values;
     const stewart_sensing sensing = stewart_sensing_of(law);
     const stewart_filter filter = filter_of(law, &sensing);
     const Filtered f = filtered_at(law, memory);
@@ -102,10 +102,10 @@ static int filtered_observe(const stewart_law *law, real *memory, int number, co
     real *last = stewart_take(&scratch, m);
     const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, f.values);
     const stewart_interval period = last_interval(law, number, torques, &scratch);
-    const stewart_history history = {last, f.still};
+    const stewart_history history = {last, f.unchanged};
     int repeated = 1; /* whether all values are the last ones */
-    if (sensing.legs)
-        sensing.legs->count_still(&sensing, values, f.values, f.still);
+    if (sensing.encoder_step)
+        sensing.encoder_step->count_unchanged(&sensing, values, f.values, f.unchanged);
     stewart_copy(m, f.values, last);
     stewart_keep_last(m, values, f.values);
     for (int i = 0; i < m; i++)
@@ -137,7 +137,7 @@ static int filtered_scratch(const stewart_law *law)
     const stewart_sensing sensing = stewart_sensing_of(law);
     const stewart_filter filter = filter_of(law, &sensing);
     const int most = law->parts > 0 ? law->parts * STEWART_REPORTED : 2; /* torques in a period */
-    return law->measured + X + estimated(law) + (U + 1) * most + stewart_nominal_scratch(law) +
+    return law->num_values + X + estimated(law) + (U + 1) * most + stewart_nominal_scratch(law) +
            stewart_filter_scratch(&filter, most);
 }
 
@@ -200,7 +200,7 @@ static void gap_start(const stewart_law *law, real *memory)
 static int gap_observe(const stewart_law *law, real *memory, int number, const real *torques,
                        const real *values, stewart_scratch scratch)
 {
-    const int size = posterior_size(law), n = X + estimated(law), m = law->measured;
+    const int size = posterior_size(law), n = X + estimated(law), m = law->num_values;
     const stewart_filter_settings *settings = law->estimation;
     const Filtered now = filtered_at(law, memory);
     const Gap gap = gap_at(law, memory);
@@ -259,7 +259,7 @@ static int gap_scratch(const stewart_law *law)
 {
     const stewart_sensing sensing = stewart_sensing_of(law);
     const stewart_filter filter = filter_of(law, &sensing);
-    return filtered_scratch(law) + posterior_size(law) + law->measured +
+    return filtered_scratch(law) + posterior_size(law) + law->num_values +
            (U + 1) * 2 + stewart_filter_scratch(&filter, GAP_TORQUES);
 }
 

@@ -8,7 +8,7 @@
 
 #define STEWART_LEG_GATE 30 /* largest squared residual of a leg, over its variance, that is used */
 
-/* Settings at `law->estimation`. In `filter`, leave machine, sensing and legs unset: the observer fills
+/* Settings at `law->estimation`. In `filter`, leave machine, sensing and encoder_step unset: the observer fills
    them in from the law. */
 typedef struct {
     stewart_filter filter;
@@ -18,5 +18,5 @@ typedef struct {
 extern const stewart_observer stewart_filter_observer; /* of the measured state, or of encoders */
 extern const stewart_observer stewart_gap_observer;    /* of the state, re-linearised over gaps */
 
-extern const stewart_legs stewart_encoder_legs; /* filter step with encoders, see filter_attempt.h */
-stewart_sensing stewart_encoder_instants(const void *sensor); /* with that step; `stewart_encoders` */
+extern const stewart_encoder_step stewart_encoder_filter_step; /* filter step with encoders, see filter_attempt.h */
+stewart_sensing stewart_encoder_filter_sensing(const void *sensor); /* with that step; `stewart_encoders` */

@@ -4,7 +4,7 @@
 #include "short.h"
 
 #define MAX_ACTIVE STEWART_MAX_BOUNDED
-#define BOUND_TOLERANCE ((real)1e-9) /* standard deviations out of bounds that are rounding */
+#define BOUND_TOLERANCE ((real)1e-9) /* standard deviations; less out of bounds counts as rounding */
 
 /* A reflection of one column x of [row; W], rows of W being n numbers apart, by v = [v; f]:
 
@@ -233,9 +233,9 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
     const int n = filter->n, N = n + 1;
     real *e = stewart_take(&scratch, filter->max_rows), *H = stewart_take(&scratch, filter->max_rows * n);
     real *R = stewart_take(&scratch, N * N), *W = stewart_take(&scratch, filter->max_rows * N);
-    real *change = stewart_take(&scratch, n), *updated = change; /* in turn */
+    real *change = stewart_take(&scratch, n), *updated = change; /* one after the other */
     for (int round = 0; round < filter->iterations; round++) {
-        const int m = filter->residuals(filter->model, xi, e, H, scratch);
+        const int m = filter->residuals(filter->context, xi, e, H, scratch);
         if (m < 0)
             return 0;
         for (int k = 0; k < n; k++)
@@ -277,7 +277,7 @@ int stewart_kalman_update(const stewart_kalman *filter, real *xi, real *root, re
         stewart_copy(n, updated, R);
         if (!stewart_within_bounds(n, R, root, filter->lower, filter->upper, updated, scratch))
             return 0;
-        const int status = filter->step(filter->model, xi, updated, scratch);
+        const int status = filter->relinearize(filter->context, xi, updated, scratch);
         stewart_copy(n, updated, xi);
         if (status < 0)
             return 0;

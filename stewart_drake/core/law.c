@@ -1,7 +1,7 @@
 /* The predictive LQI law: see law.h.
 
-   At t = k dt the torques in flight are known, so the state at the instant from which the next torque
-   acts is predicted, and there
+   At t = k dt the torques in flight are known. They give the state at the time at which the next torque
+   begins to act, and there
 
        T_k = T_ff - K [e; z; ...],   e the predicted error of pose and rates, z its predicted integral. */
 
@@ -20,6 +20,7 @@ static int in_flight_length(const stewart_law *law)
     return law->layout.in_flight.rows;
 }
 
+/* Reserve a field at the end of the memory. */
 static stewart_field place(stewart_law *law, int rows, int columns)
 {
     stewart_field field = {law->memory, rows, columns};
@@ -32,35 +33,33 @@ void stewart_prepare(stewart_law *law)
     stewart_layout *l = &law->layout;
     const int observed = law->observer->memory(law), estimated = law->machine.estimated;
     law->memory = 0;
-    l->in_flight = place(law, 1 + law->kept + stewart_queue_length(law), U);
+    l->in_flight = place(law, 1 + law->extra_torques + stewart_queue_length(law), U);
     l->observer = place(law, 1, observed);
     l->lag = place(law, 1, 1);
     l->state = place(law, 1, X);
     l->parameters = place(law, 1, estimated);
-    l->measurement = place(law, 1, law->measured);
+    l->measurement = place(law, 1, law->num_values);
     l->error = place(law, 1, 6);
     l->integral = place(law, 1, 6);
     l->gain = place(law, U, law->design ? law->design->columns : stewart_order(&law->cost, law->fraction > 0));
     l->torque = place(law, 1, U);
     l->feedforward = place(law, 1, U);
     l->weights = place(law, 1, 2);
-    l->silence = place(law, 1, 1);
+    l->open_loop_samples = place(law, 1, 1);
     l->times = place(law, 1, law->rows);
     l->reference = place(law, law->rows, ROW);
     l->followed = place(law, law->rows, ROW);
     l->gap = place(law, 1, 1);
-    l->offset = place(law, 1, X);
-    l->way_back = place(law, 1, 2);
+    l->blend = place(law, 1, X + 2);
     l->channel = place(law, 1, law->channel ? law->channel->memory(law) : 0);
     l->planner = place(law, 1, law->planner ? law->planner->memory(law) : 0);
     l->counts = place(law, 1, STEWART_CAUSES);
 }
 
-/* Copy a torque into those in flight if it is finite. */
-static void keep(const real *torque, real *in_flight)
+static void copy_finite_torque(const real *torque, real *to)
 {
     if (stewart_all_finite(U, torque))
-        stewart_copy(U, torque, in_flight);
+        stewart_copy(U, torque, to);
 }
 
 void stewart_start(const stewart_law *law, real *memory, int number, const real *queue)
@@ -69,8 +68,9 @@ void stewart_start(const stewart_law *law, real *memory, int number, const real 
     const int length = in_flight_length(law);
     stewart_fill(law->memory, (real)NAN, memory);
     stewart_fill(U * length, 0, memory + l->in_flight.at);
-    for (int i = 0; number > 0 && i < length; i++) /* the oldest has acted before, too */
-        keep(queue + U * (i < number ? number - 1 - i : 0), memory + l->in_flight.at + U * (length - 1 - i));
+    for (int i = 0; number > 0 && i < length; i++) /* the oldest torque has acted before, too */
+        copy_finite_torque(queue + U * (i < number ? number - 1 - i : 0),
+                           memory + l->in_flight.at + U * (length - 1 - i));
     stewart_fill(U, 0, memory + l->torque.at);
     if (number > 0)
         stewart_copy(U, memory + l->in_flight.at + U * (length - 1), memory + l->torque.at);
@@ -84,10 +84,9 @@ void stewart_start(const stewart_law *law, real *memory, int number, const real 
     memory[l->lag.at] = 0;
     stewart_fill(6, 0, memory + l->error.at);
     stewart_fill(6, 0, memory + l->integral.at);
-    memory[l->silence.at] = (real)law->silence;
+    memory[l->open_loop_samples.at] = (real)law->open_loop_samples;
     memory[l->gap.at] = 0;
-    stewart_fill(X, 0, memory + l->offset.at);
-    stewart_fill(2, 0, memory + l->way_back.at);
+    stewart_fill(X + 2, 0, memory + l->blend.at);
     stewart_fill(STEWART_CAUSES, 0, memory + l->counts.at);
 }
 
@@ -97,12 +96,12 @@ void stewart_note_acted(const stewart_law *law, real *memory, int ago, int numbe
     real *in_flight = memory + law->layout.in_flight.at;
     for (int at = 1; number > 0 && at <= length; at++)
         if (ago <= at && ago > at - number)
-            keep(torques + U * (at - ago), in_flight + U * (length - at));
+            copy_finite_torque(torques + U * (at - ago), in_flight + U * (length - at));
 }
 
 /* ---- estimation ------------------------------------------------------------------------------- */
 
-/* Fill in what of `outlook` follows from a known delay. */
+/* Fill in the part of an outlook that follows from a known delay. */
 static void fixed_delay_outlook(const stewart_law *law, const real *in_flight, stewart_outlook *outlook,
                              stewart_scratch *scratch)
 {
@@ -136,9 +135,9 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
     const stewart_observer *observer = law->observer;
     const int length = in_flight_length(law), longest = law->longest_wait;
     const real *in_flight = memory + l->in_flight.at, *y = sample->measurement;
-    real *missing = stewart_take(scratch, law->measured), *observed = memory + l->observer.at;
+    real *missing = stewart_take(scratch, law->num_values), *observed = memory + l->observer.at;
     int lag = (int)memory[l->lag.at] + 1, usable = 0;
-    for (int i = 0; i < law->measured; i++) {
+    for (int i = 0; i < law->num_values; i++) {
         usable |= isfinite(y[i]) != 0;
         missing[i] = (real)NAN;
     }
@@ -182,8 +181,8 @@ static void estimate(const stewart_law *law, real *memory, const stewart_sample 
 
 /* ---- the reference to follow ------------------------------------------------------------------ */
 
-/* Instants of a preview: now, those of the prediction, and two nodes in each hold; the last of the
-   prediction and the nodes again for each further torque that is planned. */
+/* Write the times of a preview: now, those of the prediction, and two nodes in each hold; for each further
+   planned torque the last time of the prediction and the nodes again, a period later. */
 static int preview_times(const stewart_law *law, const stewart_outlook *outlook, real *times)
 {
     const int torques = law->channel ? law->channel->torques(law) : 1;
@@ -201,12 +200,12 @@ static int preview_times(const stewart_law *law, const stewart_outlook *outlook,
     return n;
 }
 
-/* Whether this sample belongs to the open-loop start. It does not while a torque in flight is at the limit:
-   what the limit takes away is known without a measurement. */
+/* Whether this sample belongs to the open-loop start. It does not while a torque in flight is at the limit,
+   whose effect is known without a measurement. */
 static int is_open_loop(const stewart_law *law, const real *memory)
 {
     const stewart_field *in_flight = &law->layout.in_flight;
-    return memory[law->layout.silence.at] > 0 &&
+    return memory[law->layout.open_loop_samples.at] > 0 &&
            !stewart_at_limit(&law->machine, in_flight->rows, memory + in_flight->at);
 }
 
@@ -219,15 +218,15 @@ static stewart_course last_course(const stewart_law *law, real *memory)
         .reference = memory + l->reference.at,
         .followed = memory + l->followed.at,
         .gap = memory[l->gap.at] > 0,
-        .back = {.holds = (int)memory[l->way_back.at], .samples = (int)memory[l->way_back.at + 1]},
+        .blend = {.holds = (int)memory[l->blend.at + X], .samples = (int)memory[l->blend.at + X + 1]},
     };
     while (last.number < law->rows && isfinite(last.times[last.number]))
         last.number++;
-    stewart_copy(X, memory + l->offset.at, last.back.offset);
+    stewart_copy(X, memory + l->blend.at, last.blend.offset);
     return last;
 }
 
-/* Ask for the reference, and compute the course to follow. */
+/* Read the reference, and compute the course to follow. */
 static void follow(const stewart_law *law, real *memory, const stewart_sample *sample,
                    const stewart_outlook *outlook, stewart_course *c, stewart_scratch *scratch)
 {
@@ -257,15 +256,15 @@ static void remember_course(const stewart_law *law, real *memory, const stewart_
     stewart_copy(ROW * c->number, c->reference, memory + l->reference.at);
     stewart_copy(ROW * c->number, c->followed, memory + l->followed.at);
     memory[l->gap.at] = (real)c->gap;
-    memory[l->way_back.at] = (real)c->back.holds;
-    memory[l->way_back.at + 1] = (real)c->back.samples;
-    stewart_copy(X, c->back.offset, memory + l->offset.at);
+    stewart_copy(X, c->blend.offset, memory + l->blend.at);
+    memory[l->blend.at + X] = (real)c->blend.holds;
+    memory[l->blend.at + X + 1] = (real)c->blend.samples;
 }
 
 /* ---- feedback --------------------------------------------------------------------------------- */
 
-/* Predict state, error and integral at the instant from which the next torque acts, by the exact equations.
-   The integral is constant in every part in which a motor is at its limit (anti-windup). */
+/* Predict state, error and integral to the time at which the next torque begins to act, by the equations of
+   motion. The integral is constant in each period in which a motor is at its limit (anti-windup). */
 static void predict(const stewart_law *law, const stewart_outlook *outlook, const real *followed,
                     const real *integral, stewart_predicted *a, stewart_scratch scratch)
 {
@@ -276,7 +275,7 @@ static void predict(const stewart_law *law, const stewart_outlook *outlook, cons
     }
     real *states = stewart_take(&scratch, X * (schedule->number + 1)), before[6];
     /* Number of torques of the schedule in each period. */
-    const int each = outlook->samples > 0 ? schedule->number / outlook->samples : 1;
+    const int per_period = outlook->samples > 0 ? schedule->number / outlook->samples : 1;
     stewart_copy(X, outlook->state, states);
     stewart_copy(6, integral, a->integral);
     for (int i = 0; i < 6; i++)
@@ -286,11 +285,11 @@ static void predict(const stewart_law *law, const stewart_outlook *outlook, cons
     else
         stewart_predict(&law->machine, outlook->theta, schedule, states, states + X);
     for (int k = 0; k < outlook->samples; k++) {
-        const real *wanted = followed + ROW * (k + 1), *end = states + X * each * (k + 1);
-        const int limited = stewart_at_limit(&law->machine, each, schedule->torques + U * each * k);
+        const real *wanted = followed + ROW * (k + 1), *end = states + X * per_period * (k + 1);
+        const int limited = stewart_at_limit(&law->machine, per_period, schedule->torques + U * per_period * k);
         real h = 0;
-        for (int i = 0; i < each; i++)
-            h += schedule->durations[each * k + i];
+        for (int i = 0; i < per_period; i++)
+            h += schedule->durations[per_period * k + i];
         for (int i = 0; i < 6; i++) {
             real error = end[i] - wanted[i];
             if (!limited)
@@ -310,16 +309,16 @@ int stewart_design_feedback(const stewart_law *law, const stewart_outlook *outlo
     if (law->design && law->design->design)
         return law->design->design(law, outlook, theta, nodes, state, weights, torques, error, K);
     const real h = law->period, fraction = outlook->fraction;
-    stewart_held held;
-    stewart_hold(&law->machine, &law->cost, theta, outlook->pending, nodes, &held);
+    stewart_feedforward held;
+    stewart_hold_feedforward(&law->machine, &law->cost, theta, outlook->pending, nodes, &held);
     stewart_copy(U * (1 + outlook->pending), held.torque[0], torques);
     if (!error)
         return 0;
     real *A = stewart_take(&scratch, X * X), *B = stewart_take(&scratch, X * U);
-    const int trouble =
+    const int failure =
         stewart_linearize(&law->machine, theta, h, fraction, state, &held, A, B, error, scratch);
-    if (trouble || !weights || stewart_gain(&law->cost, h, fraction, A, B, weights, K, scratch))
-        return trouble;
+    if (failure || !weights || stewart_gain(&law->cost, h, fraction, A, B, weights, K, scratch))
+        return failure;
     return STEWART_RICCATI_FAILURE;
 }
 
@@ -338,7 +337,7 @@ static int feed_back(const stewart_law *law, real *memory, const stewart_outlook
     const stewart_layout *l = &law->layout;
     const int pending = outlook->pending, n = U * stewart_order(&law->cost, pending);
     const real *nodes = followed + ROW * (1 + outlook->samples), h = law->period;
-    const real *late = memory + l->in_flight.at + U * (in_flight_length(law) - pending);
+    const real *pending_torques = memory + l->in_flight.at + U * (in_flight_length(law) - pending);
     real *error = memory + l->error.at, *integral = memory + l->integral.at;
     real *gain = memory + l->gain.at, *K = stewart_take(&scratch, n);
     real *torques = stewart_take(&scratch, U * (1 + pending));
@@ -351,26 +350,26 @@ static int feed_back(const stewart_law *law, real *memory, const stewart_outlook
         error[i] = now;
     }
     predict(law, outlook, followed, integral, a, scratch);
-    const int trouble = stewart_design_feedback(law, outlook, outlook->theta, nodes, a->state, cautious,
+    const int failure = stewart_design_feedback(law, outlook, outlook->theta, nodes, a->state, cautious,
                                                 torques, a->error, K, scratch);
     stewart_copy(U, torques + U * pending, torque);
     stewart_copy(U, torque, memory + l->feedforward.at);
-    if (trouble == STEWART_UNREACHABLE) /* no linearisation there: the feedforward alone */
-        return trouble;
-    if (!trouble) {
+    if (failure == STEWART_UNREACHABLE) /* no linear model: the feedforward alone */
+        return failure;
+    if (!failure) {
         stewart_fill(U * l->gain.columns, (real)NAN, gain);
         stewart_copy(n, K, gain);
     }
     if (!fits(&l->gain, gain, n)) /* no usable gain: the feedforward alone */
-        return trouble;
+        return failure;
     a->gain = gain;
-    stewart_feed_back(&law->cost, gain, a->error, a->integral, pending, late, torques, torque);
-    return trouble;
+    stewart_feed_back(&law->cost, gain, a->error, a->integral, pending, pending_torques, torques, torque);
+    return failure;
 }
 
 /* ---- a sample --------------------------------------------------------------------------------- */
 
-/* Compute the torque of a sample, with feedback or without; `waiting`: the reference has not been
+/* Compute the torque of a sample, with feedback or without. `waiting`: no row of the reference has been
    complete yet. Returns bits of `stewart_status`. */
 static int respond(const stewart_law *law, real *memory, const stewart_outlook *outlook,
                    const stewart_course *c, int waiting, const real *weights, stewart_predicted *a, real *torque,
@@ -407,23 +406,24 @@ int stewart_step_scratch(const stewart_law *law)
 {
     const stewart_channel *channel = law->channel;
     const int queue = law->design ? in_flight_length(law) + law->rows : stewart_queue_length(law);
-    const int rows = ROW * law->rows, parts = 2 * queue + 2, late = law->design ? queue : 1;
+    const int rows = ROW * law->rows, parts = 2 * queue + 2, most_pending = law->design ? queue : 1;
     const int known_delay = 2 * queue + 2 + (U + 1) * (parts + 2); /* of `fixed_delay_outlook` */
     const int lag = (X + U + 1) * 2 * (law->longest_wait + 1);
     const int course = 2 * rows + X * (queue + 2); /* of `stewart_follow` */
     const int sent = channel ? channel->scratch(law) : 0;
     const int gain = stewart_gain_scratch(&law->cost, law->fraction > 0);
     const int design = stewart_linearize_scratch() + gain;
-    const int feedback = U * (X + 7 + U * late) + U * (1 + late) + X * (X + U) + X * (parts + 1) + design;
+    const int feedback = U * (X + 7 + U * most_pending) + U * (1 + most_pending) + X * (X + U) +
+                         X * (parts + 1) + design;
     const int planner = law->planner ? law->planner->scratch(law) : 0;
     const int part = planner > sent ? planner : sent;
     const int own = feedback > course ? feedback : course;
     const int followed = 3 * rows + law->rows + (own > part ? own : part);
     const int predicted = shares_prediction(law) ? X * (queue + 1) : 0;
     const int observer = law->observer->scratch(law);
-    /* An estimated delay has its own instants and torques, of the preview and of the last period. */
+    /* `delayed_outlook` takes times and torques of the prediction and of the last period. */
     const int outlook = law->observer->outlook ? (U + 2) * law->rows + 2 * (U + 1) * 8 : known_delay;
-    return law->measured + outlook + lag + predicted +
+    return law->num_values + outlook + lag + predicted +
            (followed > observer ? followed : observer);
 }
 
@@ -447,20 +447,20 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
     }
     if (law->planner &&
         law->planner->follow(law, memory + l->planner.at, &outlook, sample, scratch)) {
-        stewart_fill(6, 0, memory + l->error.at); /* there is none left to feed back */
+        stewart_fill(6, 0, memory + l->error.at); /* the law follows the prediction: no error remains */
         stewart_fill(6, 0, memory + l->integral.at);
     }
     follow(law, memory, sample, &outlook, &c, &scratch);
     int status = outlook.status | (c.missing ? STEWART_REFERENCE_MISSING : 0);
     const real *nodes = c.followed + ROW * (1 + outlook.samples);
     const int waiting = !stewart_all_finite(ROW * 2 * (3 + outlook.pending), nodes);
-    /* The open-loop start ends at the first numbers of the reference that are filled in: its torques were
-       computed for another reference. */
+    /* A reference with filled-in numbers ends the open-loop start: its torques were computed for another
+       reference. */
     if (c.missing && !c.gap && !waiting)
-        memory[l->silence.at] = 0;
+        memory[l->open_loop_samples.at] = 0;
     if (!stewart_all_finite(X, outlook.state)) { /* no measurement yet: assume the reference */
         stewart_copy(X, c.followed, outlook.state);
-        if (law->longest_wait == 0) /* the observer's state is that of now */
+        if (law->longest_wait == 0) /* then the observer's state is the present one */
             stewart_copy(X, outlook.state, memory + l->observer.at);
     }
     status |= respond(law, memory, &outlook, &c, waiting, sample->weights, &ahead, torque, scratch);
@@ -478,10 +478,10 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
     stewart_copy(X, outlook.state, memory + l->state.at);
     stewart_copy(law->machine.estimated, outlook.theta, memory + l->parameters.at);
     stewart_copy(U, torque, memory + l->torque.at);
-    stewart_copy(law->measured, sample->measurement, memory + l->measurement.at);
+    stewart_copy(law->num_values, sample->measurement, memory + l->measurement.at);
     stewart_copy(2, sample->weights, memory + l->weights.at);
-    if (memory[l->silence.at] > 0 && !waiting)
-        memory[l->silence.at] -= 1;
+    if (memory[l->open_loop_samples.at] > 0 && !waiting)
+        memory[l->open_loop_samples.at] -= 1;
     for (int i = 0; i < STEWART_CAUSES; i++)
         if (status >> i & 1 && memory[l->counts.at + i] < MOST_COUNTED)
             memory[l->counts.at + i] += 1;

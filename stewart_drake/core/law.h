@@ -8,7 +8,11 @@
    A pose is roll, pitch, yaw (rad) and x, y, z (m) of the plate's centre of mass, a state the pose
    and its rates, a reference the pose, its rates and its accelerations. Matrices are stored by rows.
    No memory is allocated. All state, counts and flags included, is in the caller's vector `memory`;
-   `law.layout` names its fields. */
+   `law.layout` names its fields.
+
+   The lag of an estimate is the age of its last measurement. The outlook of a sample (observer.h) is the
+   estimate now with the torques that act until the next one does. A hold is a period in which one torque
+   acts; a torque is pending where it still acts at the end of the prediction. */
 
 #pragma once
 
@@ -30,38 +34,37 @@ typedef struct {
     stewart_field state;       /* estimate at this sample */
     stewart_field parameters;  /* estimated, else assumed */
     stewart_field measurement; /* the last one, unchanged */
-    stewart_field error;       /* of the pose */
-    stewart_field integral;
+    stewart_field error;       /* of the pose at this sample */
+    stewart_field integral;    /* of that error */
     stewart_field gain;        /* the last finite one; NaN before the first */
     stewart_field torque;      /* the last one, before the limit */
-    stewart_field feedforward; /* share of `torque` without feedback */
+    stewart_field feedforward; /* part of `torque` without feedback */
     stewart_field weights;
-    stewart_field silence;     /* samples left without feedback */
+    stewart_field open_loop_samples; /* that remain without feedback */
     stewart_field times;       /* of the last preview, s from its sample */
     stewart_field reference;   /* the last preview, with missing numbers filled in */
-    stewart_field followed;    /* `reference` and the way back onto it after a gap */
-    stewart_field gap;         /* whether the last row of the last preview was missing */
-    stewart_field offset;      /* from the reference where the next torque acts, after a gap in it */
-    stewart_field way_back;    /* holds until the offset is zero; then samples until it has acted */
+    stewart_field followed;    /* `reference` with the blend onto it after a gap */
+    stewart_field gap;         /* whether the last row of the last preview was incomplete */
+    stewart_field blend;       /* offset (12), holds and samples of a `stewart_blend` */
     stewart_field channel;     /* packets that were sent */
     stewart_field planner;     /* memory of the planner */
     stewart_field counts;      /* samples with each bit of `stewart_status` */
 } stewart_layout;
 
-/* Prediction at the instant from which the next torque acts; a channel plans further torques from it. */
+/* Prediction to the time at which the next torque begins to act; a channel plans further torques from it. */
 typedef struct {
     real state[STEWART_STATES], error[STEWART_STATES], integral[6];
     real limited[STEWART_MOTORS]; /* the torque within the motors' limit, N m */
-    const real *theta;            /* parameters that it is computed with; NULL: the assumed ones */
+    const real *theta;            /* parameters of the prediction; NULL: the nominal ones */
     const real *gain;             /* or NULL without feedback */
-    const real *rows;             /* of the reference, at further instants of the preview */
+    const real *rows;             /* of the reference, at further times of the preview */
 } stewart_predicted;
 
-/* Functions in place of the core's; NULL: that of the core. */
+/* Prediction and gain in Python; a function that is NULL is that of the core. */
 typedef struct {
     int columns; /* of the gain, at the most */
-    /* Change the outlook, which is that of the core under the assumed delay; the state is `lag` periods
-       after the one that was observed. */
+    /* Change the outlook, which is that of the core under the assumed delay and has the state `lag` periods
+       after the last measurement. */
     void (*outlook)(const stewart_law *law, int lag, stewart_outlook *outlook);
     /* Fill in state, error and integral, for the rows to follow and the integral (6) now. */
     void (*predict)(const stewart_law *law, const stewart_outlook *outlook, const real *followed,
@@ -95,10 +98,10 @@ typedef struct {
     int (*memory)(const stewart_law *law);
     int (*scratch)(const stewart_law *law);
     void (*start)(const stewart_law *law, real *memory);
-    /* Plan again if that is useful, once at each sample. Returns whether it did. */
+    /* Called once at each sample: plan anew where the prediction requires it. Returns whether it did. */
     int (*follow)(const stewart_law *law, real *memory, const stewart_outlook *outlook,
                   const stewart_sample *sample, stewart_scratch scratch);
-    /* Rows (number, 18) of that motion, at instants in s from now. */
+    /* Rows (number, 18) of that motion, at times in s from now. */
     void (*rows)(const stewart_law *law, const real *memory, const stewart_sample *sample, int number,
                  const real *times, real *rows);
 } stewart_planner;
@@ -108,62 +111,62 @@ struct stewart_law {
     stewart_machine machine;
     stewart_cost cost;
     real period;       /* s */
-    real fraction;     /* of the assumed delay: its rest, periods */
-    int steps;         /* of the assumed delay: whole periods */
-    int kept;          /* torques in memory besides those in flight */
-    int longest_wait;  /* periods: the greatest age of a measurement */
-    int silence;       /* samples at the start without feedback */
-    real tolerated_timing; /* s; the weight of torques grows if their timing deviates more; 0: weights as given */
-    int measured;      /* size of a measurement */
-    int parts;         /* torques of a period that a machine reports; 0: the law's own act */
+    int steps;         /* mu, whole periods of the assumed delay */
+    real fraction;     /* rest of the assumed delay, periods */
+    int extra_torques; /* torques in memory beyond those of the assumed delay */
+    int longest_wait;  /* greatest age of a measurement, periods */
+    int open_loop_samples; /* samples at the start without feedback */
+    real tolerated_timing; /* s; the weight of torques grows if their timing varies more; 0: weights as given */
+    int num_values;    /* m, values of a measurement */
+    int parts;         /* torques per period that a machine reports; 0: the law's own torques act */
     int rows;          /* largest number of rows in a preview */
-    int memory;        /* numbers of the memory, and the place of each field: `stewart_prepare` */
+    int memory;        /* numbers of the memory; `stewart_prepare` sets this and `layout` */
     stewart_layout layout;
     const stewart_observer *observer;
     const stewart_design *design;     /* NULL: prediction and gain of the core */
-    const void *sensing, *estimation; /* assumptions of the observer */
-    stewart_sensing (*read)(const void *sensing); /* the model of the sensor */
-    const stewart_sensing *described; /* replaces `sensing`; or NULL */
+    const void *estimation;           /* settings of the observer */
+    const void *sensing;              /* settings of the sensor, of which `make_sensing` makes the model */
+    stewart_sensing (*make_sensing)(const void *sensing);
+    const stewart_sensing *own_sensing; /* a sensor model in Python, or NULL */
     const stewart_channel *channel;   /* NULL: every torque arrives, after the delay */
-    const stewart_packets *packets;   /* assumptions of the channel */
+    const stewart_packets *packets;   /* settings of the channel */
     const stewart_planner *planner;   /* NULL: the law follows the caller's reference */
-    const void *planning;             /* assumptions of the planner */
+    const void *planning;             /* settings of the planner */
 };
 
-/* Rows (number, 18) of the reference at instants in s from now, some of them negative. */
+/* Write the rows (number, 18) of the reference at times in s from now, some of them negative. */
 typedef void (*stewart_preview_function)(void *context, int number, const real *times, real *rows);
 
 /* Input of a sample. */
 struct stewart_sample {
-    const real *measurement; /* (measured); what is lost is NaN */
-    int age;                 /* of it in periods; negative for a lost one. One that is not newer than
-                                the last one used, or older than `longest_wait`, is missing */
+    const real *measurement; /* (num_values); lost values are NaN */
+    int age;                 /* of the measurement, periods; negative for a lost one. A measurement counts
+                                as missing if it is not newer than the last one used, or older than
+                                `longest_wait` */
     /* NaN or infinite numbers of the reference are filled in from neighbouring rows and the last
-       preview; after a gap the law goes back onto it. Until the first complete row the torque is the
-       last one in flight. */
+       preview (reference.h). Until the first complete row the torque is the last one in flight. */
     stewart_preview_function reference;
-    stewart_preview_function goal; /* that plans lead back to; from the first plan on it is read in
-                                      the place of `reference`; NULL: no plan is made */
+    stewart_preview_function goal; /* motion to which plans lead; from the first plan on it replaces
+                                      `reference`; NULL: no plan is made */
     void *context;                 /* first argument of both */
     const stewart_report *report; /* that came with the measurement, or NULL */
-    real weights[2]; /* of errors and of torques; if one is not finite, the last gain is used */
+    real weights[2]; /* w_Q and w_R; if one is not finite, the last gain is used */
 };
 
 /* Fill in `memory` and `layout` from the other fields of a law. */
 void stewart_prepare(stewart_law *law);
 
-/* Numbers of scratch memory that a step takes at the most. */
+/* Largest number of scratch numbers of a step. */
 int stewart_step_scratch(const stewart_law *law);
 
-/* Torques in flight at a sample, by the assumed delay. */
+/* Number of torques in flight at a sample, under the assumed delay. */
 int stewart_queue_length(const stewart_law *law);
 
-/* Before the first step; `queue` (number, 6) has the torques that are under way, the oldest first. */
+/* Call before the first step. `queue` (number, 6) has the torques in flight, the oldest first. */
 void stewart_start(const stewart_law *law, real *memory, int number, const real *queue);
 
-/* One sample: the torque (6) to send; it is not limited: apply `stewart_limit` before you send it.
-   Returns what went wrong, bits of `stewart_status`. `scratch` has place for `stewart_step_scratch`
-   numbers. */
+/* Compute the torque (6) of a sample. It is not limited: apply `stewart_limit` before you send it.
+   Returns the problems, bits of `stewart_status`. `scratch` has place for `stewart_step_scratch` numbers. */
 int stewart_step(const stewart_law *law, real *memory, real *scratch, const stewart_sample *sample,
                  real *torque);
 
@@ -175,7 +178,7 @@ void stewart_note_acted(const stewart_law *law, real *memory, int ago, int numbe
 /* A `stewart_preview_function` that copies its rows from `context`. */
 void stewart_given_rows(void *context, int number, const real *times, real *rows);
 
-/* Compute the feedforward `torques` (1 + pending, 6): of the pending ones, then of the next. The
+/* Compute the feedforward `torques` (1 + pending, 6) of the pending holds, then of the next one. The
    reference is given at two `nodes` of each of 3 + pending holds. If `error` (12) is given, subtract from
    it the offset that held torques cause in a state (12). If `weights` are given, compute the gain K
    (6, `stewart_order`). Returns 0, or the cause of failure, of `stewart_status`. */
@@ -184,20 +187,20 @@ int stewart_design_feedback(const stewart_law *law, const stewart_outlook *outlo
                             real *error, real *K, stewart_scratch scratch);
 
 /* Plan the torques (`channel->torques`, 6) of this sample and of further ones: the model continues from the
-   end of the prediction, under feedback with the same gain. `late` (pending, 6) are still to act. */
+   end of the prediction, under feedback with the same gain. `pending_torques` (pending, 6) still act then. */
 void stewart_plan_torques(const stewart_law *law, const stewart_outlook *outlook,
-                          const stewart_predicted *ahead, const real *late, real *plan,
+                          const stewart_predicted *ahead, const real *pending_torques, real *plan,
                           stewart_scratch scratch);
 int stewart_planning_scratch(const stewart_law *law);
 
-/* Limit a torque. Returns whether that changed it. */
+/* Limit a torque (6). Returns whether that changed it. */
 int stewart_limit(const stewart_machine *machine, const real *torque, real *limited);
 
 /* Return the schedule of `periods` periods. In each the older torque acts for `fraction` of it, then the
-   next one. `torques` (periods + 1, 6), the oldest first. */
+   next one. `torques` (periods + 1, 6) begin with the oldest. */
 stewart_schedule stewart_schedule_of(real period, real fraction, int periods, const real *torques,
                                      stewart_scratch *scratch);
 
-/* For observers of a fixed delay: torques of the last `periods` of those sent (number, 6). */
+/* Return the schedule of the last `periods` periods under the assumed delay, from torques (number, 6). */
 stewart_interval stewart_last_periods(const stewart_law *law, int number, const real *torques, int periods,
                                       stewart_scratch *scratch);

@@ -5,31 +5,31 @@
 
 #define FINE_SUBSTEP_FACTOR 2 /* times as many substeps above `coarse_torque_limit`, see law/nominal.py */
 
-void stewart_believe(const stewart_machine *machine, const real *theta, stewart_belief *belief)
+void stewart_set_model(const stewart_machine *machine, const real *theta, stewart_model *model)
 {
-    stewart_copy(STEWART_PARAMETERS, machine->parameters, belief->parameters);
+    stewart_copy(STEWART_PARAMETERS, machine->parameters, model->parameters);
     for (int i = 0; theta && i < machine->estimated; i++)
         if (machine->place[i] >= 0)
-            belief->parameters[machine->place[i]] = theta[i];
-    belief->plant.geometry = machine->geometry;
-    belief->plant.gravity = &machine->gravity;
-    belief->plant.joints = machine->joints;
-    belief->plant.parameters = belief->parameters;
-    belief->acceleration_per_torque = machine->acceleration_per_torque;
+            model->parameters[machine->place[i]] = theta[i];
+    model->plant.geometry = machine->geometry;
+    model->plant.gravity = &machine->gravity;
+    model->plant.joints = machine->joints;
+    model->plant.parameters = model->parameters;
+    model->acceleration_per_torque = machine->acceleration_per_torque;
 }
 
-void stewart_accelerate(const stewart_belief *belief, const real *state, const real *torque,
+void stewart_accelerate(const stewart_model *model, const real *state, const real *torque,
                         real *accelerations)
 {
-    const real *per_torque = belief->acceleration_per_torque;
+    const real *per_torque = model->acceleration_per_torque;
     if (!per_torque) {
-        stewart_accelerations(&belief->plant, state, state + 6, torque, accelerations);
+        stewart_accelerations(&model->plant, state, state + 6, torque, accelerations);
         return;
     }
     for (int i = 0; i < 6; i++) {
         accelerations[i] = 0;
         for (int j = 0; j < U; j++) /* the biases are the first of the parameters */
-            accelerations[i] += per_torque[U * i + j] * (torque[j] + belief->parameters[j]);
+            accelerations[i] += per_torque[U * i + j] * (torque[j] + model->parameters[j]);
     }
 }
 
@@ -51,31 +51,31 @@ int stewart_at_limit(const stewart_machine *machine, int number, const real *tor
     return 0;
 }
 
-void stewart_required_torque(const stewart_belief *belief, const real *row, real *torque)
+void stewart_required_torque(const stewart_model *model, const real *row, real *torque)
 {
     real per_torque[36];
-    if (!belief->acceleration_per_torque) {
-        stewart_inverse_dynamics(&belief->plant, row, row + 6, row + 12, torque);
+    if (!model->acceleration_per_torque) {
+        stewart_inverse_dynamics(&model->plant, row, row + 6, row + 12, torque);
         return;
     }
-    stewart_copy(36, belief->acceleration_per_torque, per_torque);
+    stewart_copy(36, model->acceleration_per_torque, per_torque);
     stewart_copy(U, row + 12, torque);
     if (!stewart_solve(6, 1, per_torque, torque))
         stewart_fill(U, (real)NAN, torque);
     for (int i = 0; i < U; i++)
-        torque[i] -= belief->parameters[i];
+        torque[i] -= model->parameters[i];
 }
 
-void stewart_advance(const stewart_belief *belief, const real *torque, real duration, int substeps,
+void stewart_advance(const stewart_model *model, const real *torque, real duration, int substeps,
                      real *state)
 {
     real a[6];
-    if (!belief->acceleration_per_torque) {
+    if (!model->acceleration_per_torque) {
         for (int i = 0; i < substeps; i++)
-            stewart_move(&belief->plant, torque, duration / (real)substeps, state);
+            stewart_runge_kutta_step(&model->plant, torque, duration / (real)substeps, state);
         return;
     }
-    stewart_accelerate(belief, state, torque, a);
+    stewart_accelerate(model, state, torque, a);
     for (int i = 0; i < 6; i++) {
         state[i] += duration * (state[6 + i] + duration / 2 * a[i]);
         state[6 + i] += duration * a[i];
@@ -92,17 +92,17 @@ void stewart_predict(const stewart_machine *machine, const real *theta, const st
     const int substeps = schedule->substeps
                              ? schedule->substeps
                              : stewart_substeps(machine, schedule->number, schedule->torques);
-    stewart_belief belief;
-    stewart_believe(machine, theta, &belief);
+    stewart_model model;
+    stewart_set_model(machine, theta, &model);
     for (int k = 0; k < schedule->number; k++, state = states, states += X) {
         stewart_copy(X, state, states);
-        stewart_advance(&belief, schedule->torques + U * k, schedule->durations[k], substeps, states);
+        stewart_advance(&model, schedule->torques + U * k, schedule->durations[k], substeps, states);
     }
 }
 
 /* right (6, 18 + p) <- -M^-1 dF/d[state, torque, theta] of the equations F of dynamics.h; dF/dtorque = -B.
    dF_dx, dF_dp and M are by columns, B and `mass`, which is M, by rows. */
-static int solve_acceleration_derivatives(const stewart_machine *machine, const stewart_belief *belief,
+static int solve_acceleration_derivatives(const stewart_machine *machine, const stewart_model *model,
                         const real *state, const real *torque, int p, real *right,
                         stewart_scratch scratch)
 {
@@ -110,8 +110,8 @@ static int solve_acceleration_derivatives(const stewart_machine *machine, const 
     real *dF_dx = stewart_take(&scratch, 6 * X);
     real *dF_dp = stewart_take(&scratch, 6 * STEWART_PARAMETERS);
     real accelerations[6], M[36], mass[36], B[36];
-    stewart_accelerations(&belief->plant, state, state + 6, torque, accelerations);
-    stewart_residual_derivatives(&belief->plant, state, state + 6, accelerations, torque, dF_dx,
+    stewart_accelerations(&model->plant, state, state + 6, torque, accelerations);
+    stewart_residual_derivatives(&model->plant, state, state + 6, accelerations, torque, dF_dx,
                                  dF_dp, M, B);
     for (int i = 0; i < 6; i++) {
         real *row = right + columns * i;
@@ -127,13 +127,13 @@ static int solve_acceleration_derivatives(const stewart_machine *machine, const 
     return stewart_solve(6, columns, mass, right);
 }
 
-int stewart_derivatives(const stewart_machine *machine, const stewart_belief *belief,
+int stewart_derivatives(const stewart_machine *machine, const stewart_model *model,
                         const real *state, const real *torque, real *A, real *B, real *G,
                         stewart_scratch scratch)
 {
     const int p = G ? machine->estimated : 0, columns = X + U + p;
     real *right = stewart_take(&scratch, 6 * columns);
-    const real *per_torque = belief->acceleration_per_torque;
+    const real *per_torque = model->acceleration_per_torque;
     if (per_torque) {
         stewart_fill(6 * columns, 0, right);
         for (int i = 0; i < 6; i++) {
@@ -142,7 +142,7 @@ int stewart_derivatives(const stewart_machine *machine, const stewart_belief *be
                 if (machine->place[j] >= 0 && machine->place[j] < U)
                     right[columns * i + X + U + j] = per_torque[U * i + machine->place[j]];
         }
-    } else if (!solve_acceleration_derivatives(machine, belief, state, torque, p, right, scratch)) {
+    } else if (!solve_acceleration_derivatives(machine, model, state, torque, p, right, scratch)) {
         return 0;
     }
     stewart_fill(6 * X, 0, A);
@@ -176,7 +176,7 @@ static void hermite_state(const real *start, const real *end, real h, real s, re
    of the solution F of F_dot = L F, L = [A G; 0 0]. With L1 and L2 at the two Gauss nodes, the method of
    fourth order is F = exp(h/2 (L1 + L2) + sqrt(3)/12 h^2 [L2, L1]). Else the midpoint rule,
    F = exp(h L). The exponent is [omega omega_theta; 0 0]. */
-static int transition_of_hold(const stewart_machine *machine, const stewart_belief *belief,
+static int transition_of_hold(const stewart_machine *machine, const stewart_model *model,
                               const real *torque, real h, int fourth_order, const real *start,
                               const real *end, real *Phi, real *S, stewart_scratch scratch)
 {
@@ -186,7 +186,7 @@ static int transition_of_hold(const stewart_machine *machine, const stewart_beli
     real *B = stewart_take(&scratch, X * U), state[X];
     for (int node = 0; node < nodes; node++) {
         hermite_state(start, end, h, fourth_order ? GAUSS_NODES[node] : (real)0.5, state);
-        if (!stewart_derivatives(machine, belief, state, torque, A + X * X * node, B,
+        if (!stewart_derivatives(machine, model, state, torque, A + X * X * node, B,
                                  G + X * p * node, scratch))
             return 0;
     }
@@ -220,11 +220,11 @@ int stewart_transitions(const stewart_machine *machine, const real *xi, const st
     real *Phi = stewart_take(&scratch, X * X), *S = stewart_take(&scratch, X * p);
     real *before = stewart_take(&scratch, X * n);
     const real *start = xi;
-    stewart_belief belief;
-    stewart_believe(machine, xi + X, &belief);
+    stewart_model model;
+    stewart_set_model(machine, xi + X, &model);
     for (int k = 0; k < schedule->number; k++, start = states, states += X, H += next) {
         const real *torque = schedule->torques + U * k, h = schedule->durations[k];
-        if (!transition_of_hold(machine, &belief, torque, h, fourth_order, start, states, Phi, S, scratch))
+        if (!transition_of_hold(machine, &model, torque, h, fourth_order, start, states, Phi, S, scratch))
             return 0;
         if (k > 0) /* [Phi S; 0 1] [H; 0 1] */
             stewart_multiply(X, X, n, Phi, before, H);

@@ -52,10 +52,10 @@ typedef struct {
     stewart_plant plant;
     real parameters[STEWART_PARAMETERS];
     const real *acceleration_per_torque; /* as of the machine */
-} stewart_belief;
+} stewart_model;
 
-/* `theta` (p), or NULL for what is known beforehand. The belief points into itself: it is not copied. */
-void stewart_believe(const stewart_machine *machine, const real *theta, stewart_belief *belief);
+/* `theta` (p), or NULL for what is known beforehand. The model points into itself: it is not copied. */
+void stewart_set_model(const stewart_machine *machine, const real *theta, stewart_model *model);
 
 int stewart_substeps(const stewart_machine *machine, int number, const real *torques);
 
@@ -63,14 +63,14 @@ int stewart_substeps(const stewart_machine *machine, int number, const real *tor
 int stewart_at_limit(const stewart_machine *machine, int number, const real *torques);
 
 /* Second derivative (6) of the pose of a state (12) under torques (6). */
-void stewart_accelerate(const stewart_belief *belief, const real *state, const real *torque,
+void stewart_accelerate(const stewart_model *model, const real *state, const real *torque,
                         real *accelerations);
 
 /* Torque (6) for a row of 18 numbers: pose, rates and accelerations. */
-void stewart_required_torque(const stewart_belief *belief, const real *row, real *torque);
+void stewart_required_torque(const stewart_model *model, const real *row, real *torque);
 
 /* Advance a state (12) by a torque of some duration, s. */
-void stewart_advance(const stewart_belief *belief, const real *torque, real duration, int substeps,
+void stewart_advance(const stewart_model *model, const real *torque, real duration, int substeps,
                      real *state);
 
 /* States (number, 12) after each of the torques, from a state (12). */
@@ -79,7 +79,7 @@ void stewart_predict(const stewart_machine *machine, const real *theta, const st
 
 /* d[accelerations]/d[state, torque, theta] at a point: A (12, 12), B (12, 6), G (12, p) of the state;
    G may be NULL. Returns 0 where they do not exist. */
-int stewart_derivatives(const stewart_machine *machine, const stewart_belief *belief,
+int stewart_derivatives(const stewart_machine *machine, const stewart_model *model,
                         const real *state, const real *torque, real *A, real *B, real *G,
                         stewart_scratch scratch);
 

@@ -7,12 +7,12 @@
 
 int stewart_planning_scratch(const stewart_law *law)
 {
-    const int late = law->design ? law->layout.in_flight.rows : 1;
-    return 2 * U * (1 + late) + 2 * (X + U + 1) + X * (X + U) + stewart_linearize_scratch();
+    const int most_pending = law->design ? law->layout.in_flight.rows : 1;
+    return 2 * U * (1 + most_pending) + 2 * (X + U + 1) + X * (X + U) + stewart_linearize_scratch();
 }
 
 void stewart_plan_torques(const stewart_law *law, const stewart_outlook *outlook,
-                          const stewart_predicted *ahead, const real *late, real *plan,
+                          const stewart_predicted *ahead, const real *pending_torques, real *plan,
                           stewart_scratch scratch)
 {
     const int pending = outlook->pending, nodes = 2 * (3 + pending);
@@ -25,7 +25,7 @@ void stewart_plan_torques(const stewart_law *law, const stewart_outlook *outlook
     stewart_copy(X, ahead->state, state);
     stewart_copy(X, ahead->error, error);
     stewart_copy(6, ahead->integral, integral);
-    stewart_copy(U * pending, late, flying);
+    stewart_copy(U * pending, pending_torques, flying);
     for (int k = 1; k < torques; k++, rows += ROW * (1 + nodes)) {
         real *torque = plan + U * k;
         stewart_scratch rest = scratch;
@@ -42,11 +42,11 @@ void stewart_plan_torques(const stewart_law *law, const stewart_outlook *outlook
             for (int i = 0; i < 6; i++)
                 integral[i] += law->period / 2 * (before[i] + error[i]);
         stewart_copy(X, error, before); /* without what held torques put there */
-        const int trouble =
+        const int failure =
             stewart_design_feedback(law, outlook, ahead->theta, rows + ROW, state, NULL, feedforward,
                                     ahead->gain ? before : NULL, NULL, rest);
         stewart_copy(U, feedforward + U * pending, torque);
-        if (ahead->gain && !trouble)
+        if (ahead->gain && !failure)
             stewart_feed_back(&law->cost, ahead->gain, before, integral, pending, flying, feedforward,
                               torque);
         if (stewart_all_finite(U, torque))

@@ -26,7 +26,7 @@ void stewart_keep_last(int number, const real *values, real *last)
             last[i] = values[i];
 }
 
-int stewart_plain_memory(const stewart_law *law) { return X + law->measured; }
+int stewart_plain_memory(const stewart_law *law) { return X + law->num_values; }
 
 void stewart_plain_start(const stewart_law *law, real *memory)
 {
@@ -57,7 +57,7 @@ static int state_observe(const stewart_law *law, real *memory, int number, const
     const stewart_sensing sensing = stewart_sensing_of(law);
     const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, last);
     const int had_state = stewart_all_finite(X, state);
-    stewart_keep_last(law->measured, values, last);
+    stewart_keep_last(law->num_values, values, last);
     if ((fault || !sensing.start(&sensing, values, had_state ? state : NULL, state, root, scratch))
         && had_state)
         stewart_predict_nominal(law, number, torques, state, scratch);

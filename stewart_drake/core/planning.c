@@ -43,7 +43,7 @@ static real reach(const real *geometry)
 
 /* ---- pieces ------------------------------------------------------------------------------------- */
 
-int stewart_along(int number, const real *pieces, real time, real *row)
+int stewart_path_row(int number, const real *pieces, real time, real *row)
 {
     for (int k = 0; k < number; k++, pieces += STEWART_PIECE) {
         const real begin = pieces[0], end = pieces[1], *first = pieces + 2, *last = first + ROW;
@@ -64,22 +64,22 @@ int stewart_along(int number, const real *pieces, real time, real *row)
     return 0;
 }
 
-static void end_row(const stewart_belief *belief, const real *state, const real *torque, real *row)
+static void end_row(const stewart_model *model, const real *state, const real *torque, real *row)
 {
     stewart_copy(X, state, row);
-    stewart_accelerate(belief, state, torque, row + X);
+    stewart_accelerate(model, state, torque, row + X);
 }
 
-static void add_piece(const stewart_belief *belief, real begin, real end, const real *states,
+static void add_piece(const stewart_model *model, real begin, real end, const real *states,
                       const real *torque, real *piece)
 {
     piece[0] = begin;
     piece[1] = end;
-    end_row(belief, states, torque, piece + 2);
-    end_row(belief, states + X, torque, piece + 2 + ROW);
+    end_row(model, states, torque, piece + 2);
+    end_row(model, states + X, torque, piece + 2 + ROW);
 }
 
-int stewart_predicted_pieces(const stewart_belief *belief, const stewart_schedule *schedule,
+int stewart_predicted_pieces(const stewart_model *model, const stewart_schedule *schedule,
                              const real *states, real begin, real *pieces)
 {
     int number = 0;
@@ -88,7 +88,7 @@ int stewart_predicted_pieces(const stewart_belief *belief, const stewart_schedul
         const real from = begin + passed, h = schedule->durations[k];
         passed += h;
         if (h > SHORTEST)
-            add_piece(belief, from, begin + passed, states + X * k, schedule->torques + U * k,
+            add_piece(model, from, begin + passed, states + X * k, schedule->torques + U * k,
                       pieces + STEWART_PIECE * number++);
     }
     return number;
@@ -108,7 +108,7 @@ int stewart_predicted_pieces(const stewart_belief *belief, const stewart_schedul
    the number of periods. */
 
 typedef struct {
-    const stewart_belief *belief;
+    const stewart_model *model;
     real sign;
     int number, pieces; /* holds, and equal pieces of each */
     real *edges;        /* (number + 1) s from the beginning */
@@ -160,16 +160,16 @@ void stewart_plan_times(real begin, real period, int periods, real times[3])
 
 /* State (12) at which held torques take the reference over: with a change s of the torque over the
    hold, rates are off by -dt/24 B s at its beginning (law/feedforward.py). */
-static int target(const stewart_belief *belief, real period, const real *rows, real *state,
+static int target(const stewart_model *model, real period, const real *rows, real *state,
                   stewart_scratch scratch)
 {
     real *A = stewart_take(&scratch, X * X), *B = stewart_take(&scratch, X * U), torques[2][U], mean[U];
     for (int node = 0; node < 2; node++)
-        stewart_required_torque(belief, rows + ROW * (1 + node), torques[node]);
+        stewart_required_torque(model, rows + ROW * (1 + node), torques[node]);
     for (int j = 0; j < U; j++)
         mean[j] = (torques[0][j] + torques[1][j]) / 2;
     stewart_copy(X, rows, state);
-    if (!stewart_derivatives(NULL, belief, rows, mean, A, B, NULL, scratch))
+    if (!stewart_derivatives(NULL, model, rows, mean, A, B, NULL, scratch))
         return 0;
     for (int i = 0; i < 6; i++)
         for (int j = 0; j < U; j++)
@@ -189,7 +189,7 @@ static void guess(const real *start, const real *end, plan *p)
         for (int node = 0; node < 2; node++) {
             const real time = p->edges[k] + (p->edges[k + 1] - p->edges[k]) * GAUSS_NODES[node];
             stewart_between(from, end, duration, time / duration, row);
-            stewart_required_torque(p->belief, row, torques[node]);
+            stewart_required_torque(p->model, row, torques[node]);
         }
         for (int j = 0; j < U; j++)
             p->torques[U * k + j] = (torques[0][j] + torques[1][j]) / 2;
@@ -201,7 +201,7 @@ static int is_inside(const plan *p, const real *pose)
     static const real least[STEWART_MEASURES] = { /* dynamics/workspace.py */
         (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)1e-3,
         (real)-1.4835298641951802};
-    return stewart_margin(p->belief->plant.geometry, pose, p->sign, least) > 0;
+    return stewart_margin(p->model->plant.geometry, pose, p->sign, least) > 0;
 }
 
 /* States under the torques. Returns 0 where one of them is out of the workspace. */
@@ -211,7 +211,7 @@ static int respond(plan *p)
         const int k = i / p->pieces;
         real *state = p->states + X * (i + 1);
         stewart_copy(X, state - X, state);
-        stewart_advance(p->belief, p->torques + U * k,
+        stewart_advance(p->model, p->torques + U * k,
                         (p->edges[k + 1] - p->edges[k]) / (real)p->pieces, 1, state);
     }
     for (int i = 0; i <= p->number * p->pieces; i++)
@@ -235,7 +235,7 @@ static int differentiate(const real *size, plan *p, stewart_scratch scratch)
         real middle[X];
         for (int i = 0; i < X; i++)
             middle[i] = (start[i] + end[i]) / 2;
-        if (!stewart_derivatives(NULL, p->belief, middle, p->torques + U * k, A, B, NULL, scratch))
+        if (!stewart_derivatives(NULL, p->model, middle, p->torques + U * k, A, B, NULL, scratch))
             return 0;
         for (int i = 0; i < X * X; i++)
             A[i] *= h;
@@ -294,7 +294,7 @@ static int add_least_norm(int m, int n, real *A, real *b, real *x, stewart_scrat
 
 static int solve(const real *goal, plan *p, stewart_scratch scratch)
 {
-    const real longest = reach(p->belief->plant.geometry), size[6] = {1, 1, 1, longest, longest, longest};
+    const real longest = reach(p->model->plant.geometry), size[6] = {1, 1, 1, longest, longest, longest};
     const real *last = p->states + X * p->number * p->pieces;
     for (int round = 0; round < ROUNDS; round++) {
         real miss[X], most = 0;
@@ -322,11 +322,11 @@ static real time_of(const plan *p, int state)
     return p->edges[k] + (p->edges[k + 1] - p->edges[k]) / (real)p->pieces * (real)part;
 }
 
-int stewart_plan_way(const stewart_belief *belief, real sign, const real *start, real begin,
+int stewart_plan_path(const stewart_model *model, real sign, const real *start, real begin,
                      real period, int periods, const real *rows, real *pieces, real *peak,
                      stewart_scratch scratch)
 {
-    plan p = {belief, sign, holds_of(periods), pieces_per_hold(period, periods), NULL, NULL, NULL, NULL};
+    plan p = {model, sign, holds_of(periods), pieces_per_hold(period, periods), NULL, NULL, NULL, NULL};
     real goal[X];
     p.edges = stewart_take(&scratch, p.number + 1);
     p.torques = stewart_take(&scratch, U * p.number);
@@ -335,7 +335,7 @@ int stewart_plan_way(const stewart_belief *belief, real sign, const real *start,
     for (int k = 0; k <= p.number; k++)
         p.edges[k] = period * sample_of(periods, k);
     stewart_copy(X, start, p.states);
-    if (!target(belief, period, rows, goal, scratch))
+    if (!target(model, period, rows, goal, scratch))
         return 0;
     guess(start, rows, &p);
     if (!solve(goal, &p, scratch))
@@ -345,7 +345,7 @@ int stewart_plan_way(const stewart_belief *belief, real sign, const real *start,
         if (REAL(fabs)(p.torques[i]) > *peak)
             *peak = REAL(fabs)(p.torques[i]);
     for (int i = 0; i < p.number * p.pieces; i++)
-        add_piece(belief, begin + time_of(&p, i), begin + time_of(&p, i + 1), p.states + X * i,
+        add_piece(model, begin + time_of(&p, i), begin + time_of(&p, i + 1), p.states + X * i,
                   p.torques + U * (i / p.pieces), pieces + STEWART_PIECE * i);
     return p.number * p.pieces;
 }

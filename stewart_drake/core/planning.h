@@ -25,15 +25,15 @@ int stewart_plan_scratch(real period, int periods);
 /* Plan from a state (12) onto the reference, with its rows (3, 18) at `stewart_plan_times`. Returns the
    number of pieces, 0 without a plan; `peak` is the largest torque, `sign` that of the parallel measure at
    home. */
-int stewart_plan_way(const stewart_belief *belief, real sign, const real *start, real begin,
+int stewart_plan_path(const stewart_model *model, real sign, const real *start, real begin,
                      real period, int periods, const real *rows, real *pieces, real *peak,
                      stewart_scratch scratch);
 
 /* Pieces of the motion through `states` (1 + schedule->number, 12) under torques from `begin` s on;
    their number. */
-int stewart_predicted_pieces(const stewart_belief *belief, const stewart_schedule *schedule,
+int stewart_predicted_pieces(const stewart_model *model, const stewart_schedule *schedule,
                              const real *states, real begin, real *pieces);
 
 /* The row of a way at an instant. Before a piece the pose goes on the straight line that its first
    rates continue. Returns 0 after the last piece. */
-int stewart_along(int number, const real *pieces, real time, real *row);
+int stewart_path_row(int number, const real *pieces, real time, real *row);

@@ -145,12 +145,12 @@ void stewart_interpolate(const stewart_preview *reference, real time, real *row)
 
    What is left after the first hold is solved by the rest of these, so that d and n are all there is
    to remember. */
-static void move_offset(stewart_way_back *way, real h, real time, real *accelerations)
+static void move_offset(stewart_blend *blend, real h, real time, real *accelerations)
 {
-    const real n = (real)way->holds;
+    const real n = (real)blend->holds;
     for (int i = 0; i < 6; i++) {
-        real *pose = way->offset + i, *rate = pose + 6, a = -*rate / (n * h);
-        if (way->holds > 1)
+        real *pose = blend->offset + i, *rate = pose + 6, a = -*rate / (n * h);
+        if (blend->holds > 1)
             a -= 6 * (*pose + n * h / 2 * *rate) / (h * h * n * (n + 1));
         *pose += time * (*rate + time / 2 * a);
         *rate += time * a;
@@ -158,96 +158,96 @@ static void move_offset(stewart_way_back *way, real h, real time, real *accelera
     }
 }
 
-void stewart_begin_way_back(const real *offset, real period, int queue, stewart_way_back *way)
+void stewart_begin_blend(const real *offset, real period, int queue, stewart_blend *blend)
 {
     int holds = (int)REAL(ceil)(CATCH_UP / period - (real)1e-6);
-    stewart_copy(X, offset, way->offset);
-    way->holds = holds > 2 ? holds : 2;
-    way->samples = queue + 2;
+    stewart_copy(X, offset, blend->offset);
+    blend->holds = holds > 2 ? holds : 2;
+    blend->samples = queue + 2;
 }
 
-void stewart_go_on_way_back(stewart_way_back *way, real period)
+void stewart_advance_blend(stewart_blend *blend, real period)
 {
     real a[6];
-    if (way->holds > 0) {
-        move_offset(way, period, period, a);
-        way->holds--;
-    } else if (way->samples > 0) {
-        way->samples--;
+    if (blend->holds > 0) {
+        move_offset(blend, period, period, a);
+        blend->holds--;
+    } else if (blend->samples > 0) {
+        blend->samples--;
     }
 }
 
-void stewart_add_offset(stewart_way_back way, real period, real time, real *row)
+void stewart_add_offset(stewart_blend blend, real period, real time, real *row)
 {
     real a[6];
-    for (; way.holds > 0 && time > period; way.holds--, time -= period)
-        move_offset(&way, period, period, a);
-    if (way.holds == 0)
+    for (; blend.holds > 0 && time > period; blend.holds--, time -= period)
+        move_offset(&blend, period, period, a);
+    if (blend.holds == 0)
         return;
-    move_offset(&way, period, time, a);
+    move_offset(&blend, period, time, a);
     for (int i = 0; i < X; i++)
-        row[i] += way.offset[i];
+        row[i] += blend.offset[i];
     for (int i = 0; i < 6; i++)
         row[X + i] += a[i];
 }
 
 /* Rows of the predicted motion, and the state (12) where the next torque acts. */
-static void predict_way(const stewart_course_input *m, const stewart_course *c, real *way, real *state,
+static void predicted_rows(const stewart_course_input *m, const stewart_course *c, real *before, real *state,
                         stewart_scratch scratch)
 {
     const stewart_schedule *until = &m->until;
     real *states = stewart_take(&scratch, X * (until->number + 1)), ends[2][ROW], begin = 0;
-    stewart_belief belief;
-    stewart_believe(m->machine, m->theta, &belief);
+    stewart_model model;
+    stewart_set_model(m->machine, m->theta, &model);
     stewart_copy(X, m->state, states);
     stewart_predict(m->machine, m->theta, until, states, states + X);
     stewart_copy(X, states + X * until->number, state);
     for (int i = 0; i < c->number; i++) {
-        stewart_copy(X, state, way + ROW * i);
-        stewart_fill(6, 0, way + ROW * i + X);
+        stewart_copy(X, state, before + ROW * i);
+        stewart_fill(6, 0, before + ROW * i + X);
     }
     for (int k = 0; k < until->number; k++) {
         const real h = until->durations[k], *torque = until->torques + U * k;
         for (int end = 0; end < 2; end++) {
             stewart_copy(X, states + X * (k + end), ends[end]);
-            stewart_accelerate(&belief, ends[end], torque, ends[end] + X);
+            stewart_accelerate(&model, ends[end], torque, ends[end] + X);
         }
         for (int i = 0; i < c->number; i++)
             if (c->times[i] >= begin && c->times[i] < begin + h)
-                stewart_between(ends[0], ends[1], h, (c->times[i] - begin) / h, way + ROW * i);
+                stewart_between(ends[0], ends[1], h, (c->times[i] - begin) / h, before + ROW * i);
         begin += h;
     }
 }
 
-/* Follows a way back, which may begin now. */
+/* Follow a blend, which may begin now. */
 static void return_after_gap(const stewart_course_input *m, const stewart_course *last, int ended,
                              const real *geometry, stewart_course *c, stewart_scratch scratch)
 {
     const real h = m->period, eta = m->eta, acts = eta - (real)1e-6 * h;
-    real *way = stewart_take(&scratch, ROW * c->number), wanted[ROW], reached[ROW] = {0};
-    stewart_way_back *back = &c->back;
+    real *before = stewart_take(&scratch, ROW * c->number), wanted[ROW], reached[ROW] = {0};
+    stewart_blend *blend = &c->blend;
     const stewart_preview reference = {c->number, c->times, c->reference};
     const stewart_preview given_before = {last->number, last->times, last->reference};
     const stewart_preview followed_before = {last->number, last->times, last->followed};
     const int known =
         last->number > 0 && stewart_all_finite(ROW, last->followed + ROW * (last->number - 1));
-    const int early = ended || 2 * (real)back->holds * h >= CATCH_UP;
-    const int predicted = !known || (early && !c->missing && m->quiet);
+    const int early = ended || 2 * (real)blend->holds * h >= CATCH_UP;
+    const int predicted = !known || (early && !c->missing && m->open_loop);
     if (!predicted) {
-        stewart_complete(geometry, h, eta, &reference, acts, &followed_before, way);
+        stewart_complete(geometry, h, eta, &reference, acts, &followed_before, before);
         if (ended) { /* without a step in what is followed */
             real *continued = stewart_take(&scratch, ROW * c->number);
             const stewart_preview went_on = {c->number, c->times, continued};
-            stewart_add_offset(*back, h, 0, reached);
+            stewart_add_offset(*blend, h, 0, reached);
             stewart_complete(geometry, h, eta, &reference, (real)HUGE_VAL, &given_before, continued);
             stewart_interpolate(&went_on, eta, wanted);
             for (int i = 0; i < X; i++)
                 reached[i] += wanted[i];
         }
     } else if (stewart_all_finite(X, m->state)) {
-        predict_way(m, c, way, reached, scratch);
+        predicted_rows(m, c, before, reached, scratch);
     } else { /* nothing else to go on with */
-        back->holds = back->samples = 0;
+        blend->holds = blend->samples = 0;
         return;
     }
     if (ended || predicted) {
@@ -255,16 +255,16 @@ static void return_after_gap(const stewart_course_input *m, const stewart_course
         for (int i = 0; i < X; i++)
             reached[i] -= wanted[i];
         if (ended || !known)
-            stewart_begin_way_back(reached, h, m->queue, back);
+            stewart_begin_blend(reached, h, m->queue, blend);
         else
-            stewart_copy(X, reached, back->offset);
+            stewart_copy(X, reached, blend->offset);
     }
     for (int i = 0; i < c->number; i++) {
         real *row = c->followed + ROW * i;
         if (c->times[i] < acts)
-            stewart_copy(ROW, way + ROW * i, row);
+            stewart_copy(ROW, before + ROW * i, row);
         else
-            stewart_add_offset(*back, h, c->times[i] - eta, row);
+            stewart_add_offset(*blend, h, c->times[i] - eta, row);
     }
 }
 
@@ -278,9 +278,9 @@ void stewart_follow(const stewart_course_input *m, const stewart_course *last, c
     stewart_copy(ROW * c->number, c->reference, c->followed);
     c->missing = !stewart_all_finite(ROW * c->number, given);
     c->gap = !stewart_all_finite(ROW, given + ROW * (c->number - 1));
-    c->back = last->back;
-    stewart_go_on_way_back(&c->back, m->period);
+    c->blend = last->blend;
+    stewart_advance_blend(&c->blend, m->period);
     const int ended = last->gap && !c->gap;
-    if (ended || c->back.holds + c->back.samples > 0)
+    if (ended || c->blend.holds + c->blend.samples > 0)
         return_after_gap(m, last, ended, geometry, c, scratch);
 }

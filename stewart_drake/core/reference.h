@@ -1,11 +1,11 @@
-/* The reference between the instants at which it is known, and the way back onto it after a gap.
+/* Interpolation of the reference, its completion over gaps, and the blend back onto it after a gap.
    A row has 18 numbers: pose, rates and accelerations. */
 
 #pragma once
 
 #include "design.h"
 
-/* A reference at some instants, s from a sample. */
+/* A reference at some times, s from a sample. */
 typedef struct {
     int number;
     const real *times; /* (number) */
@@ -13,42 +13,41 @@ typedef struct {
 } stewart_preview;
 
 /* Offset from the reference that is zero after some holds; and further samples at which torques of
-   the way back are in flight. */
+   the blend are in flight. */
 typedef struct {
     real offset[STEWART_STATES];
     int holds, samples;
-} stewart_way_back;
+} stewart_blend;
 
-/* The share s of the way between two rows that are h seconds apart, by the polynomial of fifth order. */
+/* Interpolate at s in [0, 1] between two rows h seconds apart, by the polynomial of fifth order. */
 void stewart_between(const real *from, const real *to, real h, real s, real *row);
 
-/* The row at an instant, between those before and after it. */
+/* Interpolate at a time between the rows before and after it. */
 void stewart_interpolate(const stewart_preview *reference, real time, real *row);
 
-/* `rows`: the given reference with numbers for what is missing of it from `since` s on; before that
-   all of it counts as missing. What is missing lies between the rows next to it in time, of this
-   preview or of the last one, a period earlier, or continues one of them. As long as there is no
-   complete row it stays missing. `eta`: s until the next torque acts; `geometry` NULL: any pose is
-   within reach. */
+/* Write `rows`: the given reference with its missing numbers filled in. Rows before `since` s count as
+   missing. The neighbours in time, of this preview or of the last one (a period earlier), are
+   interpolated; a single one is continued to rest. Without a complete row numbers stay missing.
+   `eta`: s until the next torque acts; `geometry` NULL: any pose is within reach. */
 void stewart_complete(const real *geometry, real period, real eta, const stewart_preview *given,
                       real since, const stewart_preview *last, real *rows);
 
-/* Begin a way back from an offset, with `queue` torques in flight. */
-void stewart_begin_way_back(const real *offset, real period, int queue, stewart_way_back *way);
+/* Begin a blend from an offset, with `queue` torques in flight. */
+void stewart_begin_blend(const real *offset, real period, int queue, stewart_blend *blend);
 
 /* Advance by one hold. */
-void stewart_go_on_way_back(stewart_way_back *way, real period);
+void stewart_advance_blend(stewart_blend *blend, real period);
 
 /* Add the offset at `time` s from the beginning to a row. */
-void stewart_add_offset(stewart_way_back way, real period, real time, real *row);
+void stewart_add_offset(stewart_blend blend, real period, real time, real *row);
 
 /* The preview of a sample, and the rows that are followed. */
 typedef struct {
     int number;
-    real *times, *reference, *followed; /* (number), (number, 18); with numbers for what is missing */
-    int missing; /* whether anything was missing */
-    int gap;     /* whether the last row was */
-    stewart_way_back back;
+    real *times, *reference, *followed; /* (number), (number, 18); missing numbers are filled in */
+    int missing; /* whether any number was missing */
+    int gap;     /* whether the last row was incomplete */
+    stewart_blend blend;
 } stewart_course;
 
 /* The motion of the plate until the next torque acts. */
@@ -60,13 +59,12 @@ typedef struct {
     const real *state;       /* (12) now, NaN if unknown */
     const real *theta;       /* estimated parameters */
     stewart_schedule until;  /* torques that act until then */
-    int quiet;               /* whether nothing is fed back yet */
+    int open_loop;           /* whether nothing is fed back yet */
 } stewart_course_input;
 
 /* Fill in a course, with `number` and `times` set, from the rows `given` at its times and the course of
-   the last sample. After a gap in the reference the way back leads onto it. Up to the instant
-   at which the next torque acts, the course is that of the last sample; at the first preview ever, and
-   as long as nothing is fed back, it is the predicted motion. Scratch: 2 * 18 numbers for each row, and
-   12 for each torque of `until` and one. */
+   the last sample. After a gap in the reference a blend leads back onto it. Until the next torque acts,
+   the course is that of the last sample; at the first preview, and as long as nothing is fed back, it is
+   the predicted motion. Scratch: 2 * 18 numbers for each row, and 12 for each torque of `until` and one. */
 void stewart_follow(const stewart_course_input *motion, const stewart_course *last, const real *given,
                     stewart_course *course, stewart_scratch scratch);

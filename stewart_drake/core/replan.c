@@ -59,7 +59,7 @@ static void rows_of(const stewart_law *law, const real *memory, const stewart_sa
         sample->reference(sample->context, number, times, rows);
     for (int i = 0; i < number && pieces > 0; i++) {
         real *row = rows + ROW * i;
-        if (!stewart_along(pieces, memory + PATH, now + times[i], row))
+        if (!stewart_path_row(pieces, memory + PATH, now + times[i], row))
             (sample->goal ? sample->goal : sample->reference)(sample->context, 1, times + i, row);
     }
 }
@@ -73,13 +73,13 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
     int periods = replan->periods, added;
     real times[3], rows[3 * ROW], peak, *pieces = stewart_take(&scratch, PIECE * most_pieces(law));
     const real *last = states + X * outlook->until_next.number;
-    stewart_belief belief;
-    stewart_believe(&law->machine, outlook->theta, &belief);
-    const int number = stewart_predicted_pieces(&belief, &outlook->until_next, states, 0, pieces);
+    stewart_model model;
+    stewart_set_model(&law->machine, outlook->theta, &model);
+    const int number = stewart_predicted_pieces(&model, &outlook->until_next, states, 0, pieces);
     for (;; periods = 2 * periods < replan->most ? 2 * periods : replan->most) {
         stewart_plan_times(outlook->eta, law->period, periods, times);
         sample->goal(sample->context, 3, times, rows);
-        added = stewart_plan_way(&belief, replan->sign, last, outlook->eta, law->period, periods, rows,
+        added = stewart_plan_path(&model, replan->sign, last, outlook->eta, law->period, periods, rows,
                                    pieces + PIECE * number, &peak, scratch);
         if (added == 0)
             return 0;

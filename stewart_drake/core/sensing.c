@@ -4,10 +4,10 @@
 #include "sensing.h"
 #include "short.h"
 
-#define MOVED ((real)1e-3)     /* share of the motion within a period that counts as moved */
-#define NOISY ((real)1048576)  /* units in the last place; larger noise repeats once in a million */
-#define SIGMAS 6               /* standard deviations of rates that do not prove a motion */
-#define STEEPEST ((real)1.5707963267948966) /* rad; beyond, other angles are the same pose */
+#define MOVED ((real)1e-3)    /* part of the motion within a period that counts as moved */
+#define NOISY ((real)1048576) /* units in the last place; larger noise repeats once in a million */
+#define SIGMAS 6              /* standard deviations of the rates up to which they do not prove a motion */
+#define STEEPEST ((real)1.5707963267948966) /* rad, largest pitch: beyond it other angles are the same pose */
 
 static int start_of_state(const stewart_sensing *sensing, const real *values, const real *near,
                           real *state, real *root, stewart_scratch scratch)
@@ -21,15 +21,14 @@ static int start_of_state(const stewart_sensing *sensing, const real *values, co
     return 1;
 }
 
-/* A measurement that is frozen repeats the last one bit for bit, which is a fault only where it cannot
-   be so. Noise that numbers can tell apart never comes twice: with noise a value that repeats is
-   frozen. Without noise the poses q and rates v have to agree: between two samples a smooth motion
+/* A value is frozen if it repeats the last one bit for bit although it must have changed: with noise that
+   the numbers resolve, always. Without noise it depends on the rates v: between two samples a smooth motion
    goes
 
        q_k - q_{k-1} = dt/2 (v_{k-1} + v_k) + O(dt^3),
 
-   so a pose that repeats is frozen if its own rates say that it has moved on. A plate at rest repeats
-   pose and rates and is not frozen. A pose that the machine cannot have is rejected. */
+   so a coordinate that repeats is frozen if its rates show a motion. A plate at rest repeats pose and rates
+   and is not frozen. A pose that the machine cannot have is rejected. */
 static int fault_of_state(const stewart_sensing *sensing, const real *geometry, real period,
                           const real *values, const real *last)
 {

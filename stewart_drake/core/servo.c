@@ -26,7 +26,7 @@ void stewart_servo_prepare(stewart_servo *servo)
     l->lag = place(servo, 1);
     l->state = place(servo, X);
     l->parameters = place(servo, law->machine.estimated);
-    l->measurement = place(servo, law->measured);
+    l->measurement = place(servo, law->num_values);
     l->torque = place(servo, U);
     l->in_flight = place(servo, U);
     l->counts = place(servo, STEWART_CAUSES);
@@ -54,7 +54,7 @@ void stewart_servo_start(const stewart_servo *servo, real *memory, const real *c
     stewart_fill(servo->memory, 0, memory);
     stewart_copy(STEWART_COMMAND, command, memory + l->command.at);
     servo->law.observer->start(&servo->law, memory + l->observer.at);
-    stewart_fill(servo->law.measured, (real)NAN, memory + l->measurement.at);
+    stewart_fill(servo->law.num_values, (real)NAN, memory + l->measurement.at);
     take_estimate(servo, memory);
 }
 
@@ -116,15 +116,15 @@ static int unlimited(const stewart_servo *servo, const real *theta, const real *
     const int moves = law->cost.feedforward == STEWART_INVERSE_DYNAMICS;
     const real *geometry = law->machine.geometry;
     real J[36];
-    stewart_belief belief;
+    stewart_model model;
     stewart_fill(STEWART_COMMAND, 0, found);
     stewart_crank_angles(geometry, row, found);
     if (!stewart_all_finite(6, found) || !stewart_crank_jacobian(geometry, row, J))
         return STEWART_UNREACHABLE;
     stewart_multiply(6, 6, 1, J, row + 6, found + 6);
-    stewart_believe(&law->machine, theta, &belief);
+    stewart_set_model(&law->machine, theta, &model);
     if (law->cost.feedforward != STEWART_NO_FEEDFORWARD)
-        stewart_inverse_dynamics(&belief.plant, row, moves ? row + 6 : still,
+        stewart_inverse_dynamics(&model.plant, row, moves ? row + 6 : still,
                                  moves ? row + 12 : still, found + 12);
     const stewart_stiffness *stiff = &servo->stiff;
     if (stiff->stiffness > 0) /* before the check, so that NaN stops here */
@@ -140,11 +140,11 @@ static int command_for(const stewart_servo *servo, const real *theta, const real
     real found[STEWART_COMMAND];
     if (!stewart_all_finite(ROW, row))
         return STEWART_REFERENCE_MISSING;
-    int trouble = unlimited(servo, theta, row, found);
-    if (!trouble && servo->command)
-        trouble = servo->command(servo, theta, row, found);
-    if (trouble)
-        return trouble;
+    int failure = unlimited(servo, theta, row, found);
+    if (!failure && servo->command)
+        failure = servo->command(servo, theta, row, found);
+    if (failure)
+        return failure;
     if (!stewart_all_finite(STEWART_COMMAND, found))
         return STEWART_NONFINITE_TORQUE;
     if (stiff->stiffness > 0)
@@ -165,7 +165,7 @@ int stewart_servo_step(const stewart_servo *servo, real *memory, real *scratch_m
     const int lag = (int)memory[l->lag.at] + 1;
     real row[ROW], *last = memory + l->command.at;
     int there = 0, status = STEWART_MEASUREMENT_MISSING;
-    for (int i = 0; i < law->measured; i++)
+    for (int i = 0; i < law->num_values; i++)
         there |= isfinite(sample->measurement[i]) != 0;
     if (there && sample->age >= 0 && sample->age < lag)
         status = observe(servo, memory, sample, report, lag - sample->age, scratch);
@@ -173,13 +173,13 @@ int stewart_servo_step(const stewart_servo *servo, real *memory, real *scratch_m
         there = 0;
     memory[l->lag.at] = (real)(there ? sample->age : lag);
     sample->reference(sample->context, 1, &time, row);
-    int trouble = command_for(servo, memory + l->parameters.at, row, last);
-    if (trouble) /* the cranks stop where they are */
+    int failure = command_for(servo, memory + l->parameters.at, row, last);
+    if (failure) /* the cranks stop where they are */
         stewart_fill(6, 0, last + 6);
     stewart_copy(STEWART_COMMAND, last, command);
-    stewart_copy(law->measured, sample->measurement, memory + l->measurement.at);
+    stewart_copy(law->num_values, sample->measurement, memory + l->measurement.at);
     stewart_limit(&law->machine, memory + l->torque.at, memory + l->in_flight.at);
-    status |= trouble;
+    status |= failure;
     for (int i = 0; i < STEWART_CAUSES; i++)
         memory[l->counts.at + i] += (real)(status >> i & 1);
     return status;

@@ -92,7 +92,7 @@ void stewart_shoot(const stewart_plant *plant, int legs, long number, const doub
         if (columns)
             step(plant, legs, columns, torque, h[k], x, S);
         else
-            stewart_move(plant, torque, h[k], x);
+            stewart_runge_kutta_step(plant, torque, h[k], x);
         if (columns && memcmp(torque, next, U * sizeof *torque)) {
             /* Jump of the last column, d[rates]/d[delay]. It precedes the sample: a sample at the switch
                has the derivative after it. */

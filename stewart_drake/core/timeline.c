@@ -7,7 +7,7 @@ int stewart_queue_length(const stewart_law *law) { return law->steps + (law->fra
 
 stewart_sensing stewart_sensing_of(const stewart_law *law)
 {
-    return law->described ? *law->described : law->read(law->sensing);
+    return law->own_sensing ? *law->own_sensing : law->make_sensing(law->sensing);
 }
 
 int stewart_limit(const stewart_machine *machine, const real *torque, real *limited)

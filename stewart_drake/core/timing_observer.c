@@ -63,15 +63,15 @@ static void timing_restart(const stewart_law *law, real *memory)
 /* Compute the impulse u (6) from the predicted to the measured state. */
 static void impulse_between(const stewart_law *law, const real *predicted, const real *measured, real *u)
 {
-    stewart_belief belief;
+    stewart_model model;
     real row[ROW], unaccelerated[U];
-    stewart_believe(&law->machine, NULL, &belief);
+    stewart_set_model(&law->machine, NULL, &model);
     stewart_copy(X, measured, row);
     stewart_fill(6, 0, row + X);
-    stewart_required_torque(&belief, row, unaccelerated);
+    stewart_required_torque(&model, row, unaccelerated);
     for (int i = 0; i < 6; i++)
         row[X + i] = (measured[6 + i] - predicted[6 + i]) / law->period;
-    stewart_required_torque(&belief, row, u);
+    stewart_required_torque(&model, row, u);
     for (int i = 0; i < U; i++)
         u[i] = law->period * (u[i] - unaccelerated[i]);
 }

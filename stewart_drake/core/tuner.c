@@ -273,7 +273,7 @@ static void innovate(const stewart_tuner_input *in, real *innovation, real *late
 {
     const stewart_schedule *schedule = &in->schedule;
     real a[3][U];
-    stewart_belief belief;
+    stewart_model model;
     stewart_fill(U, 0, late);
     stewart_fill(U, 0, early);
     if (!stewart_all_finite(X, in->state)) {
@@ -284,14 +284,14 @@ static void innovate(const stewart_tuner_input *in, real *innovation, real *late
     real *states = stewart_take(&scratch, X * schedule->number);
     const real *last = schedule->torques + U * (schedule->number - 1);
     stewart_predict(in->machine, in->theta, schedule, in->state, states);
-    stewart_believe(in->machine, in->theta, &belief);
+    stewart_set_model(in->machine, in->theta, &model);
     if (schedule->number > 1)
         stewart_copy(U, last - U, acted);
     else if (!stewart_all_finite(U, acted))
         stewart_copy(U, last, acted);
     const real *torques[3] = {acted, last, in->following};
     for (int k = 0; k < 3; k++)
-        stewart_accelerate(&belief, in->state, torques[k], a[k]);
+        stewart_accelerate(&model, in->state, torques[k], a[k]);
     for (int i = 0; i < U; i++) {
         late[i] = a[1][i] - a[0][i];
         early[i] = a[2][i] - a[1][i];
@@ -387,7 +387,7 @@ int stewart_tuned_step(const stewart_law *law, const stewart_tuner *t, real *mem
         .machine = &law->machine,
         .state = before + l->state.at,
         .theta = before + l->parameters.at,
-        .measured = memory + (law->measured == X ? l->measurement.at : l->state.at),
+        .measured = memory + (law->num_values == X ? l->measurement.at : l->state.at),
         .torque = {memory + l->torque.at, before + l->torque.at},
         .feedforward = {memory + l->feedforward.at, before + l->feedforward.at},
         .std = std,

@@ -71,32 +71,32 @@ class Innovations(NamedTuple):
     squared (Bar-Shalom, Li, Kirubarajan, Estimation with Applications, section 5.4).
 
     Attributes:
-        squares: sum of nu' S^-1 nu over the measurements that were used.
-        values: number of values in them.
-        changes: number of values at which the parameters had to change, see core/noise.h.
+        chi2: sum of nu' S^-1 nu over the measurements that were used.
+        num_values: number of values in them.
+        changed_values: number of values at which parameters had to change, see core/noise.h.
     """
 
-    squares: float = 0.0
-    values: float = 0.0
-    changes: float = 0.0
+    chi2: float = 0.0
+    num_values: float = 0.0
+    changed_values: float = 0.0
 
     @property
     def ratio(self) -> float:
-        """Mean per value, 1 where the stated uncertainty is right; NaN without measurements."""
-        return self.squares / self.values if self.values else math.nan
+        """chi^2 per value, 1 where the stated uncertainty is right; NaN without measurements."""
+        return self.chi2 / self.num_values if self.num_values else math.nan
 
     @property
     def verdict(self) -> Literal["consistent", "cautious", "overconfident"] | None:
         """Result of the test, None with too few measurements.
 
         The ratio is below 1 / TOLERATED (`cautious`) or above TOLERATED (`overconfident`) by more
-        than chance explains: its standard deviation is sqrt(2 / values). Parameters that were
+        than chance explains: its standard deviation is sqrt(2 / num_values). Parameters that were
         assumed to be constant and had to change are `overconfident` too.
         """
-        chance = CHANCE * math.sqrt(2 / self.values) if self.values else math.inf
+        chance = CHANCE * math.sqrt(2 / self.num_values) if self.num_values else math.inf
         if not chance < 1:
             return None
-        if self.changes > CHANGING * self.values:
+        if self.changed_values > CHANGING * self.num_values:
             return "overconfident"
         if self.ratio > TOLERATED * (1 + chance):
             return "overconfident"

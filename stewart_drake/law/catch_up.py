@@ -154,13 +154,13 @@ def periods_of(duration: float, period: float) -> int:
 
 
 class Model:
-    """The `stewart_belief` of a plant for the functions of core/planning.h."""
+    """The `stewart_model` of a plant for the functions of core/planning.h."""
 
     def __init__(self, dynamics: StewartDynamics) -> None:
         c = core()
         self._machine = machine_of(NominalPlant(dynamics, 1, math.inf, TorqueLimit()))
-        self._sign, self.data = home_sign(dynamics.mechanism), c.ffi.new("stewart_belief *")
-        c.lib.stewart_believe(self._machine.it, c.ffi.NULL, self.data)
+        self._sign, self.data = home_sign(dynamics.mechanism), c.ffi.new("stewart_model *")
+        c.lib.stewart_set_model(self._machine.it, c.ffi.NULL, self.data)
 
     def plan(
         self, reference: Trajectory, start: Array, begin: float, period: float, periods: int
@@ -180,5 +180,5 @@ class Model:
         scratch = c.scratch(c.lib.stewart_plan_scratch(period, periods))
         given = c.at(np.array(start, np.float64)), begin, period, periods, c.at(rows)
         results = c.at(pieces), c.at(peak), scratch
-        number = c.lib.stewart_plan_way(self.data, self._sign, *given, *results)
+        number = c.lib.stewart_plan_path(self.data, self._sign, *given, *results)
         return Plan(pieces, float(peak[0])) if number else None

@@ -111,7 +111,7 @@ class CompiledLaw:
         self._raised += machine.raised
         self.keep += machine.pointed()
         data.period, data.steps, data.fraction = timeline.period, timeline.steps, timeline.fraction
-        data.measured, data.rows = law.sensing.size, len(law.preview_times)
+        data.num_values, data.rows = law.sensing.size, len(law.preview_times)
         if "feedforward" not in self._python:
             data.cost.feedforward = getattr(c.lib, _FEEDFORWARDS[type(law.feedforward)])
         if "observer" in self._python:
@@ -138,10 +138,12 @@ class CompiledLaw:
             cost = law.cost
             d.cost.errors, d.cost.torques = cost.errors.tolist(), cost.torques.tolist()
             d.cost.integrals = (np.zeros(6) if cost.integrals is None else cost.integrals).tolist()
-        d.kept, d.silence, d.longest_wait = law.kept + self._more, law.silence, law.longest_wait
+        d.extra_torques, d.longest_wait = law.extra_torques + self._more, law.longest_wait
+        d.open_loop_samples = law.open_loop_samples
         d.tolerated_timing = 0.0 if math.isinf(law.tolerated_timing) else law.tolerated_timing
         if law.finds_delay:  # it finds steps and fraction itself
-            d.kept, d.steps, d.fraction = d.kept + law.observer.kept(d.period), 0, 0.0
+            d.extra_torques += law.observer.extra_torques(d.period)
+            d.steps, d.fraction = 0, 0.0
             d.rows = 1 + law.observer.max_schedule_length(d.period) + 6
         if python & {"observer", *_DESIGN}:
             self._designs()
@@ -162,7 +164,7 @@ class CompiledLaw:
         d, law, python = self.data, self.law, self._python
         pending = law.predictor.pending(law.timeline)
         if "observer" in python:
-            most = d.rows if law.finds_delay else 1 + d.kept + law.timeline.queue_length
+            most = d.rows if law.finds_delay else 1 + d.extra_torques + law.timeline.queue_length
             pending, again = most, 1 + 2 * (most + 3)
             d.rows = most + again * law.channel.torques
         self._own.design(
@@ -187,7 +189,7 @@ class CompiledLaw:
     def sources(self) -> list[str]:
         """Files of the core that the law needs."""
         law, step = self.torques_law, "stewart_servo_step" if self._servos else "stewart_step"
-        parts = law.observer, law.read, law.channel, law.planner, law.machine.joints
+        parts = law.observer, law.make_sensing, law.channel, law.planner, law.machine.joints
         names = [core().symbols.get(address_of(part)) for part in parts]
         return sources_of([step, *filter(None, names)])
 

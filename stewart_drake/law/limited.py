@@ -247,8 +247,8 @@ class LimitedLqi(OuterLqi):
             given, motion = Preview(own, rows[: len(own)]), Preview(times, rows[len(own) :])
         after = self.free.step(before, measurement, given, weights, report)
         further = after.compiled.followed(after, motion, times)
-        quiet = before.silence > 0 and after.silence > 0
-        if quiet or not after.belief.feeds_back or not np.isfinite(further).all():
+        open_loop = before.open_loop_samples > 0 and after.open_loop_samples > 0
+        if open_loop or not after.belief.feeds_back or not np.isfinite(further).all():
             return memory.following(after)
         belief, timeline = after.belief, after.belief.timeline
         flying = after.in_flight[:-1]

@@ -79,9 +79,9 @@ class Memory:
         return sent
 
     @property
-    def silence(self) -> int:
+    def open_loop_samples(self) -> int:
         """Samples that remain without feedback."""
-        return int(self.field("silence")[0])
+        return int(self.field("open_loop_samples")[0])
 
     @cached_property
     def counts(self) -> Counts:

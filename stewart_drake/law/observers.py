@@ -87,7 +87,7 @@ class DelaySettings:
         walk: s per root s, of the delay itself.
         rate_std: s/s, of its rate; 0 for none.
         rate_walk: s/s per root s.
-        quiet: whether feedback waits until the delay is found.
+        open_loop_start: whether feedback waits until the delay is found.
         timing_std: s, least standard deviation of the instant of a single torque.
     """
 
@@ -97,7 +97,7 @@ class DelaySettings:
     walk: float = 0.0
     rate_std: float = 0.0
     rate_walk: float = 0.0
-    quiet: bool = False
+    open_loop_start: bool = False
     timing_std: float = TIMING_STD
 
     def __post_init__(self) -> None:
@@ -113,11 +113,11 @@ class DelaySettings:
         mean: float,
         std: float,
         longest: float,
-        quiet: bool,
+        open_loop_start: bool,
     ) -> "DelaySettings":
         """Return the prior of a constant delay, or of one with an unknown rate."""
         drift = (0.0, 0.0, 0.0) if kind == "constant" else (3e-4, 0.02, 5e-3)
-        return cls(mean, std, longest, *drift, quiet)
+        return cls(mean, std, longest, *drift, open_loop_start)
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class CoreObserver:
     gaps: bool = False
     timing: bool = False
 
-    def kept(self, period: float) -> int:
+    def extra_torques(self, period: float) -> int:
         """Return the number of torques to keep in flight beyond the assumed delay."""
         return 0 if self.delay is None else math.ceil(self.delay.longest / period) + 2
 
@@ -150,8 +150,8 @@ class CoreObserver:
 
     def start(self, timeline: Timeline, sensing: Sensing, plant: NominalPlant) -> Belief:
         if self.delay is not None:
-            before = np.zeros((1, NUM_TORQUES))
-            timeline = Arrivals(timeline.period, Delay(0), self.delay.mean, before=before)
+            other = np.zeros((1, NUM_TORQUES))
+            timeline = Arrivals(timeline.period, Delay(0), self.delay.mean, other_torques=other)
         law = self.law(timeline, sensing, plant)
         memory = np.empty(law.it.observer.memory(law.it))
         law.it.observer.start(law.it, core().at(memory))
@@ -176,8 +176,10 @@ class CoreObserver:
             last = _last_values(self, law.it)
             memory[last : last + sensing.size] = belief.measured
         else:
-            if len(in_flight) != 1 + law.it.kept:
-                raise ValueError(f"in_flight: got {len(in_flight)}; expected {1 + law.it.kept}")
+            if len(in_flight) != 1 + law.it.extra_torques:
+                raise ValueError(
+                    f"in_flight: got {len(in_flight)}; expected {1 + law.it.extra_torques}"
+                )
             memory[:NUM_STATE] = belief.state
         values, torques = measurement.known(sensing.size), numbers(in_flight)
         given = c.at(memory), len(torques), c.at(torques), c.at(values)
@@ -193,8 +195,8 @@ class CoreObserver:
 
 _ENCODERS: Final = {
     "differences": "stewart_encoder_sensing",
-    "filter": "stewart_encoder_instants",
-    "delay": "stewart_newest_encoders",
+    "filter": "stewart_encoder_filter_sensing",
+    "delay": "stewart_newest_encoder_sensing",
 }
 """Functions of the core that read encoders, by the kind of observer."""
 
@@ -206,7 +208,7 @@ def set_observer(
     c, within, settings = core(), type(sensing) is EncoderSensing, observer.settings
     if not within and type(sensing) is not StateSensing:
         sensor = described(sensing, plant.mechanism)
-        law.described = sensor.it
+        law.own_sensing = sensor.it
     else:
         sensor = encoders_of(sensing) if within else state_sensor(sensing)
         law.sensing = sensor.it
@@ -224,7 +226,7 @@ def set_observer(
         law.estimation = estimation.it
     law.observer = c.ffi.addressof(c.lib, f"stewart_{kind}_observer")
     read = _ENCODERS[kind] if within else "stewart_state_sensing"
-    law.read = c.ffi.addressof(c.lib, read)
+    law.make_sensing = c.ffi.addressof(c.lib, read)
     return Compiled(sensor.it, (sensor.keeps, estimation), sensor.raised)
 
 
@@ -241,7 +243,7 @@ def _law_of(
     law, machine = core().ffi.new("stewart_law *"), machine_of(plant)
     part = set_observer(law, observer, sensing, plant, period)
     law.machine, law.period, law.parts = machine.it[0], period, parts
-    law.measured, law.kept = sensing.size, observer.kept(period)
+    law.num_values, law.extra_torques = sensing.size, observer.extra_torques(period)
     if observer.delay is None:
         law.steps, law.fraction = steps, fraction
     return Compiled(law, (machine, part), (*machine.raised, *part.raised))
@@ -286,8 +288,8 @@ def _delay_settings_of(
     it, assumed = c.ffi.new("stewart_delay_settings *"), filter_settings_of(settings, size)
     it.values, it.most = size, observer.max_schedule_length(period)
     it.delay.filter, it.delay.prior = assumed.it.filter, assumed.it.prior
-    it.delay.std, it.delay.period, it.delay.believed = c.at(std), period, delay.mean
-    it.delay.delay_std, it.delay.quiet = delay.std, delay.quiet
+    it.delay.std, it.delay.period, it.delay.delay_mean = c.at(std), period, delay.mean
+    it.delay.delay_std, it.delay.open_loop_start = delay.std, delay.open_loop_start
     for name in ("longest", "timing_std", "walk", "rate_std", "rate_walk"):
         setattr(it.delay, name, getattr(delay, name))
     return Compiled(it, (std, assumed))
@@ -295,7 +297,7 @@ def _delay_settings_of(
 
 def _last_values(observer: CoreObserver, law: Any) -> int:
     """Return the place of the last values in the memory of an observer of a known delay."""
-    size = core().lib.stewart_posterior_size(NUM_STATE + law.machine.estimated, law.measured)
+    size = core().lib.stewart_posterior_size(NUM_STATE + law.machine.estimated, law.num_values)
     return int(size) if observer.settings is not None else NUM_STATE
 
 
@@ -316,7 +318,7 @@ def belief_of(
     faults = tuple(name for i, name in enumerate(counted) if status >> i & 1)
     if observer.delay is not None:
         return _delay_belief(law, memory, timeline, faults)
-    n, m, last = NUM_STATE + p, law.measured, _last_values(observer, law)
+    n, m, last = NUM_STATE + p, law.num_values, _last_values(observer, law)
     measured, uncertainty = memory[last : last + m], law.observer.uncertainty
     timing = uncertainty(law, c.at(memory), c.ffi.NULL) if uncertainty else 0.0
     if observer.settings is not None:
@@ -334,21 +336,24 @@ def belief_of(
 
 
 def _delay_belief(law: Any, memory: Array, timeline: Timeline, faults: tuple[str, ...]) -> Belief:
-    c, p, flights = core(), law.machine.estimated, 1 + law.kept
+    c, p, num_in_flight = core(), law.machine.estimated, 1 + law.extra_torques
     settings = c.ffi.cast("stewart_delay_settings *", law.estimation)
     m, n, first = settings.values, NUM_STATE + p + 2, NUM_STATE + c.lib.STEWART_DELAY_NUMBERS
     it = c.ffi.cast("stewart_delay_memory *", c.at(memory[NUM_STATE:]))
     state, last = memory[:NUM_STATE], memory[-m:]
     belief = Belief.nothing(timeline, m, np.array(c.ffi.unpack(settings.delay.prior, p)))
     if it.known:
-        best, L = c.lib.stewart_delay_guess(p, m, flights, it, int(it.best)), np.zeros((n, n))
-        c.lib.stewart_guess_root(best, n, c.at(L))
+        best, L = (
+            c.lib.stewart_delay_hypothesis(p, m, num_in_flight, it, int(it.best)),
+            np.zeros((n, n)),
+        )
+        c.lib.stewart_hypothesis_root(best, n, c.at(L))
         mean, root = np.array(c.ffi.unpack(best.numbers, n))[:-2], L[:-2, :-2]
-        seen = Innovations(best.squares, best.values)
+        seen = Innovations(best.chi2, best.chi2_values)
         belief = replace(belief, estimate=Estimate(mean, root @ root.T), innovations=seen)
-    others = max(flights - 1, 1)
+    others = max(num_in_flight - 1, 1)
     before = memory[first : first + NUM_TORQUES * others].reshape(others, NUM_TORQUES)
-    sent = max(0, int(it.sent))  # -1 before the first sample
+    sent = max(0, int(it.num_own))  # -1 before the first sample
     return replace(
         belief.at(state),
         timeline=Arrivals(timeline.period, Delay(0), it.eta, it.rate, sent, before),

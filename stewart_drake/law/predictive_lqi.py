@@ -50,14 +50,14 @@ class PredictiveLqi:
         model: of the error, for the gain.
         cost: computes the gain.
         channel: link to the motors.
-        kept: number of torques in flight beyond those of the delay, for late measurements.
+        extra_torques: number of torques in memory beyond those of the delay, for late measurements.
         longest_wait: periods to wait for a late measurement before the model continues; 0:
             measurements are of the present.
         planner: of the way back, where the prediction is off the reference.
         tolerated_timing: s, standard deviation of the instant of single torques from which on the
             weight of the torques grows with its square; infinite: the weight is given.
-        silence: samples at the start without feedback: until an own torque has acted, feedback
-            only adds noise.
+        open_loop_samples: samples at the start without feedback: until an own torque has acted,
+            feedback only adds noise.
     """
 
     timeline: Timeline
@@ -69,10 +69,10 @@ class PredictiveLqi:
     model: DesignModel
     cost: Cost
     channel: Channel | Wire | Packets = field(default_factory=Wire)
-    kept: int = 0
+    extra_torques: int = 0
     longest_wait: int = 0
     planner: Planner | NoPlanner | Replan = field(default_factory=NoPlanner)
-    silence: int = 0
+    open_loop_samples: int = 0
     tolerated_timing: float = math.inf
 
     def __post_init__(self) -> None:
@@ -130,7 +130,7 @@ class PredictiveLqi:
         """Torques in flight at the start."""
         if self.finds_delay:
             assert isinstance(self.observer, CoreObserver)
-            return self.observer.kept(self.timeline.period)
+            return self.observer.extra_torques(self.timeline.period)
         return self.timeline.queue_length
 
     @cached_property

@@ -234,14 +234,14 @@ def described(sensing: Sensing, mechanism: Mechanism) -> Compiled:
 ROUNDING = 1e-13
 """Smallest accepted eigenvalue of a covariance, times -1, as a share of its largest one."""
 NODES = 3
-"""Largest number of Gauss nodes per period (`node_shares`)."""
+"""Largest number of Gauss nodes per period (`node_times`)."""
 FINEST = 1e-7
 """Smallest standard deviation of an encoder's value, rad: that of the model's crank angles."""
 
 
 @cache
-def node_shares(samples: int) -> Array:
-    """Return Gauss nodes (M,) of N samples at 1/N, 2/N, ..., 1 of a period, as shares of it.
+def node_times(samples: int) -> Array:
+    """Return the Gauss nodes (M,) of N samples at 1/N, 2/N, ..., 1 of a period, in periods.
 
     They are the roots of the polynomial of degree M that is orthogonal on the samples: eigenvalues
     of the Jacobi matrix of its recurrence (Golub and Welsch).
@@ -266,14 +266,14 @@ def node_shares(samples: int) -> Array:
 class EncoderSensing:
     """Motor encoders, y = h(q) + o: six crank angles, sampled N times a period.
 
-    The residuals of a predicted motion at the N samples are projected onto at most three nodes of
-    the period, see core/encoders.h.
+    A parabola fits the residuals of a predicted motion at the N samples; its values at three nodes
+    of the period, or fewer, are compared, see core/encoders.h.
 
     Attributes:
         mechanism: as the controller knows it.
         samples: N per period, the last of them at the controller's sample.
         quantum: q, rad; 0 for exact encoders.
-        declared: (12,) pose and rates at the start. They select one of the assemblies with the
+        initial_state: (12,) pose and rates at the start. They select one of the assemblies with the
             measured angles.
         rates_std: (6,) rad/s and m/s, of those rates and of the rates after any restart.
         motion: (6,) expected range of each coordinate, rad and m.
@@ -283,7 +283,7 @@ class EncoderSensing:
     mechanism: Mechanism
     samples: int
     quantum: float
-    declared: Array
+    initial_state: Array
     rates_std: Array
     motion: Array
     offset: Array
@@ -291,7 +291,7 @@ class EncoderSensing:
     def __post_init__(self) -> None:
         whole("samples", self.samples, 1)
         fixed("quantum", self.quantum, (), 0.0)
-        fixed("declared", self.declared, (NUM_STATE,))
+        fixed("initial_state", self.initial_state, (NUM_STATE,))
         for name in ("rates_std", "motion"):
             fixed(name, getattr(self, name), (NUM_COORDINATES,), 0.0)
         fixed("offset", self.offset, (NUM_LEGS,))
@@ -354,12 +354,12 @@ def _sensing_of(sensing: EncoderSensing) -> Compiled:
 @Once
 def encoders_of(sensing: EncoderSensing) -> Compiled:
     """Return the `stewart_encoders` of encoders."""
-    c, it, shares = core(), core().ffi.new("stewart_encoders *"), node_shares(sensing.samples)
+    c, it, times = core(), core().ffi.new("stewart_encoders *"), node_times(sensing.samples)
     machine, noise = geometry(sensing.mechanism), sensing.noise_std
     it.geometry, it.noise_std = c.at(machine), c.at(noise)
-    it.samples, it.nodes = sensing.samples, len(shares)
+    it.samples, it.nodes = sensing.samples, len(times)
     it.quantum, it.std = sensing.quantum, sensing.std
-    it.shares = list(shares)
-    for name in ("declared", "rates_std", "motion", "offset"):
+    it.node_times = list(times)
+    for name in ("initial_state", "rates_std", "motion", "offset"):
         setattr(it, name, list(getattr(sensing, name)))
     return Compiled(it, (machine, noise))

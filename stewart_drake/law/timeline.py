@@ -151,15 +151,15 @@ class Arrivals(Timeline):
     Attributes:
         arrival: eta in s, of a torque that arrives now; infinite if none ever arrives.
         rate: of eta, s/s.
-        sent: number of torques in flight that the controller computed, the newest ones.
-        before: (b, 6) N m, torques in the periods from now on until the first of those arrives;
+        num_own: number of torques in flight that the controller computed, the newest ones.
+        other_torques: (b, 6) N m, in the periods from now on until the first of those arrives;
             the last one continues.
     """
 
     arrival: float = 0.0
     rate: float = 0.0
-    sent: int = 0
-    before: Array = field(default_factory=lambda: np.zeros((1, NUM_TORQUES)))
+    num_own: int = 0
+    other_torques: Array = field(default_factory=lambda: np.zeros((1, NUM_TORQUES)))
 
     @property
     def eta(self) -> float:
@@ -189,7 +189,7 @@ class Arrivals(Timeline):
         """Return the schedule between two instants, s from now.
 
         Args:
-            in_flight: (n, 6) torques, oldest first; those before the last `sent` are not used.
+            in_flight: (n, 6) torques, oldest first; only the last `num_own` are used.
             begin: s, of the first instant.
             end: s, of the last instant.
             newest: sample of the last torque: -1 before this sample's is computed, 0 after it.
@@ -204,9 +204,9 @@ class Arrivals(Timeline):
         return TorqueSchedule(torques[:number], durations[:number])
 
     def _compiled(self) -> Any:
-        """Return the `stewart_arrivals`; `before` must be contiguous and outlive it."""
-        numbers = (self.period, self.arrival, self.rate, self.sent, len(self.before))
-        return core().ffi.new("stewart_arrivals *", (*numbers, core().at(self.before)))
+        """Return the `stewart_arrivals`; `other_torques` must be contiguous and outlive it."""
+        numbers = (self.period, self.arrival, self.rate, self.num_own, len(self.other_torques))
+        return core().ffi.new("stewart_arrivals *", (*numbers, core().at(self.other_torques)))
 
     def _most(self, end: float) -> int:
         return int(core().lib.stewart_max_torques(self._compiled(), end))

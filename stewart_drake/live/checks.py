@@ -150,7 +150,9 @@ def recovered(
     in s, `size` (6,) that of the motion.
     """
     belief, plant, in_flight = memory.belief, law.plant, memory.in_flight
-    if not (belief.has_state and belief.feeds_back and belief.settled and not memory.silence):
+    if not (
+        belief.has_state and belief.feeds_back and belief.settled and not memory.open_loop_samples
+    ):
         return None
     until, period = until_next(belief.timeline, in_flight[:-1]), law.timeline.period
     schedule = TorqueSchedule(

@@ -177,8 +177,8 @@ def design(scenario: Scenario, machine: MachineMessage, learned: Learned = None)
         law = replace(law, limits=replace(law.limits, budget=BUDGET * scenario.controller.period))
     repeats = scenario.controller.packet_repeats if scenario.link.kind == "network" else 0
     queue = first_queue(experiment, law)
-    assert law.kept < MOST_HISTORY
-    took = _step_times(replace(law, silence=0), planned, queue, _TRIED, np.ones(2))
+    assert law.extra_torques < MOST_HISTORY
+    took = _step_times(replace(law, open_loop_samples=0), planned, queue, _TRIED, np.ones(2))
     step = min(took), uncovered(law)
     return Design(experiment, law, planned, queue, repeats, limit, step, learned=learned)
 

@@ -315,7 +315,7 @@ class LiveLoop:
         """Record the torques that have acted, and return the report on them for the law."""
         self.record.acted(acted)
         law, rows = self._design.law, list[Array]()
-        number = reported(law.kept)
+        number = reported(law.extra_torques)
         for n in range(k - 1, k - 1 - number, -1):
             torque = self.record.applied.get(n)
             if torque is None:
@@ -362,7 +362,7 @@ class LiveLoop:
         if message is not None and len(message.acted):
             acts = message.acted[0]
         queue = np.tile(acts, (len(design.queue), 1))
-        self._law = replace(design.law, silence=0)
+        self._law = replace(design.law, open_loop_samples=0)
         self.memory = self._law.initial_memory(queue)
         schedule = until_next(design.law.timeline, queue)
         steering = replanned(self._steering, design.law.plant, t, state, schedule)

@@ -472,7 +472,7 @@ def _link(
     else:
         queue, limit = experiment.torques_in_flight(delay), experiment.torque_limit
     if sc.link.kind == "network":
-        history = reported(law.kept) if isinstance(law, PredictiveLqi) else 1
+        history = reported(law.extra_torques) if isinstance(law, PredictiveLqi) else 1
         transit = _padded(forward_times(sc, number), number)
         link = buffer_of(period, delay, rows, sc.link.dry, history, limit)
     else:

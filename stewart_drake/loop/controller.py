@@ -110,9 +110,9 @@ def held_by(dynamics: StewartDynamics) -> dict[str, Callable[[Memory], Array]]:
     return HELD | own
 
 
-def reported(kept: int) -> int:
-    """Return the periods of a report for a law that keeps `kept` torques beyond its delay."""
-    return kept + 1
+def reported(extra_torques: int) -> int:
+    """Return the periods of a report for a law with extra torques in memory."""
+    return extra_torques + 1
 
 
 class _RecordedLaw(SteppedLaw):
@@ -197,7 +197,7 @@ class DelayLqiController(_RecordedLaw):
         self._weights = self.DeclareVectorInputPort("weights", len(WEIGHTS))
         self._age = self.DeclareVectorInputPort("age", 1) if law.longest_wait else None
         sends = isinstance(law.channel, Packets)
-        size = reported(law.kept) * (1 + NUM_TORQUES)
+        size = reported(law.extra_torques) * (1 + NUM_TORQUES)
         self._report = self.DeclareVectorInputPort("report", size) if sends else None
         self._record(law, first)
         self._put_out("torque", NUM_TORQUES, lambda m: m.torque, now=True)

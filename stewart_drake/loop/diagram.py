@@ -215,7 +215,7 @@ def _add_torques(builder: DiagramBuilder, experiment: Experiment) -> float:
         _add_own_controller(builder, experiment)
     else:
         law, catch_up = _add_law(builder, experiment)
-        channel, reports = law.channel, reported(law.kept)
+        channel, reports = law.channel, reported(law.extra_torques)
     link, config = experiment.own.systems.get("link"), experiment.scenario.link
     if link is None:
         link = LINKS[type(config)].system(config, experiment, channel, reports)

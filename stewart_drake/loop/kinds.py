@@ -74,7 +74,7 @@ def _encoder_sensing(config: EncoderSensorConfig, experiment: Experiment) -> Sen
         mechanism=experiment.mechanism,
         samples=config.samples,
         quantum=0.0 if config.bits is None else 2 * np.pi / 2**config.bits,
-        declared=experiment.start,
+        initial_state=experiment.start,
         rates_std=motion if rates is None else np.array(rates),
         motion=motion,
         offset=np.array([(known and known.value(name)) or 0.0 for name in OFFSETS]),

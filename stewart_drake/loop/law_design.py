@@ -243,7 +243,7 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     gaps = sc.sensor.kind == "state" and sc.sensor.loss > 0
     timing = white and not any(noise or ()) and math.isfinite(tolerated)
     observer = CoreObserver(settings if c.estimate else None, gaps=gaps, timing=timing)
-    quiet = c.open_loop_start and sc.start == "rest"
+    open_loop = c.open_loop_start and sc.start == "rest"
     before = int(bool(c.estimate) and c.delay_estimator == "none")  # torques, as the filter asks
     waits = longest_wait(sc)
     channel = link.channel(sc.link, experiment, timeline, waits)
@@ -259,18 +259,18 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
         cost=cost_of(experiment, peak_torque),
         channel=channel,
         longest_wait=waits,
-        kept=waits + (REPORTS if isinstance(channel, Packets) else before),
-        silence=_until_seen(timeline.delay, waits) if quiet else 0,
+        extra_torques=waits + (REPORTS if isinstance(channel, Packets) else before),
+        open_loop_samples=_until_seen(timeline.delay, waits) if open_loop else 0,
         tolerated_timing=tolerated,
     )
     if c.delay_estimator != "none":
         prior = timeline.eta, c.delay_std, c.delay_max
-        delay = DelaySettings.of(c.delay_estimator, *prior, quiet)
+        delay = DelaySettings.of(c.delay_estimator, *prior, open_loop)
         law = replace(
             law,
             observer=CoreObserver(settings, delay),
             predictor=ArrivalPredictor(),
-            silence=0,  # until the delay is found
+            open_loop_samples=0,  # until the delay is found
         )
     if c.limits == "qp":
         law = LimitedLqi(**law.parts, limits=QpLimits(c.horizon, clear_space(experiment)))

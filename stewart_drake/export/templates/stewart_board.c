@@ -52,7 +52,7 @@ static void follow(uint64_t time)
                            c->machine.joints};
     while (plate.free && !plate.fault.fault && plate.time < time) {
         uint64_t h = time - plate.time < FINEST ? time - plate.time : FINEST;
-        stewart_move(&plant, plate.torque, (real)(1e-9 * (double)h), plate.state);
+        stewart_runge_kutta_step(&plant, plate.torque, (real)(1e-9 * (double)h), plate.state);
         plate.time += h;
         plate.fault = left();
     }

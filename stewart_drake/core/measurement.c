@@ -1,6 +1,6 @@
-/* See instant.h. */
+/* See measurement.h. */
 
-#include "instant.h"
+#include "measurement.h"
 #include "short.h"
 
 #define SMALL_CORRECTION ((real)0.1) /* standard deviations; a shorter correction ends the iterations */
@@ -20,7 +20,7 @@ void stewart_measurement_jacobian(const stewart_sensing *sensing, const real *st
 }
 
 void stewart_apply_jacobian(const stewart_sensing *sensing, const real *J, int k, const real *A,
-                          real *JA)
+                            real *JA)
 {
     if (sensing->jacobian) {
         stewart_multiply_by_transpose(sensing->size, X, k, J, A, JA);
@@ -32,7 +32,7 @@ void stewart_apply_jacobian(const stewart_sensing *sensing, const real *J, int k
 }
 
 int stewart_innovation_root(const stewart_sensing *sensing, const real *state, int k, const real *A,
-                      const real *std, real *C, stewart_scratch scratch)
+                            const real *std, real *C, stewart_scratch scratch)
 {
     const int m = sensing->size;
     real *J = stewart_take(&scratch, m * X), *JA = stewart_take(&scratch, m * k);
@@ -64,7 +64,7 @@ void stewart_whiten(int m, int n, const real *C, real *B)
     }
 }
 
-void stewart_instant_derivative(const stewart_instant *a, real *H)
+void stewart_whitened_derivative(const stewart_measurement *a, real *H)
 {
     const int m = a->sensing->size;
     if (a->sensing->jacobian)
@@ -74,15 +74,15 @@ void stewart_instant_derivative(const stewart_instant *a, real *H)
     stewart_whiten(m, a->n, a->C, H);
 }
 
-int stewart_instant_residuals(void *model, const real *xi, real *e, real *H, stewart_scratch scratch)
+int stewart_measurement_residuals(void *context, const real *xi, real *e, real *H, stewart_scratch scratch)
 {
-    const stewart_instant *a = model;
+    const stewart_measurement *a = context;
     const int m = a->sensing->size;
     (void)xi;
     (void)scratch;
     stewart_predict_measurement(a->sensing, a->state, e);
     stewart_measurement_jacobian(a->sensing, a->state, a->J);
-    stewart_instant_derivative(a, H);
+    stewart_whitened_derivative(a, H);
     for (int i = 0; i < m; i++)
         e[i] = a->values[i] - e[i];
     stewart_whiten(m, 1, a->C, e);
@@ -90,7 +90,7 @@ int stewart_instant_residuals(void *model, const real *xi, real *e, real *H, ste
 }
 
 /* Whether a change of the state changes each predicted value by less than SMALL_CORRECTION. */
-static int is_small(const stewart_instant *a, const real *change, stewart_scratch scratch)
+static int is_small(const stewart_measurement *a, const real *change, stewart_scratch scratch)
 {
     const int m = a->sensing->size;
     real *change_of_values = stewart_take(&scratch, m);
@@ -105,26 +105,26 @@ static int is_small(const stewart_instant *a, const real *change, stewart_scratc
     return 1;
 }
 
-int stewart_instant_step(void *model, const real *xi, const real *better, stewart_scratch scratch)
+int stewart_measurement_relinearize(void *context, const real *xi, const real *updated, stewart_scratch scratch)
 {
-    const stewart_instant *a = model;
+    const stewart_measurement *a = context;
     real shift[X], linearised[X];
     for (int i = 0; i < X; i++) {
         shift[i] = 0;
         for (int j = 0; j < a->n; j++)
-            shift[i] += a->H[a->n * i + j] * (better[j] - xi[j]);
+            shift[i] += a->H[a->n * i + j] * (updated[j] - xi[j]);
         linearised[i] = a->state[i] + shift[i];
     }
     if (is_small(a, shift, scratch)) {
         stewart_copy(X, linearised, a->state);
         return 1;
     }
-    if (!a->predict(a->period, better, a->state))
+    if (!a->predict(a->context, updated, a->state))
         return -1;
     for (int i = 0; i < X; i++)
         shift[i] = a->state[i] - linearised[i];
     stewart_measurement_jacobian(a->sensing, a->state, a->J);
     if (is_small(a, shift, scratch))
         return 1;
-    return a->linearize(a->period, better, a->H, scratch) ? 0 : -1;
+    return a->linearize(a->context, updated, a->H, scratch) ? 0 : -1;
 }
