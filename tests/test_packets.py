@@ -378,7 +378,7 @@ def test_the_most_probable_content_is_believed():
 
 def test_packets_that_come_later_than_reports_tell_of_are_borne():
     """The state of a packet that was missing in the last report is unknown."""
-    channel = Packets(1, 0, (0.5,), (0.0, 0.2, 0.4, 1.0, 1.0, 1.0), told=2)
+    channel = Packets(1, 0, (0.5,), (0.0, 0.2, 0.4, 1.0, 1.0, 1.0), report_periods=2)
     sent = Buffer(channel)
     for k in range(6):
         sent.send(np.full((1, 6), 10.0 + k), np.zeros((6, 6)))
@@ -389,11 +389,13 @@ def test_packets_that_come_later_than_reports_tell_of_are_borne():
     believed = sent.of(late).believed(np.zeros((6, 6)), timeline, nothing)
     assert believed[-4, 0] == 12
     # All were told of after four periods, by when every packet is there: this one is lost.
-    longer = dataclasses.replace(late, told=4)
+    longer = dataclasses.replace(late, report_periods=4)
     believed = sent.of(longer).believed(np.zeros((6, 6)), timeline, nothing)
     assert believed[-4, 0] == 0
     law = compose_law(prepare(scenario(*NETWORK)))
-    assert isinstance(law.channel, Packets) and law.channel.told == reported(law.extra_torques)
+    assert isinstance(law.channel, Packets) and law.channel.report_periods == reported(
+        law.extra_torques
+    )
     slow = run(*NETWORK, "link.loss=0", "link.high=2.5", "link.playout=2.3", *LONG)
     assert slow.status == "completed"
 

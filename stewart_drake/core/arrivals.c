@@ -38,7 +38,7 @@ int stewart_switch_times(const stewart_arrivals *a, real begin, real end, int ne
 }
 
 int stewart_torque_schedule(const stewart_arrivals *a, int num_in_flight, const real *in_flight, real begin,
-                   real end, int newest, real *torques, real *durations)
+                            real end, int newest, real *torques, real *durations)
 {
     const int number = 1 + stewart_switch_times(a, begin, end, newest, durations + 1);
     static const real none[U];

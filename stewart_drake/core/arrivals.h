@@ -38,4 +38,4 @@ int stewart_switch_times(const stewart_arrivals *arrivals, real begin, real end,
    for n = stewart_max_torques(arrivals, end). `in_flight` (num_in_flight, 6) has the oldest torque first;
    only the last `num_own` count. */
 int stewart_torque_schedule(const stewart_arrivals *arrivals, int num_in_flight, const real *in_flight, real begin,
-                   real end, int newest, real *torques, real *durations);
+                            real end, int newest, real *torques, real *durations);

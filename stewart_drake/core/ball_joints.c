@@ -7,7 +7,7 @@
 #define BALL_FRICTION 14
 #define BALL_SPEED 15
 #define ROUNDS 60
-/* Of Newton's last step; the error is of its square. */
+/* Tolerance of Newton's last step; the error is of the order of its square. */
 #ifdef STEWART_FLOAT
 #define SPIN_TOLERANCE ((real)1e-4)
 #define DIFFERENCE ((real)5e-3) /* of the central differences: rad, m over the crank's length, per s */
@@ -16,7 +16,7 @@
 #define DIFFERENCE 1e-5
 #endif
 
-/* c, f and s of a joint. */
+/* Parameters c, f and s of a joint. */
 typedef struct {
     real damping, friction, speed;
 } Joint;
@@ -26,7 +26,7 @@ static Joint joint_of_plant(const real *parameters)
     return (Joint){parameters[BALL_DAMPING], parameters[BALL_FRICTION], parameters[BALL_SPEED]};
 }
 
-/* q(|w|) = |tau| / |w|, and its slope over |w|. */
+/* q = |tau| / |w|, and q' / |w|. */
 typedef struct {
     real value, slope;
 } Resistance;
@@ -39,8 +39,8 @@ static Resistance resistance(const Joint *joint, real square)
     if (slip < (real)1e-4)
         return (Resistance){joint->damping + f * (1 - slip * slip / 3),
                             -2 * f / (3 * joint->speed * joint->speed)};
-    const real t = REAL(tanh)(slip), share = t / slip;
-    return (Resistance){joint->damping + f * share, f * (1 - t * t - share) / square};
+    const real t = REAL(tanh)(slip), ratio = t / slip;
+    return (Resistance){joint->damping + f * ratio, f * (1 - t * t - ratio) / square};
 }
 
 /* Spin z that minimises the potentials of both joints, whose angular velocities have the parts p = a + z
@@ -68,13 +68,14 @@ static real spin_of(const Joint *joint, real a, real m, real b, real n)
     return z;
 }
 
-/* Adds a leg's part of the force. With r the rod's direction, l its length, u the crank's, n the motor
-   axis, t the direction of the crank's tip and d = v_Q - u alpha_dot t,
+/* Add a leg's part of the force. With r the rod's direction, l its length, u the crank's length, n the motor
+   axis, t the direction in which the crank's tip moves and d = v_Q - u alpha_dot t,
 
        omega_rod = r x d / l,  w_1 = omega_rod - alpha_dot n + z r,  w_2 = omega - omega_rod - z r.
 
-   At constant z, which does no work, tau_1 - tau_2 acts on the rod as g = (tau_1 - tau_2) x r / l at d.
-   With delta alpha = r.delta v_Q / (u r.t) the joint Q feels g - (u g.t + tau_1.n) / (u r.t) r. */
+   A virtual change of z does no work: at constant z, tau_1 - tau_2 does work on d as the force
+   g = (tau_1 - tau_2) x r / l. With delta alpha = r.delta v_Q / (u r.t) the force at the joint Q is
+   g - (u g.t + tau_1.n) / (u r.t) r. */
 static void add_leg(const Joint *joint, const Leg *leg, const LegMotion *m, const real *w, int at_crank,
                     int at_plate, real *force)
 {

@@ -1,4 +1,5 @@
-/* Friction of the ball joints between cranks, rods and plate, by virtual work. */
+/* Friction of the ball joints between cranks, rods and plate, by virtual work. Its parameters are the damping
+   c (N m s/rad), the friction torque f (N m) and the speed s (rad/s) at which friction changes sides. */
 
 #pragma once
 
@@ -9,8 +10,8 @@
 
        tau(w) = (c + f tanh(|w| / s) / |w|) w,     the slope of c |w|^2 / 2 + f s log cosh(|w| / s).
 
-   The rod may spin about its own axis. It spins such that the sum of these potentials of its two joints is
-   least. If only one of them has friction, the spin in that joint is 0. Virtual work,
+   The rod spins about its axis so that the sum of these potentials of its two joints is least. If only one of
+   them has friction, the spin in that joint is 0. Virtual work,
 
        F' [delta w; delta v] = sum tau_1' delta w_1 + tau_2' delta w_2,
 

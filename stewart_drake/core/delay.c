@@ -340,7 +340,7 @@ static int choose_delay(Model *a, const stewart_hypothesis *hypothesis, const re
    of K. With T = B' S^-1 B the traces are those of T and of T T. Returns 0 if S is not positive
    definite, 2 if this measurement alone gives more than twice the largest variance, else 1. */
 static int update_timing(Model *a, const real *L, real used, stewart_hypothesis *after,
-                        stewart_scratch scratch)
+                         stewart_scratch scratch)
 {
     const real dt = a->period->delay->period, most = MAX_TIMING_STD * dt * (MAX_TIMING_STD * dt);
     const int m = a->m, n = a->n, k = a->rows - a->others + 1;

@@ -115,7 +115,7 @@ int stewart_delay_scratch(int p, int m, int num_in_flight);
 
 /* Return the hypothesis at a place: 0 is the master (delay_search.c) or the only one, 1 to `cells` are cells. */
 stewart_hypothesis *stewart_delay_hypothesis(int p, int m, int num_in_flight, stewart_delay_memory *memory,
-                                   int place);
+                                             int place);
 
 void stewart_delay_start(const stewart_delay *delay, int num_in_flight, stewart_delay_memory *memory);
 

@@ -65,7 +65,7 @@ int stewart_delay_scratch(int p, int m, int num_in_flight)
 }
 
 stewart_hypothesis *stewart_delay_hypothesis(int p, int m, int num_in_flight, stewart_delay_memory *memory,
-                                   int place)
+                                             int place)
 {
     real *first = memory->numbers + U * periods_before(num_in_flight) + 2 * m;
     return (stewart_hypothesis *)(first + place * stewart_hypothesis_size(p));

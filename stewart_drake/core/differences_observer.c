@@ -1,6 +1,6 @@
 /* The observer of encoders without a filter: q_k by forward kinematics, v_k = (q_k - q_{k-1}) / dt. The
    rates are those of half a period ago, and quantisation is divided by the period. The model predicts
-   if a leg is silent, or if no pose has the angles. */
+   if a leg has no value, or if no pose has the angles. */
 
 #include "encoders.h"
 #include "observers.h"

@@ -41,8 +41,8 @@ static double norm(const dop853 *s, const double *values)
 {
     double sum = 0.;
     for (int i = 0; i < STATES; i++) {
-        double share = values[i] / scale(s, s->x[i], 0.);
-        sum += share * share;
+        double ratio = values[i] / scale(s, s->x[i], 0.);
+        sum += ratio * ratio;
     }
     return sqrt(sum / STATES);
 }

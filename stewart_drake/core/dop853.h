@@ -1,4 +1,4 @@
-/* Runge-Kutta steps of order 8 with error control, and the polynomial of order 7 within each. */
+/* Runge-Kutta steps of order 8 with error control, and a polynomial of order 7 within each step. */
 
 #pragma once
 
@@ -12,21 +12,21 @@ typedef struct {
     slope_function slope;
     void *system;
     double tolerance;  /* of the error of a step: relative and absolute */
-    double longest;    /* step, s */
+    double longest;    /* longest step, s */
     double time, x[STATES];
     double next_step;  /* largest step that the error allows, s; 0 for none known yet */
-    double before, start[STATES]; /* where the last step began */
+    double before, start[STATES]; /* time and state at which the last step began */
     double slopes[STAGES][STATES]; /* of its stages */
     double within[7][STATES];     /* coefficients of its polynomial */
     int has_polynomial;
     long steps, evaluations;
 } dop853;
 
-/* To be called at first, and wherever the slope has jumped. */
+/* Call this before the first step, and wherever the slope has jumped. */
 void dop853_begin(dop853 *s);
 
-/* One step, up to `end` and not beyond; 0 where no step is short enough. */
+/* Take one step, at most up to `end`. Returns 0 if no step is short enough. */
 int dop853_step(dop853 *s, double end);
 
-/* The state at a time within the last step. */
+/* Interpolate the state at a time within the last step. */
 void dop853_at(dop853 *s, double time, double *x);

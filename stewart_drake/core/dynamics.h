@@ -22,14 +22,14 @@ typedef struct {
 struct stewart_joint_friction {
     /* F (6) at a pose and its rates, added to h. Beyond the workspace it stays finite. */
     void (*force)(const stewart_plant *plant, const real *pose, const real *rates, real *force);
-    /* dF/d[pose; rates] (6, 12), added to `by_state`, and dF/d[c, f, s] (6, 3) in `by_parameters`, by
-       columns and by central differences. */
+    /* Add dF/d[pose; rates] (6, 12) to `by_state`, and compute dF/d[c, f, s] (6, 3) of ball_joints.h in
+       `by_parameters`, both by columns and by central differences. */
     void (*derivatives)(const stewart_plant *plant, const real *pose, const real *rates, real *by_state,
                         real *by_parameters);
 };
 
-/* A pose and its rates are 6 numbers each, angles (rad) before positions (m), torques 6 in N m, a
-   state is pose and rates; matrices are stored by columns. */
+/* A pose and its rates are 6 numbers each, angles (rad) before positions (m); a torque is 6 in N m; a state is
+   pose and rates. Matrices of this header are stored by columns. */
 
 /* Second derivative of the pose. */
 void stewart_accelerations(const stewart_plant *plant, const real *pose, const real *rates,
@@ -39,21 +39,21 @@ void stewart_accelerations(const stewart_plant *plant, const real *pose, const r
 void stewart_inverse_dynamics(const stewart_plant *plant, const real *pose, const real *rates,
                               const real *accelerations, real *torque);
 
-/* Slope (12) of a state (12): its rates and accelerations. */
+/* Time derivative (12) of a state (12): its rates and accelerations. */
 void stewart_change(const stewart_plant *plant, const real *state, const real *torque, real *slope);
 
 /* Kinetic and potential energy, J. */
 void stewart_energy(const stewart_plant *plant, const real *pose, const real *rates, real *energy);
 
-/* Of F = M accelerations + h - B torque at constant accelerations: dF/dstate (6, 12),
+/* Derivatives of F = M accelerations + h - B torque at constant accelerations: dF/dstate (6, 12),
    dF/dparameters (6, STEWART_PARAMETERS), then M (6, 6), and B (6, 6) by rows. Without friction of the
    ball joints, derivatives by its parameters are 0. */
 void stewart_residual_derivatives(const stewart_plant *plant, const real *pose, const real *rates,
                                   const real *accelerations, const real *torque, real *dF_dx,
                                   real *dF_dp, real *M, real *B);
 
-/* Sine of each crank's angle off dead centre (6), the signed measure of parallel singularity, minus
-   the pitch's amount; `angles` of the cranks where they are known, else NULL. */
+/* Measures of the workspace (8): sine of each crank's angle off dead centre (6), the signed measure of
+   parallel singularity, and -|pitch|. `angles` are those of the cranks if known, else NULL. */
 void stewart_measures(const real *geometry, const real *pose, const real *angles, real *measures);
 
 /* Advance a state (12) by one step of h seconds of the classical Runge-Kutta method. */

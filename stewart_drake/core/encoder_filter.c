@@ -17,7 +17,7 @@
 /* Cut a schedule (number) at times (n), ascending, in s. There is place for number + n torques and
    durations; `places` (n) are the pieces that end at the times. */
 static stewart_schedule cut(const stewart_schedule *schedule, int n, const real *times,
-                          real *torques, real *durations, real *places)
+                            real *torques, real *durations, real *places)
 {
     stewart_schedule pieces = {0, torques, durations, 0};
     real total = 0, longest = 0, most = 0, passed = 0, end = 0;

@@ -189,7 +189,7 @@ static int changes_of(const stewart_encoders *encoders, const real *values, cons
 }
 
 void stewart_count_unchanged(const stewart_sensing *sensing, const real *values, const real *last,
-                         real *unchanged)
+                             real *unchanged)
 {
     const stewart_encoders *encoders = sensing->kind;
     for (int leg = 0; leg < LEGS; leg++) {
@@ -305,7 +305,7 @@ void stewart_read(const stewart_encoders *encoders, const real *values, const re
 }
 
 void stewart_node_residuals(const stewart_encoders *encoders, const stewart_reading *reading,
-                    const real *predicted, real *e)
+                            const real *predicted, real *e)
 {
     const int N = encoders->samples, M = encoders->nodes;
     for (int leg = 0; leg < LEGS; leg++) {

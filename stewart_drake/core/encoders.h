@@ -27,7 +27,7 @@ stewart_sensing stewart_newest_encoder_sensing(const void *sensor);
 /* Count in `unchanged` (6) the periods for which each leg's code has been constant, by values (6 N) and those
    of the period before, `last`. */
 void stewart_count_unchanged(const stewart_sensing *sensing, const real *values, const real *last,
-                         real *unchanged);
+                             real *unchanged);
 
 /* Values (6 N) of a period, compared with a predicted motion.
 
@@ -59,7 +59,7 @@ void stewart_read(const stewart_encoders *encoders, const real *values, const re
 
 /* Compute e (M, 6) of a reading for predicted angles (N, 6). */
 void stewart_node_residuals(const stewart_encoders *encoders, const stewart_reading *reading,
-                    const real *predicted, real *e);
+                            const real *predicted, real *e);
 
 /* Largest number of scratch numbers of `start` and `stewart_read`. */
 int stewart_encoder_scratch(const stewart_encoders *encoders);

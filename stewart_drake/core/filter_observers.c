@@ -83,7 +83,7 @@ static stewart_filter filter_of(const stewart_law *law, const stewart_sensing *s
 }
 
 static stewart_interval last_interval(const stewart_law *law, int number, const real *torques,
-                                       stewart_scratch *scratch)
+                                      stewart_scratch *scratch)
 {
     stewart_interval period = stewart_last_periods(law, number, torques, 1, scratch);
     period.schedule.substeps =

@@ -3,9 +3,9 @@
 #include "legs.h"
 
 #define NEWTON_STEPS 50
-#define LEAST_STEP ((real)1e-3) /* share of Newton's */
-#define WRONG_BRANCH ((real)1e-5)
-#define MOST_PIECES 16 /* of the way of the cranks from the guess, where one leads across a singularity */
+#define LEAST_STEP ((real)1e-3) /* over Newton's step */
+#define WRONG_BRANCH ((real)1e-5) /* rod.tangent that counts as another branch */
+#define MOST_PIECES 16 /* steps from the angles of the guess, where a single one crosses a singularity */
 #define TURN ((real)6.283185307179586)
 #ifdef STEWART_FLOAT
 #define TOLERANCE ((real)5e-7)   /* of a rod's length, relative */
@@ -71,7 +71,7 @@ static void misfit(const Leg *legs, real (*tips)[3], const real *pose, Misfit *m
     }
 }
 
-/* Newton's method from a guess in the place of the pose. */
+/* Newton's method; `pose` holds a guess before. */
 static int newton(const real *geometry, const real *angles, real *pose, stewart_scratch scratch)
 {
     Leg legs[LEGS];
@@ -125,6 +125,7 @@ static int side_of(const real *geometry, const real *pose)
     return (measures[LEGS] > 0) - (measures[LEGS] < 0);
 }
 
+/* Return an angle, moved by whole turns to within half a turn of another. */
 static real turned(real angle, real near)
 {
     return angle - TURN * REAL(floor)((angle - near) / TURN + (real)0.5);

@@ -103,7 +103,7 @@ void stewart_note_acted(const stewart_law *law, real *memory, int ago, int numbe
 
 /* Fill in the part of an outlook that follows from a known delay. */
 static void fixed_delay_outlook(const stewart_law *law, const real *in_flight, stewart_outlook *outlook,
-                             stewart_scratch *scratch)
+                                stewart_scratch *scratch)
 {
     const int queue = stewart_queue_length(law), pending = law->fraction > 0;
     const int length = in_flight_length(law);

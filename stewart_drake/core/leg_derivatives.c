@@ -1,10 +1,10 @@
-/* See shooting.h. Apart from dynamics.c, which is exported to boards. */
+/* See shooting.h. In a file of its own, since dynamics.c is exported to boards. */
 
 #include <string.h>
 
 #include "shooting.h"
 
-/* It uses two of the functions. */
+/* Only two functions of equations.h are used here. */
 #pragma GCC diagnostic ignored "-Wunused-function"
 #include "equations.h"
 #include "short.h"

@@ -5,7 +5,7 @@
 #include "kinematics.h"
 #include "short.h"
 
-/* The numbers of a leg. */
+/* Lengths, branch and places of a leg; symbols as in kinematics.h. */
 typedef struct {
     real crank, rod, branch, R[3][3] /* R_WS */, joint[3] /* p_PQ */, shaft[3] /* p_WS */;
 } Leg;
@@ -23,7 +23,7 @@ static inline Leg leg_of(const real *geometry, int i)
     return leg;
 }
 
-/* R_WP of roll, pitch and yaw, and E. */
+/* R_WP of roll, pitch and yaw, and E, the map from their rates to the angular velocity. */
 typedef struct {
     real R[3][3], E[3][3];
 } Turn;
@@ -41,7 +41,7 @@ static inline Turn turn_of(const real *angles)
 
 static inline real dot(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
-/* arm (3), from the plate's COM to the joint, and q (3), in the motor's frame. */
+/* Compute arm = p_PQ in W, and q = p_SQ in the motor's frame. */
 static inline void joint_of(const Leg *leg, const Turn *turn, const real *pose, real *arm, real *q)
 {
     real p[3];
@@ -53,7 +53,7 @@ static inline void joint_of(const Leg *leg, const Turn *turn, const real *pose, 
         q[j] = leg->R[0][j] * p[0] + leg->R[1][j] * p[1] + leg->R[2][j] * p[2];
 }
 
-/* Crank angle for a joint at q; NaN out of reach. */
+/* Return the crank angle for a joint at q; NaN out of reach. */
 static inline real angle_of(const Leg *leg, const real *q)
 {
     const real a = 2 * leg->crank * q[0], b = 2 * leg->crank * q[1];
@@ -91,10 +91,10 @@ typedef struct {
     real lever;            /* u rod.tangent */
 } LegMotion;
 
-#define LEAST_TRANSMISSION ((real)0.01) /* of a rod; below it, outside the workspace, it stays there */
+#define LEAST_TRANSMISSION ((real)0.01) /* |rod.tangent| is at least this; it is less outside the workspace */
 
-/* Motion of a leg for the plate's angular velocity w and the velocity v of its COM. Out of reach and at
-   dead centres, which an integrator's stages may pass, it stays finite. */
+/* Return the motion of a leg for the plate's angular velocity w and the velocity v of its COM. It is finite
+   also out of reach and at dead centres, which the stages of an integrator may pass. */
 static inline LegMotion leg_motion_of(const Leg *leg, const Turn *turn, const real *pose, const real *w,
                                       const real *v)
 {

@@ -88,7 +88,7 @@ static int keep(const stewart_link *link, double *memory, double at, double sequ
 }
 
 void stewart_link_preload(const stewart_link *link, double *memory, double first, int number,
-                        const double *commands)
+                          const double *commands)
 {
     for (int i = 0; i < number; i++)
         keep(link, memory, first + i * link->period, i - number + 1 /* <= 0 */, -(double)HUGE_VAL,

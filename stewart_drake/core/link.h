@@ -1,6 +1,7 @@
 /* The link from controller to motors, as an event-driven state machine: call `start` once, `take` for
    each plan, `change` at every time that `next` returns. It is either a wire, on which a command acts
-   when it arrives, or a play-out buffer, in which commands wait for their times.
+   when it arrives, or a play-out buffer, in which commands wait for their times. A buffer is dry in a period
+   for which it has no command.
 
    Events at the same time have this order: the controller samples and sends its command; then the
    newest of the due commands acts; then the plant moves on.
@@ -56,7 +57,7 @@ void stewart_link_assume(const stewart_link *link, double *memory, double time,
 
 /* Queue commands (number, size) for `first`, a period later, and so on, as if under way already. */
 void stewart_link_preload(const stewart_link *link, double *memory, double first, int number,
-                        const double *commands);
+                          const double *commands);
 
 /* Take a plan (number, size): its first command is to act at `first`, each other one a period later. A
    wire takes only the first. `sequence` > 0 orders plans by age. The plan arrives at `arrival`

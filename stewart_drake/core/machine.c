@@ -3,7 +3,7 @@
 #include "machine.h"
 #include "short.h"
 
-#define FINE_SUBSTEP_FACTOR 2 /* times as many substeps above `coarse_torque_limit`, see law/nominal.py */
+#define FINE_SUBSTEP_FACTOR 2 /* on the substeps above `coarse_torque_limit`, see law/nominal.py */
 
 void stewart_set_model(const stewart_machine *machine, const real *theta, stewart_model *model)
 {
@@ -103,8 +103,8 @@ void stewart_predict(const stewart_machine *machine, const real *theta, const st
 /* right (6, 18 + p) <- -M^-1 dF/d[state, torque, theta] of the equations F of dynamics.h; dF/dtorque = -B.
    dF_dx, dF_dp and M are by columns, B and `mass`, which is M, by rows. */
 static int solve_acceleration_derivatives(const stewart_machine *machine, const stewart_model *model,
-                        const real *state, const real *torque, int p, real *right,
-                        stewart_scratch scratch)
+                                          const real *state, const real *torque, int p, real *right,
+                                          stewart_scratch scratch)
 {
     const int columns = X + U + p;
     real *dF_dx = stewart_take(&scratch, 6 * X);
@@ -160,7 +160,7 @@ int stewart_derivatives(const stewart_machine *machine, const stewart_model *mod
     return 1;
 }
 
-/* State after the share s of h seconds, on the cubic through the states at both ends. */
+/* State at s in [0, 1] of h seconds, on the cubic through the states at both ends. */
 static void hermite_state(const real *start, const real *end, real h, real s, real *state)
 {
     real left = 1 - s;

@@ -134,9 +134,9 @@ void stewart_multiply_by_transpose(int n, int k, int m, const real *A, const rea
 void stewart_swap_rows(int n, real *a, real *b)
 {
     for (int j = 0; j < n; j++) {
-        const real kept = a[j];
+        const real a_j = a[j];
         a[j] = b[j];
-        b[j] = kept;
+        b[j] = a_j;
     }
 }
 

@@ -6,8 +6,8 @@
 
 #include "real.h"
 
-/* Passed by value: memory that a function takes is free again when it returns. The caller of the
-   outermost function provides enough, so that nothing is checked here. */
+/* Passed by value: memory that a function takes is free again when it returns. The caller of the outermost
+   function provides enough; nothing is checked. */
 typedef struct {
     real *next;
 } stewart_scratch;
@@ -27,7 +27,7 @@ real stewart_norm(int n, const real *x);
 void stewart_transpose(int n, real *A);
 void stewart_swap_rows(int n, real *a, real *b);
 
-/* C = A B, (n, k) (k, m); C is apart from A and B. */
+/* C = A B, (n, k) (k, m); C does not overlap A or B. */
 void stewart_multiply(int n, int k, int m, const real *A, const real *B, real *C);
 
 /* C = A' B, (k, n)' (k, m), and C = A B', (n, k) (m, k)'. */

@@ -1,4 +1,4 @@
-/* The interface of observers: state, parameters and delay at a sample, as they are estimated. */
+/* Interface of observers, which estimate state, parameters and delay at a sample. */
 
 #pragma once
 
@@ -9,18 +9,19 @@
 enum stewart_status {
     STEWART_RICCATI_FAILURE = 1,      /* no new gain: the last one was used */
     STEWART_UNREACHABLE = 2,          /* the predicted pose is out of the workspace: feedforward alone */
-    STEWART_NONFINITE_TORQUE = 4,     /* not a number: the last torque was used */
-    STEWART_MEASUREMENT_MISSING = 8,  /* replaced, at least in part, by the model's prediction */
-    STEWART_MEASUREMENT_FROZEN = 16,  /* repeated bit for bit; replaced as well */
-    STEWART_MEASUREMENT_REJECTED = 32, /* does not fit the machine or the estimate; replaced as well */
+    STEWART_NONFINITE_TORQUE = 4,     /* NaN or infinity: the last torque was used */
+    /* The model's prediction replaced the measurement, at least in part, which was */
+    STEWART_MEASUREMENT_MISSING = 8,   /* lost, */
+    STEWART_MEASUREMENT_FROZEN = 16,   /* repeated bit for bit, or */
+    STEWART_MEASUREMENT_REJECTED = 32, /* not one of the machine, or an outlier */
     STEWART_SATURATED = 64,           /* a torque is at the limit */
-    STEWART_REFERENCE_MISSING = 128,  /* NaN or infinity in the preview: the reference continued */
-    STEWART_MEASUREMENT_PARTIAL = 256 /* with the three of a measurement: only in part; not counted */
+    STEWART_REFERENCE_MISSING = 128,  /* NaN or infinity in the preview, filled in */
+    STEWART_MEASUREMENT_PARTIAL = 256 /* with a bit of a measurement: a part of it was used; not counted */
 };
-#define STEWART_CAUSES 8 /* number of these bits */
-#define STEWART_CAUSES_AT 3 /* shift of a `fault` of `stewart_sensing` to its bits */
+#define STEWART_CAUSES 8 /* number of bits that are counted */
+#define STEWART_CAUSES_AT 3 /* shift from a `fault` of `stewart_sensing` to these bits */
 
-/* Whether a step used no part of its measurement, by its result. */
+/* Return whether a step with this result used no part of its measurement. */
 static inline int stewart_unmeasured(int status)
 {
     const int causes =
@@ -30,28 +31,31 @@ static inline int stewart_unmeasured(int status)
 
 typedef struct stewart_law stewart_law;
 
-/* Pointers are valid until the step is over. */
+/* Estimate at a sample, and the torques that act until the next one does. Pointers are valid until the step is
+   over. */
 typedef struct {
     int status;         /* problems of the measurement, bits of `stewart_status` */
     int feeds_back;     /* whether the estimate is good enough for feedback */
     int settled, found; /* whether the delay is known; whether it was found at this sample */
     int assumed;        /* whether the delay is the assumed one */
     real caution;       /* factor on the weight of torques */
-    real state[STEWART_STATES]; /* now; NaN before there is any */
-    real theta[STEWART_MAX_ESTIMATED];
+    real state[STEWART_STATES]; /* now; NaN before the first measurement */
+    real theta[STEWART_MAX_ESTIMATED]; /* parameters */
     const real *observed;   /* memory of the observer */
     real eta;               /* s until the torque that is computed now begins to act */
-    real fraction;          /* of a period, of `eta` beyond the last of `times` */
-    stewart_schedule until_next; /* torques until then */
-    stewart_schedule horizon; /* torques until the last of `times`, the same number of pieces each */
-    int samples;            /* instants of the prediction */
+    real fraction;          /* time from the last of `times` to `eta`, periods */
+    stewart_schedule until_next; /* torques until `eta` */
+    stewart_schedule horizon; /* torques until the last of `times`, the same number of pieces for each time */
+    int samples;            /* number of times at which the prediction is compared with the reference */
     const real *times;      /* (samples) s from now */
-    int pending;            /* number of the newest torques that still act then, left to the gain */
+    int pending;            /* number of the newest torques that still act after the last of `times`; the gain
+                               accounts for them */
     int limited;            /* whether a torque since the last sample was at the limit */
-    real *predicted; /* (until_next.number + 1, 12) states that a planner fills in, NULL without; first NaN */
+    real *predicted;        /* (until_next.number + 1, 12) states that a planner writes, before that NaN; NULL
+                               without a planner */
 } stewart_outlook;
 
-/* A kind of observer. Its memory, a part of the law's, begins with the state (12), which may be set. */
+/* A kind of observer. Its memory is a part of the law's and begins with the state (12), which callers may set. */
 typedef struct {
     int (*memory)(const stewart_law *law);  /* numbers of memory */
     int (*scratch)(const stewart_law *law); /* numbers of scratch memory for `observe` */
@@ -64,17 +68,18 @@ typedef struct {
     void (*restart)(const stewart_law *law, real *memory);
     /* Parameters (p) and their standard deviations (p), NaN where nothing is estimated. */
     void (*parameters)(const stewart_law *law, const real *memory, real *theta, real *std);
-    /* NULL if the delay is the assumed one. Fill in all that follows from the estimated delay, with
+    /* NULL if the delay is the assumed one. Fill in the fields that follow from the estimated delay, with
        torques (number, 6) in flight now. */
     void (*outlook)(const stewart_law *law, const real *memory, int number, const real *torques,
                     stewart_outlook *outlook, stewart_scratch *scratch);
-    /* The same: torques since the last sample, and the next torque. */
+    /* NULL likewise. Find the torques since the last sample, and the next torque. */
     void (*last_period)(const stewart_law *law, const real *memory, int number, const real *torques,
                         stewart_schedule *schedule, const real **following, stewart_scratch *scratch);
-    /* NULL without a covariance. Root L (12 + p, 12 + p) of that of state and parameters, NaN before
-       there is any. Returns the standard deviation of the instant of a single torque, s; L may be NULL. */
+    /* NULL without a covariance. Compute the root L (12 + p, 12 + p) of the covariance of state and parameters,
+       NaN before the first estimate; L may be NULL. Returns the standard deviation of the timing of single
+       torques, s. */
     real (*uncertainty)(const stewart_law *law, const real *memory, real *L);
 } stewart_observer;
 
-/* The sensor of the law: `described`, else `read` of `sensing`. */
+/* Return the sensor model of a law. */
 stewart_sensing stewart_sensing_of(const stewart_law *law);

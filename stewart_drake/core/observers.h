@@ -5,19 +5,16 @@
 
 #include "law.h"
 
-/* The state as measured. */
-extern const stewart_observer stewart_state_observer;
-/* The same; it also learns by how much the timing of torques varies. */
-extern const stewart_observer stewart_timing_observer;
-/* The pose from encoders, and rates by differences of poses. */
-extern const stewart_observer stewart_differences_observer;
+extern const stewart_observer stewart_state_observer; /* the state as measured */
+extern const stewart_observer stewart_timing_observer; /* the same, and it learns the timing of torques */
+extern const stewart_observer stewart_differences_observer; /* the pose from encoders, rates by differences */
 
-/* Advance the state (12) by a period with the nominal parameters; and the scratch memory for it. */
+/* Advance the state (12) by a period with the nominal parameters. */
 void stewart_predict_nominal(const stewart_law *law, int number, const real *torques, real *state,
                              stewart_scratch scratch);
 int stewart_nominal_scratch(const stewart_law *law);
 
-/* Copy the finite ones of `values` to `last`. */
+/* Copy those of `values` that are finite to `last`. */
 void stewart_keep_last(int number, const real *values, real *last);
 
 /* Parts of these observers: functions of the same names in `stewart_observer`. */

@@ -1,4 +1,4 @@
-/* Belief about the packets in flight: see packets.h. */
+/* Probable torques in flight over a network: see packets.h. */
 
 #include <string.h>
 
@@ -6,10 +6,10 @@
 #include "packets.h"
 #include "short.h"
 
-/* Ratio of probabilities from which a torque in flight is replaced. Each replacement makes the law
-   correct, and a wrong one makes it correct again. */
+/* Ratio of probabilities above which a torque in flight is replaced. After each replacement the law corrects
+   the motion, and after a wrong one it does so twice. */
 #define SURE 2
-/* Probability of a packet that is later than any, so that no report is impossible. */
+/* Least probability of a late packet, so that no report has the probability 0. */
 #define LEAST ((real)1e-9)
 
 /* ---- losses in bursts ---------------------------------------------------------------------------
@@ -26,26 +26,26 @@ static real begins(const stewart_packets *p)
 }
 
 /* Probability of each state (burst + 1). */
-static void stationary(const stewart_packets *p, real *shares)
+static void stationary(const stewart_packets *p, real *chances)
 {
     const real b = begins(p);
-    real share = b;
-    for (int a = 0; a < p->burst; a++, share *= 1 - b)
-        shares[a] = share;
-    shares[p->burst] = 1 - p->loss;
+    real chance = b;
+    for (int a = 0; a < p->burst; a++, chance *= 1 - b)
+        chances[a] = chance;
+    chances[p->burst] = 1 - p->loss;
 }
 
 /* Weights of the states one packet later. */
-static void after(const stewart_packets *p, real *shares)
+static void after(const stewart_packets *p, real *chances)
 {
-    const real b = begins(p), stays = (1 - b) * shares[p->burst];
-    real sum = shares[0];
+    const real b = begins(p), stays = (1 - b) * chances[p->burst];
+    real sum = chances[0];
     for (int a = 1; a <= p->burst; a++)
-        sum += shares[a];
+        sum += chances[a];
     for (int a = p->burst; a > 0; a--)
-        shares[a] = (1 - b) * shares[a - 1];
-    shares[p->burst] += stays;
-    shares[0] = b * sum;
+        chances[a] = (1 - b) * chances[a - 1];
+    chances[p->burst] += stays;
+    chances[0] = b * sum;
 }
 
 /* Expectation of a function of the next state, by state. */
@@ -67,23 +67,23 @@ static void before(const stewart_packets *p, real *values)
 typedef struct {
     int n;              /* packets that count */
     const real *newest; /* whether the newest has arrived; the older ones lie before it */
-    real *kept;         /* (n) probability that it is not lost, by the evidence on older ones */
+    real *not_lost;     /* (n) probability that it is not lost, given the evidence on older ones */
     real *evidence;     /* (n) c_i */
-    real *absent;       /* (n) probability that it had not arrived by the report if it is not lost */
+    real *absent;       /* (n) probability that it had not arrived by the report, if it is not lost */
     real *states;       /* (burst + 1) */
 } Evidence;
 
-static int there(const Evidence *c, int i) { return c->newest[-i] > 0; }
+static int has_arrived(const Evidence *c, int i) { return c->newest[-i] > 0; }
 
 static Evidence condition(const stewart_packets *p, int known, const real *arrived, int since, int last,
-                    stewart_scratch *scratch)
+                          stewart_scratch *scratch)
 {
     Evidence c = {known, arrived + known - 1, stewart_take(scratch, known), stewart_take(scratch, known),
                 stewart_take(scratch, known), stewart_take(scratch, p->burst + 1)};
     /* An arrived packet ends all bursts: newer packets do not depend on older ones. */
     int relevant = (last + p->torques < known ? last + p->torques : known) - 1;
     for (int i = relevant > 0 ? relevant : 0; i < known; i++)
-        if (there(&c, i)) {
+        if (has_arrived(&c, i)) {
             c.n = i + 1;
             break;
         }
@@ -91,15 +91,15 @@ static Evidence condition(const stewart_packets *p, int known, const real *arriv
     for (int i = c.n - 1; i >= 0; i--) {
         int age = i + 1 - since; /* of the packet at the last report, periods */
         real sum = 0, absent = 1;
-        if (age > 0 && !there(&c, i) && since < p->kept) {
+        if (age > 0 && !has_arrived(&c, i) && since < p->num_packets) {
             age = age < p->report_periods ? age : p->report_periods;
-            absent = 1 - p->arrived_by[age < p->kept ? age : p->kept - 1];
+            absent = 1 - p->arrived_by[age < p->num_packets ? age : p->num_packets - 1];
         }
         c.absent[i] = absent > LEAST ? absent : LEAST;
-        c.kept[i] = c.states[p->burst];
-        if (there(&c, i))
+        c.not_lost[i] = c.states[p->burst];
+        if (has_arrived(&c, i))
             stewart_fill(p->burst, 0, c.states);
-        c.states[p->burst] = c.absent[i] * c.kept[i];
+        c.states[p->burst] = c.absent[i] * c.not_lost[i];
         for (int a = 0; a <= p->burst; a++)
             sum += c.states[a];
         c.evidence[i] = sum;
@@ -115,30 +115,30 @@ static Evidence condition(const stewart_packets *p, int known, const real *arriv
 static real lateness(const stewart_packets *p, const Evidence *c, int i, int d)
 {
     const int row = i - d + p->repeats, has_row = row >= 0 && row < p->repeats + p->torques;
-    const real least = there(c, i) ? 0 : LEAST;
+    const real least = has_arrived(c, i) ? 0 : LEAST;
     real late = c->absent[i];
     if (has_row)
-        late = there(c, i) ? 0 : 1 - p->in_time[row];
+        late = has_arrived(c, i) ? 0 : 1 - p->in_time[row];
     late = late > least ? late : least;
     return late < c->absent[i] ? late : c->absent[i];
 }
 
 static void sources(const stewart_packets *p, const Evidence *c, int d, real *chances)
 {
-    real *newer = c->states, share = begins(p), none = 0;
+    real *newer = c->states, chance = begins(p), none = 0;
     for (int a = 0; a <= p->burst; a++)
         newer[a] = 1;
     for (int i = 0; i < c->n; i++) {
         const real late = lateness(p, c, i, d), unlost = newer[p->burst];
-        chances[i] = unlost * c->kept[i] * (c->absent[i] - late) / c->evidence[i];
+        chances[i] = unlost * c->not_lost[i] * (c->absent[i] - late) / c->evidence[i];
         for (int a = 0; a < p->burst; a++)
-            newer[a] = there(c, i) ? 0 : newer[a] / c->evidence[i];
+            newer[a] = has_arrived(c, i) ? 0 : newer[a] / c->evidence[i];
         newer[p->burst] = late / c->evidence[i] * unlost;
         if (i < c->n - 1)
             before(p, newer);
     }
-    for (int a = 0; a < p->burst; a++, share *= 1 - begins(p))
-        none += newer[a] * share;
+    for (int a = 0; a < p->burst; a++, chance *= 1 - begins(p))
+        none += newer[a] * chance;
     chances[c->n] = none + newer[p->burst] * (1 - p->loss);
 }
 
@@ -156,21 +156,21 @@ static int packet_size(const stewart_packets *p) { return U * (p->repeats + p->t
 
 int stewart_packets_memory(const stewart_packets *p)
 {
-    return 1 + p->kept + p->kept * packet_size(p);
+    return 1 + p->num_packets + p->num_packets * packet_size(p);
 }
 
-int stewart_packets_scratch(const stewart_packets *p) { return 4 * p->kept + p->burst + 2; }
+int stewart_packets_scratch(const stewart_packets *p) { return 4 * p->num_packets + p->burst + 2; }
 
 void stewart_packets_start(const stewart_packets *p, real *memory)
 {
-    memory[0] = (real)p->kept;
-    stewart_fill(p->kept, 0, memory + 1);
-    stewart_fill(p->kept * packet_size(p), (real)NAN, memory + 1 + p->kept);
+    memory[0] = (real)p->num_packets;
+    stewart_fill(p->num_packets, 0, memory + 1);
+    stewart_fill(p->num_packets * packet_size(p), (real)NAN, memory + 1 + p->num_packets);
 }
 
-/* What most probably acts as T_{k-1-d}, or NULL for a dry buffer. Repetitions say the same, so that
-   their probabilities add up. Averaging over what the buffer might play is worse: it will never play
-   the average. */
+/* Return the torque that most probably acts as T_{k-1-d}, or NULL for a dry buffer (one without a torque for
+   its period). Repeated torques are equal, so that their probabilities add up. The mean over the candidates
+   would be worse: the buffer never plays it. */
 static const real *expected(const stewart_packets *p, const real *newest, const real *chances, int n,
                             int d)
 {
@@ -189,36 +189,35 @@ static const real *expected(const stewart_packets *p, const real *newest, const 
 }
 
 /* T_{k-1-d} begins to act mu - 1 - d periods and eta0 from now. With a report that is m periods old,
-   all that began before it is known, d >= m + mu. Of the others the law goes on what the buffer will
-   most probably play. */
+   all that began before it is known, d >= m + mu. For the others the law assumes the most probable one. */
 void stewart_packets_update(const stewart_packets *p, real *memory, const stewart_report *report,
                             int steps, int number, real *in_flight, stewart_scratch scratch)
 {
-    const int kept = p->kept, size = packet_size(p);
-    real *arrived = memory + 1, *packets = arrived + kept, *newest = in_flight + U * (number - 1);
+    const int num_packets = p->num_packets, size = packet_size(p);
+    real *arrived = memory + 1, *packets = arrived + num_packets, *newest = in_flight + U * (number - 1);
     if (report && report->age < 0)
         report = NULL;
     int since = report ? report->age : (int)memory[0] + 1, known = 0;
-    since = since < kept ? since : kept;
+    since = since < num_packets ? since : num_packets;
     memory[0] = (real)since;
-    for (int i = 0; report && i < report->packets && i + since < kept; i++)
+    for (int i = 0; report && i < report->packets && i + since < num_packets; i++)
         if (report->arrived[i] > 0)
-            arrived[kept - 1 - i - since] = 1;
+            arrived[num_packets - 1 - i - since] = 1;
     for (int i = 0; report && i < report->periods && i + since + steps < number; i++)
         if (stewart_all_finite(U, report->acted + U * i))
             stewart_copy(U, report->acted + U * i, newest - U * (i + since + steps));
-    for (int i = 0; i < kept; i++)
+    for (int i = 0; i < num_packets; i++)
         known += !isnan(packets[size * i]);
-    int last = since + steps < kept ? since + steps : kept;
+    int last = since + steps < num_packets ? since + steps : num_packets;
     last = last < number - 1 ? last : number - 1;
-    if (!known)
-        return; /* all torques are from before the first sample */
-    const Evidence c = condition(p, known, arrived + kept - known, since, last, &scratch);
+    if (!known) /* all torques in flight are from before the first sample */
+        return;
+    const Evidence c = condition(p, known, arrived + num_packets - known, since, last, &scratch);
     real *chances = stewart_take(&scratch, c.n + 1);
     for (int d = (last < known ? last : known) - 1; d >= 0; d--) {
         real *flying = newest - U * d;
         sources(p, &c, d, chances);
-        const real *torque = expected(p, packets + size * (kept - 1), chances, c.n, d);
+        const real *torque = expected(p, packets + size * (num_packets - 1), chances, c.n, d);
         if (torque)
             stewart_copy(U, torque, flying);
         else if (p->holds)
@@ -230,21 +229,21 @@ void stewart_packets_update(const stewart_packets *p, real *memory, const stewar
 
 const real *stewart_newest_packet(const stewart_packets *p, const real *memory)
 {
-    return memory + 1 + p->kept + packet_size(p) * (p->kept - 1);
+    return memory + 1 + p->num_packets + packet_size(p) * (p->num_packets - 1);
 }
 
 void stewart_packets_send(const stewart_packets *p, real *memory, const real *plan, int number,
                           const real *in_flight)
 {
-    const int kept = p->kept, size = packet_size(p), repeated = U * p->repeats;
-    real *arrived = memory + 1, *packets = arrived + kept, *newest = packets + size * (kept - 1);
+    const int num_packets = p->num_packets, size = packet_size(p), repeated = U * p->repeats;
+    real *arrived = memory + 1, *packets = arrived + num_packets, *newest = packets + size * (num_packets - 1);
     const int first = !(newest[0] == newest[0]); /* NaN */
-    memmove(arrived, arrived + 1, (size_t)(kept - 1) * sizeof(real));
-    arrived[kept - 1] = 0;
-    memmove(packets, packets + size, (size_t)(size * (kept - 1)) * sizeof(real));
+    memmove(arrived, arrived + 1, (size_t)(num_packets - 1) * sizeof(real));
+    arrived[num_packets - 1] = 0;
+    memmove(packets, packets + size, (size_t)(size * (num_packets - 1)) * sizeof(real));
     if (first)
         stewart_copy(repeated, in_flight + U * (number - p->repeats), newest);
-    else if (kept > 1) /* the last packet's, which lies before the place of the new one */
+    else if (num_packets > 1) /* the last packet's, which lies before the place of the new one */
         stewart_copy(repeated, newest - size + U, newest);
     else
         memmove(newest, newest + U, (size_t)repeated * sizeof(real));

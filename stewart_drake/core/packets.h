@@ -1,4 +1,4 @@
-/* The controller's belief about torques in flight over a network. */
+/* Probable torques in flight over a network, from sent packets and the machine's reports. */
 
 #pragma once
 
@@ -9,17 +9,17 @@
 typedef struct {
     int torques; /* N >= 1 */
     int repeats; /* r */
-    int kept;    /* packets that are remembered, >= 1 */
+    int num_packets; /* packets in memory, >= 1 */
     int report_periods; /* periods that a report covers */
     int holds;   /* whether a dry buffer holds the last torque, or puts out zero */
     int burst;   /* packets that are lost together, >= 1 */
-    real loss;   /* share of the packets that are lost */
-    const real *in_time;    /* (rows) probability that a packet which is not lost is there at the
+    real loss;   /* probability that a packet is lost */
+    const real *in_time;    /* (rows) probability that a packet which is not lost has arrived by the
                                time of the row */
-    const real *arrived_by; /* (kept) the same after 0, 1, ... periods */
+    const real *arrived_by; /* (num_packets) the same after 0, 1, ... periods */
 } stewart_packets;
 
-/* Report that came with a measurement. */
+/* The machine's report, which came with a measurement. */
 typedef struct {
     int packets;         /* in the report, the newest first */
     const real *arrived; /* whether the one sent i + 1 samples before has arrived, 1 or 0 */
@@ -29,14 +29,14 @@ typedef struct {
     int age;             /* periods since that sample; negative: no report */
 } stewart_report;
 
-/* Memory: periods since the last report, `kept` where there was none; whether each packet is known to
-   have arrived, 1 or 0 (kept); the packets, the newest last (kept, rows, 6), NaN before there were
-   any. */
+/* Memory: periods since the last report, num_packets where there was none; whether each packet is known to
+   have arrived, 1 or 0 (num_packets); the packets, the newest last (num_packets, rows, 6), NaN before the
+   first ones. */
 int stewart_packets_memory(const stewart_packets *packets);
 
 int stewart_packets_scratch(const stewart_packets *packets);
 
-/* Memory before the first sample. */
+/* Set the memory before the first sample. */
 void stewart_packets_start(const stewart_packets *packets, real *memory);
 
 /* Update the memory and the torques in flight (number, 6), the oldest first, by a report or NULL. T_k
@@ -56,7 +56,7 @@ const real *stewart_newest_packet(const stewart_packets *packets, const real *me
    samples ago is in time and no newer one is; chances[n] that no packet is. Returns n <= known.
    `chances` has room for known + 1 numbers.
 
-   known: packets that were sent so far, of those that are remembered.
+   known: number of packets in memory that have been sent.
    arrived: (known) whether each is known to have arrived, the newest last.
    since: periods since the last report.
    last: number of torques of the query, > d. */

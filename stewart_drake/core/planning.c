@@ -6,16 +6,16 @@
 
 #define ROUNDS 12 /* Newton steps */
 
-/* By which a plan may miss the reference: rad, shares of the reach, and per s. */
+/* Largest error at the end of a plan: rad, m over the reach, and both per s. */
 #ifdef STEWART_FLOAT
 #define TOLERANCE ((real)1e-4)
 #else
 #define TOLERANCE ((real)1e-10)
 #endif
-/* Longest piece between two states that are taken from the dynamics, and shortest one, s. */
+/* Longest and shortest piece between two states of the dynamics, s. */
 #define PIECE ((real)0.025)
 #define SHORTEST ((real)1e-6)
-/* Share of a piece by which rounding may move an instant: one at a joint belongs to the later piece. */
+/* Rounding of a time, over the length of a piece. A time between two pieces belongs to the later one. */
 #define ROUNDING ((real)1e-5)
 
 real stewart_margin(const real *geometry, const real *pose, real sign, const real *least)
@@ -31,7 +31,7 @@ real stewart_margin(const real *geometry, const real *pose, real sign, const rea
     return margin;
 }
 
-/* The longest that a leg reaches, crank and rod in line, m. */
+/* Return the longest reach of a leg, crank and rod in line, m. */
 static real reach(const real *geometry)
 {
     real longest = 0;
@@ -96,16 +96,15 @@ int stewart_predicted_pieces(const stewart_model *model, const stewart_schedule 
 
 /* ---- plans --------------------------------------------------------------------------------------
 
-   A plan is a sequence of n held torques that takes the plant from its state at the first instant a
+   A plan is a sequence of n held torques that takes the plant from its state at the first time at which a
    torque can act exactly onto the reference: 12 equations in 6 n unknowns, n >= 2. Starting from the
    mean torques along a quintic, Newton steps of least norm (a Gauss-Newton shooting method)
 
        dT = J^+ (x_reference - x_n(T)),     J = [Phi_n ... Phi_2 Gamma_1, ..., Gamma_n],
 
-   change it as little as possible, so that it stays smooth. What is followed then is the response to
-   the plan. Each torque is held for one period, and in a plan of more than STEWART_MOST_HOLDS periods
-   for several: that can be followed just as well, and the time it takes to plan no longer grows with
-   the number of periods. */
+   change it as little as possible, so that it stays smooth. The law follows the response to the plan. Each
+   torque is held for one period, and in a plan of more than STEWART_MOST_HOLDS periods for several: it is
+   followed just as well, and the time for planning does not grow further. */
 
 typedef struct {
     const stewart_model *model;
@@ -115,14 +114,14 @@ typedef struct {
     real *torques;      /* (number, 6) */
     real *states;       /* (number pieces + 1, 12) */
     real *J;            /* (6 number, 12), transposed */
-} plan;
+} Plan;
 
 static int holds_of(int periods)
 {
     return periods < STEWART_MOST_HOLDS ? periods : STEWART_MOST_HOLDS;
 }
 
-/* Periods until the hold k begins. */
+/* Return the number of periods until hold k begins. */
 static real sample_of(int periods, int k)
 {
     const int holds = holds_of(periods);
@@ -158,8 +157,8 @@ void stewart_plan_times(real begin, real period, int periods, real times[3])
         times[1 + node] = end + period * GAUSS_NODES[node];
 }
 
-/* State (12) at which held torques take the reference over: with a change s of the torque over the
-   hold, rates are off by -dt/24 B s at its beginning (law/feedforward.py). */
+/* State (12) from which held torques follow the reference: with a change s of the torque over the hold, the
+   rates are off by -dt/24 B s at its beginning (law/feedforward.py). */
 static int target(const stewart_model *model, real period, const real *rows, real *state,
                   stewart_scratch scratch)
 {
@@ -179,7 +178,7 @@ static int target(const stewart_model *model, real period, const real *rows, rea
 }
 
 /* Mean torques along the quintic from the start, without acceleration, to a row. */
-static void guess(const real *start, const real *end, plan *p)
+static void guess(const real *start, const real *end, Plan *p)
 {
     const real duration = p->edges[p->number];
     real from[ROW], row[ROW], torques[2][U];
@@ -196,7 +195,7 @@ static void guess(const real *start, const real *end, plan *p)
     }
 }
 
-static int is_inside(const plan *p, const real *pose)
+static int is_inside(const Plan *p, const real *pose)
 {
     static const real least[STEWART_MEASURES] = { /* dynamics/workspace.py */
         (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)1e-3,
@@ -205,7 +204,7 @@ static int is_inside(const plan *p, const real *pose)
 }
 
 /* States under the torques. Returns 0 where one of them is out of the workspace. */
-static int respond(plan *p)
+static int respond(Plan *p)
 {
     for (int i = 0; i < p->number * p->pieces; i++) {
         const int k = i / p->pieces;
@@ -221,7 +220,7 @@ static int respond(plan *p)
 }
 
 /* J, its rows divided by `size`, linearised half-way through each hold. */
-static int differentiate(const real *size, plan *p, stewart_scratch scratch)
+static int differentiate(const real *size, Plan *p, stewart_scratch scratch)
 {
     real *A = stewart_take(&scratch, X * X), *B = stewart_take(&scratch, X * U);
     real *Phi = stewart_take(&scratch, X * X), *Gamma = stewart_take(&scratch, X * U);
@@ -292,7 +291,7 @@ static int add_least_norm(int m, int n, real *A, real *b, real *x, stewart_scrat
     return stewart_all_finite(m, d);
 }
 
-static int solve(const real *goal, plan *p, stewart_scratch scratch)
+static int solve(const real *goal, Plan *p, stewart_scratch scratch)
 {
     const real longest = reach(p->model->plant.geometry), size[6] = {1, 1, 1, longest, longest, longest};
     const real *last = p->states + X * p->number * p->pieces;
@@ -314,7 +313,7 @@ static int solve(const real *goal, plan *p, stewart_scratch scratch)
 }
 
 /* s from the beginning to a state. */
-static real time_of(const plan *p, int state)
+static real time_of(const Plan *p, int state)
 {
     const int k = state / p->pieces, part = state % p->pieces;
     if (part == 0)
@@ -323,10 +322,10 @@ static real time_of(const plan *p, int state)
 }
 
 int stewart_plan_path(const stewart_model *model, real sign, const real *start, real begin,
-                     real period, int periods, const real *rows, real *pieces, real *peak,
-                     stewart_scratch scratch)
+                      real period, int periods, const real *rows, real *pieces, real *peak,
+                      stewart_scratch scratch)
 {
-    plan p = {model, sign, holds_of(periods), pieces_per_hold(period, periods), NULL, NULL, NULL, NULL};
+    Plan p = {model, sign, holds_of(periods), pieces_per_hold(period, periods), NULL, NULL, NULL, NULL};
     real goal[X];
     p.edges = stewart_take(&scratch, p.number + 1);
     p.torques = stewart_take(&scratch, U * p.number);

@@ -21,10 +21,10 @@ typedef struct {
     const stewart_position_servo *servo; /* turns setpoints into torques, NULL for none */
     double torque[U], setpoint[U], bias[U];
     int at_limit; /* whether a servo has reached its limit since the last sample */
-} driven;
+} DrivenPlant;
 
 /* Torque at the cranks, from the servos with the state. */
-static void set_by_servo(driven *d, const double *x)
+static void set_by_servo(DrivenPlant *d, const double *x)
 {
     double asked[U];
     stewart_position_torque(d->servo, d->run->plant->geometry, d->setpoint, x, asked, d->torque);
@@ -32,8 +32,8 @@ static void set_by_servo(driven *d, const double *x)
         d->torque[i] += d->bias[i];
 }
 
-/* Notes whether a servo is at its limit. Not at the stages of steps, which may be rejected. */
-static void note_limit(driven *d, const double *x)
+/* Note whether a servo is at its limit. This is not done at the stages of a step, which may be rejected. */
+static void note_limit(DrivenPlant *d, const double *x)
 {
     double asked[U], torque[U];
     if (!d->servo)
@@ -43,7 +43,7 @@ static void note_limit(driven *d, const double *x)
         d->at_limit |= fabs(asked[i]) > d->servo->torque_limit;
 }
 
-static void set_torque(driven *d, const stewart_drive *drive, double time)
+static void set_torque(DrivenPlant *d, const stewart_drive *drive, double time)
 {
     for (int i = 0; i < U; i++)
         d->torque[i] = drive->constant[i] + drive->amplitude[i] * sin(drive->frequency * time + drive->phase[i]);
@@ -51,7 +51,7 @@ static void set_torque(driven *d, const stewart_drive *drive, double time)
 
 static void slope(void *system, double time, const double *x, double *rate)
 {
-    driven *d = system;
+    DrivenPlant *d = system;
     if (d->drive)
         set_torque(d, d->drive, time);
     if (d->servo)
@@ -64,8 +64,8 @@ static int inside(const stewart_run *r, const double *x)
     return stewart_margin(r->plant->geometry, x, r->sign, r->least) > 0.;
 }
 
-/* Bisect for the instant between `from`, inside, and `to`, outside, to 1e-13 s; s->x is the state just
-   outside. The margin is a minimum of several measures and therefore not smooth. */
+/* Bisect for the time between `from`, inside, and `to`, outside, to 1e-13 s; s->x is the state just outside.
+   The margin is a minimum of several measures and therefore not smooth. */
 static int leave(dop853 *s, const stewart_run *r, double from, double to)
 {
     double x[X];
@@ -83,8 +83,8 @@ static int leave(dop853 *s, const stewart_run *r, double from, double to)
 /* Advance to `end`, up to which the torque is smooth. */
 static int advance(dop853 *s, stewart_run *r, double end)
 {
-    for (; r->seen < r->number && r->times[r->seen] <= s->time; r->seen++)
-        stewart_copy(X, s->x, r->states + X * r->seen);
+    for (; r->recorded < r->number && r->times[r->recorded] <= s->time; r->recorded++)
+        stewart_copy(X, s->x, r->states + X * r->recorded);
     if (s->time < end) {
         note_limit(s->system, s->x);
         dop853_begin(s);
@@ -93,8 +93,8 @@ static int advance(dop853 *s, stewart_run *r, double end)
         if (!dop853_step(s, end))
             return STEWART_TOO_SHORT_STEPS;
         double from = s->before;
-        for (; r->seen < r->number && r->times[r->seen] <= s->time; r->seen++) {
-            double *x = r->states + X * r->seen, to = r->times[r->seen];
+        for (; r->recorded < r->number && r->times[r->recorded] <= s->time; r->recorded++) {
+            double *x = r->states + X * r->recorded, to = r->times[r->recorded];
             dop853_at(s, to, x);
             if (!inside(r, x))
                 return leave(s, r, from, to);
@@ -107,10 +107,10 @@ static int advance(dop853 *s, stewart_run *r, double end)
     return STEWART_INSIDE;
 }
 
-static dop853 integrator(driven *d)
+static dop853 integrator(DrivenPlant *d)
 {
     const stewart_run *r = d->run;
-    dop853 s = {.slope = slope, .system = d, .tolerance = r->tolerance, .longest = r->longest};
+    dop853 s = {.slope = slope, .system = d, .tolerance = r->tolerance, .longest = r->longest_step};
     s.time = r->time;
     stewart_copy(X, r->state, s.x);
     return s;
@@ -125,7 +125,7 @@ static int ended(stewart_run *r, const dop853 *s, int how)
 
 int stewart_open_loop(stewart_run *r, const stewart_drive *drives, long number)
 {
-    driven d = {.run = r};
+    DrivenPlant d = {.run = r};
     dop853 s = integrator(&d);
     int how = STEWART_INSIDE;
     for (long i = 0; i < number && how == STEWART_INSIDE; i++) {
@@ -143,7 +143,7 @@ int stewart_open_loop(stewart_run *r, const stewart_drive *drives, long number)
 int stewart_servo_run(stewart_run *r, const stewart_position_servo *servo, long number,
                       const double *from, const double *setpoints)
 {
-    driven d = {.run = r, .servo = servo};
+    DrivenPlant d = {.run = r, .servo = servo};
     dop853 s = integrator(&d);
     int how = STEWART_INSIDE;
     for (long i = 0; i < number && how == STEWART_INSIDE; i++) {
@@ -201,7 +201,7 @@ static int sample(const dop853 *s, stewart_loop *o, long k, stewart_controller l
         return STEWART_CONTROLLER_FAILED;
     if (o->servo && k > 0) { /* before, no setpoint has acted */
         double limited[U];
-        driven *d = s->system;
+        DrivenPlant *d = s->system;
         stewart_position_torque(o->servo, d->run->plant->geometry, d->setpoint, s->x, torque, limited);
         o->saturated += d->at_limit;
         d->at_limit = 0;
@@ -229,11 +229,11 @@ static int advance_pushed(dop853 *s, stewart_run *r, const stewart_loop *o, doub
     }
 }
 
-/* Take samples and release torques until the run's end. A change of the torque that coincides with a
-   sample takes place at the sample's instant. */
+/* Take samples and release torques until the run's end. A change of the torque that coincides with a sample
+   takes place after it, at the time of the sample. */
 int stewart_closed_loop(stewart_run *r, stewart_loop *o, stewart_controller law, void *context)
 {
-    driven d = {.run = r, .servo = o->servo};
+    DrivenPlant d = {.run = r, .servo = o->servo};
     dop853 s = integrator(&d);
     stewart_copy(U, o->bias, d.bias);
     for (long k = 0;;) {
@@ -276,7 +276,7 @@ static int step(void *context, long k, const stewart_sample *measured, double *t
                            in->wanted + X * k, torque);
         stewart_copy(2, sample.weights, in->weights + 2 * k);
         stewart_copy((int)in->columns, in->tuner_memory + 3 + in->columns * (STEWART_WINDOW - 1),
-                     in->kept + in->columns * k);
+                     in->tuner_rows + in->columns * k);
     } else {
         stewart_step(in->law, in->memory, in->scratch, &sample, torque);
     }

@@ -1,4 +1,4 @@
-/* The exact plant in simulation: alone under known torques, or in a loop with a delay.
+/* Simulation of the exact plant: alone under known torques, or in a loop with a delay.
 
    DOP853 integrates from one change of the torque to the next, and the polynomials of its steps give
    the state at any time. A run ends where the plate leaves its workspace. Nothing is allocated: any
@@ -18,15 +18,15 @@ const char *stewart_source(void);
 
 enum { STEWART_INSIDE, STEWART_LEFT, STEWART_TOO_SHORT_STEPS, STEWART_CONTROLLER_FAILED };
 
-/* One run. The state is the start, then the last one. */
+/* A run. `time` and `state` are those of its start, then of its end. */
 typedef struct {
     const stewart_plant *plant;
     double sign, least[STEWART_MEASURES]; /* workspace, see `stewart_margin` */
-    double tolerance, longest, end;       /* error of a step; longest step, s; end of the run, s */
-    long number;                          /* instants at which the state is wanted */
+    double tolerance, longest_step, end;  /* error of a step; longest step, s; end of the run, s */
+    long number;                          /* of times at which the state is recorded */
     const double *times;                  /* (number) ascending, s */
-    double *states;                       /* (number, 12) result; the first `seen` are known */
-    long seen;
+    double *states;                       /* (number, 12) result; the first `recorded` are valid */
+    long recorded;
     double time, state[STEWART_STATES];
     long steps, evaluations;
 } stewart_run;
@@ -40,7 +40,7 @@ typedef struct {
 /* Run under drives (number), the first from the start on. Returns how the run has ended. */
 int stewart_open_loop(stewart_run *run, const stewart_drive *drives, long number);
 
-/* Controller at a sample: writes its torque (6) without limit, and the command (rows, 6) that it sends.
+/* Controller at a sample: write its torque (6) without limit, and the command (rows, 6) that it sends.
    The sample has measurement, age and report only. Returns 0, or 1 to end the run. */
 typedef int (*stewart_controller)(void *context, long number, const stewart_sample *sample,
                                   double *torque, double *command);
@@ -48,13 +48,13 @@ typedef int (*stewart_controller)(void *context, long number, const stewart_samp
 /* Connection of a controller and the plant. */
 typedef struct {
     long samples;             /* in the run */
-    const double *sampled;    /* (samples) instants, s */
-    double period;            /* by the controller's clock, s */
+    const double *sampled;    /* (samples) their times, s */
+    double period;            /* of the controller's clock, s */
     const stewart_link *link; /* to the motors: a wire, or a buffer of packets */
     double *memory;           /* of the link */
-    const double *transit;    /* (samples) of the commands, s; infinite for a lost one */
+    const double *transit;    /* (samples) transit time of each command, s; infinite for a lost one */
     int rows;                 /* torques of a command, 1 on a wire */
-    int repeats;              /* of them before that of the sample */
+    int repeats;              /* number of these that precede the torque of the sample */
     double delay;             /* of a buffer, from a sample to the action of its torque, periods */
     const double *noise;      /* (samples, 12), or NULL */
     const stewart_link *back; /* a wire for measurements and reports, or NULL: without delay */
@@ -63,18 +63,18 @@ typedef struct {
     int reported;               /* periods of a report, 0 for none */
     double bias[STEWART_MOTORS]; /* added to the torque at the plant */
     double push[6], push_from, push_to; /* wrench on the plate between two times, s; infinite: never */
-    double *wrench;              /* (6) its place among the plant's parameters */
+    double *wrench;              /* (6) place of the wrench among the plant's parameters */
     const stewart_position_servo *servo; /* commands begin with its setpoints (6); NULL: with torques */
     double *scratch;          /* 12 + 7 reported + 6 rows numbers */
-    double *measured;         /* (samples, 12) result: as the controller gets them */
+    double *measured;         /* (samples, 12) result: measurements as the controller gets them */
     double *asked;            /* (samples, 6) result: torques without limit, of servos at the samples */
-    long taken;               /* result: samples */
+    long taken;               /* result: number of samples */
     long saturated;           /* result: periods in which a servo reached its limit */
 } stewart_loop;
 
 int stewart_closed_loop(stewart_run *run, stewart_loop *loop, stewart_controller law, void *context);
 
-/* The law of law.h, or of servo.h without reports, as the controller; its memories have been started. */
+/* The law of law.h, or of servo.h without reports, as the controller. The caller has started its memories. */
 typedef struct {
     const stewart_law *law;
     const stewart_servo *servos; /* or NULL */
@@ -84,7 +84,7 @@ typedef struct {
     double period;               /* of the samples, s, see `event_time` of Drake's loop */
     const double *wanted; /* (samples, 12) reference, for a tuner */
     double *weights;      /* (samples, 2) given, or result of the tuner */
-    double *kept;         /* (samples, columns) result: rows of the tuner's window */
+    double *tuner_rows;   /* (samples, columns) result: rows of the tuner's window */
     long columns;
     int rows; /* torques of a command */
     const double *report; /* of servos, of NaN */

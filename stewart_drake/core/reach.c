@@ -1,4 +1,4 @@
-/* Reach of the legs: see kinematics.h. */
+/* Reach of the legs, see kinematics.h. */
 
 #include "legs.h"
 

@@ -4,10 +4,10 @@
 #include "reference.h"
 #include "short.h"
 
-#define FURTHER ((real)1.25) /* times as far as to its rest, a continued motion stays within reach */
+#define FURTHER ((real)1.25) /* factor on the distance to rest at which a continued motion is within reach */
 #define DOUBLINGS 6          /* of the rate of coming to rest, at the most */
-#define CATCH_UP ((real)0.3) /* s, of a way back */
-#define ROUNDING ((real)1e-4) /* periods, between instants that are the same */
+#define CATCH_UP ((real)0.3) /* s, duration of a blend */
+#define ROUNDING ((real)1e-4) /* periods; times nearer than this are the same */
 
 void stewart_between(const real *from, const real *to, real h, real s, real *row)
 {
@@ -22,9 +22,9 @@ void stewart_between(const real *from, const real *to, real h, real s, real *row
     }
 }
 
-/* The reference `later` s after a row of it (negative: before). It decays to rest at the rate w:
-   da/dt = -2 w a - w^2 v, of accelerations a and rates v. That is (2 v + a / w) / w away; w doubles
-   until the plate could go FURTHER. With b = a + w v:  v(t) = (v + b t) exp(-w t). */
+/* Continue a row of the reference to `later` s after it (negative: before). The motion decays to rest at the
+   rate w: da/dt = -2 w a - w^2 v, with accelerations a and rates v. The rest is (2 v + a / w) / w away; w is
+   doubled until FURTHER times that is within reach. With b = a + w v:  v(t) = (v + b t) exp(-w t). */
 static void continued(const real *geometry, const real *from, real later, real w, real *row)
 {
     for (int doubled = 0; doubled < DOUBLINGS; doubled++, w *= 2) {
@@ -43,8 +43,8 @@ static void continued(const real *geometry, const real *from, real later, real w
     }
 }
 
-/* Accelerations from rates v and the rows before and after, `later` s away, unless one is next to it:
-   (v1 - v) / h = (a + a1) / 2. */
+/* Compute accelerations from rates v and the rows before and after, `later` s away, unless one of them is
+   nearer than `closest`:  (v1 - v) / h = (a + a1) / 2. */
 static void slopes(const real *const next[2], const real later[2], const real *v, real closest,
                    real *accelerations)
 {
@@ -60,18 +60,19 @@ static void slopes(const real *const next[2], const real later[2], const real *v
         accelerations[i] = sum[i] / (real)sides;
 }
 
-/* The rows next to an instant among those that are complete, and how much later they are. */
+/* Complete rows next to a time, and by how much they are later. */
 typedef struct {
     const real *next[2]; /* before and after, or NULL */
     real later[2];
-} neighbours;
+} Neighbours;
 
-static void look(neighbours *n, real gap, const real *row)
+/* Replace a neighbour by a complete row that is nearer. */
+static void consider(Neighbours *n, real later, const real *row)
 {
-    const int side = gap > 0;
-    if ((side ? gap < n->later[1] : gap > n->later[0]) && stewart_all_finite(ROW, row)) {
+    const int side = later > 0;
+    if ((side ? later < n->later[1] : later > n->later[0]) && stewart_all_finite(ROW, row)) {
         n->next[side] = row;
-        n->later[side] = gap;
+        n->later[side] = later;
     }
 }
 
@@ -88,15 +89,15 @@ void stewart_complete(const real *geometry, real period, real eta, const stewart
         real *row = rows + ROW * i;
         if (stewart_all_finite(ROW, row))
             continue;
-        neighbours n = {{NULL, NULL}, {-(real)HUGE_VAL, (real)HUGE_VAL}};
+        Neighbours n = {{NULL, NULL}, {-(real)HUGE_VAL, (real)HUGE_VAL}};
         for (int j = 0; j < given->number; j++)
             if (given->times[j] >= since)
-                look(&n, given->times[j] - given->times[i], given->rows + ROW * j);
+                consider(&n, given->times[j] - given->times[i], given->rows + ROW * j);
         for (int j = 1; j < last->number; j++)
-            look(&n, last->times[j] - given->times[i] - period, last->rows + ROW * j);
+            consider(&n, last->times[j] - given->times[i] - period, last->rows + ROW * j);
         const real *const *next = n.next;
         const real *later = n.later;
-        const real near = ROUNDING * period; /* instants of a preview repeat but for rounding */
+        const real near = ROUNDING * period; /* previews repeat times but for rounding */
         const real *same = -later[0] < near ? next[0] : later[1] < near ? next[1] : NULL;
         if (same)
             stewart_copy(ROW, same, found);
@@ -143,8 +144,8 @@ void stewart_interpolate(const stewart_preview *reference, real time, real *row)
 
        a_i = -d_rates / (n h) - 12 (d_pose + n h d_rates / 2) c_i / (h^2 n (n^2 - 1)).
 
-   What is left after the first hold is solved by the rest of these, so that d and n are all there is
-   to remember. */
+   After the first hold the rest of these accelerations solves the remaining problem: d and n suffice as
+   memory. */
 static void move_offset(stewart_blend *blend, real h, real time, real *accelerations)
 {
     const real n = (real)blend->holds;
@@ -191,9 +192,9 @@ void stewart_add_offset(stewart_blend blend, real period, real time, real *row)
         row[X + i] += a[i];
 }
 
-/* Rows of the predicted motion, and the state (12) where the next torque acts. */
-static void predicted_rows(const stewart_course_input *m, const stewart_course *c, real *before, real *state,
-                        stewart_scratch scratch)
+/* Compute the rows of the predicted motion, and the state (12) where the next torque acts. */
+static void predicted_rows(const stewart_course_input *m, const stewart_course *c, real *rows, real *state,
+                           stewart_scratch scratch)
 {
     const stewart_schedule *until = &m->until;
     real *states = stewart_take(&scratch, X * (until->number + 1)), ends[2][ROW], begin = 0;
@@ -203,8 +204,8 @@ static void predicted_rows(const stewart_course_input *m, const stewart_course *
     stewart_predict(m->machine, m->theta, until, states, states + X);
     stewart_copy(X, states + X * until->number, state);
     for (int i = 0; i < c->number; i++) {
-        stewart_copy(X, state, before + ROW * i);
-        stewart_fill(6, 0, before + ROW * i + X);
+        stewart_copy(X, state, rows + ROW * i);
+        stewart_fill(6, 0, rows + ROW * i + X);
     }
     for (int k = 0; k < until->number; k++) {
         const real h = until->durations[k], *torque = until->torques + U * k;
@@ -214,12 +215,12 @@ static void predicted_rows(const stewart_course_input *m, const stewart_course *
         }
         for (int i = 0; i < c->number; i++)
             if (c->times[i] >= begin && c->times[i] < begin + h)
-                stewart_between(ends[0], ends[1], h, (c->times[i] - begin) / h, before + ROW * i);
+                stewart_between(ends[0], ends[1], h, (c->times[i] - begin) / h, rows + ROW * i);
         begin += h;
     }
 }
 
-/* Follow a blend, which may begin now. */
+/* Follow a blend, which begins now if a gap has ended. */
 static void return_after_gap(const stewart_course_input *m, const stewart_course *last, int ended,
                              const real *geometry, stewart_course *c, stewart_scratch scratch)
 {

@@ -13,13 +13,13 @@ enum {
     PLANNED,     /* whether a plan was made after the first torque had acted for a period */
     PATH,        /* first number of the pieces; their times are from the sample of the plan */
 };
-#define EARLY ((real)0.5) /* share of the assumed delay before which no torque arrives */
-#define LATE_TORQUES 2 /* factor on the weight of torques (`caution`) above which no plan is made */
+#define EARLY ((real)0.5) /* part of the assumed delay before which no torque arrives */
+#define MOST_CAUTION 2 /* factor on the weight of torques above which no plan is made */
 #define MOST_SAMPLES ((real)1e6) /* largest count of samples since the start */
-/* Share of the motion by which a prediction is off, when the delay was just found and else. */
-#define SURPRISE ((real)0.02)
+/* Error of a prediction, over the motion, above which a plan is made: when the delay was just found, and else. */
+#define OFF_WHEN_FOUND ((real)0.02)
 #define OFF ((real)0.08)
-#define ROUNDING ((real)1e-3) /* samples; an instant nearer to a sample than this is at the sample */
+#define ROUNDING ((real)1e-3) /* samples; a time nearer to a sample than this is at the sample */
 
 static int most_pieces(const stewart_law *law)
 {
@@ -49,9 +49,9 @@ static int has_acted(const stewart_law *law, const stewart_outlook *outlook, con
     return memory[SINCE_START] >= outlook->eta / law->period + 2 - ROUNDING;
 }
 
-/* Fill in rows of the pieces, and of the goal after their end; without pieces, of the caller's reference. */
+/* Compute the rows of the plan, then of the goal; without a plan those of the caller's reference. */
 static void rows_of(const stewart_law *law, const real *memory, const stewart_sample *sample, int number,
-                 const real *times, real *rows)
+                    const real *times, real *rows)
 {
     const int pieces = (int)memory[PIECES];
     const real now = memory[SINCE_PLAN] * law->period;
@@ -64,8 +64,8 @@ static void rows_of(const stewart_law *law, const real *memory, const stewart_sa
     }
 }
 
-/* Plan: pieces of the predicted motion, through `states`, then those back onto the goal. Returns 0
-   without a plan. */
+/* Plan: pieces of the predicted motion through `states`, then of the path onto the goal. Returns 0 without a
+   plan. */
 static int plan(const stewart_law *law, const stewart_outlook *outlook, const stewart_sample *sample,
                 const real *states, real *memory, stewart_scratch scratch)
 {
@@ -122,8 +122,8 @@ static int is_sure(const stewart_machine *machine, const stewart_schedule *sched
     return 1;
 }
 
-/* Whether a predicted state (12) is far enough off the wanted one for a new plan; `found`: whether the delay
-   has just been found. */
+/* Whether a predicted state (12) is so far off the wanted one that a plan is made; `found`: whether the delay
+   was found at this sample. */
 static int is_off(const real *size, const real *state, const real *wanted, int found)
 {
     real most = 0;
@@ -133,7 +133,7 @@ static int is_off(const real *size, const real *state, const real *wanted, int f
             return 0;
         most = away > most ? away : most;
     }
-    return most > (found ? SURPRISE : OFF);
+    return most > (found ? OFF_WHEN_FOUND : OFF);
 }
 
 static int replan_follow(const stewart_law *law, real *memory, const stewart_outlook *outlook,
@@ -149,8 +149,8 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     const int before_first = (memory[SINCE_START] - ROUNDING) * law->period <= EARLY * outlook->eta;
     if (!sample->goal || !(outlook->settled || before_first) || !stewart_all_finite(X, outlook->state))
         return 0;
-    /* Torques at uncertain instants do not follow a plan. */
-    if (outlook->settled && outlook->caution > LATE_TORQUES)
+    /* Torques of uncertain timing do not follow a plan. */
+    if (outlook->settled && outlook->caution > MOST_CAUTION)
         return 0;
     stewart_copy(X, outlook->state, states);
     stewart_predict(&law->machine, outlook->theta, &outlook->until_next, states, states + X);

@@ -23,11 +23,11 @@
 #define LARGEST_RESIDUAL 1e-2f
 #else
 #define VANISHED 1e-9
-#define NOTED_RESIDUAL 1e-13 /* beyond rounding, for want of balance: one in some hundred designs */
-#define LARGEST_RESIDUAL 1e-4 /* as of law/riccati.py: relative to the solution */
+#define NOTED_RESIDUAL 1e-13 /* above rounding; needed in one of some hundred badly scaled designs */
+#define LARGEST_RESIDUAL 1e-4 /* as in law/riccati.py, relative to the solution */
 #endif
 
-/* Columns of rows i and i + 1 that are not above the diagonal, in whole blocks; i is even. */
+/* Number of columns of rows i and i + 1 up to the diagonal, in whole blocks; i is even. */
 static int columns_below(int i) { return (i / BLOCK + 1) * BLOCK; }
 
 static void mirror(int n, real *S)
@@ -93,8 +93,7 @@ static int factor(int n, real *W, int *pivot)
     return 1;
 }
 
-/* X <- W^-1 X (n, n) with the factors of W; of a symmetric solution what is not above the diagonal, and
-   then the rest. */
+/* X <- W^-1 X (n, n) with the factors of W. A symmetric solution is computed up to the diagonal, then mirrored. */
 static void solve(int n, const real *W, const int *pivot, int symmetric, real *X)
 {
     for (int k = 0; k < n; k++)

@@ -38,7 +38,7 @@ int stewart_servo_scratch(const stewart_servo *servo)
     return U * law->parts * servo->periods + U + law->observer->scratch(law);
 }
 
-/* Takes state and parameters from the observer. */
+/* Copy state and parameters from the observer. */
 static void take_estimate(const stewart_servo *servo, real *memory)
 {
     const stewart_law *law = &servo->law;
@@ -58,7 +58,7 @@ void stewart_servo_start(const stewart_servo *servo, real *memory, const real *c
     take_estimate(servo, memory);
 }
 
-/* Read the torques of a number of periods from a report. Returns their number, 0 if it lacks them. */
+/* Read the torques of the last `periods` periods from a report. Returns their number, 0 if it lacks some. */
 static int read_report(const stewart_servo *servo, const real *report, int periods, real *torques,
                        int *saturated)
 {
@@ -87,7 +87,7 @@ static int observe(const stewart_servo *servo, real *memory, const stewart_sampl
     if (number > 0) {
         const real *asked = report + stewart_servo_report(servo) - U;
         stewart_copy(U, asked, memory + l->torque.at);
-        if (saturated > 0) /* the step counts one of them, by the status */
+        if (saturated > 0) /* one of them is counted by the status */
             memory[l->counts.at + SATURATED] += (real)(saturated - 1);
     } else {
         if (stewart_all_finite(X, memory + l->state.at))
@@ -100,7 +100,7 @@ static int observe(const stewart_servo *servo, real *memory, const stewart_sampl
     return saturated > 0 ? status | STEWART_SATURATED : status;
 }
 
-/* The setpoint within range and speed, a period after `last`. */
+/* Return a setpoint within range and speed, a period after `last`. */
 static real limited(const stewart_stiffness *stiff, int i, real setpoint, real last)
 {
     const real near = last + REAL(remainder)(setpoint - last, (real)6.283185307179586);
@@ -108,11 +108,12 @@ static real limited(const stewart_stiffness *stiff, int i, real setpoint, real l
     return last + REAL(fmax)(-stiff->most, REAL(fmin)(stiff->most, within - last));
 }
 
-/* [crank angles; their rates; torque] for a row of the reference, without limits; what went wrong. */
+/* Compute [crank angles; their rates; torque] for a row of the reference, without limits. Returns 0 or the cause
+   of failure. */
 static int unlimited(const stewart_servo *servo, const real *theta, const real *row, real *found)
 {
     const stewart_law *law = &servo->law;
-    static const real still[12] = {0};
+    static const real zero[12] = {0};
     const int moves = law->cost.feedforward == STEWART_INVERSE_DYNAMICS;
     const real *geometry = law->machine.geometry;
     real J[36];
@@ -124,8 +125,8 @@ static int unlimited(const stewart_servo *servo, const real *theta, const real *
     stewart_multiply(6, 6, 1, J, row + 6, found + 6);
     stewart_set_model(&law->machine, theta, &model);
     if (law->cost.feedforward != STEWART_NO_FEEDFORWARD)
-        stewart_inverse_dynamics(&model.plant, row, moves ? row + 6 : still,
-                                 moves ? row + 12 : still, found + 12);
+        stewart_inverse_dynamics(&model.plant, row, moves ? row + 6 : zero,
+                                 moves ? row + 12 : zero, found + 12);
     const stewart_stiffness *stiff = &servo->stiff;
     if (stiff->stiffness > 0) /* before the check, so that NaN stops here */
         for (int i = 0; i < U; i++)
@@ -133,7 +134,7 @@ static int unlimited(const stewart_servo *servo, const real *theta, const real *
     return 0;
 }
 
-/* The command for a row of the reference, in the place of the last one; what went wrong. */
+/* Replace the last command by that for a row of the reference. Returns 0 or the cause of failure. */
 static int command_for(const stewart_servo *servo, const real *theta, const real *row, real *command)
 {
     const stewart_stiffness *stiff = &servo->stiff;

@@ -6,9 +6,9 @@
 
    over the samples that are known; 1 where nothing but zeros is.
 
-   Features of health relate timing, surprise, error and feedback to their usual size. A torque that
+   Features of health relate timing, innovations, error and feedback to their usual size. A torque that
    arrives tau late leaves the rates off by -tau kappa at the next sample, kappa the change of the
-   accelerations with which it arrives. With the innovation nu of the rates and its floor f,
+   accelerations with which it arrives. With the innovation nu of the rates and its noise floor f,
 
        n = sum nu kappa / f^2,   d = sum kappa^2 / f^2,   E n^2 = tau^2 d^2 + d,
 
@@ -33,9 +33,9 @@
 #define LEAST ((real)-4) /* ratios */
 #define MOST ((real)2)
 
-/* A row of the window: mean squares over what is known, else NaN, n and d of torques that come late or
-   early, log10(w_Q / w_R), variance of the parameters over that of their prior; then the torque (6)
-   that acted last. */
+/* A row of the window: mean squares of the pose error, of feedback, of its change, of the innovation over its
+   floor (SURPRISE) and over the tolerance (MISSED), NaN where unknown; n and d of late and of early torques;
+   log10(w_Q / w_R); variance of the parameters over that of their prior; then the torque (6) that acted last. */
 enum {
     ERROR, FEEDBACK, CHANGE, SURPRISE, MISSED, LATE, LATE_WEIGHT, EARLY, EARLY_WEIGHT, RATIO, DOUBT,
     ACTED, HEALTH_ROW = ACTED + U
@@ -53,11 +53,11 @@ void stewart_tuner_start(const stewart_tuner *t, real *memory)
     memory[2] = 0;
 }
 
-static real between(real low, real x, real high) { return x < low ? low : x > high ? high : x; }
+static real clamped(real low, real x, real high) { return x < low ? low : x > high ? high : x; }
 
 static real decades(real x)
 {
-    return x > 0 ? between(LOWEST, REAL(log10)(x), HIGHEST) : LOWEST; /* NaN too */
+    return x > 0 ? clamped(LOWEST, REAL(log10)(x), HIGHEST) : LOWEST; /* NaN too */
 }
 
 static real mean_square(int n, const real *x)
@@ -74,7 +74,7 @@ static real mean_square(int n, const real *x)
 
 /* ---- densities -------------------------------------------------------------------------------- */
 
-/* In units of the largest of the window, so that no sum overflows. */
+/* Return (45) of a column. Signals are divided by the largest of the window, so that no sum overflows. */
 static real density(const stewart_tuner *t, const real *window, int column)
 {
     const int columns = X + U;
@@ -101,7 +101,7 @@ static real density(const stewart_tuner *t, const real *window, int column)
         return (real)known * (REAL(fabs)(last) / total);
     if (last == 0)
         return 0;
-    return between(-SIGNED_LIMIT, (real)known * (last / total), SIGNED_LIMIT);
+    return clamped(-SIGNED_LIMIT, (real)known * (last / total), SIGNED_LIMIT);
 }
 
 /* ---- health ----------------------------------------------------------------------------------- */
@@ -134,7 +134,7 @@ static real newest(const real *window, int column)
     return isnan(x) ? 0 : x;
 }
 
-/* tau in s over a number of rows, 0 if not significant; the column of d is after that of n. */
+/* Return tau in s over a number of rows, 0 if it is not significant; the column of d is after that of n. */
 static real timing(const real *window, int column, int number)
 {
     real squares = 0, excess = 0;
@@ -230,20 +230,20 @@ int stewart_decide_by(const stewart_tuner *t, const real *values, const real *la
         real above = values[SURPRISE_PEAK] - t->knee;
         ratio = t->ratio - t->slope * (above > 0 ? above : 0);
         usable = isfinite(ratio);
-        ratio = usable ? between(LEAST, ratio, MOST) : t->ratio;
+        ratio = usable ? clamped(LEAST, ratio, MOST) : t->ratio;
     } else {
         network(t, values, goal);
         usable = stewart_all_finite(2, goal);
         for (int k = 0; k < 2; k++)
-            goal[k] = usable ? between(t->bounds[k], goal[k], t->bounds[2 + k]) : t->first[k];
+            goal[k] = usable ? clamped(t->bounds[k], goal[k], t->bounds[2 + k]) : t->first[k];
         if (t->policy == STEWART_PAPER_NETWORK) {
             for (int k = 0; k < 2; k++)
-                weights[k] = between(last[k] / MAX_FACTOR, goal[k], last[k] * MAX_FACTOR);
+                weights[k] = clamped(last[k] / MAX_FACTOR, goal[k], last[k] * MAX_FACTOR);
             return !usable;
         }
         ratio = ratio_of(goal);
     }
-    ratio = between(ratio_of(last) - FALL, ratio, ratio_of(last) + RISE);
+    ratio = clamped(ratio_of(last) - FALL, ratio, ratio_of(last) + RISE);
     weights[0] = REAL(pow)(10, ratio / 2);
     weights[1] = REAL(pow)(10, -ratio / 2);
     return !usable;
@@ -265,9 +265,9 @@ int stewart_decide(const stewart_tuner *t, const real *memory, real *weights)
 
 /* ---- a row of the window ----------------------------------------------------------------------- */
 
-/* Measurement less prediction (12), changes (6) of the accelerations at the beginning and at the end of
-   the last period, and in `acted` the torque (6) that acted last for the one of the period before. NaN
-   and zeros before there is a state. */
+/* Compute the innovation (12), and the changes (6) of the accelerations at the beginning and at the end of the
+   last period. `acted` (6) is the torque that acted last before that period, then in it. Without a state the
+   results are NaN, and zeros. */
 static void innovate(const stewart_tuner_input *in, real *innovation, real *late, real *early,
                      real *acted, stewart_scratch scratch)
 {
@@ -310,7 +310,7 @@ static real known_product(const real *x, const real *y)
     return isfinite(sum) ? sum : 0;
 }
 
-/* A row of health, after the last one in its place. */
+/* Compute a row of health in place of the last one. */
 static void health_row(const stewart_tuner *t, const stewart_tuner_input *in, const real *wanted,
                        const real *weights, real *row, stewart_scratch scratch)
 {
@@ -321,19 +321,19 @@ static void health_row(const stewart_tuner *t, const stewart_tuner_input *in, co
     for (int i = 0; i < X; i++) {
         const real noise = t->noise[i], model = MODEL_ERROR * t->motion[i];
         const real floor = REAL(sqrt)(2 * noise * noise + model * model);
-        innovation[i] = between(-HUGEST * floor, innovation[i], HUGEST * floor);
+        innovation[i] = clamped(-HUGEST * floor, innovation[i], HUGEST * floor);
         over_floor[i] = innovation[i] / floor;
         innovation[i] /= t->tolerance[i];
         if (i >= 6) {
-            late[i - 6] = between(-HUGEST, late[i - 6] / floor, HUGEST);
-            early[i - 6] = between(-HUGEST, early[i - 6] / floor, HUGEST);
+            late[i - 6] = clamped(-HUGEST, late[i - 6] / floor, HUGEST);
+            early[i - 6] = clamped(-HUGEST, early[i - 6] / floor, HUGEST);
         }
     }
     for (int i = 0; i < U; i++) {
         for (int k = 0; k < 2; k++)
-            fed[k][i] = between(-HUGEST, (in->torque[k][i] - in->feedforward[k][i]) / t->torque, HUGEST);
+            fed[k][i] = clamped(-HUGEST, (in->torque[k][i] - in->feedforward[k][i]) / t->torque, HUGEST);
         change[i] = fed[0][i] - fed[1][i];
-        error[i] = between(-HUGEST, (in->measured[i] - wanted[i]) / t->tolerance[i], HUGEST);
+        error[i] = clamped(-HUGEST, (in->measured[i] - wanted[i]) / t->tolerance[i], HUGEST);
     }
     for (int i = 0; t->doubts && i < p; i++)
         doubt[i] = in->std[i] / t->prior[i];

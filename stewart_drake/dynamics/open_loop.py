@@ -45,7 +45,7 @@ class NativePlant:
         longest_step: s.
 
     Attributes:
-        states: (n, 12) result; the first `run.seen` are valid.
+        states: (n, 12) result; the first `run.recorded` are valid.
         wrench: (6,) on the plate, a view of the parameters that the run reads.
     """
 
@@ -66,7 +66,7 @@ class NativePlant:
         plant = c.plant(*map(c.at, copies))
         self.run: Any = c.ffi.new("stewart_run *")
         self.run.plant, self.run.sign, self.run.least = plant, home_sign(mechanism), list(LEAST)
-        self.run.tolerance, self.run.longest, self.run.end = accuracy, longest_step, times[-1]
+        self.run.tolerance, self.run.longest_step, self.run.end = accuracy, longest_step, times[-1]
         self.run.number, self.run.times = len(times), c.at(times)
         self.run.states, self.run.state = c.at(self.states), list(start)
         self._kept = copies, plant, times
@@ -171,7 +171,7 @@ def follow(
 
 def _course(plant: NativePlant, ended: Ended, looks: Array) -> Course:
     failure, run = plant.failure(ended), plant.run
-    kept = looks[: run.seen], plant.states[: run.seen]
+    kept = looks[: run.recorded], plant.states[: run.recorded]
     return Course(*kept, run.time, plant.final, failure, run.steps)
 
 

@@ -48,8 +48,8 @@ class Sent:
     @property
     def packets(self) -> Array:
         """Last packets (n, rows, 6), the newest last; NaN before the first."""
-        kept = (len(self.memory) - 1) // (1 + NUM_TORQUES * self.rows)
-        return self.memory[1 + kept :].reshape(kept, self.rows, NUM_TORQUES)
+        number = (len(self.memory) - 1) // (1 + NUM_TORQUES * self.rows)
+        return self.memory[1 + number :].reshape(number, self.rows, NUM_TORQUES)
 
 
 class Channel(Protocol):
@@ -101,7 +101,7 @@ class Packets:
         arrived_by: the same after 0, 1, ... periods, for all packets that are remembered.
         losses: Markov chain of the packets that are lost.
         holds: whether an empty buffer holds the last torque, or puts out zero.
-        told: periods that a report covers. The later arrival of older packets is not reported.
+        report_periods: number that a report covers. The later arrival of older packets is not reported.
     """
 
     torques: int
@@ -110,7 +110,7 @@ class Packets:
     arrived_by: tuple[float, ...]
     losses: BurstChain = NO_LOSSES
     holds: bool = True
-    told: int = sys.maxsize
+    report_periods: int = sys.maxsize
 
     def __post_init__(self) -> None:
         if len(self.in_time) != self.repeats + self.torques:
@@ -132,13 +132,13 @@ def report_of(report: Report | None) -> Compiled:
 
 @Once
 def packets_of(channel: Packets) -> Compiled:
-    c, kept = core(), len(channel.arrived_by)
+    c, num_packets = core(), len(channel.arrived_by)
     shares = numbers(channel.in_time), numbers(channel.arrived_by)
     values = {
         "torques": channel.torques,
         "repeats": channel.repeats,
-        "kept": kept,
-        "report_periods": min(channel.told, kept),
+        "num_packets": num_packets,
+        "report_periods": min(channel.report_periods, num_packets),
         "holds": channel.holds,
         "burst": channel.losses.burst,
         "loss": channel.losses.loss,

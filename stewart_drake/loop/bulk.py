@@ -312,7 +312,7 @@ class CompiledController:
                 "period": event_time(law.timeline.period),
                 "wanted": c.at(self._kept[3]),
                 "weights": c.at(self.weights),
-                "kept": c.at(self.rows),
+                "tuner_rows": c.at(self.rows),
                 "columns": self.rows.shape[1],
                 "report": c.at(report),
             },
@@ -453,7 +453,7 @@ def run_loop(
     stopped = plant.failure(ended)
     measured, asked = measured[: loop.taken], asked[: loop.taken]
     sent = np.clip(asked, -experiment.torque_limit, experiment.torque_limit)
-    seen = plant.states[: plant.run.seen]
+    seen = plant.states[: plant.run.recorded]
     return Course(seen, measured, asked, sent, stopped, loop.saturated)
 
 

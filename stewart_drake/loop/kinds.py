@@ -134,7 +134,7 @@ def _packets(_: NetworkConfig, experiment: Experiment, timeline: Timeline, waits
         arrived_by=tuple(in_time(link, c.period * np.arange(kept)).tolist()),
         losses=BurstChain(link.loss, link.burst),
         holds=link.dry == "hold",
-        told=reported(waits + REPORTS),
+        report_periods=reported(waits + REPORTS),
     )
 
 

@@ -195,7 +195,7 @@ static int was_sent(const controller *c, int period, const real *torque)
     const int rows = p->repeats + p->torques;
     const real *packet = stewart_newest_packet(p, c->memory + LAW->layout.channel.at);
     int row = period - LAW->steps - (int)c->samples + 1 + p->repeats; /* of the newest packet */
-    for (int i = 0; i < p->kept; i++, row++, packet -= rows * STEWART_MOTORS)
+    for (int i = 0; i < p->num_packets; i++, row++, packet -= rows * STEWART_MOTORS)
         if (row >= 0 && row < rows &&
             memcmp(packet + row * STEWART_MOTORS, torque, STEWART_MOTORS * sizeof *torque) == 0)
             return 1;
