@@ -71,22 +71,22 @@ class Filter:
         c = core()
         machine = machine_of(NominalPlant(self.dynamics, 1, np.inf, TorqueLimit()))
         settings = filter_settings_of(self.settings, self.sensing.size)
-        it = c.ffi.new("stewart_filter *", settings.it.filter)
+        it = c.ffi.new("stewart_filter *", settings.pointer.filter)
         if isinstance(self.sensing, EncoderSensing):
             encoders = encoders_of(self.sensing)
-            sensing: Any = c.lib.stewart_encoder_sensing(encoders.it)
+            sensing: Any = c.lib.stewart_encoder_sensing(encoders.pointer)
             kept = encoders, c.ffi.new("stewart_sensing *", sensing)
             it.encoder_step = c.ffi.addressof(c.lib, "stewart_encoder_filter_step")
         else:
             kept = self._state_sensing()
-        it.machine, it.sensing = machine.it, kept[1]
+        it.machine, it.sensing = machine.pointer, kept[1]
         return it, (machine, settings, kept)
 
     def _state_sensing(self) -> tuple[Any, Any]:
         if type(self.sensing) is not StateSensing:
-            return None, described(self.sensing, self.dynamics.mechanism).it
+            return None, described(self.sensing, self.dynamics.mechanism).pointer
         c, sensor = core(), state_sensor(self.sensing)
-        return sensor, c.ffi.new("stewart_sensing *", c.lib.stewart_state_sensing(sensor.it))
+        return sensor, c.ffi.new("stewart_sensing *", c.lib.stewart_state_sensing(sensor.pointer))
 
     def start(self, values: Array, parameters: Array) -> FilterEstimate:
         """Return the estimate from values (m,) alone."""

@@ -75,7 +75,7 @@ def test_no_burst_is_under_way_at_the_first_packet():
 
 def chances(channel, arrived, since, last):
     """(last, n + 1) probabilities of the sources of the last torques, see core/packets.h."""
-    c, packets, known = core(), packets_of(channel).it, len(arrived)
+    c, packets, known = core(), packets_of(channel).pointer, len(arrived)
     flags, rows = arrived.astype(np.float64), np.empty((last, known + 1))
     for d in range(last):
         n = c.lib.stewart_packet_chances(

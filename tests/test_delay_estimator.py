@@ -110,15 +110,15 @@ class Period:
         c = core()
         self.torques, self.before, self.n = torques, np.zeros((1, 6)), 22
         self.law = OBSERVER.law(Timeline(DT, Delay(0)), SENSING, plant)
-        settings = c.ffi.cast("stewart_delay_settings *", self.law.it.estimation)
-        sensing = c.lib.stewart_state_sensing(state_sensor(SENSING).it)
+        settings = c.ffi.cast("stewart_delay_settings *", self.law.pointer.estimation)
+        sensing = c.lib.stewart_state_sensing(state_sensor(SENSING).pointer)
         self.delay = c.ffi.new("stewart_delay *", settings.delay)
         self.machine, self.sensing = machine_of(plant), c.ffi.new("stewart_sensing *", sensing)
-        self.delay.filter.machine = self.machine.it
+        self.delay.filter.machine = self.machine.pointer
         self.delay.filter.sensing = self.sensing
         view = (DT, 0.0, 0.0, len(torques) if sent is None else sent, 1, c.at(self.before))
         numbers = (self.delay, view, len(torques), 0, c.at(torques))
-        self.it = c.ffi.new("stewart_period *", numbers)
+        self.pointer = c.ffi.new("stewart_period *", numbers)
 
     def scratch(self):
         lib = core().lib
@@ -126,14 +126,14 @@ class Period:
 
     def end(self, xi):
         state = np.empty(12)
-        given = (self.it, core().at(xi), core().at(state), self.scratch())
+        given = (self.pointer, core().at(xi), core().at(state), self.scratch())
         assert core().lib.stewart_period_end(*given)
         return state
 
     def derivatives(self, xi):
         """(12, 22) of the state at the end."""
         state, H = np.empty(12), np.empty((12, self.n))
-        given = (self.it, core().at(xi), 1, core().at(state), core().at(H), self.scratch())
+        given = (self.pointer, core().at(xi), 1, core().at(state), core().at(H), self.scratch())
         assert core().lib.stewart_period_at(*given)
         assert state == pytest.approx(self.end(xi), abs=1e-14)
         return H
@@ -142,7 +142,7 @@ class Period:
         """Rows (k, 12) of the controller's own torques, which are all here."""
         K, others = np.empty((8, 12)), core().ffi.new("int *")
         given = (core().at(xi), core().at(state), std, core().at(K), others, self.scratch())
-        rows = core().lib.stewart_period_late(self.it, *given)
+        rows = core().lib.stewart_period_late(self.pointer, *given)
         assert rows > 0 and others[0] == 0
         return K[:rows]
 
@@ -355,7 +355,7 @@ def known_delay_likelihood(torques, measured, eta):
     total = 0.0
     for k in range(1, len(measured)):
         period, y = Period(torques[:k].copy()), measured[k].copy()
-        c.lib.stewart_delay_advance(period.it, before, c.at(y), later, period.scratch())
+        c.lib.stewart_delay_advance(period.pointer, before, c.at(y), later, period.scratch())
         guess[:] = after
         total += later.log_likelihood
     return total

@@ -121,8 +121,8 @@ def reading(sensing, said, predicted, last, unchanged):
     variance, residuals = np.empty((nodes, 6)), np.empty((nodes, 6))
     it = c.ffi.new("stewart_reading *", list(map(c.at, (angles, fit, variance))))
     given = map(c.at, (said.known(sensing.size), predicted, last, unchanged))
-    c.lib.stewart_read(encoders.it, *given, it, c.scratch(sensing.samples))
-    c.lib.stewart_node_residuals(encoders.it, it, c.at(predicted), c.at(residuals))
+    c.lib.stewart_read(encoders.pointer, *given, it, c.scratch(sensing.samples))
+    c.lib.stewart_node_residuals(encoders.pointer, it, c.at(predicted), c.at(residuals))
     return Reading(angles, variance, list(it.has_outliers), residuals)
 
 
@@ -191,7 +191,7 @@ def test_a_code_that_stands_still_is_worth_less_and_less():
     codes[7:, 1] += ten.quantum
     said, last = Measurement.of(codes.ravel()), np.tile(codes[0], 10)
     unchanged, c = np.zeros(6), core()
-    sensor = c.ffi.new("stewart_sensing *", c.lib.stewart_encoder_sensing(encoders_of(ten).it))
+    sensor = c.ffi.new("stewart_sensing *", c.lib.stewart_encoder_sensing(encoders_of(ten).pointer))
     for periods in range(1, 4):
         c.lib.stewart_count_unchanged(sensor, *map(c.at, (said.values, last, unchanged)))
         assert np.array_equal(unchanged, [0, 0, *[periods] * 4])

@@ -71,9 +71,9 @@ def transition(dynamics, xi, period):
     schedule = [number, c.at(period.torques), c.at(period.durations), period.substeps]
     until, scratch = c.ffi.new("stewart_schedule *", schedule), c.lib.stewart_transitions_scratch(8)
     machine = machine_of(NominalPlant(dynamics, 1, np.inf, TorqueLimit()))
-    c.lib.stewart_predict(machine.it, c.at(xi[12:]), until, c.at(xi), c.at(states))
+    c.lib.stewart_predict(machine.pointer, c.at(xi[12:]), until, c.at(xi), c.at(states))
     along = c.at(xi), until, 1, c.at(states), H[0].size, c.at(H)
-    assert c.lib.stewart_transitions(machine.it, *along, c.scratch(scratch))
+    assert c.lib.stewart_transitions(machine.pointer, *along, c.scratch(scratch))
     F[:12] = H[-1]
     return states[-1], F
 
@@ -230,7 +230,7 @@ def test_kicks_are_what_early_and_late_torques_do(split, tolerance, late):
     c, effects = core(), np.empty((len(acted) + 1, 12))
     schedule = [len(acted), c.at(acted), c.at(durations), 8]
     period = c.ffi.new("stewart_interval *", [schedule, c.at(old), c.at(new)])
-    machine = machine_of(NominalPlant(PLANT, 1, np.inf, TorqueLimit())).it
+    machine = machine_of(NominalPlant(PLANT, 1, np.inf, TorqueLimit())).pointer
     assert c.lib.stewart_changes(period) == len(effects)
     c.lib.stewart_timing_effects(machine, period, *map(c.at, (after, theta, effects)))
     changed = np.flatnonzero(np.any(effects, axis=1))

@@ -304,7 +304,7 @@ class Buffer:
     """Packets that were sent, as core/packets.h remembers them."""
 
     def __init__(self, channel, memory=None):
-        self._it = packets_of(channel).it
+        self._it = packets_of(channel).pointer
         self._rows, self._memory = len(channel.in_time), memory
         if memory is None:
             self._memory = np.empty(core().lib.stewart_packets_memory(self._it))
@@ -320,7 +320,7 @@ class Buffer:
 
     def believed(self, flying, timeline, report):
         c, memory, flying = core(), self._memory.copy(), flying.copy()
-        given = c.at(memory), report_of(report).it, timeline.steps, len(flying), c.at(flying)
+        given = c.at(memory), report_of(report).pointer, timeline.steps, len(flying), c.at(flying)
         scratch = c.scratch(c.lib.stewart_packets_scratch(self._it))
         c.lib.stewart_packets_update(self._it, *given, scratch)
         return flying

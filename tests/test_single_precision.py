@@ -43,10 +43,10 @@ class Single:
             one.ctypes.data if isinstance(one, np.ndarray) else address_of(one): one
             for one in made.pointed()
         }
-        law = self._copy(made.it, known)
+        law = self._copy(made.pointer, known)
         table, read = (
             library.core().symbols[address_of(one)]
-            for one in (made.it.observer, made.it.make_sensing)
+            for one in (made.pointer.observer, made.pointer.make_sensing)
         )
         law.observer, law.make_sensing = (
             self.ffi.addressof(self.lib, table),

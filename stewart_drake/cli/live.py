@@ -199,8 +199,8 @@ def _delivered(
         "earliest arrival of their measurement"
         if s["samples"]
         else "no sample, nothing was sent",
-        f"the machine had {commands} for {counted(s['periods_played'], 'periods')}, for "
-        f"{s['periods_dry']} it had none (dry), with those of coming to rest",
+        f"the machine had {commands} for {counted(s['periods_played'], 'periods')}, and none (dry) "
+        f"for {s['periods_dry']}, with those of coming to rest",
     )
     if result.stopped is not None and s["periods_dry"] > _MANY_DRY * s["periods_played"]:
         delivery.say_wrapped(
@@ -343,6 +343,6 @@ def machine(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
         f"datagrams: {s['received']} received, {s['sent']} sent, {s['unsent']} not sent, "
         f"{s['lost'] + s['measurements_lost']} lost by the simulated link; refused: "
         f"{refused or 'none'}",
-        f"torques: {s['played']} played, {counted(s['dry'], 'periods dry')}",
+        f"torques: {s['played']} played, {counted(s['dry'], 'periods')} without one (dry)",
     )
     return delivery.end(s, interrupted)

@@ -133,7 +133,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
             name.replace(".c", ".o") for name in (*sources, "stewart_config.c") if ".c" in name
         ],
         "configuration": Constants(
-            compiled.keep, core().symbols, suffix, compiled.data[0], "stewart_law"
+            compiled.keep_alive, core().symbols, suffix, compiled.data[0], "stewart_law"
         ),
         "memory": compiled.data.memory,
         "scratch": compiled.scratch,
@@ -217,11 +217,11 @@ def _tuner(
 ) -> dict[str, Any]:
     """Return the constants of a tuner in C, sizes of memory, and the reference of each sample."""
     c, period = core(), recorded.law.timeline.period
-    kept = [array for array in tuner.keeps if isinstance(array, np.ndarray)]
+    kept = [array for array in tuner.keep_alive if isinstance(array, np.ndarray)]
     times = period * np.arange(len(recorded.steps))
     return {
-        "tuner": Constants(kept, {}, suffix, tuner.it[0], "tuner"),
-        "tuner_memory": c.lib.stewart_tuner_memory(tuner.it),
+        "tuner": Constants(kept, {}, suffix, tuner.pointer[0], "tuner"),
+        "tuner_memory": c.lib.stewart_tuner_memory(tuner.pointer),
         "scratch": c.lib.stewart_tuned_step_scratch(compiled.data),
         "wanted": rows_along(experiment.reference, times)[:, :NUM_STATE],
     }
@@ -232,7 +232,7 @@ def _motion(experiment: Experiment, law: Any) -> "Constants":
     planned = (servo_law if isinstance(law, ServoPreview) else control_law)(experiment)[1]
     motions = planned, experiment.reference
     known = KnownMotion(*motions, 0.0).compiled()
-    keep = [kept for one in motions for kept in one.keep]  # type: ignore[attr-defined]
+    keep = [kept for one in motions for kept in one.keep_alive]  # type: ignore[attr-defined]
     return Constants(keep, {}, "", known[0], "motion", "double")
 
 

@@ -160,7 +160,7 @@ class Model:
         c = core()
         self._machine = machine_of(NominalPlant(dynamics, 1, math.inf, TorqueLimit()))
         self._sign, self.data = home_sign(dynamics.mechanism), c.ffi.new("stewart_model *")
-        c.lib.stewart_set_model(self._machine.it, c.ffi.NULL, self.data)
+        c.lib.stewart_set_model(self._machine.pointer, c.ffi.NULL, self.data)
 
     def plan(
         self, reference: Trajectory, start: Array, begin: float, period: float, periods: int

@@ -101,7 +101,8 @@ class Packets:
         arrived_by: the same after 0, 1, ... periods, for all packets that are remembered.
         losses: Markov chain of the packets that are lost.
         holds: whether an empty buffer holds the last torque, or puts out zero.
-        report_periods: number that a report covers. The later arrival of older packets is not reported.
+        report_periods: number that a report covers. A later arrival of older packets is not
+            reported.
     """
 
     torques: int

@@ -24,13 +24,13 @@ DYNAMICS = StewartDynamics, FrozenDynamics
 class Compiled(NamedTuple):
     """A structure of the core."""
 
-    it: Any  # pointer to it
-    keeps: tuple[Any, ...] = ()  # objects that it points to
+    pointer: Any
+    keep_alive: tuple[Any, ...] = ()  # objects that it points to
     raised: tuple[list[BaseException], ...] = ()  # errors of Python parts that C has called
 
     def pointed(self) -> list[Any]:
         """Return the structure and all arrays and structures that it points to."""
-        return [self.it, *_flat(self.keeps)]
+        return [self.pointer, *_flat(self.keep_alive)]
 
 
 def raise_first(raised: Iterable[list[BaseException]]) -> None:
@@ -42,14 +42,14 @@ def raise_first(raised: Iterable[list[BaseException]]) -> None:
             raise first
 
 
-def _flat(kept: Any) -> list[Any]:
-    if isinstance(kept, Compiled):
-        return kept.pointed()
-    if isinstance(kept, Mapping):
-        kept = tuple(kept.values())
-    if isinstance(kept, tuple):
-        return [one for part in kept for one in _flat(part)]
-    return [kept] if isinstance(kept, np.ndarray | core().ffi.CData) else []
+def _flat(objects: Any) -> list[Any]:
+    if isinstance(objects, Compiled):
+        return objects.pointed()
+    if isinstance(objects, Mapping):
+        objects = tuple(objects.values())
+    if isinstance(objects, tuple):
+        return [one for part in objects for one in _flat(part)]
+    return [objects] if isinstance(objects, np.ndarray | core().ffi.CData) else []
 
 
 class Once(Generic[Made]):
@@ -110,12 +110,12 @@ def call_back(it: Any, raised: list[BaseException], **functions: tuple[Any, ...]
             *(array(*one, given) for one in zip(given, sizes, strict=True))
         )
 
-    kept = []
+    keep_alive = []
     for name, (function, *sizes) in functions.items():
         kind = ffi.typeof(getattr(it, name))
-        kept.append(ffi.callback(kind, called(function, *sizes), onerror=failed))
-        setattr(it, name, kept[-1])
-    return kept
+        keep_alive.append(ffi.callback(kind, called(function, *sizes), onerror=failed))
+        setattr(it, name, keep_alive[-1])
+    return keep_alive
 
 
 def numbers(values: Any, *shape: int) -> Array:
@@ -160,14 +160,14 @@ def machine_of(plant: NominalPlant) -> Compiled:
         machine.joints = core().ffi.addressof(core().lib, "stewart_ball_joints")
     for i, name in enumerate(dynamics.free):
         machine.place[i] = PLANT_PARAMETERS.index(name) if name in PLANT_PARAMETERS else -1
-    keeps, raised = list[Any](), list[BaseException]()
+    keep_alive, raised = list[Any](), list[BaseException]()
     if isinstance(dynamics, FrozenDynamics):
-        keeps = [numbers(dynamics.map)]
-        machine.acceleration_per_torque = core().at(keeps[0])
+        keep_alive = [numbers(dynamics.map)]
+        machine.acceleration_per_torque = core().at(keep_alive[0])
     shipped = NominalPlant, TorqueLimit, *DYNAMICS
     if not all(type(part) in shipped for part in (plant, plant.motors, dynamics)):
-        keeps += _own_machine(plant, machine, raised)
-    return Compiled(machine, tuple(keeps), (raised,))
+        keep_alive += _own_machine(plant, machine, raised)
+    return Compiled(machine, tuple(keep_alive), (raised,))
 
 
 def _own_machine(plant: NominalPlant, machine: Any, raised: list[BaseException]) -> list[Any]:
@@ -191,7 +191,7 @@ def _own_machine(plant: NominalPlant, machine: Any, raised: list[BaseException])
 
     own, p = core().ffi.new("stewart_own_machine *"), len(plant.dynamics.free)
     given = p, None, 12, Out(lambda _, __, it, *___: 12 * it.number)
-    kept = call_back(
+    keep_alive = call_back(
         own,
         raised,
         predict=(predict, None, *given),
@@ -199,4 +199,4 @@ def _own_machine(plant: NominalPlant, machine: Any, raised: list[BaseException])
         at_limit=(at_limit, None, None, lambda _, number, __: 6 * number),
     )
     machine.own = own
-    return [own, *kept]
+    return [own, *keep_alive]

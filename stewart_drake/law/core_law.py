@@ -78,13 +78,13 @@ class CompiledLaw:
         law: the law.
         data: `stewart_law *`, or of servos `stewart_servo *`.
         fields: (place, rows, columns) of each field of the memory.
-        keep: arrays and C structures that it points to.
+        keep_alive: arrays and C structures that it points to.
     """
 
     def __init__(self, law: Any, more: int = 0) -> None:
         c = core()
         self.law, self._servos, self._more = law, not hasattr(law, "cost"), more
-        self.keep: list[Any] = []
+        self.keep_alive: list[Any] = []
         self.data = c.ffi.new("stewart_servo *" if self._servos else "stewart_law *")
         given = c.ffi.addressof(self.data, "law") if self._servos else self.data
         self.torques_law = given
@@ -97,7 +97,7 @@ class CompiledLaw:
         else:
             self._of_torques()
             c.lib.stewart_prepare(self.data)
-        self.keep += self._own.kept
+        self.keep_alive += self._own.keep_alive
         layout = self.data.layout
         self.fields = {
             name: (field.at, field.rows, field.columns)
@@ -107,9 +107,9 @@ class CompiledLaw:
     def _fill(self, data: Any) -> None:
         c, law, timeline = core(), self.law, self.law.timeline
         machine = machine_of(law.plant)
-        data.machine = machine.it[0]
+        data.machine = machine.pointer[0]
         self._raised += machine.raised
-        self.keep += machine.pointed()
+        self.keep_alive += machine.pointed()
         data.period, data.steps, data.fraction = timeline.period, timeline.steps, timeline.fraction
         data.num_values, data.rows = law.sensing.size, len(law.preview_times)
         if "feedforward" not in self._python:
@@ -119,7 +119,7 @@ class CompiledLaw:
             return
         part = set_observer(data, law.observer, law.sensing, law.plant, timeline.period)
         self._raised += part.raised
-        self.keep += part.pointed()
+        self.keep_alive += part.pointed()
 
     def _of_servos(self) -> None:
         law, d = self.law, self.data
@@ -152,8 +152,8 @@ class CompiledLaw:
         elif isinstance(law.channel, Packets):
             d.channel = c.ffi.addressof(c.lib, "stewart_network")
             packets = packets_of(law.channel)
-            d.packets = packets.it
-            self.keep += packets.pointed()
+            d.packets = packets.pointer
+            self.keep_alive += packets.pointed()
         if "planner" in python:
             self._own.planner()
         elif isinstance(law.planner, Replan):
@@ -183,7 +183,7 @@ class CompiledLaw:
         plan.size, plan.sign = planner.size.tolist(), home_sign(law.plant.mechanism)
         plan.sure = planner.sure
         d.planner, d.planning = c.ffi.addressof(c.lib, "stewart_replanner"), plan
-        self.keep.append(plan)
+        self.keep_alive.append(plan)
 
     @property
     def sources(self) -> list[str]:
@@ -243,7 +243,7 @@ class CompiledLaw:
             if np.shape(weights) != (len(WEIGHTS),):
                 raise ValueError(f"weights: got shape {np.shape(weights)}; expected (2,)")
             compiled, torque = report_of(report), np.empty(NUM_TORQUES)
-            sample.report, sample.weights = compiled.it, list(weights)
+            sample.report, sample.weights = compiled.pointer, list(weights)
             c.lib.stewart_step(*given, c.at(torque))
         raise_first(self._raised)
         return after

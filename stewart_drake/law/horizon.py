@@ -77,7 +77,7 @@ class HoldModel:
         c, dynamics = core(), plant.dynamics
         by_bias = _by_bias(plant)
         whole = dynamics.complete(parameters)
-        machine = c.ffi.new("stewart_machine *", machine_of(by_bias).it[0])
+        machine = c.ffi.new("stewart_machine *", machine_of(by_bias).pointer[0])
         for i in range(NUM_PLANT_PARAMETERS):
             machine.parameters[i] = whole[i]
         self._core, self._machine = c, machine
@@ -173,7 +173,7 @@ def pose_root(
         until = c.ffi.new("stewart_schedule *", [number, torques, durations, 0])
         scratch = c.scratch(c.lib.stewart_transitions_scratch(len(belief.parameters)))
         arrays = until, 0, after, 0, c.at(H), scratch
-        if not c.lib.stewart_transitions(machine_of(plant).it, xi, *arrays):
+        if not c.lib.stewart_transitions(machine_of(plant).pointer, xi, *arrays):
             raise ArithmeticError("prediction: no derivatives at a state of it")
     return np.asarray(H[POSE] @ belief.estimate.covariance_root)
 

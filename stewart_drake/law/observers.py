@@ -153,9 +153,9 @@ class CoreObserver:
             other = np.zeros((1, NUM_TORQUES))
             timeline = Arrivals(timeline.period, Delay(0), self.delay.mean, other_torques=other)
         law = self.law(timeline, sensing, plant)
-        memory = np.empty(law.it.observer.memory(law.it))
-        law.it.observer.start(law.it, core().at(memory))
-        return belief_of(self, law.it, memory, timeline)
+        memory = np.empty(law.pointer.observer.memory(law.pointer))
+        law.pointer.observer.start(law.pointer, core().at(memory))
+        return belief_of(self, law.pointer, memory, timeline)
 
     def observe(
         self,
@@ -167,25 +167,25 @@ class CoreObserver:
     ) -> Belief:
         timeline, c = belief.timeline, core()
         law = self.law(timeline, sensing, plant)
-        observer, memory = law.it.observer, belief.memory.copy()
+        observer, memory = law.pointer.observer, belief.memory.copy()
         if self.delay is None:
             if not timeline.parts:
                 timeline.queue(in_flight)  # refuses too few torques
             known = belief.estimate.mean if self.settings else belief.state
             memory[: len(known)] = known  # the caller may have set another state
-            last = _last_values(self, law.it)
+            last = _last_values(self, law.pointer)
             memory[last : last + sensing.size] = belief.measured
         else:
-            if len(in_flight) != 1 + law.it.extra_torques:
+            if len(in_flight) != 1 + law.pointer.extra_torques:
                 raise ValueError(
-                    f"in_flight: got {len(in_flight)}; expected {1 + law.it.extra_torques}"
+                    f"in_flight: got {len(in_flight)}; expected {1 + law.pointer.extra_torques}"
                 )
             memory[:NUM_STATE] = belief.state
         values, torques = measurement.known(sensing.size), numbers(in_flight)
         given = c.at(memory), len(torques), c.at(torques), c.at(values)
-        status = observer.observe(law.it, *given, c.scratch(observer.scratch(law.it)))
+        status = observer.observe(law.pointer, *given, c.scratch(observer.scratch(law.pointer)))
         raise_first(law.raised)
-        return belief_of(self, law.it, memory, timeline, status)
+        return belief_of(self, law.pointer, memory, timeline, status)
 
     def law(self, timeline: Timeline, sensing: Sensing, plant: NominalPlant) -> Compiled:
         """Return a `stewart_law` with all that the observer reads of it."""
@@ -208,10 +208,10 @@ def set_observer(
     c, within, settings = core(), type(sensing) is EncoderSensing, observer.settings
     if not within and type(sensing) is not StateSensing:
         sensor = described(sensing, plant.mechanism)
-        law.own_sensing = sensor.it
+        law.own_sensing = sensor.pointer
     else:
         sensor = encoders_of(sensing) if within else state_sensor(sensing)
-        law.sensing = sensor.it
+        law.sensing = sensor.pointer
     kind, estimation = "differences" if within else "timing" if observer.timing else "state", None
     if settings is not None and settings.parameters.names != tuple(plant.dynamics.free):
         free = ", ".join(plant.dynamics.free)
@@ -223,11 +223,11 @@ def set_observer(
         kind = "gap" if observer.gaps and not within else "filter"
         estimation = filter_settings_of(settings, sensing.size)
     if estimation is not None:
-        law.estimation = estimation.it
+        law.estimation = estimation.pointer
     law.observer = c.ffi.addressof(c.lib, f"stewart_{kind}_observer")
     read = _ENCODERS[kind] if within else "stewart_state_sensing"
     law.make_sensing = c.ffi.addressof(c.lib, read)
-    return Compiled(sensor.it, (sensor.keeps, estimation), sensor.raised)
+    return Compiled(sensor.pointer, (sensor.keep_alive, estimation), sensor.raised)
 
 
 @Once
@@ -242,7 +242,7 @@ def _law_of(
 ) -> Compiled:
     law, machine = core().ffi.new("stewart_law *"), machine_of(plant)
     part = set_observer(law, observer, sensing, plant, period)
-    law.machine, law.period, law.parts = machine.it[0], period, parts
+    law.machine, law.period, law.parts = machine.pointer[0], period, parts
     law.num_values, law.extra_torques = sensing.size, observer.extra_torques(period)
     if observer.delay is None:
         law.steps, law.fraction = steps, fraction
@@ -287,7 +287,7 @@ def _delay_settings_of(
     assert delay is not None
     it, assumed = c.ffi.new("stewart_delay_settings *"), filter_settings_of(settings, size)
     it.values, it.most = size, observer.max_schedule_length(period)
-    it.delay.filter, it.delay.prior = assumed.it.filter, assumed.it.prior
+    it.delay.filter, it.delay.prior = assumed.pointer.filter, assumed.pointer.prior
     it.delay.std, it.delay.period, it.delay.delay_mean = c.at(std), period, delay.mean
     it.delay.delay_std, it.delay.open_loop_start = delay.std, delay.open_loop_start
     for name in ("longest", "timing_std", "walk", "rate_std", "rate_walk"):

@@ -45,14 +45,14 @@ class Step:
         motion: the caller's motion.
         report: the machine's report, or None.
         followed: motion that the planner chose.
-        kept: arrays that C reads until the end of the step.
+        keep_alive: arrays that C reads until the end of the step.
     """
 
     memory: Memory
     motion: Motion | None = None
     report: Any = None
     followed: Motion | None = None
-    kept: list[Any] = field(default_factory=list)
+    keep_alive: list[Any] = field(default_factory=list)
 
 
 class OwnParts:
@@ -64,7 +64,7 @@ class OwnParts:
 
     Attributes:
         raised: errors of the parts, which C does not see.
-        kept: C structures that must outlive `data`.
+        keep_alive: C structures that must outlive `data`.
         now: the present step.
     """
 
@@ -73,7 +73,7 @@ class OwnParts:
     def __init__(self, law: Any, data: Any) -> None:
         self.law, self._data, self._has_observer = law, data, False
         self.raised: list[BaseException] = []
-        self.kept: list[Any] = []
+        self.keep_alive: list[Any] = []
 
     @cached_property
     def motion(self) -> tuple[Any, Any]:
@@ -96,7 +96,7 @@ class OwnParts:
 
     def _table(self, kind: str, **functions: tuple[Any, ...]) -> Any:
         table = core().ffi.new(f"stewart_{kind} *")
-        self.kept += [table, *call_back(table, self.raised, **functions)]
+        self.keep_alive += [table, *call_back(table, self.raised, **functions)]
         return table
 
     def rows_of(self, times: Array, motion: Motion | None) -> Array:
@@ -244,13 +244,13 @@ class OwnParts:
         times, pending = numbers(law.predictor.samples(timeline)), law.predictor.pending(timeline)
         if 1 + len(times) + 2 * (3 + pending) > self._data.rows:
             raise ValueError(f"predictor: got {len(times)} samples and {pending} pending torques")
-        self.now.kept.append(times)
+        self.now.keep_alive.append(times)
         outlook.samples, outlook.times, outlook.pending = len(times), c.at(times), pending
 
     def _schedule(self, schedule: TorqueSchedule) -> list[Any]:
         """Return the fields of a `stewart_schedule`; C chooses the substeps."""
         arrays = [numbers(part) for part in schedule]
-        self.now.kept += arrays
+        self.now.keep_alive += arrays
         substeps = 0
         return [len(arrays[0]), *map(core().at, arrays), substeps]
 
@@ -305,7 +305,9 @@ class OwnParts:
             computes: whether Python computes the command; otherwise it only adds what was learned.
         """
         p, row = len(self.law.plant.dynamics.free), NUM_REFERENCE
-        self.kept += call_back(servo, self.raised, command=(self._command, None, p, row, Out(row)))
+        self.keep_alive += call_back(
+            servo, self.raised, command=(self._command, None, p, row, Out(row))
+        )
         self._computes = computes
 
     def _command(self, _servo: Any, theta: Array, row: Array, command: Array) -> int:

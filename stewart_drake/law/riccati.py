@@ -75,9 +75,9 @@ def lqr_by_doubling(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Arra
     c, n = core(), len(A)
     if n > MAX_ORDER:
         raise ValueError(f"A: got {n} states; expected at most {MAX_ORDER}")
-    kept = [np.ascontiguousarray(matrix, np.float64) for matrix in (A, B, Q, R)]
+    matrices = [np.ascontiguousarray(matrix, np.float64) for matrix in (A, B, Q, R)]
     K, P = np.empty((B.shape[1], n)), np.empty((n, n))
-    given = (*map(c.at, kept), c.at(K), c.at(P), c.scratch(c.lib.stewart_lqr_scratch(n)))
+    given = (*map(c.at, matrices), c.at(K), c.at(P), c.scratch(c.lib.stewart_lqr_scratch(n)))
     if not c.lib.stewart_lqr(n, *given):
         raise RiccatiError("Riccati equation: doubling has found no solution")
     return K, P

@@ -164,7 +164,7 @@ class StateSensing:
         """Return the fault; one missing value makes the whole measurement missing."""
         c, values, before = core(), measurement.known(self.size), numbers(last, self.size)
         arguments = c.at(geometry(mechanism)), period, c.at(values), c.at(before)
-        return _fault(c.lib.stewart_state_sensing(state_sensor(self).it), *arguments)
+        return _fault(c.lib.stewart_state_sensing(state_sensor(self).pointer), *arguments)
 
     def start(self, measurement: Measurement, near: Array | None = None) -> FirstState:
         """Return the measurement, with the variance of its noise."""
@@ -220,7 +220,7 @@ def described(sensing: Sensing, mechanism: Mechanism) -> Compiled:
         return 0 if found is None else 1 << FAULTS.index(found)
 
     table, n = c.ffi.new("stewart_sensing *", [m, c.at(noise)]), NUM_STATE
-    kept = call_back(
+    keep_alive = call_back(
         table,
         raised,
         seen=(seen, None, n, Out(m)),
@@ -228,7 +228,7 @@ def described(sensing: Sensing, mechanism: Mechanism) -> Compiled:
         start=(start, None, m, n, Out(n), Out(n * n), None),
         fault=(fault, None, None, None, m, m),
     )
-    return Compiled(table, (noise, *kept), (raised,))
+    return Compiled(table, (noise, *keep_alive), (raised,))
 
 
 ROUNDING = 1e-13
@@ -320,7 +320,7 @@ class EncoderSensing:
 
     def _filled(self, state: Array, values: Array, function: str) -> Array:
         """Return `values` after a function of `stewart_sensing` has written them for a state."""
-        copy, sensing = numbers(state), _sensing_of(self).it
+        copy, sensing = numbers(state), _sensing_of(self).pointer
         getattr(sensing, function)(sensing, core().at(copy), core().at(values))
         return values
 
@@ -330,14 +330,14 @@ class EncoderSensing:
         """Return the fault: a measurement is of use as long as one leg is."""
         values, c = measurement.known(self.size), core()
         arguments = c.ffi.NULL, 0.0, c.at(values), c.ffi.NULL
-        return _fault(c.lib.stewart_encoder_sensing(encoders_of(self).it), *arguments)
+        return _fault(c.lib.stewart_encoder_sensing(encoders_of(self).pointer), *arguments)
 
     def start(self, measurement: Measurement, near: Array | None = None) -> FirstState | None:
         """Return the pose by forward kinematics, with the expected rates."""
-        c, values, sensing = core(), measurement.known(self.size), _sensing_of(self).it
+        c, values, sensing = core(), measurement.known(self.size), _sensing_of(self).pointer
         state, root = np.empty(NUM_STATE), np.empty((NUM_STATE, NUM_STATE))
         expected = None if near is None else numbers(near)
-        scratch = c.scratch(c.lib.stewart_encoder_scratch(encoders_of(self).it))
+        scratch = c.scratch(c.lib.stewart_encoder_scratch(encoders_of(self).pointer))
         arrays = map(c.at, (values, expected, state, root))
         found = sensing.start(sensing, *arrays, scratch)
         return FirstState(state, root @ root.T) if found else None
@@ -347,7 +347,7 @@ class EncoderSensing:
 def _sensing_of(sensing: EncoderSensing) -> Compiled:
     """Return the `stewart_sensing` of encoders."""
     encoders = encoders_of(sensing)
-    it = core().ffi.new("stewart_sensing *", core().lib.stewart_encoder_sensing(encoders.it))
+    it = core().ffi.new("stewart_sensing *", core().lib.stewart_encoder_sensing(encoders.pointer))
     return Compiled(it, (encoders,))
 
 

@@ -293,8 +293,8 @@ class CompiledController:
         self.weights, self.rows = np.tile(weights, (samples, 1)), np.empty((samples, 0))
         self._tuned = np.zeros(3)  # two weights, fallbacks
         if tuner is not None:
-            self._tuned = np.empty(c.lib.stewart_tuner_memory(tuner.it))
-            c.lib.stewart_tuner_start(tuner.it, c.at(self._tuned))
+            self._tuned = np.empty(c.lib.stewart_tuner_memory(tuner.pointer))
+            c.lib.stewart_tuner_start(tuner.pointer, c.at(self._tuned))
             self.rows = np.empty((samples, (len(self._tuned) - 3) // WINDOW))
             scratch = c.lib.stewart_tuned_step_scratch(compiled.data)
         motion = prepared.motion(0.0).compiled()
@@ -304,7 +304,7 @@ class CompiledController:
             "stewart_law_in_loop *",
             {
                 "law" if report is None else "servos": compiled.data,
-                "tuner": c.ffi.NULL if tuner is None else tuner.it,
+                "tuner": c.ffi.NULL if tuner is None else tuner.pointer,
                 "memory": c.at(self._memory.data),
                 "tuner_memory": c.at(self._tuned),
                 "scratch": c.at(self._kept[4]),

@@ -83,13 +83,13 @@ class PlateTrajectory(FunctionHandleTrajectory):
             raise ValueError(f"times: got {self.times}; expected ascending numbers, s")
         if then is not None and not pieces:
             raise ValueError("then: got a motion; expected one after pieces only")
-        after, kept = (c.ffi.NULL, ()) if then is None else (then.data, then.keep)
+        after, kept = (c.ffi.NULL, ()) if then is None else (then.data, then.keep_alive)
         waves = (np.array(one, np.float64).tolist() for one in (offset, amplitude, frequency))
         tables = (c.at(self.times), c.at(powers)) if pieces else (c.ffi.NULL, c.ffi.NULL)
         given = pieces, degree, *tables, after, *waves
         self.data: Any = c.ffi.new("stewart_motion *", given)
-        self.keep: list[Any] = [self.times, powers, self.data, *kept]
-        derivative = partial(_derivative, self.data, self.keep)
+        self.keep_alive: list[Any] = [self.times, powers, self.data, *kept]
+        derivative = partial(_derivative, self.data, self.keep_alive)
         super().__init__(partial(derivative, order=0), 6, 1, 0.0, math.inf)
         self.set_derivative(derivative)
 

@@ -97,7 +97,7 @@ _PAPER_FIGURES: Final = {
 }
 """Figures of the paper with the same content, for its experiment."""
 _PACKETS_BELOW: Final = (
-    " Below: packets sent, lost or late, and periods with a packet to play or with a dry buffer."
+    " Below: packets sent, lost or late, and periods with a packet to play or without one (dry)."
 )
 
 

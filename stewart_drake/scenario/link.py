@@ -121,6 +121,6 @@ def link_text(scenario: Scenario, bound: bool = True) -> str | None:
             "null)"
         )
     bursts = f" in bursts of {link.burst}" if link.burst > 1 else ""
-    back = "measurements at once" if link.back is None else "measurements over a network too"
+    back = "measurements without delay" if link.back is None else "measurements over a network too"
     playout = f", play-out bound {link.playout:g} s" if bound else ""
     return f"network, packets take {times}, {100 * link.loss:g} % lost{bursts}{playout}; {back}"

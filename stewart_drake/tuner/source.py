@@ -174,7 +174,7 @@ class WeightsSource:
 
     def start(self, law: Memory) -> TunerMemory:
         """Return the memory before the first sample of a law."""
-        it, c = self.compiled.it, core()
+        it, c = self.compiled.pointer, core()
         memory = np.empty(c.lib.stewart_tuner_memory(it))
         c.lib.stewart_tuner_start(it, c.at(memory))
         return TunerMemory(memory, law)
@@ -182,19 +182,19 @@ class WeightsSource:
     def decide(self, memory: TunerMemory) -> Decision:
         """Return the weights of the next sample, from data up to the last one."""
         weights, c = np.empty(2), core()
-        fell_back = c.lib.stewart_decide(self.compiled.it, c.at(memory.data), c.at(weights))
+        fell_back = c.lib.stewart_decide(self.compiled.pointer, c.at(memory.data), c.at(weights))
         return Decision(weights, bool(fell_back))
 
     def decide_by(self, values: Array, last: Array) -> Decision:
         """Return the weights from features (18,) and the weights (2,) of the sample before."""
         weights, c = np.empty(2), core()
         given = map(c.at, (numbers(values), numbers(last), weights))
-        return Decision(weights, bool(c.lib.stewart_decide_by(self.compiled.it, *given)))
+        return Decision(weights, bool(c.lib.stewart_decide_by(self.compiled.pointer, *given)))
 
     def values(self, window: Array) -> Array:
         """Return the features (18,) of a window (31, columns), NaN before the first sample."""
         found, c = np.empty(NUM_INPUTS), core()
-        c.lib.stewart_tuner_features(self.compiled.it, c.at(numbers(window)), c.at(found))
+        c.lib.stewart_tuner_features(self.compiled.pointer, c.at(numbers(window)), c.at(found))
         return found
 
     def row(self, memory: TunerMemory) -> Array:
@@ -230,7 +230,7 @@ class WeightsSource:
         given = c.ffi.new(
             "stewart_tuner_input *",
             {
-                "machine": c.ffi.NULL if self.plant is None else machine_of(self.plant).it,
+                "machine": c.ffi.NULL if self.plant is None else machine_of(self.plant).pointer,
                 "schedule": [len(acted[0]), *map(c.at, acted), 0],
                 "torque": [*map(c.at, torques)],
                 "feedforward": [*map(c.at, feedforwards)],
@@ -239,7 +239,7 @@ class WeightsSource:
         )
         weights, reference = numbers(decision.weights), numbers(wanted)
         c.lib.stewart_tuner_observe(
-            *(self.compiled.it, c.at(data), given, c.at(reference), c.at(weights)),
+            *(self.compiled.pointer, c.at(data), given, c.at(reference), c.at(weights)),
             *(decision.fell_back, c.scratch(NUM_STATE * len(acted[0]))),
         )
         return TunerMemory(data, after)

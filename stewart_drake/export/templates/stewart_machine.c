@@ -396,7 +396,7 @@ int main(int argc, char **argv)
         fail(&m, STEWART_ENDED, 0, 0, now);
     for (int i = 0; i < LAST_DATAGRAMS && m.driven; i++)
         say(&m, now);
-    printf("ended after %.1f s: %u measurements sent, %u torques played, %u periods dry, %u silences\n",
+    printf("ended after %.1f s: %u measurements sent, %u torques played, %u periods without one (dry), %u silences\n",
            1e-9 * (double)now, m.sent, (unsigned)m.link[STEWART_LINK_PLAYED],
            (unsigned)m.link[STEWART_LINK_DRY], m.silences);
     udp_tell(m.refused);
