@@ -6,7 +6,7 @@ from tempfile import TemporaryDirectory
 
 import typer
 
-from stewart_drake.cli.common import GO_ON, Chosen, Delivery, stopping
+from stewart_drake.cli.common import RESUMABLE, Chosen, Delivery, on_interrupt
 from stewart_drake.cli.options import Given, command
 from stewart_drake.reporting.analyses import ANALYSES, analyze, options_of, words_of
 from stewart_drake.reporting.terminal import count_bar
@@ -36,11 +36,11 @@ def _callback(name: str) -> Callable[..., int | None]:
         options, out, loaded = given.options(load), delivery.out, chosen.load(*fixed)
         options.check_scenario(loaded)  # before anything heavy is imported
         line = chosen.line(*words_of(name), **given.words, out=out)
-        kept = GO_ON.replace("runs", row.keeps) if out else "nothing is kept without --out"
+        kept = RESUMABLE.replace("runs", row.keeps) if out else "nothing is kept without --out"
         first = "preparing" if row.counts else "computing"
         with (
             TemporaryDirectory() as scratch,
-            stopping(kept) if row.keeps else contextlib.nullcontext(),
+            on_interrupt(kept) if row.keeps else contextlib.nullcontext(),
             count_bar(row.counts or name, delivery.quiet, first) as progress,
         ):
             delivery.say_link(loaded)

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 INTERRUPTED: Final = 130
 """Exit status after Ctrl-C."""
 
-GO_ON: Final = "finished runs are kept, the same command goes on from there"
+RESUMABLE: Final = "finished runs are kept, the same command goes on from there"
+"""Text after Ctrl-C of commands that continue."""
 _at_exit: Final = contextlib.ExitStack()
 """Clean-up when the running command ends."""
 
@@ -192,7 +193,7 @@ def _remove_empty(directories: list[Path]) -> None:
 
 
 @contextlib.contextmanager
-def stopping(text: str) -> Iterator[None]:
+def on_interrupt(text: str) -> Iterator[None]:
     """Print `text` and end the command on Ctrl-C."""
     try:
         yield
@@ -251,7 +252,7 @@ class Delivery:
 
         if self.out is not None:
             write_json(self.out / "summary.json", summary)
-            self.wrote("summary.json")
+            self.add_files("summary.json")
 
     def draw(self, what: str, draw: Callable[[Path], Any]) -> None:
         """Write figures or a page after the results.
@@ -270,9 +271,10 @@ class Delivery:
             text = f"warning: {what} could not be drawn ({reason}); everything else is kept"
             echo(text, error=True)
         else:
-            self.wrote(counted(len(found), "figures") if what == "figures" else what)
+            self.add_files(counted(len(found), "figures") if what == "figures" else what)
 
-    def wrote(self, *names: str) -> None:
+    def add_files(self, *names: str) -> None:
+        """Add names to the files that `end` prints."""
         self._written += names
 
     def answer(
@@ -283,7 +285,7 @@ class Delivery:
         self.discard(page)  # a page of an earlier run would contradict the new numbers
         self.write(found.summary)
         self.draw(page, lambda folder: found.write_page(folder, page))
-        self.wrote(*files)
+        self.add_files(*files)
         return self.end(found.summary, interrupted)
 
     def end(self, summary: Mapping[str, Any], interrupted: bool = False) -> int:

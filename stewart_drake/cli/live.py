@@ -215,7 +215,7 @@ def _delivered(
     if delivery.out is not None:
         delivery.discard(PAGE)  # of an earlier run
         result.save(delivery.out)
-        delivery.wrote("summary.json", "signals.nc", *logs)
+        delivery.add_files("summary.json", "signals.nc", *logs)
     if found is not None:
         delivery.draw(PAGE, found.write_page)
     lost = result.status in ("lost_machine", "lost_contact", "refused", "left_workspace")

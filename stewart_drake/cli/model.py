@@ -14,7 +14,7 @@ from stewart_drake.cli.common import (
     InPlaceOfOutput,
     MechanismName,
     command_line,
-    stopping,
+    on_interrupt,
     write_or_print,
 )
 from stewart_drake.cli.options import Given, command
@@ -67,7 +67,7 @@ def view(*, mechanism: MechanismName, delivery: Delivery) -> int:
     viewer = PoseViewer(sd.load_mechanism(mechanism), Meshcat())
     if delivery.out is not None:
         write_whole(delivery.out / "view.html", viewer.meshcat.StaticHtml())
-        delivery.wrote("view.html")
+        delivery.add_files("view.html")
         return delivery.end({})
     # The address is printed also with --quiet.
     echo(f"{STOP!r} or Ctrl-C ends it; showing it at {viewer.meshcat.web_url()}")
@@ -99,7 +99,7 @@ def new(
         from stewart_drake.reporting.machine_form import MachineForm
 
         with (
-            stopping("nothing was written"),
+            on_interrupt("nothing was written"),
             closing(MachineForm(given.given, "new machine")) as page,
         ):
             # The address is printed also with --quiet.
@@ -124,7 +124,7 @@ def _new(
 
     with given.named():
         made = NewMachine(*study.new_machine(measurements, _name_of(folder), folder))
-    delivery.wrote(study.MACHINE, study.SCENARIO)
+    delivery.add_files(study.MACHINE, study.SCENARIO)
     delivery.say(made.table())
     delivery.discard(PAGE)
     delivery.write(made.summary)

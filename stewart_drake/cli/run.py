@@ -97,7 +97,7 @@ def simulate(
 
             write_whole(delivery.out / CSV, signals_csv(result.signals))
         result.save(delivery.out)
-        delivery.wrote("summary.json", "signals.nc", *[CSV] * csv)
+        delivery.add_files("summary.json", "signals.nc", *[CSV] * csv)
     delivery.draw("figures", result.plot)
     if replay or meshcat:
         delivery.draw(REPLAY, film)
@@ -256,7 +256,7 @@ def compare(
     delivery.discard(*(f"{name}.nc" for name in known), *_pictures((*COMPARED_FIGURES, *drawn)))
     if delivery.out is not None:
         results.save(delivery.out)
-        delivery.wrote("summary.json", f"{len(results)} signal files")
+        delivery.add_files("summary.json", f"{len(results)} signal files")
     delivery.draw("figures", results.plot)
     ended = [result.status for result in results.values()]
     interrupted = "interrupted" in ended or len(ended) < len(names)

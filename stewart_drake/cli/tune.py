@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from stewart_drake.cli.common import GO_ON, Chosen, Delivery, command_line, stopping
+from stewart_drake.cli.common import RESUMABLE, Chosen, Delivery, command_line, on_interrupt
 from stewart_drake.cli.options import Given, command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.reporting.terminal import count_bar
@@ -24,13 +24,17 @@ def dataset(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
     """
     from stewart_drake import functions
 
-    with given.named(), stopping(GO_ON), count_bar("conditions", delivery.quiet) as progress:
+    with (
+        given.named(),
+        on_interrupt(RESUMABLE),
+        count_bar("conditions", delivery.quiet) as progress,
+    ):
         found = functions.make_tuner_data(
             delivery.folder, *chosen, progress=progress, options=given.options()
         )
     delivery.write(found.summary)
     delivery.say(found.table())
-    delivery.wrote("dataset.nc", "conditions/")
+    delivery.add_files("dataset.nc", "conditions/")
     return delivery.end(found.summary)
 
 
@@ -59,12 +63,14 @@ def train(
     if out.suffix != ".json":
         raise ConfigError(f"--out: got {str(out)!r}; expected a file ending in .json")
     options, delivery = given.options(), delivery.into(out.parent)
-    name, kept = ("own runs", GO_ON) if options.regret else ("training", "nothing written")
-    first = "training" if options.regret else "computing"
-    with given.named(), stopping(kept), count_bar(name, delivery.silent, first) as progress:
-        found = functions.train_tuner(data, out, progress=progress, options=options)
-    delivery.discard()
-    delivery.wrote(out.name, *([f"{out.stem}-runs/"] if options.regret else []))
+    if options.regret:  # trains on the data, then counts runs of the network
+        bar, first, interrupted = "own runs", "training", RESUMABLE
+    else:
+        bar, first, interrupted = "training", "computing", "nothing written"
+    with given.named(), on_interrupt(interrupted), count_bar(bar, delivery.silent, first) as shown:
+        found = functions.train_tuner(data, out, progress=shown, options=options)
+    delivery.discard()  # the summary of an earlier training in this folder
+    delivery.add_files(out.name, *([f"{out.stem}-runs/"] if options.regret else []))
     delivery.write(found.summary)
     delivery.say(found.table())
     if not options.regret:
@@ -91,10 +97,14 @@ def evaluate(
     from stewart_drake import functions
 
     options, weights = given.options(), weights or []
-    named = {"scenario": None if options.family else scenario, "controller": chosen.controller}
-    words, typed = ("tune", "evaluate", *weights), named | given.words
-    line = command_line(*words, settings=chosen.settings, options=typed)
-    with given.named(), stopping(GO_ON), count_bar("conditions", delivery.quiet) as progress:
+    typed = {"scenario": None if options.family else scenario, "controller": chosen.controller}
+    typed |= given.words
+    line = command_line("tune", "evaluate", *weights, settings=chosen.settings, options=typed)
+    with (
+        given.named(),
+        on_interrupt(RESUMABLE),
+        count_bar("conditions", delivery.quiet) as progress,
+    ):
         found = functions.evaluate_tuner(
             delivery.folder,
             weights,

@@ -15,8 +15,6 @@
 #include "delay.h"
 #include "short.h"
 
-#define MOST STEWART_MAX_SCHEDULE
-
 #define MAX_ITERATIONS 6       /* of the update, while the delay is hardly known */
 #define MAX_ITERATIONS_KNOWN 4 /* the same once it is known */
 #define DELAYS_TRIED 15        /* first values of the delay for the iterations, while it is hardly known */
@@ -76,7 +74,7 @@ static stewart_arrivals arriving(const stewart_period *t, const real *xi)
 typedef struct {
     int number;
     real *torques, *durations;
-    real states[X * MOST]; /* after each of them */
+    real states[X * STEWART_MAX_SCHEDULE]; /* after each of them */
 } Path;
 
 static Path take_path(const stewart_period *t, stewart_scratch *scratch)
@@ -93,7 +91,7 @@ static int schedule_between(const stewart_period *t, const real *xi, real begin,
     const stewart_arrivals view = arriving(t, xi);
     path->number = stewart_torque_schedule(&view, t->num_in_flight, t->in_flight, begin, end, t->newest,
                                            path->torques, path->durations);
-    return path->number <= MOST;
+    return path->number <= STEWART_MAX_SCHEDULE;
 }
 
 /* Compute the path of a period from xi, and the state at its end. Returns 0 for too many torques. */
@@ -114,12 +112,12 @@ int stewart_period_scratch(int p, int num_in_flight)
 
 int stewart_delay_advance_scratch(int p, int m, int num_in_flight)
 {
-    const int n = X + p + 2, own = (2 * n + 2 * X + 1 + m) * n + (m + X + 1 + MOST) * m
+    const int n = X + p + 2, own = (2 * n + 2 * X + 1 + m) * n + (m + X + 1 + STEWART_MAX_SCHEDULE) * m
         + 2 * X + (U + 1) * (num_in_flight + 3); /* L, the model and `attempt` */
-    const int tried = (X + 1) * n + (X + 1 + n) * m, judged = (n + m + MOST) * m;
+    const int tried = (X + 1) * n + (X + 1 + n) * m, judged = (n + m + STEWART_MAX_SCHEDULE) * m;
     const int update = stewart_kalman_scratch(n, m);
     const int more = (tried > update ? tried : update) + stewart_period_scratch(p, num_in_flight);
-    const int predicted = (2 * n + MOST) * n, most = more > judged ? more : judged;
+    const int predicted = (2 * n + STEWART_MAX_SCHEDULE) * n, most = more > judged ? more : judged;
     return own + 2 * n + (most > predicted ? most : predicted);
 }
 
@@ -200,7 +198,7 @@ int stewart_period_late(const stewart_period *t, const real *xi, const real *sta
     for (int k = 0; k + 1 < path.number; k++, K += X) {
         real left, late = REAL(sqrt)(UNKNOWN_PHASE) * dt; /* s: time to the end; timing's deviation */
         at += path.durations[k];
-        left = dt - at < 0 ? 0 : dt - at < dt ? dt - at : dt;
+        left = clamped(0, dt - at, dt);
         if (view.num_own > 0 && at >= first_own - STEWART_TIME_TOLERANCE)
             late = std * REAL(sqrt)(REAL(fmax)(probability_between(-at, dt - at, std), 0));
         else
@@ -226,7 +224,7 @@ typedef struct {
     int m, n, fourth_order;
     int rows, others;    /* of K: number of all rows, and of those before the controller's own */
     real *at_prior;      /* state and H about the prior, for all attempts */
-    real K[X * MOST];    /* (rows, 12), see stewart_period_late */
+    real K[X * STEWART_MAX_SCHEDULE];    /* (rows, 12), see stewart_period_late */
     real drift[X];       /* standard deviations of the model's other errors */
     real *late_effects;  /* (m, rows) J K', effect of K on the measurement */
     real *white, *nu;    /* (m, n) C^-1 J H, and (m) C^-1 nu, nu the innovation about the prior */
@@ -530,7 +528,7 @@ void stewart_delay_advance(const stewart_period *t, const stewart_hypothesis *hy
     real *L = stewart_take(&scratch, n * n);
     a.path = take_path(t, &scratch);
     a.at_prior = stewart_take(&scratch, X + X * n);
-    a.late_effects = stewart_take(&scratch, m * MOST);
+    a.late_effects = stewart_take(&scratch, m * STEWART_MAX_SCHEDULE);
     a.white = stewart_take(&scratch, m * n);
     a.nu = stewart_take(&scratch, m);
     a.measurement = (stewart_measurement){.sensing = d->filter.sensing, .n = n, .context = &a,

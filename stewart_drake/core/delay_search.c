@@ -139,7 +139,7 @@ static void spawn(Search *s, int k, stewart_scratch scratch)
     const real left = left_of_prior(d, low);
     real p = left > 0 ? 1 - left_of_prior(d, high) / left : 1;
     real *L = stewart_take(&scratch, n * n);
-    p = p < LEAST_PROBABILITY ? LEAST_PROBABILITY : p < 1 - LEAST_PROBABILITY ? p : 1 - LEAST_PROBABILITY;
+    p = clamped(LEAST_PROBABILITY, p, 1 - LEAST_PROBABILITY);
     s->memory->cells += 1;
     cell = hypothesis_at(s, (int)s->memory->cells);
     copy_hypothesis(n, master, cell);

@@ -10,9 +10,12 @@ int stewart_order(const stewart_cost *cost, int pending)
     return X + 6 * (cost->integrates != 0) + U * pending;
 }
 
-/* Let T(t) be the torque that the motion takes, s_k its change over hold k. Held at its mean it gives
-   the rates of the motion at the end of the hold, but puts the pose ahead by B s dt^2 / 12; that adds up.
-   The poses at the samples are right with
+/* Let T(t) be the torque of the motion, T' its slope and s_k = T' dt its change over hold k. Held at its mean
+   it gives the rates of the motion at the end of the hold, but puts the pose ahead by
+
+       int_0^dt (dt - t) B (mean - T(t)) dt = B s_k dt^2 / 12,
+
+   which adds up. One torque per period cannot meet both. The poses at the samples are right with
 
        T_k = mean_k - (s_{k+1} - s_{k-1}) / 24                                              (hold)
 

@@ -3,7 +3,6 @@
 #include "kalman.h"
 #include "short.h"
 
-#define MAX_ACTIVE STEWART_MAX_BOUNDED
 #define BOUND_TOLERANCE ((real)1e-9) /* standard deviations; less out of bounds counts as rounding */
 
 /* A reflection of one column x of [row; W], rows of W being n numbers apart, by v = [v; f]:
@@ -119,15 +118,10 @@ void stewart_widen_root(int n, const real *jump, real *L, stewart_scratch scratc
     stewart_root_of_prediction(n, same, none, jump, 0, NULL, L, scratch);
 }
 
-static real clipped(real x, real lower, real upper)
-{
-    return x < lower ? lower : x > upper ? upper : x;
-}
-
 /* Components that are fixed at a bound, with their Lagrange multipliers. */
 typedef struct {
-    int number, index[MAX_ACTIVE], upper[MAX_ACTIVE];
-    real value[MAX_ACTIVE], multiplier[MAX_ACTIVE];
+    int number, index[STEWART_MAX_BOUNDED], upper[STEWART_MAX_BOUNDED];
+    real value[STEWART_MAX_BOUNDED], multiplier[STEWART_MAX_BOUNDED];
 } ActiveSet;
 
 /* Solve P_aa multiplier = mean_a - value_a for the set a, and release components one by one whose
@@ -171,14 +165,14 @@ static int find_multipliers(ActiveSet *set, int n, const real *mean, const real 
 int stewart_within_bounds(int n, const real *mean, const real *L, const real *lower,
                           const real *upper, real *bounded, stewart_scratch scratch)
 {
-    real *shift = stewart_take(&scratch, n), *P = stewart_take(&scratch, MAX_ACTIVE * MAX_ACTIVE);
+    real *shift = stewart_take(&scratch, n), *P = stewart_take(&scratch, STEWART_MAX_BOUNDED * STEWART_MAX_BOUNDED);
     ActiveSet set = {0};
     stewart_copy(n, mean, bounded);
-    for (int round = 0; round < 4 * MAX_ACTIVE; round++) {
+    for (int round = 0; round < 4 * STEWART_MAX_BOUNDED; round++) {
         int worst = -1, slot = 0;
         real furthest = BOUND_TOLERANCE;
         for (int i = 0; i < n; i++) {
-            const real beyond = bounded[i] - clipped(bounded[i], lower[i], upper[i]);
+            const real beyond = bounded[i] - clamped(lower[i], bounded[i], upper[i]);
             if (beyond == 0)
                 continue;
             const real excess = REAL(fabs)(beyond) / stewart_norm(n, L + n * i);
@@ -193,7 +187,7 @@ int stewart_within_bounds(int n, const real *mean, const real *L, const real *lo
             break;
         while (slot < set.number && set.index[slot] != worst)
             slot++;
-        if (slot == MAX_ACTIVE)
+        if (slot == STEWART_MAX_BOUNDED)
             return 0;
         set.number += slot == set.number;
         set.index[slot] = worst;
@@ -209,13 +203,14 @@ int stewart_within_bounds(int n, const real *mean, const real *L, const real *lo
             bounded[i] = mean[i] - stewart_dot(n, L + n * i, shift);
     }
     for (int i = 0; i < n; i++)
-        bounded[i] = clipped(bounded[i], lower[i], upper[i]);
+        bounded[i] = clamped(lower[i], bounded[i], upper[i]);
     return 1;
 }
 
 int stewart_kalman_scratch(int n, int max_rows)
 {
-    return max_rows + max_rows * n + (max_rows + n + 1) * (n + 1) + 2 * n + MAX_ACTIVE * MAX_ACTIVE;
+    const int active = STEWART_MAX_BOUNDED * STEWART_MAX_BOUNDED;
+    return max_rows + max_rows * n + (max_rows + n + 1) * (n + 1) + 2 * n + active;
 }
 
 /* With whitened residuals the updated mean is xi = mean + L z, with z the minimum of

@@ -6,7 +6,6 @@
 #define LEAST_STEP ((real)1e-3) /* over Newton's step */
 #define WRONG_BRANCH ((real)1e-5) /* rod.tangent that counts as another branch */
 #define MOST_PIECES 16 /* steps from the angles of the guess, where a single one crosses a singularity */
-#define TURN ((real)6.283185307179586)
 #ifdef STEWART_FLOAT
 #define TOLERANCE ((real)5e-7)   /* of a rod's length, relative */
 #define DEAD_CENTRE ((real)5e-4)

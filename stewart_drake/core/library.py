@@ -12,74 +12,78 @@ from stewart_drake.core.build import DECLARED, LIBRARY, declarations, source_has
 from stewart_drake.files.errors import ConfigError
 
 
-def _declared(path: Path) -> Any:
-    """Return the declarations that the build has read; parse the headers where it has not."""
+def _load_declarations(path: Path) -> Any:
+    """Return the `FFI` with the declarations of the core.
+
+    The build writes them to a module, so that no process parses the headers. Without a current
+    module they are parsed here.
+    """
     if path.exists():
-        names: dict[str, Any] = {}
-        exec(compile(path.read_text("utf-8"), path, "exec"), names)
-        if names["source"] == source_hash():
-            return names["ffi"]
+        module: dict[str, Any] = {}
+        exec(compile(path.read_text("utf-8"), path, "exec"), module)
+        if module["source"] == source_hash():
+            return module["ffi"]
     ffi = FFI()
     ffi.cdef(declarations())
     return ffi
 
 
 class Core:
-    """The library for cffi.
+    """The compiled library.
 
     Args:
-        path: of the library.
+        path: of the shared library.
 
     Attributes:
-        ffi: creates structures.
-        lib: functions and constants.
+        ffi: `cffi.FFI`, which creates structures and arrays of C.
+        lib: functions and constants by their names in C.
     """
 
     def __init__(self, path: Path = LIBRARY) -> None:
-        self.ffi: Any = _declared(path.with_name(DECLARED))
+        self.ffi: Any = _load_declarations(path.with_name(DECLARED))
         self.lib: Any = self.ffi.dlopen(str(path))
         names = {np.float64: "double[]", np.intc: "int[]"}
-        self._kinds = {np.dtype(kind): self.ffi.typeof(name) for kind, name in names.items()}
-        self._block = self.ffi.new_allocator(should_clear_after_alloc=False)
+        self._pointer_types = {np.dtype(t): self.ffi.typeof(name) for t, name in names.items()}
+        self._new_uncleared = self.ffi.new_allocator(should_clear_after_alloc=False)
 
     @cached_property
     def symbols(self) -> dict[int, str]:
-        """Names of the functions and their tables, by address."""
+        """Names of functions and tables of functions, by address."""
         names = [name for name in dir(self.lib) if name.startswith("stewart_")]
-        at = {name: self.ffi.addressof(self.lib, name) for name in names}
-        return {int(self.ffi.cast("intptr_t", pointer)): name for name, pointer in at.items()}
+        pointers = {name: self.ffi.addressof(self.lib, name) for name in names}
+        return {int(self.ffi.cast("intptr_t", at)): name for name, at in pointers.items()}
 
     def at(self, array: NDArray[Any] | None) -> Any:
         """Return a pointer to a contiguous array of doubles or C ints.
 
-        The pointer keeps the array alive; a copy of it in a structure does not.
+        The pointer keeps the array alive; its copy in a structure does not. None becomes NULL.
 
         Raises:
-            ValueError: other numbers, or not contiguous.
+            ValueError: another type, or not contiguous.
         """
         if array is None:
             return self.ffi.NULL
-        kind = self._kinds.get(array.dtype)
-        if kind is None or not array.flags.c_contiguous:
+        pointer_type = self._pointer_types.get(array.dtype)
+        if pointer_type is None or not array.flags.c_contiguous:
             raise ValueError(
                 f"array: got {array.dtype}, strides {array.strides}; expected contiguous doubles "
                 "or C ints"
             )
-        return self.ffi.from_buffer(kind, array)
+        return self.ffi.from_buffer(pointer_type, array)
 
-    def call(self, name: str, *given: Any) -> Any:
-        """Call a function; an array is given by its address."""
-        addresses = (self.at(one) if isinstance(one, np.ndarray) else one for one in given)
-        return getattr(self.lib, f"stewart_{name}")(*addresses)
+    def call(self, name: str, *arguments: Any) -> Any:
+        """Call `stewart_NAME`, with arrays as pointers."""
+        values = (self.at(one) if isinstance(one, np.ndarray) else one for one in arguments)
+        return getattr(self.lib, f"stewart_{name}")(*values)
 
     def plant(self, geometry: Any, parameters: Any, gravity: Any) -> Any:
-        """Return a `stewart_plant` that points to numbers of these addresses."""
+        """Return a `stewart_plant *` with these pointers, and friction of ball joints."""
         joints = self.ffi.addressof(self.lib, "stewart_ball_joints")
         return self.ffi.new("stewart_plant *", (geometry, parameters, gravity, joints))
 
     def scratch(self, numbers: int) -> Any:
-        """Return a `stewart_scratch` with `numbers` numbers, for one call."""
-        return [self._block("real[]", numbers)]
+        """Return a `stewart_scratch` of `numbers` numbers, for one call."""
+        return [self._new_uncleared("real[]", numbers)]
 
 
 @lru_cache(maxsize=1)

@@ -3,8 +3,6 @@
 #include "observers.h"
 #include "short.h"
 
-static int estimated(const stewart_law *law) { return law->machine.estimated; }
-
 void stewart_predict_nominal(const stewart_law *law, int number, const real *torques, real *state,
                              stewart_scratch scratch)
 {
@@ -36,8 +34,8 @@ void stewart_plain_start(const stewart_law *law, real *memory)
 void stewart_plain_parameters(const stewart_law *law, const real *memory, real *theta, real *std)
 {
     (void)memory;
-    stewart_fill(estimated(law), (real)NAN, std);
-    for (int i = 0; i < estimated(law); i++) {
+    stewart_fill(law->machine.estimated, (real)NAN, std);
+    for (int i = 0; i < law->machine.estimated; i++) {
         const int at = law->machine.place[i];
         theta[i] = at < 0 ? 0 : law->machine.parameters[at];
     }

@@ -158,7 +158,7 @@ void stewart_plan_times(real begin, real period, int periods, real times[3])
 }
 
 /* State (12) from which held torques follow the reference: with a change s of the torque over the hold, the
-   rates are off by -dt/24 B s at its beginning (law/feedforward.py). */
+   rates are off by -dt/24 B s at its beginning (design.c). */
 static int target(const stewart_model *model, real period, const real *rows, real *state,
                   stewart_scratch scratch)
 {

@@ -12,7 +12,7 @@ void stewart_position_torque(const stewart_position_servo *servo, const real *ge
     for (int i = 0; i < LEGS; i++) {
         const Leg leg = leg_of(geometry, i);
         const LegMotion motion = leg_motion_of(&leg, &turn, state, w, rates + 3);
-        const real error = REAL(remainder)(setpoint[i] - motion.angle, (real)6.283185307179586);
+        const real error = REAL(remainder)(setpoint[i] - motion.angle, TURN);
         asked[i] = servo->stiffness * error - servo->velocity_gain * motion.rate;
         torque[i] = REAL(fmax)(-limit, REAL(fmin)(limit, asked[i]));
     }

@@ -3,8 +3,6 @@
 #include "replan.h"
 #include "short.h"
 
-#define PIECE STEWART_PIECE
-
 /* Places in the memory. */
 enum {
     SINCE_PLAN,  /* samples since the last plan, or without one since the start */
@@ -27,14 +25,14 @@ static int most_pieces(const stewart_law *law)
     return replan->until + stewart_plan_pieces(law->period, replan->most);
 }
 
-static int replan_memory(const stewart_law *law) { return PATH + PIECE * most_pieces(law); }
+static int replan_memory(const stewart_law *law) { return PATH + STEWART_PIECE * most_pieces(law); }
 
 static int replan_scratch(const stewart_law *law)
 {
     const stewart_replan *replan = law->planning;
     const int p = law->machine.estimated;
     const int judged = (X + p) * (X + p + X + 1) + stewart_transitions_scratch(p);
-    const int planned = PIECE * most_pieces(law) + stewart_plan_scratch(law->period, replan->most);
+    const int planned = STEWART_PIECE * most_pieces(law) + stewart_plan_scratch(law->period, replan->most);
     return X * (replan->until + 1) + (judged > planned ? judged : planned);
 }
 
@@ -71,7 +69,7 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
 {
     const stewart_replan *replan = law->planning;
     int periods = replan->periods, added;
-    real times[3], rows[3 * ROW], peak, *pieces = stewart_take(&scratch, PIECE * most_pieces(law));
+    real times[3], rows[3 * ROW], peak, *pieces = stewart_take(&scratch, STEWART_PIECE * most_pieces(law));
     const real *last = states + X * outlook->until_next.number;
     stewart_model model;
     stewart_set_model(&law->machine, outlook->theta, &model);
@@ -80,7 +78,7 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
         stewart_plan_times(outlook->eta, law->period, periods, times);
         sample->goal(sample->context, 3, times, rows);
         added = stewart_plan_path(&model, replan->sign, last, outlook->eta, law->period, periods, rows,
-                                   pieces + PIECE * number, &peak, scratch);
+                                   pieces + STEWART_PIECE * number, &peak, scratch);
         if (added == 0)
             return 0;
         if (peak <= law->machine.torque_limit)
@@ -91,7 +89,7 @@ static int plan(const stewart_law *law, const stewart_outlook *outlook, const st
     memory[SINCE_PLAN] = 0;
     memory[PIECES] = (real)(number + added);
     memory[PLANNED] = (real)has_acted(law, outlook, memory);
-    stewart_copy(PIECE * (number + added), pieces, memory + PATH);
+    stewart_copy(STEWART_PIECE * (number + added), pieces, memory + PATH);
     return 1;
 }
 

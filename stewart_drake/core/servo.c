@@ -103,7 +103,7 @@ static int observe(const stewart_servo *servo, real *memory, const stewart_sampl
 /* Return a setpoint within range and speed, a period after `last`. */
 static real limited(const stewart_stiffness *stiff, int i, real setpoint, real last)
 {
-    const real near = last + REAL(remainder)(setpoint - last, (real)6.283185307179586);
+    const real near = last + REAL(remainder)(setpoint - last, TURN);
     const real within = REAL(fmax)(stiff->low[i], REAL(fmin)(stiff->high[i], near));
     return last + REAL(fmax)(-stiff->most, REAL(fmin)(stiff->most, within - last));
 }

@@ -17,7 +17,7 @@ int stewart_limit(const stewart_machine *machine, const real *torque, real *limi
     if (machine->own)
         return machine->own->limit(machine, torque, limited);
     for (int i = 0; i < U; i++) {
-        limited[i] = torque[i] > most ? most : torque[i] < -most ? -most : torque[i];
+        limited[i] = clamped(-most, torque[i], most);
         saturated |= limited[i] != torque[i];
     }
     return saturated;

@@ -53,8 +53,6 @@ void stewart_tuner_start(const stewart_tuner *t, real *memory)
     memory[2] = 0;
 }
 
-static real clamped(real low, real x, real high) { return x < low ? low : x > high ? high : x; }
-
 static real decades(real x)
 {
     return x > 0 ? clamped(LOWEST, REAL(log10)(x), HIGHEST) : LOWEST; /* NaN too */

@@ -119,7 +119,7 @@ class Belief:
         settled: whether the delay is known.
         found: whether the delay was found, or changed, at this sample.
         delay_mean, delay_std: s, of the delay; NaN where it is not estimated.
-        timing: s, standard deviation of the instant of a single torque; 0 where it is not learnt.
+        timing: s, standard deviation of the timing of single torques; 0 where it is not learnt.
         innovations: since the estimator's last start.
         memory: numbers of an observer of the core.
     """

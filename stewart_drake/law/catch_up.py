@@ -1,4 +1,4 @@
-"""Way from rest onto a moving reference, planned with held torques by core/planning.h."""
+"""Catch-up: a path from rest onto a moving reference, with held torques (core/planning.h)."""
 
 import math
 from collections.abc import Callable
@@ -27,7 +27,7 @@ HEADROOM = 0.95
 LEAST_ERROR_SHARE = 0.65
 """The same for a plan of least error, which is at its limit for most of its time."""
 PIECE = 0.025
-"""s; largest distance of the instants at which a planned motion is checked."""
+"""s; largest distance of the times at which a planned motion is checked."""
 
 
 class Plan(NamedTuple):
@@ -43,7 +43,7 @@ class CatchUp:
     Args:
         dynamics: the nominal plant.
         reference: the motion to reach.
-        start: (12,) state at `t_start`, the first instant at which a torque can act.
+        start: (12,) state at `t_start`, the first time at which a torque can act.
         t_start: s.
         period: of the controller, s.
         least: makes the plans of least error under a torque limit, or None for the shortest ones.

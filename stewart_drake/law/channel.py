@@ -1,9 +1,6 @@
 """Channel to the motors: single torques over a wire, or plans in packets over a network.
 
-Packet k carries the torques of `repeats` earlier samples again, then T_k and the planned torques of
-further samples. Which packets arrive in time is not known in advance; of earlier packets it is
-known from the last report. The law assumes the torques that the buffer will *most probably* play.
-Their average would be worse, since the buffer never plays it.
+The law assumes the torques that the buffer will most probably play, see core/packets.h.
 """
 
 import sys

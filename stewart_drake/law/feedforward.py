@@ -1,23 +1,11 @@
 """Torque that the reference takes, held for a period each so that the plate follows it.
 
-Let T(t) be the inverse-dynamics torque of the motion. Held at its mean over each interval, it gives
-the rates of the motion at the end of the interval, up to dt^3, but not the pose. With the input map
-B nearly constant and T' the slope of T within the hold, the pose is ahead by
+With s_k the change of the inverse-dynamics torque over hold k, and B accelerations per torque,
 
-    int_0^dt (dt - s) B (mean - T(s)) ds = B T' dt^3 / 12
-
-after each interval, which adds up to dt^2/12 int B T' dt: an error in proportion to the torque. It
-is removed by holding  mean - dt^2/12 T''  instead. With s_k = T' dt, the change of T over hold k,
-
-    T_k = mean_k - (s_{k+1} - s_{k-1}) / 24.                                           (hold)
-
-Pose and rates cannot both be met by one torque per period. With (hold) the poses at the samples are
-right, and the rates there differ from the motion's by
-
+    T_k = mean_k - (s_{k+1} - s_{k-1}) / 24,                                           (hold)
     rates_k - rates(t_k) = -dt/24 B (s_{k-1} + s_k),                                   (rates)
 
-which must not be fed back as an error. A motion under held torques has s = 0 and is followed
-exactly.
+see core/design.c. A motion under held torques has s = 0 and is followed exactly.
 """
 
 from abc import ABC, abstractmethod

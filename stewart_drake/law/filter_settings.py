@@ -131,7 +131,7 @@ class FilterSettings:
     # (12,) error of one step of the model. Without it the filter would attribute integration
     # errors to parameters where a sensor has no noise
     model_std: Array
-    timing_std: float  # s, of the instant of a torque
+    timing_std: float  # s, of the timing of a torque
     walk_std: Array | None = None  # (p,) change of a parameter in a period; None: constants
     jump_std: Array | None = None  # (p,) sudden change of a parameter; None: constants
     learns_timing: bool = False  # whether innovations correct `timing_std`
@@ -158,7 +158,7 @@ INTEGRATION_ERROR = 1e-5
 USUAL_PERIOD = 0.1
 """Period for which these errors are given, s."""
 TIMING_ERROR = 0.01
-"""Standard deviation of a torque's instant, as a share of a period. Without it the filter would
+"""Standard deviation of the timing of a torque, in periods. Without it the filter would
 attribute the effect of a late torque, large in a catch-up, to payload and bias."""
 FIRST_TIMING_ERROR = 0.006
 """Initial value of the same where innovations correct it."""
@@ -280,7 +280,7 @@ def filter_settings(
         parameters: to estimate.
         model_error: share of the motion per s^1.5, see `acceleration_noise`; None:
             `usual_model_error`.
-        timing_std: s, of the instant of a torque; None:
+        timing_std: s, of the timing of a torque; None:
             TIMING_ERROR of the period, or FIRST_TIMING_ERROR with `learns`.
         white: whether the errors of model and sensor are white. Those of an engine's steps and of
             rounded angles add up instead: their default is that of a USUAL_PERIOD at any period.

@@ -32,7 +32,7 @@ from stewart_drake.scenario.signals import (
 from stewart_drake.types import Array
 
 NODES = len(GAUSS_NODES)
-"""Instants within a hold at which the cost sees the pose error."""
+"""Number of times within a hold at which the cost has the pose error."""
 
 
 class Plan(NamedTuple):
@@ -69,7 +69,7 @@ class HoldModel:
 
     Args:
         plant: model of the plant.
-        parameters: (p,) free parameters of its dynamics, as they are believed.
+        parameters: (p,) free parameters of its dynamics, as estimated.
         period: of a hold, s.
     """
 

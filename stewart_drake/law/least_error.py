@@ -1,6 +1,6 @@
-"""Way of least error onto a moving reference within a torque limit.
+"""Path of least error onto a moving reference within a torque limit.
 
-The shortest plan along a quintic (`law.catch_up`) reaches the torque limit at one instant only, and
+The shortest plan along a quintic (`law.catch_up`) reaches the torque limit at one time only, and
 minimises its length instead of its error. Here N torques T_j are free, each held for a time, the
 *hold* j. The plan of least error solves
 

@@ -12,13 +12,13 @@ from stewart_drake.mechanism.trajectories import PlateTrajectory, rows_along
 from stewart_drake.types import Array
 
 Motion = Callable[[Array], Array]
-"""The reference (p, 18), pose, rates and accelerations, at instants (p,) in s from now; some of
-them may be negative."""
+"""The reference (p, 18), pose, rates and accelerations, at times (p,) in s from now; some of them
+may be negative."""
 
 
 @dataclass(frozen=True)
 class Preview:
-    """A motion that is known at the instants that a law asks for."""
+    """A motion that is known at the times that a law asks for."""
 
     times: Array  # (p,) s from now
     reference: Array  # (p, 18)
@@ -27,7 +27,7 @@ class Preview:
         """Return the reference at all of `times`.
 
         Raises:
-            ValueError: at other instants than those.
+            ValueError: at other times.
         """
         asked = times is self.times or np.array_equal(times, self.times)
         if not asked or len(self.reference) != len(times):
@@ -44,7 +44,7 @@ class KnownMotion:
     """A motion that is known at all times.
 
     Attributes:
-        planned: trajectory (6, 1) to follow: the way onto the reference, then the reference.
+        planned: trajectory (6, 1) to follow: the catch-up, then the reference.
         reference: trajectory that a new plan leads back to.
         now: s, on the clock of both.
     """

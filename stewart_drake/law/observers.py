@@ -43,7 +43,7 @@ from stewart_drake.types import Array
 OUTLIER: Final = 1e-6
 """Probability of an outlier under the assumptions of the filter."""
 TIMING_STD: Final = 2e-4
-"""Least standard deviation of the instant of a single torque, s, where the delay is estimated."""
+"""Least standard deviation of the timing of single torques, s, where the delay is estimated."""
 
 
 class Observer(Protocol):
@@ -88,7 +88,7 @@ class DelaySettings:
         rate_std: s/s, of its rate; 0 for none.
         rate_walk: s/s per root s.
         open_loop_start: whether feedback waits until the delay is found.
-        timing_std: s, least standard deviation of the instant of a single torque.
+        timing_std: s, least standard deviation of the timing of single torques.
     """
 
     mean: float
@@ -128,7 +128,7 @@ class CoreObserver:
         settings: of the filter; None: only the state is estimated.
         delay: prior of an unknown delay; None: the delay is known.
         gaps: whether the filter corrects the estimate before a gap between measurements.
-        timing: whether the standard deviation of the torques' instants is learnt without a filter.
+        timing: whether the timing of the torques is learnt without a filter.
     """
 
     settings: FilterSettings | None = None

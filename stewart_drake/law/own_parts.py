@@ -1,11 +1,8 @@
 """Parts of a law in Python, as tables of functions that the step in C calls back.
 
-Tables and arguments are those of `stewart_observer` (core/observer.h), `stewart_design`,
-`stewart_planner`, `stewart_channel` and `stewart_sample` (core/law.h) and `stewart_servo`
-(core/servo.h). An argument that Python does not need has the name of the header with an underscore.
-Python keeps the memory of its parts in `Memory.own`, not in the vector that C passes.
-
-Next to each function stand the sizes of its arguments, as `call_back` takes them.
+Tables and arguments are those of core/observer.h, core/law.h and core/servo.h. Arguments that are
+not used have an underscore. Memories of parts in Python are in `Memory.own`, not in the vector that
+C passes. Next to each function are the sizes of its arguments, as `call_back` takes them.
 """
 
 import math

@@ -1,11 +1,4 @@
-"""Planning, during the motion, of a way back onto the reference.
-
-The prediction can be far off the reference, for example when the delay has just been found or has
-changed. Feedback of such an error through a long delay responds badly. The torques in flight cannot
-be changed, so `law.catch_up` plans a motion from the instant at which the next one acts. Torques
-that are constant over each period follow it without error. The law then follows the predicted
-motion, the plan, and the reference: no error is left to feed back, and the integral starts at 0.
-"""
+"""Replanning: a path back onto the reference during the motion, see core/replan.h."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -66,11 +59,11 @@ class NoPlanner:
 
 @dataclass(frozen=True)
 class Replan:
-    """Plans a way back where the prediction is off the reference.
+    """Plans a path back where the prediction is off the reference.
 
     Attributes:
         duration: of the plan, s. It is doubled while the plan exceeds the motors' limit.
-        longest: s, up to which. No plan is made that exceeds the limit.
+        longest: largest duration, s. A plan that still exceeds the limit is not made.
         size: (6,) of the motion, peak to peak, rad and m.
         sure: largest standard deviation of the predicted pose at which a plan is made, as a share
             of the size. A plan from an uncertain state can make things worse.

@@ -1,6 +1,6 @@
 """The predictive LQI control law as a pure function: memory and measurement in, memory out.
 
-At t = k dt the torques in flight are known. They give the state at the instant at which the next
+At t = k dt the torques in flight are known. They give the state at the time at which the next
 torque begins to act, and (42) is applied there:
 
     T_k = T_ff - K [e; z; ...],   e = predicted pose and rate error, z = predicted integral,
@@ -53,8 +53,8 @@ class PredictiveLqi:
         extra_torques: number of torques in memory beyond those of the delay, for late measurements.
         longest_wait: periods to wait for a late measurement before the model continues; 0:
             measurements are of the present.
-        planner: of the way back, where the prediction is off the reference.
-        tolerated_timing: s, standard deviation of the instant of single torques from which on the
+        planner: of a path back, where the prediction is off the reference.
+        tolerated_timing: s, standard deviation of the timing of single torques above which the
             weight of the torques grows with its square; infinite: the weight is given.
         open_loop_samples: samples at the start without feedback: until an own torque has acted,
             feedback only adds noise.
@@ -99,7 +99,7 @@ class PredictiveLqi:
 
     @property
     def moves(self) -> bool:
-        """Whether the law reads the motion at instants that it chooses itself."""
+        """Whether the law reads the motion at times that it chooses itself."""
         return self.finds_delay or not isinstance(self.planner, NoPlanner)
 
     def require_age(self, measurement: Measurement) -> None:
@@ -188,7 +188,7 @@ class OuterLqi(PredictiveLqi):
 
     @cached_property
     def free(self) -> PredictiveLqi:
-        """The law without what this one adds."""
+        """The law of the same parts without the addition of this class."""
         return PredictiveLqi(**self.parts)
 
 

@@ -1,4 +1,4 @@
-"""Prediction of error and integral at the instant at which the next torque begins to act."""
+"""Prediction of error and integral to the time at which the next torque begins to act."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -25,7 +25,7 @@ class Predictor(Protocol):
     """A kind of prediction. Instances are immutable."""
 
     def samples(self, timeline: Timeline) -> Array:
-        """Return the instants (s,), s from now, of further comparisons with the reference."""
+        """Return the times (s,), s from now, of further comparisons with the reference."""
         ...
 
     def pending(self, timeline: Timeline) -> int:
@@ -82,8 +82,8 @@ class LinearPredictor:
 class NonlinearPredictor:
     """Integration of the exact equations over mu periods, with the torques in flight (core/law.c).
 
-    A torque that still acts for eta0 by then is left to the gain. The integral waits in every part
-    in which a motor is at its limit.
+    A torque that still acts for eta0 then is left to the gain. The integral is constant in each
+    period in which a motor is at its limit.
     """
 
     def samples(self, timeline: Timeline) -> Array:
@@ -101,7 +101,7 @@ class NonlinearPredictor:
 
 @dataclass(frozen=True)
 class ArrivalPredictor(NonlinearPredictor):
-    """Integration to the exact instant at which the next torque acts, for an estimated delay."""
+    """Integration to the exact time at which the next torque acts, for an estimated delay."""
 
     def pending(self, timeline: Timeline) -> int:
         return 0

@@ -1,18 +1,8 @@
-"""The law for position servos: crank angles of the reference, sent ahead.
+"""The law for position servos: crank angles of the reference, sent ahead, see core/servo.h.
 
-The command computed at t = k dt is reached one period after it arrives, at t + eta + dt. Until then
-the servos move to it from the one before (`law.servos.Segment`):
-
-    command = [alpha(r); Jac(r) r'; T_ff],    r the reference at t + eta + dt.
-
-Nothing is fed back across the delay, so that no delay makes the loop unstable. Estimates of an
-observer enter T_ff, the torque that the reference takes; without T_ff the servos need an error to
-produce it. The torques that acted depend on the servos' measurements, so that the machine reports
-them with the measurement.
-
-Servos given by their stiffness hold a setpoint for a period instead of moving to it. Its angles are
-(setpoint) of `law.servos` for the middle of that period, r at t + eta + dt / 2: with T_ff they are
-compensated for torque and velocity gain, without it they are the angles of the reference.
+Until a command is reached, the servos move to it from the one before (`law.servos.Segment`).
+Without T_ff they need an error to produce the torque of the motion. Servos given by their stiffness
+hold a setpoint instead, (setpoint) of `law.servos`.
 """
 
 from collections.abc import Callable
