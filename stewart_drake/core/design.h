@@ -17,7 +17,7 @@ typedef struct {
     int feedforward;
 } stewart_cost;
 
-/* Held feedforward torques of the pending hold, if there is one, and of the next hold; and the change of
+/* Feedforward torques of the pending hold, if there is one, and of the next hold; and the change of
    the exact torque over these holds and their two neighbours. */
 typedef struct {
     real torque[2][6], change[4][6];

@@ -10,7 +10,7 @@
 
    `residuals` computes e = y - h(xi) (m) and H = dh/dxi (m, n), both whitened: with noise of covariance
    R = C C' they are C^-1 e and C^-1 H. Values that are left out have no row. Returns m, at most
-   `max_rows`, or -1 if there is no prediction from xi.
+   `max_rows`, or -1 without a prediction from xi.
 
    `relinearize` ends an iteration, which corrected `xi` to `updated`. Returns 1 if the correction is small,
    which ends the iterations. Otherwise it linearises at `updated`, and returns 0, or -1 if there is no

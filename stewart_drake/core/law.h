@@ -125,7 +125,7 @@ struct stewart_law {
     const stewart_observer *observer;
     const stewart_design *design;     /* NULL: prediction and gain of the core */
     const void *estimation;           /* settings of the observer */
-    const void *sensing;              /* settings of the sensor, of which `make_sensing` makes the model */
+    const void *sensing;              /* settings of the sensor, argument of `make_sensing` */
     stewart_sensing (*make_sensing)(const void *sensing);
     const stewart_sensing *own_sensing; /* a sensor model in Python, or NULL */
     const stewart_channel *channel;   /* NULL: every torque arrives, after the delay */

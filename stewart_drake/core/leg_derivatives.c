@@ -1,4 +1,4 @@
-/* See shooting.h. In a file of its own, since dynamics.c is exported to boards. */
+/* See shooting.h. Separate from dynamics.c, which is exported to boards. */
 
 #include <string.h>
 
