@@ -81,6 +81,8 @@ def test_no_other_height_gives_the_rods_a_better_push(tmp_path):
 @pytest.mark.parametrize(("gravity", "queue"), [(True, "equilibrium"), (False, "zero")])
 def test_its_scenario_starts_as_live_advises(gravity, queue, tmp_path):
     made(tmp_path, gravity=gravity)
+    # A balanced plate needs no torque at home.
+    assert gravity or made(tmp_path / "weak", gravity=False, torque_limit=0.1).effort_limit == 0.1
     scenario = sd.load_scenario(tmp_path / "scenario.yaml")
     assert (scenario.start, scenario.queue) == ("rest", queue)
 
@@ -140,6 +142,7 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(tmp_path, capsys):
         ({"shaft_distance": 0.35}, "--shaft-distance: got 0.35 m on a circle of radius 0.2 m"),
         ({"delay": -1}, "--delay: got -1.0; expected at least 0"),
         ({"torque_limit": 0}, "--torque-limit: got 0.0; expected more than 0"),
+        ({"torque_limit": 0.1}, "--torque-limit: got 0.1 N m, too weak to hold the plate at home"),
         ({"rod": None, "plate_mass": None}, "got no --rod, --plate-mass;"),
         ({"rod": None, "crank": "200 kg"}, "--crank: got '200 kg'; expected a number with mm"),
         ({"rod": None, "torque_limit": 0}, "--torque-limit: got 0.0; expected more than 0"),
@@ -215,6 +218,7 @@ def test_the_form_draws_before_masses_are_known_and_names_what_is_wrong(form):
         ("rod", "55 mm", "reach the plate"),
         ("crank", "-1 mm", "expected more than 0"),
         ("cranks", "up", "expected"),
+        ("torque_limit", "0.1", "too weak to hold the plate at home; expected more than 0.244 N m"),
     ):
         _, found = asked(form.url, "/check", json.dumps(fields(**{field: value})))
         assert found["field"] == field and words in found["problem"]

@@ -14,7 +14,7 @@ from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.reporting.local_page import LocalServer
 from stewart_drake.reporting.mechanism import mechanism_figure
 from stewart_drake.reporting.page import source
-from stewart_drake.studies.new_machine import machine_text
+from stewart_drake.studies.new_machine import machine_text, proposed
 from stewart_drake.studies.options import Option
 from stewart_drake.studies.study_options import Measurements
 
@@ -45,7 +45,9 @@ def answer(entries: Entries) -> dict[str, Any]:
     found: dict[str, Any] = {"drawing": None, "field": None, "problem": None}
     try:
         found["drawing"] = drawing(entries)
-        Measurements(**entries)
+        measurements = Measurements(**entries)
+        with TemporaryDirectory() as folder:
+            proposed(measurements, "machine", Path(folder) / "machine.yaml")
     except ConfigError as error:
         name, _, words = str(error).partition(": ")
         known = name in Measurements.model_fields

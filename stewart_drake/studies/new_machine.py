@@ -51,8 +51,8 @@ class MechanismCheck(NamedTuple):
     failure: Failure | None
     measures: Measures  # at home
     crank_angles: Array  # (6,) rad
-    torque: Array  # (6,) N m that hold the plate under gravity
-    # (12,) of the open loop under gravity, 1/s, the fastest growing first
+    torque: Array  # (6,) N m that hold the plate
+    # (12,) of the open loop, 1/s, the fastest growing first
     poles: NDArray[np.complex128]
     travel: list[Travel]  # of each coordinate
 
@@ -92,13 +92,13 @@ class MechanismCheck(NamedTuple):
         }
 
 
-def check_mechanism(mechanism: Mechanism) -> MechanismCheck:
+def check_mechanism(mechanism: Mechanism, gravity: bool = True) -> MechanismCheck:
     """Check a mechanism at home; a singular home pose is a finding, not an error."""
     home = mechanism.home
     failure = diagnose(mechanism, 0.0, home)
     torque, poles = np.empty(0), np.empty(0, dtype=np.complex128)
     if failure is None:
-        dynamics = StewartDynamics(mechanism, gravity=True)
+        dynamics = StewartDynamics(mechanism, gravity=gravity)
         torque = dynamics.equilibrium_torque(home)
         found = np.linalg.eigvals(dynamics.linearize(home)[0]).astype(np.complex128)
         poles = found[np.lexsort((found.imag, -found.real))]
@@ -266,16 +266,28 @@ def refuse_existing(folder: Path) -> None:
             raise ConfigError(f"{folder / file}: already exists; expected a folder without it")
 
 
+def proposed(m: Measurements, name: str, machine: Path) -> MechanismCheck:
+    """Write a mechanism file and return its check; raise an error if it cannot be used."""
+    machine.write_text(machine_text(m, name))
+    check = check_mechanism(load_mechanism(machine), m.gravity)
+    if check.failure is not None:
+        raise ConfigError(f"{check.verdict}; expected other lengths")
+    needed = float(np.abs(check.torque).max())
+    if m.torque_limit is not None and m.torque_limit < needed:
+        raise ConfigError(
+            f"torque_limit: got {m.torque_limit:g} N m, too weak to hold the plate at home; "
+            f"expected more than {needed:.3g} N m, or other measurements"
+        )
+    return check
+
+
 def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
     """Check a new machine, and write MACHINE and SCENARIO into a folder if it can be used."""
     refuse_existing(folder)
     with TemporaryDirectory() as temporary:
         machine, scenario = Path(temporary) / MACHINE, Path(temporary) / SCENARIO
-        machine.write_text(machine_text(m, name))
-        mechanism = load_mechanism(machine)
-        check = check_mechanism(mechanism)
-        if check.failure is not None:
-            raise ConfigError(f"{check.verdict}; expected other lengths")
+        check = proposed(m, name, machine)
+        mechanism = check.mechanism
         scenario.write_text(scenario_text(m, mechanism))
         experiment = prepare(load_scenario(scenario))
         time = np.linspace(0.0, _MOTION_PERIOD, _CHECKED_POSES)
