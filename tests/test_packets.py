@@ -528,12 +528,29 @@ def test_bounds_are_alike_where_the_seeds_do_not_tell_them_apart(known_outcomes)
 
     assert document(study).tone == "fair"
     assert document(replace(study, bounds=cells[:2])).tone == "good"
-    mostly_late = replace(study, bounds=[cells[0]._replace(late=0.8), cells[1]])
-    for one, warned in ((study, False), (mostly_late, True)):
-        said = " ".join(document(one).plain().split())
-        assert ("Older plans replace most torques" in said) is warned
     many = [cells[0]._replace(runs=8, errors=(*common, *common)), cells[4]._replace(runs=8)]
     assert replace(study, bounds=many).unconfirmed_losses == []  # 3 of 8 against 8 of 8
+
+
+def test_a_bound_at_which_most_packets_are_late_is_not_recommended(known_outcomes):
+    """Old plans, which a simulation computes without an error, replace the torques there."""
+    study = study_link(scenario(*QUICK), LinkOptions(runs=2))
+    late = [cell._replace(late=0.8, errors=(0.1, 0.1)) for cell in study.bounds[:1]]
+    lost = [cell._replace(errors=()) for cell in study.bounds[1:]]
+    for bounds, best, words in (
+        ([*late, *study.bounds[1:]], 0.45, "at which at least half of the packets are in time"),
+        ([*late, study.bounds[1]._replace(errors=(1.0,)), *lost[1:]], 0.35, "lost 1 of 2. A bound"),
+        (
+            [*late, *lost],
+            None,
+            "No bound works for this link. Up to 0.3 s most packets are late. From 0.35 s on "
+            "torques act 0.45 s or more after their measurement, and no run completed.",
+        ),
+    ):
+        other = replace(study, bounds=bounds)
+        assert other.summary["best_bound"] == (best and pytest.approx(best))
+        assert words in document(other).verdict
+    assert document(other).tone == "bad"
 
 
 def test_the_worst_run_has_an_interval_from_runs_that_chose_nothing(known_outcomes):

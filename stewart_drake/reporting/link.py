@@ -18,7 +18,7 @@ _ASSURED: Final = 0.9
 
 
 def document(study: LinkStudy) -> Document:
-    best, checked = study.best, study.checked
+    best, checked, controller = study.best, study.checked, study.scenario.controller
     own = best is not None and all(one is None or one.completed == 1 for one in (best, checked))
     same = [f"{bound:g}" for bound, excess in study.alike.items() if excess < NEGLIGIBLE]
     undecided = {bound: excess for bound, excess in study.alike.items() if not excess < NEGLIGIBLE}
@@ -27,6 +27,7 @@ def document(study: LinkStudy) -> Document:
         "link",
         "bad" if not own else "fair" if undecided or unsure else "good",
         study=study,
+        repeated=controller.packet_repeats * controller.period,
         spread=lambda cell: float(np.std(cell.errors, ddof=1)),
         same=", ".join(same),
         undecided=undecided,
