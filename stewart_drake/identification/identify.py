@@ -77,10 +77,17 @@ class Identification:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariance of all unknowns, 0 for known ones; of the prior if the fit is wrong."""
+        """Covariance of all unknowns, 0 for known ones; of the prior if the fit is wrong.
+
+        The steps of a multibody plant shift the delay, by up to one step. It is added to the
+        standard deviation of the delay.
+        """
         if not self.right:
             return np.diag(self.unknowns.std**2)
-        return self.unknowns.whole(self.fit.covariance)
+        found = self.unknowns.whole(self.fit.covariance)
+        if self.unknowns.std[DELAY] > 0:
+            found[DELAY, DELAY] += max(log.step for log in self.logs) ** 2
+        return found
 
     @property
     def std(self) -> Array:

@@ -116,10 +116,11 @@ def file_names(logs: Sequence[Log]) -> list[str]:
 
 def _cautions(found: Identification) -> list[str]:
     cautions = []
-    if step := max(log.step for log in found.logs):
+    step = max(log.step for log in found.logs)
+    if step and found.unknowns.std[DELAY]:
         cautions.append(
-            f"a log of the multibody plant: its steps shift the delay by about {1e3 * step:g} ms, "
-            "which no interval contains; plant.kind=exact has no such error"
+            f"a log of the multibody plant: its steps shift the delay by up to {1e3 * step:g} ms, "
+            "which its interval contains; plant.kind=exact has no such error"
         )
     if left_out := found.fit.left_out:
         stretches = "1 stretch" if left_out == 1 else f"{left_out} stretches"
