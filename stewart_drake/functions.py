@@ -94,9 +94,7 @@ def identify(
         raise ConfigError("logs: got none; expected one or more")
     if delay is not None and not 0 <= delay <= 100:
         raise ConfigError(f"delay: got {delay:g}; expected 0 to 100 s")
-    if all(is_run(Path(path)) for path in paths):
-        of_csv = {"precision": precision, "gravity": None if gravity else gravity}
-        refuse(of_csv, "with logs of runs, which contain it; expected it with an own CSV log")
+    refuse_for_runs(paths, {"precision": precision, "gravity": None if gravity else gravity})
     if any(is_servo_log(Path(path)) for path in paths):
         if len(paths) > 1 or delay is not None or tolerances is not None:
             raise ConfigError(
@@ -111,6 +109,12 @@ def identify(
     read = [read_log(Path(path), machine, precision or Precision(), gravity) for path in paths]
     found = partial(identification.identify, read, machine, tolerances, delay)
     return analysis_result(found, document, typed, _write_machine)
+
+
+def refuse_for_runs(logs: Iterable[str | Path], options: Mapping[str, object]) -> None:
+    """Refuse options of a CSV log that are not None, for logs of runs."""
+    if all(is_run(Path(log)) for log in logs):
+        refuse(options, "with logs of runs, which contain it; expected it with an own CSV log")
 
 
 def plan_identification(

@@ -68,7 +68,10 @@ BAD_ARGUMENTS = [
     (["analyze", "robustness", "--also", "lqi", "--also", "lqi"], "--also: got two of one"),
     (["analyze", "robustness", "--beside", "lqi"], "--beside: got an option of 0.2"),
     (["identify", "--plan", "paper", "--mechanism", "paper"], "--mechanism: got paper with --plan"),
-    (["identify", "run.nc", "--bits", "14"], "--bits: got 14 with logs of runs, which contain it"),
+    (
+        ["identify", "run.nc", "--mechanism", "paper", "--bits", "14"],
+        "--bits: got 14 with logs of runs, which contain it",
+    ),
     (["layout", "paper", "--goal", "beauty"], "--goal: got beauty"),
     (["layout", "paper", "--set", "plant.mechanism=desktop"], "plant.mechanism: got desktop"),
     (["export", "nowhere.nc"], "nowhere.nc"),

@@ -79,16 +79,11 @@ def identify(
         "pose-std": pose_std,
         "out": delivery.out,
     }
-    of_csv = {"--bits": bits, "--pose-std": pose_std, "--gravity": gravity}
     if plan is not None:
         of_scenario = {"--mechanism": mechanism, "--delay": delay, "--gravity": gravity}
         refuse(of_scenario, "with --plan; expected it in the scenario, or as --set")
     else:
-        from stewart_drake.scenario.run_log import is_run
-
         refuse({"--set": chosen.settings}, "without --plan; expected it with --plan")
-        if all(map(is_run, logs or ())):
-            refuse(of_csv, "with logs of runs, which contain it; expected it with an own CSV log")
     if plan is None and mechanism is None:
         raise ConfigError("--mechanism: is missing; expected a shipped name or a file, as drawn")
     from stewart_drake import functions
@@ -105,6 +100,8 @@ def identify(
             found = functions.plan_identification(loaded, poses=pose_std is not None, **more)
         delivery.discard(MOTION, functions.SCENARIO, SETPOINTS_FILE)
     else:
+        of_csv = {"--bits": bits, "--pose-std": pose_std, "--gravity": gravity}
+        functions.refuse_for_runs(logs or [], of_csv)
         words = [*map(str, logs or []), *(["--no-gravity"] if gravity is False else [])]
         options = {"mechanism": mechanism, **typed}
         more["command"] = command_line("identify", *words, options=options)
