@@ -447,6 +447,13 @@ def test_a_machine_is_found_from_encoders_of_14_bit(log_and_truth):
     less = dataclasses.replace(found.unknowns, std=np.minimum(found.unknowns.std, 1.5 * found.std))
     told = document(dataclasses.replace(found, unknowns=less)).plain()
     assert "Weak, hardly better known than before: torque bias 1, torque" in " ".join(told.split())
+    assert "negative payload" not in told
+    less, payload = found.fit.guess.values.copy(), NAMES.index("payload_mass")
+    less[payload] = -0.4
+    fit = found.fit._replace(guess=found.fit.guess._replace(values=less))
+    told = " ".join(document(dataclasses.replace(found, fit=fit)).plain().split())
+    assert "a negative payload: the plate is lighter than the mechanism file says" in told
+    assert "set its plate.mass to 3.6 kg and identify again" in told
     for name, size in {"torque_bias_1": 1e-4, "payload_mass": 0.02, "joint_damping": 1e-4}.items():
         assert abs(found.values[NAMES.index(name)] - true[NAMES.index(name)]) < size
 

@@ -182,6 +182,17 @@ def test_a_bad_command_is_reported_in_one_line(tmp_path, capsys, arguments, name
     assert not list((tmp_path / "out").glob("*.yaml"))
 
 
+def test_an_error_names_the_log_and_the_mechanism(lost, tmp_path, capsys):
+    path = tmp_path / "log.csv"
+    path.write_text(csv_text())
+    for log, mechanism, words in (
+        (lost, "desktop", "its poses do not suit the mechanism desktop (pose out of reach"),
+        (path, "paper", "got a plate that does not move"),
+    ):
+        assert main(["identify", str(log), "--mechanism", mechanism]) == 2
+        assert f"error: {log}: {words}" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_a_lost_log_lets_the_next_run_be_held(lost, tmp_path, capsys):
     assert main(["identify", str(lost), "--mechanism", "paper", "--out", str(tmp_path)]) == 0

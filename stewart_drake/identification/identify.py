@@ -5,7 +5,7 @@ A fit predicts the motion in segments of the logs. Its start needs a delay that 
 segments that the start predicts best, then all of them, and takes the first fit that is not wrong.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, NamedTuple
@@ -39,6 +39,7 @@ from stewart_drake.identification.unknowns import (
     unknowns_of,
 )
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint
+from stewart_drake.mechanism.kinematics import SingularPoseError, UnreachablePoseError
 from stewart_drake.scenario.calibration import Calibration
 from stewart_drake.types import Array
 
@@ -173,7 +174,7 @@ def identify(
     """
     if len({log.gravity for log in logs}) > 1:
         raise ConfigError(
-            "LOG: got logs with gravity and without; expected one machine in one place"
+            f"{_files(logs)}: got logs with gravity and without; expected one machine in one place"
         )
     tolerances = Tolerances() if tolerances is None else tolerances
     delays = (delay, *(log.delay for log in logs), USUAL_DELAY)
@@ -244,9 +245,11 @@ def _fit_all(first_fit: _FirstFit) -> Solution:
     progress.phase("whole log")
     problem, guess = without_diverged(first_fit.whole, first_fit.guess)
     if not problem.segments:
+        name = first_fit.whole.unknowns.mechanism.name
         raise ConfigError(
-            "LOG: got no stretch that the mechanism could have moved through under these torques; "
-            "expected a log of this machine, torques in N m as they were commanded"
+            f"{_files(s.log for s in first_fit.whole.segments)}: got no stretch that the mechanism "
+            f"{name} could have moved through under these torques; expected a log of this machine, "
+            "torques in N m as they were commanded"
         )
     if first_fit.chi2 > WRONG:
         return solve(problem, guess, whole=first_fit.whole)
@@ -259,6 +262,10 @@ def _fit_all(first_fit: _FirstFit) -> Solution:
     return found if found.iterations < _FIRST_ITERATIONS else found.refitted(found.problem)
 
 
+def _files(logs: Iterable[Log]) -> str:
+    return ", ".join(dict.fromkeys(log.name for log in logs))
+
+
 def _unknowns(
     pairs: Sequence[start.Pair], mechanism: Mechanism, tolerances: Tolerances, believed: float
 ) -> Unknowns:
@@ -266,11 +273,19 @@ def _unknowns(
     speeds = []
     for log, poses in pairs:
         known = np.isfinite(poses).all(axis=1)
-        J = mechanism.jacobian(np.median(poses[known], axis=0))
+        try:
+            J = mechanism.jacobian(np.median(poses[known], axis=0))
+        except (UnreachablePoseError, SingularPoseError) as error:
+            raise ConfigError(
+                f"{log.name}: its poses do not suit the mechanism {mechanism.name} ({error}); "
+                "expected a log of this machine"
+            ) from None
         turns, spans = np.diff(poses[known] @ J.T, axis=0), np.diff(log.times[known])
         speeds.append(float(np.abs(turns / spans[:, None]).max()))
     if not max(speeds) > 0:
-        raise ConfigError("LOG: got a plate that does not move; expected one that does")
+        raise ConfigError(
+            f"{_files(log for log, _ in pairs)}: got a plate that does not move; expected one that does"
+        )
     torque = max(float(np.abs(log.torques).max()) for log, _ in pairs)
     unknowns = unknowns_of(mechanism, tolerances, believed, torque, max(speeds))
     has_encoders = any(log.measures(ANGLES) for log, _ in pairs)

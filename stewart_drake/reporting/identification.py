@@ -23,7 +23,7 @@ from stewart_drake.reporting.document import (
 )
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import FACTORS, LEG_LINES, UNITS
-from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS
+from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, PAYLOAD
 from stewart_drake.types import Array
 
 _UNITS: Final = {
@@ -121,6 +121,14 @@ def _cautions(found: Identification) -> list[str]:
         cautions.append(
             f"a log of the multibody plant: its steps shift the delay by up to {1e3 * step:g} ms, "
             "which its interval contains; plant.kind=exact has no such error"
+        )
+    payload, std = found.values[PAYLOAD], found.std[PAYLOAD]
+    if found.right and payload < -2 * std:
+        plate = found.unknowns.mechanism.plate.mass + payload
+        cautions.append(
+            "a negative payload: the plate is lighter than the mechanism file says; set its "
+            f"plate.mass to {plate:.4g} kg and identify again, since plant.payload_mass is at "
+            "least 0"
         )
     if left_out := found.fit.left_out:
         stretches = "1 stretch" if left_out == 1 else f"{left_out} stretches"
