@@ -403,6 +403,16 @@ def test_wrong_commands_of_the_programs_in_c_are_one_line(arguments, expected, f
     assert done.stderr.count("\n") == 1 and done.stderr.startswith(expected)
 
 
+@pytest.mark.parametrize("program", ["stewart_machine", "stewart_udp"])
+def test_the_programs_in_c_print_their_usage(program, folder):
+    command = [str(folder / program), "--help"]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=60, stdin=subprocess.DEVNULL
+    )
+    assert (done.returncode, done.stderr, done.stdout.count("\n")) == (0, "", 1)
+    assert done.stdout.startswith(f"usage: {program} ")
+
+
 def test_wrong_commands_are_one_line(capfd, tmp_path):
     busy = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     busy.bind(("127.0.0.1", 0))

@@ -15,6 +15,7 @@
 #include "stewart_example.h"
 #include "udp.h"
 
+#define USAGE "stewart_machine PORT [SECONDS [KEYFILE]]"
 #define WAITING 1024         /* largest number of waiting torques */
 #define WATCHDOG SECOND      /* ns of silence */
 #define FURTHEST (3600ull * SECOND) /* longest time ahead for a begin or a plan */
@@ -362,8 +363,10 @@ static uint64_t advance(machine *m, uint64_t now)
 int main(int argc, char **argv)
 {
     static machine m;
+    if (udp_help(argc, argv, USAGE))
+        return 0;
     if (argc < 2 || argc > 4) {
-        fprintf(stderr, "expected: stewart_machine PORT [SECONDS [KEYFILE]]\n");
+        fprintf(stderr, "expected: " USAGE "\n");
         return 2;
     }
     double port = udp_number("PORT", argv[1], UDP_LAST_PORT, 0), seconds = INFINITY;

@@ -20,6 +20,9 @@
 #include "stewart_example.h"
 #include "udp.h"
 
+#define USAGE                                                                                      \
+    "stewart_udp ADDRESS PORT [seconds=S] [key=FILE] [log=FILE] [arm], the address in numbers, "   \
+    "beyond 127.0.0.1 with a key"
 #define RECENT 128 /* datagrams by which the link is judged */
 #define ENOUGH 50  /* round trips before the begin */
 #define REQUEST_PERIOD (SECOND / 50) /* ns between two requests */
@@ -706,14 +709,15 @@ static int understood(controller *c, int argc, char **argv)
     }
     if (usable && (c->key.size || ntohl(c->machine.sin_addr.s_addr) >> 24 == 127))
         return 1;
-    fprintf(stderr, "expected: stewart_udp ADDRESS PORT [seconds=S] [key=FILE] [log=FILE] [arm], "
-                    "the address in numbers, beyond 127.0.0.1 with a key\n");
+    fprintf(stderr, "expected: " USAGE "\n");
     return 0;
 }
 
 int main(int argc, char **argv)
 {
     static controller c;
+    if (udp_help(argc, argv, USAGE))
+        return 0;
     if (!understood(&c, argc, argv))
         return 2;
     udp_interrupted();

@@ -54,6 +54,14 @@ int udp_open(uint16_t port, stewart_key key)
     return s;
 }
 
+int udp_help(int argc, char **argv, const char *usage)
+{
+    int asked = argc > 1 && (strcmp(argv[1], "--help") == 0 || strcmp(argv[1], "-h") == 0);
+    if (asked)
+        printf("usage: %s\n", usage);
+    return asked;
+}
+
 double udp_number(const char *name, const char *text, double most, int parts)
 {
     char *end;

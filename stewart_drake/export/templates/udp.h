@@ -22,6 +22,9 @@ int udp_draw(void *bytes, size_t size);
    which is printed. */
 int udp_open(uint16_t port, stewart_key key);
 
+/* Whether the first argument is --help or -h; then prints the usage. */
+int udp_help(int argc, char **argv, const char *usage);
+
 /* A number of the command line, above 0 and up to `most`, a whole one unless `parts`. Prints an error and
    returns 0 for anything else. */
 double udp_number(const char *name, const char *text, double most, int parts);
