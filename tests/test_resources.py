@@ -28,9 +28,14 @@ def test_a_path_starts_from_the_given_folder_or_the_working_directory(tmp_path, 
     assert resources.resolve("scenario", "sub/mine.yaml", relative_to=tmp_path) == file
     assert resources.resolve("scenario", "mine.yaml", relative_to=file.parent) == file
     assert resources.resolve("scenario", file) == file
+    inside = file.with_name("scenario.yaml")
+    inside.touch()
+    assert resources.resolve("scenario", file.parent) == inside
     monkeypatch.chdir(tmp_path)
     assert resources.resolve("scenario", "./sub/mine.yaml") == file
     assert resources.resolve("scenario", Path("sub/mine.yaml")) == file
+    with pytest.raises(ConfigError, match=r"got 'sub'; expected sub/scenario\.yaml, one of"):
+        resources.resolve("scenario", "sub")
 
 
 def test_a_shipped_name_is_a_file_and_never_one_in_the_working_directory(tmp_path, monkeypatch):

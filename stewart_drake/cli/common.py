@@ -36,7 +36,7 @@ def _shipped_argument(kind: Kind) -> Any:
     def complete(incomplete: str) -> list[str]:
         return [name for name in shipped(kind) if name.startswith(incomplete)]
 
-    help = "Shipped name or file."
+    help = f"Shipped name, file, or folder with {kind}.yaml."
     return typer.Argument(metavar=kind.upper(), help=help, autocompletion=complete)
 
 

@@ -59,7 +59,7 @@ def resolve(kind: Kind, name_or_path: str | Path, relative_to: Path | None = Non
 
     Args:
         kind: of the data.
-        name_or_path: a shipped name or a path.
+        name_or_path: a shipped name, or the path of a file or of a folder with a file KIND.yaml.
         relative_to: folder that relative paths start from; the working directory by default.
 
     Raises:
@@ -67,14 +67,18 @@ def resolve(kind: Kind, name_or_path: str | Path, relative_to: Path | None = Non
     """
     if is_path(name_or_path):
         path = absolute_path(name_or_path, relative_to)
+        if os.path.exists(inside := path / f"{kind}.yaml"):
+            return inside
         if os.path.exists(path):
             return path
         raise ConfigError(f"{kind}: no file {str(path)!r}; shipped names: {_nearest(kind, '')}")
     name, (_, folder, suffix) = str(name_or_path), KINDS[kind]
     path = data_root() / folder / f"{name}{suffix}"
     if not name or not path.exists():
+        inside = f"{name}/{kind}.yaml"  # of a folder, without a slash
+        nearest = f"{inside}, " if name and absolute_path(inside, relative_to).exists() else ""
         raise ConfigError(
-            f"{kind}: got {name!r}; expected one of {_nearest(kind, name)}, or a path "
+            f"{kind}: got {name!r}; expected {nearest}one of {_nearest(kind, name)}, or a path "
             "(with a slash, or ending in .yaml, .yml or .json)"
         )
     return path
