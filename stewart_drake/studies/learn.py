@@ -39,7 +39,6 @@ from stewart_drake.loop.results import SimulationResult, accumulated_error
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.signals import NUM_PARAMETERS, POSE, RATES
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.study_options import LearnOptions
@@ -134,14 +133,7 @@ def check_learning(scenario: Scenario) -> None:
     if scenario.controller.learned is not None:
         raise ConfigError("controller.learned: got a file; expected null, where learning begins")
     motion_period(scenario)
-    if found := differing(scenario, {"link.kind": "wire"}):
-        raise ConfigError(
-            found.problem(
-                "for learning",
-                ", with a delay.steps that covers the round trip; over a network `live --learn` "
-                "measures the link itself",
-            )
-        )
+    LearnOptions().check_scenario(scenario)
     # The rules for a file hold for what is learned.
     asking = replace(scenario, controller=replace(scenario.controller, learned="learned.npz"))
     asking.check()

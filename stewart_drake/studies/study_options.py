@@ -12,6 +12,7 @@ from pydantic.dataclasses import dataclass
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import one_message, units_of, validate, validate_pairs
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.studies.options import JobOptions, Options, option
 
@@ -89,6 +90,16 @@ class DelayOptions(Options):
 
 class LearnOptions(Options):
     repetitions: int = option(6, "Largest number of repetitions.", "N", ge=1, le=1000)
+
+    def check_scenario(self, scenario: Scenario) -> None:
+        if found := differing(scenario, {"link.kind": "wire"}):
+            raise ConfigError(
+                found.problem(
+                    "for learning",
+                    ", with a delay.steps that covers the round trip; over a network `live --learn` "
+                    "measures the link itself",
+                )
+            )
 
 
 class LinkOptions(Options):
