@@ -182,9 +182,13 @@ def test_a_file_of_another_machine_or_damaged_is_refused(file, tmp_path):
     bad.coefficients[0, 0] = np.nan
     save_learned(tmp_path / "nan.npz", bad, own)
     (tmp_path / "text.npz").write_text("text")
+    (tmp_path / "cut.npz").write_bytes(file.read_bytes()[:300])
+    np.savez(tmp_path / "names.npz", coefficients=bad.coefficients)
+    damaged = r"cannot be read \(it is damaged, or of another kind\); expected a file that the"
     for name, message in (
-        *(("other.npz", "another machine"), ("nan.npz", "NaN"), ("text.npz", "cannot be read")),
-        ("none.npz", "cannot be read"),
+        *(("other.npz", "another machine"), ("nan.npz", "NaN"), ("text.npz", damaged)),
+        *(("cut.npz", damaged), ("names.npz", r"names\.npz: has arrays of other names, kinds")),
+        ("none.npz", r"none\.npz: cannot be read \(No such file or directory\); expected"),
     ):
         with pytest.raises(ConfigError, match=message):
             prepare_law(scenario(f"controller.learned={tmp_path / name}"))
@@ -210,6 +214,12 @@ def test_boards_and_setpoints_do_not_get_a_learned_torque(file, tmp_path):
 def test_what_cannot_be_learned_is_refused(setting):
     with pytest.raises(ConfigError, match=r"^[^\n]+$"):
         study_learn(scenario(setting), LearnOptions())
+
+
+def test_the_command_describes_no_network_that_it_refuses(capsys):
+    assert main(["learn", "paper", "--set", "link.kind=network"]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("error: link.kind: got 'network' for learning")
 
 
 @pytest.mark.slow

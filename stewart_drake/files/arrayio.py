@@ -1,5 +1,6 @@
 """Files of arrays: .npz and NetCDF."""
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,12 +21,13 @@ def load_npz(path: Path, shapes: Shapes, expected: str) -> dict[str, NDArray[Any
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
-        found = {name: (array.dtype.kind, array.shape) for name, array in arrays.items()}
-        if found != shapes:
-            raise ValueError("its arrays have other names, kinds or shapes")
-        return arrays
     except Exception as error:  # from zipfile, zlib and numpy
         raise _unreadable(path, error, expected) from None
+    if {name: (array.dtype.kind, array.shape) for name, array in arrays.items()} != shapes:
+        raise ConfigError(
+            f"{path}: has arrays of other names, kinds or shapes; expected {expected}"
+        )
+    return arrays
 
 
 def load_netcdf(path: Path, expected: str) -> xr.Dataset:
@@ -47,5 +49,6 @@ def write_netcdf(path: Path, data: xr.Dataset) -> None:
 
 
 def _unreadable(path: Path, error: Exception, expected: str) -> ConfigError:
-    problem = " ".join(str(error).split())[:120] or type(error).__name__
+    number = error.errno if isinstance(error, OSError) else None
+    problem = os.strerror(number) if number else "it is damaged, or of another kind"
     return ConfigError(f"{path}: cannot be read ({problem}); expected {expected}")
