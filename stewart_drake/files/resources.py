@@ -75,8 +75,8 @@ def resolve(kind: Kind, name_or_path: str | Path, relative_to: Path | None = Non
     name, (_, folder, suffix) = str(name_or_path), KINDS[kind]
     path = data_root() / folder / f"{name}{suffix}"
     if not name or not path.exists():
-        inside = f"{name}/{kind}.yaml"  # of a folder, without a slash
-        nearest = f"{inside}, " if name and absolute_path(inside, relative_to).exists() else ""
+        own = f"{name}/{kind}.yaml"  # of a folder, without a slash
+        nearest = f"{own}, " if name and absolute_path(own, relative_to).exists() else ""
         raise ConfigError(
             f"{kind}: got {name!r}; expected {nearest}one of {_nearest(kind, name)}, or a path "
             "(with a slash, or ending in .yaml, .yml or .json)"

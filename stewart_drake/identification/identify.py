@@ -284,7 +284,8 @@ def _unknowns(
         speeds.append(float(np.abs(turns / spans[:, None]).max()))
     if not max(speeds) > 0:
         raise ConfigError(
-            f"{_files(log for log, _ in pairs)}: got a plate that does not move; expected one that does"
+            f"{_files(log for log, _ in pairs)}: got a plate that does not move; expected one that "
+            "does"
         )
     torque = max(float(np.abs(log.torques).max()) for log, _ in pairs)
     unknowns = unknowns_of(mechanism, tolerances, believed, torque, max(speeds))

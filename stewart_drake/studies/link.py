@@ -99,13 +99,13 @@ class LinkStudy:
 
     @property
     def alike(self) -> dict[float, float]:
-        """Usable bounds in s that the seeds do not show to be worse than the best, each with its excess.
+        """Usable bounds in s that the seeds do not show to be worse than the best.
 
-        The excess is the largest share, with 95 % confidence, by which the mean E_ac exceeds that
-        of the best; NaN for one seed. A bound is worse if its mean is larger by NEGLIGIBLE and a
-        one-sided t-test confirms that it is larger. The test is paired, as all bounds have the same
-        seeds; where runs were lost it is one of two samples. Bounds that lost more runs than the
-        best are in `unconfirmed_losses`.
+        Each has its excess: the largest share, with 95 % confidence, by which the mean E_ac exceeds
+        that of the best; NaN for one seed. A bound is worse if its mean is larger by NEGLIGIBLE and
+        a one-sided t-test confirms that it is larger. The test is paired, as all bounds have the
+        same seeds; where runs were lost it is one of two samples. Bounds that lost more runs than
+        the best are in `unconfirmed_losses`.
         """
         best, found = self.best, dict[float, float]()
         for cell in self.usable:
@@ -123,7 +123,7 @@ class LinkStudy:
 
     @property
     def unconfirmed_losses(self) -> list[float]:
-        """Usable bounds in s that lost more runs than the best, which Fisher's test does not confirm."""
+        """Usable bounds in s that lost more runs than the best, unconfirmed by Fisher's test."""
         best, found = self.best, list[float]()
         for cell in self.usable:
             if best is None or len(cell.errors) >= len(best.errors):

@@ -96,8 +96,8 @@ class LearnOptions(Options):
             raise ConfigError(
                 found.problem(
                     "for learning",
-                    ", with a delay.steps that covers the round trip; over a network `live --learn` "
-                    "measures the link itself",
+                    ", with a delay.steps that covers the round trip; over a network `live "
+                    "--learn` measures the link itself",
                 )
             )
 
