@@ -10,7 +10,10 @@ from tests.browser import needs_chromium
 
 pytestmark = needs_chromium
 NARROW = 400
-MADE = Provenance("stewart-drake analyze hautus paper --out out/hautus")
+MADE = Provenance(
+    "stewart-drake analyze hautus paper "
+    + " ".join(f"--set plant.{'m' * k}=1e-4" for k in range(3, 25))
+)
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +33,25 @@ def small(tmp_path_factory):
     sections = [Section("Figure", Picture(figure, "Lines.")), Section("Tables", wide, words)]
     path = tmp_path_factory.mktemp("small") / "report.html"
     return write_page(Document("A page", "Fine.", sections), MADE, path)
+
+
+BROKEN = r"""(() => {
+  const text = document.querySelector('footer pre'), range = document.createRange(), found = [];
+  for (const parts = document.createTreeWalker(text, NodeFilter.SHOW_TEXT); parts.nextNode();)
+    for (const word of parts.currentNode.data.matchAll(/\S+/g)) {
+      range.setStart(parts.currentNode, word.index);
+      range.setEnd(parts.currentNode, word.index + word[0].length);
+      if (new Set([...range.getClientRects()].map(one => one.top)).size > 1) found.push(word[0]);
+    }
+  return found;
+})()"""
+"""Words of the command that a page breaks."""
+
+
+def test_no_line_ends_within_an_option(tab, small):
+    tab.open(small, NARROW, 1000)
+    assert tab.evaluate(BROKEN) == []
+    assert tab.evaluate("document.querySelector('footer pre').innerText") == MADE.command
 
 
 def enlarged(tab):

@@ -20,7 +20,7 @@ from stewart_drake.loop import bulk
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism import kinematics
-from stewart_drake.reporting.page import Provenance, html
+from stewart_drake.reporting.page import Provenance, html, unbroken
 from stewart_drake.reporting.robustness import document
 from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.studies import robustness, statistics
@@ -695,7 +695,7 @@ def test_the_command(tmp_path, capsys):
     summary = summary_in(out)
     assert summary["runs"] == 3 and summary["ranges"]["noise"] == 0.002
     assert summary["scenario"]["plant"]["kind"] == "exact"
-    command = "stewart-drake analyze robustness paper --set duration=0.2 --vary delay=0 --vary"
+    command = unbroken("analyze robustness paper --set duration=0.2 --vary delay=0 --vary")
     assert command in (out / "report.html").read_text()
     assert {p.name for p in out.iterdir() if p.name[0] != "."} == {
         "summary.json", "report.html", "runs.csv", "runs",

@@ -13,6 +13,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from jinja2 import Environment
+from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
 from stewart_drake.files.fileio import write_whole
@@ -60,12 +61,18 @@ def size(figure: Figure) -> tuple[int, int]:
     return round(width), round(height)
 
 
+def unbroken(text: object) -> Markup:
+    """Return escaped text in which a line never ends at the hyphens of --set or 1e-05."""
+    words = r"(?<!\S)(?!stewart-drake)\S*-\S+"
+    return Markup(re.sub(words, r'<span class="unbroken">\g<0></span>', str(escape(text))))
+
+
 @cache
 def environment() -> Environment:
     # Names come from files, and are escaped. Numbers in styles and scripts keep all digits.
     found = templates().overlay(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, finalize=None
     )
-    found.filters |= {"source": source, "size": size}
+    found.filters |= {"source": source, "size": size, "unbroken": unbroken}
     found.filters |= {"sentence": sentence, "kind": lambda block: type(block).__name__}
     return found
