@@ -125,13 +125,13 @@ def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bo
 def _of_run(path: Path, mechanism: Mechanism) -> Log:
     signals = read_run(path)
     scenario = scenario_of(signals, path)
+    if "torque_commanded" not in signals or not np.isfinite(signals.torque_commanded).any():
+        raise ConfigError(
+            f"{path}: has the torques that acted, not those sent, as a log of `machine`; "
+            "expected that of its controller, from `live --log`"
+        )
     try:
         time, measured = signals.time.values, signals.measurement.transpose("time", ...).values
-        if "torque_commanded" not in signals or not np.isfinite(signals.torque_commanded).any():
-            raise ConfigError(
-                f"{path}: has the torques that acted, not those sent, as a log of `machine`; "
-                "expected that of its controller, from `live --log`"
-            )
         commanded = signals.torque_commanded.transpose("time", "leg").values
         applied = signals.torque_applied.transpose("time", "leg").values
         believed = float(signals.delay_estimate.values[-1])
