@@ -296,7 +296,7 @@ def test_feedback_acts_between_two_recoveries(tmp_path):
         host, port = running.address
         wanted = sd.load_scenario("paper", settings=(*common, *law))
         result, study = learn_live(wanted, f"{host}:{port}", options, print)
-    assert len(study.repetitions) == 2
+    assert study is not None and len(study.repetitions) == 2
     first, second = (one.error for one in study.repetitions)
     assert second < 0.2 * first < 1
     assert result.status == "completed" and result.summary["live"]["recoveries"] > 2
