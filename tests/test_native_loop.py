@@ -167,6 +167,14 @@ def test_drawn_machines_end_as_in_drake():
     assert_drawn(range(4), 3.0)
 
 
+def test_the_plan_of_a_run_without_noise_is_not_that_of_one_with_noise():
+    """The law predicts in two steps with noise, else in one; plans within a limit depend on it."""
+    settings = ("controller.period=0.12", "delay.steps=7", "actuator.torque_limit=1", "duration=3")
+    run_in_bulk(scenario("paper", *settings))
+    noisy = scenario("paper", *settings, f"sensor.noise_std={[1e-5] * 12}")
+    assert_same(run_in_bulk(noisy), drake(noisy))
+
+
 @pytest.mark.soak
 @pytest.mark.parametrize("part", range(5))
 def test_many_drawn_machines_end_as_in_drake(part):
