@@ -273,6 +273,8 @@ def test_error_names_the_legs_and_how_far_each_is_out_of_reach(leg, beyond):
     for method in (mechanism.jacobian, lambda p: leg_geometry(mechanism, p)):
         with pytest.raises(UnreachablePoseError):
             method(pose)
+        with pytest.raises(UnreachablePoseError, match="numbers that are not finite"):
+            method(np.full(6, np.nan))
 
 
 # ------------------------------------------------------------------ dead centre

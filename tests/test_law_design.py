@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.trajectories import PiecewisePolynomial
 
 import stewart_drake as sd
@@ -29,7 +30,10 @@ def law_of(scenario, **changes):
 
 @pytest.mark.parametrize("fraction", [0.0, 0.5])
 def test_it_is_the_law_of_the_scenario(fraction):
-    """The loop of a scenario, made by hand from public parts, gives the same torques."""
+    """The loop of a scenario, made by hand from public parts, gives the same torques.
+
+    With a fraction the weights come from a system of the diagram.
+    """
     settings = ("plant.kind=exact", "duration=2", f"delay.fraction={fraction}", "delay.steps=4")
     scenario = sd.load_scenario("paper", settings=settings)
     # As a trajectory too, whose size is its range within the duration.
@@ -41,7 +45,9 @@ def test_it_is_the_law_of_the_scenario(fraction):
     config = sd.PlantConfig(kind="exact")
     start = scenario.reference.offset
     platform = sd.AddStewartPlatform(builder, "paper", config, start=start)
-    controller = law.AddToBuilder(builder)
+    own = builder.AddSystem(ConstantVectorSource(law.weights)) if fraction else None
+    weights = None if own is None else own.get_output_port()
+    controller = law.AddToBuilder(builder, weights=weights)
     chain = builder.AddSystem(DelayChain(0.1, 4, fraction, law.queue))
     builder.Connect(platform.GetOutputPort("state"), controller.GetInputPort("measurement"))
     builder.Connect(controller.GetOutputPort("torque"), chain.get_input_port())

@@ -273,8 +273,8 @@ def test_a_state_out_of_reach_is_refused(kind):
         set_state(DiagramBuilder(), [0, 0, 5, *np.zeros(9)], kind)
 
 
-def own_plant(builder, finalized):
-    plant, _ = AddMultibodyPlantSceneGraph(builder, 1e-3)
+def own_plant(builder, finalized, time_step=1e-3):
+    plant, _ = AddMultibodyPlantSceneGraph(builder, time_step)
     if finalized:
         plant.Finalize()
     return plant
@@ -285,6 +285,10 @@ def own_plant(builder, finalized):
     [
         (lambda b: sd.AddStewartPlatform(b, PAPER, plant=own_plant(b, True)), "is finalized; exp"),
         (lambda b: sd.AddStewartPlatform(b, PAPER, plant=3), "plant: got 3; expected a Multibody"),
+        (
+            lambda b: sd.AddStewartPlatform(b, PAPER, plant=own_plant(b, False, 0.0)),
+            "plant: got a continuous one; expected",
+        ),
         (
             lambda b: sd.AddStewartPlatform(
                 b, PAPER, sd.PlantConfig(kind="exact"), plant=own_plant(b, False)

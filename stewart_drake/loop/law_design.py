@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, OutputPort
 from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.trajectories import Trajectory
 
@@ -530,12 +530,18 @@ class DesignedLaw:
         motion = followed_motion(self.law, self.planned, self.reference)
         return DelayLqiController(self.law, self.queue, motion)
 
-    def AddToBuilder(self, builder: DiagramBuilder, name: str = "delay_lqi") -> DelayLqiController:
+    def AddToBuilder(
+        self,
+        builder: DiagramBuilder,
+        name: str = "delay_lqi",
+        weights: OutputPort | None = None,
+    ) -> DelayLqiController:
         """Add the law, connected with its reference and weights.
 
         Args:
             builder: of the diagram.
             name: of the controller; its reference is `NAME_reference`, its weights `NAME_weights`.
+            weights: w_Q and w_R (2,) of a tuner in the diagram; constant ones if None.
 
         Returns:
             The controller. Connect its `measurement` (12) and its `torque` (6). The system that
@@ -546,9 +552,11 @@ class DesignedLaw:
         reference = builder.AddNamedSystem(
             f"{name}_reference", Reference(self.reference, self.planned, self.law.preview_times)
         )
-        weights = builder.AddNamedSystem(f"{name}_weights", ConstantVectorSource(self.weights))
+        if weights is None:
+            constant = ConstantVectorSource(self.weights)
+            weights = builder.AddNamedSystem(f"{name}_weights", constant).get_output_port()
         builder.Connect(reference.GetOutputPort("preview"), controller.GetInputPort("preview"))
-        builder.Connect(weights.get_output_port(), controller.GetInputPort("weights"))
+        builder.Connect(weights, controller.GetInputPort("weights"))
         return controller
 
 

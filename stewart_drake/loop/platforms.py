@@ -550,6 +550,11 @@ def AddStewartPlatform(
             raise ConfigError(
                 "plant: got one that is finalized; expected one before plant.Finalize()"
             )
+        if not plant.time_step() > 0:
+            raise ConfigError(
+                "plant: got a continuous one; expected MultibodyPlant(time_step) above 0, as "
+                "constraints close the legs"
+            )
     own = plant is None
     if plant is None:
         plant, scene_graph = add_scene(builder, config.time_step)

@@ -46,6 +46,8 @@ class UnreachablePoseError(ValueError):
             short = f"all legs {by[LEGS[0]]}"
         else:
             short = ", ".join(f"leg {leg} {text}" for leg, text in by.items())
+        if np.isnan(self.margins).any():
+            short = "got numbers that are not finite"
         super().__init__(f"{prefix}: {short}{suffix}")
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop.preparation import assemble, simulated_machine
-from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.results import SimulationResult, accumulated_error
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.reporting.analyses import analyze, options_of
@@ -317,8 +317,8 @@ def verdict(found: ReportData) -> tuple[str, Tone]:
     average = f"{number(round(mean_error(run), 9), 2)} % {_averaged(run)}"
     if floor > 0:
         text += (
-            f"{error} % s. The time before any torque can act contributes {number(floor)} % s; "
-            f"the rest is {average}."
+            f"{error} % s, {number(floor)} % s of it before any torque can act"
+            f"{_second_half(run)}. Once torques act the mean error is {average}."
         )
     else:
         text += f"{error} % s, {average}."
@@ -360,6 +360,17 @@ def _averaged(run: SimulationResult) -> str:
     return "of peak to peak on average" + (
         "" if moved.all() else f" over moving coordinates ({names})"
     )
+
+
+def _second_half(run: SimulationResult) -> str:
+    """Return the parts of E_ac until half of the run and after it, if torques act by then."""
+    s, half = run.summary, run.scenario.duration / 2
+    if half <= run.scenario.eta:
+        return ""
+    late = run.signals.sel(time=slice(half, None))
+    after = accumulated_error(late.time.values, late.error.values, assemble(run.scenario).scale)
+    between = s["accumulated_error"] - s["delay_floor"] - after
+    return f", {number(between)} % s until half of the run, and {number(after)} % s after it"
 
 
 def mean_error(run: SimulationResult) -> float:
