@@ -232,7 +232,7 @@ def test_the_controller_in_c_hears_what_has_acted(soon, tmp_path):
     take that for a torque bias, which takes the plate four amplitudes away."""
     settings = (*in_a_row(10, loss=0.2, seed=12), "controller.packet_torques=8")
     states, said, _ = over(soon, settings, tmp_path / "log", SLOW)
-    dry = int(re.search(r"(\d+) periods? dry", said)[1])
+    dry = int(re.search(r"(\d+) periods? without one", said)[1])
     undisturbed = simulated(40, LONG)
     assert dry >= 2
     most = np.abs(simulated(40, settings) - undisturbed) / MOTION
