@@ -695,7 +695,9 @@ def test_the_command(tmp_path, capsys):
     summary = summary_in(out)
     assert summary["runs"] == 3 and summary["ranges"]["noise"] == 0.002
     assert summary["scenario"]["plant"]["kind"] == "exact"
-    command = unbroken("analyze robustness paper --set duration=0.2 --vary delay=0 --vary")
+    command = unbroken(
+        "stewart-drake analyze robustness paper --set duration=0.2 --vary delay=0 --vary"
+    )
     assert command in (out / "report.html").read_text()
     assert {p.name for p in out.iterdir() if p.name[0] != "."} == {
         "summary.json", "report.html", "runs.csv", "runs",
