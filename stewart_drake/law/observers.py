@@ -343,10 +343,8 @@ def _delay_belief(law: Any, memory: Array, timeline: Timeline, faults: tuple[str
     state, last = memory[:NUM_STATE], memory[-m:]
     belief = Belief.nothing(timeline, m, np.array(c.ffi.unpack(settings.delay.prior, p)))
     if it.known:
-        best, L = (
-            c.lib.stewart_delay_hypothesis(p, m, num_in_flight, it, int(it.best)),
-            np.zeros((n, n)),
-        )
+        best = c.lib.stewart_delay_hypothesis(p, m, num_in_flight, it, int(it.best))
+        L = np.zeros((n, n))
         c.lib.stewart_hypothesis_root(best, n, c.at(L))
         mean, root = np.array(c.ffi.unpack(best.numbers, n))[:-2], L[:-2, :-2]
         seen = Innovations(best.chi2, best.chi2_values)

@@ -42,12 +42,12 @@ class UnreachablePoseError(ValueError):
         self.margins = np.asarray(margins)
         self.legs = tuple(leg for leg, m in zip(LEGS, self.margins, strict=True) if not m >= 0)
         by = {leg: f"short by {-1e3 * self.margins[leg - 1]:.3g} mm" for leg in self.legs}
-        if len(by) == len(LEGS) and len(set(by.values())) == 1:
+        if np.isnan(self.margins).any():
+            short = "got numbers that are not finite"
+        elif len(by) == len(LEGS) and len(set(by.values())) == 1:
             short = f"all legs {by[LEGS[0]]}"
         else:
             short = ", ".join(f"leg {leg} {text}" for leg, text in by.items())
-        if np.isnan(self.margins).any():
-            short = "got numbers that are not finite"
         super().__init__(f"{prefix}: {short}{suffix}")
 
 
