@@ -149,12 +149,13 @@ class Hand(Viewer):
 def test_a_hand_leads_from_the_motion_until_a_leg_is_at_the_end_of_its_reach():
     hand = Hand(load_mechanism("paper").home + [0, 0, 0, 0, 0, 0.3])
     with paper_machine(rate=2.0) as running:
-        result = driven(running, 7.0, viewer=hand)
+        result = driven(running, 9.0, viewer=hand)
     assert result.status == "completed"
-    last = hand.seen[69]  # then it comes to rest
-    assert [one.resting for one in hand.seen[68:72]] == [False, False, True, True]
+    last = hand.seen[89]  # then it comes to rest
+    assert [one.resting for one in hand.seen[88:91]] == [False, False, True]
     assert last.by_hand and "leg" in last.limit and last.state[5] > 0.45
-    np.testing.assert_allclose(last.state[POSE], last.wanted[POSE], atol=2e-3)
+    away = np.array([one.state[POSE] - one.wanted[POSE] for one in hand.seen[:90]])
+    assert np.abs(away).max() < 3e-3 and np.abs(away[80:]).max() < 3e-4
 
 
 @pytest.mark.slow
@@ -280,6 +281,45 @@ def test_measurements_may_take_longer_than_a_period():
         result = driven(running, 4.0, *FROM_REST, "link.kind=network")
     assert result.status == "completed"
     assert result.summary["measured_share"] > 0.85  # 0.65 without the wait
+
+
+@pytest.mark.slow
+@in_real_time
+def test_coarse_encoders_over_a_lossy_link_come_to_rest():
+    """Their rates are uncertain, which is no reason for a new reference."""
+    way = "low: 0.005, high: 0.03, loss: 0.05"
+    link = f"link={{kind: network, {way}, burst: 3, return: {{{way}}}}}"
+    heavy = ("plant.gravity=true", "start=rest", "queue=equilibrium", "controller.period=0.02")
+    encoders = ("sensor={kind: encoders, bits: 12, samples: 8}", "actuator.torque_limit=6")
+    settings = (*heavy, *encoders, "reference.amplitude=[0, 0, 0, 0, 0, 0.01]", link)
+    said = []
+    with paper_machine(*settings) as running:
+        ready = prepare_session(scenario_of(*settings), running.address)
+        result = drive(ready, 3.0, accept_jitter=True, say=said.append)
+    assert result.status == "completed" and any("at rest" in line for line in said), said
+    assert result.accumulated_error < 0.5 and result.summary["live"]["recoveries"] == 0
+
+
+LOADED = ("plant.gravity=true", "start=rest", "queue=equilibrium", "actuator.torque_limit=6")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("settings", "unknown", "error"),
+    [
+        ((*LOADED, "reference.amplitude=[0, 0, 0, 0, 0, 0.02]"), "payload_mass=0.15", 48),
+        (("delay.steps=3",), "push={wrench: [0, 0, 0, 0.1, 0, 0], from: 1.0, to: 100}", 27),
+    ],
+)
+@in_real_time
+def test_a_plate_that_was_carried_off_is_led_back(settings, unknown, error):
+    """Without a new reference the loaded plate is lost. One at every sample takes E of the pushed
+    plate to 30 % s.
+    """
+    with paper_machine(*settings, f"plant.{unknown}", rate=5.0) as running:
+        result = driven(running, 8.0, *settings)
+    assert result.status == "completed" and 1 <= result.summary["live"]["recoveries"] < 6
+    assert result.accumulated_error < error
 
 
 # ---------------------------------------------------------------- the end

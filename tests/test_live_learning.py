@@ -285,8 +285,8 @@ def test_a_repetition_of_which_too_little_was_measured_is_done_again(measured, e
 
 @pytest.mark.slow
 @in_real_time
-def test_feedback_acts_between_two_recoveries(tmp_path):
-    """Friction keeps the small motion 10 % off. Led back at every sample, it would be lost."""
+def test_friction_that_keeps_the_plate_off_is_learned(tmp_path):
+    """It keeps the small motion 10 % off, which is no reason for a new reference."""
     small = "reference.amplitude=[0.08,0.08,0.08,0.008,0.008,0.02]"
     common = ("plant.kind=exact", "delay.steps=3", small, "reference.frequency=1.7")
     machine = sd.load_scenario("paper", settings=(*common, "plant.coulomb_friction=2e-4"))
@@ -298,8 +298,8 @@ def test_feedback_acts_between_two_recoveries(tmp_path):
         result, study = learn_live(wanted, f"{host}:{port}", options, print)
     assert study is not None and len(study.repetitions) == 2
     first, second = (one.error for one in study.repetitions)
-    assert second < 0.2 * first < 1
-    assert result.status == "completed" and result.summary["live"]["recoveries"] > 2
+    assert second < 0.2 * first and second < 0.5
+    assert result.status == "completed" and result.summary["live"]["recoveries"] == 0
 
 
 @pytest.mark.slow

@@ -13,18 +13,17 @@ too long if three standard deviations of a leg exceed its remaining reach.
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 from scipy.linalg import expm
 
 from stewart_drake.dynamics.workspace import diagnose
-from stewart_drake.law.belief import Belief, Estimate
+from stewart_drake.law.belief import Estimate
+from stewart_drake.law.horizon import pose_root
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.timeline import Timeline, TorqueSchedule
 from stewart_drake.live.governor import Steering
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE, NUM_TORQUES, POSE, RATES
 from stewart_drake.types import Array
 
@@ -144,9 +143,12 @@ def replanned(
 def recovered(
     steering: Steering, law: Any, memory: Any, t: float, size: Array
 ) -> Steering | str | None:
-    """Return a new reference if the prediction is too far from the old one, else None.
+    """Return a new reference if the prediction is surely too far from the old one, else None.
 
-    Where there is none, the reason is returned. `memory` is that of the law after the sample at t
+    Surely: by more than three standard deviations, since encoders with a coarse quantum may let a
+    plate at rest seem far off. Only poses are judged: the law corrects a rate before it becomes an
+    error of the pose, whereas a new reference needs a second. If there is none, the reason is
+    returned. `memory` is that of the law after the sample at t
     in s, `size` (6,) that of the motion.
     """
     belief, plant, in_flight = memory.belief, law.plant, memory.in_flight
@@ -158,24 +160,13 @@ def recovered(
     schedule = TorqueSchedule(
         np.vstack([until.torques, in_flight[-1:]]), np.append(until.durations, period)
     )
-    ahead = plant.predict(belief.state, schedule, belief.parameters)[-1]
-    away = np.abs(ahead - _wanted(steering, law, t, in_flight[-1], belief)) / np.tile(size, 2)
-    if not away.max() > REPLAN_ERROR:  # or NaN
+    states = plant.predict(belief.state, schedule, belief.parameters)
+    away = np.abs(states[-1, POSE] - steering.way.at(t + belief.timeline.eta + period)[POSE])
+    far = away > REPLAN_ERROR * size  # False where NaN
+    if not far.any():
         return None
+    with suppress(ArithmeticError):  # next to a dead centre there is no time to lose
+        root = pose_root(plant, belief, schedule, states)
+        if not np.any(far & (away > _DEVIATIONS * np.linalg.norm(root, axis=1))):
+            return None
     return replanned(steering, plant, t, belief.state, schedule, belief.parameters)
-
-
-def _wanted(steering: Steering, law: Any, t: float, torque: Array, belief: Belief) -> Array:
-    """Return the state (12,) that the next torque leads to at the end of its hold, if all is well.
-
-    Constant torques reach the poses of the reference there. The rates differ from its rates by
-    equation (rates) of `law.feedforward`.
-    """
-    way, timeline, dynamics = steering.way, belief.timeline, law.plant.dynamics
-    wanted = way.at(t + timeline.eta + timeline.period)[:NUM_STATE].copy()
-    nodes = [way.at(t + node) for node in law.feedforward.nodes(timeline, 0)]
-    changes = law.feedforward.held(np.array(nodes), dynamics, belief.parameters).changes
-    with suppress(ArithmeticError, np.linalg.LinAlgError):
-        B = law.model.at(wanted, torque, belief.parameters, law.plant).B[RATES]
-        wanted += law.feedforward.offset(changes[1:], B, replace(timeline, delay=Delay(1)))
-    return wanted

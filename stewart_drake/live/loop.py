@@ -6,6 +6,7 @@ taken all the same, one after the other, until the loop has caught up.
 
 import math
 import time as clock
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -52,7 +53,12 @@ from stewart_drake.types import Array
 START_ERROR: Final = 0.02
 """Distance from the scenario's start up to which the plate is there, as a share of the motion."""
 REST_RATE: Final = 0.005
-"""Rate up to which the plate is at rest, in the same unit per s."""
+"""Rate up to which a reference is at rest, in the same unit per s."""
+_REST_TIME: Final = 0.5
+"""Time within which a plate at rest moves by at most START_ERROR, s.
+
+Its rate alone says less: coarse encoders let it tremble.
+"""
 RESTING: Final = 8.0
 """Longest time for coming to rest, s."""
 _SOFT_STARTS: Final = (1.0, 2.0, 4.0, 8.0)
@@ -111,6 +117,7 @@ class LiveLoop:
         self.recoveries, self.taken_over = 0, False
         self._feedback_acted = 0.0  # s, from when on the plate may be led back again
         self.missed, self.resting = 0, list[float]()
+        self._poses = deque[Array](maxlen=1 + math.ceil(_REST_TIME / self._period))
 
     def _ahead(self) -> float:
         """Return how far ahead of a sample the reference is fixed, s."""
@@ -178,7 +185,7 @@ class LiveLoop:
                 return end
             rests, k = self._rests(k), k + 1
             if not held and (rests or k == last):
-                found = "at rest" if rests else "still in motion"
+                found = "at rest" if rests else f"still in motion, {self._motion()}"
                 self._watch.report(k, f"{found}; held until {again}" if self._hold else found)
                 held = self._hold
                 if not held:
@@ -188,8 +195,16 @@ class LiveLoop:
     def _rests(self, k: int) -> bool:
         way, t = self._steering.way, k * self._period
         wanted = np.array([way.at(t)[RATES], way.at(t + self._horizon)[RATES]])
-        rates = np.vstack([wanted, self.memory.belief.state[RATES]])
-        return bool(np.all(np.abs(rates) <= REST_RATE * self._size))
+        still = np.all(np.abs(wanted) <= REST_RATE * self._size)
+        return bool(still and np.all(self._moved() <= START_ERROR * self._size))
+
+    def _moved(self) -> Array:
+        """Return by how much each coordinate (6,) has varied during the last _REST_TIME."""
+        return np.asarray(np.ptp(self._poses, axis=0))
+
+    def _motion(self) -> str:
+        angle, way = self._moved()[:3].max(), self._moved()[3:].max()
+        return f"by {math.degrees(angle):.2g} deg and {1e3 * way:.2g} mm in {_REST_TIME:g} s"
 
     def _sample(self, k: int, message: MachineMessage | None) -> End | None:
         """Step the law and send its torques; return the end of the run, or None."""
@@ -219,6 +234,7 @@ class LiveLoop:
         packet, first = self._packet(k)
         seconds = clock.perf_counter() - started
         self._send(k, packet, first)
+        self._poses.append(self.memory.belief.state[POSE])
         late = self.exchange.late(k)
         self.missed += late > self.exchange.real_period + self.exchange.jitter
         wanted = self._steering.way.at(t)
