@@ -50,7 +50,9 @@ def read(path):
 def test_a_csv_log_is_read(tmp_path):
     path = tmp_path / "log.csv"
     poses = ["roll[deg]", "pitch[rad]", "yaw[rad]", "x[mm]", "y[m]", "z[m]"]
-    rows = [[*row, "1.5", "0.1", "", "2", "0", "0.38"] for row in ROWS]
+    rows = [
+        [*row, "1.5", "0.1", ("", "nan")[k % 2], "2", "0", "0.38"] for k, row in enumerate(ROWS)
+    ]
     path.write_text(csv_text([*HEADER, *poses], rows))
     log = read(path)
     assert len(log.times) == 60 and log.gravity == 9.81 and log.delay is None

@@ -71,7 +71,7 @@ def read_table(
         units: of all columns that it may have.
         prefix: that the names in `units` may have in the file. If only columns with the prefix
             are in `units`, apart from `time`, all columns without it are ignored.
-        optional: names of columns whose cells may be empty.
+        optional: names of columns whose cells may be empty, or nan.
 
     Raises:
         ConfigError: one line that begins with the path, and the row and column if there are any.
@@ -105,7 +105,7 @@ def read_table(
         # Converted by Python's float: that of pandas may round the last digit wrongly.
         is_number = pd.to_numeric(texts, errors="coerce").notna()
         values = texts.where(is_number, "nan").to_numpy(np.float64)
-        may_be_empty = (texts == "").to_numpy() & (name in optional)
+        may_be_empty = texts.str.lower().isin(("", "nan")).to_numpy() & (name in optional)
         wrong = np.flatnonzero(~(np.isfinite(values) | may_be_empty))
         if len(wrong):
             raise ConfigError(
