@@ -244,6 +244,8 @@ def test_a_plan_can_be_run(tmp_path):
     assert 1e-6 < summary["delay_std_s"] < 1e-4 and summary["share"] == 1
     unseen = set(summary["unseen"]["names"])
     assert {f"where the base stands along {axis}" for axis in "xyz"} <= unseen
+    alone = sd.controller_margin(tmp_path / "scenario.yaml").summary["delay_margin_s"]
+    assert summary["controller_margin"]["delay_margin_s"] == pytest.approx(alone, rel=1e-3)
     words = ["--set", "plant.kind=exact", "--set", "duration=3", "--out", str(tmp_path / "run")]
     assert main(["simulate", str(tmp_path / "scenario.yaml"), *words, "--quiet"]) == 0
     run = json.loads((tmp_path / "run" / "summary.json").read_text())

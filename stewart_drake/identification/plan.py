@@ -15,6 +15,8 @@ that follow it, J'J is known before anything has moved (Fisher's information).
 """
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -42,6 +44,7 @@ from stewart_drake.identification.unknowns import (
 )
 from stewart_drake.law.feedforward import mean_torques
 from stewart_drake.loop.bulk import run_in_bulk
+from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.trajectories import poses_along, rows_along
@@ -73,6 +76,7 @@ class Plan:
     share: float  # part of the requested amplitude that fits the workspace and the loop
     lost: Failure | None  # how the scenario's loop loses a larger motion, or None
     kept: bool  # whether it keeps this one
+    margin: ControllerMargin  # of the scenario's loop along this one
     times: Array  # (n,) s, of the motion
     poses: Array  # (n, 6) rad and m
     unknowns: Unknowns  # before the log
@@ -103,6 +107,7 @@ class Plan:
             "share": self.share,
             "lost": None if self.lost is None else str(self.lost),
             "kept": self.kept,
+            "controller_margin": self.margin.summary,
             "delay_std_s": float(self.std[DELAY]),
             "parameters": {
                 NAMES[k]: {
@@ -164,20 +169,23 @@ def fitted_multisine(
     )
 
 
-def loss_along(scenario: Scenario, times: Array, poses: Array) -> Failure | None:
-    """Return how the scenario's loop loses the plate along a motion, or None.
-
-    The plant is the exact one.
-    """
+@contextmanager
+def following(scenario: Scenario, times: Array, poses: Array) -> Iterator[Scenario]:
+    """Yield the scenario with the exact plant along a motion, whose file exists meanwhile."""
     with TemporaryDirectory() as folder:
         file = Path(folder) / MOTION
         file.write_text(motion_csv(times, poses), encoding="utf-8")
-        followed = dataclasses.replace(
+        yield dataclasses.replace(
             scenario,
             reference=CsvConfig(file=str(file)),
             duration=float(times[-1]),
             plant=scenario.plant.without_engine,
         )
+
+
+def loss_along(scenario: Scenario, times: Array, poses: Array) -> Failure | None:
+    """Return how the scenario's loop loses the plate along a motion, or None."""
+    with following(scenario, times, poses) as followed:
         return run_in_bulk(followed).stopped
 
 
@@ -200,6 +208,8 @@ def plan(experiment: Experiment, std: Array, tolerances: Tolerances | None = Non
         kept = loss_along(sc, times, poses) is None
     if not kept:
         times, poses, share = whole
+    with following(sc, times, poses) as followed:
+        judged = controller_margin(followed)
     motion = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(times, poses.T)
     log, states = _predicted(experiment, motion, times[-1], std)
     torque = float(np.abs(log.torques).max())
@@ -220,7 +230,7 @@ def plan(experiment: Experiment, std: Array, tolerances: Tolerances | None = Non
     spread = covariance(problem.normal(guess)[1])
     reference = CsvConfig(file=MOTION)
     changed = dataclasses.replace(sc, reference=reference, duration=float(times[-1]))
-    return Plan(changed, share, lost, kept, times, poses, unknowns, spread)
+    return Plan(changed, share, lost, kept, judged, times, poses, unknowns, spread)
 
 
 def _predicted(

@@ -14,7 +14,7 @@ _ADVICE: Final = {
     "computers or the network; else check the sensor. --max-missing SECONDS allows longer gaps.",
     "lost_machine": "Check the machine's process and the network, and the load of its computer. "
     "--max-missing SECONDS allows longer gaps. The machine goes to its safe torque by itself.",
-    "refused": "Correct what is named, then start live again.",
+    "refused": "Correct what is named, or bring the plate to its start; then start live again.",
 }
 """What to do after a run, by its status."""
 

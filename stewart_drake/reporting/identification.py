@@ -24,6 +24,7 @@ from stewart_drake.reporting.document import (
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import FACTORS, LEG_LINES, UNITS
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, PAYLOAD
+from stewart_drake.studies.verdict import loop_verdict
 from stewart_drake.types import Array
 
 _UNITS: Final = {
@@ -88,6 +89,7 @@ def plan_document(plan: Plan) -> Document:
         found=_unknowns(free, columns, brief=True),
         poses=plan.pose_uncertainty,
         reduced=plan.share < 1,
+        loop=loop_verdict(plan.margin),
         logs=(),
         segments="",
         **dict.fromkeys(("cautions", "weak", "outside", "fits", "residuals", "geometry")),
