@@ -374,10 +374,9 @@ class LiveLoop:
     def _lead(self, t: float, state: Array, message: MachineMessage | None) -> str | None:
         """Lead the plate from a state (12,) at t in s to the motion; return why not, or None."""
         design = self._design
-        acts = np.zeros(NUM_TORQUES)
+        queue = design.queue if self._parked else np.zeros_like(design.queue)
         if message is not None and len(message.acted):
-            acts = message.acted[0]
-        queue = np.tile(acts, (len(design.queue), 1))
+            queue = np.tile(message.acted[0], (len(queue), 1))
         self._law = replace(design.law, open_loop_samples=0)
         self.memory = self._law.initial_memory(queue)
         schedule = until_next(design.law.timeline, queue)
