@@ -753,7 +753,7 @@ int main(int argc, char **argv)
     }
     for (int i = 0; i < 3 && c.session.nonce; i++)
         say(&c, STEWART_STOP, 0, 0, 0);
-    printf("%s after %u samples, %u of them without a measurement, %u late\n",
+    printf("%s after %u samples, %u of them without a@" new" if wait@ measurement, %u late\n",
            problem ? problem : "completed", c.samples, c.missing, c.missed);
     udp_tell(c.refused);
     if (c.log)
