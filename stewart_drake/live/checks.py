@@ -12,7 +12,6 @@ too long if three standard deviations of a leg exceed its remaining reach.
 """
 
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Any, Final
 
 import numpy as np
@@ -20,7 +19,6 @@ from scipy.linalg import expm
 
 from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.law.belief import Estimate
-from stewart_drake.law.horizon import pose_root
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.timeline import Timeline, TorqueSchedule
 from stewart_drake.live.governor import Steering
@@ -37,7 +35,7 @@ _ROWS: Final = 8
 _KEPT: Final = 64
 """Number of periods whose sent torques are kept."""
 REPLAN_ERROR: Final = 0.08
-"""Prediction error at which a new reference is planned, as a share of the motion."""
+"""Smallest prediction error at which a new reference is planned, as a share of the motion."""
 
 
 def stays_within_reach(plant: NominalPlant, estimate: Estimate, torque: Array, span: float) -> bool:
@@ -143,13 +141,12 @@ def replanned(
 def recovered(
     steering: Steering, law: Any, memory: Any, t: float, size: Array
 ) -> Steering | str | None:
-    """Return a new reference if the prediction is surely too far from the old one, else None.
+    """Return a new reference if the law would hardly lead the plate back to the old one, else None.
 
-    Surely: by more than three standard deviations, since encoders with a coarse quantum may let a
-    plate at rest seem far off. Only poses are judged: the law corrects a rate before it becomes an
-    error of the pose, whereas a new reference needs a second. If there is none, the reason is
-    returned. `memory` is that of the law after the sample at t
-    in s, `size` (6,) that of the motion.
+    The law may overshoot by as much as the plate is off. It needs help where that pose, or the
+    predicted one, has less than half of the room that the reference has; elsewhere it is faster
+    than a new reference, which takes a second. If there is none, the reason is returned. `memory`
+    is that of the law after the sample at t in s, `size` (6,) that of the motion.
     """
     belief, plant, in_flight = memory.belief, law.plant, memory.in_flight
     if not (
@@ -160,13 +157,13 @@ def recovered(
     schedule = TorqueSchedule(
         np.vstack([until.torques, in_flight[-1:]]), np.append(until.durations, period)
     )
-    states = plant.predict(belief.state, schedule, belief.parameters)
-    away = np.abs(states[-1, POSE] - steering.way.at(t + belief.timeline.eta + period)[POSE])
-    far = away > REPLAN_ERROR * size  # False where NaN
-    if not far.any():
+    ahead = plant.predict(belief.state, schedule, belief.parameters)[-1, POSE]
+    wanted = steering.way.at(t + belief.timeline.eta + period)[POSE]
+    if not np.any(np.abs(ahead - wanted) > REPLAN_ERROR * size):  # or NaN
         return None
-    with suppress(ArithmeticError):  # next to a dead centre there is no time to lose
-        root = pose_root(plant, belief, schedule, states)
-        if not np.any(far & (away > _DEVIATIONS * np.linalg.norm(root, axis=1))):
-            return None
+    room, *others = (
+        plant.mechanism.reach_margins(pose).min() for pose in (wanted, ahead, 2 * wanted - ahead)
+    )
+    if min(others) > room / 2:
+        return None
     return replanned(steering, plant, t, belief.state, schedule, belief.parameters)

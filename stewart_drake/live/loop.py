@@ -115,7 +115,6 @@ class LiveLoop:
         self._late = 0  # number of overtaken measurements before it
         self._learned: Any = None if design.learned is None else self._learned_part(design)
         self.recoveries, self.taken_over = 0, False
-        self._feedback_acted = 0.0  # s, from when on the plate may be led back again
         self.missed, self.resting = 0, list[float]()
         self._poses = deque[Array](maxlen=1 + math.ceil(_REST_TIME / self._period))
 
@@ -387,17 +386,10 @@ class LiveLoop:
         return None
 
     def _recover(self, t: float) -> None:
-        """Lead the plate back from where it is predicted to be, if that is too far off.
-
-        Feedback, which starts again there, first acts for a delay: else an error that the model
-        cannot explain, such as friction, would move the reference at every sample.
-        """
-        if t < self._feedback_acted:
-            return
+        """Lead the plate back from where it is predicted to be, if the law would hardly do it."""
         steering = recovered(self._steering, self._design.law, self.memory, t, self._size)
         if isinstance(steering, Steering):  # otherwise tried again at the next sample
             self._steering, self.memory = steering, self.memory.without_error()
-            self._feedback_acted = t + 2 * (self.memory.belief.timeline.eta + self._period)
             self.recoveries += 1
 
     def _snapshot(self, k: int, wanted: Array, judged: Array) -> Snapshot:
