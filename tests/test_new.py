@@ -17,6 +17,7 @@ import stewart_drake as sd
 from stewart_drake.cli import main, model
 from stewart_drake.mechanism.kinematics import leg_geometry
 from stewart_drake.reporting.machine_form import MachineForm
+from stewart_drake.studies.study_options import Measurements
 from tests.browser import needs_chromium
 from tests.copies import Command
 from tests.screen import too_long
@@ -34,7 +35,10 @@ MEASURED = {
 }
 
 
-UNITS = {"base_radius": "200 mm", "shaft_distance": "13cm", "rod": "0.26 m", "rod_mass": "50 g"}
+UNITS = {
+    **{"base_radius": "200 mm", "shaft_distance": "13cm", "rod": "0.26 m", "rod_mass": "50 g"},
+    **{"delay": "50 ms", "torque_limit": "2 Nm"},
+}
 """Some of them in other units."""
 
 
@@ -90,7 +94,7 @@ def test_its_scenario_starts_as_live_advises(gravity, queue, tmp_path):
 @pytest.mark.usefixtures("blank_figures")
 def test_what_it_proposes_runs_and_is_reported(tmp_path, capsys):
     folder = tmp_path / "mine"
-    assert main(["new", str(folder), *flags(torque_limit=2.0, delay=0.05, **UNITS)]) == 0
+    assert main(["new", str(folder), *flags(**UNITS)]) == 0
     said = capsys.readouterr().out
     assert said.startswith("yes: ") and not too_long(said)
     assert "(estimated: uniform disc)" in said and "the motors have 2" in said
@@ -111,10 +115,28 @@ def test_what_it_proposes_runs_and_is_reported(tmp_path, capsys):
     assert page.count("<img") >= 4  # the drawing, and the figures of the run
     asked_for = yaml.safe_load((folder / "scenario.yaml").read_text())
     assert asked_for["mechanism"] == "machine.yaml"
-    # Lengths and masses have units; the function writes the same without them.
-    made(tmp_path, torque_limit=2.0)
-    texts = [(where / "machine.yaml").read_text() for where in (folder, tmp_path)]
-    assert texts[0] == texts[1]
+    # The function writes the same without units.
+    made(tmp_path, torque_limit=2.0, delay=0.05)
+    for name in ("machine.yaml", "scenario.yaml"):
+        texts = [(where / name).read_text() for where in (folder, tmp_path)]
+        assert texts[0] == texts[1]
+
+
+@pytest.mark.parametrize(
+    ("delay", "torque_limit"),
+    [
+        ("80 ms", "6 N m"),
+        ("80ms", "6Nm"),
+        ("0.08 s", "6000 mN m"),
+        ("0.08", " 6  "),
+        (" 80 ms ", "6000mNm"),
+        (0.08, 6),
+    ],
+)
+def test_delay_and_torque_limit_may_have_units(delay, torque_limit):
+    given = {name.replace("-", "_"): value for name, value in MEASURED.items()}
+    taken = Measurements(**given, delay=delay, torque_limit=torque_limit)
+    assert (taken.delay, taken.torque_limit) == (0.08, 6.0)
 
 
 @pytest.mark.usefixtures("blank_figures")
@@ -141,6 +163,9 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(tmp_path, capsys):
         ({"crank_mass": -1}, "--crank-mass: got -1.0; expected more than 0"),
         ({"shaft_distance": 0.35}, "--shaft-distance: got 0.35 m on a circle of radius 0.2 m"),
         ({"delay": -1}, "--delay: got -1.0; expected at least 0"),
+        ({"delay": "80"}, "--delay: got 80.0; expected at most 5"),
+        ({"delay": "80 mm"}, "--delay: got '80 mm'; expected a number with ms, s or without"),
+        ({"torque_limit": "6 N"}, "'6 N'; expected a number with mN m, N m or without"),
         ({"torque_limit": 0}, "--torque-limit: got 0.0; expected more than 0"),
         ({"torque_limit": 0.1}, "--torque-limit: got 0.1 N m, too weak to hold the plate at home"),
         ({"rod": None, "plate_mass": None}, "got no --rod, --plate-mass;"),
@@ -234,16 +259,21 @@ def test_the_form_refuses_strangers_and_malformed_requests(form):
     assert asked(form.url, "/other", json.dumps(fields()))[0] == 400
     with urlopen(form.url) as page:
         text = page.read().decode()
-    assert 'value="0.26"' in text and "Radius of the circle of the motor shafts" in text
+    assert (
+        'value="0.26"' in text
+        and 'value="0.1 s"' in text
+        and "Radius of the circle of the motor shafts" in text
+    )
 
 
 def test_the_form_gives_the_measurements_and_shows_the_report(form):
-    waiting = ThreadPoolExecutor(2)
+    waiting, late = ThreadPoolExecutor(2), {"delay": "80 ms", "torque_limit": "6 Nm"}
     measured = waiting.submit(form.wait)
     assert asked(form.url, "/write", json.dumps(fields(rod="")))[1]["problem"] == "is missing"
     assert not measured.done()
-    assert asked(form.url, "/write", json.dumps(fields(rod="260 mm")))[1]["problem"] is None
-    assert measured.result(timeout=30).rod == 0.26
+    assert asked(form.url, "/write", json.dumps(fields(rod="260 mm", **late)))[1]["problem"] is None
+    taken = measured.result(timeout=30)
+    assert (taken.rod, taken.delay, taken.torque_limit) == (0.26, 0.08, 6)
     shown = waiting.submit(form.show, "<p>done</p>")
     with urlopen(form.url.replace("/?", "/report?")) as page:
         assert page.read() == b"<p>done</p>"

@@ -16,7 +16,7 @@ setpoints reachy_mini --out out/setpoints.csv
 report paper --set plant.kind=exact --out out/report
 identify --plan paper --out out/plan
 identify out/lqi/signals.nc --mechanism paper --out out/m
-new mine --torque-limit 6 --delay 0.08
+new mine --torque-limit 6Nm --delay 80ms
 live --demo --duration 5 --no-browser --out out/live
 machine paper --set plant.kind=exact --port 0 --duration 1
 list

@@ -88,8 +88,8 @@ def new(
 ) -> int:
     """Make a machine and a first scenario from a few measurements.
 
-    Asks for the measurements that are not given. Lengths in m or with a unit, as 300 mm; masses in
-    kg, or as 250 g. Moments of inertia are estimated. Runs the scenario, and writes report.html.
+    Asks for the measurements that are not given. A number is in m, kg, s or N m, or has a unit, as
+    300 mm or 250 g. Moments of inertia are estimated. Runs the scenario, and writes report.html.
     """
     from stewart_drake.studies import new_machine as study
 

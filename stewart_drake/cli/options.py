@@ -117,7 +117,8 @@ def _parameter(one: Option) -> inspect.Parameter:
     if one.read:
         annotation, default = list[str] | None, None
     elif one.unit:
-        annotation, default = str | None, None if one.required else f"{default:g} {one.unit}"
+        bare = one.required or default is None
+        annotation, default = str | None, None if bare else f"{default:g} {one.unit}"
     elif one.required:
         annotation, default = annotation | None, None
     option = typer.Option(

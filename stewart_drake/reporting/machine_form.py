@@ -1,7 +1,6 @@
 """Form for the measurements of a machine, a page on this computer with a drawing that follows."""
 
 import json
-import re
 import threading
 from collections.abc import Mapping
 from pathlib import Path
@@ -126,10 +125,12 @@ def _field(one: Option, given: Any) -> dict[str, Any]:
     if get_origin(one.annotation) is Literal:
         choices = list(get_args(one.annotation))
     default = "" if one.required or one.default is None else one.default
+    if one.unit and default != "":
+        default = f"{default:g} {one.unit}"
     value = default if given is None else given
     text = str(value).lower() if isinstance(value, bool) else f"{value}"
-    label = re.sub(r", (m|kg)\.$", ".", one.help).removesuffix(".")
-    example = {"m": "300 mm", "kg": "250 g"}.get(one.unit or "", "")
+    label = one.help.removesuffix(".").removesuffix(f", {one.unit}")
+    example = {"m": "300 mm", "kg": "250 g", "N m": "6 N m"}.get(one.unit or "", "")
     return {
         "name": one.name,
         "label": label,

@@ -49,18 +49,22 @@ def option(
 _UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "m": {"mm": 1e-3, "cm": 1e-2, "m": 1.0},
     "kg": {"g": 1e-3, "kg": 1.0},
+    "s": {"ms": 1e-3, "s": 1.0},
+    "N m": {"mN m": 1e-3, "N m": 1.0},
 }
 
 
 def quantity(name: str, text: str, unit: str) -> float:
-    """Return a text such as `300 mm`, `0.3 m` or `0.3` in a unit, m or kg."""
-    number, word = re.fullmatch(r"\s*(.*?)\s*([^\W\d_]*)\s*", text, re.DOTALL).groups()  # type: ignore[union-attr]
-    smallest, factor = next(iter(_UNITS[unit])), _UNITS[unit].get(word or unit)
+    """Return a text such as `300 mm`, `0.3 m` or `0.3` in a unit: m, kg, s or N m."""
+    number, word = re.fullmatch(r"\s*(.*?)\s*((?:[^\W\d_]+ ?)*)\s*", text, re.DOTALL).groups()  # type: ignore[union-attr]
+    together = {name.replace(" ", ""): factor for name, factor in _UNITS[unit].items()}  # 6 Nm
+    factor = (together | _UNITS[unit]).get(word.strip() or unit)
     try:
         value = float(number)
     except ValueError:
         factor = None
     if factor is None:
+        smallest = next(iter(_UNITS[unit]))
         size = f"{0.3 / _UNITS[unit][smallest]:g}"
         raise ConfigError(
             f"{name}: got {text!r}; expected a number with {', '.join(_UNITS[unit])} or without, "
@@ -94,7 +98,8 @@ class Option(NamedTuple):
     @property
     def accepted(self) -> Any:
         """Type of the Python argument, which also takes texts as of the command line."""
-        return Sequence[str] | self.annotation if self.read else self.annotation
+        texts = Sequence[str] if self.read else str
+        return texts | self.annotation if self.read or self.unit else self.annotation
 
     @property
     def dashed(self) -> str:

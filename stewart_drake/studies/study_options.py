@@ -219,7 +219,7 @@ _Mass = Annotated[float, Field(gt=0, lt=1e6)]
 
 
 class Measurements(Options):
-    """Measurements of a machine with a ruler and scales, in m and kg, or as `300 mm`, `250 g`."""
+    """Measurements of a machine with a ruler and scales, in m, kg, s, N m, or as `300 mm`."""
 
     base_radius: _Length = option(..., "Radius of the circle of the motor shafts, m.", unit="m")
     shaft_distance: _Length = option(..., "Distance of the two shafts of a pair, m.", unit="m")
@@ -239,8 +239,12 @@ class Measurements(Options):
     cranks: Literal["apart", "together"] = option(
         "apart", "Of a pair: they point apart, or together."
     )
-    torque_limit: float | None = option(None, "Torque limit of each motor, N m.", gt=0, lt=1e6)
-    delay: float = option(0.1, "Time from computing a torque to its action, s.", ge=0, le=5)
+    torque_limit: float | None = option(
+        None, "Torque limit of each motor, N m.", unit="N m", gt=0, lt=1e6
+    )
+    delay: float = option(
+        0.1, "Time from computing a torque to its action, s.", unit="s", ge=0, le=5
+    )
     gravity: bool = option(True, "Gravity acts; not on a counterbalanced plate.")
 
     def __init__(self, **values: object) -> None:
