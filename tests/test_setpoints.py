@@ -136,6 +136,16 @@ def test_a_motion_shorter_than_its_soft_start_is_refused():
     assert made("duration=0.9", ON).blend == 0
 
 
+@pytest.mark.parametrize(("duration", "said"), [(3, True), (2, False), (1.5, False)])
+def test_the_command_says_where_a_shorter_motion_ends(duration, said, tmp_path, capsys):
+    poses = [ROBOT.home.tolist(), (ROBOT.home + [0, 0.1, 0, 0, 0, 0]).tolist()]
+    motion = f"reference={{kind: waypoints, times: [0, 2], poses: {poses}}}"
+    settings = ["--set", motion, "--set", f"duration={duration}"]
+    assert main(["setpoints", "--out", str(tmp_path / "a.csv"), *settings]) == 0
+    line = f"\nthe motion ends at 2 s: its last pose is held up to {duration} s\n"
+    assert (line in capsys.readouterr().out) == said
+
+
 def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
     log = tmp_path / "log.csv"
     log.write_text("x")

@@ -19,7 +19,7 @@ from stewart_drake.law.servos import Stiffness, rise, turned
 from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
 from stewart_drake.loop.servos import known_stiffness
-from stewart_drake.mechanism.trajectories import evaluate
+from stewart_drake.mechanism.trajectories import PlateTrajectory, evaluate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.field_types import Row, section
 from stewart_drake.scenario.signals import ACCELERATIONS, LEGS, NUM_TORQUES, POSE, RATES
@@ -80,6 +80,7 @@ class Setpoints:
     crank_rates: Array  # (n, 6) rad/s
     torques: Array  # (n, 6) that the motion takes there from the servos, N m
     blend: float  # length of the soft start, s; 0 without one
+    ends: float = math.inf  # end of a motion that is shorter than the duration, s
 
     def __repr__(self) -> str:
         return f"Setpoints({len(self.times)} of six cranks)"
@@ -93,6 +94,9 @@ class Setpoints:
         text = f"every limit kept: largest torque {torque:.3g} N m, crank speed {speed:.3g} rad/s"
         if self.blend:
             text += f"\nsoft start: the motion joins the reference after {self.blend:g} s"
+        if self.ends <= self.times[-1]:
+            end = self.times[-1] + self.times[1]
+            text += f"\nthe motion ends at {self.ends:.6g} s: its last pose is held up to {end:g} s"
         return text
 
     def csv(self, units: ServoUnits | None = None) -> str:
@@ -266,7 +270,10 @@ def _along(
         middles = times + 0.5 / rate
         share = 1.0 if start is None else rise(middles / blend)[:, None]
         setpoints = setpoints + share * learned(middles)
-    found = Setpoints(times, setpoints, cranks, rates, torques, blend)
+    course = experiment.reference
+    sampled = isinstance(course, PlateTrajectory) and len(course.times) > 0
+    ends = float(course.times[-1]) if sampled else math.inf
+    found = Setpoints(times, setpoints, cranks, rates, torques, blend, ends)
     _check(found, servo, experiment, rate)
     return found
 
