@@ -15,8 +15,10 @@ import yaml
 
 import stewart_drake as sd
 from stewart_drake.cli import main, model
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.kinematics import leg_geometry
 from stewart_drake.reporting.machine_form import MachineForm
+from stewart_drake.studies.options import quantity
 from stewart_drake.studies.study_options import Measurements
 from tests.browser import needs_chromium
 from tests.copies import Command
@@ -137,6 +139,12 @@ def test_delay_and_torque_limit_may_have_units(delay, torque_limit):
     given = {name.replace("-", "_"): value for name, value in MEASURED.items()}
     taken = Measurements(**given, delay=delay, torque_limit=torque_limit)
     assert (taken.delay, taken.torque_limit) == (0.08, 6.0)
+
+
+@pytest.mark.parametrize("text", ["a" * 5000 + "!", "6 N N m", "6 N  m", "6 m N", "N m", ""])
+def test_other_texts_are_refused_at_once(text):
+    with pytest.raises(ConfigError, match=r"torque_limit: got '.*expected a number with mN m, N m"):
+        quantity("torque_limit", text, "N m")
 
 
 @pytest.mark.usefixtures("blank_figures")

@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 import stewart_drake as sd
+from stewart_drake import functions
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.functions import _write_servos
@@ -334,6 +335,86 @@ def test_a_log_of_motors_that_are_off_is_refused_at_once():
     log = servo_log("off", times, cranks + 0.2 * np.sin(times)[:, None], cranks, ROBOT)
     with pytest.raises(ConfigError, match="off: got crank angles that hardly change; expected"):
         identify_servos(log, ROBOT, angle_std(12))
+
+
+# Logs of another sign, unit or machine.
+
+
+ALL = set(range(1, 7))
+
+
+def flipped(*legs):
+    def change(setpoints, cranks):
+        return setpoints, np.where(np.isin(range(1, 7), legs), 2 * cranks[0] - cranks, cranks)
+
+    return change
+
+
+def unrelated(setpoints, cranks):
+    return setpoints, cranks[0] + np.random.default_rng(0).normal(0, 0.02, cranks.shape)
+
+
+def small_in_degrees(setpoints, cranks):
+    """Degrees of less than a turn."""
+    small = (x[0] + (x - x[0]) / 20 for x in (setpoints, np.degrees(cranks)))
+    return tuple(small)
+
+
+@pytest.mark.parametrize(
+    ("change", "words", "legs"),
+    [
+        (flipped(2), "move against their setpoints", {2}),
+        (flipped(*ALL), "move against their setpoints", ALL),
+        (lambda u, a: (u, a * np.where(np.arange(6) == 3, -1, 1)), "move against", {4}),
+        (unrelated, "do not follow their setpoints", ALL),
+        (lambda u, a: (u, np.degrees(a)), "more than a turn in rad: crank_1", ALL - {3}),
+        (lambda u, a: (np.degrees(u), np.degrees(a)), "a turn in rad: setpoint_1", ALL - {3}),
+        (lambda u, a: (np.degrees(u), a), "more than a turn in rad: setpoint_1", set()),
+        (small_in_degrees, "motions of cranks over those of their setpoints: ", ALL),
+    ],
+)
+def test_cranks_of_another_sign_or_unit_are_named(drake_log, change, words, legs):
+    times, setpoints, cranks = drake_log
+    with pytest.raises(ConfigError, match=words) as said:
+        servo_log("log.csv", times, *change(setpoints, cranks), ROBOT)
+    text = str(said.value)
+    assert text.startswith("log.csv: got ") and "; expected " in text and "\n" not in text
+    assert {leg for leg in ALL if f"crank_{leg} " in text} == legs
+
+
+@pytest.mark.parametrize("late", [0.0, 0.2])
+@pytest.mark.parametrize("ball_joints", [0.0, 1.0])
+def test_weak_servos_with_joints_that_stick_follow_their_setpoints(ball_joints, late):
+    """Joints as shipped leave a fifth of the motion."""
+    true = TRUE + [late, 0, 0, 0, 0, 0, 0.127 * ball_joints, 0.15 * ball_joints]
+    assert log_of(mixed(5.0), true).name == "log"
+
+
+def test_servos_that_are_too_stiff_take_no_minutes():
+    model = mixed(5.0)
+    assert model.states(np.array([0.0, 1e4, 1e3, 1e2, 2e-3, 0.0, 0.0, 0.0])) is None
+    assert model.steps[-1] <= 25_000
+
+
+@pytest.mark.slow
+def test_a_fit_that_finds_nothing_ends(drake_log):
+    """Cranks that move half as far as any servo moves them."""
+    times, setpoints, cranks = drake_log
+    halved = cranks[0] + (cranks - cranks[0]) / 2
+    found = identify_servos(servo_log("log", times, setpoints, halved, ROBOT), ROBOT, angle_std(12))
+    assert not found.right
+    # Each of two fits may begin an iteration of nine integrations before it ends.
+    assert sum(found.model.steps) < 6 * (120_000 + 2 * 9 * 5_000)
+
+
+def test_ctrl_c_ends_it_with_a_line(drake_log, tmp_path, monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(functions, "identify_servos", interrupted)
+    path = as_csv(tmp_path / "log.csv", *drake_log)
+    assert main(["identify", str(path), "--mechanism", "reachy_mini"]) == 130
+    assert capsys.readouterr().err == "stopped; nothing was written\n"
 
 
 def test_a_log_that_no_servo_explains_has_neither_intervals_nor_an_overlay(tmp_path):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from stewart_drake.cli.common import Chosen, Delivery, command_line, named
+from stewart_drake.cli.common import Chosen, Delivery, command_line, named, on_interrupt
 from stewart_drake.cli.options import command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.progress import shown_by
@@ -90,13 +90,14 @@ def identify(
     from stewart_drake.identification.plan import MOTION
     from stewart_drake.identification.servo_plan import SETPOINTS_FILE
 
+    stopped = "nothing was written"
     more: Any = {"tolerances": tolerances, "precision": precision}
     if plan is not None:
         loaded = load_scenario(plan, settings=chosen.settings)
         more["command"] = command_line(
             "identify", settings=chosen.settings, options={"plan": plan, **typed}
         )
-        with phase_bar("plan", delivery.quiet):
+        with on_interrupt(stopped), phase_bar("plan", delivery.quiet):
             found = functions.plan_identification(loaded, poses=pose_std is not None, **more)
         delivery.discard(MOTION, functions.SCENARIO, SETPOINTS_FILE)
     else:
@@ -105,7 +106,12 @@ def identify(
         words = [*map(str, logs or []), *(["--no-gravity"] if gravity is False else [])]
         options = {"mechanism": mechanism, **typed}
         more["command"] = command_line("identify", *words, options=options)
-        with named(delay="--delay"), phase_bar("identify", delivery.quiet) as show, shown_by(show):
+        with (
+            on_interrupt(stopped),
+            named(delay="--delay"),
+            phase_bar("identify", delivery.quiet) as show,
+            shown_by(show),
+        ):
             found = functions.identify(
                 logs or [], mechanism or "", delay=delay, gravity=gravity is not False, **more
             )

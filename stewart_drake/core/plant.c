@@ -90,7 +90,7 @@ static int advance(dop853 *s, stewart_run *r, double end)
         dop853_begin(s);
     }
     while (s->time < end) {
-        if (!dop853_step(s, end))
+        if ((r->most_steps > 0 && s->steps >= r->most_steps) || !dop853_step(s, end))
             return STEWART_TOO_SHORT_STEPS;
         double from = s->before;
         for (; r->recorded < r->number && r->times[r->recorded] <= s->time; r->recorded++) {

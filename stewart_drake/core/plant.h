@@ -29,6 +29,7 @@ typedef struct {
     long recorded;
     double time, state[STEWART_STATES];
     long steps, evaluations;
+    long most_steps; /* after which it ends with STEWART_TOO_SHORT_STEPS; 0 for no such limit */
 } stewart_run;
 
 /* Torque constant + amplitude sin(frequency t + phase) from the time `from` on, s. */

@@ -271,8 +271,8 @@ def _along(
         share = 1.0 if start is None else rise(middles / blend)[:, None]
         setpoints = setpoints + share * learned(middles)
     course = experiment.reference
-    sampled = isinstance(course, PlateTrajectory) and len(course.times) > 0
-    ends = float(course.times[-1]) if sampled else math.inf
+    samples = course.times if isinstance(course, PlateTrajectory) else np.empty(0)
+    ends = float(samples[-1]) if len(samples) else math.inf
     found = Setpoints(times, setpoints, cranks, rates, torques, blend, ends)
     _check(found, servo, experiment, rate)
     return found

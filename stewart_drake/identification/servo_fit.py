@@ -35,9 +35,9 @@ Blocks may have any correlation inside. The interval is t(B - 1) sqrt(P), with S
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import count
 from typing import Any, Final
 
 import numpy as np
@@ -108,6 +108,8 @@ _ACCURACY: Final = 1e-7  # of the integration
 _BLOCK: Final = 3.0  # s
 _FEWEST_BLOCKS: Final = 4
 _ITERATIONS: Final = 20
+_RUN_STEPS: Final = 5_000  # largest number of an integration's steps, per s; real servos take 1000
+_ALL_STEPS: Final = 120_000  # of all, per s, after which a fit ends; real servos take 100 000
 _CONVERGED: Final = 1e-5  # relative change of the sum of squares
 _DELAY_STEP: Final = 5e-5  # s, of differences
 _STEP: Final = 3e-3  # of other unknowns, relative to their scale
@@ -126,18 +128,24 @@ class ServoModel:
     mechanism: Mechanism  # without armature
     torque_limit: float  # of each motor, N m, infinite for none
     gravity: float = DEFAULT_GRAVITY  # m/s^2 along -z
+    steps: list[int] = field(default_factory=list, compare=False)  # of each integration so far
 
     def states(self, theta: Array) -> Array | None:
-        """Return states (n, 12) at the times of the log, from rest; None if the plate leaves."""
+        """Return states (n, 12) at the times of the log, from rest.
+
+        Return None if the plate leaves, or if the servos are too stiff to integrate.
+        """
         times = self.log.times - self.log.times[0]
         start = np.concatenate([self.log.poses[0], np.zeros(NUM_STATE // 2)])
         plant = NativePlant(self._dynamics(theta), start, times, _ACCURACY, math.inf)
+        plant.run.most_steps = round(_RUN_STEPS * times[-1])
         servo = PositionServo(theta[K], 0.0, self.torque_limit)
         # The first setpoint acts from the start on.
         acts, setpoints = times + theta[D], np.ascontiguousarray(self.log.setpoints)
         ended = plant.call(
             "servo_run", servo.compiled, len(acts), core().at(acts), core().at(setpoints)
         )
+        self.steps.append(plant.run.steps)
         return plant.states if ended == Ended.INSIDE else None
 
     def _dynamics(self, theta: Array) -> StewartDynamics:
@@ -228,7 +236,7 @@ class ServoIdentification:
     free: NDArray[np.intp]  # (k,) places of those in theta
     rounding: float  # standard deviation of the rounding of a measured angle, rad
     ball_joints_tried: bool  # whether friction of the ball joints was fitted
-    iterations: int  # evaluations of the fit
+    iterations: int  # of the fit
     # (8,) of theta from the first fit to the second, 0 if that explains the log
     change: Array = field(default_factory=lambda: np.zeros(len(NAMES)))
 
@@ -441,6 +449,10 @@ def identify_servos(
     return replace(kept, change=change, ball_joints_tried=found.ball_joints_tried)
 
 
+class _Spent(Exception):
+    """The fits have had their number of steps."""
+
+
 def _fitted(
     model: ServoModel,
     start: Array,
@@ -451,7 +463,8 @@ def _fitted(
     """Return the fit of the free unknowns by output error, of filtered residuals if given."""
     filtered = white or (lambda residuals: residuals / rounding)
     first, scale = _in_reach(model, start), scale_of(start)[free]
-    iterations, here, left = count(1), np.empty(0), np.empty(0)
+    here, accepted = np.empty(0), list[tuple[Array, Array, Array]]()
+    most = _ALL_STEPS * float(np.ptp(model.log.times))
 
     def whole(x: Array) -> Array:
         theta = first.copy()
@@ -464,33 +477,36 @@ def _fitted(
         return filtered(here).ravel()
 
     def jacobian(x: Array) -> Array:
-        nonlocal left
-        progress.iteration(next(iterations), _ITERATIONS)
+        if accepted and sum(model.steps) > most:
+            raise _Spent
+        progress.iteration(len(accepted) + 1, _ITERATIONS)
         # The solver asks for it where it has just asked for the residuals, last at the result.
         left = here
         J = filtered(model.jacobian(whole(x), free, here) * scale)
+        accepted.append((whole(x), left, J))
         return J.reshape(-1, len(free))
 
-    found = least_squares(
-        residuals,
-        np.maximum(first[free], _LOW[free] + 1e-2 * scale) / scale,
-        jac=jacobian,
-        bounds=(_LOW[free] / scale, _HIGH[free] / scale),
-        ftol=_CONVERGED,
-        xtol=1e-4,
-        max_nfev=_ITERATIONS,
-    )
-    J: Any = found.jac
+    with suppress(_Spent):
+        least_squares(
+            residuals,
+            np.maximum(first[free], _LOW[free] + 1e-2 * scale) / scale,
+            jac=jacobian,
+            bounds=(_LOW[free] / scale, _HIGH[free] / scale),
+            ftol=_CONVERGED,
+            xtol=1e-4,
+            max_nfev=_ITERATIONS,
+        )
+    theta, left, J = accepted[-1]
     return ServoIdentification(
         model=model,
-        theta=whole(found.x),
+        theta=theta,
         residuals=left,
         innovations=filtered(left),
-        jacobian=J.reshape(-1, NUM_TORQUES, len(free)) / scale,
+        jacobian=J / scale,
         free=free,
         rounding=rounding,
         ball_joints_tried=bool(np.isin(BALL_FRICTION, free)),
-        iterations=int(found.nfev),
+        iterations=len(accepted),
     )
 
 

@@ -1,5 +1,6 @@
 """Logs of setpoints and crank angles of a machine with position servos, as CSV."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -11,7 +12,7 @@ from stewart_drake.law.servos import turned
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import ForwardKinematicsError
 from stewart_drake.scenario.signals import LEGS
-from stewart_drake.types import Array
+from stewart_drake.types import Array, Flags
 
 SETPOINTS: Final = tuple(f"setpoint_{leg}" for leg in LEGS)
 CRANKS: Final = tuple(f"crank_{leg}" for leg in LEGS)
@@ -21,6 +22,12 @@ _UNITS: Final = {"time": {"s": 1.0}, **dict.fromkeys((*SETPOINTS, *CRANKS), ANGL
 _HEADER: Final = "time[s], setpoint_1[rad] to setpoint_6, crank_1[rad] to crank_6 (or deg)"
 _EXPECTED: Final = f"CSV with {_HEADER}"
 _LONGEST_GAP: Final = 0.1  # s
+_LATEST: Final = 0.4  # s, of an angle after its setpoint: delay and lag
+_FOLLOWS: Final = 0.2
+"""Least correlation of a crank with its setpoint. Weak servos with joints that stick have 0.45."""
+_SHARES: Final = (0.05, 7.5)
+"""Range of the motion of a crank over its setpoint's. Friction leaves 0.15; degrees are 57."""
+_STILL: Final = 0.01  # rad; what moves less is judged later
 
 
 class ServoLog(NamedTuple):
@@ -66,7 +73,9 @@ def servo_log(
     table: Table | None = None,
 ) -> ServoLog:
     """Return a log with its poses; angles of any turn, the arrays of `ServoLog`."""
-    cranks = turned(np.unwrap(cranks, axis=0), mechanism.crank_angles(mechanism.home))
+    cranks, setpoints = np.unwrap(cranks, axis=0), np.unwrap(setpoints, axis=0)
+    _check_following(name, times, setpoints, cranks)
+    cranks = turned(cranks, mechanism.crank_angles(mechanism.home))
     cranks = np.unwrap(cranks, axis=0)
     poses, pose = np.empty_like(cranks), mechanism.home
     for row, angles in enumerate(cranks):
@@ -79,3 +88,53 @@ def servo_log(
                 "expected those of this mechanism, with its signs and zeros"
             ) from None
     return ServoLog(name, times, turned(setpoints, cranks), cranks, poses)
+
+
+def _check_following(name: str, times: Array, setpoints: Array, cranks: Array) -> None:
+    """Refuse cranks that do not follow their setpoints, by the delay that suits most of them."""
+    both = np.hstack([setpoints, cranks])
+    spans = np.ptp(both, axis=0)
+    # The torque of a crank changes its sign before a whole turn.
+    if np.any(spans >= 2 * np.pi):
+        raise ConfigError(
+            f"{name}: got ranges of more than a turn in rad: "
+            f"{_listed((*SETPOINTS, *CRANKS), spans, spans >= 2 * np.pi)}; "
+            "expected angles in rad, or [deg] in the header"
+        )
+    usual = np.ptp(np.quantile(both, (0.05, 0.95), axis=0), axis=0).reshape(2, -1)
+    if not usual.max(axis=1).min() > _STILL:
+        return
+    sizes, apart = setpoints.std(axis=0), cranks - cranks.mean(axis=0)
+    judged = sizes > sizes.max() / 3  # others may stick
+    fits = []
+    for delay in np.arange(0.0, _LATEST, 0.01):
+        newest = np.searchsorted(times + delay, times, side="right") - 1
+        sent = setpoints[np.maximum(newest, 0)]
+        sent = sent - sent.mean(axis=0)
+        norm = np.sqrt(np.sum(sent**2, axis=0) * np.sum(apart**2, axis=0))
+        fits.append(np.sum(sent * apart, axis=0) / np.maximum(norm, 1e-12))
+    fit = np.array(fits)[np.argmax(np.sum(fits, axis=1, where=judged))]
+    bad = judged & (fit < _FOLLOWS)
+    if bad.any():
+        least = np.min(fits, axis=0)
+        against = bool(np.all(least[bad] < -0.5))
+        raise ConfigError(
+            f"{name}: got cranks that {'move against' if against else 'do not follow'} their "
+            f"setpoints, correlation {_listed(CRANKS, least if against else fit, bad)}; expected "
+            f"{_FOLLOWS:g} or more"
+            + (", with the signs of the setpoints" if against else ", a log of this motion")
+        )
+    shares = apart.std(axis=0) / np.maximum(sizes, 1e-12)
+    bad = judged & ~((_SHARES[0] <= shares) & (shares <= _SHARES[1]))
+    if bad.any():
+        raise ConfigError(
+            f"{name}: got motions of cranks over those of their setpoints: "
+            f"{_listed(CRANKS, shares, bad)}; expected {_SHARES[0]:g} to {_SHARES[1]:g}, with both "
+            "in rad, or [deg] in the header"
+        )
+
+
+def _listed(names: Sequence[str], values: Array, chosen: Flags) -> str:
+    return ", ".join(
+        f"{name} {value:.2g}" for name, value, one in zip(names, values, chosen, strict=True) if one
+    )

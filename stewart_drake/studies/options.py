@@ -56,9 +56,11 @@ _UNITS: Final[Mapping[str, Mapping[str, float]]] = {
 
 def quantity(name: str, text: str, unit: str) -> float:
     """Return a text such as `300 mm`, `0.3 m` or `0.3` in a unit: m, kg, s or N m."""
-    number, word = re.fullmatch(r"\s*(.*?)\s*((?:[^\W\d_]+ ?)*)\s*", text, re.DOTALL).groups()  # type: ignore[union-attr]
+    number, word = re.fullmatch(
+        r"\s*(.*?)\s*((?:[^\W\d_]+ )*[^\W\d_]*)\s*", text, re.DOTALL
+    ).groups()  # type: ignore[union-attr]
     together = {name.replace(" ", ""): factor for name, factor in _UNITS[unit].items()}  # 6 Nm
-    factor = (together | _UNITS[unit]).get(word.strip() or unit)
+    factor = {**together, **_UNITS[unit]}.get(word.strip() or unit)
     try:
         value = float(number)
     except ValueError:
