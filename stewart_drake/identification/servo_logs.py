@@ -94,7 +94,7 @@ def _check_following(name: str, times: Array, setpoints: Array, cranks: Array) -
     """Refuse cranks that do not follow their setpoints, by the delay that suits most of them."""
     both = np.hstack([setpoints, cranks])
     spans = np.ptp(both, axis=0)
-    # The torque of a crank changes its sign before a whole turn.
+    # Before a whole turn a crank is in line with its rod, where the workspace ends.
     if np.any(spans >= 2 * np.pi):
         raise ConfigError(
             f"{name}: got ranges of more than a turn in rad: "
