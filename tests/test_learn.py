@@ -15,6 +15,8 @@ from stewart_drake.law.learned import LearnedLqi, LearnedSignal, with_learned
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.learned import HARMONICS, harmonics_below, save_learned
 from stewart_drake.loop.preparation import prepare
+from stewart_drake.loop.results import Failure
+from stewart_drake.loop.simulation import simulate
 from stewart_drake.studies.learn import (
     Anderson,
     Fit,
@@ -401,3 +403,32 @@ def test_what_takes_a_part_of_the_missing_torque_is_named():
     found = sd.learn(scenario("duration=3", *period), repetitions=2)
     said = " ".join(str(found).split())
     assert "--set controller.estimate=[] --set controller.integral=false" in said
+
+
+def test_nothing_is_learned_from_a_lost_first_repetition(tmp_path, monkeypatch, capsys):
+    """Learning from what happens before a loss gave torques of 3 kN m."""
+    monkeypatch.chdir(tmp_path)
+    settings = ("controller.estimate=[]", "controller.integral=false", "plant.coulomb_friction=0.1")
+    settings = [word for one in (*EXACT, *settings) for word in ("--set", one)]
+    assert main(["learn", "paper", *settings, "--repetitions", "3"]) == 0
+    said, warned = capsys.readouterr()
+    said = " ".join(said.split())
+    assert said.startswith("Nothing is learned, because the first repetition is lost: leg ")
+    assert "simulate completes, such as a smaller reference.amplitude." in said
+    assert said.count(" end of its reach") == 2 and "Warning" not in warned  # head and one row
+
+
+def test_a_lost_repetition_ends_learning_and_the_best_one_is_kept(monkeypatch):
+    def lost(*args, **kwargs):
+        result = simulate(*args, **kwargs)
+        runs.append(result)
+        failure = Failure(1.0, 2, 0.0, "leg 2 reached the end of its reach")
+        end = {"status": "left_workspace", "stopped": failure} if len(runs) == 3 else {}
+        return dataclasses.replace(result, **end)
+
+    runs = []
+    monkeypatch.setattr("stewart_drake.studies.learn.simulate", lost)
+    found = sd.learn(sd.load_scenario("paper", settings=FAST), repetitions=5)
+    said = " ".join(str(found).split())
+    assert len(runs) == 3 and found.summary["best"] == 2 and not found.summary["stopped"]
+    assert "Learning ended because repetition 3 is lost: leg 2" in said

@@ -20,7 +20,7 @@ def document(study: LearnStudy) -> Document:
     first, best = study.repetitions[0], study.best
     numbers = {id(one): k for k, one in enumerate(study.repetitions, 1)}
     shown = [first] if best is first else [first, best]
-    machine = study.experiment.truth
+    machine, scenario = study.experiment.truth, study.experiment.scenario
     largest = [one.largest for one in study.repetitions if one.learned]
     unit, factor = ("rad", 1.0) if study.setpoints else unit_for(largest, TORQUES)
     return from_template(
@@ -32,6 +32,7 @@ def document(study: LearnStudy) -> Document:
         first=first,
         best=best,
         learned=best is not first,
+        on_reference=(scenario.start, scenario.queue) == ("on_reference", "reference"),
         number=lambda one: numbers[id(one)],
         films=[
             Frame(partial(replay_html, one.result, machine, f"repetition {numbers[id(one)]}"))

@@ -113,7 +113,12 @@ class LearnStudy:
     def stopped(self) -> bool:
         """Whether it ended because the error no longer fell."""
         early = len(self.repetitions) < self.asked
-        return early and not (self.interrupted or self.lacking)
+        return early and not (self.interrupted or self.lacking or self.lost)
+
+    @property
+    def lost(self) -> bool:
+        """Whether the last repetition did not complete, so that nothing is learned from it."""
+        return self.repetitions[-1].result.stopped is not None
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -144,8 +149,8 @@ def study_learn(
 ) -> LearnStudy:
     """Repeat the motion of a scenario, and learn from each repetition.
 
-    Learning ends early after two repetitions without a smaller error, or one with too few
-    measurements. Each repetition has other noise. The motion is periodic, the link a wire of known
+    Learning ends early after two repetitions without a smaller error, or one that is lost or has
+    too few measurements. Each repetition has other noise. The motion is periodic, the link a wire of known
     delay.
     """
     check_learning(scenario)
@@ -169,9 +174,10 @@ def study_learn(
         done.append(Repetition(learned, result, lessons.errors[-1]))
         if progress is not None:
             progress(k + 1, options.repetitions)
-        times, values = lacking(experiment, result, period)
-        if lessons.ended or len(done) == options.repetitions:
+        # The samples before a loss are those of another motion, far outside of the model.
+        if result.stopped or lessons.ended or len(done) == options.repetitions:
             break
+        times, values = lacking(experiment, result, period)
         if few := len(times) < lessons.least:
             break
         learned = lessons.learned(times, values)
