@@ -42,6 +42,16 @@ def test_the_help_of_every_command_ends_with_an_example(words, capsys):
     assert all(len(line) <= 80 for line in lines)
 
 
+CONTINUING = ("analyze robustness", "layout", "tune dataset", "tune train", "tune evaluate")
+
+
+@pytest.mark.parametrize("words", CONTINUING)
+def test_the_help_of_a_long_command_says_that_it_continues(words, capsys):
+    assert main([*words.split(), "--help"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "same command continues an interrupted " in said
+
+
 def test_every_example_is_of_a_command_and_parses():
     unknown = set(EXAMPLES) - set(COMMANDS) - {""}
     assert not unknown

@@ -21,6 +21,7 @@ def dataset(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
     """Run a grid of 180 scenarios, or the conditions of a family.
 
     The grid varies delay, frequency and weights. A family has faults of timing, friction and noise.
+    The same command continues an interrupted run.
     """
     from stewart_drake import functions
 
@@ -54,7 +55,7 @@ def train(
     """Train the network on a data set.
 
     By Levenberg-Marquardt on labels. With --regret on the runs of a family, then on runs of the
-    network itself.
+    network itself, where the same command continues an interrupted training.
     """
     from stewart_drake import functions
     from stewart_drake.reporting.results import drawn
@@ -93,6 +94,7 @@ def evaluate(
     """Compare a tuner with fixed gains on unseen scenarios.
 
     With --family on fresh conditions of a family, where runs that end early count too.
+    The same command continues an interrupted evaluation.
     """
     from stewart_drake import functions
 

@@ -150,8 +150,8 @@ def study_learn(
     """Repeat the motion of a scenario, and learn from each repetition.
 
     Learning ends early after two repetitions without a smaller error, or one that is lost or has
-    too few measurements. Each repetition has other noise. The motion is periodic, the link a wire of known
-    delay.
+    too few measurements. Each repetition has other noise. The motion is periodic, the link a wire
+    of known delay.
     """
     check_learning(scenario)
     lessons = Lessons(scenario)
