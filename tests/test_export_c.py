@@ -1,5 +1,6 @@
 """The controller as a folder of C: it builds strictly, and replays what Python answered."""
 
+import dataclasses
 import shutil
 import subprocess
 from pathlib import Path
@@ -15,6 +16,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.compare import SERVOS
+from tests.board import run as board
 from tests.building import SANITIZED, c_compiler, keeping_objects, make
 
 NOISE = "sensor.noise_std=[1e-5,1e-5,1e-5,1e-6,1e-6,1e-6,1e-4,1e-4,1e-4,1e-5,1e-5,1e-5]"
@@ -467,3 +469,62 @@ def test_the_readme_is_that_of_the_composition(case, tmp_path):
         commands.append(["g++", "-std=c++20", *strict, initial, "wiring.cpp"])
     for command in commands:
         subprocess.run(command, cwd=tmp_path, check=True)
+
+
+# ---------------------------------------------------------------- time on a board
+
+
+@pytest.mark.parametrize(
+    ("settings", "single", "said"),
+    [
+        ((), True, "17 and 49 ms on a Cortex-M4 at 168 MHz"),
+        (("controller.period=0.02",), False, "the longest step takes longer than the period of 20"),
+        (("controller.period=0.01",), True, "a usual step takes longer than the period of 10 ms"),
+        (("controller.delay_estimator=constant",), True, "the longest step takes longer than the"),
+    ],
+)
+def test_the_readme_estimates_a_step_and_warns_of_a_short_period(settings, single, said):
+    scenario = load_scenario("paper", settings=(*SHORT, *settings))
+    readme = export_c.exported(scenario, single, measured=False)["README.md"]
+    assert said in readme
+    assert ("**By that estimate" in readme) == bool(settings)
+
+
+def board_table():
+    """Return kind of law, median and most of each row in docs/howto/board.md."""
+    table = board.PAGE.read_text("utf-8").split(board.MARKS[0])[1].split(board.MARKS[1])[0]
+    for line in table.strip().splitlines()[2:]:
+        name, *_, median, most, _ = (cell.strip(" *") for cell in line.strip("|").split("|"))
+        kinds = {"network": "network", "delay estimator": "delay estimator"}
+        kind = kinds.get(name, "plain" if "without" in name else "estimator")
+        yield kind, float(median), float(most.split()[0])
+
+
+def test_the_estimates_are_those_of_the_table():
+    found = list(board_table())
+    for kind, (median, most) in export_c.MILLIONS.items():
+        medians, longest = zip(*(row for name, *row in found if name == kind), strict=True)
+        assert 0.9 * median <= max(medians) <= median and max(longest) <= most
+        assert kind == "delay estimator" or max(longest) >= 0.9 * most
+
+
+def test_a_row_shows_in_bold_what_takes_longer_than_the_period():
+    sizes = {"flash": 90000, "state": 1, "workspace": 1, "stack": 1}
+    found = board.Counted(**sizes, median=2.0, most=20.0, error=1e-6, period=100.0)
+    assert board.cells(board.ROWS[3], found)[-3:-1] == ["2.00", "**20.00 (119)**"]
+    found = dataclasses.replace(found, period=10.0)
+    assert board.cells(board.ROWS[3], found)[-3:-1] == ["**2.00**", "**20.00 (119)**"]
+
+
+def test_make_board_writes_the_page_only_where_that_is_asked_for(tmp_path, monkeypatch, capsys):
+    page = tmp_path / "board.md"
+    page.write_text(f"a\n{board.MARKS[0]}old{board.MARKS[1]}\nb\n", "utf-8")
+    monkeypatch.setattr(board, "PAGE", page)
+    monkeypatch.setattr(board, "ROWS", ())
+    monkeypatch.setattr(board, "missing", list)
+    monkeypatch.setattr("sys.argv", ["run"])
+    assert board.main() == 0 and "| controller | processor |" in capsys.readouterr().out
+    assert "old" in page.read_text("utf-8")
+    monkeypatch.setattr("sys.argv", ["run", "--docs"])
+    assert board.main() == 0
+    assert "old" not in page.read_text("utf-8") and "| controller |" in page.read_text("utf-8")

@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -71,6 +71,27 @@ MOST_IN_SINGLE: Final = 100
 """Largest number of samples that a replay in single precision has.
 
 Later in `gravity`, rounding of 1e-6 in the predicted state, times gains of 700, exceeds 1e-3.
+"""
+
+
+class Clock(NamedTuple):
+    """Processor for which times are estimated, at one instruction per cycle."""
+
+    name: str
+    mhz: float
+
+
+CLOCKS: Final = {False: Clock("Cortex-M7", 400.0), True: Clock("Cortex-M4", 168.0)}
+"""By whether numbers have single precision."""
+MILLIONS: Final = {
+    "plain": (1.8, 2.1),
+    "estimator": (2.9, 8.2),
+    "network": (5.0, 5.5),
+    "delay estimator": (3.0, 42.0),
+}
+"""Million instructions of a step of `paper`, median and most, from the table of `make board`.
+
+The most of the last one is of a new search for the delay, which the table lacks.
 """
 _MACHINE: Final[Accepted] = {
     "sensor.kind": "state",
@@ -141,7 +162,10 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "tuner": None,
         "least": LEAST,
         "home_sign": home_sign(experiment.mechanism),
+        "clock": CLOCKS[single],
+        "period_ms": 1e3 * law.timeline.period,
     }
+    values["millions"] = MILLIONS[_kind(values)]
     if tuner is not None:
         values |= _tuner(tuner, compiled, recorded, experiment, suffix)
     if moves:
@@ -154,6 +178,15 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     files |= {name: texts.get_template(name).render(values) for name in names - {README}}
     values["measured_sizes"] = _sizes(files) if measured else _UNMEASURED
     return files | {README: texts.get_template(README).render(values)}
+
+
+def _kind(values: Mapping[str, Any]) -> str:
+    """Return the kind of a law in MILLIONS."""
+    if values["finds_delay"]:
+        return "delay estimator"
+    if values["network"]:
+        return "network"
+    return "plain" if values["law"].observer.settings is None else "estimator"
 
 
 def _templates(suffix: str) -> Environment:
