@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
+from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve, shipped
 from stewart_drake.files.yamlio import load_yaml
@@ -207,7 +208,10 @@ BAD_FILES = {
     "overflow": ("controller: {w_Q: 1e999}", ["controller.w_Q: got inf", "finite"]),
     "yes for a boolean": ("plant: {gravity: yes}", ["plant.gravity: got 'yes'", "true or false"]),
     "float for an integer": ("delay: {steps: 8.5}", ["delay.steps: got 8.5", "a whole number"]),
-    "five numbers": ("reference: {offset: [0, 0, 0, 0, 0]}", ["reference.offset", "6 items"]),
+    "five numbers": (
+        "reference: {offset: [0, 0, 0, 0, 0]}",
+        ["reference.offset", "6 numbers, not 5"],
+    ),
     "text in a list": ("reference: {offset: [0, 0, 0, a, 0, 0]}", ["reference.offset[3]", "'a'"]),
     "no mechanism": ("mechanism: ''", ["mechanism: got ''"]),
 }
@@ -243,7 +247,7 @@ REFUSED = [
     ("a.b.c=1", "settings: a: unknown key; expected one of mechanism"),
     ("plant.push.wrensh=1", "plant.push.wrensh: unknown key; did you mean plant.push.wrench?"),
     ("plant.gravity.x=1", "plant.gravity: got {'x': 1}; expected true or false"),
-    ("duration=", "duration: got None; expected a number"),
+    ("duration=", "duration: got no value; expected a value, or null for none"),
     ("duration=[1", "duration: line 1"),
     ("controller.perid=1", "controller.perid: unknown key; did you mean controller.period?"),
     ("controller=5", "controller: got 5; expected a mapping of fields"),
@@ -485,3 +489,27 @@ def test_the_period_and_fraction_that_messages_suggest_are_accepted(steps, perio
         assert 0 <= suggested < 1
         assert abs(suggested - fraction) <= time_step / period
         assert step_problem(time_step, period, suggested) is None
+
+
+def test_each_fault_of_a_file_is_printed_on_its_own_line(tmp_path, capsys):
+    path = tmp_path / "mine.yaml"
+    path.write_text("{duration: -1, foo: 3, plant: {gravity: 7}, sensor: {noise_std: [0]}}")
+    assert main(["simulate", str(path)]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.removeprefix(f"error: {path}: ").partition(":")[0] for line in lines] == [
+        *("foo", "duration", "plant.gravity", "sensor.noise_std")
+    ]
+    assert lines[-1].endswith("got [0]; expected 12 numbers, not 1")
+    settings = ["controller={w_Q: 0, w_R: 0, period: 0, integral: 0, kp: a, kd: a, estimate: 0}"]
+    assert main(["simulate", "--set", *settings]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 6 and all(line.startswith("error: --set: ") for line in lines)
+    assert lines[-1] == "error: --set: and 2 more"
+
+
+def test_an_empty_setting_is_not_null(capsys):
+    assert main(["simulate", "paper", "--set", "controller.w_R="]) == 2
+    said = capsys.readouterr().err
+    assert (
+        said == "error: --set: controller.w_R: got no value; expected a value, or null for none\n"
+    )

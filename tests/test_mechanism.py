@@ -70,7 +70,7 @@ INVALID = [
     ({"rod.length": [-0.4] + [0.4] * 5}, "rod.length: got [-0.4, 0.4,", "positive"),
     ({"rod.length": [0.404] * 5 + [0.11]}, "rod.length: got 0.11 m for leg 6", "longer than its"),
     ({"plate.inertia": [0, 30e-4, 30e-4]}, "plate.inertia: got [0, 0.003, 0.003]", "positive"),
-    ({"rod.inertia": [1e-6, 1e-4]}, "rod.inertia: got [1e-06, 0.0001]", "3 items"),
+    ({"rod.inertia": [1e-6, 1e-4]}, "rod.inertia: got [1e-06, 0.0001]", "3 numbers, not 2"),
     (
         {"crank.inertia": [0.01e-4, 0.58e-4, 0.60e-4]},  # as printed in Table I
         "crank.inertia: got [1e-06, 5.8e-05, 6e-05] kg m^2, which violates the triangle inequality",
@@ -95,7 +95,7 @@ INVALID = [
     ({"home": [0, np.pi / 2, 0, 0, 0, 0.38]}, "home: got a pitch of 1.5708", "less than pi/2"),
     ({"pattern": ABSENT}, "pattern, legs: got neither", "exactly one of the two"),
     ({"legs": [LEG] * 6}, "pattern, legs: got both", "exactly one of the two"),
-    ({"pattern": ABSENT, "legs": [LEG] * 5}, "legs: got [{'shaft'", "6 items"),
+    ({"pattern": ABSENT, "legs": [LEG] * 5}, "legs: got [{'shaft'", "6 legs, not 5"),
     (third_leg(motor_axis=[0, 0, 0]), "legs[2].motor_axis: got [0.0, 0.0, 0.0]", "not zero"),
     (third_leg(crank_zero=[0, 0, 0]), "legs[2].crank_zero: got [0.0, 0.0, 0.0]", "not zero"),
     (third_leg(crank_zero=[0.005, 1, 0]), "legs[2].crank_zero: got 89.7", "perpendicular"),

@@ -82,6 +82,13 @@ def load_yaml(path: str | Path) -> dict[str, Any]:
     return data
 
 
+def parse_value(text: str, where: str) -> Any:
+    """Parse the value of `name=value`, as `parse_yaml`; an empty one, which is null, is refused."""
+    if not text.strip():
+        raise ConfigError(f"{where}: got no value; expected a value, or null for none")
+    return parse_yaml(text, where)
+
+
 def parse_yaml(text: str, where: str) -> Any:
     """Parse one YAML value of any kind under the rules of `load_yaml`.
 
@@ -144,14 +151,14 @@ def validate(type_: type[_T], data: Any, where: str) -> _T:
 
     Raises:
         ConfigError: `<where>: <section.field>: got <value>; expected <accepted values>` for the
-            first few problems, in one line. Unknown keys are reported first, each with the
-            nearest known one, as they may be the reason for other problems.
+            first few problems, in one line. Unknown keys come first, each with the nearest known
+            one. Then no field is reported as missing, as it may be one of these.
     """
     try:
         # JSON mode is the one in which strict pydantic lets a mapping become a nested dataclass.
         return pydantic.TypeAdapter(type_).validate_json(json.dumps(data, default=str))
     except pydantic.ValidationError as caught:
-        raise ConfigError(f"{where}: {_explained(type_, data, caught)}") from None
+        raise _refusal(where, type_, data, caught) from None
     except (ValueError, RecursionError) as error:  # recursive data, numbers of too many digits
         raise ConfigError(f"{where}: {_cut(str(error), 160)}; expected plain data") from None
 
@@ -165,8 +172,7 @@ def in_one_line(type_: Any) -> Any:
         try:
             call(*arguments)
         except pydantic.ValidationError as caught:
-            text = _explained(type_, given, caught)
-            raise ConfigError(f"{type_.__name__}: {text}") from None
+            raise _refusal(type_.__name__, type_, given, caught) from None
 
     @functools.wraps(make)
     def init(self: Any, *args: Any, **kwargs: Any) -> None:
@@ -181,13 +187,14 @@ def in_one_line(type_: Any) -> Any:
     return type_
 
 
-def _explained(type_: type, data: Any, caught: pydantic.ValidationError) -> str:
+def _refusal(where: str, type_: type, data: Any, caught: pydantic.ValidationError) -> ConfigError:
     errors = caught.errors(include_url=False)
-    problems = [_explain_unknown(type_, data, one) for one in errors if one["type"] in _UNKNOWN]
-    problems = problems or [explain(data, one) for one in errors]
+    unknown = [_explain_unknown(type_, data, one) for one in errors if one["type"] in _UNKNOWN]
+    hidden = (*_UNKNOWN, "missing") if unknown else ()
+    problems = unknown + [explain(data, one) for one in errors if one["type"] not in hidden]
     if (more := len(problems) - _MOST_PROBLEMS) > 0:
         problems = [*problems[:_MOST_PROBLEMS], f"and {more} more"]
-    return "; ".join(problems)
+    return ConfigError(f"{where}: {'; '.join(problems)}", [f"{where}: {one}" for one in problems])
 
 
 def validate_pairs(
@@ -207,7 +214,7 @@ def validate_pairs(
             name, equals, text = setting.partition("=")
             if not equals or not name.strip():
                 raise ConfigError(f"{option}: got {brief(setting)}; expected name=value")
-            given[name.strip()] = parse_yaml(text, f"{option}: {name.strip()}")
+            given[name.strip()] = parse_value(text, f"{option}: {name.strip()}")
         return validate(type_, given, option)
     except ConfigError as error:
         named = set(re.findall(r"\w+", str(error).partition("; expected one of ")[0]))
@@ -236,6 +243,17 @@ def one_message(expected: str) -> pydantic.WrapValidator:
             raise ValueError(expected) from None
 
     return pydantic.WrapValidator(check)
+
+
+def exactly(number: int, what: str = "numbers") -> pydantic.AfterValidator:
+    """Return an annotation of a list with a fixed length, with one message for both bounds."""
+
+    def check(values: list[Any]) -> list[Any]:
+        if len(values) != number:
+            raise ValueError(f"{number} {what}, not {len(values)}")
+        return values
+
+    return pydantic.AfterValidator(check)
 
 
 def brief(value: object) -> str:

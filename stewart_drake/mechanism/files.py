@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
-from stewart_drake.files.yamlio import load_yaml, one_message, validate, yaml_text
+from stewart_drake.files.yamlio import exactly, load_yaml, one_message, validate, yaml_text
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism, bar_inertia, disc_inertia
 from stewart_drake.mechanism.kinematics import Legs, UnreachablePoseError, dot
 from stewart_drake.scenario.field_types import STRICT
@@ -49,16 +49,16 @@ Coordinate = Annotated[float, AfterValidator(_in_metres)]
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 Radius = Annotated[float, Field(ge=_SHORTEST), AfterValidator(_in_metres)]
 Mass = Annotated[float, Field(ge=0, le=1e6)]
-Point = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
-Moments = Annotated[list[Annotated[float, Field(le=1e6)]], Field(min_length=3, max_length=3)]
-Six = Annotated[list[Coordinate], Field(min_length=6, max_length=6)]
+Point = Annotated[list[Coordinate], exactly(3)]
+Moments = Annotated[list[Annotated[float, Field(le=1e6)]], exactly(3)]
+Six = Annotated[list[Coordinate], exactly(6)]
 Joint = Annotated[int, Field(ge=0, le=5)]
-Order = Annotated[list[Joint], Field(min_length=6, max_length=6), AfterValidator(_each_joint_once)]
+Order = Annotated[list[Joint], exactly(6), AfterValidator(_each_joint_once)]
 Branch = Annotated[int, AfterValidator(_one_of_two), one_message("-1 or 1")]
-Branches = Annotated[list[Branch], Field(min_length=6, max_length=6)]
+Branches = Annotated[list[Branch], exactly(6)]
 LegNumbers = Annotated[list[Annotated[int, Field(ge=1, le=6)]], Field(max_length=6)]
 Length = Annotated[
-    Radius | Annotated[list[Radius], Field(min_length=6, max_length=6)],
+    Radius | Annotated[list[Radius], exactly(6)],
     one_message(f"a positive number, or a list of six, metres of {_SHORTEST:g} to {_LONGEST:g}"),
 ]
 
@@ -142,7 +142,7 @@ class MechanismSpec:
     motor: MotorSpec = Field(default_factory=MotorSpec)
     ball_joints: BallJointSpec = Field(default_factory=BallJointSpec)
     pattern: PatternSpec | None = None
-    legs: Annotated[list[LegSpec], Field(min_length=6, max_length=6)] | None = None
+    legs: Annotated[list[LegSpec], exactly(6, "legs")] | None = None
 
 
 def load_mechanism(name_or_path: str | Path) -> Mechanism:

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.schema import ByKind
-from stewart_drake.files.yamlio import brief, differences, validate
+from stewart_drake.files.yamlio import brief, differences, exactly, validate
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.dependencies import contradiction
 from stewart_drake.scenario.field_types import (
@@ -46,10 +46,8 @@ from stewart_drake.scenario.signals import DEFAULT_BALL_JOINT_SPEED, DEFAULT_COU
 from stewart_drake.scenario.timing import METRIC_PERIOD, log_problem, step_problem
 
 _Friction = Annotated[float, Field(ge=0, le=1e3)]
-_Wrench = Annotated[
-    list[Annotated[float, Field(ge=-1e9, le=1e9)]], Field(min_length=6, max_length=6)
-]
-_MomentAndForce = Annotated[list[Positive], Field(min_length=2, max_length=2)]
+_Wrench = Annotated[list[Annotated[float, Field(ge=-1e9, le=1e9)]], exactly(6)]
+_MomentAndForce = Annotated[list[Positive], exactly(2)]
 _Speed = Annotated[float, Field(ge=1e-6, le=1e3)]
 _SensorDelay = Annotated[float, Field(ge=0, le=100)]
 
@@ -125,9 +123,7 @@ class PlantConfig:
     mechanism: Name | None = None
     coulomb_friction: _Friction = 0.0
     coulomb_speed: _Speed = DEFAULT_COULOMB_SPEED
-    payload_position: Annotated[list[Length], Field(min_length=3, max_length=3)] = field(
-        default_factory=lambda: [0.0] * 3
-    )
+    payload_position: Annotated[list[Length], exactly(3)] = field(default_factory=lambda: [0.0] * 3)
     push: PushConfig = field(default_factory=PushConfig)
     ball_joint_damping: _Friction = 0.0
     ball_joint_friction: _Friction = 0.0
@@ -215,7 +211,7 @@ class PriorConfig:
     payload: Positive | None = None
     payload_position: Positive | None = None
     damping: Positive | None = None
-    rates: Annotated[list[Positive], Field(min_length=6, max_length=6)] | None = None
+    rates: Annotated[list[Positive], exactly(6)] | None = None
     offsets: Positive | None = None
     wrench: _MomentAndForce | None = None
     wrench_walk: _MomentAndForce | None = None
@@ -485,9 +481,7 @@ class StateSensorConfig:
 
     measures_state, samples = True, None  # not annotated: no fields
     kind: Literal["state"] = "state"
-    noise_std: Annotated[list[Deviation], Field(min_length=12, max_length=12)] = field(
-        default_factory=lambda: [0.0] * 12
-    )
+    noise_std: Annotated[list[Deviation], exactly(12)] = field(default_factory=lambda: [0.0] * 12)
     delay: _SensorDelay = 0.0
     loss: Loss = 0.0
     seed: Seed = 0

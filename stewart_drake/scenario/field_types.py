@@ -17,7 +17,7 @@ import pydantic
 from pydantic import AfterValidator, ConfigDict, Field, with_config
 from typing_extensions import TypedDict  # which pydantic wants before Python 3.12
 
-from stewart_drake.files.yamlio import in_one_line, one_message
+from stewart_drake.files.yamlio import exactly, in_one_line, one_message
 from stewart_drake.scenario.timing import LEAST_FRACTION
 
 _T = TypeVar("_T")
@@ -56,8 +56,8 @@ TorqueLimit = Annotated[
 ]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Steps = Annotated[int, Field(ge=0, le=MOST_PERIODS)]
-Row = Annotated[list[float], Field(min_length=6, max_length=6)]
-Six = Annotated[list[Length], Field(min_length=6, max_length=6)]
+Row = Annotated[list[float], exactly(6)]
+Six = Annotated[list[Length], exactly(6)]
 Name = Annotated[str, Field(min_length=1)]
 
 
@@ -69,11 +69,11 @@ def _check_range(low_high: list[float]) -> list[float]:
 
 _Range = Annotated[
     list[Annotated[float, Field(ge=-10, le=10)]],
-    Field(min_length=2, max_length=2),
+    exactly(2),
     AfterValidator(_check_range),
 ]
 AngleRange = Annotated[
-    _Range | Annotated[list[_Range], Field(min_length=6, max_length=6)] | None,
+    _Range | Annotated[list[_Range], exactly(6)] | None,
     one_message("[low, high] in rad with low below high, or a list of six of these, or null"),
 ]
 """Range of crank angles, one for all cranks or one for each."""

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import absolute_path, is_path, resolve, shipped
 from stewart_drake.files.schema import field_names, plain, sections, spelling
-from stewart_drake.files.yamlio import brief, load_yaml, parse_yaml, validate, yaml_text
+from stewart_drake.files.yamlio import brief, load_yaml, parse_value, validate, yaml_text
 from stewart_drake.scenario.config import (
     ControllerConfig,
     Scenario,
@@ -304,7 +304,7 @@ def _parse_setting(setting: str) -> dict[str, Any]:
             f"{_SETTINGS}: got {brief(setting)}; expected section.field=value or field=value, "
             "where a value may be {name: value, ...}"
         )
-    change = parse_yaml(text, f"{_SETTINGS}: {key}")
+    change = parse_value(text, f"{_SETTINGS}: {key.strip()}")
     for part in reversed(parts[2:]):
         change = _Within({part: change})
     for part in reversed(parts[:2]):
