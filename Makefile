@@ -52,8 +52,8 @@ test: $(INSTALLED)  ## the tests but for the slow ones; ARGS="..." is handed to 
 slow: $(INSTALLED)  ## the slow ones: whole commands, documents and processes
 	$(BIN)/pytest $(WORKERS) -n $$((2 * $$(nproc --all))) -m "slow and not soak" $(ARGS)
 
-board: $(INSTALLED)  ## exported controllers on emulated Cortex-M processors; DOCS=1: also writes docs/howto/board.md
-	$(BIN)/python -m tests.board.run $(if $(DOCS),--docs)
+board: $(INSTALLED)  ## exported controllers on emulated Cortex-M processors; their table in docs/howto/board.md
+	$(BIN)/python -m tests.board.run
 
 soak: $(INSTALLED)  ## the endurance runs
 	$(BIN)/pytest $(WORKERS) -m soak -o faulthandler_timeout=0 $(ARGS)

@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
         arguments: those of the command line by default.
 
     Returns:
-        The exit status: 0; 2 for bad input, with a line on stderr for each problem; 130 for Ctrl-C.
+        The exit status: 0; 2 for bad input, with one line on stderr; 130 for Ctrl-C.
     """
     _prepare_surroundings()
     words = sys.argv[1:] if arguments is None else arguments
@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
     except _bad_input() as error:
         no_room = isinstance(error, OSError) and error.errno in _NO_ROOM and not error.filename
         where = f" (standard output, or a file in {tempfile.gettempdir()})" if no_room else ""
-        return _complain(*getattr(error, "problems", ()) or [f"{error}{where}"])
+        return _complain(f"{error}{where}")
     finally:
         release()
 
@@ -138,9 +138,8 @@ def _bad_input() -> tuple[type[Exception], ...]:
     return ConfigError, UnreachablePoseError, SingularPoseError, OSError
 
 
-def _complain(*messages: str) -> int:
-    for message in messages:
-        echo("error: " + " ".join(message.split()), error=True)
+def _complain(message: str) -> int:
+    echo("error: " + " ".join(message.split()), error=True)
     return _BAD_INPUT
 
 

@@ -147,12 +147,8 @@ def named(**options: str) -> Iterator[None]:
     try:
         yield
     except ConfigError as error:
-
-        def renamed(message: str) -> str:
-            name, colon, rest = message.partition(":")
-            return f"{options.get(name, name)}{colon}{rest}"
-
-        raise type(error)(renamed(str(error)), [*map(renamed, error.problems)]) from None
+        name, colon, rest = str(error).partition(":")
+        raise type(error)(f"{options.get(name, name)}{colon}{rest}") from None
 
 
 def check_file(path: Path | None, option: str = "--out") -> None:

@@ -1,21 +1,17 @@
 """The error that every reader of user input raises."""
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 
 class ConfigError(ValueError):
     """Bad input from a file, an option or a setting.
 
     The message is one line that names the field, the value, and what would be accepted.
-
-    Attributes:
-        problems: the message of each problem, where there are several.
     """
 
-    def __init__(self, message: str, problems: Sequence[str] = ()) -> None:
+    def __init__(self, message: str) -> None:
         super().__init__(" ".join(message.splitlines()))  # a file name may hold line breaks
-        self.problems = problems
 
 
 def resembling(name: str, names: Iterable[str]) -> list[str]:

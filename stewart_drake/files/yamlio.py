@@ -194,7 +194,7 @@ def _refusal(where: str, type_: type, data: Any, caught: pydantic.ValidationErro
     problems = unknown + [explain(data, one) for one in errors if one["type"] not in hidden]
     if (more := len(problems) - _MOST_PROBLEMS) > 0:
         problems = [*problems[:_MOST_PROBLEMS], f"and {more} more"]
-    return ConfigError(f"{where}: {'; '.join(problems)}", [f"{where}: {one}" for one in problems])
+    return ConfigError(f"{where}: {'; '.join(problems)}")
 
 
 def validate_pairs(

@@ -1,8 +1,8 @@
 """Replay exported controllers on emulated Cortex-M processors and count instructions: `make board`.
 
 QEMU counts instructions, not cycles: it emulates neither caches nor the latency of an operation.
-Prints a table, and with --docs writes it into docs/howto/board.md. The exit status is 0 where every
-replay is within the tolerance of its export and every step within the bounds of its row.
+Writes the table in docs/howto/board.md. The exit status is 0 where every replay is within the
+tolerance of its export and every step within the bounds of its row.
 """
 
 import re
@@ -209,7 +209,7 @@ def beyond(row: Row, found: Counted) -> list[str]:
 
 
 def main() -> int:
-    """Replay every row, print the table, and write it into the page if --docs is given."""
+    """Replay every row, print the table and write it into the page."""
     packages = missing()
     if packages:
         print(f"make board: missing, expected from apt-get install {' '.join(packages)}")
@@ -223,10 +223,10 @@ def main() -> int:
         lines.append(f"| {' | '.join(cells(row, found))} |")
         print(lines[-1], flush=True)
         exceeded += beyond(row, found)
-    if "--docs" in sys.argv[1:]:
-        before, rest = PAGE.read_text("utf-8").split(MARKS[0])
-        table = "\n".join(("", *lines, ""))
-        PAGE.write_text(f"{before}{MARKS[0]}{table}{MARKS[1]}{rest.split(MARKS[1])[1]}", "utf-8")
+    text = PAGE.read_text("utf-8")
+    before, rest = text.split(MARKS[0])
+    table = "\n".join(("", *lines, ""))
+    PAGE.write_text(f"{before}{MARKS[0]}{table}{MARKS[1]}{rest.split(MARKS[1])[1]}", "utf-8")
     print("\n".join(exceeded), end="\n" if exceeded else "")
     return 1 if exceeded else 0
 
