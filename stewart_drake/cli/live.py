@@ -191,6 +191,7 @@ def _delivered(
     if result.status == "completed":
         delivery.say(run_document(result).plain())
     late = s["sent_after_due_ms"]
+    lost = result.status in ("lost_machine", "lost_contact", "refused", "left_workspace")
     commands = "setpoints" if result.scenario.controller.command == "cranks" else "torques"
     delivery.say_wrapped(
         f"{counted(s['samples'], 'samples')} with those of coming to rest, "
@@ -207,6 +208,14 @@ def _delivered(
             f"{commands} came too late or not at all for many periods: a larger link.playout or "
             "controller.packet_repeats bridges more; stewart-drake analyze link compares bounds"
         )
+    judged, jitter = result.summary["controller_margin"], s["jitter_std_ms"]
+    if lost and judged and judged["stable"] and result.scenario.link.kind == "wire":
+        margin = 1e3 * min(judged["delay_margin_s"])
+        if jitter > margin:
+            delivery.say_wrapped(
+                f"{commands} were late by {jitter:.2g} ms (standard deviation), and the loop is "
+                f"stable for {margin:.2g} ms: relieve both computers, or raise controller.w_R"
+            )
     if s["recoveries"]:
         delivery.say_wrapped(
             f"the plate was too far off {counted(s['recoveries'], 'times')}: a new path led it "
@@ -218,7 +227,6 @@ def _delivered(
         delivery.add_files("summary.json", "signals.nc", *logs)
     if found is not None:
         delivery.draw(PAGE, found.write_page)
-    lost = result.status in ("lost_machine", "lost_contact", "refused", "left_workspace")
     return delivery.end(result.summary, result.status == "interrupted") or int(lost)
 
 

@@ -264,7 +264,7 @@ def drive(
     as_run = replace(as_run, log_period=period)
     loop.record.ran(as_run)
     experiment = made.experiment._replace(scenario=as_run)
-    summary = summarize(experiment, loop.record, status, stopped, wall, None)
+    summary = summarize(experiment, loop.record, status, stopped, wall, ready.margin)
     summary["warnings"] += overconfidence(summary)
     if len(late) < samples:
         summary["warnings"].append(
