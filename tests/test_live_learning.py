@@ -167,7 +167,7 @@ def test_the_command_writes_the_page_of_learn(tmp_path, monkeypatch, capsys):
     run = sd.simulate(scenario, judge_stability=False)
     late = {"median": 1.0, "p99": 2.0, "worst": 3.0}
     counts = {"samples": 11, "deadlines_missed": 0, "periods_played": 10, "periods_dry": 0}
-    counts |= {"recoveries": 0}
+    counts |= {"recoveries": 0, "jitter_std_ms": 0.1}
     summary = run.summary | {"live": counts | {"sent_after_due_ms": late}}
     run = dataclasses.replace(run, summary=summary)
     done = [Repetition(None, run, 2.0), Repetition(some_torque(PERIOD, 0.05), run, 1.0)]
@@ -187,7 +187,7 @@ def test_a_lost_run_names_its_log_and_what_may_have_caused_the_loss(tmp_path, ca
     run = sd.simulate(sd.load_scenario("paper", "lqr", ("plant.kind=exact", "duration=2")))
     late = {"median": 1.0, "p99": 2.0, "worst": 3.0}
     counts = {"samples": 1, "deadlines_missed": 1, "periods_played": 14, "periods_dry": 1}
-    live = counts | {"recoveries": 2, "sent_after_due_ms": late}
+    live = counts | {"recoveries": 2, "sent_after_due_ms": late, "jitter_std_ms": 0.1}
     run = dataclasses.replace(run, summary=run.summary | {"live": live})
     assert _delivered(Delivery(tmp_path), run, LOG) == 1
     said = " ".join(capsys.readouterr().out.split())
