@@ -55,6 +55,7 @@ MECHANISM: Final = "mechanism.yaml"
 CALIBRATION: Final = "calibration.yaml"
 SCENARIO: Final = "scenario.yaml"
 SERVOS: Final = "servos.yaml"
+FOUND: Final = "found.yaml"
 _CODE_12_BITS: Final = angle_std(12)
 """Rounding of a crank angle in a log of servos by default, rad."""
 
@@ -71,7 +72,8 @@ def identify(
 ) -> AnalysisResult:
     """Find delay, friction and geometry in logs of one machine.
 
-    `save` of the result also writes mechanism.yaml and calibration.yaml, for `simulate`. From a CSV
+    `save` of the result also writes mechanism.yaml and calibration.yaml, and, if they explain the
+    log, found.yaml, an overlay of a scenario that reads both. From a CSV
     log of setpoints and crank angles it finds the numbers of position servos instead, and writes
     servos.yaml, an overlay of a scenario, if they explain the log.
 
@@ -178,15 +180,21 @@ def _write_machine(found: identification.Identification, folder: Path) -> list[s
     write_whole(folder / MECHANISM, mechanism_yaml(found.mechanism))
     calibration = found.calibration(load_mechanism(folder / MECHANISM))
     save_calibration(folder / CALIBRATION, calibration)
-    return [MECHANISM, CALIBRATION]
+    read = {"mechanism": MECHANISM, "controller": {"calibration": CALIBRATION}}
+    fields = read | {"plant": found.plant} if found.right else None
+    return [MECHANISM, CALIBRATION, *_write_overlay(folder / FOUND, fields)]
 
 
 def _write_servos(found: ServoIdentification, folder: Path) -> list[str]:
-    """Write the overlay if servos explain the log; otherwise remove that of an earlier log."""
-    if found.right:
-        return _written(folder, {SERVOS: yaml_text(found.overlay)})
-    (folder / SERVOS).unlink(missing_ok=True)
-    return []
+    return _write_overlay(folder / SERVOS, found.overlay if found.right else None)
+
+
+def _write_overlay(path: Path, fields: dict[str, Any] | None) -> list[str]:
+    """Write an overlay; if nothing explains the log, remove that of an earlier one."""
+    if fields is None:
+        path.unlink(missing_ok=True)
+        return []
+    return _written(path.parent, {path.name: yaml_text(fields)})
 
 
 def _written(folder: Path, texts: dict[str, str]) -> list[str]:

@@ -443,7 +443,7 @@ def test_a_machine_is_found_from_encoders_of_14_bit(log_and_truth):
     assert 0.5 < away @ np.linalg.solve(found.fit.covariance, away) / len(free) < 1.6
     assert {f"where the base stands along {axis}" for axis in "xyz"} <= set(found.unseen[1])
     told = document(found).plain()
-    assert "Weak" not in told and "Enter mechanism.yaml" in told
+    assert "Weak" not in told and "overlay=DIR/found.yaml" in told
     less = dataclasses.replace(found.unknowns, std=np.minimum(found.unknowns.std, 1.5 * found.std))
     told = document(dataclasses.replace(found, unknowns=less)).plain()
     assert "Weak, hardly better known than before: torque bias 1, torque" in " ".join(told.split())

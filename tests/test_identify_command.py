@@ -212,7 +212,13 @@ def test_a_lost_log_lets_the_next_run_be_held(lost, tmp_path, capsys):
     machine = load_mechanism(tmp_path / "mechanism.yaml")
     assert np.abs(machine.rod_lengths - PAPER.rod_lengths).max() < 1e-3
     page = (tmp_path / "report.html").read_text()
-    assert "Enter mechanism.yaml as mechanism" in " ".join(out.split())
+    assert "--set overlay=DIR/found.yaml" in " ".join(out.split())
+    overlay = f"overlay={tmp_path / 'found.yaml'}"
+    found = sd.load_scenario("paper", settings=("overlay=dirty", overlay, "plant.kind=exact"))
+    assert found.mechanism == str(tmp_path / "mechanism.yaml")
+    assert found.controller.calibration == str(tmp_path / "calibration.yaml")
+    assert found.plant.payload_mass == pytest.approx(known.value("payload_mass"), rel=1e-5)
+    assert found.plant.mechanism is None and found.sensor.noise_std[0] > 0  # that of dirty
     assert "What the log does not show" in page and "<svg" not in page.split("<body")[0]
     settings = (
         "plant.kind=exact", "plant.mechanism=paper", "delay.steps=9", "delay.fraction=0.3",

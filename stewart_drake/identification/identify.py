@@ -41,6 +41,7 @@ from stewart_drake.identification.unknowns import (
 from stewart_drake.mechanism.geometry import Mechanism, fingerprint
 from stewart_drake.mechanism.kinematics import SingularPoseError, UnreachablePoseError
 from stewart_drake.scenario.calibration import Calibration
+from stewart_drake.scenario.signals import BIAS, COULOMB, DAMPING, PAYLOAD, PAYLOAD_POSITION
 from stewart_drake.types import Array
 
 WRONG: Final = 1.5  # chi^2 per value above which a fit is wrong and its intervals have no meaning
@@ -112,6 +113,18 @@ class Identification:
         names = tuple(NAMES[k] for k in places)
         P = self.covariance[np.ix_(places, places)]
         return Calibration(fingerprint(mechanism), names, self.values[places], P)
+
+    @property
+    def plant(self) -> dict[str, float | list[float]]:
+        """Fields of a scenario's plant that is like the machine."""
+        value = [float(f"{x:.6g}") for x in self.values[DYNAMIC]]
+        return {
+            "torque_bias": value[BIAS],
+            "payload_mass": max(value[PAYLOAD], 0.0),
+            "payload_position": value[PAYLOAD_POSITION],
+            "joint_damping": max(value[DAMPING], 0.0),
+            "coulomb_friction": max(value[COULOMB], 0.0),
+        }
 
     @cached_property
     def unseen(self) -> tuple[int, list[str]]:
