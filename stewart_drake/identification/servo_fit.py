@@ -55,7 +55,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification import progress
 from stewart_drake.identification.innovations import Innovations
-from stewart_drake.identification.servo_logs import ServoLog
+from stewart_drake.identification.servo_logs import ServoLog, held_setpoints
 from stewart_drake.law.servos import PositionServo, turned
 from stewart_drake.mechanism.geometry import Mechanism, with_rotors
 from stewart_drake.mechanism.kinematics import legs_along
@@ -183,9 +183,7 @@ class ServoModel:
 
     def held_setpoints(self, delay: float) -> Array:
         """Return the setpoints (n, 6) in effect at the times of the log."""
-        times = self.log.times
-        newest = np.searchsorted(times + delay, times, side="right") - 1
-        return self.log.setpoints[np.maximum(newest, 0)]
+        return held_setpoints(self.log.times, self.log.setpoints, delay)
 
     def innovations(self, theta: Array, rounding: float) -> Innovations:
         """Return the filter of residuals near theta; friction of slow cranks is unknown."""
