@@ -73,9 +73,9 @@ def identify(
     """Find delay, friction and geometry in logs of one machine.
 
     `save` of the result also writes mechanism.yaml and calibration.yaml, and, if they explain the
-    log, found.yaml, an overlay of a scenario that reads both. From a CSV
-    log of setpoints and crank angles it finds the numbers of position servos instead, and writes
-    servos.yaml, an overlay of a scenario, if they explain the log.
+    log, found.yaml, an overlay of a scenario that reads both. From a CSV log of setpoints and crank
+    angles it finds the numbers of position servos instead, and writes servos.yaml, an overlay of a
+    scenario, if they explain the log.
 
     Args:
         logs: signals.nc of a run, or CSV; one CSV log of setpoints.

@@ -181,8 +181,8 @@ def _delivered(
 
     summary: Any = result.summary
     s = summary["live"]
+    end = End(result.status, result.stopped)
     if result.stopped is not None:
-        end = End(result.status, result.stopped)
         advice = end.advice
         if delivery.out is not None and LOG in logs:
             advice = advice.replace("With --out the log", "The log")
@@ -191,7 +191,6 @@ def _delivered(
     if result.status == "completed":
         delivery.say(run_document(result).plain())
     late = s["sent_after_due_ms"]
-    lost = result.status in ("lost_machine", "lost_contact", "refused", "left_workspace")
     commands = "setpoints" if result.scenario.controller.command == "cranks" else "torques"
     delivery.say_wrapped(
         f"{counted(s['samples'], 'samples')} with those of coming to rest, "
@@ -208,8 +207,8 @@ def _delivered(
             f"{commands} came too late or not at all for many periods: a larger link.playout or "
             "controller.packet_repeats bridges more; stewart-drake analyze link compares bounds"
         )
-    judged, jitter = result.summary["controller_margin"], s["jitter_std_ms"]
-    if lost and judged and judged["stable"] and result.scenario.link.kind == "wire":
+    judged, jitter = summary["controller_margin"], s["jitter_std_ms"]
+    if end.failed and judged and judged["stable"] and result.scenario.link.kind == "wire":
         margin = 1e3 * min(judged["delay_margin_s"])
         if jitter > margin:
             delivery.say_wrapped(
@@ -227,7 +226,7 @@ def _delivered(
         delivery.add_files("summary.json", "signals.nc", *logs)
     if found is not None:
         delivery.draw(PAGE, found.write_page)
-    return delivery.end(result.summary, result.status == "interrupted") or int(lost)
+    return delivery.end(result.summary, result.status == "interrupted") or int(end.failed)
 
 
 def _serve(address: Connection, chosen: Chosen) -> None:
