@@ -58,9 +58,17 @@ from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
 from tests.browser import browser, needs_chromium
 from tests.live_driver import in_real_time, running_machine
 
-WAY = "low: 0.1, high: 0.12, loss: 0.02"
-OVER_A_NETWORK = f"link={{kind: network, {WAY}, return: {{{WAY}}}}}"
+
+def network(way, back=None):
+    """Return the setting of a link with these fields of the way there, and of the way back."""
+    return f"link={{kind: network, {way}, return: {{{back or way}}}}}"
+
+
+OVER_A_NETWORK = network("low: 0.1, high: 0.12, loss: 0.02")
+QUICK = network("low: 0.01, high: 0.02, loss: 0")
 FROM_REST = ("start=rest", "queue=zero")
+PARKED = ("plant.gravity=true", "start=rest", "queue=equilibrium")
+HEAVY = (*PARKED, "actuator.torque_limit=6")
 SETTINGS = ("plant.kind=exact", "start=on_reference", "queue=reference")
 
 
@@ -208,8 +216,7 @@ def test_a_second_controller_takes_over_in_motion():
 @in_real_time
 def test_a_parked_plate_that_is_not_at_the_start_is_held_on_the_way_to_it():
     """The torques that hold it act until the first ones of the law arrive."""
-    small = "reference.amplitude=[0, 0, 0, 0, 0, 0.02]"
-    settings = ("plant.gravity=true", "start=rest", "queue=equilibrium", small)
+    settings = (*PARKED, "reference.amplitude=[0, 0, 0, 0, 0, 0.02]")
     with paper_machine(*settings, "reference.offset=[0, 0, 0, 0, 0, 0.384]", rate=5.0) as running:
         result = driven(running, 4.0, *settings)
     assert result.status == "completed" and result.summary["live"]["taken_over"]
@@ -261,10 +268,8 @@ def test_a_run_ends_where_measurements_stay_away(kind, missing):
 @in_real_time
 def test_a_gap_after_the_first_measurement_of_encoders_does_not_end_a_run():
     """One set of angles shows no rates, but the plate of a parked machine rests."""
-    way = "low: 0.01, high: 0.02, loss: 0"
-    link = f"link={{kind: network, {way}, return: {{{way}}}}}"
-    heavy = ("plant.gravity=true", "start=rest", "queue=equilibrium", "controller.period=0.02")
-    settings = (*heavy, "sensor.kind=encoders", "reference.amplitude=[0, 0, 0, 0, 0, 0.005]", link)
+    encoders = ("sensor.kind=encoders", "controller.period=0.02")
+    settings = (*PARKED, *encoders, "reference.amplitude=[0, 0, 0, 0, 0, 0.005]", QUICK)
     with paper_machine(*settings, kind=silent(lambda time: 0 < time < 0.3)) as running:
         result = driven(running, 0.6, *settings)
     assert result.status == "completed" or result.stopped.time > 0.6, result.failure
@@ -286,8 +291,7 @@ def test_an_error_of_which_half_was_measured_is_none():
 @in_real_time
 def test_measurements_may_take_longer_than_a_period():
     """The step waits for as long as the round trips of the call varied."""
-    way = "low: 0.02, high: 0.03, loss: 0"
-    link = f"link={{kind: network, {way}, return: {{low: 0.02, high: 0.17, loss: 0}}}}"
+    link = network("low: 0.02, high: 0.03, loss: 0", "low: 0.02, high: 0.17, loss: 0")
     with paper_machine(link, *FROM_REST) as running:
         result = driven(running, 4.0, *FROM_REST, "link.kind=network")
     assert result.status == "completed"
@@ -299,10 +303,9 @@ def test_measurements_may_take_longer_than_a_period():
 def test_coarse_encoders_over_a_lossy_link_come_to_rest():
     """Their rates are uncertain, which is no reason for a new reference."""
     way = "low: 0.005, high: 0.03, loss: 0.05"
-    link = f"link={{kind: network, {way}, burst: 3, return: {{{way}}}}}"
-    heavy = ("plant.gravity=true", "start=rest", "queue=equilibrium", "controller.period=0.02")
-    encoders = ("sensor={kind: encoders, bits: 12, samples: 8}", "actuator.torque_limit=6")
-    settings = (*heavy, *encoders, "reference.amplitude=[0, 0, 0, 0, 0, 0.01]", link)
+    link = network(f"{way}, burst: 3", way)
+    encoders = ("sensor={kind: encoders, bits: 12, samples: 8}", "controller.period=0.02")
+    settings = (*HEAVY, *encoders, "reference.amplitude=[0, 0, 0, 0, 0, 0.01]", link)
     said = []
     with paper_machine(*settings) as running:
         ready = prepare_session(scenario_of(*settings), running.address)
@@ -311,7 +314,6 @@ def test_coarse_encoders_over_a_lossy_link_come_to_rest():
     assert result.accumulated_error < 0.5 and result.summary["live"]["recoveries"] == 0
 
 
-HEAVY = ("plant.gravity=true", "start=rest", "queue=equilibrium", "actuator.torque_limit=6")
 FAR_OFF = (*HEAVY, "reference.amplitude=[0, 0, 0, 0, 0, 0.02]")
 NEAR = (
     *HEAVY, "controller.period=0.05", "delay.steps=4",
@@ -374,13 +376,10 @@ class Holds(Viewer):
 @in_real_time
 def test_at_the_end_the_plate_is_held_until_it_is_asked_to_end(duration, status):
     """Without torques it falls within tenths of a second, as is said before and after."""
-    small = "reference.amplitude=[0, 0, 0, 0, 0, 0.005]"
-    heavy = ("plant.gravity=true", "start=rest", "queue=equilibrium", small)
-    way = "low: 0.01, high: 0.02, loss: 0"
-    link = f"link={{kind: network, {way}, return: {{{way}}}}}"
-    with paper_machine(*heavy, link) as running:
+    settings = (*PARKED, "reference.amplitude=[0, 0, 0, 0, 0, 0.005]", QUICK)
+    with paper_machine(*settings) as running:
         viewer = Holds(running.machine)
-        ready = prepare_session(scenario_of(*heavy, link), running.address)
+        ready = prepare_session(scenario_of(*settings), running.address)
         told = plans(ready, duration, "paper")
         how = {"hold": True, "viewer": viewer, "say": viewer.said.append, "accept_jitter": True}
         result = drive(
