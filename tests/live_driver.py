@@ -2,8 +2,9 @@
 
 import functools
 import threading
+import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -74,6 +75,14 @@ def in_a_thread(machine: Machine) -> Iterator[None]:
     finally:
         over.set()
         thread.join()
+
+
+def until(condition: Callable[[], Any], seconds: float = 10.0) -> None:
+    """Wait until a condition holds."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
 
 
 @contextmanager
@@ -265,9 +274,9 @@ class Together:
         states = []
         begin, period = self.driver.begin, self.driver.period
         now = self.machine.time()
-        for time in range(now - now % period + period, begin, period):
-            self.at(time)
-            self.driver.say(time)
+        for sampled in range(now - now % period + period, begin, period):
+            self.at(sampled)
+            self.driver.say(sampled)
         for k in range(samples):
             time = begin + k * period
             self.at(time)

@@ -28,7 +28,7 @@ from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import servo_law
 from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.signals import POSE
-from tests.live_driver import Clock, Wire, in_a_thread, in_real_time
+from tests.live_driver import Clock, Wire, in_a_thread, in_real_time, until
 
 server = pytest.importorskip("websockets.sync.server")
 
@@ -90,13 +90,6 @@ def daemon():
     made = StandIn()
     yield made
     made.close()
-
-
-def until(condition, seconds=10.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 # ---------------------------------------------------------------- setpoints without jumps

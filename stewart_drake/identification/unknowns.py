@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stewart_drake.core.layout import LEG_NUMBERS
 from stewart_drake.identification.model import LEG_PLACES, NUM_DYNAMIC, NUM_GEOMETRY, Numbers
 from stewart_drake.identification.tolerances import Tolerances
-from stewart_drake.mechanism.geometry import Mechanism, geometry_of, plate_radius
+from stewart_drake.mechanism.geometry import Mechanism, drawing_of, geometry_of, plate_radius
 from stewart_drake.scenario.signals import (
     BALL_JOINT_FRICTION_SPEED,
     BIAS,
@@ -99,6 +99,7 @@ class Unknowns:
             rod_lengths=legs[:, 1],
             p_PQ=legs[:, 2:5],
             p_WS=legs[:, 5:8],
+            drawn=drawing_of(self.mechanism),
         )
 
 

@@ -260,7 +260,8 @@ class Contact:
         differs = None if offered is None else offered.differing(self.identity)
         if differs is not None:
             raise ConfigError(
-                f"{self.where} has {differs[0]}; the controller is designed for {differs[1]}"
+                f"{self.where} has {differs[0]}; the controller is designed for {differs[1]}: "
+                "expected the same at both ends"
             )
 
 

@@ -86,15 +86,19 @@ class Exchange:
         lead = _LEAD + contact.link.longest / last.rate
         asked, until = round((here + lead * last.rate) * SECOND), now() + round(_ANSWER * SECOND)
         step = round(min(self.real_period, _REPEATED) * SECOND)
+        # A plate in motion is parked again if it has left its workspace.
+        parked = bool(last.flags & (MachineFlags.PARKED | MachineFlags.RESETS))
         while not (self._began and now() >= self._due(0)):
             if now() > until:
                 raise TimeoutError("got one that has not begun when it was asked to")
             contact.send(begin=self._began or asked, flags=flags)
             for message in contact.wait(now() + step):
-                if message.begin != NEVER and message.head.nonce == contact.session.nonce:
-                    self._began = message.begin
+                if message.head.nonce == contact.session.nonce:
+                    parked |= MachineFlags.PARKED in message.flags
+                    if message.begin != NEVER:
+                        self._began = message.begin
                 self._take(message)
-        return bool(last.flags & (MachineFlags.PARKED | MachineFlags.RESETS))
+        return parked
 
     def stop(self) -> None:
         """Order the safe torque, in three datagrams."""

@@ -40,18 +40,20 @@ from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.mechanism.trajectories import catch_up, evaluate
 from stewart_drake.scenario.run_log import RunLog
 from stewart_drake.scenario.signals import (
+    ANGLES,
     MODEL_TORQUE,
     NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
     PACKETS,
     POSE,
+    POSITION,
     RATES,
 )
 from stewart_drake.types import Array
 
 START_ERROR: Final = 0.02
-"""Distance from the scenario's start up to which the plate is there, as a share of the motion."""
+"""Distance up to which the plate is where it should rest, as a share of the motion."""
 REST_RATE: Final = 0.005
 """Rate up to which a reference is at rest, in the same unit per s."""
 _REST_TIME: Final = 0.5
@@ -86,6 +88,11 @@ class LiveLoop:
 
     _compared = slice(0, NUM_STATE)
     """Part of the state that is compared with the scenario's start."""
+    _led_from = 0.1
+    """Distance from there above which the plate is led there first, as a share of the motion.
+
+    Without a path to the start the law is faster.
+    """
 
     def __init__(
         self,
@@ -202,8 +209,7 @@ class LiveLoop:
         return np.asarray(np.ptp(self._poses, axis=0))
 
     def _motion(self) -> str:
-        angle, way = self._moved()[:3].max(), self._moved()[3:].max()
-        return f"by {math.degrees(angle):.2g} deg and {1e3 * way:.2g} mm in {_REST_TIME:g} s"
+        return f"by {_length(self._moved())} in {_REST_TIME:g} s"
 
     def _sample(self, k: int, message: MachineMessage | None) -> End | None:
         """Step the law and send its torques; return the end of the run, or None."""
@@ -362,12 +368,15 @@ class LiveLoop:
         if first is None:
             return None
         away = np.abs(first.state - design.experiment.start) / np.tile(self._size, 2)
-        if away[part].max() <= START_ERROR:
+        if away[part].max() <= self._led_from:
             return None
         self.taken_over = True
         problem = self._lead(t, first.state, message)
         if problem is None:
-            self._say("the plate is not where the scenario begins: it is led there first")
+            apart = np.abs(first.state - design.experiment.start)[POSE]
+            self._say(
+                f"the plate is {_length(apart)} off the scenario's start: it is led there first"
+            )
         return problem
 
     def _lead(self, t: float, state: Array, message: MachineMessage | None) -> str | None:
@@ -419,6 +428,11 @@ class LiveLoop:
         )
 
 
+def _length(change: Array) -> str:
+    """Return the largest turn and the largest way of a change (6,) of the pose in words."""
+    return f"{math.degrees(change[ANGLES].max()):.2g} deg and {1e3 * change[POSITION].max():.2g} mm"
+
+
 class CrankLoop(LiveLoop):
     """Runs the law for servos given by their stiffness, which sends plans of setpoints.
 
@@ -426,6 +440,7 @@ class CrankLoop(LiveLoop):
     """
 
     _compared = POSE
+    _led_from = START_ERROR  # servos would jump
     _last: Array | None = None
     """Setpoint (6,) that was sent last, rad."""
 

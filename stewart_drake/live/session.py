@@ -37,7 +37,7 @@ from stewart_drake.live.viewer import Viewer
 from stewart_drake.loop.cautions import overconfidence
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.peer import identity_of
-from stewart_drake.loop.preparation import Experiment
+from stewart_drake.loop.preparation import Experiment, known_dynamics
 from stewart_drake.loop.recording import summarize
 from stewart_drake.loop.results import LEAST_MEASURED, LiveSummary, SimulationResult
 from stewart_drake.reporting.document import templates
@@ -102,11 +102,17 @@ def prepare_session(
         with one_blas_thread:
             scenario, read = read_learned(scenario)
             made = design(as_seen(scenario, contact.link, machine), machine, learned or read)
-            margin = controller_margin(_in_time(made.experiment))
+            margin = _margin(made.experiment)
         return Ready(endpoint, contact, made, margin)
     except BaseException:
         endpoint.close()
         raise
+
+
+def _margin(experiment: Experiment) -> ControllerMargin:
+    """Judge the loop; a calibrated machine counts instead of the scenario's plant."""
+    calibrated = None if experiment.calibration is None else known_dynamics(experiment)
+    return controller_margin(_in_time(experiment), machine=calibrated)
 
 
 def _in_time(experiment: Experiment) -> Experiment:

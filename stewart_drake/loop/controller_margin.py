@@ -170,7 +170,9 @@ class ControllerMargin:
         }
 
 
-def controller_margin(loop: Judged, until: float | None = None) -> ControllerMargin:
+def controller_margin(
+    loop: Judged, until: float | None = None, machine: StewartDynamics | None = None
+) -> ControllerMargin:
     """Judge stability and margins of a loop along its reference.
 
     Takes 0.2 s for a delay of ten periods. An estimator, a tuner and torque limits are left out.
@@ -179,6 +181,7 @@ def controller_margin(loop: Judged, until: float | None = None) -> ControllerMar
         loop: a scenario, prepared or not, a shipped name or a path; or a `DesignedLaw`, with the
             machine and the delay that it assumes.
         until: s; None is the duration, or the horizon of the design.
+        machine: the machine that the law drives; None is that of the scenario's plant.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
@@ -191,6 +194,7 @@ def controller_margin(loop: Judged, until: float | None = None) -> ControllerMar
         problem = "servos close theirs at the machine, and nothing is fed back across the delay"
         return ControllerMargin(sc.controller.period, sc.eta, problem=problem, span=end)
     truth, law = _parts(loop, experiment)
+    truth = truth if machine is None else machine
     times = np.linspace(0.0, end, INSTANTS)
     poses = poses_along(experiment.reference, times)
     inside = [margin(truth.mechanism, pose) > 0 for pose in poses]

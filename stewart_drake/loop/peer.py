@@ -5,7 +5,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 from stewart_drake.mechanism.files import load_mechanism
-from stewart_drake.mechanism.geometry import fingerprint
+from stewart_drake.mechanism.geometry import drawing_of
 from stewart_drake.scenario.config import EncoderSensorConfig, Scenario, StateSensorConfig
 
 DIGEST: Final = 8
@@ -112,15 +112,15 @@ class Identity(NamedTuple):
 def identity_of(scenario: Scenario) -> Identity:
     """Return the identity of a scenario's machine as drawn.
 
-    The calibration (`controller.calibration`) and the simulated machine (`plant.mechanism`) are not
-    part of it.
+    What `identify` found (beside `drawn` in its mechanism.yaml, and `controller.calibration`) and
+    the simulated machine (`plant.mechanism`) are not part of it.
     """
     mechanism, sensor = load_mechanism(scenario.mechanism), scenario.sensor
     period, read = scenario.controller.period, str(sensor.kind)
     if sensor.kind == "encoders":
         read = f"encoders, {sensor.samples} samples, {code_bits(sensor)} bits"
     return Identity(
-        Part(bytes.fromhex(fingerprint(mechanism)), mechanism.name[:NAME]),
+        Part(bytes.fromhex(drawing_of(mechanism)), mechanism.name[:NAME]),
         _part(f"period {round(period * SECOND)} ns", f"{period:g} s"),
         _part(f"sensor {read}", read),
         _part(f"actuator {scenario.actuator.kind}", scenario.actuator.kind),

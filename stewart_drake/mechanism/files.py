@@ -56,6 +56,9 @@ Joint = Annotated[int, Field(ge=0, le=5)]
 Order = Annotated[list[Joint], exactly(6), AfterValidator(_each_joint_once)]
 Branch = Annotated[int, AfterValidator(_one_of_two), one_message("-1 or 1")]
 Branches = Annotated[list[Branch], exactly(6)]
+Fingerprint = Annotated[
+    str, Field(pattern="^[0-9a-f]{16}$"), one_message("16 hexadecimal digits in quotes")
+]
 LegNumbers = Annotated[list[Annotated[int, Field(ge=1, le=6)]], Field(max_length=6)]
 Length = Annotated[
     Radius | Annotated[list[Radius], exactly(6)],
@@ -141,6 +144,7 @@ class MechanismSpec:
     rod: LinkSpec
     motor: MotorSpec = Field(default_factory=MotorSpec)
     ball_joints: BallJointSpec = Field(default_factory=BallJointSpec)
+    drawn: Fingerprint | None = None  # of the drawing, in a file of `identify`
     pattern: PatternSpec | None = None
     legs: Annotated[list[LegSpec], exactly(6, "legs")] | None = None
 
@@ -212,6 +216,7 @@ def mechanism_yaml(mechanism: Mechanism) -> str:
             "rod": link(m.rod, m.rod_lengths),
             "motor": {"effort_limit": None if m.effort_limit is None else float(m.effort_limit)},
             **({} if np.all(m.ball_joints) else {"ball_joints": rubbing}),
+            **({} if m.drawn is None else {"drawn": m.drawn}),
         }
     )
 
@@ -247,6 +252,7 @@ def build_mechanism(spec: MechanismSpec) -> Mechanism:
             ball_joints=np.array(
                 [[leg in rubs for leg in LEGS] for rubs in (ends.crank, ends.plate)]
             ),
+            drawn=spec.drawn,
         )
     except UnreachablePoseError:
         anchors = "legs" if spec.pattern is None else "pattern"

@@ -92,6 +92,7 @@ class Mechanism(kinematics.Legs):
         ball_joints: (2, 6) of 0 or 1, whether the joints at the crank tips (first row) and at the
             plate have the friction of a scenario's `plant.ball_joint_friction` and
             `ball_joint_damping`; by default all.
+        drawn: `fingerprint` of the drawing of an identified machine, or None.
 
     Raises:
         ConfigError: naming the field, its value and what is allowed.
@@ -106,6 +107,7 @@ class Mechanism(kinematics.Legs):
     rod: Link
     effort_limit: float | None = None
     ball_joints: Array = field(default_factory=lambda: np.ones((2, NUM_LEGS)))
+    drawn: str | None = None
 
     def __post_init__(self) -> None:
         for name, shape in (
@@ -285,6 +287,11 @@ def fingerprint(mechanism: Mechanism) -> str:
     if not np.all(m.ball_joints):
         words += [f"{x:.0f}" for x in m.ball_joints.ravel()]
     return hashlib.sha256(" ".join(words).encode()).hexdigest()[:16]
+
+
+def drawing_of(mechanism: Mechanism) -> str:
+    """Return the fingerprint of a machine's drawing, which identification does not change."""
+    return mechanism.drawn or fingerprint(mechanism)
 
 
 def bar_inertia(mass: float, length: float) -> Array:
