@@ -68,11 +68,11 @@ class Ready(NamedTuple):
         """Reason why the jitter of the link may destabilise the loop, or None."""
         if self.margin.stable is False:
             return "the loop is unstable even without jitter: the plate may be lost"
-        jitter, on_wire = self.contact.link.jitter, self.design.experiment.scenario.link
-        if on_wire.kind == "network" or not jitter > self.margin.delay_margin:
+        spread, link = self.contact.link.spread, self.design.experiment.scenario.link
+        if link.kind == "network" or not spread > self.margin.delay_margin:
             return None  # a torque that comes early waits for its play-out time
         return (
-            f"the jitter of {milliseconds(jitter)} is more than the "
+            f"round trips vary by {milliseconds(spread)} (standard deviation), more than the "
             f"{milliseconds(self.margin.delay_margin)} of delay error that the loop is stable for, "
             "and the machine has no play-out buffer: jitter that reaches the motors makes errors "
             "grow until the plate is lost"
