@@ -40,20 +40,16 @@ def to_sdformat(mechanism: Mechanism, *, collision: bool = True, weld: bool = Tr
     for leg in LEGS:
         _leg(model, mechanism, home, leg)
     if collision:
-        _filter_own(model)
+        group = _add(model, "drake:collision_filter_group", name="machine")
+        for link in model.iter("link"):
+            _add(group, "drake:member", link.get("name"))
+        _add(group, "drake:ignored_collision_filter_group", "machine")
     else:
         for link in model.iter("link"):
             for shape in link.findall("collision"):
                 link.remove(shape)
     ET.indent(sdf, " " * 2)
     return '<?xml version="1.0"?>\n' + ET.tostring(sdf, encoding="unicode") + "\n"
-
-
-def _filter_own(model: ET.Element) -> None:
-    group = _add(model, "drake:collision_filter_group", name="machine")
-    for link in model.iter("link"):
-        _add(group, "drake:member", link.get("name"))
-    _add(group, "drake:ignored_collision_filter_group", "machine")
 
 
 def _base(model: ET.Element, mechanism: Mechanism, weld: bool) -> None:
@@ -80,9 +76,7 @@ def _base(model: ET.Element, mechanism: Mechanism, weld: bool) -> None:
         _solid(link, f"post_{leg}", _pose(foot), post, BASE_COLOR)
         _frame(model, f"shaft_{leg}", "base", _pose(p_WS, R_WS))
     if weld:
-        joint = _add(model, "joint", name="base_weld", type="fixed")
-        _add(joint, "parent", "world")
-        _add(joint, "child", "base")
+        _joint(model, "base_weld", "fixed", "world", "base")
 
 
 def _plate(model: ET.Element, mechanism: Mechanism, home: Assembly) -> None:
@@ -101,13 +95,8 @@ def _plate(model: ET.Element, mechanism: Mechanism, home: Assembly) -> None:
     tip = _cylinder(0.09 * radius, 0.4 * size.plate_thickness)
     _visual(link, "x_axis_tip", _pose([0.85 * radius, 0, above]), tip, CRANK_COLOR)
     for leg, p_PQ in zip(LEGS, mechanism.p_PQ, strict=True):
-        _visual(
-            link,
-            f"joint_{leg}",
-            _pose(p_PQ),
-            _shape("sphere", radius=[1.6 * size.rod_radius]),
-            JOINT_COLOR,
-        )
+        ball = _shape("sphere", radius=[1.6 * size.rod_radius])
+        _visual(link, f"joint_{leg}", _pose(p_PQ), ball, JOINT_COLOR)
         _frame(model, f"plate_joint_{leg}", "plate", _pose(p_PQ))
 
 
@@ -122,13 +111,8 @@ def _leg(model: ET.Element, mechanism: Mechanism, home: Assembly, leg: int) -> N
     _solid(crank, "arm", _pose([u / 2, 0, 0]), arm, CRANK_COLOR)
     hub = _cylinder(1.2 * size.crank_thickness, 1.5 * size.crank_thickness)
     _visual(crank, "hub", _pose([0, 0, 0]), hub, CRANK_COLOR)
-    _visual(
-        crank,
-        "tip",
-        _pose([u, 0, 0]),
-        _shape("sphere", radius=[1.6 * size.rod_radius]),
-        JOINT_COLOR,
-    )
+    ball = _shape("sphere", radius=[1.6 * size.rod_radius])
+    _visual(crank, "tip", _pose([u, 0, 0]), ball, JOINT_COLOR)
     _frame(model, f"tip_{leg}", f"crank_{leg}", _pose([u, 0, 0]))
 
     rod = _add(model, "link", name=f"rod_{leg}")
@@ -139,16 +123,12 @@ def _leg(model: ET.Element, mechanism: Mechanism, home: Assembly, leg: int) -> N
     _solid(rod, "tube", _pose([length / 2, 0, 0], along_x), tube, ROD_COLOR)
     _frame(model, f"rod_end_{leg}", f"rod_{leg}", _pose([length, 0, 0]))
 
-    motor = _add(model, "joint", name=f"motor_{leg}", type="revolute")
-    _add(motor, "parent", "base")
-    _add(motor, "child", f"crank_{leg}")
+    motor = _joint(model, f"motor_{leg}", "revolute", "base", f"crank_{leg}")
     axis = _axis(motor, "axis", np.array([0.0, 0, 1]))
     if mechanism.effort_limit is not None:
         _add(_add(axis, "limit"), "effort", f"{mechanism.effort_limit:.17g}")
 
-    universal = _add(model, "joint", name=f"universal_{leg}", type="universal")
-    _add(universal, "parent", f"crank_{leg}")
-    _add(universal, "child", f"rod_{leg}")
+    universal = _joint(model, f"universal_{leg}", "universal", f"crank_{leg}", f"rod_{leg}")
     for tag, direction in (
         ("axis", home.R_WD[i].T @ mechanism.R_WS[i][:, 2]),
         ("axis2", np.array([0.0, 1, 0])),
@@ -156,14 +136,14 @@ def _leg(model: ET.Element, mechanism: Mechanism, home: Assembly, leg: int) -> N
         passive = _add(_axis(universal, tag, direction), "limit")
         _add(passive, "effort", "0")
 
-    ball = _add(model, "drake:ball_constraint")
+    loop = _add(model, "drake:ball_constraint")
     for name, value in (
         ("body_A", f"rod_{leg}"),
         ("body_B", "plate"),
         ("p_AP", _numbers([length, 0, 0])),
         ("p_BQ", _numbers(mechanism.p_PQ[i])),
     ):
-        _add(ball, f"drake:ball_constraint_{name}", value)
+        _add(loop, f"drake:ball_constraint_{name}", value)
 
 
 def _add(parent: ET.Element, tag: str, text: str | None = None, **attributes: str) -> ET.Element:
@@ -202,6 +182,13 @@ def _inertial(link: ET.Element, body: Body, com: Array) -> None:
     moments = dict(zip(("ixx", "iyy", "izz"), body.inertia, strict=True))
     for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"):
         _add(inertia, name, _numbers([moments.get(name, 0.0)]))
+
+
+def _joint(model: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:
+    joint = _add(model, "joint", name=name, type=kind)
+    _add(joint, "parent", parent)
+    _add(joint, "child", child)
+    return joint
 
 
 def _axis(joint: ET.Element, tag: str, xyz: Array) -> ET.Element:
