@@ -16,6 +16,7 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import jsonable
+from stewart_drake.files.yamlio import validate_pairs
 from stewart_drake.loop import bulk
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
@@ -27,7 +28,7 @@ from stewart_drake.studies import robustness, statistics
 from stewart_drake.studies.robustness import RobustnessStudy, factor_values, study_robustness, table
 from stewart_drake.studies.runs import Outcome
 from stewart_drake.studies.statistics import auc_interval, explain
-from stewart_drake.studies.study_options import Ranges, RobustnessOptions, read_ranges
+from stewart_drake.studies.study_options import Ranges, RobustnessOptions
 from stewart_drake.studies.uncertainty import (
     MACHINE,
     Scales,
@@ -330,7 +331,8 @@ def test_multibody_delays_are_whole_steps():
 
 
 def test_ranges_from_settings():
-    ranges = read_ranges(["payload=0.2", "torque_limit=null", "delay_steps=1"])
+    settings = ["payload=0.2", "torque_limit=null", "delay_steps=1"]
+    ranges = validate_pairs(Ranges, settings, "--vary")
     assert ranges == Ranges(payload=0.2, torque_limit=None, delay_steps=1)
     for bad, problem in (
         ("payload", "name=value"),
@@ -340,7 +342,7 @@ def test_ranges_from_settings():
         ("noise=-1.0", "noise: got -1.0"),
     ):
         with pytest.raises(ConfigError, match=problem) as caught:
-            read_ranges([bad])
+            validate_pairs(Ranges, [bad], "--vary")
         assert "\n" not in str(caught.value)
 
 

@@ -9,8 +9,9 @@ import typer
 from stewart_drake.cli.common import Chosen, Delivery, command_line, named, on_interrupt
 from stewart_drake.cli.options import command
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.yamlio import validate_pairs
 from stewart_drake.identification.progress import shown_by
-from stewart_drake.identification.tolerances import TOLERANCE_UNITS, read_tolerances
+from stewart_drake.identification.tolerances import TOLERANCE_UNITS, Tolerances
 from stewart_drake.reporting.terminal import phase_bar
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.studies.options import refuse
@@ -67,7 +68,7 @@ def identify(
     A CSV log with time[s], setpoint_1[rad] to setpoint_6 and crank_1[rad] to crank_6 shows the
     numbers of position servos. With --out, writes servos.yaml, for --set overlay=FILE.
     """
-    tolerances = read_tolerances(tolerance) if tolerance else None
+    tolerances = validate_pairs(Tolerances, tolerance, "--tolerance") if tolerance else None
     precision = _precision(bits, pose_std) if bits is not None or pose_std else None
     if (plan is None) == (not logs):
         given = "neither" if plan is None else "both"

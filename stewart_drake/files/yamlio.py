@@ -11,7 +11,7 @@ import io
 import json
 import re
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -197,16 +197,14 @@ def _refusal(where: str, type_: type, data: Any, caught: pydantic.ValidationErro
     return ConfigError(f"{where}: {'; '.join(problems)}")
 
 
-def validate_pairs(
-    type_: type[_T], settings: Iterable[str], option: str, units: Mapping[str, str]
-) -> _T:
+def validate_pairs(type_: type[_T], settings: Iterable[str], option: str) -> _T:
     """Return a flat pydantic dataclass from `name=value` texts, the value in YAML.
 
     Args:
-        type_: the dataclass; other fields keep their defaults.
+        type_: the dataclass; other fields keep their defaults. A message shows `units_of` it for
+            the fields that it names.
         settings: the texts; of two with one name the later one counts.
         option: of the command line, opening the message.
-        units: of each field, in words. A message shows those of the fields that it names.
     """
     given: dict[str, Any] = {}
     try:
@@ -218,7 +216,7 @@ def validate_pairs(
         return validate(type_, given, option)
     except ConfigError as error:
         named = set(re.findall(r"\w+", str(error).partition("; expected one of ")[0]))
-        shown = [f"{name}: {unit}" for name, unit in units.items() if name in named]
+        shown = [f"{name}: {unit}" for name, unit in units_of(type_).items() if name in named]
         raise ConfigError(f"{error} ({'; '.join(shown)})" if shown else str(error)) from None
 
 

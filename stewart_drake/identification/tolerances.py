@@ -1,12 +1,11 @@
 """Tolerances of a machine's drawing; nothing heavy is imported here."""
 
-from collections.abc import Iterable
 from typing import Annotated, Final
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from stewart_drake.files.yamlio import units_of, validate_pairs
+from stewart_drake.files.yamlio import units_of
 from stewart_drake.scenario.field_types import STRICT
 
 _Std = Annotated[float, Field(ge=0, le=1e3)]
@@ -35,8 +34,3 @@ class Tolerances:
 
 
 TOLERANCE_UNITS: Final = units_of(Tolerances)  # unit and meaning of each field
-
-
-def read_tolerances(settings: Iterable[str]) -> Tolerances:
-    """Return tolerances from `name=value` settings, the value in YAML."""
-    return validate_pairs(Tolerances, settings, "--tolerance", TOLERANCE_UNITS)

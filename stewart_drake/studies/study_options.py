@@ -1,7 +1,7 @@
 """Options of all studies, and measurements of a new machine; nothing heavy is imported here."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -77,11 +77,6 @@ class Ranges:
 RANGE_UNITS: Final = units_of(Ranges)
 
 
-def read_ranges(settings: Iterable[str]) -> Ranges:
-    """Return the ranges of `name=value` settings, the value in YAML; others keep their default."""
-    return validate_pairs(Ranges, settings, "--vary", RANGE_UNITS)
-
-
 class DelayOptions(Options):
     simulations: Annotated[
         bool, Field(description="Whether to simulate over delay and amplitude too, on all cores.")
@@ -132,7 +127,7 @@ class RobustnessOptions(JobOptions):
         + ". torque_limit takes null too: as the scenario has it.",
         "NAME=VALUE",
         name="vary",
-        read=lambda texts, _: read_ranges(texts),
+        read=lambda texts, _: validate_pairs(Ranges, texts, "--vary"),
     )
     runs: int = option(200, "Number of machines.", "N", ge=1, le=100_000)
     seed: int = option(0, "Random seed.", ge=0)
