@@ -190,7 +190,8 @@ def test_trajectories_are_those_of_an_adaptive_integrator():
     values = unknowns.mean.copy()
     values[DYNAMIC] = CONSTANTS
     model, numbers = MachineModel(PAPER, 0.0), unknowns.numbers(values)
-    course = integrate(model, numbers, states[[0, 2]], plan_steps(segments, 0.23, 1e-3), False)
+    plan = [plan_steps(one, 0.23, 1e-3) for one in segments]
+    course = integrate(model, numbers, states[[0, 2]], plan, False)
     np.testing.assert_allclose(course[0][:, 0], states, atol=2e-7)
     np.testing.assert_allclose(course[0][:3, 1], states[2:5], atol=2e-7)
     assert np.isnan(course[0][3:, 1]).all()
@@ -201,7 +202,7 @@ def test_sensitivities_are_differences_of_trajectories(delay):
     """The delay's equal those of exact ones, unless switches are on samples, at 0.2 s."""
     times = np.arange(0.255, 0.6, 0.02)
     log, states = short_log(times, delay=delay)
-    segment = [Segment(log, 0.255, np.arange(len(times)))]
+    segment = Segment(log, 0.255, np.arange(len(times)))
     unknowns = some_unknowns(PAPER)
     values = unknowns.mean.copy()
     values[DYNAMIC], values[DELAY] = CONSTANTS, delay
@@ -209,7 +210,7 @@ def test_sensitivities_are_differences_of_trajectories(delay):
 
     def at(values, first=states[0], sensitive=False):
         plan = plan_steps(segment, values[DELAY], 2e-3)
-        return integrate(model, unknowns.numbers(values), first[None], plan, sensitive)
+        return integrate(model, unknowns.numbers(values), first[None], [plan], sensitive)
 
     slopes = at(values, sensitive=True)[1][:, 0]
     column = {DELAY: -1, 0: 12, 6: 18, 7: 19, 8: 20, 11: 23}

@@ -151,7 +151,8 @@ class Problem:
         """Return the residuals and J (m, n, 18, columns) at m samples of n segments."""
         unknowns, free = self.unknowns, self.unknowns.free
         numbers = unknowns.numbers(guess.values)
-        steps = plan_steps(self.segments, guess.values[DELAY], longest_step)
+        delay = float(guess.values[DELAY])
+        steps = [plan_steps(one, delay, longest_step) for one in self.segments]
         states, state_sensitivities = integrate(self.model, numbers, guess.first, steps, sensitive)
         m, n, _ = states.shape
         predicted = np.empty((m, n, NUM_MEASURED))
@@ -226,8 +227,7 @@ class Solution(NamedTuple):
 
     @property
     def delay(self) -> float:
-        """Delay, s."""
-        return float(self.guess.values[DELAY])
+        return float(self.guess.values[DELAY])  # s
 
     @property
     def delay_std(self) -> float:
@@ -298,7 +298,8 @@ def with_half_step(problem: Problem, guess: Guess, residual: float = 1.0) -> Pro
     machine: Coulomb friction changes its sign within some hundredths of a second. Steps end at
     samples, so that dense samples already shorten them.
     """
-    steps = plan_steps(problem.segments, guess.values[DELAY], problem.longest_step)
+    delay, longest = float(guess.values[DELAY]), problem.longest_step
+    steps = [plan_steps(one, delay, longest) for one in problem.segments]
     halved = replace(problem, longest_step=max(float(one.h.max()) for one in steps) / 2)
     if halved.longest_step < _SHORTEST_STEP:
         return None

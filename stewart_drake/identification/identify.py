@@ -232,11 +232,7 @@ def _fit_nearest(
 ) -> _FirstFit:
     """Fit the half of the segments that the start predicts best.
 
-    Args:
-        values: of the unknowns, at the start.
-        share: length of the segments, by the usual length.
-        pairs: logs with their measured poses.
-        unknowns: prior.
+    The segments have a share of the usual length; `values` are those of the unknowns at the start.
     """
     late = _COARSE_ERROR if unknowns.std[DELAY] > 0 else 0.0
     whole, first = start.problem_of(pairs, unknowns, values, late, share=share)

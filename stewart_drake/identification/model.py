@@ -127,12 +127,8 @@ class Steps(NamedTuple):
     sample: NDArray[np.intc]  # number of the segment's sample at the end of a step, or -1
 
 
-def plan_steps(segments: list[Segment], delay: float, longest_step: float) -> list[Steps]:
+def plan_steps(segment: Segment, delay: float, longest_step: float) -> Steps:
     """Return the steps from sample to sample and from torque to torque; times in s."""
-    return [_steps_of(segment, delay, longest_step) for segment in segments]
-
-
-def _steps_of(segment: Segment, delay: float, longest_step: float) -> Steps:
     log, start = segment.log, segment.start
     samples = log.times[segment.rows]
     arrivals = log.sent + delay
