@@ -20,7 +20,7 @@ from stewart_drake.files.fileio import make_folder, write_asked, write_whole
 from stewart_drake.files.yamlio import validate, yaml_text
 from stewart_drake.identification import identify as identification
 from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
-from stewart_drake.identification.plan import MOTION, Plan, plan
+from stewart_drake.identification.plan import MOTION, Plan, motion_csv, plan
 from stewart_drake.identification.servo_fit import ServoIdentification, identify_servos
 from stewart_drake.identification.servo_logs import is_servo_log, read_servo_log
 from stewart_drake.identification.servo_plan import SETPOINTS_FILE, ServoPlan, plan_servos
@@ -168,7 +168,8 @@ def _expected(tolerances: Any, precision: Any) -> tuple[Tolerances | None, Preci
 
 
 def _write_plan(found: Plan, folder: Path) -> list[str]:
-    texts = {MOTION: found.motion_csv, SCENARIO: scenario_yaml(found.scenario)}
+    motion = motion_csv(found.times, found.poses)
+    texts = {MOTION: motion, SCENARIO: scenario_yaml(found.scenario)}
     return _written(folder, texts)
 
 

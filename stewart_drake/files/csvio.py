@@ -53,6 +53,12 @@ class Table:
         return np.column_stack([self.columns[name] for name in names])
 
 
+def csv_text(heads: list[str], rows: Array, digits: int = 12) -> str:
+    """Return heads and rows (n, k) as CSV; a number that is not finite is an empty cell."""
+    frame = pd.DataFrame(np.where(np.isfinite(rows), rows, np.nan), columns=heads)
+    return str(frame.to_csv(index=False, float_format=f"%.{digits}g", lineterminator="\n"))
+
+
 def read_table(
     path: Path,
     expected: str,

@@ -28,6 +28,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, margin, margins
+from stewart_drake.files.csvio import csv_text
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.fit import Guess, Problem, covariance, without_diverged
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
@@ -121,18 +122,12 @@ class Plan:
             "unseen": {"directions": self.unseen[0], "names": self.unseen[1]},
         }
 
-    @property
-    def motion_csv(self) -> str:
-        """Motion as a file for a reference of kind csv."""
-        return motion_csv(self.times, self.poses)
-
 
 def motion_csv(times: Array, poses: Array) -> str:
+    """Return a motion, times (n,) in s and poses (n, 6), as a file for a reference of kind csv."""
     names = zip(COORDINATE_NAMES, COORDINATE_UNITS, strict=True)
-    lines = [",".join(["time[s]", *(f"{name}[{unit}]" for name, unit in names)])]
-    rows = np.column_stack([times, poses])
-    lines += [",".join(f"{value:.12g}" for value in row) for row in rows]
-    return "\n".join(lines) + "\n"
+    heads = ["time[s]", *(f"{name}[{unit}]" for name, unit in names)]
+    return csv_text(heads, np.column_stack([times, poses]))
 
 
 def multisine(middle: Array, peak: Array, duration: float) -> tuple[Array, Array]:

@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from stewart_drake.dynamics.workspace import margin, margins
+from stewart_drake.files.csvio import csv_text
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.servo_fit import (
     NAMES,
@@ -63,9 +64,8 @@ class ServoPlan:
     @property
     def csv(self) -> str:
         """Setpoints to send, as a file."""
-        head = ",".join(["time[s]", *(f"{name}[rad]" for name in SETPOINTS)])
-        rows = np.column_stack([self.log.times, self.log.setpoints])
-        return "\n".join([head, *(",".join(f"{x:.9g}" for x in row) for row in rows)]) + "\n"
+        heads = ["time[s]", *(f"{name}[rad]" for name in SETPOINTS)]
+        return csv_text(heads, np.column_stack([self.log.times, self.log.setpoints]), digits=9)
 
     @cached_property
     def summary(self) -> dict[str, Any]:
@@ -120,7 +120,9 @@ def plan_servos(
     motions = mixed_motion(experiment.motion_scale, duration, sc.controller.period, seed)
     fitted = [planner.fitted(motion) for motion in motions]
     model = planner.model(np.vstack([angles for _, angles in fitted]))
-    states = planner.inside(model)
+    states = model.states(planner.theta)
+    if states is None:
+        raise ConfigError("plan: got motions that leave the workspace one after the other")
     cranks = _cranks(experiment.truth, states)[:, POSE]
     phase = np.random.default_rng(seed).uniform(-0.5, 0.5, 6)
     code = rounding * math.sqrt(12)
@@ -222,13 +224,6 @@ class _Planner:
         torque, speed = self.peaks(model, states)
         most = _USED * self._experiment.torque_limit
         return setpoints if torque <= most and speed <= self._speed else None
-
-    def inside(self, model: ServoModel) -> Array:
-        """Return the states (n, 12) of a motion that stays in the workspace."""
-        states = model.states(self.theta)
-        if states is None:
-            raise ConfigError("plan: got motions that leave the workspace one after the other")
-        return states
 
     def peaks(self, model: ServoModel, states: Array) -> tuple[float, float]:
         """Return the largest torque without limit, N m, and crank speed, rad/s."""

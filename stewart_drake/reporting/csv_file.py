@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from stewart_drake.files.csvio import csv_text
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.run_log import EXPECTED, headings, read_log
 from stewart_drake.scenario.signals import SIGNALS
@@ -16,11 +17,7 @@ def signals_csv(signals: xr.Dataset) -> str:
 
     A reference of `kind: csv` reads the columns `pose_...` as a motion.
     """
-    import pandas
-
-    header, rows = columns_of(signals)
-    frame = pandas.DataFrame(np.where(np.isfinite(rows), rows, np.nan), columns=header)
-    return str(frame.to_csv(index=False, float_format="%.12g", lineterminator="\n"))
+    return csv_text(*columns_of(signals))
 
 
 def columns_of(signals: xr.Dataset) -> tuple[list[str], Array]:
