@@ -1,6 +1,7 @@
 """Training of the tuner's network: by labels with Levenberg-Marquardt, and by regret."""
 
 import json
+import sys
 from typing import get_args
 
 import numpy as np
@@ -224,15 +225,9 @@ def test_data_that_cannot_be_trained_on_are_refused(data, tmp_path):
 
 
 def test_without_torch_the_message_tells_the_fix(data, monkeypatch):
-    monkeypatch.setitem(training.__builtins__, "__import__", _no_torch)
+    monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(ConfigError, match=r"pip install 'stewart-drake\[train\]'"):
         train(data)
-
-
-def _no_torch(name, *rest, _import=__import__):
-    if name == "torch":
-        raise ImportError(name)
-    return _import(name, *rest)
 
 
 # ---------------------------------------------------------------- by regret

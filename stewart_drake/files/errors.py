@@ -1,7 +1,9 @@
 """The error that every reader of user input raises."""
 
 import difflib
+import importlib
 from collections.abc import Iterable
+from typing import Any
 
 
 class ConfigError(ValueError):
@@ -12,6 +14,14 @@ class ConfigError(ValueError):
 
     def __init__(self, message: str) -> None:
         super().__init__(" ".join(message.splitlines()))  # a file name may hold line breaks
+
+
+def optional(module: str, problem: str) -> Any:
+    """Import a module that may be missing; `problem` is the message of the ConfigError then."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise ConfigError(problem) from None
 
 
 def resembling(name: str, names: Iterable[str]) -> list[str]:

@@ -26,7 +26,7 @@ import numpy as np
 import xarray as xr
 
 from stewart_drake.files.arrayio import load_netcdf
-from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.errors import ConfigError, optional
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.versions import versions
 from stewart_drake.files.yamlio import parse_yaml, validate
@@ -464,12 +464,5 @@ def _scenario_near(path: Path) -> str | None:
 
 
 def _mcap(module: str) -> Any:
-    import importlib
-
-    try:
-        return importlib.import_module(module)
-    except ImportError:
-        raise ConfigError(
-            ".mcap: needs the package mcap; expected pip install 'stewart_drake[log]', or a .csv "
-            "file"
-        ) from None
+    needed = "expected pip install 'stewart_drake[log]', or a .csv file"
+    return optional(module, f".mcap: needs the package mcap; {needed}")

@@ -29,7 +29,7 @@ import cloudpickle
 import joblib
 from typing_extensions import TypeVar
 
-from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.errors import ConfigError, optional
 from stewart_drake.files.fileio import remove_partials, write_whole
 from stewart_drake.files.jsonio import jsonable, load_json
 from stewart_drake.files.yamlio import brief
@@ -310,13 +310,8 @@ def _end_with(parent: int) -> None:
 # joblib's backend for Dask waits for ever if workers die during a call, so futures are used here.
 def _on_dask(scheduler: str, calls: Sequence[_Call]) -> Generator[tuple[str, bytes]]:
     """Yield the results of calls as they finish; closing the iterator cancels the others."""
-    try:
-        import distributed
-    except ImportError:
-        raise ConfigError(
-            "--scheduler: needs the package distributed; install it with pip install distributed"
-        ) from None
-    dask: Any = distributed  # without types
+    install = "install it with pip install distributed"
+    dask = optional("distributed", f"--scheduler: needs the package distributed; {install}")
     try:
         _greet(dask, scheduler)
         client = dask.Client(scheduler, timeout=_CONNECT_TIMEOUT, set_as_default=False)

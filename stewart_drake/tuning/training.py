@@ -35,7 +35,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, least_squares
 
-from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.errors import ConfigError, optional
 from stewart_drake.files.versions import versions
 from stewart_drake.files.yamlio import validate
 from stewart_drake.scenario.config import Scenario
@@ -98,12 +98,8 @@ class Training:
 
 def require_torch() -> Any:
     """Return the module torch, with one thread."""
-    try:
-        import torch
-    except ImportError:
-        raise ConfigError(
-            "tune train: needs torch; install it with pip install 'stewart-drake[train]'"
-        ) from None
+    install = "install it with pip install 'stewart-drake[train]'"
+    torch = optional("torch", f"tune train: needs torch; {install}")
     torch.set_num_threads(1)
     return torch
 
