@@ -243,6 +243,17 @@ def one_message(expected: str) -> pydantic.WrapValidator:
     return pydantic.WrapValidator(check)
 
 
+def rule(holds: Callable[[Any], bool], expected: str = "") -> pydantic.AfterValidator:
+    """Return an annotation of values for which `holds` is true, with one message for the others."""
+
+    def check(value: Any) -> Any:
+        if not holds(value):
+            raise ValueError(expected)
+        return value
+
+    return pydantic.AfterValidator(check)
+
+
 def exactly(number: int, what: str = "numbers") -> pydantic.AfterValidator:
     """Return an annotation of a list with a fixed length, with one message for both bounds."""
 

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
-from stewart_drake.files.yamlio import exactly, load_yaml, one_message, validate, yaml_text
+from stewart_drake.files.yamlio import exactly, load_yaml, one_message, rule, validate, yaml_text
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism, bar_inertia, disc_inertia
 from stewart_drake.mechanism.kinematics import Legs, UnreachablePoseError, dot
 from stewart_drake.scenario.field_types import STRICT
@@ -27,34 +27,22 @@ _UNLIKE = 20  # lengths of one machine that differ by more are in different unit
 _PAPER = 0.1  # kg/m^2, a sheet of paper; a lighter plate has its lengths in millimetres
 
 
-def _in_metres(value: float) -> float:
-    if abs(value) > _LONGEST:
-        raise ValueError(f"metres, {_LONGEST:g} at most (are these millimetres?)")
-    return value
+_in_metres = rule(
+    lambda length: abs(length) <= _LONGEST,
+    f"metres, {_LONGEST:g} at most (are these millimetres?)",
+)
+_each_once = rule(lambda order: len(set(order)) == len(order), "each of 0 to 5 once")
 
-
-def _one_of_two(branch: int) -> int:
-    if abs(branch) != 1:
-        raise ValueError
-    return branch
-
-
-def _each_joint_once(order: list[int]) -> list[int]:
-    if len(set(order)) < len(order):
-        raise ValueError("each of 0 to 5 once")
-    return order
-
-
-Coordinate = Annotated[float, AfterValidator(_in_metres)]
+Coordinate = Annotated[float, _in_metres]
 Degrees = Annotated[float, Field(ge=-360, le=360)]
-Radius = Annotated[float, Field(ge=_SHORTEST), AfterValidator(_in_metres)]
+Radius = Annotated[float, Field(ge=_SHORTEST), _in_metres]
 Mass = Annotated[float, Field(ge=0, le=1e6)]
 Point = Annotated[list[Coordinate], exactly(3)]
 Moments = Annotated[list[Annotated[float, Field(le=1e6)]], exactly(3)]
 Six = Annotated[list[Coordinate], exactly(6)]
 Joint = Annotated[int, Field(ge=0, le=5)]
-Order = Annotated[list[Joint], exactly(6), AfterValidator(_each_joint_once)]
-Branch = Annotated[int, AfterValidator(_one_of_two), one_message("-1 or 1")]
+Order = Annotated[list[Joint], exactly(6), _each_once]
+Branch = Annotated[int, rule(lambda branch: abs(branch) == 1, "-1 or 1"), one_message("-1 or 1")]
 Branches = Annotated[list[Branch], exactly(6)]
 Fingerprint = Annotated[
     str, Field(pattern="^[0-9a-f]{16}$"), one_message("16 hexadecimal digits in quotes")
@@ -308,19 +296,12 @@ def pattern_legs(
     x = np.column_stack([sin, -cos, zero])
     y = np.column_stack([np.cos(beta) * cos, np.cos(beta) * sin, zero - np.sin(beta)])
     R_WS = np.stack([x, y, np.cross(x, y)], axis=2)
-    return _legs(p_WS, R_WS, joints[p.plate_order], crank, rod, p.branches)
+    return Legs(p_WS, R_WS, joints[p.plate_order], *map(_each, (crank, rod, p.branches)))
 
 
-def _legs(
-    p_WS: Array,
-    R_WS: Array,
-    p_PQ: Array,
-    crank: float | list[float],
-    rod: float | list[float],
-    branches: list[int],
-) -> Legs:
-    u, length = (np.broadcast_to(np.array(one, dtype=np.float64), 6) for one in (crank, rod))
-    return Legs(p_WS, R_WS, p_PQ, u, length, np.array(branches, dtype=np.float64))
+def _each(values: float | list[float]) -> Array:
+    """Return the numbers (6,) of the legs from one or six."""
+    return np.broadcast_to(np.array(values, dtype=np.float64), 6)
 
 
 def _explicit_legs(
@@ -345,4 +326,5 @@ def _explicit_legs(
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     shafts, joints = (np.array([getattr(leg, f) for leg in legs]) for f in ("shaft", "plate_joint"))
     R_WS = np.stack([x, np.cross(n, x), n], axis=2)
-    return _legs(shafts, R_WS, joints, crank, rod, [leg.branch for leg in legs])
+    branches = [leg.branch for leg in legs]
+    return Legs(shafts, R_WS, joints, *map(_each, (crank, rod, branches)))

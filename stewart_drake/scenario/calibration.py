@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
-from pydantic import AfterValidator
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.jsonio import jsonable
-from stewart_drake.files.yamlio import brief, load_yaml, validate, yaml_text
+from stewart_drake.files.yamlio import brief, load_yaml, rule, validate, yaml_text
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.field_types import section
@@ -87,16 +86,16 @@ class Calibration:
         return float(self.mean[self.names.index(name)]) if name in self.names else None
 
 
-def _check_names(names: list[str]) -> list[str]:
-    if len(set(names)) < len(names) or not {*names} <= {*CALIBRATED}:
-        raise ValueError(f"some of {', '.join(CALIBRATED)}, each once")
-    return names
+_of_calibrated = rule(
+    lambda names: len({*names} & {*CALIBRATED}) == len(names),
+    f"some of {', '.join(CALIBRATED)}, each once",
+)
 
 
 @section
 class _File:
     mechanism: str
-    names: Annotated[list[str], AfterValidator(_check_names)]
+    names: Annotated[list[str], _of_calibrated]
     mean: list[float]
     covariance: list[list[float]]
 

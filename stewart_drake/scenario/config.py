@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.schema import ByKind
-from stewart_drake.files.yamlio import brief, differences, exactly, validate
+from stewart_drake.files.yamlio import brief, differences, exactly, rule, validate
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.dependencies import contradiction
 from stewart_drake.scenario.field_types import (
@@ -229,12 +229,7 @@ def _check_estimate(names: list[str]) -> list[str]:
     return sorted(names, key=order.index)
 
 
-def _check_catch_up(duration: float) -> float:
-    if 0 < duration < 1e-3:
-        raise ValueError("0 for none, null, or at least 0.001 s")
-    return duration
-
-
+_zero_or_long = rule(lambda s: not 0 < s < 1e-3, "0 for none, null, or at least 0.001 s")
 Estimate = Annotated[list[str], AfterValidator(_check_estimate)]
 """Names of estimated parameters, in a fixed order."""
 
@@ -332,7 +327,7 @@ class ControllerConfig:
     weight_scaling: Literal["bryson", "identity"] = "bryson"
     packet_torques: Annotated[int, Field(ge=1, le=100)] = 16
     packet_repeats: Annotated[int, Field(ge=0, le=100)] = 1
-    catch_up: Annotated[float, Field(ge=0, le=10), AfterValidator(_check_catch_up)] | None = None
+    catch_up: Annotated[float, Field(ge=0, le=10), _zero_or_long] | None = None
     command: Literal["torque", "cranks"] = "torque"
     delay_estimator: Literal["none", "constant", "drifting"] = "none"
     delay_std: Annotated[float, Field(ge=1e-3, le=10)] = 0.3

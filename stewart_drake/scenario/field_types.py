@@ -17,7 +17,7 @@ import pydantic
 from pydantic import AfterValidator, ConfigDict, Field, with_config
 from typing_extensions import TypedDict  # which pydantic wants before Python 3.12
 
-from stewart_drake.files.yamlio import exactly, in_one_line, one_message
+from stewart_drake.files.yamlio import exactly, in_one_line, one_message, rule
 from stewart_drake.scenario.timing import LEAST_FRACTION
 
 _T = TypeVar("_T")
@@ -61,16 +61,10 @@ Six = Annotated[list[Length], exactly(6)]
 Name = Annotated[str, Field(min_length=1)]
 
 
-def _check_range(low_high: list[float]) -> list[float]:
-    if not low_high[0] < low_high[1]:
-        raise ValueError
-    return low_high
-
-
 _Range = Annotated[
     list[Annotated[float, Field(ge=-10, le=10)]],
     exactly(2),
-    AfterValidator(_check_range),
+    rule(lambda ends: ends[0] < ends[1]),
 ]
 AngleRange = Annotated[
     _Range | Annotated[list[_Range], exactly(6)] | None,
@@ -105,12 +99,6 @@ def _check_fault(fault: Any) -> Any:
     return fault
 
 
-def _check_no_leg(fault: Any) -> Any:
-    if fault.get("leg") is not None:
-        raise ValueError("leg null: pose and rates of the plate are measured, not the legs")
-    return fault
-
-
 LegFault = Annotated[_Fault, AfterValidator(_check_fault)]
 """One fault of encoders, from `from` up to but not at `to`, in s.
 
@@ -119,5 +107,9 @@ LegFault = Annotated[_Fault, AfterValidator(_check_fault)]
 every sample from the standard normal distribution. `leg` null is all six. A `missing` or a `spike`
 with a `share` affects that share of the samples, drawn independently for each and for each leg.
 """
-SensorFault = Annotated[LegFault, AfterValidator(_check_no_leg)]
+_no_leg = rule(
+    lambda fault: fault.get("leg") is None,
+    "leg null: pose and rates of the plate are measured, not the legs",
+)
+SensorFault = Annotated[LegFault, _no_leg]
 """One fault of a measurement of pose and rates, see `LegFault`."""

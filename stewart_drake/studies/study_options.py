@@ -6,11 +6,11 @@ from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.yamlio import one_message, units_of, validate, validate_pairs
+from stewart_drake.files.yamlio import one_message, rule, units_of, validate, validate_pairs
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.field_types import STRICT
@@ -18,12 +18,6 @@ from stewart_drake.studies.options import JobOptions, Options, option
 
 _TORQUE_SHARE: Final = "share of the reference's largest torque"
 _CRANK_SHARE: Final = "share of the mean crank length"
-
-
-def _rising(pair: list[float] | None) -> list[float] | None:
-    if pair and pair[0] > pair[1]:
-        raise ValueError("the lesser one first")
-    return pair
 
 
 def _share(unit: str, **bounds: Any) -> Any:
@@ -49,7 +43,7 @@ class Ranges:
     torque_limit: Annotated[
         Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=2, max_length=2)] | None,
         Field(description="[least, most] in peak torques of the undisturbed run"),
-        AfterValidator(_rising),
+        rule(lambda pair: not pair or pair[0] <= pair[1], "the lesser one first"),
     ] = field(default_factory=lambda: [1.0, 3.0])
     # friction torque of a crank, uniform from 0
     damping: Annotated[float, _share(f"{_TORQUE_SHARE}, at its largest crank speed")] = 0.02
