@@ -139,15 +139,6 @@ class Options(BaseModel):
             found.append(Option(name, field.annotation, default, field.description or "", **extra))
         yield from sorted(found, key=lambda option: not option.recorded)
 
-    @classmethod
-    def parameters(cls) -> list[inspect.Parameter]:
-        """Return the keyword arguments of a Python function with these options."""
-        kind = inspect.Parameter.KEYWORD_ONLY
-        return [
-            inspect.Parameter(one.name, kind, default=one.default, annotation=one.accepted)
-            for one in cls.described()
-        ]
-
 
 def in_python(text: str, kind: type[Options], function: inspect.Signature) -> str:
     """Return a text with arguments of a Python function in place of the command's options."""
@@ -165,15 +156,16 @@ def takes(
 
     The argument `second` may be positional. Errors name arguments, see `in_python`.
     """
-    by_place = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    by_place, by_name = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
 
     def decorate(function: Callable[..., _R]) -> Callable[..., _R]:
         own = inspect.signature(function)
-        before = [one for one in own.parameters.values() if one.name != "options"]
-        parameters = [
-            one.replace(kind=by_place) if one.name == second else one
-            for one in (*before, *kind.parameters())
+        parameters = [one for one in own.parameters.values() if one.name != "options"]
+        parameters += [
+            inspect.Parameter(one.name, by_name, default=one.default, annotation=one.accepted)
+            for one in kind.described()
         ]
+        parameters = [p.replace(kind=by_place) if p.name == second else p for p in parameters]
         shown = own.replace(parameters=sorted(parameters, key=lambda one: one.kind))
 
         @functools.wraps(function)
