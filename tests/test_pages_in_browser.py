@@ -4,7 +4,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from stewart_drake.reporting.document import Document, Picture, Section, Table
-from stewart_drake.reporting.page import Provenance, write_page
+from stewart_drake.reporting.page import Provenance, html
 from stewart_drake.reporting.style import CONTROLLER_LINES, figure_style
 from tests.browser import needs_chromium
 
@@ -32,7 +32,8 @@ def small(tmp_path_factory):
     )
     sections = [Section("Figure", Picture(figure, "Lines.")), Section("Tables", wide, words)]
     path = tmp_path_factory.mktemp("small") / "report.html"
-    return write_page(Document("A page", "Fine.", sections), MADE, path)
+    path.write_text(html(Document("A page", "Fine.", sections), MADE), encoding="utf-8")
+    return path
 
 
 BROKEN = r"""(() => {

@@ -16,7 +16,7 @@ from stewart_drake.loop.results import SimulationResult
 from stewart_drake.reporting import style
 from stewart_drake.reporting.document import number
 from stewart_drake.reporting.panels import Curve, Panel, Scale, draw
-from stewart_drake.reporting.run import FINER, STILL, moving, worst
+from stewart_drake.reporting.run import FINER, STILL, moving, span, worst
 from stewart_drake.reporting.style import FACTORS, UNITS, Line
 from stewart_drake.scenario.signals import (
     ANGLES,
@@ -128,7 +128,7 @@ def _poses(runs: _Runs) -> dict[str, Figure]:
 
 def _states(runs: _Runs, wanted: xarray.Dataset, held: bool) -> Figure:
     reference = FACTORS * wanted.reference.values
-    spans = _spans(reference)
+    spans = span(reference)
     motion = np.repeat([spans[ANGLES].max(), spans[POSITION].max()], 3)
     least = np.maximum(_LEAST_SPAN * motion, _FINE if held else _ROUNDING)
     time = wanted.time.values
@@ -143,7 +143,7 @@ def _states(runs: _Runs, wanted: xarray.Dataset, held: bool) -> Figure:
 
 
 def _errors(runs: _Runs, wanted: xarray.Dataset) -> Figure:
-    own = _spans(wanted.reference.values)
+    own = span(wanted.reference.values)
     spans, scale = FACTORS * own, np.where(own > STILL, own, 1.0)
     title, errors = "Errors of the pose", {one: r.accumulated_error for one, (r, _) in runs.items()}
     completed = {one: error for one, error in errors.items() if np.isfinite(error)}
@@ -344,10 +344,6 @@ def _trusted(runs: _Runs, data: list[Array]) -> list[Array]:
     """Return the data of completed runs, or of all if there are none."""
     pairs = zip(runs.values(), data, strict=True)
     return [values for (run, _), values in pairs if run.status == "completed"] or data
-
-
-def _spans(values: Array) -> Array:
-    return np.ptp(values, axis=0) if len(values) else np.zeros(values.shape[1])
 
 
 def _limits(

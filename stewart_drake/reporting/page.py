@@ -9,14 +9,12 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 from urllib.parse import quote
 
 from jinja2 import Environment
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
-from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.versions import versions
 from stewart_drake.reporting.document import Document, sentence, templates
 from stewart_drake.reporting.style import figure_style, for_dark_too
@@ -33,11 +31,6 @@ class Provenance:
 def html(document: Document, made: Provenance) -> str:
     """Return the page, with all texts escaped."""
     return environment().get_template("page.html.j2").render(page=document, made=made)
-
-
-def write_page(document: Document, made: Provenance, path: Path) -> Path:
-    write_whole(path, html(document, made))
-    return path
 
 
 def source(figure: Figure) -> str:

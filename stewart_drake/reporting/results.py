@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pandas
 import xarray
 
-from stewart_drake.files.fileio import write_asked
+from stewart_drake.files.fileio import write_asked, write_whole
 from stewart_drake.files.jsonio import write_json
 from stewart_drake.loop import controller_margin as loop_margin
 from stewart_drake.loop import results as loop_results
@@ -62,7 +62,7 @@ class Printed:
     __slots__ = ()
 
     def table(self) -> str:
-        """Return the result as text."""
+        """Return the text that the command prints."""
         raise NotImplementedError
 
     def __str__(self) -> str:
@@ -214,7 +214,6 @@ class MechanismCheck(Printed, new_machine.MechanismCheck):
         return f"MechanismCheck({self.mechanism.name!r}, {self.verdict!r})"
 
     def table(self) -> str:
-        """Return the text that the command prints."""
         from stewart_drake.reporting.mechanism import document
 
         return document(self).plain()
@@ -227,7 +226,6 @@ class NewMachine(Printed, new_machine.NewMachine):
         return f"NewMachine({self.check.mechanism.name!r}, {self.verdict!r})"
 
     def table(self) -> str:
-        """Return the text that the command prints."""
         crossings = [Caution(text).plain() for text in self.crossings]
         check = MechanismCheck(*self.check).table()
         return "\n".join([check, *map(wrap, self.findings), *crossings])
@@ -286,7 +284,6 @@ class AnalysisResult(Printed):
         return _framed(html(self.document, self.made))
 
     def table(self) -> str:
-        """Return the text that the command prints."""
         return self.document.plain()
 
     def plot(self, directory: str | Path | None = None) -> Figures:
@@ -305,9 +302,10 @@ class AnalysisResult(Printed):
 
     def write_page(self, directory: Path, name: str = PAGE) -> Path:
         """Write the page into a directory and return its path."""
-        from stewart_drake.reporting.page import write_page
+        from stewart_drake.reporting.page import html
 
-        return write_page(self.document, self.made, directory / name)
+        write_whole(directory / name, html(self.document, self.made))
+        return directory / name
 
     def save(self, directory: str | Path) -> Path:
         """Write report.html and summary.json into a directory, which is made; return the page."""

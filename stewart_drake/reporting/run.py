@@ -94,15 +94,14 @@ def _estimates(run: SimulationResult) -> list[str]:
     return shown
 
 
-def _span(run: SimulationResult) -> Array:
-    """Return the peak to peak (6,) of the recorded reference, rad and m."""
-    poses = run.signals.reference.values
+def span(poses: Array) -> Array:
+    """Return the peak to peak (6,) of poses (n, 6), which may be none."""
     return np.ptp(poses, axis=0) if len(poses) else np.zeros(NUM_COORDINATES)
 
 
 def moving(run: SimulationResult) -> Flags:
     """Return which coordinates (6,) the reference moves."""
-    return _span(run) > STILL
+    return span(run.signals.reference.values) > STILL
 
 
 def _peaks(run: SimulationResult) -> list[str]:
@@ -122,8 +121,8 @@ def worst(run: SimulationResult) -> str:
     The error of a still coordinate is compared with the largest motion in its unit, or with 1 rad
     or 1 m, as in E_ac, if there is none.
     """
-    percent, span = np.array(run.summary["peak_error"]), _span(run)
-    largest = np.repeat([span[ANGLES].max(), span[POSITION].max()], 3)
+    percent, motion = np.array(run.summary["peak_error"]), span(run.signals.reference.values)
+    largest = np.repeat([motion[ANGLES].max(), motion[POSITION].max()], 3)
     share = percent / np.where(moving(run) | (largest <= STILL), 1.0, largest)
     return _peaks(run)[int(np.argmax(share))]
 
