@@ -8,7 +8,7 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
-from pydantic import GetCoreSchemaHandler
+from pydantic import GetCoreSchemaHandler, TypeAdapter
 from pydantic_core import core_schema
 from typing_extensions import is_typeddict
 
@@ -61,12 +61,7 @@ def spelling(owner: Any, name: str) -> str:
 
 def plain(value: Any) -> Any:
     """Return a dataclass, and dataclasses within, as mappings with names as in files."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = (field.name for field in dataclasses.fields(value))
-        return {spelling(type(value), name): plain(getattr(value, name)) for name in fields}
-    if isinstance(value, dict):
-        return {key: plain(one) for key, one in value.items()}
-    return [plain(one) for one in value] if isinstance(value, list) else value
+    return TypeAdapter(type(value)).dump_python(value, by_alias=True, warnings=False)
 
 
 def dotted_names(hint: Any) -> Iterator[tuple[str, Any]]:
