@@ -85,12 +85,7 @@ def clearances(
     first, second = (_LINK_PAIRS if pairs is None else _LINK_PAIRS[pairs]).T
     start, along = center_lines(mechanism, poses, legs)
     lines = start[:, first], along[:, first], start[:, second], along[:, second]
-    radii = capsule_radii(mechanism)
-    return segment_distances(*lines) - radii[first] - radii[second]
-
-
-def capsule_radii(mechanism: Legs) -> Array:
-    """Return the radii (12,) of the links' capsules, m."""
     size = proportions(mechanism)
     crank = float(np.hypot(size.crank_width, size.crank_thickness)) / 2
-    return np.repeat([crank, size.rod_radius], NUM_LEGS)
+    radii = np.repeat([crank, size.rod_radius], NUM_LEGS)
+    return segment_distances(*lines) - radii[first] - radii[second]
