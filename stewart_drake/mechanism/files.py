@@ -18,7 +18,7 @@ from stewart_drake.mechanism.geometry import Body, Link, Mechanism, bar_inertia,
 from stewart_drake.mechanism.kinematics import Legs, UnreachablePoseError, dot
 from stewart_drake.scenario.field_types import STRICT
 from stewart_drake.scenario.signals import LEGS
-from stewart_drake.types import Array
+from stewart_drake.types import Array, ArrayLike
 
 # Limits far beyond any platform keep squares and products finite.
 _SHORTEST, _LONGEST = 1e-6, 1e3
@@ -299,7 +299,7 @@ def pattern_legs(
     return Legs(p_WS, R_WS, joints[p.plate_order], *map(_each, (crank, rod, p.branches)))
 
 
-def _each(values: float | list[float]) -> Array:
+def _each(values: ArrayLike) -> Array:
     """Return the numbers (6,) of the legs from one or six."""
     return np.broadcast_to(np.array(values, dtype=np.float64), 6)
 
