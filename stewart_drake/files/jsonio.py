@@ -17,13 +17,9 @@ _SEAL: Final = re.compile(rb'\{"crc32": "([0-9a-f]{8})", ')
 
 
 def load_json(path: Path, most: int, expected: str, *, sealed: bool = False) -> dict[str, Any]:
-    """Read one JSON object from a UTF-8 file.
+    """Read one JSON object from a UTF-8 file; `most` and `expected` are as of `read_bytes`.
 
-    Args:
-        path: of the file.
-        most: largest accepted number of bytes.
-        expected: description of the file, closing every message.
-        sealed: whether it must have the checksum that `sealed_json` writes. It is not returned.
+    A `sealed` one must have the checksum that `sealed_json` writes, which is not returned.
 
     Raises:
         ConfigError: the file cannot be read or decoded, is not one object, or holds a key twice.

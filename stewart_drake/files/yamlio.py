@@ -90,12 +90,7 @@ def parse_value(text: str, where: str) -> Any:
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """Parse one YAML value of any kind under the rules of `load_yaml`.
-
-    Args:
-        text: YAML.
-        where: opening of a message.
-    """
+    """Parse one YAML value of any kind under the rules of `load_yaml`; `where` opens a message."""
     try:
         return copy.deepcopy(_parsed(text))
     # Numbers of thousands of digits end in ValueError, deep nesting in RecursionError, and some
@@ -144,10 +139,7 @@ def yaml_text(data: dict[str, Any]) -> str:
 def validate(type_: type[_T], data: Any, where: str) -> _T:
     """Return a pydantic dataclass, with sections nested to any depth, from plain data.
 
-    Args:
-        type_: the dataclass.
-        data: as `load_yaml` returns it.
-        where: opening of a message, such as the file.
+    `data` is as `load_yaml` returns it; `where` opens a message, such as the file.
 
     Raises:
         ConfigError: `<where>: <section.field>: got <value>; expected <accepted values>` for the

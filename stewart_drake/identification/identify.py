@@ -104,10 +104,8 @@ class Identification:
     def calibration(self, mechanism: Mechanism) -> Calibration:
         """Return the values that a controller reads besides the geometry.
 
-        If the fit is wrong, that is the delay alone, with its prior variance.
-
-        Args:
-            mechanism: as read from its file.
+        If the fit is wrong, that is the delay alone, with its prior variance. `mechanism` is as
+        read from its file.
         """
         places = np.r_[DYNAMIC, OFFSETS, DELAY] if self.right else np.array([DELAY])
         names = tuple(NAMES[k] for k in places)

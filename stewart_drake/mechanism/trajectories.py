@@ -60,7 +60,7 @@ class PlateTrajectory(FunctionHandleTrajectory):
     Attributes:
         times: as given.
         data: `stewart_motion *` for C, valid as long as this object.
-        keep: arrays and structures that it points to.
+        keep_alive: arrays and structures that it points to.
     """
 
     def __init__(

@@ -69,9 +69,7 @@ def read_entries(data: bytes) -> Entries | None:
 class MachineForm:
     """The form, served until it is closed, as by `contextlib.closing`.
 
-    Args:
-        given: measurements that the form begins with, by name.
-        title: of the page.
+    It begins with the `given` measurements, by name.
     """
 
     def __init__(self, given: Mapping[str, Any], title: str) -> None:

@@ -63,11 +63,8 @@ class PoseViewer:
 
     The machine follows the sliders to every possible pose. For an impossible one it stays at the
     last possible pose, and a translucent red plate shows the pose of the sliders. The plate joints
-    are green, orange with a reach margin below 15 % of a crank, red with a short leg.
-
-    Args:
-        mechanism: to show.
-        meshcat: gets sliders and a button to stop.
+    are green, orange with a reach margin below 15 % of a crank, red with a short leg. Meshcat gets
+    sliders and a button to stop.
     """
 
     def __init__(self, mechanism: Mechanism, meshcat: Meshcat) -> None:

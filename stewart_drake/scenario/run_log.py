@@ -90,11 +90,9 @@ def _field(label: str | int) -> str:
 class RunLog(Protocol):
     def write(self, time: float, values: Mapping[str, Array]) -> None:
         """Add the values of channels at a time in s; others have none then."""
-        ...
 
     def close(self) -> None:
         """Complete the log."""
-        ...
 
 
 def kind_of_log(path: Path, name: str = "log") -> Callable[[Path, Scenario], RunLog]:
