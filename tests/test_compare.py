@@ -15,6 +15,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import data_root, shipped
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
+from stewart_drake.reporting.results import ComparisonResult
 from stewart_drake.reporting.run import _shared_warnings
 from stewart_drake.scenario.loading import load_comparison, load_scenario
 from stewart_drake.studies.compare import (
@@ -24,7 +25,6 @@ from stewart_drake.studies.compare import (
     LABELS,
     SERVOS,
     compare,
-    save_comparison,
     shown,
 )
 from stewart_drake.studies.verdict import Verdict, delay_verdict
@@ -65,7 +65,7 @@ def test_a_warning_names_its_controllers_by_one_word_each(results):
 
 def test_saved_files_are_complete(results, tmp_path):
     folder = tmp_path / "new" / "folder"
-    save_comparison(results, folder)
+    ComparisonResult(results).save(folder)
     signals = {f"{name}.nc" for name in CONTROLLERS}
     assert {path.name for path in folder.iterdir()} == signals | {"summary.json"}
     summary = summary_in(folder)["controllers"]

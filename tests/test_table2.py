@@ -12,10 +12,11 @@ from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.preparation import check_instants, prepare
 from stewart_drake.mechanism.files import mechanism_yaml
 from stewart_drake.reporting.document import Paragraph, Table
+from stewart_drake.reporting.results import ComparisonResult
 from stewart_drake.reporting.run import comparison_document
 from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.scenario.loading import load_comparison
-from stewart_drake.studies.compare import CONTROLLERS, comparison_summary, label
+from stewart_drake.studies.compare import CONTROLLERS, label
 from stewart_drake.studies.workspace_map import largest_factor
 from tests.mechanisms import PAPER
 
@@ -120,7 +121,7 @@ def test_the_verdict_names_the_least_error_and_the_runs_that_ended_early():
 def test_it_is_shown_once_and_every_row_is_in_the_summary(short):
     text = short.table()
     assert text.count("Table II") == 1 and max(map(len, text.splitlines())) <= 80
-    assert list(comparison_summary(short)["controllers"]) == list(short)
+    assert list(ComparisonResult(short).summary["controllers"]) == list(short)
     table, _ = of_the_paper(short)
     assert [row[0] for row in table.rows] == [
         *(label(name) for name in CONTROLLERS[:4]),

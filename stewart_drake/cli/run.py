@@ -260,7 +260,7 @@ def compare(
     delivery.draw("figures", results.plot)
     ended = [result.status for result in results.values()]
     interrupted = "interrupted" in ended or len(ended) < len(names)
-    return delivery.end(study.comparison_summary(results), interrupted)
+    return delivery.end(results.summary, interrupted)
 
 
 @command(out=Path("out/report"))

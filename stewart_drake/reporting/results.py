@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 import pandas
 import xarray
 
-from stewart_drake.files.fileio import write_asked, write_whole
+from stewart_drake.files.arrayio import write_netcdf
+from stewart_drake.files.fileio import remove_partials, write_asked, write_whole
 from stewart_drake.files.jsonio import write_json
 from stewart_drake.loop import controller_margin as loop_margin
 from stewart_drake.loop import results as loop_results
@@ -31,7 +32,6 @@ from stewart_drake.reporting.document import (
 )
 from stewart_drake.reporting.run import comparison_document, run_document
 from stewart_drake.studies import new_machine
-from stewart_drake.studies.compare import save_comparison
 from stewart_drake.studies.verdict import Verdict, loop_verdict, milliseconds
 
 if TYPE_CHECKING:
@@ -148,6 +148,11 @@ class ComparisonResult(Printed, dict[str, SimulationResult]):
     def __repr__(self) -> str:
         return f"ComparisonResult({', '.join(f'{k}: {run.status}' for k, run in self.items())})"
 
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Content of `summary.json`."""
+        return {"controllers": {name: run.summary for name, run in self.items()}}
+
     def table(self) -> str:
         """Return a row per controller as text."""
         return comparison_document(self).plain()
@@ -185,7 +190,12 @@ class ComparisonResult(Printed, dict[str, SimulationResult]):
 
     def save(self, directory: str | Path) -> None:
         """Write NAME.nc of every controller, then summary.json; the directory is made."""
-        save_comparison(self, directory)
+        folder = Path(directory)
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_partials(folder)
+        for name, run in self.items():
+            write_netcdf(folder / f"{name}.nc", run.signals)
+        write_json(folder / "summary.json", self.summary)
 
 
 class ControllerMargin(Printed, loop_margin.ControllerMargin):

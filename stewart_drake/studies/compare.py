@@ -14,10 +14,7 @@ import numpy as np
 from pydrake.systems.framework import System
 from pydrake.trajectories import Trajectory
 
-from stewart_drake.files.arrayio import write_netcdf
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.fileio import remove_partials
-from stewart_drake.files.jsonio import write_json
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import brief
 from stewart_drake.loop.own import OwnReference
@@ -215,20 +212,6 @@ def is_papers(scenario: Scenario, *, any_size: bool = False) -> bool:
         and motion == own.reference
         and math.isclose(scenario.eta, PAPER_DELAY)
     )
-
-
-def save_comparison(results: Mapping[str, SimulationResult], directory: str | Path) -> None:
-    """Write NAME.nc of every controller, then summary.json; each file whole or not."""
-    folder = Path(directory)
-    folder.mkdir(parents=True, exist_ok=True)
-    remove_partials(folder)
-    for name, result in results.items():
-        write_netcdf(folder / f"{name}.nc", result.signals)
-    write_json(folder / "summary.json", comparison_summary(results))
-
-
-def comparison_summary(results: Mapping[str, SimulationResult]) -> dict[str, Any]:
-    return {"controllers": {name: result.summary for name, result in results.items()}}
 
 
 def _run(name: str, scenario: Scenario, own: dict[str, Any], board: Path, run: int) -> bytes:
