@@ -95,11 +95,6 @@ class ClearTravel(NamedTuple):
     low_pair: Pair | None
     high_pair: Pair | None
 
-    @property
-    def summary(self) -> dict[str, Any]:
-        pairs = {"low_pair": self.low_pair, "high_pair": self.high_pair}
-        return self._asdict() | {k: None if p is None else list(p) for k, p in pairs.items()}
-
 
 class ClearSection(NamedTuple):
     """Distances in a section of the workspace.
@@ -146,7 +141,7 @@ class ClearanceStudy(NamedTuple):
             **{name: None if one is None else one.summary for name, one in pairs.items()},
             "touching": [one.summary for one in self.along.touching],
             "pairs": [one.summary for one in self.along.nearest],
-            "travel": [one.summary for one in self.travel],
+            "travel": [one._asdict() for one in self.travel],
             "touching_share_of_sections": [section.touching for section in self.sections],
         }
 
