@@ -80,9 +80,7 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
     for name, result in aware.items():
         alone = lines[name]._replace(linestyle="-", marker="")
         figures[f"torques_{name}"] = _torques(result, spoken(name), alone)
-    for name, result in aware.items():
-        if _finds_delay(result):
-            figures[f"delay_{name}"] = _delay(result)
+    figures |= {f"delay_{name}": _delay(one) for name, one in aware.items() if _finds_delay(one)}
     tuned = {spoken(name): run for name, run in aware.items() if _is_tuned(run)}
     if tuned:
         figures["weights"] = weights_figure(tuned)
