@@ -68,12 +68,17 @@ class Log:
     step: float = 0.0  # of a simulated multibody plant, s; 0 for another one
 
     def applied_torque(self, times: Array, delay: float) -> Array:
-        """Return the torques (k, 6) at instants (k,) in s; before any arrived, the first one."""
-        last = np.searchsorted(self.sent + delay, times, side="right") - 1
-        return self.torques[np.maximum(last, 0)]
+        """Return the torques (k, 6) at instants (k,) in s."""
+        return in_effect(self.sent + delay, self.torques, times)
 
     def measures(self, kind: slice) -> bool:
         return bool(np.isfinite(self.values[:, kind]).any())
+
+
+def in_effect(arrivals: Array, values: Array, times: Array) -> Array:
+    """Return the newest of the values (n, m) at times (k,); before any arrived, the first one."""
+    newest = np.searchsorted(arrivals, times, side="right") - 1
+    return np.asarray(values[np.maximum(newest, 0)])
 
 
 def angle_std(bits: int) -> float:

@@ -55,7 +55,8 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification import progress
 from stewart_drake.identification.innovations import Innovations
-from stewart_drake.identification.servo_logs import ServoLog, held_setpoints
+from stewart_drake.identification.logs import in_effect
+from stewart_drake.identification.servo_logs import ServoLog
 from stewart_drake.law.servos import PositionServo, turned
 from stewart_drake.mechanism.geometry import Mechanism, with_rotors
 from stewart_drake.mechanism.kinematics import legs_along
@@ -183,7 +184,7 @@ class ServoModel:
 
     def held_setpoints(self, delay: float) -> Array:
         """Return the setpoints (n, 6) in effect at the times of the log."""
-        return held_setpoints(self.log.times, self.log.setpoints, delay)
+        return in_effect(self.log.times + delay, self.log.setpoints, self.log.times)
 
     def innovations(self, theta: Array, rounding: float) -> Innovations:
         """Return the filter of residuals near theta; friction of slow cranks is unknown."""
@@ -376,7 +377,7 @@ def regression(model: ServoModel, ball_joints: bool) -> Array:
     log, machine = model.log, model.mechanism
     times = log.times - log.times[0]
     grid = np.arange(0.0, times[-1], _GRID)
-    held = log.setpoints[np.searchsorted(times, grid, side="right") - 1]
+    held = in_effect(times, log.setpoints, grid)
     filtering = butter(4, _CUTOFF * 2 * _GRID, output="sos")
     u, a = (
         CubicSpline(grid, sosfiltfilt(filtering, one, axis=0))

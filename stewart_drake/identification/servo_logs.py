@@ -8,6 +8,7 @@ import numpy as np
 
 from stewart_drake.files.csvio import ANGLE_UNITS, Table, read_table
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification.logs import in_effect
 from stewart_drake.law.servos import turned
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import ForwardKinematicsError
@@ -90,12 +91,6 @@ def servo_log(
     return ServoLog(name, times, turned(setpoints, cranks), cranks, poses)
 
 
-def held_setpoints(times: Array, setpoints: Array, delay: float) -> Array:
-    """Return the setpoints (n, 6) in effect at the times (n,) at which they are sent, s."""
-    newest = np.searchsorted(times + delay, times, side="right") - 1
-    return np.asarray(setpoints[np.maximum(newest, 0)])
-
-
 def _check_following(name: str, times: Array, setpoints: Array, cranks: Array) -> None:
     """Refuse cranks that do not follow their setpoints, by the delay that suits most of them."""
     both = np.hstack([setpoints, cranks])
@@ -114,7 +109,7 @@ def _check_following(name: str, times: Array, setpoints: Array, cranks: Array) -
     judged = sizes > sizes.max() / 3  # others may stick
     fits = []
     for delay in np.arange(0.0, _LATEST, 0.01):
-        sent = held_setpoints(times, setpoints, delay)
+        sent = in_effect(times + delay, setpoints, times)
         sent = sent - sent.mean(axis=0)
         norm = np.sqrt(np.sum(sent**2, axis=0) * np.sum(apart**2, axis=0))
         fits.append(np.sum(sent * apart, axis=0) / np.maximum(norm, 1e-12))

@@ -20,6 +20,7 @@ import numpy as np
 from stewart_drake.dynamics.workspace import margin, margins
 from stewart_drake.files.csvio import csv_text
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification.logs import in_effect
 from stewart_drake.identification.servo_fit import (
     NAMES,
     UNITS,
@@ -233,7 +234,7 @@ class _Planner:
         late = log.times - self.theta[0]
         torques = []
         for instants in (late, late - 1e-9):  # after and before a setpoint that arrives here
-            row = np.maximum(np.searchsorted(log.times, instants, side="right") - 1, 0)
-            error = (log.setpoints[row] - cranks[:, POSE] + np.pi) % (2 * np.pi) - np.pi
+            setpoints = in_effect(log.times, log.setpoints, instants)
+            error = (setpoints - cranks[:, POSE] + np.pi) % (2 * np.pi) - np.pi
             torques.append(actuator.stiffness * error - actuator.velocity_gain * cranks[:, RATES])
         return float(np.abs(torques).max()), float(np.abs(cranks[:, RATES]).max())
