@@ -13,6 +13,7 @@ from stewart_drake.files.yamlio import yaml_text
 from stewart_drake.law.filter_settings import CHANCE, EXACT, usual_parameters
 from stewart_drake.law.observers import CoreObserver
 from stewart_drake.law.startup import reference_torque
+from stewart_drake.loop.cautions import cautions_before
 from stewart_drake.loop.law_design import GENTLE, compose_law
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.geometry import Body, fingerprint
@@ -246,6 +247,14 @@ def test_what_cannot_be_used_is_refused_in_one_line(file, change, given, message
         compose_law(experiment(f"controller.calibration={file}", *given))
     with pytest.raises(ConfigError, match=r"^controller\.calibration: .*nowhere"):
         experiment("controller.calibration=/nowhere/calibration.yaml")
+
+
+def test_a_calibrated_delay_that_makes_the_loop_unstable_is_named(file):
+    for delay, said in ((0.79, ["the delay of controller.calibration, 0.79 s"]), (0.8, [])):
+        save_calibration(file, dataclasses.replace(KNOWN, mean=np.array([0.4, 1e-3, 5e-4, delay])))
+        found = experiment(f"controller.calibration={file}", "plant.kind=exact")
+        lines = cautions_before(found, sd.controller_margin(found))
+        assert len(lines) == len(said) and all(map(str.__contains__, lines, said))
 
 
 def test_what_is_known_is_worth_something(file):

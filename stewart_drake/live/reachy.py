@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from stewart_drake.dynamics.workspace import Failure
-from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.errors import ConfigError, optional
 from stewart_drake.files.yamlio import brief
 from stewart_drake.law.servos import Stiffness, rise
 from stewart_drake.live.contact import address_of
@@ -392,12 +392,10 @@ def _check_robot(scenario: Scenario) -> None:
     wanted = {"actuator.kind": "position_servo", "sensor.samples": (None, 1)}
     if found := differing(scenario, wanted):
         raise ConfigError(found.problem("with --reachy"))
-    try:
-        import websockets  # noqa: F401
-    except ImportError:
-        raise ConfigError(
-            "--reachy: needs the package websockets; expected pip install 'stewart_drake[reachy]'"
-        ) from None
+    optional(
+        "websockets",
+        "--reachy: needs the package websockets; expected pip install 'stewart_drake[reachy]'",
+    )
 
 
 def _await_positions(daemon: Daemon, where: str) -> None:

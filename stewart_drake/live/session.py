@@ -34,7 +34,7 @@ from stewart_drake.live.protocol import (
     MachineMessage,
 )
 from stewart_drake.live.viewer import Viewer
-from stewart_drake.loop.cautions import overconfidence
+from stewart_drake.loop.cautions import delays_apart, overconfidence
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.preparation import Experiment, known_dynamics
@@ -67,7 +67,8 @@ class Ready(NamedTuple):
     def jitter_problem(self) -> str | None:
         """Reason why the jitter of the link may destabilise the loop, or None."""
         if self.margin.stable is False:
-            return "the loop is unstable even without jitter: the plate may be lost"
+            apart = delays_apart(self.design.experiment, self.margin)
+            return apart or "the loop is unstable even without jitter: the plate may be lost"
         spread, link = self.contact.link.spread, self.design.experiment.scenario.link
         if link.kind == "network" or not spread > self.margin.delay_margin:
             return None  # a torque that comes early waits for its play-out time

@@ -12,6 +12,7 @@ from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.results import RunSummary
 from stewart_drake.loop.servos import quickest_crank
+from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
 
 TOLERABLE: Final = 1e5
@@ -36,7 +37,21 @@ def _of_loop(experiment: Experiment, margin: ControllerMargin | None) -> str | N
         return None  # servos have no loop across the delay
     if margin.problem:
         return f"the loop was not judged: {margin.problem}"
-    return coarse_step(experiment, margin)
+    return delays_apart(experiment, margin) or coarse_step(experiment, margin)
+
+
+def delays_apart(experiment: Experiment, margin: ControllerMargin) -> str | None:
+    """Return a warning about an unstable loop whose calibrated delay is not the scenario's."""
+    sc = experiment.scenario
+    assumed = believed_delay(sc).eta(sc.controller.period)
+    known = margin.delay_found or sc.controller.delay_steps is not None
+    if margin.stable or known or math.isclose(assumed, sc.eta):
+        return None
+    return (
+        "the loop is unstable, and its controller assumes the delay of controller.calibration, "
+        f"{assumed:.6g} s, where that of the scenario is {sc.eta:.6g} s: expected the same, by "
+        "delay.steps and delay.fraction"
+    )
 
 
 def stiff_friction(experiment: Experiment) -> str | None:
