@@ -79,8 +79,8 @@ def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys):
     assert "left workspace" in rows[0] and "at 1.36 s," in second and "leg 2" in third
     assert [row.split()[1] for row in rows] == ["NaN", "NaN", "225", "80", "-"]
     assert rows[-1].split()[3:7] == ["15.2", "roll", "36", "%"], "floor and worst beside E_ac"
-    heads = next(line for line in lines if "asked" in line)
-    assert heads.split()[-3:] == ["asked", "acted", "var."] and "(commanded)" in out
+    heads = next(line for line in lines if "applied var." in line)
+    assert heads.split()[-3:] == ["sent", "applied", "var."] and "was commanded" in out
     # The LQI asked for a torque that never acted: the plate was gone before it arrived.
     assert [float(x) for x in rows[3].split()[-3:-1]] == [1.7, 0.13]
     torques = {f"torques_{name}" for name in ("delay_lqr", "delay_lqi", "predictor_lqi")}

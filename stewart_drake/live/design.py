@@ -138,8 +138,10 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
             repeats = 0 if c.command == "cranks" else c.packet_repeats
             field, enough = "delay.steps", f"delay.steps={least + repeats}"
         raise ConfigError(
-            f"{field}: got {eta:g} s from a measurement to its torque; the link takes up to "
-            f"{longest:.3g} s there and back: expected at least --set {enough}"
+            f"{field}: got {eta:g} s from a measurement to its torque; the link takes "
+            f"{link.shortest:.3g} to {longest:.3g} s there and back and loses "
+            f"{100 * link.loss_there:.2g} and {100 * link.loss_back:.2g} %: expected at least "
+            f"--set {enough}"
         )
     if c.command == "cranks":
         delay = DelayConfig(steps=round(eta / period))
