@@ -156,7 +156,8 @@ def comparison_document(
     runs += [
         (f"{label(name)}, tuned", f"{name}, tuned", run) for name, run in (tuned or {}).items()
     ]
-    loops = {name: loop_word(run.summary["controller_margin"]) for name, run in results.items()}
+    margins = {name: run.summary["controller_margin"] for name, run in results.items()}
+    lost = [margins[name] for name, run in results.items() if run.status == "left_workspace"]
     return from_template(
         "comparison",
         verdict=_best({name: run for _, name, run in runs}),
@@ -164,7 +165,8 @@ def comparison_document(
         papers=not table_two
         and any(is_papers(run.scenario, any_size=True) for run in results.values()),
         runs=[_row(title, name, run) for title, name, run in runs],
-        loops=[(name, label(name), text) for name, text in loops.items()],
+        loops=[(name, label(name), loop_word(margin)) for name, margin in margins.items()],
+        surprising=any(margin and margin["stable"] for margin in lost),
         cautions=[text for text in _shared_warnings(results) if text not in said],
         **context,
     )

@@ -2,14 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
 import numpy as np
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.jsonio import jsonable
-from stewart_drake.files.yamlio import brief, load_yaml, rule, validate, yaml_text
+from stewart_drake.files.yamlio import brief, load_yaml, validate, yaml_text
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.field_types import section
@@ -40,6 +40,11 @@ class Calibration:
 
     def __post_init__(self) -> None:
         n, mean, P = len(self.names), np.array(self.mean), np.array(self.covariance)
+        if len({*self.names} & {*CALIBRATED}) < n:
+            accepted = ", ".join(CALIBRATED)
+            raise ConfigError(
+                f"names: got {list(self.names)}; expected some of {accepted}, each once"
+            )
         for field, value, shape in (("mean", mean, (n,)), ("covariance", P, (n, n))):
             if value.shape != shape:
                 raise ConfigError(
@@ -86,16 +91,10 @@ class Calibration:
         return float(self.mean[self.names.index(name)]) if name in self.names else None
 
 
-_of_calibrated = rule(
-    lambda names: len({*names} & {*CALIBRATED}) == len(names),
-    f"some of {', '.join(CALIBRATED)}, each once",
-)
-
-
 @section
 class _File:
     mechanism: str
-    names: Annotated[list[str], _of_calibrated]
+    names: list[str]
     mean: list[float]
     covariance: list[list[float]]
 
