@@ -63,6 +63,14 @@ def test_a_warning_names_its_controllers_by_one_word_each(results):
     assert _shared_warnings(runs) == ["all", "lqi, delay_lqi: one"]
 
 
+def test_a_lost_run_of_a_stable_loop_is_explained(results):
+    """The lost ones of the paper's comparison have unstable loops."""
+    why = "Stable means that small errors about the reference fade."
+    assert why not in ComparisonResult(results).table()
+    lost = replace(results["predictor_lqi"], status="left_workspace")
+    assert why in ComparisonResult(results | {"predictor_lqi": lost}).table()
+
+
 def test_saved_files_are_complete(results, tmp_path):
     folder = tmp_path / "new" / "folder"
     ComparisonResult(results).save(folder)
