@@ -13,6 +13,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.reporting.identification import file_names
 from stewart_drake.scenario.calibration import load_calibration
 from stewart_drake.scenario.loading import load_scenario
@@ -211,6 +212,7 @@ def test_a_lost_log_lets_the_next_run_be_held(lost, tmp_path, capsys):
     assert known.value("delay") == summary["delay_s"]
     machine = load_mechanism(tmp_path / "mechanism.yaml")
     assert np.abs(machine.rod_lengths - PAPER.rod_lengths).max() < 1e-3
+    assert machine.drawn == fingerprint(PAPER) != fingerprint(machine)
     page = (tmp_path / "report.html").read_text()
     assert "--set overlay=DIR/found.yaml" in " ".join(out.split())
     overlay = f"overlay={tmp_path / 'found.yaml'}"

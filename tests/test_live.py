@@ -54,7 +54,7 @@ from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.peer import identity_of
 from stewart_drake.loop.preparation import prepare
-from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.mechanism.trajectories import make_reference
 from stewart_drake.reporting.run import run_document
@@ -583,7 +583,8 @@ def test_a_scenario_of_another_machine_is_refused_by_both_sides(settings, parts)
         host, port = running.address
     machine, controller = parts
     assert str(refused.value) == (
-        f"machine at {host}:{port} has {machine}; the controller is designed for {controller}"
+        f"machine at {host}:{port} has {machine}; the controller is designed for {controller}: "
+        "expected the same at both ends"
     )
     (said,) = running.lines
     assert said.endswith(f"designed for {controller}; this machine has {machine}")
@@ -591,9 +592,16 @@ def test_a_scenario_of_another_machine_is_refused_by_both_sides(settings, parts)
 
 
 def test_what_was_identified_does_not_change_the_identity(tmp_path):
-    assert identity_of(scenario_of()) == identity_of(
-        scenario_of("plant.mechanism=paper_clear", "plant.gravity=true", "delay.steps=3")
-    )
+    drawing, path = load_mechanism("paper"), tmp_path / "mechanism.yaml"
+    found = replace(drawing, rod_lengths=drawing.rod_lengths + 1e-4, drawn=fingerprint(drawing))
+    path.write_text(mechanism_yaml(found))
+    for settings in (
+        ("plant.mechanism=paper_clear", "plant.gravity=true", "delay.steps=3"),
+        (f"mechanism={path}",),
+    ):
+        assert identity_of(scenario_of(*settings)) == identity_of(scenario_of())
+    path.write_text(mechanism_yaml(replace(found, drawn=None)))
+    assert identity_of(scenario_of(f"mechanism={path}")) != identity_of(scenario_of())
 
 
 @pytest.mark.parametrize(
