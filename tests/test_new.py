@@ -56,6 +56,13 @@ def made(folder, **other):
     return sd.load_mechanism(folder / "machine.yaml")
 
 
+@pytest.mark.parametrize("limit", [None, 6.0])
+def test_the_start_is_planned_within_the_torque_limit(limit, tmp_path):
+    machine = made(tmp_path, torque_limit=limit)
+    assert machine.effort_limit == limit
+    assert sd.load_scenario(tmp_path / "scenario.yaml").actuator.torque_limit == limit
+
+
 @pytest.mark.parametrize("cranks", ["apart", "together"])
 def test_the_machine_is_as_it_was_measured(cranks, tmp_path):
     machine = made(tmp_path, cranks=cranks, upright=80, shaft_height=0.03)

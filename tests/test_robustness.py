@@ -110,6 +110,11 @@ def test_rank_correlation_is_pearsons_of_the_ranks(pairs):
     assert found.rho == pytest.approx(statistics.rank_correlation(np.exp(x), y).rho)
 
 
+@pytest.mark.parametrize("constant", [np.inf, 6.0])
+def test_a_constant_quantity_has_no_rank_correlation(constant):
+    assert np.isnan(statistics.rank_correlation(np.full(9, constant), np.arange(9.0)).rho)
+
+
 def test_the_interval_of_the_rank_correlation_covers_the_truth():
     """Pairs from a normal distribution of correlation r have rho = 6/pi asin(r/2)."""
     assert math.isnan(statistics.rank_correlation([1, 2, 3], [1, 2, 3]).rho), "too few pairs"

@@ -238,6 +238,9 @@ def scenario_text(m: Measurements, mechanism: Mechanism) -> str:
     delay = Delay.of(m.delay, period)
     home = [float(value) for value in mechanism.home]
     queue = "equilibrium      # the motors hold the plate already" if m.gravity else "zero"
+    limit = m.torque_limit
+    kept = "the start from rest is planned within it"
+    actuator = "" if limit is None else f"actuator: {{torque_limit: {limit!r}}}   # N m; {kept}\n"
     return f"""# A first motion of {mechanism.name}; all fields are in the shipped paper.yaml.
 mechanism: {MACHINE}
 duration: 10.0          # s
@@ -254,7 +257,7 @@ reference:
   frequency_unit: Hz
 
 plant: {{kind: exact, gravity: {str(m.gravity).lower()}}}
-controller: {{period: {period}}}       # s
+{actuator}controller: {{period: {period}}}       # s
 delay: {{steps: {delay.steps}, fraction: {round(delay.fraction, 9)}}}   # of {m.delay:g} s in all
 """
 

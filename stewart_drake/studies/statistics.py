@@ -116,7 +116,7 @@ def rank_correlation(x: ArrayLike, y: ArrayLike) -> Correlation:
     -+ z ((1 + rho^2 / 2) / (n - 3))^(1/2), with the variance of Bonett and Wright (2000).
     """
     a, b = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-    if len(a) < 4 or np.ptp(a) == 0 or np.ptp(b) == 0:
+    if len(a) < 4 or np.all(a == a[0]) or np.all(b == b[0]):
         return Correlation(np.nan, np.nan, np.nan, np.nan)
     found = stats.spearmanr(a, b)
     rho = float(np.clip(found.statistic, -1.0, 1.0))
