@@ -135,7 +135,7 @@ def plan_identification(
     Args:
         scenario: of the machine; a shipped name or a path.
         poses: whether poses are measured, not only crank angles.
-        tolerances, precision: as of `identify`.
+        tolerances, precision: as of `identify`; by default the encoders of the scenario count.
         command: that the page names; by default the call of this function.
     """
     tolerances, precision = _expected(tolerances, precision)
@@ -151,6 +151,9 @@ def plan_identification(
         planned = partial(plan_servos, prepare(loaded), rounding)
         shown = servo_identification.plan_document
         return analysis_result(planned, shown, typed, _write_setpoints)
+    sensor = loaded.sensor
+    if precision is None and sensor.kind == "encoders" and sensor.bits is not None:
+        precision = Precision(angle=angle_std(sensor.bits))
     measured = (precision or Precision()).std
     std = np.full_like(measured, np.inf)
     for part in (ANGLES, POSE) if poses else (ANGLES,):

@@ -11,6 +11,7 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
+from stewart_drake.identification.unknowns import DELAY
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import fingerprint
@@ -283,6 +284,18 @@ def test_a_plan_shrinks_until_the_loop_keeps_it_or_says_that_it_does_not(
     found.save(tmp_path)
     run = sd.simulate(tmp_path / "scenario.yaml", judge_stability=False)
     assert (run.status == "completed") == found.summary["kept"]
+
+
+def test_a_plan_counts_with_the_encoders_of_its_scenario():
+    """2 pi / 2^n / sqrt(12) of n bits, 14 where the scenario measures the state."""
+    said, delays = [], []
+    for encoders in ((), ("sensor={kind: encoders, bits: 10, samples: 1}",)):
+        settings = (*encoders, "plant.kind=exact", "duration=2")
+        found = sd.plan_identification(sd.load_scenario("paper", settings=settings))
+        said.append(" ".join(str(found).split()))
+        delays.append(found.study.std[DELAY])
+    assert "crank angles to ± 0.11 mrad" in said[0] and "crank angles to ± 1.8 mrad" in said[1]
+    assert delays[1] > 4 * delays[0]
 
 
 @pytest.mark.slow

@@ -80,6 +80,7 @@ class Plan:
     margin: ControllerMargin  # of the scenario's loop along this one
     times: Array  # (n,) s, of the motion
     poses: Array  # (n, 6) rad and m
+    measured: Array  # (18,) standard deviations of its measurements, infinite for missing ones
     unknowns: Unknowns  # before the log
     covariance: Array  # (k, k) of the free ones after the log
 
@@ -225,7 +226,7 @@ def plan(experiment: Experiment, std: Array, tolerances: Tolerances | None = Non
     spread = covariance(problem.normal(guess)[1])
     reference = CsvConfig(file=MOTION)
     changed = dataclasses.replace(sc, reference=reference, duration=float(times[-1]))
-    return Plan(changed, share, lost, kept, judged, times, poses, unknowns, spread)
+    return Plan(changed, share, lost, kept, judged, times, poses, std, unknowns, spread)
 
 
 def _predicted(

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from stewart_drake.identification.identify import WRONG, Identification
-from stewart_drake.identification.logs import KINDS, Log
+from stewart_drake.identification.logs import ANGLES, KINDS, Log
 from stewart_drake.identification.plan import MOTION, Plan
 from stewart_drake.identification.unknowns import DELAY, GEOMETRY, NAMES
 from stewart_drake.identification.unknowns import UNITS as SI_UNITS
@@ -90,6 +90,7 @@ def plan_document(plan: Plan) -> Document:
         poses=plan.pose_uncertainty,
         reduced=plan.share < 1,
         loop=loop_verdict(plan.margin),
+        angles=number(1e3 * plan.measured[ANGLES].max(), 2),
         logs=(),
         segments="",
         **dict.fromkeys(("cautions", "weak", "outside", "fits", "residuals", "geometry")),
