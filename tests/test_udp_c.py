@@ -40,6 +40,15 @@ def test_a_key_file_beyond_what_python_takes_is_refused(folder, tmp_path):
         assert done.returncode == (0 if size in takes else 2), (size, done.stderr)
 
 
+def test_a_machine_with_another_key_does_not_answer(folder, tmp_path):
+    """It stores and says nothing for a datagram that it cannot trust; the client names the key."""
+    (tmp_path / "key").write_bytes(b"k" * SHORTEST_KEY)
+    with machine("--key", str(tmp_path / "key")) as (_, port):
+        command = [str(folder / "stewart_udp"), "127.0.0.1", str(port)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1 and "with the same key=FILE" in done.stderr + done.stdout
+
+
 def test_without_random_bytes_there_is_no_session(folder, tmp_path):
     own = shutil.copytree(folder, tmp_path / "own")
     make(own, "stewart_udp", 'CFLAGS=-DUDP_RANDOM=\\"/nowhere\\"')

@@ -602,7 +602,9 @@ static const char *greet(controller *c)
     uint64_t patience = udp_now() + PATIENCE;
     while (c->last.begin == STEWART_NEVER || c->begin == STEWART_NEVER || c->period == 0) {
         if (udp_interrupted() || udp_now() > patience)
-            return c->busy ? in_use(c) : "the machine does not answer";
+            return c->busy ? in_use(c)
+                           : "the machine does not answer: expected a running one at this address, with the "
+                             "same key=FILE";
         say(c, 0, 0, 0, 0);
         uint64_t next = udp_now() + REQUEST_PERIOD;
         while (udp_now() < next) {
