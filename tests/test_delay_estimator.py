@@ -388,6 +388,13 @@ def test_a_lost_or_impossible_measurement_is_survived():
     assert beliefs[-1].settled and abs(beliefs[-1].delay_mean - 0.337) < 3e-3
 
 
+def test_a_delay_near_the_longest_is_found_if_the_first_measurements_are_missing():
+    torques, _, measured = record(1.43, 26, seed=3)
+    measured[:18] = np.nan
+    last = observed(torques, measured, believed=0.6)[-1]
+    assert last.settled and abs(last.delay_mean - 1.43) < 1e-3
+
+
 def test_the_stated_scratch_memory_is_enough(monkeypatch):
     """A search, a jump of the delay and outliers write nothing beyond it."""
     given, take, spare, mark = [], core().scratch, 100, -1.25

@@ -195,9 +195,8 @@ static void begin(Search *s, const real *y, const real *near, stewart_scratch sc
     stewart_hypothesis_set_root(n, L, master);
     s->memory->known = s->memory->searching = 1;
     s->memory->cells = s->memory->best = 0;
-    for (int k = 1; k <= s->since.view.num_own; k++)
-        if ((real)k * d->period < d->longest)
-            spawn(s, k, scratch);
+    for (int k = 1; k <= s->since.view.num_own && (real)(k - 1) * d->period < d->longest; k++)
+        spawn(s, k, scratch);
 }
 
 /* Advance the hypothesis at a place by one period and a measurement, or NULL. */
