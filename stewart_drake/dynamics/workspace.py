@@ -1,4 +1,4 @@
-"""Workspace of a mechanism: no dead centres, no parallel singularities, distinct angles."""
+"""Workspace of a mechanism: no dead centres, no parallel singularities, pitch below its limit."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -13,22 +13,19 @@ from stewart_drake.scenario.signals import LEGS, NUM_LEGS
 from stewart_drake.types import Array
 
 PITCH_LIMIT = np.deg2rad(85.0)
-"""Largest pitch. At 90 degrees roll and yaw are one rotation."""
+"""Largest |pitch|, rad. At 90 degrees roll and yaw are one rotation."""
 SINGULARITY_LIMIT = 1e-3
 """Least |det| of the dimensionless wrenches of the six rods."""
 LEAST = np.array([DEAD_CENTRE_SINE] * NUM_LEGS + [SINGULARITY_LIMIT, -PITCH_LIMIT])
-"""Lower bounds of the measures (8,)."""
+"""Lower bounds of the measures (8,): six sines, the signed determinant, and minus |pitch|."""
 
 
 class Failure(NamedTuple):
-    """Reason of an early end: time in s, leg (from 1, or None), margin and text.
+    """Reason of an early end."""
 
-    `margin` is the reach margin of that leg in m, or the measure named in the text, NaN for none.
-    """
-
-    time: float
-    leg: int | None
-    margin: float
+    time: float  # s
+    leg: int | None  # from 1; None for a reason without a leg
+    margin: float  # reach margin of the leg in m, or distance from the named limit; NaN for none
     reason: str
 
     def __str__(self) -> str:
@@ -40,7 +37,7 @@ class Measures(NamedTuple):
     """Distances from the workspace's boundary at a pose."""
 
     sines: Array  # (6,) of the cranks' angles off dead centre, negative on the other branch
-    parallel: float  # signed, 0 where the cranks do not hold the plate
+    parallel: float  # det of the rods' wrenches, 0 where the cranks do not hold the plate
     pitch: float  # rad
     margin: float  # see the function of this name
 
@@ -48,18 +45,17 @@ class Measures(NamedTuple):
 def measures_at(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> Measures:
     """Return the measures of a pose (6,), in or out of reach.
 
-    A crank that has passed its dead centre has a negative sine if the crank angles (6,) of a
-    simulated tree are given. The pose alone does not show it.
+    A pose does not show whether a crank has passed its dead centre. With the crank angles (6,) of a
+    simulated tree, the sine of such a crank is negative.
     """
     functions = functions_of(mechanism)
     if crank_angles is None:
         measures = functions.measures(pose)[0]
     else:
         measures = functions.measures_of_tree(pose, crank_angles)[0]
-    above = measures - LEAST
-    above[NUM_LEGS] = home_sign(mechanism) * measures[NUM_LEGS] - LEAST[NUM_LEGS]
-    parallel = float(measures[NUM_LEGS])
-    return Measures(measures[:NUM_LEGS], parallel, float(pose[1]), float(above.min()))
+    parallel, signed = float(measures[NUM_LEGS]), measures.copy()
+    signed[NUM_LEGS] *= home_sign(mechanism)
+    return Measures(measures[:NUM_LEGS], parallel, float(pose[1]), float((signed - LEAST).min()))
 
 
 def margin(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> float:
@@ -72,7 +68,10 @@ def margin(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None)
 def border(
     inside: Callable[[float], bool], low: float, high: float, tolerance: float
 ) -> tuple[float, float]:
-    """Return two numbers closer than a tolerance, the first inside and the second not."""
+    """Bisect for a boundary between `low`, inside, and `high`, outside.
+
+    The two numbers returned are such a pair, closer than the tolerance.
+    """
     while high - low > tolerance:
         middle = (low + high) / 2
         low, high = (middle, high) if inside(middle) else (low, middle)
@@ -86,7 +85,7 @@ def margins(mechanism: Mechanism, poses: Array) -> Array:
 
 @lru_cache(maxsize=64)
 def home_sign(mechanism: Mechanism) -> float:
-    """Return the sign of `Measures.parallel` at home; continuous motions change it at 0 only."""
+    """Return the sign of `Measures.parallel` at home; a motion that changes it passes 0."""
     return float(np.sign(functions_of(mechanism).measures(mechanism.home)[0][NUM_LEGS]))
 
 
@@ -96,18 +95,17 @@ def diagnose(
     """Return the failure at a pose outside the workspace, or None inside it."""
     if not np.all(np.isfinite(pose)):
         return Failure(time, None, np.nan, "the simulated state is not finite")
-    now, sign = measures_at(mechanism, pose, crank_angles), home_sign(mechanism)
-    if now.margin > 0:
+    measures = measures_at(mechanism, pose, crank_angles)
+    if measures.margin > 0:
         return None
-    leg = int(now.sines.argmin())
-    if now.sines[leg] <= DEAD_CENTRE_SINE:
+    leg = int(measures.sines.argmin())
+    if measures.sines[leg] <= DEAD_CENTRE_SINE:
         reach = float(mechanism.reach_margins(pose)[leg])
         return Failure(time, LEGS[leg], reach, f"leg {LEGS[leg]} reached the end of its reach")
-    if abs(now.pitch) >= PITCH_LIMIT:
-        return Failure(time, None, PITCH_LIMIT - abs(now.pitch), "the pitch passed 85 degrees")
-    return Failure(
-        time, None, sign * now.parallel, "parallel singularity: the cranks do not hold the plate"
-    )
+    if (pitch := abs(measures.pitch)) >= PITCH_LIMIT:
+        return Failure(time, None, PITCH_LIMIT - pitch, "the pitch passed 85 degrees")
+    singular = "parallel singularity: the cranks do not hold the plate"
+    return Failure(time, None, home_sign(mechanism) * measures.parallel, singular)
 
 
 class Limits(Protocol):
@@ -123,7 +121,7 @@ class Limits(Protocol):
 
 
 class Workspace(NamedTuple):
-    """Limits of a machine, at all times the same."""
+    """Workspace of a machine as limits, the same at all times."""
 
     mechanism: Mechanism
 

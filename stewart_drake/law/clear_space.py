@@ -14,36 +14,36 @@ from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_LEGS, POSE
 from stewart_drake.types import Array
 
 RESERVE = 0.06
-"""Distance to keep, of legs from the end of their reach and of links, in shortest cranks."""
+"""Reach margin of each leg and clearance of each pair of links to keep, in shortest cranks."""
 _KEPT_SHARE = 0.9
-"""Largest share of the reference's own distances that is kept."""
+"""Share to keep of the reference's own least distance, where that is less than RESERVE."""
 _STEP = 1e-6
 """Step of the difference quotients, rad and m."""
 
 
 class NearLimit(NamedTuple):
-    """Distances near their least values, of several poses."""
+    """Distances near their bounds, at several poses."""
 
     pose: NDArray[np.intp]  # (r,) index of the pose of each
-    room: Array  # (r,) distance minus its least value, in shortest cranks
-    slopes: Array  # (r, 6) its derivative by the pose
+    room: Array  # (r,) distance minus its bound, in shortest cranks
+    slopes: Array  # (r, 6) derivative of the room by the pose
 
 
 @dataclass(frozen=True, eq=False)
 class ClearSpace:
-    """Distances at a pose, each with the least value that a plan keeps, in shortest cranks."""
+    """Lower bounds of the distances at a pose, in lengths of the shortest crank."""
 
     mechanism: Mechanism  # the machine
     pairs: NDArray[np.intp]  # (k,) of guarded links, indices in `clearance.LINK_PAIRS`
-    least: Array  # (6 + k,) least distances of the six legs and of the pairs
+    least: Array  # (6 + k,) bounds of the six reach margins and of the pairs' clearances
 
     @classmethod
     def along(cls, mechanism: Mechanism, poses: Array) -> "ClearSpace":
         """Return the distances to keep for a reference with these poses (n, 6).
 
-        Each is RESERVE, or a share of the reference's own distance if that is less. Pairs of links
-        whose capsules touch somewhere on the reference are not guarded. Legs that do not reach it
-        keep RESERVE.
+        Each is RESERVE, or a share of the reference's own least distance if that is less. Pairs of
+        links whose capsules touch somewhere on the reference are not guarded. Legs that do not
+        reach it keep RESERVE.
         """
         unit = mechanism.crank_lengths.min()
         margins = reach_margins(mechanism, poses)
@@ -52,51 +52,51 @@ class ClearSpace:
         legs = margins.min(axis=0) / unit
         apart = clearances(mechanism, reached, legs_along(mechanism, reached)).min(axis=0) / unit
         pairs = np.flatnonzero(apart > 0)
-        kept = np.concatenate([np.where(legs > 0, legs, np.inf), apart[pairs]])
-        return cls(mechanism, pairs, np.minimum(RESERVE, _KEPT_SHARE * kept))
+        own = np.concatenate([np.where(legs > 0, legs, np.inf), apart[pairs]])
+        return cls(mechanism, pairs, np.minimum(RESERVE, _KEPT_SHARE * own))
 
-    def room(self, poses: Array, pairs: NDArray[np.intp] | None = None) -> Array:
-        """Return distances minus their least values (n, 6 + k) at poses (n, 6), in shortest cranks.
+    def room(self, poses: Array, chosen: NDArray[np.intp] | None = None) -> Array:
+        """Return distances minus their bounds (n, 6 + k) at poses (n, 6), in shortest cranks.
 
         They are negative for legs out of reach, and NaN for links that cannot be placed then.
-        `pairs` are indices of guarded pairs, by default all.
+        `chosen` are places in `pairs`, by default all.
         """
         m, unit = self.mechanism, self.mechanism.crank_lengths.min()
-        chosen = slice(None) if pairs is None else pairs
-        guarded, least = self.pairs[chosen], self.least[NUM_LEGS:][chosen]
+        pairs, least = self.pairs, self.least[NUM_LEGS:]
+        if chosen is not None:
+            pairs, least = pairs[chosen], least[chosen]
         legs = reach_margins(m, poses) / unit - self.least[:NUM_LEGS]
-        if len(guarded) == 0:
+        if len(pairs) == 0:
             return legs
-        apart = clearances(m, poses, legs_along(m, poses), guarded) / unit - least
+        apart = clearances(m, poses, legs_along(m, poses), pairs) / unit - least
         return np.hstack([legs, apart])
 
     def near(self, poses: Array, below: float) -> NearLimit:
         """Return the distances with less room than `below` at poses (n, 6), with their slopes."""
         room = self.room(poses)
         is_near = room < below
-        at = np.flatnonzero(is_near.any(axis=1))
-        pairs = np.flatnonzero(is_near[:, NUM_LEGS:].any(axis=0))
-        columns = np.concatenate([np.arange(NUM_LEGS), NUM_LEGS + pairs])
-        base = poses[at][:, None]
-        stepped = np.concatenate([base, base + _STEP * np.eye(6)], axis=1)
-        rooms = self.room(stepped.reshape(-1, NUM_COORDINATES), pairs)
-        rooms = rooms.reshape(len(at), 7, len(columns))
+        near_poses = np.flatnonzero(is_near.any(axis=1))
+        near_pairs = np.flatnonzero(is_near[:, NUM_LEGS:].any(axis=0))
+        columns = np.concatenate([np.arange(NUM_LEGS), NUM_LEGS + near_pairs])
+        base = poses[near_poses][:, None]
+        stepped = np.concatenate([base, base + _STEP * np.eye(NUM_COORDINATES)], axis=1)
+        rooms = self.room(stepped.reshape(-1, NUM_COORDINATES), near_pairs)
+        rooms = rooms.reshape(len(near_poses), 1 + NUM_COORDINATES, len(columns))
         slopes = np.swapaxes((rooms[:, 1:] - rooms[:, :1]) / _STEP, 1, 2)
-        row, column = np.nonzero(is_near[at][:, columns] & np.isfinite(slopes).all(axis=2))
-        return NearLimit(at[row], room[at[row], columns[column]], slopes[row, column])
+        usable = is_near[near_poses][:, columns] & np.isfinite(slopes).all(axis=2)
+        row, column = np.nonzero(usable)
+        pose = near_poses[row]
+        return NearLimit(pose, room[pose, columns[column]], slopes[row, column])
 
     def reachable_share(self, poses: Array) -> float:
         """Return the largest share of the way from home at which all poses (n, 6) keep the reach.
 
         It is at most 1, and accurate to 0.001.
         """
-        home = self.mechanism.home
-        legs = self.least[:NUM_LEGS] * self.mechanism.crank_lengths.min()
+        m, least = self.mechanism, self.least[:NUM_LEGS] * self.mechanism.crank_lengths.min()
 
         def fits(share: float) -> bool:
-            return bool(
-                np.all(reach_margins(self.mechanism, home + share * (poses - home)) >= legs)
-            )
+            return bool(np.all(reach_margins(m, m.home + share * (poses - m.home)) >= least))
 
         if fits(1.0):
             return 1.0
@@ -107,7 +107,7 @@ class ClearSpace:
         return self.scaled(rows, self.reachable_share(rows[:, POSE]))
 
     def scaled(self, rows: Array, share: float) -> Array:
-        """Return the rows (n, 18) of a motion, with its distance from home times a share."""
+        """Return the rows (n, 18) of a motion, scaled about home."""
         if share == 1.0:
             return rows
         scaled = share * rows

@@ -1,10 +1,10 @@
-"""Distances between the parts of a machine: Drake's distances between the shapes of its model.
+"""Distances between the parts of a machine.
 
-The machine is alone in a scene, and pairs are queried one by one, without collision filters. Rods
-have round ends here, like the joints at them. Drake's iteration for two long cylinders stops early,
-with errors of 0.6 mm at 1 mm between flat ends and 0.09 mm between round ones. The distance of two
-rods is therefore that of their centre lines in closed form less two radii, exact for capsules. The
-distance of a rod and a crank is Drake's, some tenths of a percent too large at most.
+Drake computes them from the shapes of the model, pair by pair, without collision filters. Here rods
+have round ends, like the joints at them. For two long cylinders Drake's iteration stops early: at
+1 mm its error is 0.6 mm with flat ends and 0.09 mm with round ones. The distance of two rods is
+therefore computed in closed form: that of their centre lines less two radii, exact for capsules.
+The distance of a rod and a crank is Drake's, some tenths of a percent too large at most.
 """
 
 import re
@@ -20,10 +20,11 @@ from stewart_drake.loop.platforms import add_mechanism, add_scene, set_pose
 from stewart_drake.mechanism.clearance import LINKS, center_lines, proportions, segment_distances
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import legs_along
-from stewart_drake.scenario.signals import NUM_LEGS
 from stewart_drake.types import Array
 
 _AT_REST: Final = np.zeros(6)
+_ON_BASE: Final = {"base", "motor", "post"}
+"""Kinds of parts that belong to the base."""
 
 
 class Pair(NamedTuple):
@@ -35,7 +36,7 @@ class Pair(NamedTuple):
     @property
     def fixed(self) -> bool:
         """Whether one of them belongs to the base."""
-        return any(name.split()[0] in ("base", "motor", "post") for name in self)
+        return any(_kind(name) in _ON_BASE for name in self)
 
     def __str__(self) -> str:
         return f"{self.first} and {self.second}"
@@ -46,7 +47,7 @@ class ClearanceScene:
 
     Args:
         mechanism: the machine.
-        base: whether to include its base, motors and posts.
+        base: whether to include pairs with its base, motors and posts.
 
     Attributes:
         pairs: pairs of parts in the order of `distances`.
@@ -56,22 +57,20 @@ class ClearanceScene:
         builder = DiagramBuilder()
         plant, scene_graph = add_scene(builder)
         add_mechanism(plant, mechanism, collision=True)
-        _round_off(scene_graph, plant)
+        _round_rod_ends(scene_graph, plant)
         self._mechanism, self._plant = mechanism, plant
         self._diagram = builder.Build()
         self._context = self._diagram.CreateDefaultContext()
-        self._tree = plant.GetMyMutableContextFromRoot(self._context)
-        self._query: Any = scene_graph.get_query_output_port()
-        self._shapes = scene_graph.GetMyContextFromRoot(self._context)
+        self._plant_context = plant.GetMyMutableContextFromRoot(self._context)
+        self._query_port: Any = scene_graph.get_query_output_port()
+        self._scene_context = scene_graph.GetMyContextFromRoot(self._context)
         parts = _parts(scene_graph)
         pairs = [Pair(*names) for names in combinations(parts, 2) if not _joined(*names)]
         self.pairs = tuple(pair for pair in pairs if base or not pair.fixed)
         self._ids = [(parts[pair.first], parts[pair.second]) for pair in self.pairs]
-        rods = {LINKS[i]: i for i in range(NUM_LEGS, len(LINKS))}
-        of_rods = [k for k, pair in enumerate(self.pairs) if all(name in rods for name in pair)]
-        others = [k for k in range(len(self.pairs)) if k not in of_rods]
-        self._of_rods, self._others = np.array(of_rods), np.array(others)
-        self._rods = np.array([[rods[name] for name in self.pairs[k]] for k in of_rods]).T
+        two_rods = np.array([all(_kind(name) == "rod" for name in pair) for pair in self.pairs])
+        self._rod_pairs, self._other_pairs = np.flatnonzero(two_rods), np.flatnonzero(~two_rods)
+        self._rods = np.array([[LINKS.index(n) for n in self.pairs[k]] for k in self._rod_pairs]).T
 
     def distances(self, pose: Array) -> Array:
         """Return the distances of all pairs (p,), in m, at a pose (6,); negative for an overlap.
@@ -80,22 +79,22 @@ class ClearanceScene:
             UnreachablePoseError: the pose is out of reach.
         """
         m = self._mechanism
-        set_pose(self._plant, self._tree, m, pose, _AT_REST)
-        query = cast(QueryObject, self._query.Eval(self._shapes))
-        found = np.empty(len(self.pairs))
-        found[self._others] = [
+        set_pose(self._plant, self._plant_context, m, pose, _AT_REST)
+        query = cast(QueryObject, self._query_port.Eval(self._scene_context))
+        distances = np.empty(len(self.pairs))
+        distances[self._other_pairs] = [
             query.ComputeSignedDistancePairClosestPoints(*self._ids[k]).distance
-            for k in self._others
+            for k in self._other_pairs
         ]
-        one = np.asarray(pose)[None]
-        start, along = (x[0] for x in center_lines(m, one, legs_along(m, one)))
+        poses = np.asarray(pose)[None]
+        start, along = (lines[0] for lines in center_lines(m, poses, legs_along(m, poses)))
         first, second = self._rods
         apart = segment_distances(start[first], along[first], start[second], along[second])
-        found[self._of_rods] = apart - 2 * proportions(m).rod_radius
-        return found
+        distances[self._rod_pairs] = apart - 2 * proportions(m).rod_radius
+        return distances
 
 
-def _round_off(scene_graph: SceneGraph, plant: MultibodyPlant) -> None:
+def _round_rod_ends(scene_graph: SceneGraph, plant: MultibodyPlant) -> None:
     """Replace the cylinders of the rods by capsules."""
     for shape in scene_graph.model_inspector().GetAllGeometryIds(Role.kProximity):
         inspector = scene_graph.model_inspector()
@@ -111,20 +110,24 @@ def _parts(scene_graph: SceneGraph) -> dict[str, GeometryId]:
     for shape in inspector.GetAllGeometryIds(Role.kProximity):
         body = inspector.GetName(inspector.GetFrameId(shape)).split("::")[-1]
         name = inspector.GetName(shape).split("::")[-1]
-        on_base = body == "base" and name != "disc"
+        on_base = body == "base" and name != "disc"  # motors and posts; the disc is the base
         found[(name if on_base else body).replace("_", " ")] = shape
-    return {name: found[name] for name in sorted(found, key=_place)}
+    return {name: found[name] for name in sorted(found, key=_order)}
 
 
-def _place(name: str) -> tuple[int, str]:
-    kinds = ("base", "motor", "post", "plate", "crank", "rod")
-    return kinds.index(name.split()[0]), name
+def _kind(name: str) -> str:
+    """Return the kind of a part: `crank` of `crank 1`."""
+    return name.split()[0]
+
+
+def _order(name: str) -> tuple[int, str]:
+    return ("base", "motor", "post", "plate", "crank", "rod").index(_kind(name)), name
 
 
 def _joined(first: str, second: str) -> bool:
     """Return whether two parts belong to one body or meet in a joint."""
-    kinds = {name.split()[0] for name in (first, second)}
-    if kinds <= {"base", "motor", "post"} or kinds == {"plate", "rod"}:
+    kinds = {_kind(first), _kind(second)}
+    if kinds <= _ON_BASE or kinds == {"plate", "rod"}:
         return True
     same_leg = len({re.sub("[^0-9]", "", name) for name in (first, second)}) == 1
     return same_leg and kinds in ({"motor", "crank"}, {"post", "crank"}, {"crank", "rod"})

@@ -35,10 +35,10 @@ _UNITS: Final = {
     "rad": ("mrad", 1e3),
     "s": ("ms", 1e3),
 }
-"""Unit in which an unknown is shown, and the factor, by its SI unit."""
+"""Unit in which an unknown is shown and the factor to it, by SI unit."""
 _WEAK: Final = 0.5
-"""Share of its deviation before the log above which an unknown is weak."""
-_OF_KIND: Final = {
+"""Standard deviation after the log, relative to that before, above which an unknown is weak."""
+_VALUE_NAMES: Final = {
     "angles": [f"leg {leg}" for leg in LEGS],
     "pose": list(COORDINATE_NAMES),
     "rates": [f"d{name}/dt" for name in COORDINATE_NAMES],
@@ -47,14 +47,14 @@ _OF_KIND: Final = {
 
 
 def document(found: Identification) -> Document:
-    interval, delay = measured(1e3 * found.std[DELAY], 1e3 * found.values[DELAY])
+    delay_ms, right = 1e3 * found.values[DELAY], found.right
+    interval, delay = measured(1e3 * found.std[DELAY], delay_ms)
     cautions, names = _cautions(found), file_names(found.logs)
-    right = found.right
     return from_template(
         "identification",
         "bad" if not right else "fair" if cautions else "good",
         right=right,
-        delay=delay if right else f"{1e3 * found.values[DELAY]:.6g}",
+        delay=delay if right else f"{delay_ms:.6g}",
         interval=interval,
         wrong=WRONG,
         logs=names,
@@ -63,7 +63,7 @@ def document(found: Identification) -> Document:
         found=_table(found, geometry=False),
         geometry=_table(found, geometry=True),
         chi2=found.chi2,
-        fits=[("tolerances" if of == "prior" else of, chi2) for of, chi2 in found.chi2.items()],
+        fits=[("tolerances" if k == "prior" else k, chi2) for k, chi2 in found.chi2.items()],
         residuals=[
             Picture(
                 partial(residual_figure, found, i),
@@ -74,7 +74,8 @@ def document(found: Identification) -> Document:
         weak=_weak(found) if right else [],
         poses=found.pose_uncertainty if right else None,
         outside=right and found.pose_uncertainty is None,
-        **_shared(found, plan=None, reduced=False, motion=None),
+        **dict.fromkeys(("plan", "reduced", "motion")),
+        **_shared(found),
     )
 
 
@@ -91,25 +92,31 @@ def plan_document(plan: Plan) -> Document:
         reduced=plan.share < 1,
         loop=loop_verdict(plan.margin),
         angles=number(1e3 * plan.measured[ANGLES].max(), 2),
+        plan=plan,
         logs=(),
         segments="",
         **dict.fromkeys(("cautions", "weak", "outside", "fits", "residuals", "geometry")),
-        **_shared(plan, plan=plan),
+        **_shared(plan),
     )
 
 
-def _shared(of: Identification | Plan, **more: Any) -> dict[str, Any]:
-    name, unseen = of.unknowns.mechanism.name, of.unseen
-    return {"mechanism": name, "unseen": unseen[0] > 0, "directions": unseen, "pair": _pair, **more}
+def _shared(study: Identification | Plan) -> dict[str, Any]:
+    """Return the values of the template that both documents have."""
+    return {
+        "mechanism": study.unknowns.mechanism.name,
+        "unseen": study.unseen[0] > 0,
+        "directions": study.unseen,
+        "median_and_worst": _median_and_worst,
+    }
 
 
-def _pair(values: tuple[float, float], unit: str) -> str:
+def _median_and_worst(values: tuple[float, float], unit: str) -> str:
     median, worst = (number(1e3 * value, 2) for value in values)
     return f"{median} {unit}, at worst {worst} {unit}"
 
 
 def file_names(logs: Sequence[Log]) -> list[str]:
-    """Return the files of the logs, with as many folders as make them distinct."""
+    """Return the paths of the logs, shortened to the last parts that keep them distinct."""
     paths = [Path(log.name).resolve().parts for log in logs]
     depth, different = 1, len(set(paths))
     while len({parts[-depth:] for parts in paths}) < different:
@@ -136,9 +143,9 @@ def _cautions(found: Identification) -> list[str]:
     if left_out := found.fit.left_out:
         stretches = "1 stretch" if left_out == 1 else f"{left_out} stretches"
         cautions.append(f"{stretches} of the logs left out: no trajectory fits there")
-    beyond = np.abs(found.fit.residuals.prior) > 4
-    if beyond.any():
-        names = ", ".join(NAMES[k] for k in found.unknowns.free[beyond][:5])
+    far = np.abs(found.fit.residuals.prior) > 4
+    if far.any():
+        names = ", ".join(NAMES[k] for k in found.unknowns.free[far][:5])
         cautions.append(f"more than four tolerances off: {names}; is the drawing right?")
     return cautions
 
@@ -146,11 +153,12 @@ def _cautions(found: Identification) -> list[str]:
 def _weak(found: Identification) -> list[str]:
     """Return the names of the unknowns, without the geometry, that are hardly better known."""
     before = found.unknowns.std
-    rest = (k for k in found.unknowns.free if not _of_geometry(k))
-    return [NAMES[k].replace("_", " ") for k in rest if found.std[k] > _WEAK * before[k]]
+    others = (k for k in found.unknowns.free if not _of_geometry(k))
+    return [NAMES[k].replace("_", " ") for k in others if found.std[k] > _WEAK * before[k]]
 
 
 def _of_geometry(k: int) -> bool:
+    """Return whether an unknown belongs to the geometry, or is an offset of a crank angle."""
     return GEOMETRY.start <= k < DELAY
 
 
@@ -164,54 +172,52 @@ def _table(found: Identification, geometry: bool) -> Table:
 
 
 def _unknowns(free: Sequence[int], columns: dict[str, Array], brief: bool) -> Table:
-    """Return name and unit of each unknown, and columns of its numbers.
+    """Return a table of unknowns: name, unit, and their numbers by the head of the column.
 
-    A value has the digits of its deviation, the column `±`.
+    If there is a column `±`, the numbers of the first column have as many decimals as it.
     """
     rows = []
     for k in free:
         unit, factor = _UNITS[SI_UNITS[k]]
-        numbers = {head: number(factor * values[k]) for head, values in columns.items()}
-        if "±" in columns and np.isfinite(columns["±"][k]):
-            (head, values), *_ = columns.items()
-            numbers["±"], numbers[head] = measured(factor * columns["±"][k], factor * values[k])
-        rows.append((NAMES[k].replace("_", " "), unit, *numbers.values()))
+        values = {head: factor * column[k] for head, column in columns.items()}
+        texts = {head: number(value) for head, value in values.items()}
+        if np.isfinite(values.get("±", np.nan)):
+            first = next(iter(columns))
+            texts["±"], texts[first] = measured(values["±"], values[first])
+        rows.append((NAMES[k].replace("_", " "), unit, *texts.values()))
     return Table(("unknown", "unit", *columns), rows, brief=brief)
 
 
-def residual_figure(found: Identification, log: int) -> Figure:
-    times, residuals = residuals_of(found, log)
+def residual_figure(found: Identification, index: int) -> Figure:
+    """Draw the residuals of the log with this index."""
+    times, residuals = residuals_of(found, found.logs[index])
+    lines = [line._replace(linewidth=0.9) for line in LEG_LINES]
+    limits = {2.0: "2 standard deviations", -2.0: "-2 standard deviations"}
     panels = []
     for kind, part in KINDS.items():
-        if found.logs[log].measures(part):
-            values = residuals[:, part]
-            looks = (line._replace(linewidth=0.9) for line in LEG_LINES)
-            named = zip(values.T, _OF_KIND[kind], looks, strict=True)
-            curves = [Curve(times, column, label, look) for column, label, look in named]
-            limits = {sign * 2.0: f"{sign * 2} standard deviations" for sign in (1, -1)}
+        if found.logs[index].measures(part):
+            drawn = zip(residuals[:, part].T, _VALUE_NAMES[kind], lines, strict=True)
+            curves = [Curve(times, values, name, line) for values, name, line in drawn]
             panels.append(Panel(f"{kind}  [std]", curves, limits=limits, legend="panel"))
     return draw(panels)
 
 
-def residuals_of(found: Identification, log: int) -> tuple[Array, Array]:
+def residuals_of(found: Identification, log: Log) -> tuple[Array, Array]:
     """Return times (n,) of a log in s, and residuals (n, 18) in standard deviations."""
-    times, rows = [], []
+    times, rows = [np.empty(0)], [np.empty((0, 18))]
     for i, segment in enumerate(found.fit.problem.segments):
-        if segment.log is not found.logs[log]:
-            continue
-        fitted = found.fit.residuals.measured[: len(segment.rows), i]
-        measured = np.isfinite(segment.log.values[segment.rows])
-        times.append(segment.log.times[segment.rows])
-        rows.append(np.where(measured, fitted, np.nan))
-    if not times:
-        return np.empty(0), np.empty((0, 18))
+        if segment.log is log:
+            fitted = found.fit.residuals.measured[: len(segment.rows), i]
+            has_value = np.isfinite(log.values[segment.rows])
+            times.append(log.times[segment.rows])
+            rows.append(np.where(has_value, fitted, np.nan))
     return np.concatenate(times), np.concatenate(rows)
 
 
 def motion_figure(plan: Plan) -> Figure:
-    moved = FACTORS * (plan.poses - np.median(plan.poses, axis=0))
+    from_middle = FACTORS * (plan.poses - np.median(plan.poses, axis=0))
     curves = [
-        Curve(plan.times, moved[:, k], name, LEG_LINES[k % 3])
+        Curve(plan.times, from_middle[:, k], name, LEG_LINES[k % 3])
         for k, name in enumerate(COORDINATE_NAMES)
     ]
     panels = [

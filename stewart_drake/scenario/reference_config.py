@@ -1,4 +1,4 @@
-"""The reference motion, as a scenario describes it, by kind.
+"""Section `reference` of a scenario, by kind.
 
 `mechanism.trajectories.make_reference` makes the motion itself.
 """
@@ -14,11 +14,11 @@ from stewart_drake.files.yamlio import one_message
 from stewart_drake.scenario.field_types import Name, Row, Seconds, Six, section
 
 
-def _pitch_problem(largest: float) -> str | None:
-    if largest < math.pi / 2:
+def _pitch_problem(largest_pitch: float) -> str | None:
+    if largest_pitch < math.pi / 2:
         return None
     expected = "|offset| + |amplitude| below pi/2, where roll and yaw stay distinct"
-    return f"reference.offset: the pitch reaches {largest:.4g} rad; expected {expected}"
+    return f"reference.offset: the pitch reaches {largest_pitch:.4g} rad; expected {expected}"
 
 
 _Frequency = Annotated[float, Field(gt=0, le=1e4)]
@@ -30,7 +30,7 @@ _Frequencies = Annotated[
 
 @section
 class SineConfig:
-    """offset + amplitude sin(frequency t).
+    """Sine motion: offset + amplitude sin(frequency t).
 
     Attributes:
         amplitude: [roll, pitch, yaw, x, y, z] in rad and m.
@@ -42,7 +42,7 @@ class SineConfig:
     kind: Literal["sine"] = "sine"
     amplitude: Six = field(
         default_factory=lambda: [0.2617993878, 0.2617993878, 0.2617993878, 0.02, 0.02, 0.08]
-    )
+    )  # 15 degrees
     offset: Six = field(default_factory=lambda: [0.0, 0.0, 0.0, 0.0, 0.0, 0.38])
     frequency: _Frequencies = 1.0
     frequency_unit: Literal["rad/s", "Hz"] = "rad/s"
@@ -50,11 +50,12 @@ class SineConfig:
     @property
     def angular_frequency(self) -> list[float]:
         """Frequency of each coordinate, rad/s."""
-        six = self.frequency if isinstance(self.frequency, list) else [self.frequency] * 6
-        return [one * (2 * math.pi if self.frequency_unit == "Hz" else 1.0) for one in six]
+        frequencies = self.frequency if isinstance(self.frequency, list) else [self.frequency] * 6
+        factor = 2 * math.pi if self.frequency_unit == "Hz" else 1.0
+        return [frequency * factor for frequency in frequencies]
 
     def problem(self) -> str | None:
-        """Return the first rule between the fields that is broken, or None."""
+        """Return the message of the first broken rule between fields, or None."""
         return _pitch_problem(abs(self.amplitude[1]) + abs(self.offset[1]))
 
 
@@ -75,10 +76,10 @@ class HoldConfig:
 
 @section
 class WaypointsConfig:
-    """A smooth motion through poses, at rest in the first and the last; in lists or in a file.
+    """A smooth motion through poses of lists or a file, at rest in the first and the last.
 
     Attributes:
-        times: s, increasing.
+        times: ascending, s.
         poses: one [roll, pitch, yaw, x, y, z] per time, rad and m.
         file: a YAML file of `times` and `poses`.
     """
@@ -107,7 +108,7 @@ class CsvConfig:
     """A sampled motion.
 
     Attributes:
-        file: of time and six columns, see `scenario.reference_files.read_csv`.
+        file: CSV of the time and six coordinates, see `scenario.reference_files.read_csv`.
     """
 
     kind: Literal["csv"] = "csv"
