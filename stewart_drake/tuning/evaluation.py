@@ -1,13 +1,14 @@
 """Evaluation of a tuner against every fixed gain, on conditions that training did not have.
 
-All candidates run the same conditions, so that differences are paired, and a tuner is compared with
-the best fixed gain *of these very conditions*. Two measures judge them:
+All candidates run the same conditions, so differences are paired. A tuner is compared with the
+fixed gain that is best on *these very conditions*. Two measures judge it:
 
-- E_ac, averaged over the conditions that every candidate completes, with failures counted apart;
-- J (`tuning.data`), with lost runs, over all conditions: g is its geometric mean, which weighs all
-  conditions alike, m its mean, which bad conditions dominate.
+- E_ac, averaged over the conditions that every candidate completes; failures are counted apart;
+- J (`tuning.data`), over all conditions, lost runs included: by its geometric mean g, which weighs
+  all conditions alike, and by its mean m, which bad conditions dominate.
 
-Hindsight has the best fixed gain of each condition. Intervals are of a paired bootstrap.
+Hindsight is a candidate that has the best fixed gain of each condition. Intervals of improvements
+are of a paired bootstrap.
 """
 
 import hashlib
@@ -42,6 +43,7 @@ RULE: Final = "rule"
 HINDSIGHT: Final = "hindsight"
 RESAMPLES: Final = 10_000
 _FIXED: Final = "fixed"
+"""Name of the jobs that run all fixed gains of a condition."""
 
 Tuner = AnnTunerConfig | RuleTunerConfig
 Runs = dict[str, NDArray[Any]]
@@ -70,18 +72,18 @@ class Evaluation(NamedTuple):
 def tuners_of(
     family: Family, networks: Sequence[str | Path]
 ) -> tuple[dict[str, Tuner], dict[str, dict[str, Any]]]:
-    """Return sections by the name of the candidate, and name, hash and card of network files.
+    """Return the tuners by name, and the file name, hash and card of each network.
 
-    A family with faults has the rule and any number of networks, named by their files. Another one
-    has one network, called TUNER.
+    A family with faults has the rule and any number of networks, named by their files. Without
+    faults it has one network, called TUNER.
     """
     if not family.has_faults and len(networks) > 1:
         raise ConfigError(f"WEIGHTS: got {len(networks)} without --family; expected one")
     tuners: dict[str, Tuner] = {RULE: RuleTunerConfig()} if family.has_faults else {}
     files: dict[str, dict[str, Any]] = {}
     shipped = FAMILIES[family.name].network if family.has_faults else DEFAULT
-    for one in networks or [shipped]:
-        path = resolve("weights", one)
+    for network in networks or [shipped]:
+        path = resolve("weights", network)
         card = dict(load_network(path).card)
         name = path.stem if family.has_faults else TUNER
         if name in (*tuners, *family.gains, _FIXED, HINDSIGHT):
@@ -89,9 +91,9 @@ def tuners_of(
                 f"weights: got {name!r}, the name of another candidate; expected a file with "
                 "another name"
             )
-        content = hashlib.sha256(read_bytes(path, MAX_BYTES, EXPECTED)).hexdigest()
+        digest = hashlib.sha256(read_bytes(path, MAX_BYTES, EXPECTED)).hexdigest()
         tuners[name] = AnnTunerConfig(weights=str(path))
-        files[name] = {"file": path.name, "sha256": content, "card": card}
+        files[name] = {"file": path.name, "sha256": digest, "card": card}
     return tuners, files
 
 
@@ -101,46 +103,46 @@ def evaluate(
     directory: str | Path,
     *,
     progress: Progress | None = None,
-    **how: Any,
+    **execution: Any,
 ) -> Evaluation:
     """Run all candidates under all conditions of a family for evaluation, or continue.
 
     Networks are shipped names or files; none for the shipped one of the family. The directory keeps
     the runs in fixed/, rule/ and NAME-HASH/, so that a second network needs its own runs only.
-    `how` are workers and scheduler, as `run_jobs` takes them.
+    `execution` are workers and scheduler, as `run_jobs` takes them.
     """
-    cells, gains = family.conditions, tuple(family.gains.values())
-    tuners, files = tuners_of(family, networks)
+    scenarios = {key: condition.scenario for key, condition in family.conditions.items()}
+    gains, (tuners, files) = tuple(family.gains.values()), tuners_of(family, networks)
     about = {"family": family.name, "seed": family.seed, "scenario": scenario_to_dict(family.base)}
-    candidates: dict[str, dict[str, Job]] = {
-        _FIXED: {key: (one.scenario, gains, family.samples) for key, one in cells.items()}
+    jobs_of: dict[str, dict[str, Job]] = {
+        _FIXED: {key: (scenario, gains, family.samples) for key, scenario in scenarios.items()}
     }
     for name, tuner in tuners.items():
-        candidates[name] = {
-            key: (replace(one.scenario, tuner=tuner), (), family.samples)
-            for key, one in cells.items()
+        jobs_of[name] = {
+            key: (replace(scenario, tuner=tuner), (), family.samples)
+            for key, scenario in scenarios.items()
         }
     table: dict[str, list[Runs]] = {}
-    for name, jobs in candidates.items():
-        file, number = files.get(name), 1 if name in tuners else len(gains)
-        found = run_jobs(
+    for name, jobs in jobs_of.items():
+        file, runs = files.get(name), 1 if name in tuners else len(gains)
+        results = run_jobs(
             jobs,
             run_condition,
             Path(directory) / (f"{name}-{file['sha256'][:8]}" if file else name),
             settings=about | ({"network": file["sha256"]} if file else {}),
             suffix=".npz",
-            read=partial(read_condition, runs=number, samples=family.samples),
-            progress=part_of(progress, len(table) * len(cells), len(candidates) * len(cells)),
-            **how,
+            read=partial(read_condition, runs=runs, samples=family.samples),
+            progress=part_of(progress, len(table) * len(jobs), len(jobs_of) * len(jobs)),
+            **execution,
         )
-        table[name] = list(found.values())
-    return _judged(family, table, files, _nominal_costs(family, tuners))
+        table[name] = list(results.values())
+    return _compare(family, table, files, _nominal_errors(family, tuners))
 
 
-def _nominal_costs(family: Family, tuners: dict[str, Tuner]) -> dict[str, dict[str, float]]:
+def _nominal_errors(family: Family, tuners: dict[str, Tuner]) -> dict[str, dict[str, float]]:
     """Return E_ac in % s of the nominal `paper` by candidate, on the reference and from rest.
 
-    Only for a family with faults; the base of another one is varied.
+    A family without faults has none, as its base is varied.
     """
     if not family.has_faults:
         return {}
@@ -158,7 +160,7 @@ def _nominal_costs(family: Family, tuners: dict[str, Tuner]) -> dict[str, dict[s
 # ---------------------------------------------------------------- the statistics
 
 
-def _judged(
+def _compare(
     family: Family,
     table: dict[str, list[Runs]],
     files: dict[str, dict[str, Any]],
@@ -168,30 +170,31 @@ def _judged(
     tuners = [name for name in table if name != _FIXED]
     names, fixed = (*family.gains, *tuners), len(family.gains)
 
-    def rows(name: str) -> Array:
-        return np.vstack([np.array([one[name] for one in runs]).T for runs in table.values()])
+    def by_candidate(name: str) -> Array:
+        """Return a result (c, n) of each candidate under each condition."""
+        return np.vstack([np.array([run[name] for run in runs]).T for runs in table.values()])
 
-    J, error = rows("J"), rows("accumulated_error")
-    faults = [fault_of(one) if family.has_faults else "" for one in family.draws]
+    J, error = by_candidate("J"), by_candidate("accumulated_error")
+    faults = [fault_of(draw) if family.has_faults else "" for draw in family.draws]
     by_error = compare_errors(names, fixed, error, family.seed)
-    done = np.isfinite(error)
-    by_cost = compare_costs(names, fixed, J, done, np.array(faults), family.seed)
-    candidates = {
-        name: by_error["candidates"].get(name, {}) | one
-        for name, one in by_cost["candidates"].items()
+    completed = np.isfinite(error)
+    by_cost = compare_costs(names, fixed, J, completed, np.array(faults), family.seed)
+    candidates = {  # with hindsight, which has no E_ac
+        name: by_error["candidates"].get(name, {}) | costs
+        for name, costs in by_cost["candidates"].items()
     }
-    loops = Counter(str(loop) for loop in np.concatenate(rows("loop")) if loop)
+    loops = Counter(str(loop) for loop in np.concatenate(by_candidate("loop")) if loop)
     summary = {
         **by_error,
         **by_cost,
         "candidates": candidates,
         "fallbacks": {
-            name: sum(int(one["fallbacks"][0]) for one in table[name]) for name in tuners
+            name: sum(int(run["fallbacks"][0]) for run in table[name]) for name in tuners
         },
         "loops": dict(loops.most_common()),
         "scenarios": [
-            one | {"E_ac": dict(zip(names, error[:, number], strict=True))}
-            for number, one in enumerate(family.draws)
+            draw | {"E_ac": dict(zip(names, errors, strict=True))}
+            for draw, errors in zip(family.draws, error.T, strict=True)
         ],
         "family": FAMILIES[family.name].about if family.has_faults else family.name,
         "seed": family.seed,
@@ -201,7 +204,7 @@ def _judged(
         "nominal": nominal,
     }
     ratios = {
-        name: [[ratio_of(w) for w in one["used"][0] if np.isfinite(w).all()] for one in table[name]]
+        name: [[ratio_of(w) for w in run["used"][0] if np.isfinite(w).all()] for run in table[name]]
         for name in tuners
     }
     return Evaluation(family, names, J, error, ratios, summary)
@@ -220,27 +223,27 @@ def compare_errors(names: Sequence[str], fixed: int, error: Array, seed: int) ->
     failed = np.isnan(error)
     common = error[:, ~failed.any(axis=0)]
     number, failures = common.shape[1], failed.sum(axis=1)
-    some = common if number else np.full((len(names), 1), np.nan)
-    mean, half = some.mean(axis=1), np.full(len(names), np.nan)
+    if number == 0:
+        common = np.full((len(names), 1), np.nan)
+    mean, half = common.mean(axis=1), np.full(len(names), np.nan)
     if number > 1:
-        half = stats.t.ppf((1 + CONFIDENCE) / 2, number - 1) * stats.sem(some, axis=1)
+        half = stats.t.ppf((1 + CONFIDENCE) / 2, number - 1) * stats.sem(common, axis=1)
     best = min(range(fixed), key=lambda i: (failures[i], mean[i]))
-
-    improvement, *ends = _gain(some[-1], some[best], seed)
+    improvement, *ends = _reduction(common[-1], common[best], seed)
     return {
         "candidates": {
             name: {
                 "failures": int(failures[i]),
                 "mean": mean[i],
                 "interval": [mean[i] - half[i], mean[i] + half[i]],
-                "worst": some[i].max(),
+                "worst": common[i].max(),
             }
             for i, name in enumerate(names)
         },
         "common": number,
         "best_fixed": names[best],
         "improvement": improvement,
-        "hindsight": 1 - some[:fixed].min(axis=0).mean() / mean[best],
+        "hindsight": 1 - common[:fixed].min(axis=0).mean() / mean[best],
         "improvement_interval": ends if number > 1 else [np.nan, np.nan],
     }
 
@@ -257,45 +260,43 @@ def compare_costs(
 
     Returns:
         `candidates`: by name g, m and the number `completed`; `best_g` and `best_m`, the names of
-        the fixed gains that are best by each; `gains` of each tuner and of hindsight: `g`, the
-        share by which its g is below that of `best_g`, `m` the same of `best_m`, `rule` of the rule
-        by g, each [value, low, high]; `by_fault`: the first of them for each fault alone.
+        the fixed gains that are best by each; `gains` of each tuner and of hindsight: the shares by
+        which its g is below that of `best_g` (`g`) and that of the rule (`rule`), and its m below
+        that of `best_m` (`m`), each [value, low, high]; `by_fault`: `g` for each fault alone.
     """
     log_J = log_cost(J)
     best_g, best_m = int(log_J[:fixed].mean(1).argmin()), int(J[:fixed].mean(1).argmin())
     rule = names.index(RULE) if RULE in names else best_g
     picked, every = log_J[:fixed].argmin(axis=0), np.arange(J.shape[1])
-    rows, log_rows, done = (
-        dict(zip(names, x, strict=True)) | {HINDSIGHT: x[picked, every]}
-        for x in (J, log_J, completed)
+    J_of, log_J_of, completed_of = (
+        dict(zip(names, rows, strict=True)) | {HINDSIGHT: rows[picked, every]}
+        for rows in (J, log_J, completed)
     )
-    tuners = [name for name in rows if name not in names[:fixed]]
+    tuners = [name for name in J_of if name not in names[:fixed]]
 
-    by_fault: dict[str, dict[str, list[float]]] = {}
+    by_fault: dict[str, dict[str, list[float]]] = {fault: {} for fault in FAULTS}
     for fault in FAULTS:
-        here = np.flatnonzero(faults == fault)
-        by_fault[fault] = {
-            name: _gain(log_rows[name][here], log_J[best_g][here], seed, logarithms=True)
-            for name in tuners
-            if len(here)
-        }
+        has_fault = faults == fault
+        for name in tuners if has_fault.any() else ():
+            one, other = log_J_of[name][has_fault], log_J[best_g][has_fault]
+            by_fault[fault][name] = _reduction(one, other, seed, logarithms=True)
     return {
         "candidates": {
             name: {
-                "g": float(np.exp(log_rows[name].mean())),
-                "m": float(row.mean()),
-                "completed": int(done[name].sum()),
+                "g": float(np.exp(log_J_of[name].mean())),
+                "m": float(J_of[name].mean()),
+                "completed": int(completed_of[name].sum()),
             }
-            for name, row in rows.items()
+            for name in J_of
         },
         "conditions": J.shape[1],
         "best_g": names[best_g],
         "best_m": names[best_m],
         "gains": {
             name: {
-                "g": _gain(log_rows[name], log_J[best_g], seed, logarithms=True),
-                "m": _gain(rows[name], J[best_m], seed),
-                "rule": _gain(log_rows[name], log_J[rule], seed, logarithms=True),
+                "g": _reduction(log_J_of[name], log_J[best_g], seed, logarithms=True),
+                "m": _reduction(J_of[name], J[best_m], seed),
+                "rule": _reduction(log_J_of[name], log_J[rule], seed, logarithms=True),
             }
             for name in tuners
         },
@@ -303,15 +304,17 @@ def compare_costs(
     }
 
 
-def _gain(values: Array, others: Array, seed: int, logarithms: bool = False) -> list[float]:
+def _reduction(values: Array, others: Array, seed: int, logarithms: bool = False) -> list[float]:
     """Return 1 - mean / mean of the others, and its 95 % interval, by a paired bootstrap.
 
-    Of logarithms the means are geometric.
+    The means are geometric if the arguments are logarithms.
     """
-    chosen = np.random.default_rng(seed).integers(len(values), size=(RESAMPLES, len(values)))
+    n = len(values)
+    resamples = np.random.default_rng(seed).integers(n, size=(RESAMPLES, n))
     ratios: list[Any] = []
-    for some in (np.arange(len(values)), chosen):
-        one, other = values[some].mean(axis=-1), others[some].mean(axis=-1)
+    for rows in (np.arange(n), resamples):
+        one, other = values[rows].mean(axis=-1), others[rows].mean(axis=-1)
         ratios.append(one - other if logarithms else one / other)
-    found = np.append(ratios[0], np.percentile(ratios[1], (97.5, 2.5)))
+    ends = np.percentile(ratios[1], (97.5, 2.5))  # the largest ratio is the least reduction
+    found = np.append(ratios[0], ends)
     return (1 - (np.exp(found) if logarithms else found)).tolist()
