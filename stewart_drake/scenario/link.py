@@ -1,6 +1,6 @@
-"""Times at which torques and measurements arrive over a link, and those that are lost.
+"""Arrival times of torques and measurements over a link, infinite for lost ones.
 
-Everything is drawn beforehand from a seed, so that the same scenario gives the same run.
+They are drawn before the run from a seed, so that the same scenario gives the same run.
 """
 
 from typing import Final
@@ -14,12 +14,13 @@ from stewart_drake.scenario.link_config import ASSUMED_TIMES, PacketsConfig
 from stewart_drake.scenario.packets import BACK, SENSOR, packet_times
 from stewart_drake.types import Array, Flags
 
-SIMULTANEOUS: Final = 1e-9  # of a period; events closer to each other have no order
+SIMULTANEOUS: Final = 1e-9
+"""Share of a period; events that are closer count as simultaneous."""
 
 
 def number_sent(duration: float, period: float) -> int:
     """Return the number of samples of a run, with those at t = 0 and at its end."""
-    return int(duration / period + 1e-9) + 1
+    return int(duration / period + SIMULTANEOUS) + 1
 
 
 def delay_at(delay: DelayConfig, period: float, times: Array) -> Array:
@@ -29,17 +30,17 @@ def delay_at(delay: DelayConfig, period: float, times: Array) -> Array:
 
     Before t = 0 the last three terms are zero.
     """
-    began = np.maximum(times, 0.0)
-    eta = Delay(delay.steps, delay.fraction).eta(period) + delay.drift * began
-    eta = eta + delay.swing * np.sin(delay.swing_frequency * began)
+    t = np.maximum(times, 0.0)
+    eta = Delay(delay.steps, delay.fraction).eta(period) + delay.drift * t
+    eta = eta + delay.swing * np.sin(delay.swing_frequency * t)
     eta = eta + np.where((times >= 0) & (times >= delay.jump_time), delay.jump, 0.0)
     return np.maximum(eta, 0.0)
 
 
 def torque_delays(scenario: Scenario) -> Array:
-    """Return the true delay (n,) of every torque of a run over a wire with its jitter, s.
+    """Return the true delay (n,) of every torque of a run over a wire, jitter included, s.
 
-    Torques arrive at the nearest step of the multibody plant.
+    With the multibody plant, each torque arrives at the nearest step.
     """
     delay, period = scenario.delay, scenario.controller.period
     sent: Array = np.arange(number_sent(scenario.duration, period), dtype=np.float64) * period
@@ -54,7 +55,7 @@ def torque_delays(scenario: Scenario) -> Array:
 def takes_effect(arrivals: Array, together: float = 0.0) -> Flags:
     """Return which of (n,) torques ever act: those that arrive before every newer one.
 
-    The motors apply the newest torque that has arrived; one that was overtaken is out of date. Of
+    The motors apply the newest torque that has arrived and ignore those that it has overtaken. Of
     several that arrive within `together`, in s, the newest acts.
     """
     earliest_newer = np.minimum.accumulate(np.append(arrivals, np.inf)[::-1])[::-1][1:]
@@ -62,16 +63,16 @@ def takes_effect(arrivals: Array, together: float = 0.0) -> Flags:
 
 
 def releases(period: float, delays: Array, delay: Delay) -> tuple[NDArray[np.int64], Array]:
-    """Return the torques that ever act over a wire, and their arrivals in s, in that order.
+    """Return the numbers of the torques that ever act over a wire, and their arrivals in s.
 
     Torque k >= 0 is sent at k dt and has the delay `delays[k]`. Torques -L to -1 were sent before,
-    one a period, with the delay `delay` and its queue length L. Less than 1e-9 of a period is 0.
+    one a period, with the delay `delay` and its queue length L. A delay below SIMULTANEOUS is 0.
     """
     length = delay.queue_length
-    waits = np.where(delays > SIMULTANEOUS * period, delays, 0.0)
     numbers = np.arange(-length, len(delays))
-    earlier = (numbers[:length] + delay.periods) * period
-    arrivals = np.concatenate([earlier, period * numbers[length:] + waits])
+    queued = (numbers[:length] + delay.periods) * period
+    own = period * numbers[length:] + np.where(delays > SIMULTANEOUS * period, delays, 0.0)
+    arrivals = np.concatenate([queued, own])
     acts = takes_effect(arrivals, SIMULTANEOUS * period)
     return numbers[acts], arrivals[acts]
 
@@ -85,9 +86,9 @@ def forward_times(scenario: Scenario, number: int) -> Array:
 def sensor_times(scenario: Scenario, number: int) -> Array:
     """Return times (number,) from sample to measurement, s; infinite where it is lost."""
     sensor = scenario.sensor
-    at_once = PacketsConfig(low=0.0, high=0.0, loss=sensor.loss)
-    lost = np.isinf(packet_times(at_once, number, sensor.seed, SENSOR))
-    return sensor.delay + np.where(lost, np.inf, 0.0)
+    losses = PacketsConfig(low=0.0, high=0.0, loss=sensor.loss)
+    lost = np.isinf(packet_times(losses, number, sensor.seed, SENSOR))
+    return np.where(lost, np.inf, sensor.delay)
 
 
 def return_times(scenario: Scenario, number: int) -> Array:
@@ -99,13 +100,13 @@ def return_times(scenario: Scenario, number: int) -> Array:
 
 
 def measurement_times(scenario: Scenario) -> Array:
-    """Return times (n,) from sample to the controller, s; infinite where it is lost."""
+    """Return the age (n,) of each measurement at its arrival, s; infinite where it is lost."""
     n = number_sent(scenario.duration, scenario.controller.period)
     return sensor_times(scenario, n) + return_times(scenario, n)
 
 
 def link_text(scenario: Scenario, bound: bool = True) -> str | None:
-    """Return the assumed network in words, with its play-out bound or not; None for a wire."""
+    """Return the assumed network in words, with its play-out bound if asked; None for a wire."""
     link = scenario.assumed_link
     if link.kind == "wire":
         return None

@@ -1,4 +1,4 @@
-"""The link between controller and motors, as a scenario describes it, by kind."""
+"""Section `link` of a scenario, the link between controller and motors, by kind."""
 
 from typing import Annotated, Final, Literal
 
@@ -15,7 +15,8 @@ ASSUMED_TIMES: Final = (0.8, 1.2)
 class WireConfig:
     """A link that delays every torque by `delay`, and loses none."""
 
-    back, burst, acknowledged, follows_delay = None, 1, True, False  # not annotated: no fields
+    # Without annotations these are constants, not fields.
+    back, burst, acknowledged, follows_delay = None, 1, True, False
     kind: Literal["wire"] = "wire"
 
 
@@ -25,9 +26,9 @@ class PacketsConfig:
 
     Attributes:
         distribution: of the transit time, `uniform` from `low` to `high`, or `lognormal`.
-        low, high: of the uniform one, s; null otherwise.
-        median: of the lognormal one, s; null otherwise.
-        sigma: of the lognormal one, standard deviation of its logarithm; null otherwise.
+        low, high: bounds of the uniform distribution, s; null otherwise.
+        median: of the lognormal distribution, s; null otherwise.
+        sigma: standard deviation of the logarithm, of the lognormal one; null otherwise.
         loss: share of the packets that never arrive.
         burst: number of packets in a row that are lost together.
     """
@@ -41,16 +42,14 @@ class PacketsConfig:
     burst: Annotated[int, Field(ge=1, le=1000)] = 1
 
     def problem(self, where: str) -> str | None:
-        """Return the first problem with the times, or None."""
+        """Return the message of the first broken rule between fields, or None."""
         used = ("low", "high") if self.distribution == "uniform" else ("median", "sigma")
         for name in ("low", "high", "median", "sigma"):
             value = getattr(self, name)
             if (value is None) == (name in used):
                 got, expected = ("null", "a number") if name in used else (f"{value:g}", "null")
-                return (
-                    f"{where}.{name}: got {got} with distribution {self.distribution!r}; "
-                    f"expected {expected}"
-                )
+                found = f"got {got} with distribution {self.distribution!r}"
+                return f"{where}.{name}: {found}; expected {expected}"
         if self.low is not None and self.high is not None and self.low > self.high:
             return f"{where}.low: got {self.low:g} s; expected at most high, {self.high:g} s"
         return None
@@ -58,18 +57,19 @@ class PacketsConfig:
 
 @section
 class NetworkConfig(PacketsConfig):
-    """Packets of torques with the times at which they shall act, and a buffer at the machine.
+    """Packets of torques and the times at which these act, and a play-out buffer at the machine.
 
-    A torque acts a bound later than it was sent. Where no packet has brought one for a period, the
-    buffer is dry. Clocks agree. Without `low` and `high` a uniform transit time is between 0.8 and
-    1.2 times the constant delay of the section `delay`; `Scenario.assumed_link` has the numbers.
+    A torque acts a fixed time after it was sent, the play-out bound. The buffer is dry in a period
+    for which no packet has brought a torque. The clocks of controller and machine agree. Without
+    `low` and `high`, a uniform transit time is 0.8 to 1.2 times the constant delay of the section
+    `delay`; `Scenario.assumed_link` has the numbers.
 
     Attributes:
-        playout: the bound, s; null is the one that makes late packets as rare as lost ones
+        playout: play-out bound, s; null makes late packets as rare as lost ones
             (`scenario.packets.default_bound`). The controller adds its `packet_repeats` periods.
         dry: output of a dry buffer, `hold` the last torque or `zero`.
-        back: `return` in files, transit times and losses of the measurements; null is at once and
-            all of them.
+        back: `return` in files, transit times and losses of the measurements; null: every one
+            arrives, without delay.
         acknowledged: whether each measurement reports the packets that have arrived and the
             torques that have acted.
         seed: of times and losses.
