@@ -4,11 +4,11 @@
    from it, as it was at t_{k-1}, for a first arrival in between: eta uniform in (t_{k-1}, t_k]. With Phi
    the distribution of the prior, the part
 
-       p = [Phi(t_k) - Phi(t_{k-1})] / [1 - Phi(t_{k-1})]
+       share = [Phi(t_k) - Phi(t_{k-1})] / [1 - Phi(t_{k-1})]
 
    of the master's weight goes to the cell. Each measurement multiplies all weights by its likelihood. The
-   search ends with a cell as the only hypothesis when the standard deviation of its delay is below NEAR,
-   and every hypothesis farther than NEAR from it has less than e^-LEAD of its weight.
+   search ends with a cell as the only hypothesis when the standard deviation of its delay is below RESOLUTION,
+   and every hypothesis farther than RESOLUTION from it has less than e^-LEAD of its weight.
 
    Two outliers in a row may be a jump of the delay. State and parameters are known by then, so the last
    measurements are compared with the prediction for every delay of a grid. Hypotheses start from the best
@@ -20,13 +20,13 @@
 #define LEAD 7       /* log of the odds that ends the search */
 #define FORGOTTEN 14 /* log of the odds that drops a cell */
 #define YOUNG 3      /* measurements before which no cell is dropped: a bias may look like another arrival */
-#define NEAR ((real)0.2) /* periods; nearer delays are one hypothesis */
-#define LEAST_PROBABILITY ((real)1e-4) /* of a new cell, and of the master then */
+#define RESOLUTION ((real)0.2) /* periods; delays that are closer are one hypothesis */
+#define LEAST_SHARE ((real)1e-4) /* of the master's weight, for a new cell and for the master itself */
 #define SUSPICIOUS 2 /* outliers in a row that start the search for a jump */
 #define PATIENCE 3   /* outliers in a row after which the filter restarts */
 #define GRID ((real)0.5) /* periods between the delays of the grid after a jump */
 #define STARTS 2     /* hypotheses that start from the grid */
-#define HOPELESS 100 /* squared distance up to which a second one starts, besides ten times the least one */
+#define HOPELESS 100 /* largest cost of the second one, plus ten times the cost of the first */
 #define ACCEPTED 5   /* log of the odds at which one of two is accepted */
 #define MOST_TO_PLAN 2 /* largest number of cells that leaves time for a plan at the same sample */
 #define CAUTION 10   /* factor on the weight of torques during the search */
@@ -37,20 +37,21 @@
 #define SQRT_12 ((real)3.4641016151377546)
 #define SQRT_2_PI ((real)2.5066282746310005)
 
-/* The memory during one sample. */
+/* The search during one sample. */
 typedef struct {
     const stewart_delay *delay;
-    int n, m, num_in_flight;
-    stewart_period since; /* the period before this sample */
+    int n, m, num_in_flight; /* numbers of xi, of a measurement and of torques */
+    stewart_period last_period; /* before this sample */
     stewart_delay_memory *memory;
-    real *before, *past;
+    real *other_torques, *last_measurements; /* in `memory` */
 } Search;
 
-static int periods_before(int num_in_flight) { return num_in_flight > 1 ? num_in_flight - 1 : 1; }
+/* Number of torques in the memory that act until an own one arrives. */
+static int max_others(int num_in_flight) { return num_in_flight > 1 ? num_in_flight - 1 : 1; }
 
 int stewart_delay_size(int p, int m, int num_in_flight)
 {
-    return STEWART_DELAY_NUMBERS + U * periods_before(num_in_flight) + 2 * m
+    return STEWART_DELAY_NUMBERS + U * max_others(num_in_flight) + 2 * m
         + (num_in_flight + 1) * stewart_hypothesis_size(p);
 }
 
@@ -67,7 +68,7 @@ int stewart_delay_scratch(int p, int m, int num_in_flight)
 stewart_hypothesis *stewart_delay_hypothesis(int p, int m, int num_in_flight, stewart_delay_memory *memory,
                                              int place)
 {
-    real *first = memory->numbers + U * periods_before(num_in_flight) + 2 * m;
+    real *first = memory->numbers + U * max_others(num_in_flight) + 2 * m;
     return (stewart_hypothesis *)(first + place * stewart_hypothesis_size(p));
 }
 
@@ -88,10 +89,10 @@ static real distance_of(int n, const stewart_hypothesis *a, const stewart_hypoth
 
 /* ---- the prior of the delay ------------------------------------------------------------------- */
 
-/* Probability that a normal number is between x and y. */
+/* Probability that a standard normal number is between x and y. */
 static real probability(real x, real y)
 {
-    const int mirrored = x + y < 0; /* far from the mean a difference from 1 would be lost */
+    const int mirrored = x + y < 0; /* far below the mean both values would round to 1 */
     const real low = mirrored ? -y : x, high = mirrored ? -x : y;
     return (real)0.5 * (REAL(erfc)(low * SQRT_HALF) - REAL(erfc)(high * SQRT_HALF));
 }
@@ -134,19 +135,18 @@ static void spawn(Search *s, int k, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
     const int n = s->n;
-    stewart_hypothesis *master = hypothesis_at(s, 0), *cell;
     const real low = (real)(k - 1) * d->period, high = (real)k * d->period;
     const real left = left_of_prior(d, low);
-    real p = left > 0 ? 1 - left_of_prior(d, high) / left : 1;
+    const real prior_share = left > 0 ? 1 - left_of_prior(d, high) / left : 1;
+    const real share = clamped(LEAST_SHARE, prior_share, 1 - LEAST_SHARE);
     real *L = stewart_take(&scratch, n * n);
-    p = clamped(LEAST_PROBABILITY, p, 1 - LEAST_PROBABILITY);
     s->memory->cells += 1;
-    cell = hypothesis_at(s, (int)s->memory->cells);
+    stewart_hypothesis *master = hypothesis_at(s, 0), *cell = hypothesis_at(s, (int)s->memory->cells);
     copy_hypothesis(n, master, cell);
     cell->low = low;
     cell->high = high;
-    cell->weight += REAL(log)(p);
-    master->weight += REAL(log1p)(-p);
+    cell->weight += REAL(log)(share);
+    master->weight += REAL(log1p)(-share);
     cell->numbers[STEWART_ETA(n)] = (low + high) / 2;
     cell->numbers[STEWART_RATE(n)] = 0;
     stewart_hypothesis_root(cell, n, L); /* its last two rows are 0 */
@@ -195,7 +195,7 @@ static void begin(Search *s, const real *y, const real *near, stewart_scratch sc
     stewart_hypothesis_set_root(n, L, master);
     s->memory->known = s->memory->searching = 1;
     s->memory->cells = s->memory->best = 0;
-    for (int k = 1; k <= s->since.view.num_own && (real)(k - 1) * d->period < d->longest; k++)
+    for (int k = 1; k <= s->last_period.view.num_own && (real)(k - 1) * d->period < d->longest; k++)
         spawn(s, k, scratch);
 }
 
@@ -205,69 +205,88 @@ static void update(Search *s, int place, const real *y, stewart_scratch scratch)
     stewart_hypothesis *hypothesis = hypothesis_at(s, place);
     stewart_hypothesis *after =
         (stewart_hypothesis *)stewart_take(&scratch, stewart_hypothesis_size(s->n - X - 2));
-    stewart_delay_advance(&s->since, hypothesis, y, after, scratch);
+    stewart_delay_advance(&s->last_period, hypothesis, y, after, scratch);
     if (y && s->memory->searching > 0)
         after->weight += after->log_likelihood;
     copy_hypothesis(s->n, after, hypothesis);
 }
 
-/* Advance master and cells by a period and a measurement, or NULL; drop unlikely cells; end the search if one
-   hypothesis is left. */
+static real highest_weight(const Search *s)
+{
+    real highest = hypothesis_at(s, 0)->weight;
+    for (int i = 1; i <= (int)s->memory->cells; i++)
+        if (hypothesis_at(s, i)->weight > highest)
+            highest = hypothesis_at(s, i)->weight;
+    return highest;
+}
+
+/* Drop unlikely cells, close the gaps that they leave, and set weights relative to the best hypothesis. */
+static void drop_unlikely_cells(Search *s)
+{
+    const real highest = highest_weight(s);
+    int best = 0, remaining = 0;
+    hypothesis_at(s, 0)->weight -= highest;
+    for (int i = 1; i <= (int)s->memory->cells; i++) {
+        stewart_hypothesis *cell = hypothesis_at(s, i);
+        const int young = cell->measurements <= YOUNG && cell->fits > 0;
+        if (!young && !(cell->weight > highest - FORGOTTEN))
+            continue;
+        cell->weight -= highest;
+        remaining++;
+        if (remaining < i)
+            copy_hypothesis(s->n, cell, hypothesis_at(s, remaining));
+        if (hypothesis_at(s, remaining)->weight > hypothesis_at(s, best)->weight)
+            best = remaining;
+    }
+    s->memory->cells = (real)remaining;
+    s->memory->best = (real)best;
+}
+
+/* Whether the best hypothesis is a cell with a precise delay, and all others are near it or unlikely. */
+static int is_found(const Search *s)
+{
+    const real resolution = RESOLUTION * s->delay->period;
+    const int best = (int)s->memory->best;
+    const stewart_hypothesis *found = hypothesis_at(s, best);
+    real rival = hypothesis_at(s, 0)->weight;
+    for (int i = 1; i <= (int)s->memory->cells; i++) {
+        const stewart_hypothesis *cell = hypothesis_at(s, i);
+        if (distance_of(s->n, cell, found) > resolution && cell->weight > rival)
+            rival = cell->weight;
+    }
+    return best > 0 && found->fits > 0 && rival < -LEAD && stewart_hypothesis_std(found, s->n) < resolution;
+}
+
+/* Advance master and cells by a period and a measurement, or NULL; drop unlikely cells; end the search if the
+   delay is found. */
 static void search(Search *s, const real *y, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
     stewart_delay_memory *memory = s->memory;
-    const int n = s->n, k = s->since.view.num_own;
-    const real near = NEAR * d->period;
-    real top, rival;
-    int best = 0, remaining = 0;
+    const int k = s->last_period.view.num_own;
     if (k < s->num_in_flight && (real)(k - 1) * d->period < d->longest)
         spawn(s, k, scratch);
     const int cells = (int)memory->cells;
-    const int many = cells > MOST_TO_PLAN;
     for (int i = 0; i <= cells; i++)
         update(s, i, y, scratch);
-    top = hypothesis_at(s, 0)->weight;
-    for (int i = 1; i <= cells; i++)
-        top = hypothesis_at(s, i)->weight > top ? hypothesis_at(s, i)->weight : top;
-    hypothesis_at(s, 0)->weight -= top;
-    for (int i = 1; i <= cells; i++) {
-        stewart_hypothesis *cell = hypothesis_at(s, i);
-        const int young = cell->measurements <= YOUNG && cell->fits > 0;
-        if (!young && !(cell->weight > top - FORGOTTEN))
-            continue;
-        cell->weight -= top;
-        remaining++;
-        if (remaining < i)
-            copy_hypothesis(n, cell, hypothesis_at(s, remaining));
-        if (hypothesis_at(s, remaining)->weight > hypothesis_at(s, best)->weight)
-            best = remaining;
-    }
-    memory->cells = (real)remaining;
-    memory->best = (real)best;
-    stewart_hypothesis *found = hypothesis_at(s, best);
-    rival = hypothesis_at(s, 0)->weight;
-    for (int i = 1; i <= remaining; i++) {
-        const stewart_hypothesis *cell = hypothesis_at(s, i);
-        if (distance_of(n, cell, found) > near && cell->weight > rival)
-            rival = cell->weight;
-    }
-    if (best == 0 || !(found->fits > 0) || !y || !(rival < -LEAD)
-        || !(stewart_hypothesis_std(found, n) < near))
+    drop_unlikely_cells(s);
+    if (!y || !is_found(s))
         return;
+    stewart_hypothesis *found = hypothesis_at(s, (int)memory->best);
     found->low = 0;
     found->high = d->longest;
     found->weight = 0;
-    copy_hypothesis(n, found, hypothesis_at(s, 0));
+    copy_hypothesis(s->n, found, hypothesis_at(s, 0));
     memory->searching = memory->cells = memory->best = 0;
     memory->found = 1;
-    memory->deferred = (real)many;
+    memory->deferred = cells > MOST_TO_PLAN;
 }
 
 /* ---- jumps and new starts --------------------------------------------------------------------- */
 
-/* Begin `hypothesis` from a state (12) with the root of its covariance (12, 12), and an eta of variance std^2.
-   Parameters are those of `from`, with `loosened` times the standard deviations of the prior added. */
+/* Begin `hypothesis` from a state (12) with the root of its covariance (12, 12), and a delay eta with the
+   standard deviation `std`. Parameters are those of `from`; `loosened` times the standard deviations of the
+   prior is added to their uncertainty. */
 static void begin_at(const Search *s, const stewart_hypothesis *from, real eta, real std, real loosened,
                      const real *state, const real *root, stewart_hypothesis *hypothesis,
                      stewart_scratch scratch)
@@ -300,9 +319,10 @@ static void begin_at(const Search *s, const stewart_hypothesis *from, real eta, 
     hypothesis->outliers = 0;
 }
 
-/* Add to `cost` the squared distance of a measurement after a period from the prediction for every
-   delay of a grid. The period begins in a state with the root of its covariance. */
-static int compare(const Search *s, const stewart_period *t, const stewart_hypothesis *hypothesis,
+/* Add to `cost` (number) the squared distance of the measurement y after a period from its prediction, for
+   every delay of the grid. The period begins in a state with the root of its covariance. Returns 0 without a
+   prediction. */
+static int add_costs(const Search *s, const stewart_period *t, const stewart_hypothesis *hypothesis,
                    const real *state, const real *root, const real *y, int number, real *cost,
                    stewart_scratch scratch)
 {
@@ -357,26 +377,45 @@ static int lowest_minimum(int number, const real *cost, int excluded)
     return best;
 }
 
+/* Begin `tried` at eta, two periods ago, and advance it by the measurements at the ends of the periods. Returns
+   the log of their likelihood. */
+static real try_delay(const Search *s, const stewart_period *periods, const real *const *measured, real eta,
+                      const real *state, const real *root, stewart_hypothesis *tried, stewart_scratch scratch)
+{
+    const stewart_delay *d = s->delay;
+    stewart_hypothesis *after =
+        (stewart_hypothesis *)stewart_take(&scratch, stewart_hypothesis_size(s->n - X - 2));
+    real total = 0;
+    begin_at(s, hypothesis_at(s, 0), eta, d->period / SQRT_12, LOOSENED_BY_JUMP, state, root, tried, scratch);
+    tried->low = eta > d->period ? eta - d->period : 0;
+    tried->high = eta + d->period < d->longest ? eta + d->period : d->longest;
+    for (int i = 0; i < 2; i++) {
+        stewart_delay_advance(periods + i, tried, measured[i], after, scratch);
+        copy_hypothesis(s->n, after, tried);
+        total += after->log_likelihood;
+    }
+    return total;
+}
+
 /* Replace the only hypothesis by one of another delay that explains the last three measurements: two in
    the memory, and y. Returns 0 if there is none. */
 static int jump(Search *s, const real *y, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
-    const int n = s->n, m = s->m, size = stewart_hypothesis_size(n - X - 2);
-    const real near = NEAR * d->period;
-    const real *measured[3] = {s->past, s->past + m, y};
+    const int n = s->n, m = s->m, num_others = s->last_period.view.num_others;
+    const real resolution = RESOLUTION * d->period;
+    const real *measured[3] = {s->last_measurements, s->last_measurements + m, y};
     const int wanted = (int)REAL(ceil)((d->longest / d->period - GRID) / GRID);
     const int number = wanted < 2 * s->num_in_flight ? wanted : 2 * s->num_in_flight;
-    stewart_hypothesis *hypothesis = hypothesis_at(s, 0);
-    stewart_hypothesis *tried[STARTS], *moved = (stewart_hypothesis *)stewart_take(&scratch, size);
+    stewart_hypothesis *hypothesis = hypothesis_at(s, 0), *tried[STARTS];
     real *cost = stewart_take(&scratch, number), states[2][X], roots[2][X * X], total[STARTS];
-    real *before = stewart_take(&scratch, U * (s->since.view.num_others + 1));
-    stewart_period periods[2] = {s->since, s->since};
-    if (!stewart_all_finite(2 * m, s->past) || !stewart_all_finite(m, y))
+    real *others = stewart_take(&scratch, U * (num_others + 1));
+    stewart_period periods[2] = {s->last_period, s->last_period};
+    if (!stewart_all_finite(2 * m, s->last_measurements) || !stewart_all_finite(m, y))
         return 0;
-    stewart_copy(U, s->before, before); /* the torque before the first is unknown: assume the same */
-    stewart_copy(U * s->since.view.num_others, s->before, before + U);
-    periods[0].view.other_torques = before;
+    stewart_copy(U, s->other_torques, others); /* the torque before the first is unknown: assume the same */
+    stewart_copy(U * num_others, s->other_torques, others + U);
+    periods[0].view.other_torques = others;
     periods[0].view.num_others++;
     periods[0].newest = 1;
     stewart_fill(number, 0, cost);
@@ -384,7 +423,7 @@ static int jump(Search *s, const real *y, stewart_scratch scratch)
         if (!start_of(d->filter.sensing, measured[i], hypothesis->numbers, states[i], roots[i], scratch))
             return 0;
     for (int i = 0; i < 2; i++)
-        if (!compare(s, periods + i, hypothesis, states[i], roots[i], measured[i + 1], number, cost, scratch))
+        if (!add_costs(s, periods + i, hypothesis, states[i], roots[i], measured[i + 1], number, cost, scratch))
             return 0;
     int tries = 0, lowest = -1;
     for (; tries < STARTS; tries++) {
@@ -392,28 +431,19 @@ static int jump(Search *s, const real *y, stewart_scratch scratch)
         if (place < 0 || (tries > 0 && !(cost[place] <= HOPELESS + 10 * cost[lowest])))
             break;
         lowest = tries > 0 ? lowest : place;
-        const real eta = (real)(place + 1) * GRID * d->period;
-        tried[tries] = (stewart_hypothesis *)stewart_take(&scratch, size);
-        begin_at(s, hypothesis, eta, d->period / SQRT_12, LOOSENED_BY_JUMP, states[0], roots[0],
-                 tried[tries], scratch);
-        tried[tries]->low = eta > d->period ? eta - d->period : 0;
-        tried[tries]->high = eta + d->period < d->longest ? eta + d->period : d->longest;
-        total[tries] = 0;
-        for (int i = 0; i < 2; i++) {
-            stewart_delay_advance(periods + i, tried[tries], measured[i + 1], moved, scratch);
-            copy_hypothesis(n, moved, tried[tries]);
-            total[tries] += moved->log_likelihood;
-        }
+        tried[tries] = (stewart_hypothesis *)stewart_take(&scratch, stewart_hypothesis_size(n - X - 2));
+        total[tries] = try_delay(s, periods, measured + 1, (real)(place + 1) * GRID * d->period, states[0],
+                                 roots[0], tried[tries], scratch);
     }
-    if (!tries) /* not finite */
+    if (!tries) /* no cost is finite */
         return 0;
-    const int second = tries > 1, best = second && total[1] > total[0];
+    const int has_rival = tries > 1, best = has_rival && total[1] > total[0];
     stewart_hypothesis *found = tried[best];
-    if (second && distance_of(n, tried[0], tried[1]) > near
+    if (has_rival && distance_of(n, tried[0], tried[1]) > resolution
         && !(total[best] - total[1 - best] >= ACCEPTED))
         return 0;
-    if (!(found->fits > 0) || !(stewart_hypothesis_std(found, n) < near)
-        || !(distance_of(n, found, hypothesis) > near)) /* less than that is not a jump */
+    if (!(found->fits > 0) || !(stewart_hypothesis_std(found, n) < resolution)
+        || !(distance_of(n, found, hypothesis) > resolution)) /* less than that is not a jump */
         return 0;
     found->low = 0;
     found->high = d->longest;
@@ -422,8 +452,8 @@ static int jump(Search *s, const real *y, stewart_scratch scratch)
     return 1;
 }
 
-/* Restart from the last measurement, after outliers that nothing explains. If they come while the prior of
-   the delay is hardly over, the delay was found wrongly: friction may look like an arrival. */
+/* Restart from the last measurement, after outliers that nothing explains. If they come before most delays of
+   the prior have passed, the delay was found wrongly, since friction may look like an arrival: search again. */
 static void restart(Search *s, const real *y, const real *near, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
@@ -448,33 +478,31 @@ static void restart(Search *s, const real *y, const real *near, stewart_scratch 
 /* ---- one sample ------------------------------------------------------------------------------- */
 
 /* Compute mean and standard deviation of the delay during the search. */
-static void mix(Search *s)
+static void set_mixture_moments(Search *s)
 {
     stewart_delay_memory *memory = s->memory;
     const int n = s->n, cells = (int)memory->cells;
-    real total = 0, mean = 0, square = 0, rest, spread, top = hypothesis_at(s, 0)->weight;
-    rest_of_prior(s->delay, memory->num_own * s->delay->period, &rest, &spread);
-    for (int i = 1; i <= cells; i++)
-        top = hypothesis_at(s, i)->weight > top ? hypothesis_at(s, i)->weight : top;
-    for (int pass = 0; pass < 2; pass++)
-        for (int i = 0; i <= cells; i++) {
-            const stewart_hypothesis *cell = hypothesis_at(s, i);
-            const real weight = REAL(exp)(cell->weight - top);
-            const real eta = i > 0 ? cell->numbers[STEWART_ETA(n)] : rest;
-            const real std = i > 0 ? stewart_hypothesis_std(cell, n) : spread;
-            if (pass == 0) {
-                total += weight;
-                mean += weight * eta;
-            } else {
-                square += weight * (std * std + (eta - memory->mean) * (eta - memory->mean));
-            }
-            if (pass == 0 && i == cells)
-                memory->mean = mean / total;
-        }
-    memory->std = REAL(sqrt)(square / total);
+    const real highest = highest_weight(s);
+    real total = 0, sum = 0, squares = 0, master_eta, master_std;
+    rest_of_prior(s->delay, memory->num_own * s->delay->period, &master_eta, &master_std);
+    for (int i = 0; i <= cells; i++) {
+        const stewart_hypothesis *cell = hypothesis_at(s, i);
+        const real weight = REAL(exp)(cell->weight - highest);
+        total += weight;
+        sum += weight * (i > 0 ? cell->numbers[STEWART_ETA(n)] : master_eta);
+    }
+    memory->mean = sum / total;
+    for (int i = 0; i <= cells; i++) {
+        const stewart_hypothesis *cell = hypothesis_at(s, i);
+        const real error = (i > 0 ? cell->numbers[STEWART_ETA(n)] : master_eta) - memory->mean;
+        const real std = i > 0 ? stewart_hypothesis_std(cell, n) : master_std;
+        squares += REAL(exp)(cell->weight - highest) * (std * std + error * error);
+    }
+    memory->std = REAL(sqrt)(squares / total);
 }
 
-/* Write the delay for the law, and whether to use it. */
+/* Write the delay for the law, and whether to feed back: not in an open-loop start, nor once the mean of the
+   prior has passed without an arrival. */
 static void report(Search *s, int measured)
 {
     const stewart_delay *d = s->delay;
@@ -482,7 +510,7 @@ static void report(Search *s, int measured)
     const stewart_hypothesis *hypothesis = hypothesis_at(s, (int)memory->best);
     const real eta = hypothesis->numbers[STEWART_ETA(s->n)];
     const int settled = !(memory->searching > 0) && !(memory->deferred > 0);
-    const int open_loop = memory->open_loop > 0 && !settled, waiting = !(eta < STEWART_NEVER);
+    const int open_loop = memory->open_loop > 0 && !settled, no_arrival = !(eta < STEWART_NEVER);
     memory->rejected = measured && !(hypothesis->fits > 0);
     memory->settled = (real)settled;
     memory->open_loop = (real)open_loop;
@@ -490,16 +518,16 @@ static void report(Search *s, int measured)
     memory->eta = eta > 0 ? eta : 0;
     memory->rate = hypothesis->numbers[STEWART_RATE(s->n)];
     memory->feeds_back = 1;
-    if (!settled && (waiting || open_loop)) {
-        const int late = memory->num_own * d->period >= d->delay_mean;
-        memory->feeds_back = !(open_loop || (waiting && late));
+    if (!settled && (no_arrival || open_loop)) {
+        const int overdue = no_arrival && memory->num_own * d->period >= d->delay_mean;
+        memory->feeds_back = !(open_loop || overdue);
         memory->eta = d->delay_mean > 0 ? d->delay_mean : 0;
         memory->rate = 0;
     }
     memory->mean = eta;
     memory->std = stewart_hypothesis_std(hypothesis, s->n);
     if (memory->searching > 0)
-        mix(s);
+        set_mixture_moments(s);
 }
 
 void stewart_delay_start(const stewart_delay *d, int num_in_flight, stewart_delay_memory *memory)
@@ -511,7 +539,7 @@ void stewart_delay_start(const stewart_delay *d, int num_in_flight, stewart_dela
     memory->open_loop = d->open_loop_start ? 1 : 0;
     memory->settled = memory->feeds_back = memory->caution = 1;
     memory->mean = memory->std = (real)NAN;
-    stewart_fill(2 * m, (real)NAN, memory->numbers + U * periods_before(num_in_flight));
+    stewart_fill(2 * m, (real)NAN, memory->numbers + U * max_others(num_in_flight));
 }
 
 void stewart_delay_observe(const stewart_delay *d, int num_in_flight, const real *in_flight,
@@ -519,17 +547,18 @@ void stewart_delay_observe(const stewart_delay *d, int num_in_flight, const real
                            stewart_scratch scratch)
 {
     const int n = X + d->filter.machine->estimated + 2, m = d->filter.sensing->size, first = memory->num_own < 0;
-    const int others = periods_before(num_in_flight);
+    const int others = max_others(num_in_flight);
     Search s = {.delay = d, .n = n, .m = m, .num_in_flight = num_in_flight, .memory = memory};
-    s.before = memory->numbers;
-    s.past = memory->numbers + U * others;
+    s.other_torques = memory->numbers;
+    s.last_measurements = memory->numbers + U * others;
     if (first) /* no own torque in flight yet; without a queue the torque of the last period continues */
-        stewart_copy(U * others, in_flight + U * (num_in_flight - others), s.before);
-    memory->num_own = first ? 0 : memory->num_own < (real)num_in_flight ? memory->num_own + 1 : (real)num_in_flight;
+        stewart_copy(U * others, in_flight + U * (num_in_flight - others), s.other_torques);
+    if (memory->num_own < (real)num_in_flight)
+        memory->num_own += 1;
     memory->found = memory->deferred;
     memory->deferred = memory->rejected = 0;
-    s.since = (stewart_period){d, {d->period, 0, 0, (int)memory->num_own, others, s.before},
-                               num_in_flight, 0, in_flight};
+    s.last_period = (stewart_period){d, {d->period, 0, 0, (int)memory->num_own, others, s.other_torques},
+                                     num_in_flight, 0, in_flight};
     if (!(memory->known > 0)) {
         if (y)
             begin(&s, y, near, scratch);
@@ -542,12 +571,12 @@ void stewart_delay_observe(const stewart_delay *d, int num_in_flight, const real
     }
     if (y && memory->known > 0 && hypothesis_at(&s, (int)memory->best)->outliers >= PATIENCE)
         restart(&s, y, near, scratch);
-    stewart_copy(m, s.past + m, s.past);
+    stewart_copy(m, s.last_measurements + m, s.last_measurements);
     for (int i = 0; i < m; i++)
-        s.past[m + i] = y ? y[i] : (real)NAN;
+        s.last_measurements[m + i] = y ? y[i] : (real)NAN;
     if (!first) { /* move on by a period; the last torque stays */
         for (int i = 0; i < U * (others - 1); i++)
-            s.before[i] = s.before[i + U];
+            s.other_torques[i] = s.other_torques[i + U];
     }
     if (memory->known > 0)
         report(&s, y != NULL);
