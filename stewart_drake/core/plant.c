@@ -14,17 +14,17 @@
 
 const char *stewart_source(void) { return SOURCE; }
 
-/* The plant of a run under its torque; `drive` gives a torque that changes with time, else NULL. */
+/* The plant of a run with the source of its torque. */
 typedef struct {
     stewart_run *run;
-    const stewart_drive *drive;
+    const stewart_drive *drive; /* of a torque that changes with time, else NULL */
     const stewart_position_servo *servo; /* turns setpoints into torques, NULL for none */
     double torque[U], setpoint[U], bias[U];
     int at_limit; /* whether a servo has reached its limit since the last sample */
 } DrivenPlant;
 
-/* Torque at the cranks, from the servos with the state. */
-static void set_by_servo(DrivenPlant *d, const double *x)
+/* Set the torque that the servos and the bias apply in a state. */
+static void set_servo_torque(DrivenPlant *d, const double *x)
 {
     double asked[U];
     stewart_position_torque(d->servo, d->run->plant->geometry, d->setpoint, x, asked, d->torque);
@@ -32,7 +32,7 @@ static void set_by_servo(DrivenPlant *d, const double *x)
         d->torque[i] += d->bias[i];
 }
 
-/* Note whether a servo is at its limit. This is not done at the stages of a step, which may be rejected. */
+/* Note whether a servo is at its limit. This is not done in `slope`, whose step may be rejected. */
 static void note_limit(DrivenPlant *d, const double *x)
 {
     double asked[U], torque[U];
@@ -55,7 +55,7 @@ static void slope(void *system, double time, const double *x, double *rate)
     if (d->drive)
         set_torque(d, d->drive, time);
     if (d->servo)
-        set_by_servo(d, x);
+        set_servo_torque(d, x);
     stewart_change(d->run->plant, x, d->torque, rate);
 }
 
@@ -64,8 +64,8 @@ static int inside(const stewart_run *r, const double *x)
     return stewart_margin(r->plant->geometry, x, r->sign, r->least) > 0.;
 }
 
-/* Bisect for the time between `from`, inside, and `to`, outside, to 1e-13 s; s->x is the state just outside.
-   The margin is a minimum of several measures and therefore not smooth. */
+/* Bisect, to 1e-13 s, for the time of leaving between `from`, inside, and `to`, outside. Then s->x is the state
+   just outside. The margin is a minimum of several measures and therefore not smooth. */
 static int leave(dop853 *s, const stewart_run *r, double from, double to)
 {
     double x[X];
@@ -80,7 +80,7 @@ static int leave(dop853 *s, const stewart_run *r, double from, double to)
     return STEWART_LEFT;
 }
 
-/* Advance to `end`, up to which the torque is smooth. */
+/* Advance to `end`, up to which the torque is smooth, and record the states at the run's times. */
 static int advance(dop853 *s, stewart_run *r, double end)
 {
     for (; r->recorded < r->number && r->times[r->recorded] <= s->time; r->recorded++)
@@ -92,17 +92,17 @@ static int advance(dop853 *s, stewart_run *r, double end)
     while (s->time < end) {
         if ((r->most_steps > 0 && s->steps >= r->most_steps) || !dop853_step(s, end))
             return STEWART_TOO_SHORT_STEPS;
-        double from = s->before;
+        double last_inside = s->before;
         for (; r->recorded < r->number && r->times[r->recorded] <= s->time; r->recorded++) {
-            double *x = r->states + X * r->recorded, to = r->times[r->recorded];
-            dop853_at(s, to, x);
+            double *x = r->states + X * r->recorded, time = r->times[r->recorded];
+            dop853_at(s, time, x);
             if (!inside(r, x))
-                return leave(s, r, from, to);
-            from = to;
+                return leave(s, r, last_inside, time);
+            last_inside = time;
         }
         note_limit(s->system, s->x);
         if (!inside(r, s->x))
-            return leave(s, r, from, s->time);
+            return leave(s, r, last_inside, s->time);
     }
     return STEWART_INSIDE;
 }
@@ -116,28 +116,29 @@ static dop853 integrator(DrivenPlant *d)
     return s;
 }
 
-static int ended(stewart_run *r, const dop853 *s, int how)
+/* Write the end into the run; return the outcome. */
+static int finish(stewart_run *r, const dop853 *s, int outcome)
 {
     r->time = s->time, r->steps = s->steps, r->evaluations = s->evaluations;
     stewart_copy(X, s->x, r->state);
-    return how;
+    return outcome;
 }
 
 int stewart_open_loop(stewart_run *r, const stewart_drive *drives, long number)
 {
     DrivenPlant d = {.run = r};
     dop853 s = integrator(&d);
-    int how = STEWART_INSIDE;
-    for (long i = 0; i < number && how == STEWART_INSIDE; i++) {
+    int outcome = STEWART_INSIDE;
+    for (long i = 0; i < number && outcome == STEWART_INSIDE; i++) {
         const stewart_drive *drive = drives + i;
         int constant = 1;
         for (int j = 0; j < U; j++)
             constant &= drive->amplitude[j] == 0. || drive->frequency == 0.;
         d.drive = constant ? NULL : drive;
         set_torque(&d, drive, s.time);
-        how = advance(&s, r, i + 1 < number ? fmin(drive[1].from, r->end) : r->end);
+        outcome = advance(&s, r, i + 1 < number ? fmin(drive[1].from, r->end) : r->end);
     }
-    return ended(r, &s, how);
+    return finish(r, &s, outcome);
 }
 
 int stewart_servo_run(stewart_run *r, const stewart_position_servo *servo, long number,
@@ -145,23 +146,23 @@ int stewart_servo_run(stewart_run *r, const stewart_position_servo *servo, long 
 {
     DrivenPlant d = {.run = r, .servo = servo};
     dop853 s = integrator(&d);
-    int how = STEWART_INSIDE;
-    for (long i = 0; i < number && how == STEWART_INSIDE; i++) {
+    int outcome = STEWART_INSIDE;
+    for (long i = 0; i < number && outcome == STEWART_INSIDE; i++) {
         stewart_copy(U, setpoints + U * i, d.setpoint);
-        how = advance(&s, r, i + 1 < number ? fmin(from[i + 1], r->end) : r->end);
+        outcome = advance(&s, r, i + 1 < number ? fmin(from[i + 1], r->end) : r->end);
     }
-    return ended(r, &s, how);
+    return finish(r, &s, outcome);
 }
 
-/* The report of a buffer: whether each of the last packets has arrived, and the torques that acted in
-   the last periods, the newest first. */
-static void write_report(const stewart_loop *o, long k, double *arrived)
+/* Write the report of a buffer: `arrived` (reported), whether each of the last packets has arrived, and `acted`
+   (reported, 6), the torques of the last periods, the newest first. */
+static void write_report(const stewart_loop *o, long k, double *arrived, double *acted)
 {
     const double until = o->period * (double)k + o->link->time_tolerance;
-    const double *acted = o->memory + STEWART_LINK_COMMANDS + 1;
+    const double *past = o->memory + STEWART_LINK_COMMANDS + 1; /* after the time of the first one */
     for (long i = 0, packet = k - 1; i < o->reported; i++, packet--) {
         arrived[i] = packet >= 0 && o->period * (double)packet + o->transit[packet] <= until;
-        stewart_copy(U, acted + (1 + U) * i, arrived + o->reported + U * i);
+        stewart_copy(U, past + (1 + U) * i, acted + U * i);
     }
 }
 
@@ -171,7 +172,7 @@ static int pass_back(const stewart_loop *o, long k, double *values)
 {
     const stewart_link *back = o->back;
     const double now = o->period * (double)k, *newest = o->back_memory + STEWART_LINK_COMMANDS;
-    double arrival = now + o->back_transit[k];
+    const double arrival = now + o->back_transit[k];
     stewart_link_take(back, o->back_memory, now, (double)(k + 1), 0., arrival, 1, values);
     if (stewart_link_next(back, o->back_memory) <= now + back->time_tolerance)
         stewart_link_change(back, o->back_memory, now);
@@ -182,6 +183,7 @@ static int pass_back(const stewart_loop *o, long k, double *values)
     return arrived ? (int)((double)(k + 1) - o->back_memory[STEWART_LINK_NEWEST]) : 0;
 }
 
+/* Measure at sample k, call the controller and send its command. */
 static int sample(const dop853 *s, stewart_loop *o, long k, stewart_controller law, void *context)
 {
     double *y = o->measured + X * k, *torque = o->asked + U * k, now = o->period * (double)k;
@@ -191,7 +193,7 @@ static int sample(const dop853 *s, stewart_loop *o, long k, stewart_controller l
     stewart_sample measured = {.measurement = y};
     for (int i = 0; i < X; i++)
         values[i] = o->noise ? s->x[i] + o->noise[X * k + i] : s->x[i];
-    write_report(o, k, arrived);
+    write_report(o, k, arrived, acted);
     if (o->back)
         measured.age = report.age = pass_back(o, k, values);
     stewart_copy(X, values, y);
@@ -199,14 +201,14 @@ static int sample(const dop853 *s, stewart_loop *o, long k, stewart_controller l
         measured.report = &report;
     if (law(context, k, &measured, torque, command))
         return STEWART_CONTROLLER_FAILED;
-    if (o->servo && k > 0) { /* before, no setpoint has acted */
+    if (o->servo && k > 0) { /* at k = 0 no setpoint has acted */
         double limited[U];
         DrivenPlant *d = s->system;
         stewart_position_torque(o->servo, d->run->plant->geometry, d->setpoint, s->x, torque, limited);
         o->saturated += d->at_limit;
         d->at_limit = 0;
     }
-    if (o->link->is_wire)
+    if (o->link->is_wire) /* the command acts when it arrives */
         stewart_link_take(o->link, o->memory, now, (double)(k + 1), 0., arrival, 1, command);
     else
         stewart_link_take(o->link, o->memory, now, (double)(k + 1), arrival,
@@ -223,9 +225,9 @@ static int advance_pushed(dop853 *s, stewart_run *r, const stewart_loop *o, doub
         const double change = acts ? o->push_to : s->time < o->push_from ? o->push_from : HUGE_VAL;
         for (int i = 0; i < 6; i++)
             o->wrench[i] = acts ? o->push[i] : 0.;
-        const int how = advance(s, r, fmin(change, end));
-        if (how != STEWART_INSIDE || end <= change)
-            return how;
+        const int outcome = advance(s, r, fmin(change, end));
+        if (outcome != STEWART_INSIDE || end <= change)
+            return outcome;
     }
 }
 
@@ -242,22 +244,23 @@ int stewart_closed_loop(stewart_run *r, stewart_loop *o, stewart_controller law,
             d.torque[i] = stewart_link_current(o->memory)[i] + o->bias[i];
         double sampled = k < o->samples ? o->sampled[k] : HUGE_VAL;
         double released = stewart_link_next(o->link, o->memory);
-        int samples = sampled <= released + o->link->time_tolerance, how = STEWART_INSIDE;
-        double next = samples ? sampled : released;
+        int is_sample = sampled <= released + o->link->time_tolerance, outcome = STEWART_INSIDE;
+        double next = is_sample ? sampled : released;
         if (next > r->end)
-            return ended(r, &s, advance_pushed(&s, r, o, r->end));
+            return finish(r, &s, advance_pushed(&s, r, o, r->end));
         if (next > s.time + o->link->time_tolerance)
-            how = advance_pushed(&s, r, o, next);
-        if (how == STEWART_INSIDE && samples)
-            how = sample(&s, o, k++, law, context);
-        else if (how == STEWART_INSIDE)
+            outcome = advance_pushed(&s, r, o, next);
+        if (outcome == STEWART_INSIDE && is_sample)
+            outcome = sample(&s, o, k++, law, context);
+        else if (outcome == STEWART_INSIDE)
             stewart_link_change(o->link, o->memory, fmax(released, s.time));
-        if (how != STEWART_INSIDE)
-            return ended(r, &s, how);
+        if (outcome != STEWART_INSIDE)
+            return finish(r, &s, outcome);
     }
 }
 
-static int step(void *context, long k, const stewart_sample *measured, double *torque, double *command)
+/* The `stewart_controller` of a law. */
+static int step_law(void *context, long k, const stewart_sample *measured, double *torque, double *command)
 {
     stewart_law_in_loop *in = context;
     const double *sent = torque;
@@ -266,7 +269,7 @@ static int step(void *context, long k, const stewart_sample *measured, double *t
     sample.context = &in->motion;
     in->motion.now = in->period * (double)k;
     if (in->servos) {
-        stewart_fill(U, 0, torque); /* replaced by that of the servos */
+        stewart_fill(U, 0, torque); /* `sample` writes that of the servos */
         stewart_servo_step(in->servos, in->memory, in->scratch, &sample, in->report, command);
         return 0;
     }
@@ -288,5 +291,5 @@ static int step(void *context, long k, const stewart_sample *measured, double *t
 
 int stewart_closed_loop_of_law(stewart_run *run, stewart_loop *loop, stewart_law_in_loop *law)
 {
-    return stewart_closed_loop(run, loop, step, law);
+    return stewart_closed_loop(run, loop, step_law, law);
 }
