@@ -1,7 +1,7 @@
-"""The step of a law in C, core/law.c: its constants, and the call of it.
+"""The constants of a law for its step in C (core/law.c), and the calls of that step.
 
-A part is a table of functions, of the core or, for a part in Python, of callbacks
-(`law.own_parts`). Memory is one flat vector, whose fields `stewart_layout` names.
+A part is a table of functions: those of the core, or callbacks for a part in Python
+(`law.own_parts`). The memory is one flat vector, whose fields `stewart_layout` names.
 """
 
 import math
@@ -44,6 +44,7 @@ _FEEDFORWARDS: Final = {
     InverseDynamicsFeedforward: "STEWART_INVERSE_DYNAMICS",
 }
 _DESIGN: Final = ("plant", "feedforward", "predictor", "model", "cost")
+"""Parts that prediction and gain depend on."""
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "plant": DYNAMICS,
     "observer": (CoreObserver,),
@@ -54,17 +55,17 @@ _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "cost": (QuadraticCost,),
     "channel": (Wire, Packets),
 }
-"""Kinds of the parts that the core has."""
+"""Classes of each part that the core has."""
 
 
 def in_python(law: Any) -> set[str]:
-    """Return the parts of a law that the core does not have; a user's is another kind."""
+    """Return the names of the parts that Python computes, a user's subclasses among them."""
     parts = {name: getattr(law, name) for name in _KINDS if hasattr(law, name)}
     parts["plant"] = law.plant.dynamics
-    found = {name for name, part in parts.items() if type(part) not in _KINDS[name]}
+    names = {name for name, part in parts.items() if type(part) not in _KINDS[name]}
     if "predictor" in parts and law.finds_delay != isinstance(law.predictor, ArrivalPredictor):
-        found.add("predictor")
-    return found
+        names.add("predictor")
+    return names
 
 
 class CompiledLaw:
@@ -77,34 +78,32 @@ class CompiledLaw:
     Attributes:
         law: the law.
         data: `stewart_law *`, or of servos `stewart_servo *`.
+        torques_law: `stewart_law *`, of servos the one in `data`.
         fields: (place, rows, columns) of each field of the memory.
-        keep_alive: arrays and C structures that it points to.
+        keep_alive: arrays and C structures that `data` points to.
     """
 
     def __init__(self, law: Any, more: int = 0) -> None:
         c = core()
-        self.law, self._servos, self._more = law, not hasattr(law, "cost"), more
+        self.law, self._servos = law, not hasattr(law, "cost")
         self.keep_alive: list[Any] = []
         self.data = c.ffi.new("stewart_servo *" if self._servos else "stewart_law *")
-        given = c.ffi.addressof(self.data, "law") if self._servos else self.data
-        self.torques_law = given
-        self._own, self._python = OwnParts(law, given), in_python(law)
-        self._raised = [self._own.raised]
-        self._fill(given)
+        self.torques_law = c.ffi.addressof(self.data, "law") if self._servos else self.data
+        self._own_parts, self._in_python = OwnParts(law, self.torques_law), in_python(law)
+        self._raised = [self._own_parts.raised]
+        self._set_common_parts(self.torques_law)
         if self._servos:
-            self._of_servos()
+            self._set_servos()
             c.lib.stewart_servo_prepare(self.data)
         else:
-            self._of_torques()
+            self._set_torque_law(more)
             c.lib.stewart_prepare(self.data)
-        self.keep_alive += self._own.keep_alive
+        self.keep_alive += self._own_parts.keep_alive
         layout = self.data.layout
-        self.fields = {
-            name: (field.at, field.rows, field.columns)
-            for name, field in ((n, getattr(layout, n)) for n, _ in c.ffi.typeof(layout).fields)
-        }
+        fields = {name: getattr(layout, name) for name, _ in c.ffi.typeof(layout).fields}
+        self.fields = {name: (one.at, one.rows, one.columns) for name, one in fields.items()}
 
-    def _fill(self, data: Any) -> None:
+    def _set_common_parts(self, data: Any) -> None:
         c, law, timeline = core(), self.law, self.law.timeline
         machine = machine_of(law.plant)
         data.machine = machine.pointer[0]
@@ -112,74 +111,74 @@ class CompiledLaw:
         self.keep_alive += machine.pointed()
         data.period, data.steps, data.fraction = timeline.period, timeline.steps, timeline.fraction
         data.num_values, data.rows = law.sensing.size, len(law.preview_times)
-        if "feedforward" not in self._python:
+        if "feedforward" not in self._in_python:
             data.cost.feedforward = getattr(c.lib, _FEEDFORWARDS[type(law.feedforward)])
-        if "observer" in self._python:
-            self._own.observer()
+        if "observer" in self._in_python:
+            self._own_parts.observer()
             return
-        part = set_observer(data, law.observer, law.sensing, law.plant, timeline.period)
-        self._raised += part.raised
-        self.keep_alive += part.pointed()
+        sensor = set_observer(data, law.observer, law.sensing, law.plant, timeline.period)
+        self._raised += sensor.raised
+        self.keep_alive += sensor.pointed()
 
-    def _of_servos(self) -> None:
+    def _set_servos(self) -> None:
         law, d = self.law, self.data
         d.law.parts, d.periods = law.reports.parts, law.reports.periods
-        computes = bool(self._python & set(_DESIGN))
+        computes = bool(self._in_python & set(_DESIGN))
         if computes or law.learned is not None:
-            self._own.command(d, computes=computes)
+            self._own_parts.command(d, computes=computes)
         if (servo := law.servo) is not None:
             limits = servo.low.tolist(), servo.high.tolist(), servo.most
             d.stiff = (servo.stiffness, servo.velocity_gain, *limits)
 
-    def _of_torques(self) -> None:
-        c, d, law, python = core(), self.data, self.law, self._python
+    def _set_torque_law(self, more: int) -> None:
+        c, d, law, python = core(), self.data, self.law, self._in_python
         d.cost.integrates = law.cost.integrates
         if "cost" not in python:
             cost = law.cost
             d.cost.errors, d.cost.torques = cost.errors.tolist(), cost.torques.tolist()
             d.cost.integrals = (np.zeros(6) if cost.integrals is None else cost.integrals).tolist()
-        d.extra_torques, d.longest_wait = law.extra_torques + self._more, law.longest_wait
+        d.extra_torques, d.longest_wait = law.extra_torques + more, law.longest_wait
         d.open_loop_samples = law.open_loop_samples
         d.tolerated_timing = 0.0 if math.isinf(law.tolerated_timing) else law.tolerated_timing
-        if law.finds_delay:  # it finds steps and fraction itself
+        if law.finds_delay:  # no delay is assumed
             d.extra_torques += law.observer.extra_torques(d.period)
             d.steps, d.fraction = 0, 0.0
-            d.rows = 1 + law.observer.max_schedule_length(d.period) + 6
+            # now, the times of the prediction, and the two nodes of three holds
+            d.rows = 1 + law.observer.max_schedule_length(d.period) + 2 * 3
         if python & {"observer", *_DESIGN}:
-            self._designs()
+            self._set_design()
         if "channel" in python:
-            self._own.channel()
+            self._own_parts.channel()
         elif isinstance(law.channel, Packets):
             d.channel = c.ffi.addressof(c.lib, "stewart_network")
             packets = packets_of(law.channel)
             d.packets = packets.pointer
             self.keep_alive += packets.pointed()
         if "planner" in python:
-            self._own.planner()
+            self._own_parts.planner()
         elif isinstance(law.planner, Replan):
-            self._plans(law.planner)
+            self._set_planner(law.planner)
 
-    def _designs(self) -> None:
+    def _set_design(self) -> None:
         """Set prediction and gain with parts in Python, for any delay that these may find."""
-        d, law, python = self.data, self.law, self._python
+        d, law, python = self.data, self.law, self._in_python
         pending = law.predictor.pending(law.timeline)
-        if "observer" in python:
-            most = d.rows if law.finds_delay else 1 + d.extra_torques + law.timeline.queue_length
-            pending, again = most, 1 + 2 * (most + 3)
-            d.rows = most + again * law.channel.torques
-        self._own.design(
+        if "observer" in python:  # up to this many times and pending torques
+            times = d.rows if law.finds_delay else 1 + d.extra_torques + law.timeline.queue_length
+            pending, nodes = times, 2 * (times + 3)
+            d.rows = times + (1 + nodes) * law.channel.torques
+        self._own_parts.design(
             NUM_STATE + 6 * d.cost.integrates + NUM_TORQUES * pending,
             predicts=hasattr(law.predictor, "predict"),
             designs=bool(python & set(_DESIGN)),
         )
 
-    def _plans(self, planner: Replan) -> None:
+    def _set_planner(self, planner: Replan) -> None:
         c, d, law = core(), self.data, self.law
-        plan, until = c.ffi.new("stewart_replan *"), law.timeline.queue_length
-        if law.finds_delay or "observer" in self._python:
-            until = d.rows
+        plan = c.ffi.new("stewart_replan *")
+        unknown_delay = law.finds_delay or "observer" in self._in_python
         plan.periods, plan.most = planner.lengths(d.period)
-        plan.until = until
+        plan.until = d.rows if unknown_delay else law.timeline.queue_length
         plan.size, plan.sign = planner.size.tolist(), home_sign(law.plant.mechanism)
         plan.sure = planner.sure
         d.planner, d.planning = c.ffi.addressof(c.lib, "stewart_replanner"), plan
@@ -207,12 +206,11 @@ class CompiledLaw:
             first: (n, 6) torques in flight, or for servos (18,) the command that was sent last.
         """
         c, memory = core(), Memory(np.empty(self.data.memory), self, {})
-        first, self._own.now = numbers(first), Step(memory)
-        given = self.data, c.at(memory.data)
+        first, self._own_parts.now = numbers(first), Step(memory)
         if self._servos:
-            c.lib.stewart_servo_start(*given, c.at(first))
+            c.lib.stewart_servo_start(self.data, c.at(memory.data), c.at(first))
         else:
-            c.lib.stewart_start(*given, len(first), c.at(first))
+            c.lib.stewart_start(self.data, c.at(memory.data), len(first), c.at(first))
         raise_first(self._raised)
         return memory
 
@@ -231,20 +229,20 @@ class CompiledLaw:
         after = Memory(memory.data.copy(), self, dict(memory.own))
         values, scratch = measurement.known(law.sensing.size), np.empty(self.scratch)
         after.own["samples"] = after.own.get("samples", -1) + 1
-        self._own.now = Step(after, motion, report)
-        sample, _read = self._sample(motion)
+        self._own_parts.now = Step(after, motion, report)
+        sample, _kept = self._sample(motion)
         sample.measurement = c.at(values)
         sample.age = round(measurement.age / law.timeline.period)
-        given = self.data, c.at(after.data), c.at(scratch), sample
+        arguments = self.data, c.at(after.data), c.at(scratch), sample
         if weights is None:
-            said, command = numbers(report), np.empty(NUM_REFERENCE)
-            c.lib.stewart_servo_step(*given, c.at(said), c.at(command))
+            reported, command = numbers(report), np.empty(NUM_REFERENCE)
+            c.lib.stewart_servo_step(*arguments, c.at(reported), c.at(command))
         else:
             if np.shape(weights) != (len(WEIGHTS),):
                 raise ValueError(f"weights: got shape {np.shape(weights)}; expected (2,)")
             compiled, torque = report_of(report), np.empty(NUM_TORQUES)
             sample.report, sample.weights = compiled.pointer, list(weights)
-            c.lib.stewart_step(*given, c.at(torque))
+            c.lib.stewart_step(*arguments, c.at(torque))
         raise_first(self._raised)
         return after
 
@@ -253,14 +251,14 @@ class CompiledLaw:
         c, planner = core(), self.data.planner
         if planner == c.ffi.NULL:
             return motion(times)
-        rows, (sample, _read) = np.empty((len(times), NUM_REFERENCE)), self._sample(motion)
-        given = c.at(memory.field("planner")), sample, len(times), c.at(times), c.at(rows)
-        planner.rows(self.data, *given)
+        rows, (sample, _kept) = np.empty((len(times), NUM_REFERENCE)), self._sample(motion)
+        path = c.at(memory.field("planner"))
+        planner.rows(self.data, path, sample, len(times), c.at(times), c.at(rows))
         raise_first(self._raised)
         return rows
 
     def _sample(self, motion: Motion) -> tuple[Any, Any]:
-        """Return a `stewart_sample *` that reads a motion, and what must outlive it."""
+        """Return a `stewart_sample *` that reads a motion, and an object that must outlive it."""
         c, law = core(), self.law
         sample = c.ffi.new("stewart_sample *")
         known = motion.compiled() if isinstance(motion, KnownMotion) else None
@@ -268,10 +266,11 @@ class CompiledLaw:
             sample.reference, sample.goal = c.lib.stewart_planned_rows, c.lib.stewart_goal_rows
             sample.context = known
             return sample, known
-        if self._servos or not (law.moves or "observer" in self._python):  # known instants
+        times_are_fixed = self._servos or not (law.moves or "observer" in self._in_python)
+        if times_are_fixed:
             rows = preview_rows(motion(law.preview_times), len(law.preview_times))
             sample.reference, sample.context = c.lib.stewart_given_rows, c.at(rows)
             return sample, rows
-        sample.reference, goal = self._own.motion
+        sample.reference, goal = self._own_parts.motion
         sample.goal = goal if isinstance(motion, KnownMotion) else c.ffi.NULL
         return sample, None
