@@ -1,6 +1,6 @@
-"""Python functions of the commands that are neither a run nor an analysis of a scenario.
+"""Python functions of the commands other than runs and analyses of a scenario.
 
-Bad input is a ConfigError of one line.
+Bad input raises a ConfigError of one line.
 """
 
 import math
@@ -32,6 +32,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
 from stewart_drake.reporting import servo_identification
 from stewart_drake.reporting.csv_file import read_signals, signals_csv
+from stewart_drake.reporting.document import Document
 from stewart_drake.reporting.identification import document, plan_document
 from stewart_drake.reporting.page import Provenance
 from stewart_drake.reporting.results import (
@@ -56,8 +57,8 @@ CALIBRATION: Final = "calibration.yaml"
 SCENARIO: Final = "scenario.yaml"
 SERVOS: Final = "servos.yaml"
 FOUND: Final = "found.yaml"
-_CODE_12_BITS: Final = angle_std(12)
-"""Rounding of a crank angle in a log of servos by default, rad."""
+_STD_12_BITS: Final = angle_std(12)
+"""Default standard deviation of a crank angle in a log of servos, rad."""
 
 
 def identify(
@@ -73,14 +74,14 @@ def identify(
     """Find delay, friction and geometry in logs of one machine.
 
     `save` of the result also writes mechanism.yaml and calibration.yaml, and, if they explain the
-    log, found.yaml, an overlay of a scenario that reads both. From a CSV log of setpoints and crank
-    angles it finds the numbers of position servos instead, and writes servos.yaml, an overlay of a
-    scenario, if they explain the log.
+    log, found.yaml, an overlay of a scenario that reads both. A CSV log of setpoints and crank
+    angles identifies position servos instead; if their numbers explain the log, `save` writes them
+    to servos.yaml, an overlay of a scenario.
 
     Args:
         logs: signals.nc of a run, or CSV; one CSV log of setpoints.
         mechanism: as drawn; a shipped name or a path.
-        delay: believed, s; None is that of the log, or 0.1 s.
+        delay: assumed before, s; by default that of the log, or 0.1 s.
         tolerances: prior standard deviations of the machine, such as `{"lengths": 1e-4}`; the
             defaults for others.
         precision: of a CSV log, such as `{"angle": 1e-4}`; the defaults for others, with 12 bits
@@ -96,7 +97,7 @@ def identify(
         raise ConfigError("logs: got none; expected one or more")
     if delay is not None and not 0 <= delay <= 100:
         raise ConfigError(f"delay: got {delay:g}; expected 0 to 100 s")
-    refuse_for_runs(paths, {"precision": precision, "gravity": None if gravity else gravity})
+    refuse_for_runs(paths, {"precision": precision, "gravity": None if gravity else False})
     if any(is_servo_log(Path(path)) for path in paths):
         if len(paths) > 1 or delay is not None or tolerances is not None:
             raise ConfigError(
@@ -104,17 +105,17 @@ def identify(
                 "one log, whose delay is found without any"
             )
         log = read_servo_log(Path(paths[0]), machine)
-        rounding = _CODE_12_BITS if precision is None else precision.angle
+        std = _STD_12_BITS if precision is None else precision.angle
         g = DEFAULT_GRAVITY if gravity else 0.0
-        fitted = partial(identify_servos, log, machine, rounding, g)
-        return analysis_result(fitted, servo_identification.document, typed, _write_servos)
+        find_servos = partial(identify_servos, log, machine, std, g)
+        return analysis_result(find_servos, servo_identification.document, typed, _write_servos)
     read = [read_log(Path(path), machine, precision or Precision(), gravity) for path in paths]
-    found = partial(identification.identify, read, machine, tolerances, delay)
-    return analysis_result(found, document, typed, _write_machine)
+    find = partial(identification.identify, read, machine, tolerances, delay)
+    return analysis_result(find, document, typed, _write_machine)
 
 
 def refuse_for_runs(logs: Iterable[str | Path], options: Mapping[str, object]) -> None:
-    """Refuse options of a CSV log that are not None, for logs of runs."""
+    """Refuse options of a CSV log that are not None if all logs are of runs."""
     if all(is_run(Path(log)) for log in logs):
         refuse(options, "with logs of runs, which contain it; expected it with an own CSV log")
 
@@ -147,19 +148,19 @@ def plan_identification(
                 "plan: got measured poses or tolerances with position servos; expected neither, "
                 "their log has setpoints and crank angles"
             )
-        rounding = _CODE_12_BITS if precision is None else precision.angle
-        planned = partial(plan_servos, prepare(loaded), rounding)
+        angle = _STD_12_BITS if precision is None else precision.angle
+        make_servo_plan = partial(plan_servos, prepare(loaded), angle)
         shown = servo_identification.plan_document
-        return analysis_result(planned, shown, typed, _write_setpoints)
+        return analysis_result(make_servo_plan, shown, typed, _write_setpoints)
     sensor = loaded.sensor
     if precision is None and sensor.kind == "encoders" and sensor.bits is not None:
         precision = Precision(angle=angle_std(sensor.bits))
-    measured = (precision or Precision()).std
-    std = np.full_like(measured, np.inf)
+    all_std = (precision or Precision()).std
+    std = np.full_like(all_std, np.inf)  # not measured
     for part in (ANGLES, POSE) if poses else (ANGLES,):
-        std[part] = measured[part]
-    planned_motion = partial(plan, prepare(loaded), std, tolerances)
-    return analysis_result(planned_motion, plan_document, typed, _write_plan)
+        std[part] = all_std[part]
+    make_plan = partial(plan, prepare(loaded), std, tolerances)
+    return analysis_result(make_plan, plan_document, typed, _write_plan)
 
 
 def _expected(tolerances: Any, precision: Any) -> tuple[Tolerances | None, Precision | None]:
@@ -172,20 +173,19 @@ def _expected(tolerances: Any, precision: Any) -> tuple[Tolerances | None, Preci
 
 def _write_plan(found: Plan, folder: Path) -> list[str]:
     motion = motion_csv(found.times, found.poses)
-    texts = {MOTION: motion, SCENARIO: scenario_yaml(found.scenario)}
-    return _written(folder, texts)
+    return _write_texts(folder, {MOTION: motion, SCENARIO: scenario_yaml(found.scenario)})
 
 
 def _write_setpoints(found: ServoPlan, folder: Path) -> list[str]:
-    return _written(folder, {SETPOINTS_FILE: found.csv})
+    return _write_texts(folder, {SETPOINTS_FILE: found.csv})
 
 
 def _write_machine(found: identification.Identification, folder: Path) -> list[str]:
     write_whole(folder / MECHANISM, mechanism_yaml(found.mechanism))
     calibration = found.calibration(load_mechanism(folder / MECHANISM))
     save_calibration(folder / CALIBRATION, calibration)
-    read = {"mechanism": MECHANISM, "controller": {"calibration": CALIBRATION}}
-    fields = read | {"plant": found.plant} if found.right else None
+    files = {"mechanism": MECHANISM, "controller": {"calibration": CALIBRATION}}
+    fields = files | {"plant": found.plant} if found.right else None
     return [MECHANISM, CALIBRATION, *_write_overlay(folder / FOUND, fields)]
 
 
@@ -194,14 +194,14 @@ def _write_servos(found: ServoIdentification, folder: Path) -> list[str]:
 
 
 def _write_overlay(path: Path, fields: dict[str, Any] | None) -> list[str]:
-    """Write an overlay; if nothing explains the log, remove that of an earlier one."""
+    """Write an overlay, or for None remove that of an earlier log; return the names written."""
     if fields is None:
         path.unlink(missing_ok=True)
         return []
-    return _written(path.parent, {path.name: yaml_text(fields)})
+    return _write_texts(path.parent, {path.name: yaml_text(fields)})
 
 
-def _written(folder: Path, texts: dict[str, str]) -> list[str]:
+def _write_texts(folder: Path, texts: dict[str, str]) -> list[str]:
     for name, text in texts.items():
         write_whole(folder / name, text)
     return list(texts)
@@ -231,7 +231,7 @@ def replay_log(log: str | Path, out: str | Path | None = None) -> str:
         out: file to write, if not None.
 
     Raises:
-        ConfigError: no log of a run, or one without its scenario.
+        ConfigError: the file is no log of a run, or the log has no scenario.
     """
     from stewart_drake.reporting.replay import log_html
 
@@ -272,12 +272,11 @@ def setpoints(
     """
     if out is None:
         refuse({"units": units}, "without out; expected both or neither")
-    told = None if units is None else load_units(units)
-    made = make_setpoints(
-        as_scenario(scenario, controller, settings), rate, plain=plain, start=start
-    )
+    servo_units = None if units is None else load_units(units)
+    loaded = as_scenario(scenario, controller, settings)
+    made = make_setpoints(loaded, rate, plain=plain, start=start)
     if out is not None:
-        made.save(out, told)
+        made.save(out, servo_units)
     return made
 
 
@@ -360,7 +359,7 @@ def run_live(
         OPTIONS
 
     Returns:
-        The run. With `learn` it is that of all repetitions, or of the best one of setpoints.
+        The run; with `learn` that of all repetitions, or for setpoints the best repetition.
 
     Raises:
         ConfigError: no such machine, or one that does not begin.
@@ -372,25 +371,27 @@ def run_live(
 
     options.check_learned()
     if options.learn:
-        of_run = options.model_dump(include={"duration", "log", "mirror"})
-        refuse(of_run, "with --learn; expected none")
+        without_learning = options.model_dump(include={"duration", "log", "mirror"})
+        refuse(without_learning, "with --learn; expected none")
         learnt = learn_live(as_scenario(scenario), machine, options, print).run
         return SimulationResult.of(learnt)
     ready = prepare_session(as_scenario(scenario), address_of(machine), read_key(options.key))
-    how: Any = options.model_dump(include={"armed", "accept_jitter", "max_missing", "hold"})
-    span = math.inf if options.duration is None else options.duration
-    return SimulationResult.of(drive(ready, span, logs=open_logs(ready, options, print), **how))
+    rules: Any = options.model_dump(include={"armed", "accept_jitter", "max_missing", "hold"})
+    duration = math.inf if options.duration is None else options.duration
+    logs = open_logs(ready, options, print)
+    return SimulationResult.of(drive(ready, duration, logs=logs, **rules))
 
 
 @takes(MachineOptions)
 def run_machine(scenario: Scenario | str | Path, *, options: MachineOptions) -> dict[str, Any]:
     """Simulate a machine, or drive a robot, over UDP in real time.
 
-    Returns what happened.
-
     Args:
-        scenario: a Scenario, a shipped name or a path; its plant, sensor, delay, link and limits.
+        scenario: a Scenario, a shipped name or a path, for plant, sensor, delay, link and limits.
         OPTIONS
+
+    Returns:
+        The summary of the run.
     """
     from stewart_drake.live.reachy import open_chosen
 
@@ -409,14 +410,14 @@ def make_tuner_data(
     options: DataOptions,
     progress: Progress | None = None,
 ) -> AnalysisResult:
-    """Make the data that a tuner is trained on, or go on with it.
+    """Make the data that a tuner is trained on, or continue to make it.
 
     Args:
         directory: of dataset.nc and of the runs.
         scenario: shipped name or path.
         controller: laid over the scenario's own.
         settings: as `load_scenario` takes them.
-        progress: called with the number of finished conditions and of all.
+        progress: called with the numbers of finished and of all conditions.
         OPTIONS
     """
     from stewart_drake.reporting.tuner import data_document
@@ -425,7 +426,8 @@ def make_tuner_data(
     family, started = options.conditions(scenario, controller, settings), time.perf_counter()
     data = make_data(family, directory, progress=progress, **options.jobs)
     command = f"sd.make_tuner_data({str(directory)!r}, {scenario!r})"
-    return _timed(data, summarize(data), data_document, command, started)
+    summary = summarize(data)
+    return _timed(data, summary, partial(data_document, data, summary), command, started)
 
 
 @takes(TrainingOptions)
@@ -441,7 +443,7 @@ def train_tuner(
     Args:
         data: folder or file of `make_tuner_data`.
         out: file of the network; with `regret` its runs are kept in the same folder.
-        progress: called with the number of the network's finished runs and of all.
+        progress: called with the numbers of finished and of all runs of the network.
         OPTIONS
 
     Raises:
@@ -454,15 +456,13 @@ def train_tuner(
 
     options.check()
     read, out = load_data(data), Path(out)
-
-    given: dict[str, Any]
     if options.regret:
-        given = options.model_dump(include={"seed", "start", "workers"})
+        chosen = options.model_dump(include={"seed", "start", "workers"})
         runs = out.with_name(f"{out.stem}-runs")
-        found = training.train_by_regret(read, runs, progress=progress, **given)
+        found = training.train_by_regret(read, runs, progress=progress, **chosen)
     else:
         given = {"kind": options.labels, "split": options.split, "density": options.density}
-        chosen = {name: one for name, one in given.items() if one is not None}
+        chosen = {name: value for name, value in given.items() if value is not None}
         found = training.train(read, seed=options.seed, **chosen)
     save_network(found.network, out)
     summary, made = training.summarize(found), f"sd.train_tuner({str(data)!r}, {str(out)!r})"
@@ -484,12 +484,12 @@ def evaluate_tuner(
     """Compare a tuner with fixed gains on conditions that training did not have.
 
     Args:
-        directory: where the runs are kept, so that a second call goes on with them.
+        directory: of the runs; a second call continues with those that are there.
         networks: shipped name or file, or several; none for the shipped one.
         scenario: shipped name or path.
         controller: laid over the scenario's own.
         settings: as `load_scenario` takes them.
-        progress: called with the number of finished conditions and of all.
+        progress: called with the numbers of finished and of all conditions.
         command: that the page names; by default the call of this function.
         OPTIONS
     """
@@ -500,18 +500,17 @@ def evaluate_tuner(
     networks = [networks] if isinstance(networks, str | Path) else networks
     found = evaluate(family, networks, directory, progress=progress, **options.jobs)
     command = command or f"sd.evaluate_tuner({str(directory)!r}, {list(networks)!r})"
-    return _timed(
-        found, found.summary, lambda found, _: evaluation_document(found), command, started
-    )
+    return _timed(found, found.summary, partial(evaluation_document, found), command, started)
 
 
 def _timed(
     study: Any,
     summary: dict[str, Any],
-    document: Callable[[Any, dict[str, Any]], Any],
+    make_page: Callable[[], Document],
     command: str,
     started: float,
 ) -> AnalysisResult:
+    """Return the result of a study with its duration; `started` is of `time.perf_counter`."""
     seconds = time.perf_counter() - started
     made = Provenance(command, seconds=seconds)
-    return AnalysisResult(study, summary | {"wall_s": seconds}, document(study, summary), made)
+    return AnalysisResult(study, summary | {"wall_s": seconds}, make_page(), made)
