@@ -34,22 +34,23 @@ from stewart_drake.types import Array, ArrayLike
 
 _CONSTANT: Final = 1e-9
 """Range in rad, or relative to the largest position, below which a coordinate is constant."""
-_GRID: Final = 1e-3  # step at which the peak-to-peak of a sampled reference is read, s
-_INSTANT: Final = 1e-6
+_GRID: Final = 1e-3  # s, step at which the range of a motion is read
+_LEAST_LENGTH: Final = 1e-6
 """Least length of a piece, s; derivatives of a shorter one would be rounding errors."""
 _STOP_SPEED: Final = 1e-3
-"""rad/s or m/s; a motion that ends slower than this, or than the share below, is at rest."""
-_STOP_SHARE: Final = 0.05  # of the coordinate's largest speed at a sample
+"""Speed in rad/s or m/s up to which a motion ends at rest."""
+_STOP_SHARE: Final = 0.05
+"""The same as a share of the coordinate's largest speed at a sample; the larger one counts."""
 _GOLDEN: Final = (math.sqrt(5) - 1) / 2
 
 
 class PlateTrajectory(FunctionHandleTrajectory):
-    """Polynomials in pieces, then `then` or waves, computed in C (core/motion.h).
+    """Piecewise polynomials, followed by sines or another motion, computed in C (core/motion.h).
 
     Args:
         times: (n + 1,) begin of each piece and end of the last one, s.
-        coefficients: (degree + 1, n, 6), that of the highest power of the time in the piece first,
-            as of `scipy.interpolate.PPoly`.
+        coefficients: (degree + 1, n, 6) for powers of the time since the begin of the piece, the
+            highest first, as in `scipy.interpolate.PPoly`.
         then: the motion after the last piece, or None for offset + amplitude sin(frequency t).
         offset, amplitude: (6,) rad, m.
         frequency: (6,) rad/s.
@@ -60,7 +61,7 @@ class PlateTrajectory(FunctionHandleTrajectory):
     Attributes:
         times: as given.
         data: `stewart_motion *` for C, valid as long as this object.
-        keep_alive: arrays and structures that it points to.
+        keep_alive: arrays and structures that `data` points to.
     """
 
     def __init__(
@@ -84,10 +85,10 @@ class PlateTrajectory(FunctionHandleTrajectory):
         if then is not None and not pieces:
             raise ValueError("then: got a motion; expected one after pieces only")
         after, kept = (c.ffi.NULL, ()) if then is None else (then.data, then.keep_alive)
-        waves = (np.array(one, np.float64).tolist() for one in (offset, amplitude, frequency))
+        sines = (np.array(six, np.float64).tolist() for six in (offset, amplitude, frequency))
         tables = (c.at(self.times), c.at(powers)) if pieces else (c.ffi.NULL, c.ffi.NULL)
-        given = pieces, degree, *tables, after, *waves
-        self.data: Any = c.ffi.new("stewart_motion *", given)
+        fields = pieces, degree, *tables, after, *sines
+        self.data: Any = c.ffi.new("stewart_motion *", fields)
         self.keep_alive: list[Any] = [self.times, powers, self.data, *kept]
         derivative = partial(_derivative, self.data, self.keep_alive)
         super().__init__(partial(derivative, order=0), 6, 1, 0.0, math.inf)
@@ -101,8 +102,8 @@ class PlateTrajectory(FunctionHandleTrajectory):
         return rows
 
 
-def _derivative(data: Any, keep: list[Any], time: float, order: int) -> Array:
-    """Return a derivative (6, 1) of a motion in C; `keep` is what that points to."""
+def _derivative(data: Any, keep_alive: list[Any], time: float, order: int) -> Array:
+    """Return a derivative (6, 1) of a motion in C, which points to `keep_alive`."""
     c, values = core(), np.empty((order + 1, 6))
     c.lib.stewart_derivatives_of_motion(data, time, order + 1, c.at(values))
     return values[order].reshape(6, 1)
@@ -112,10 +113,10 @@ def _derivative(data: Any, keep: list[Any], time: float, order: int) -> Array:
 def make_reference(config: ReferenceConfig, duration: float) -> PlateTrajectory:
     """Return the motion of a section `reference`; each kind registers its own function.
 
-    Waypoints are left and reached at rest in the first, the last, and wherever two neighbours are
-    the same pose; in between the pose is twice continuously differentiable. A CSV motion is the
-    cubic spline through its samples, with third derivatives continuous next to its ends. Before
-    the first and after the last sample of either the pose is constant.
+    A motion through waypoints is at rest at the first, at the last, and at two equal neighbours. It
+    is twice continuously differentiable. A CSV motion is the cubic spline through its samples, with
+    continuous third derivatives at the second and the last but one. In both, the pose is constant
+    before the first and after the last sample.
 
     Raises:
         ConfigError: the samples or their file break a rule of `reference_files`, or a CSV motion
@@ -126,12 +127,12 @@ def make_reference(config: ReferenceConfig, duration: float) -> PlateTrajectory:
 
 @make_reference.register
 def _sine(config: SineConfig, duration: float) -> PlateTrajectory:
-    waves = {"amplitude": config.amplitude, "frequency": config.angular_frequency}
-    return PlateTrajectory(offset=config.offset, **waves)
+    amplitude, frequency = config.amplitude, config.angular_frequency
+    return PlateTrajectory(offset=config.offset, amplitude=amplitude, frequency=frequency)
 
 
 @make_reference.register
-def _constant(config: HoldConfig, duration: float) -> PlateTrajectory:
+def _hold(config: HoldConfig, duration: float) -> PlateTrajectory:
     return PlateTrajectory(offset=config.offset)
 
 
@@ -169,11 +170,11 @@ def poses_along(trajectory: Trajectory, times: Array) -> Array:
 
 
 def spread_instants(duration: float, number: int) -> Array:
-    """Return instants (number,) to sample a motion of unknown period, one in each equal part.
+    """Return instants (number,) in s to sample a motion of unknown period, from 0 on.
 
-    Evenly spaced ones may all have the same phase, such as the zeros of a sine of 0.5 Hz that is
-    sampled once a second. Within their parts these are placed by the golden sequence, so that the
-    phases are spread evenly for any period. The first one is 0; times are in s.
+    Evenly spaced instants may all have the same phase: a sine of 0.5 Hz is 0 at each whole second.
+    Here there is one instant in each of `number` equal parts, placed in it by the golden ratio, so
+    that the phases are spread evenly for any period.
     """
     k = np.arange(number)
     return duration / number * (k + k * _GOLDEN % 1)
@@ -207,10 +208,10 @@ def catch_up(
 ) -> Trajectory:
     """Return a reference that leaves the start state smoothly and ends on `reference`.
 
-    Up to `t_start` it keeps the constant rates of the start at t = 0, as a plate on which no torque
-    acts yet. Over the next `duration` it is the quintic that continues pose and rates with zero
-    acceleration and reaches pose, rates and accelerations of the reference; then it is the
-    reference. Below 1e-6 s `t_start` counts as 0.
+    Up to `t_start` it keeps the rates of the start at t = 0, as a plate on which no torque acts
+    yet. Over the next `duration` it is a quintic: this continues pose and rates with zero
+    acceleration, and reaches pose, rates and accelerations of the reference. Then it is the
+    reference. A `t_start` below 1e-6 s counts as 0.
 
     Returns:
         A 6x1 trajectory, defined for t >= 0, with derivatives of order 1 and 2.
@@ -220,15 +221,15 @@ def catch_up(
         raise ValueError(
             f"start_pose and start_rates have shapes {pose.shape} and {rates.shape}; expected (6,)"
         )
-    if not (0 <= t_start < math.inf and _INSTANT <= duration < math.inf):
+    if not (0 <= t_start < math.inf and _LEAST_LENGTH <= duration < math.inf):
         raise ValueError(
             f"got t_start {t_start}, duration {duration}; expected t_start >= 0, "
-            f"duration >= {_INSTANT}"
+            f"duration >= {_LEAST_LENGTH}"
         )
-    t_start = t_start if t_start >= _INSTANT else 0.0
+    t_start = t_start if t_start >= _LEAST_LENGTH else 0.0
     t_end = t_start + duration
-    leave = np.concatenate([pose + rates * t_start, rates, np.zeros(6)])
-    return through_states([(t_start, leave, t_end, evaluate(reference, t_end))], reference)
+    start = np.concatenate([pose + rates * t_start, rates, np.zeros(6)])
+    return through_states([(t_start, start, t_end, evaluate(reference, t_end))], reference)
 
 
 Piece = tuple[float, Array, float, Array]
@@ -238,26 +239,26 @@ Piece = tuple[float, Array, float, Array]
 def through_states(pieces: Sequence[Piece], reference: Trajectory) -> Trajectory:
     """Return quintics through given states, followed by `reference`, with two derivatives.
 
-    Before the first piece the pose is on the straight line with its first rates. Accelerations may
-    jump between two pieces.
+    Before the first piece the rates are constant, as at its start. Accelerations may jump between
+    two pieces.
     """
-    t_start, leave = pieces[0][:2]
+    t_start, start = pieces[0][:2]
     quintics = [_quintic(*piece) for piece in pieces]
     times = [t_start, *(piece[2] for piece in pieces)]
     if t_start > 0:
         line = np.zeros((6, 6))
-        line[-1], line[-2] = leave[POSE] - leave[RATES] * t_start, leave[RATES]
+        line[-1], line[-2] = start[POSE] - start[RATES] * t_start, start[RATES]
         times, quintics = [0.0, *times], [line, *quintics]
     powers = np.stack(quintics, axis=1)
     if isinstance(reference, PlateTrajectory):
         return PlateTrajectory(times, powers, reference)
     segments = []
-    for one, begin, end in (
+    for motion, begin, end in (
         (PlateTrajectory(times, powers), 0.0, times[-1]),
         (reference, times[-1], math.inf),
     ):
-        segments.append(FunctionHandleTrajectory(one.value, 6, 1, begin, end))
-        segments[-1].set_derivative(one.EvalDerivative)
+        segments.append(FunctionHandleTrajectory(motion.value, 6, 1, begin, end))
+        segments[-1].set_derivative(motion.EvalDerivative)
     return CompositeTrajectory(segments)
 
 
@@ -267,15 +268,11 @@ def _through_waypoints(config: WaypointsConfig, duration: float) -> PlateTraject
     from scipy.interpolate import CubicSpline  # slow to import
 
     times, poses = waypoints(config)
-    same = np.all(np.diff(poses, axis=0) == 0, axis=1)
-    rest = np.zeros(len(times), dtype=bool)
-    rest[[0, -1]] = True
-    rest[:-1] |= same
-    rest[1:] |= same
+    repeated = np.all(np.diff(poses, axis=0) == 0, axis=1)
+    at_rest = np.concatenate([[True], repeated]) | np.concatenate([repeated, [True]])
     knots = np.zeros((len(times), NUM_REFERENCE))
     knots[:, POSE] = poses
-    stops = np.flatnonzero(rest)
-    for first, last in itertools.pairwise(stops):
+    for first, last in itertools.pairwise(np.flatnonzero(at_rest)):
         part = slice(first, last + 1)
         spline = CubicSpline(times[part], poses[part], bc_type="clamped")
         inner = slice(first + 1, last)
@@ -292,8 +289,7 @@ def through_samples(times: Array, poses: Array, duration: float, file: str) -> P
     """Return the cubic spline through samples (n,), (n, 6), followed by the last pose."""
     from scipy.interpolate import CubicSpline  # slow to import
 
-    # The free ends follow the samples; prescribed rest would bend the first and last interval of
-    # a motion that was recorded on the move.
+    # A clamped spline would bend the first and last interval of a motion recorded on the move.
     cubic = CubicSpline(times, poses, bc_type="not-a-knot")
     end = float(times[-1])
     if end < duration:
@@ -313,14 +309,16 @@ def through_samples(times: Array, poses: Array, duration: float, file: str) -> P
 def _quintic(t0: float, start: Array, t1: float, end: Array) -> Array:
     """Return the coefficients (6, 6) of the quintic between two [pose; rates; accelerations].
 
-    With its Taylor series at the start up to the second power, and what that misses of the pose,
-    the rates and the accelerations at the end, p, v and a over h = t1 - t0:
-    c_3 = (10 p - 4 v h + a h^2 / 2) / h^3, and so on.
+    The Taylor series at the start gives c_0 to c_2. Over h = t1 - t0 these miss the pose at the end
+    by p, the rates by v / h and the accelerations by a / h^2, which gives c_3 to c_5:
+    c_3 h^3 = 10 p - 4 v + a / 2, and so on.
     """
     h = t1 - t0
     c0, c1, c2 = start[POSE], start[RATES], start[ACCELERATIONS] / 2
     p = end[POSE] - c0 - h * (c1 + h * c2)
     v = h * (end[RATES] - c1 - 2 * h * c2)
     a = h**2 * (end[ACCELERATIONS] - 2 * c2)
-    c3, c4, c5 = 10 * p - 4 * v + a / 2, -15 * p + 7 * v - a, 6 * p - 3 * v + a / 2
-    return np.array([c5 / h**5, c4 / h**4, c3 / h**3, c2, c1, c0])
+    c3 = (10 * p - 4 * v + a / 2) / h**3
+    c4 = (-15 * p + 7 * v - a) / h**4
+    c5 = (6 * p - 3 * v + a / 2) / h**5
+    return np.array([c5, c4, c3, c2, c1, c0])
