@@ -1,7 +1,7 @@
 """Export of a scenario's controller as a folder of C, with a test that replays a run of it.
 
-The sources are copies of those in core/ that the law uses. The configuration is generated, and so
-are the recorded inputs and outputs of the law in Python, for the test.
+The sources are copies of those in core/ that the law uses. The configuration is generated. The test
+replays inputs of the law that were recorded in Python, and compares its outputs.
 """
 
 import os
@@ -54,13 +54,14 @@ LINK: Final = ("link.h", "link.c")
 """Additional sources of core/ for the machine."""
 MOTION: Final = ("motion.h", "motion.c")
 """Additional sources of core/ for the scenario's motion."""
+MOTION_TEMPLATES: Final = ("stewart_motion.c", "stewart_motion.h")
 OVER_UDP: Final = (
     *("protocol.c", "protocol.h", "protocol_test.c", "udp.c", "udp.h"),
     *("stewart_example.c", "stewart_example.h", "stewart_udp.c"),
 )
-"""Templates of the controller over UDP, see `_not_over_udp`."""
+"""Templates of the controller over UDP, see `_no_udp_reason`."""
 MACHINE: Final = ("stewart_machine.c", "stewart_board.c", "stewart_board.h")
-"""Templates of the machine, see `_no_machine`."""
+"""Templates of the machine, see `_no_machine_reason`."""
 DIGESTS: Final = "exported.sha256"
 """Digests of the written files, for `sha256sum -c`."""
 TEMPLATES: Final = Path(__file__).with_name("templates")
@@ -68,7 +69,7 @@ README: Final = "README.md"
 TOLERANCES: Final = {"double": 1e-9, "float": 1e-3}
 """Tolerance of the replay, as a share of the peak."""
 MOST_IN_SINGLE: Final = 100
-"""Largest number of samples that a replay in single precision has.
+"""Largest number of samples of a replay in single precision.
 
 Later in `gravity`, rounding of 1e-6 in the predicted state, times gains of 700, exceeds 1e-3.
 """
@@ -91,7 +92,7 @@ MILLIONS: Final = {
 }
 """Million instructions of a step of `paper`, median and most, from the table of `make board`.
 
-The most of the last one is of a new search for the delay, which the table lacks.
+That table lacks the most of the last kind: it is of a new search for the delay.
 """
 _MACHINE: Final[Accepted] = {
     "sensor.kind": "state",
@@ -106,25 +107,30 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     """Return the text of the files of an export, by name.
 
     Args:
-        scenario: whose controller it is.
+        scenario: of the controller.
         single: whether numbers have single precision.
         measured: whether to compile and run it here, for the sizes in its README.
     """
     recorded, experiment = record(scenario), prepare(scenario)
     law, compiled, suffix = recorded.law, CompiledLaw(recorded.law), "f" if single else ""
-    servos, tuner = isinstance(law, ServoPreview), None
-    if not isinstance(law, ServoPreview):
-        source = weights_source(experiment, law)
-        tuner = None if source is None else source.compiled
-    not_over_udp = _not_over_udp(scenario, law)
-    no_machine, over_udp = not_over_udp or _no_machine(scenario), not not_over_udp
+    servos = isinstance(law, ServoPreview)
+    source = None if isinstance(law, ServoPreview) else weights_source(experiment, law)
+    tuner = None if source is None else source.compiled
+    no_udp_reason = _no_udp_reason(scenario, law)
+    no_machine_reason = no_udp_reason or _no_machine_reason(scenario)
+    over_udp, has_motion = not no_udp_reason, not no_udp_reason or recorded.moves
     sources = _sources(compiled, tuner)
-    names = {path.name for path in TEMPLATES.iterdir()}
-    names -= set() if over_udp else set(OVER_UDP)
-    names -= set(MACHINE) if no_machine else set()
-    moves = over_udp or recorded.moves
-    names -= set() if moves else {"stewart_motion.c", "stewart_motion.h"}
-    copied = *sources, *(() if no_machine else LINK), *(MOTION if moves else ())
+    copied, templates = [*sources], {path.name for path in TEMPLATES.iterdir()}
+    if not over_udp:
+        templates -= {*OVER_UDP}
+    if no_machine_reason:
+        templates -= {*MACHINE}
+    else:
+        copied += LINK
+    if has_motion:
+        copied += MOTION
+    else:
+        templates -= {*MOTION_TEMPLATES}
     files = {name: (FOLDER / name).read_text("utf-8") for name in copied}
     if single:
         del recorded.steps[MOST_IN_SINGLE:]
@@ -143,16 +149,14 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "finds_delay": scenario.controller.delay_estimator != "none",
         "wait": law.longest_wait if isinstance(law, PredictiveLqi) else 0,
         "over_udp": over_udp,
-        "not_over_udp": not_over_udp,
-        "no_machine": no_machine,
+        "no_udp_reason": no_udp_reason,
+        "no_machine_reason": no_machine_reason,
         "moves": recorded.moves,
         "sampled": event_time(law.timeline.period),
         "steps": recorded.steps,
         "queue": np.atleast_2d(recorded.first),
         "headers": [name for name in sources if name.endswith(".h") and name != "equations.h"],
-        "objects": [
-            name.replace(".c", ".o") for name in (*sources, "stewart_config.c") if ".c" in name
-        ],
+        "objects": [f"{name[:-2]}.o" for name in (*sources, "stewart_config.c") if ".c" in name],
         "configuration": Constants(
             compiled.keep_alive, core().symbols, suffix, compiled.data[0], "stewart_law"
         ),
@@ -168,20 +172,20 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     values["millions"] = MILLIONS[_kind(values)]
     if tuner is not None:
         values |= _tuner(tuner, compiled, recorded, experiment, suffix)
-    if moves:
+    if has_motion:
         values["motion"] = _motion(experiment, law)
     if over_udp:
-        # Samples that are kept: those of a report and of the wait for it.
+        # Number of samples in memory, a power of two: those of a report and of the wait for it.
         kept = 1 << (2 * values["wait"] + 63).bit_length()
         values |= {"identity": identity_of(scenario), "faults": FAULTS.values(), "kept": kept}
-    texts = _templates(suffix)
-    files |= {name: texts.get_template(name).render(values) for name in names - {README}}
+    environment = _environment(suffix)
+    files |= {name: environment.get_template(name).render(values) for name in templates - {README}}
     values["measured_sizes"] = _sizes(files) if measured else _UNMEASURED
-    return files | {README: texts.get_template(README).render(values)}
+    return files | {README: environment.get_template(README).render(values)}
 
 
 def _kind(values: Mapping[str, Any]) -> str:
-    """Return the kind of a law in MILLIONS."""
+    """Return the kind of a law in MILLIONS, from the values of the templates."""
     if values["finds_delay"]:
         return "delay estimator"
     if values["network"]:
@@ -189,9 +193,9 @@ def _kind(values: Mapping[str, Any]) -> str:
     return "plain" if values["law"].observer.settings is None else "estimator"
 
 
-def _templates(suffix: str) -> Environment:
-    """Return the templates, with filters for arrays."""
-    texts = Environment(
+def _environment(suffix: str) -> Environment:
+    """Return the environment of the templates, with filters for arrays."""
+    environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         variable_start_string="@",
         variable_end_string="@",
@@ -200,15 +204,15 @@ def _templates(suffix: str) -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    texts.filters |= {
+    environment.filters |= {
         "c": partial(numbers, suffix=suffix),
         "rows": partial(_rows, suffix=suffix),
     }
-    return texts
+    return environment
 
 
-def _not_over_udp(scenario: Scenario, law: PredictiveLqi | ServoPreview) -> str:
-    """Return the field that the protocol does not cover and why, in words; empty if it does."""
+def _no_udp_reason(scenario: Scenario, law: PredictiveLqi | ServoPreview) -> str:
+    """Return the first field that the protocol does not cover, and why; empty if it covers all."""
     samples = scenario.sensor.samples or 1
     if scenario.actuator.kind == "servo":
         return "`actuator.kind: servo`: rows of a datagram have six numbers, commands have 18"
@@ -223,8 +227,8 @@ def _not_over_udp(scenario: Scenario, law: PredictiveLqi | ServoPreview) -> str:
     return ""
 
 
-def _no_machine(scenario: Scenario) -> str:
-    """Return the field that the machine in C does not support, in words; empty if it does."""
+def _no_machine_reason(scenario: Scenario) -> str:
+    """Return the first field that the machine in C does not support; empty if it supports all."""
     if found := differing(scenario, _MACHINE):
         return f"`{found.field}: {found.got}`"
     return ""
@@ -250,10 +254,10 @@ def _tuner(
 ) -> dict[str, Any]:
     """Return the constants of a tuner in C, sizes of memory, and the reference of each sample."""
     c, period = core(), recorded.law.timeline.period
-    kept = [array for array in tuner.keep_alive if isinstance(array, np.ndarray)]
+    arrays = [array for array in tuner.keep_alive if isinstance(array, np.ndarray)]
     times = period * np.arange(len(recorded.steps))
     return {
-        "tuner": Constants(kept, {}, suffix, tuner.pointer[0], "tuner"),
+        "tuner": Constants(arrays, {}, suffix, tuner.pointer[0], "tuner"),
         "tuner_memory": c.lib.stewart_tuner_memory(tuner.pointer),
         "scratch": c.lib.stewart_tuned_step_scratch(compiled.data),
         "wanted": rows_along(experiment.reference, times)[:, :NUM_STATE],
@@ -261,7 +265,7 @@ def _tuner(
 
 
 def _motion(experiment: Experiment, law: Any) -> "Constants":
-    """Return the scenario's motion and its reference, a `stewart_known_motion`."""
+    """Return the planned motion and the reference, a `stewart_known_motion`."""
     planned = (servo_law if isinstance(law, ServoPreview) else control_law)(experiment)[1]
     motions = planned, experiment.reference
     known = KnownMotion(*motions, 0.0).compiled()
@@ -274,10 +278,10 @@ def _rows(rows: Iterable[Array], suffix: str) -> str:
 
 
 def write(files: Mapping[str, str], folder: Path) -> list[Path]:
-    """Write files to an existing folder or, on an error, none; return the paths of the written.
+    """Write files to an existing folder or, on an error, none; return the paths of those written.
 
-    Files that were `changed` since the last export are kept, others that this export has not are
-    removed.
+    Files that were `changed` since the last export are kept. Unchanged files of that export which
+    this one does not have are removed.
 
     Raises:
         ConfigError: another file would be replaced that no export has written.
@@ -312,7 +316,7 @@ def changed(folder: Path) -> list[str]:
 
 
 def _digests(folder: Path) -> dict[str, str]:
-    """Return the digest of each exported file in a folder, as it was written."""
+    """Return the digest of each exported file in a folder, as it was at the export."""
     listed = folder / DIGESTS
     lines = listed.read_text("utf-8").splitlines() if listed.exists() else []
     return {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
@@ -349,12 +353,12 @@ class Constants:
     """Initialiser of a C structure, and definitions of the data that it points to.
 
     Args:
-        keep: arrays and C structures that a pointer may refer to.
+        targets: arrays and C structures that a pointer may refer to.
         tables: names of the core's tables of functions, by address.
         suffix: of a number, `f` in single precision.
         data: the structure.
-        about: beginning of the names of its targets.
-        kind: type of the numbers that it points to.
+        prefix: beginning of the names of its targets.
+        number_type: type in C of the numbers that it points to.
 
     Attributes:
         text: initialiser of the structure.
@@ -363,69 +367,68 @@ class Constants:
 
     def __init__(
         self,
-        keep: Iterable[Any],
+        targets: Iterable[Any],
         tables: dict[int, str],
         suffix: str,
         data: Any,
-        about: str,
-        kind: str = "real",
+        prefix: str,
+        number_type: str = "real",
     ) -> None:
-        self._tables, self._suffix, self._type = tables, suffix, kind
-        self._arrays, self._structures, self._names = {}, {}, dict[int, str]()
-        for kept in keep:
-            if isinstance(kept, np.ndarray):
-                self._arrays[kept.ctypes.data] = kept
+        self._tables, self._suffix, self._number_type = tables, suffix, number_type
+        self._arrays, self._structures, self._defined = {}, {}, dict[int, str]()
+        for target in targets:
+            if isinstance(target, np.ndarray):
+                self._arrays[target.ctypes.data] = target
             else:
-                self._structures[address_of(kept)] = kept
+                self._structures[address_of(target)] = target
         self.before: list[str] = []
-        self.text = self._struct(data, about)
+        self.text = self._struct(data, prefix)
 
-    def _struct(self, data: Any, about: str) -> str:
-        fields = core().ffi.typeof(data).fields
+    def _struct(self, data: Any, name: str) -> str:
         parts = (
-            f".{name} = {self._value(getattr(data, name), field.type, f'{about}_{name}')}"
-            for name, field in fields
+            f".{part} = {self._value(getattr(data, part), field.type, f'{name}_{part}')}"
+            for part, field in core().ffi.typeof(data).fields
         )
         return "{" + ", ".join(parts) + "}"
 
-    def _value(self, value: Any, kind: Any, about: str) -> str:
-        if kind.kind == "struct":
-            return self._struct(value, about)
-        if kind.kind == "array":
-            return "{" + ", ".join(self._value(v, kind.item, about) for v in value) + "}"
-        if kind.kind in ("pointer", "function"):
-            return self._pointed(value, about)
-        return number(value, self._suffix) if kind.cname == "double" else str(int(value))
+    def _value(self, value: Any, ctype: Any, name: str) -> str:
+        if ctype.kind == "struct":
+            return self._struct(value, name)
+        if ctype.kind == "array":
+            return "{" + ", ".join(self._value(v, ctype.item, name) for v in value) + "}"
+        if ctype.kind in ("pointer", "function"):
+            return self._pointer(value, name)
+        return number(value, self._suffix) if ctype.cname == "double" else str(int(value))
 
-    def _pointed(self, value: Any, about: str) -> str:
-        """Return the initialiser of a pointer, and define its target."""
+    def _pointer(self, value: Any, name: str) -> str:
+        """Return the initialiser of a pointer; define its target under a name, once."""
         address = address_of(value)
         if address == 0:
             return "0"
         if address in self._tables:
             return f"&{self._tables[address]}"
-        if address in self._names:
-            return self._names[address]
+        if address in self._defined:
+            return self._defined[address]
         if address in self._arrays:
             values = numbers(self._arrays[address].ravel(), self._suffix)
-            self.before.append(f"static const {self._type} {about}[] = {values};")
-            return self._names.setdefault(address, about)
+            self.before.append(f"static const {self._number_type} {name}[] = {values};")
+            return self._defined.setdefault(address, name)
         pointer = self._structures[address]
-        kind = core().ffi.typeof(pointer).item.cname
-        text = self._struct(pointer[0], about)
-        self.before.append(f"static const {kind} {about} = {text};")
-        return self._names.setdefault(address, f"&{about}")
+        ctype = core().ffi.typeof(pointer).item.cname
+        text = self._struct(pointer[0], name)
+        self.before.append(f"static const {ctype} {name} = {text};")
+        return self._defined.setdefault(address, f"&{name}")
 
 
 def numbers(values: ArrayLike, suffix: str) -> str:
     """Return an array as an initialiser in braces, a scalar as a number."""
     array = np.asarray(values, dtype=np.float64)
-    found = [number(value, suffix) for value in array.ravel().tolist()]
-    return found[0] if array.ndim == 0 else f"{{{', '.join(found)}}}"
+    texts = [number(value, suffix) for value in array.ravel().tolist()]
+    return texts[0] if array.ndim == 0 else f"{{{', '.join(texts)}}}"
 
 
 def number(value: float, suffix: str) -> str:
-    """Return a number in C, exact in double precision."""
+    """Return a number as a constant in C, exact in double precision."""
     if not np.isfinite(value):
         return "NAN" if np.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
     return f"{value!r}{suffix}"
