@@ -169,13 +169,33 @@ static int start_of(const stewart_sensing *sensing, const real *y, const real *n
     return 1;
 }
 
+/* Set a hypothesis: state and parameters, each with the root of its covariance, and a delay eta with the
+   standard deviation `std`. L (n, n) is scratch. */
+static void set_hypothesis(int n, const real *state, const real *state_root, const real *theta,
+                           const real *theta_root, real eta, real std, real rate_std, real *L,
+                           stewart_hypothesis *hypothesis)
+{
+    const int p = n - X - 2;
+    stewart_copy(X, state, hypothesis->numbers);
+    stewart_copy(p, theta, hypothesis->numbers + X);
+    hypothesis->numbers[STEWART_ETA(n)] = eta;
+    hypothesis->numbers[STEWART_RATE(n)] = 0;
+    stewart_fill(n * n, 0, L);
+    for (int i = 0; i < X; i++)
+        stewart_copy(X, state_root + X * i, L + n * i);
+    for (int i = 0; i < p; i++)
+        stewart_copy(p, theta_root + p * i, L + n * (X + i) + X);
+    L[(n + 1) * STEWART_ETA(n)] = std;
+    L[(n + 1) * STEWART_RATE(n)] = rate_std;
+    stewart_hypothesis_set_root(n, L, hypothesis);
+}
+
 /* Begin from one measurement, with the master and a cell for every period so far. */
 static void begin(Search *s, const real *y, const real *near, stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
-    const int n = s->n, p = n - X - 2;
     stewart_hypothesis *master = hypothesis_at(s, 0);
-    real *L = stewart_take(&scratch, n * n), root[X * X], state[X];
+    real *L = stewart_take(&scratch, s->n * s->n), root[X * X], state[X];
     if (!start_of(d->filter.sensing, y, near, state, root, scratch))
         return;
     stewart_fill(STEWART_HYPOTHESIS, 0, (real *)master);
@@ -183,16 +203,7 @@ static void begin(Search *s, const real *y, const real *near, stewart_scratch sc
     master->fits = 1;
     master->timing = d->filter.timing_std * d->filter.timing_std;
     master->torques = FIRST_TORQUES;
-    stewart_copy(X, state, master->numbers);
-    stewart_copy(p, d->prior, master->numbers + X);
-    master->numbers[STEWART_ETA(n)] = STEWART_NEVER;
-    master->numbers[STEWART_RATE(n)] = 0;
-    stewart_fill(n * n, 0, L);
-    for (int i = 0; i < X; i++)
-        stewart_copy(X, root + X * i, L + n * i);
-    for (int i = 0; i < p; i++)
-        stewart_copy(p, d->filter.prior_root + p * i, L + n * (X + i) + X);
-    stewart_hypothesis_set_root(n, L, master);
+    set_hypothesis(s->n, state, root, d->prior, d->filter.prior_root, STEWART_NEVER, 0, 0, L, master);
     s->memory->known = s->memory->searching = 1;
     s->memory->cells = s->memory->best = 0;
     for (int k = 1; k <= s->last_period.view.num_own && (real)(k - 1) * d->period < d->longest; k++)
@@ -303,19 +314,9 @@ static void begin_at(const Search *s, const stewart_hypothesis *from, real eta, 
         for (int j = 0; j < p; j++)
             W[p * i + j] = L[n * (X + j) + i];
     stewart_add_root(p, X + p, R, W);
+    stewart_transpose(p, R);
     copy_hypothesis(n, from, hypothesis);
-    stewart_copy(X, state, hypothesis->numbers);
-    hypothesis->numbers[STEWART_ETA(n)] = eta;
-    hypothesis->numbers[STEWART_RATE(n)] = 0;
-    stewart_fill(n * n, 0, L);
-    for (int i = 0; i < X; i++)
-        stewart_copy(X, root + X * i, L + n * i);
-    for (int i = 0; i < p; i++)
-        for (int j = 0; j <= i; j++)
-            L[n * (X + i) + X + j] = R[p * j + i];
-    L[(n + 1) * STEWART_ETA(n)] = std;
-    L[(n + 1) * STEWART_RATE(n)] = d->rate_std;
-    stewart_hypothesis_set_root(n, L, hypothesis);
+    set_hypothesis(n, state, root, from->numbers + X, R, eta, std, d->rate_std, L, hypothesis);
     hypothesis->outliers = 0;
 }
 
@@ -420,10 +421,8 @@ static int jump(Search *s, const real *y, stewart_scratch scratch)
     periods[0].newest = 1;
     stewart_fill(number, 0, cost);
     for (int i = 0; i < 2; i++)
-        if (!start_of(d->filter.sensing, measured[i], hypothesis->numbers, states[i], roots[i], scratch))
-            return 0;
-    for (int i = 0; i < 2; i++)
-        if (!add_costs(s, periods + i, hypothesis, states[i], roots[i], measured[i + 1], number, cost, scratch))
+        if (!start_of(d->filter.sensing, measured[i], hypothesis->numbers, states[i], roots[i], scratch)
+            || !add_costs(s, periods + i, hypothesis, states[i], roots[i], measured[i + 1], number, cost, scratch))
             return 0;
     int tries = 0, lowest = -1;
     for (; tries < STARTS; tries++) {

@@ -5,7 +5,6 @@ replays inputs of the law that were recorded in Python, and compares its outputs
 """
 
 import os
-import re
 import shutil
 import subprocess
 import tempfile
@@ -120,17 +119,13 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     no_machine_reason = no_udp_reason or _no_machine_reason(scenario)
     over_udp, has_motion = not no_udp_reason, not no_udp_reason or recorded.moves
     sources = _sources(compiled, tuner)
-    copied, templates = [*sources], {path.name for path in TEMPLATES.iterdir()}
-    if not over_udp:
-        templates -= {*OVER_UDP}
-    if no_machine_reason:
-        templates -= {*MACHINE}
-    else:
-        copied += LINK
-    if has_motion:
-        copied += MOTION
-    else:
-        templates -= {*MOTION_TEMPLATES}
+    copied = *sources, *(() if no_machine_reason else LINK), *(MOTION if has_motion else ())
+    omitted = {
+        *(() if over_udp else OVER_UDP),
+        *(MACHINE if no_machine_reason else ()),
+        *(() if has_motion else MOTION_TEMPLATES),
+    }
+    templates = {path.name for path in TEMPLATES.iterdir()} - omitted
     files = {name: (FOLDER / name).read_text("utf-8") for name in copied}
     if single:
         del recorded.steps[MOST_IN_SINGLE:]
@@ -229,9 +224,8 @@ def _no_udp_reason(scenario: Scenario, law: PredictiveLqi | ServoPreview) -> str
 
 def _no_machine_reason(scenario: Scenario) -> str:
     """Return the first field that the machine in C does not support; empty if it supports all."""
-    if found := differing(scenario, _MACHINE):
-        return f"`{found.field}: {found.got}`"
-    return ""
+    found = differing(scenario, _MACHINE)
+    return f"`{found.field}: {found.got}`" if found else ""
 
 
 def _sources(compiled: CompiledLaw, tuner: Compiled | None) -> list[str]:
@@ -240,13 +234,6 @@ def _sources(compiled: CompiledLaw, tuner: Compiled | None) -> list[str]:
     for name in (*SOURCES, *compiled.sources, *([] if tuner is None else ["tuner"])):
         found |= dict.fromkeys([name] if "." in name else [f"{name}.h", f"{name}.c"])
     return list(found)
-
-
-def objects(files: Mapping[str, str]) -> list[str]:
-    """Return the objects of the controller in an export, as its Makefile names them."""
-    found = re.search(r"^STEWART = (.*)$", files["Makefile"], re.MULTILINE)
-    assert found is not None
-    return found[1].split()
 
 
 def _tuner(
