@@ -58,20 +58,15 @@ def measures_at(mechanism: Mechanism, pose: Array, crank_angles: Array | None = 
     return Measures(measures[:NUM_LEGS], parallel, float(pose[1]), float((signed - LEAST).min()))
 
 
-def margin(mechanism: Mechanism, pose: Array, crank_angles: Array | None = None) -> float:
+def margin(mechanism: Mechanism, pose: Array) -> float:
     """Return a margin, positive inside the workspace, zero on its boundary; NaN for NaN."""
-    if crank_angles is None:
-        return float(margins(mechanism, pose)[0])
-    return measures_at(mechanism, pose, crank_angles).margin
+    return float(margins(mechanism, pose)[0])
 
 
 def border(
     inside: Callable[[float], bool], low: float, high: float, tolerance: float
 ) -> tuple[float, float]:
-    """Bisect for a boundary between `low`, inside, and `high`, outside.
-
-    The two numbers returned are such a pair, closer than the tolerance.
-    """
+    """Bisect between `low`, inside, and `high`, outside, until they are closer than a tolerance."""
     while high - low > tolerance:
         middle = (low + high) / 2
         low, high = (middle, high) if inside(middle) else (low, middle)

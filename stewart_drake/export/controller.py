@@ -333,9 +333,6 @@ def _make(folder: str, command: Iterable[str], target: str) -> str:
     return done.stdout.rstrip().lstrip("\n")
 
 
-# ---------------------------------------------------------------- structures as text
-
-
 class Constants:
     """Initialiser of a C structure, and definitions of the data that it points to.
 

@@ -1,10 +1,10 @@
 """Distances between the parts of a machine.
 
 Drake computes them from the shapes of the model, pair by pair, without collision filters. Here rods
-have round ends, like the joints at them. For two long cylinders Drake's iteration stops early: at
-1 mm its error is 0.6 mm with flat ends and 0.09 mm with round ones. The distance of two rods is
-therefore computed in closed form: that of their centre lines less two radii, exact for capsules.
-The distance of a rod and a crank is Drake's, some tenths of a percent too large at most.
+have round ends, like the joints at them. Drake's iteration stops early for two long cylinders: at a
+distance of 1 mm its error is 0.6 mm with flat ends, 0.09 mm with round ones. The distance of two
+rods is therefore that of their centre lines in closed form less two radii, exact for capsules. The
+distance of a rod and a crank is Drake's, at most some tenths of a percent too large.
 """
 
 import re

@@ -40,7 +40,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import AffineSystem
 
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.dynamics.workspace import Failure, diagnose, margin
+from stewart_drake.dynamics.workspace import Failure, diagnose, measures_at
 from stewart_drake.files.arguments import fixed, of_kind
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.exact import ExactPlant, checked_loads, plate_of_mass
@@ -220,7 +220,7 @@ class PlateState(LeafSystem):
     def _watch(self, context: Context) -> EventStatus:
         tree = np.asarray(self._tree.Eval(context))
         angles = self._home_angles + tree[self._cranks]
-        if margin(self._mechanism, tree[self._pose], angles) > 0:
+        if measures_at(self._mechanism, tree[self._pose], angles).margin > 0:
             return EventStatus.DidNothing()
         return EventStatus.ReachedTermination(self, "the plate left its workspace")
 

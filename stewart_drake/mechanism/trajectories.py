@@ -212,9 +212,6 @@ def catch_up(
     yet. Over the next `duration` it is a quintic: this continues pose and rates with zero
     acceleration, and reaches pose, rates and accelerations of the reference. Then it is the
     reference. A `t_start` below 1e-6 s counts as 0.
-
-    Returns:
-        A 6x1 trajectory, defined for t >= 0, with derivatives of order 1 and 2.
     """
     pose, rates = np.asarray(start_pose, dtype=float), np.asarray(start_rates, dtype=float)
     if pose.shape != (6,) or rates.shape != (6,):

@@ -66,9 +66,6 @@ class Evaluation(NamedTuple):
         return self.names[len(self.family.gains) :]
 
 
-# ---------------------------------------------------------------- the runs
-
-
 def tuners_of(
     family: Family, networks: Sequence[str | Path]
 ) -> tuple[dict[str, Tuner], dict[str, dict[str, Any]]]:
@@ -155,9 +152,6 @@ def _nominal_errors(family: Family, tuners: dict[str, Tuner]) -> dict[str, dict[
         }
         for name, tuner in {"default": family.base.tuner, **tuners}.items()
     }
-
-
-# ---------------------------------------------------------------- the statistics
 
 
 def _compare(
