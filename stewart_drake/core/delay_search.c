@@ -324,8 +324,8 @@ static void begin_at(const Search *s, const stewart_hypothesis *from, real eta, 
    every delay of the grid. The period begins in a state with the root of its covariance. Returns 0 without a
    prediction. */
 static int add_costs(const Search *s, const stewart_period *t, const stewart_hypothesis *hypothesis,
-                   const real *state, const real *root, const real *y, int number, real *cost,
-                   stewart_scratch scratch)
+                     const real *state, const real *root, const real *y, int number, real *cost,
+                     stewart_scratch scratch)
 {
     const stewart_delay *d = s->delay;
     const stewart_sensing *sensing = d->filter.sensing;
