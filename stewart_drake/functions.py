@@ -231,7 +231,7 @@ def replay_log(log: str | Path, out: str | Path | None = None) -> str:
         out: file to write, if not None.
 
     Raises:
-        ConfigError: the file is no log of a run, or the log has no scenario.
+        ConfigError: not a log of a run, or one without its scenario.
     """
     from stewart_drake.reporting.replay import log_html
 

@@ -228,7 +228,7 @@ class CompiledLaw:
         c, law = core(), self.law
         after = Memory(memory.data.copy(), self, dict(memory.own))
         values, scratch = measurement.known(law.sensing.size), np.empty(self.scratch)
-        after.own["samples"] = after.own.get("samples", -1) + 1
+        after.own["sample"] = after.own.get("sample", -1) + 1  # its number, from 0
         self._own_parts.now = Step(after, motion, report)
         sample, _kept = self._sample(motion)
         sample.measurement = c.at(values)

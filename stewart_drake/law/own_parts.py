@@ -308,14 +308,14 @@ class OwnParts:
         self._computes = computes
 
     def _command(self, _servo: Any, theta: Array, row: Array, command: Array) -> int:
-        law, samples = self.law, self.now.memory.own["samples"]
+        law, sample = self.law, self.now.memory.own["sample"]
         if self._computes:
             try:
                 command[:] = law.command(row, theta)
             except UnreachablePoseError:
                 return int(core().lib.STEWART_UNREACHABLE)
         if law.learned is not None:
-            time = law.timeline.period * samples
+            time = law.timeline.period * sample
             command[POSE] += law.learned(time + law.preview_times)[0]
         return 0
 
