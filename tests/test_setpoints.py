@@ -7,6 +7,7 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.export.setpoints import ServoUnits, load_units, softened
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import data_root
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.preparation import prepare
@@ -175,3 +176,12 @@ def test_the_command_writes_the_file(tmp_path, capsys):
         said = capsys.readouterr().err
         assert said.count("\n") == 1 and (option == "--units" or f"error: {option}: got" in said)
     assert out.read_text() == kept
+
+
+@pytest.mark.parametrize(("duration", "says"), [(1.0, True), (6.0, False)])
+def test_a_file_that_ends_in_motion_says_so(duration, says):
+    """A move of 6 s that ends at rest, whole and cut."""
+    file = data_root() / "diagrams" / "moves" / "look_around.json"
+    move = f"reference={{kind: reachy_move, file: {file}}}"
+    scenario = sd.load_scenario("reachy_mini", settings=(move, f"duration={duration}"))
+    assert ("the last setpoint is in motion" in str(sd.setpoints(scenario))) == says

@@ -70,6 +70,10 @@ def load_units(path: str | Path) -> ServoUnits:
     return units
 
 
+_RESTING: Final = 0.02
+"""Crank speed of the last setpoint that counts as rest, as a share of the largest one."""
+
+
 @dataclass(frozen=True)
 class Setpoints:
     """Setpoints, each to be held until the next one."""
@@ -97,6 +101,12 @@ class Setpoints:
         if self.ends <= self.times[-1]:
             end = self.times[-1] + self.times[1]
             text += f"\nthe motion ends at {self.ends:.6g} s: its last pose is held up to {end:g} s"
+        last = np.abs(self.crank_rates[-1]).max()
+        if last > _RESTING * speed:
+            text += (
+                f"\nwarning: the last setpoint is in motion, at {last:.2g} rad/s: "
+                "choose a duration at whose end the motion rests"
+            )
         return text
 
     def csv(self, units: ServoUnits | None = None) -> str:

@@ -112,11 +112,15 @@ stewart_key udp_key(const char *path)
         key.size = fread(bytes, 1, sizeof bytes, file);
         fclose(file);
     }
+    if (path && !file) {
+        fprintf(stderr, "%s: cannot be read; expected a file with a key\n", path);
+        return key;
+    }
     while (key.size && (bytes[key.size - 1] == '\n' || bytes[key.size - 1] == '\r'))
         key.size--;
     if (path && (key.size < SHORTEST_KEY || key.size > LONGEST_KEY)) {
-        fprintf(stderr, "%s: got %u bytes or more; expected a key of %d to %d\n", path,
-                (unsigned)key.size, SHORTEST_KEY, LONGEST_KEY);
+        fprintf(stderr, "%s: got %s%u bytes; expected a key of %d to %d\n", path,
+                key.size > LONGEST_KEY ? "at least " : "", (unsigned)key.size, SHORTEST_KEY, LONGEST_KEY);
         key.size = 0;
     }
     return key;
