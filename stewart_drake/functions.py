@@ -248,6 +248,7 @@ def setpoints(
     *,
     plain: bool = False,
     start: Sequence[float] | None = None,
+    soft_end: bool = False,
     units: str | Path | None = None,
     controller: str | Path | None = None,
     settings: Iterable[str] = (),
@@ -263,6 +264,7 @@ def setpoints(
         out: CSV file to write, if not None.
         plain: whether to send the angles of the reference, without compensation.
         start: (6,) pose at which the plate rests at first, rad and m; None is the reference's.
+        soft_end: whether the motion comes to rest at the end of the duration.
         units: YAML file with the units of the servos (`export.setpoints.ServoUnits`), for `out`.
         controller: laid over the scenario's own; for a name or a path.
         settings: as `load_scenario` takes them; for a name or a path.
@@ -274,7 +276,7 @@ def setpoints(
         refuse({"units": units}, "without out; expected both or neither")
     servo_units = None if units is None else load_units(units)
     loaded = as_scenario(scenario, controller, settings)
-    made = make_setpoints(loaded, rate, plain=plain, start=start)
+    made = make_setpoints(loaded, rate, plain=plain, start=start, soft_end=soft_end)
     if out is not None:
         made.save(out, servo_units)
     return made

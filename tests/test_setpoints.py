@@ -179,9 +179,33 @@ def test_the_command_writes_the_file(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("duration", "says"), [(1.0, True), (6.0, False)])
-def test_a_file_that_ends_in_motion_says_so(duration, says):
+def test_a_move_that_is_cut_in_motion_says_so(duration, says):
     """A move of 6 s that ends at rest, whole and cut."""
     file = data_root() / "diagrams" / "moves" / "look_around.json"
     move = f"reference={{kind: reachy_move, file: {file}}}"
     scenario = sd.load_scenario("reachy_mini", settings=(move, f"duration={duration}"))
-    assert ("the last setpoint is in motion" in str(sd.setpoints(scenario))) == says
+    said = str(sd.setpoints(scenario))
+    assert ("the last setpoint is in motion" in said) == says
+    assert ("the motion goes on to 6 s, beyond the duration" in said) == says
+
+
+@pytest.mark.parametrize("start", ["on_reference", "rest"])
+def test_a_soft_end_comes_to_rest(start):
+    """The motion is that without it until the last second, and consistent with its rates."""
+    settings, rate = (f"start={start}",), 200.0
+    soft = sd.setpoints("reachy_mini", rate, soft_end=True, settings=settings)
+    plain = sd.setpoints("reachy_mini", rate, settings=settings)
+    before = soft.times < 7 - 1 / rate
+    assert np.abs(soft.angles[before] - plain.angles[before]).max() < 1e-12
+    assert np.abs(soft.crank_rates[-1]).max() < 1e-5 < 0.1 < np.abs(plain.crank_rates[-1]).max()
+    slopes = np.gradient(soft.cranks, 1 / rate, axis=0)[2:-2]
+    assert np.abs(slopes - soft.crank_rates[2:-2]).max() < 1e-3  # h^2 / 6 of the third derivative
+
+
+def test_the_torque_of_a_held_setpoint():
+    """The motion leads the angle of a setpoint by half of its period at most."""
+    made = sd.setpoints("reachy_mini", 50.0)
+    stiffness = sd.load_scenario("reachy_mini").actuator.stiffness
+    step = stiffness * np.abs(np.diff(made.angles, axis=0)).max() / 2
+    assert step == pytest.approx((made.steps - np.abs(made.torques)).max(), rel=0.1)
+    assert f"up to {made.steps.max():.3g} N m where it changes" in str(made)

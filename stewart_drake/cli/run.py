@@ -186,6 +186,9 @@ def setpoints(
         metavar="POSE",
         help="Pose where the plate rests: roll,pitch,yaw in rad, x,y,z in m.",
     ),
+    soft_end: bool = typer.Option(
+        False, "--soft-end", help="Come to rest at the end of the duration."
+    ),
     units: Path | None = typer.Option(
         None, metavar="FILE", help="Units of the servos: rad, deg or ticks, offset, sign."
     ),
@@ -201,6 +204,7 @@ def setpoints(
             *(chosen.scenario, rate, out),
             plain=plain,
             start=None if start is None else _pose(start),
+            soft_end=soft_end,
             units=units,
             controller=chosen.controller,
             settings=chosen.settings,

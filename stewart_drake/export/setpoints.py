@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -29,6 +29,7 @@ SHORTEST_BLEND: Final = 1.0
 """Shortest soft start, s; it is doubled until the motion keeps its limits."""
 _LARGEST_RATE: Final = 1000.0  # Hz
 _ROUNDING: Final = 1e-12
+_REVERSED: Final = np.repeat([1.0, -1.0, 1.0], 6)  # a motion (18,) backwards in time
 
 
 @section
@@ -83,8 +84,10 @@ class Setpoints:
     cranks: Array  # (n, 6) angles of the cranks in the middle of each period, rad
     crank_rates: Array  # (n, 6) rad/s
     torques: Array  # (n, 6) that the motion takes there from the servos, N m
-    blend: float  # length of the soft start, s; 0 without one
-    ends: float = math.inf  # end of a motion that is shorter than the duration, s
+    steps: Array  # (n, 6) largest torques of servos that hold the setpoints, N m
+    blend: float  # length of the soft start and the soft end, s; 0 without both
+    softens: str = "start"  # what is soft: "start", "end" or "start and end"
+    ends: float = math.inf  # end of a motion that has one, s
 
     def __repr__(self) -> str:
         return f"Setpoints({len(self.times)} of six cranks)"
@@ -93,20 +96,23 @@ class Setpoints:
         return self.table()
 
     def table(self) -> str:
-        """Return the largest torque and speed, and the soft start, as text."""
-        torque, speed = np.abs(self.torques).max(), np.abs(self.crank_rates).max()
+        """Return the largest torques and speed, and how the motion begins and ends, as text."""
+        torque, speed, step = (
+            np.abs(values).max() for values in (self.torques, self.crank_rates, self.steps)
+        )
+        end = self.times[-1] + self.times[1]
         text = f"every limit kept: largest torque {torque:.3g} N m, crank speed {speed:.3g} rad/s"
+        if step > torque:
+            text += f"\nservos that hold each setpoint give up to {step:.3g} N m where it changes"
         if self.blend:
-            text += f"\nsoft start: the motion joins the reference after {self.blend:g} s"
-        if self.ends <= self.times[-1]:
-            end = self.times[-1] + self.times[1]
+            text += f"\nsoft {self.softens}: {self.blend:g} s"
+        if self.ends < end - _ROUNDING:
             text += f"\nthe motion ends at {self.ends:.6g} s: its last pose is held up to {end:g} s"
+        if math.inf > self.ends > end + _ROUNDING:
+            text += f"\nwarning: the motion goes on to {self.ends:.6g} s, beyond the duration"
         last = np.abs(self.crank_rates[-1]).max()
-        if last > _RESTING * speed:
-            text += (
-                f"\nwarning: the last setpoint is in motion, at {last:.2g} rad/s: "
-                "choose a duration at whose end the motion rests"
-            )
+        if last > _RESTING * speed and "end" not in self.softens:
+            text += f"\nwarning: the last setpoint is in motion ({last:.2g} rad/s): see --soft-end"
         return text
 
     def csv(self, units: ServoUnits | None = None) -> str:
@@ -132,6 +138,7 @@ def make_setpoints(
     *,
     plain: bool = False,
     start: Sequence[float] | Array | None = None,
+    soft_end: bool = False,
 ) -> Setpoints:
     """Return the setpoints of a scenario's motion.
 
@@ -146,13 +153,15 @@ def make_setpoints(
 
         x(t) = x_0 + g(t / T) (r(t) - x_0),   g(s) = 10 s^3 - 15 s^4 + 6 s^5 up to s = 1, then 1.
 
-    T is 1 s, or 2, 4, .. s if the limits need it. What was learned is blended in alike.
+    T is 1 s, or 2, 4, .. s if the limits need it. What was learned is blended in alike. A soft end
+    is the same, backwards in time from rest at the reference's pose at the end.
 
     Args:
         scenario: whose motors are position servos.
         rate: of the setpoints, Hz.
         plain: whether to send the crank angles alone.
         start: (6,) pose at which the plate rests at t = 0, rad and m.
+        soft_end: whether the motion comes to rest at the end of the duration.
 
     Raises:
         ConfigError: bad input, or a motion beyond reach, or beyond the range, speed or torque of a
@@ -173,23 +182,27 @@ def make_setpoints(
     learned = learned_signal(experiment)
     if learned is not None:
         _check_learned(scenario, rate, plain)
-    if start is None and scenario.start == "on_reference":
-        return _along(experiment, None, 0.0, rate, plain, learned)
-    pose = experiment.start[POSE] if start is None else _checked(start, experiment)
-    blend = SHORTEST_BLEND
-    if scenario.duration < blend:
+    if start is not None:
+        start = _checked(start, experiment)
+    elif scenario.start == "rest":
+        start = experiment.start[POSE]
+    if start is None and not soft_end:
+        return _along(experiment, _Soft(), rate, plain, learned)
+    stop = evaluate(experiment.reference, scenario.duration)[POSE] if soft_end else None
+    soft = _Soft(start, stop, SHORTEST_BLEND, scenario.duration)
+    if scenario.duration < soft.blend:
         raise ConfigError(
-            f"duration: got {scenario.duration:g} s; expected at least {blend:g} s, the length of "
-            "the soft start, or a start on the reference"
+            f"duration: got {scenario.duration:g} s; expected at least {soft.blend:g} s, the length "
+            f"of the soft {soft.name}, or a start on the reference and no soft end"
         )
     while True:
         try:
-            return _along(experiment, pose, blend, rate, plain, learned)
+            return _along(experiment, soft, rate, plain, learned)
         except _BrokenLimit as broken:
-            # A slower start does not mend what the motion itself breaks later.
-            if broken.time > blend or 2 * blend > scenario.duration:
+            # A slower start or end does not mend what the motion between them breaks.
+            if not soft.at(broken.time) or 2 * soft.blend > scenario.duration:
                 raise ConfigError(str(broken)) from None
-            blend *= 2
+            soft = replace(soft, blend=2 * soft.blend)
 
 
 def _check_learned(scenario: Scenario, rate: float, plain: bool) -> None:
@@ -248,10 +261,48 @@ def softened(wanted: Array, pose: Array, time: float, blend: float) -> Array:
     )
 
 
+@dataclass(frozen=True)
+class _Soft:
+    """A soft start from one pose, and a soft end at another; None is without."""
+
+    start: Array | None = None
+    stop: Array | None = None
+    blend: float = 0.0  # s
+    end: float = math.inf  # of the motion, s
+
+    @property
+    def name(self) -> str:
+        named = (("start", self.start), ("end", self.stop))
+        return " and ".join(name for name, pose in named if pose is not None)
+
+    def at(self, time: float) -> bool:
+        """Return whether the motion is softened at a time in s."""
+        return (self.start is not None and time <= self.blend) or (
+            self.stop is not None and time >= self.end - self.blend
+        )
+
+    def motion(self, wanted: Array, time: float) -> Array:
+        """Return pose, rates and accelerations (18,) for those of the reference."""
+        if self.start is not None:
+            wanted = softened(wanted, self.start, time, self.blend)
+        if self.stop is not None:
+            backwards = softened(wanted * _REVERSED, self.stop, self.end - time, self.blend)
+            wanted = backwards * _REVERSED
+        return wanted
+
+    def share(self, times: Array) -> Array:
+        """Return the share of the reference in the motion at times in s."""
+        share = np.ones(len(times))
+        if self.start is not None:
+            share *= rise(times / self.blend)
+        if self.stop is not None:
+            share *= rise((self.end - times) / self.blend)
+        return share
+
+
 def _along(
     experiment: Experiment,
-    start: Array | None,
-    blend: float,
+    soft: _Soft,
     rate: float,
     plain: bool,
     learned: LearnedSignal | None,
@@ -263,9 +314,7 @@ def _along(
     times, (cranks, rates, torques) = np.arange(number) / rate, np.empty((3, number, NUM_TORQUES))
     for k, t in enumerate(times):
         middle = t + 0.5 / rate
-        x = evaluate(experiment.reference, middle)
-        if start is not None:
-            x = softened(x, start, middle, blend)
+        x = soft.motion(evaluate(experiment.reference, middle), middle)
         if failure := diagnose(mechanism, middle, x[POSE]):
             raise _BrokenLimit(middle, f"motion: {failure.reason} at t = {middle:.2f} s")
         angles = mechanism.crank_angles(x[POSE])
@@ -273,17 +322,21 @@ def _along(
         rates[k] = mechanism.jacobian(x[POSE]) @ x[RATES]
         torques[k] = dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
     setpoints = cranks
+    steps = np.abs(torques)
     if not plain:
         assert servo is not None
         setpoints = servo.setpoint(cranks, rates, torques)
+        # A period begins and ends half of it away from the angle for which the setpoint is.
+        steps = steps + servo.stiffness * np.abs(rates) * (0.5 / rate)
     if learned is not None:
         middles = times + 0.5 / rate
-        share = 1.0 if start is None else rise(middles / blend)[:, None]
-        setpoints = setpoints + share * learned(middles)
+        setpoints = setpoints + soft.share(middles)[:, None] * learned(middles)
     course = experiment.reference
     samples = course.times if isinstance(course, PlateTrajectory) else np.empty(0)
     ends = float(samples[-1]) if len(samples) else math.inf
-    found = Setpoints(times, setpoints, cranks, rates, torques, blend, ends)
+    found = Setpoints(
+        *(times, setpoints, cranks, rates, torques, steps, soft.blend), soft.name, ends
+    )
     _check(found, servo, experiment, rate)
     return found
 
