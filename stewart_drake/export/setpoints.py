@@ -192,8 +192,8 @@ def make_setpoints(
     soft = _Soft(start, stop, SHORTEST_BLEND, scenario.duration)
     if scenario.duration < soft.blend:
         raise ConfigError(
-            f"duration: got {scenario.duration:g} s; expected at least {soft.blend:g} s, the length "
-            f"of the soft {soft.name}, or a start on the reference and no soft end"
+            f"duration: got {scenario.duration:g} s; expected at least {soft.blend:g} s, the "
+            f"length of the soft {soft.name}, or a start on the reference and no soft end"
         )
     while True:
         try:
