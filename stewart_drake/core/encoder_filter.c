@@ -88,6 +88,7 @@ static int predict_readings(EncoderUpdate *s, const real *xi, stewart_scratch sc
     const stewart_encoders *encoders = s->encoders;
     const int n = a->n, last = s->coarse.number - 1;
     stewart_predict(f->machine, xi + X, &s->coarse, xi, s->states);
+    /* Fourth order where the pieces are long: one or two in the period. */
     if (!stewart_transitions(f->machine, xi, &s->coarse, s->coarse.number <= 2, s->states, X * n, s->H,
                              scratch))
         return 0;
@@ -105,7 +106,17 @@ static int predict_readings(EncoderUpdate *s, const real *xi, stewart_scratch sc
     return 1;
 }
 
-/* Return the causes of left-out values, and count the legs that do not fit. `present` as below. */
+/* Return the causes of left-out values as bits of a `fault`, and count in `gated_legs` the legs beyond the
+   gate. `present` (6 M) are the rows that have a value, before the test.
+
+       a sample was not read                              missing
+       samples of a leg are outliers within the period    rejected
+       else: a leg is beyond the gate at a node
+           and its code is constant                       frozen: the encoder does not follow the motion
+           and its code changes                           rejected
+
+   Only the last two count as gated: they may be a jump of the parameters, which filter.c tries. Outliers within
+   a period cannot. */
 static int causes_of(const EncoderUpdate *s, const int *present)
 {
     int causes = s->reading.missing ? STEWART_MISSING : 0;
@@ -114,12 +125,12 @@ static int causes_of(const EncoderUpdate *s, const int *present)
         int gated = 0;
         for (int row = leg; row < LEGS * s->encoders->nodes; row += LEGS)
             gated = gated || (present[row] && !s->is_used[row]);
-        s->attempt->gated_legs += gated && !s->reading.has_outliers[leg];
-        const int stuck = gated && s->attempt->history->unchanged[leg] > 0 && !s->reading.has_outliers[leg];
-        if (stuck)
-            causes |= STEWART_FROZEN;
-        if (s->reading.has_outliers[leg] || (gated && !stuck))
+        if (s->reading.has_outliers[leg]) {
             causes |= STEWART_REJECTED;
+        } else if (gated) {
+            s->attempt->gated_legs++;
+            causes |= s->attempt->history->unchanged[leg] > 0 ? STEWART_FROZEN : STEWART_REJECTED;
+        }
     }
     return causes;
 }
@@ -290,7 +301,8 @@ static int attempt_scratch(const stewart_filter *filter, int torques)
     const int N = encoders->samples, M = encoders->nodes, n = X + filter->machine->estimated;
     const int coarse = torques + M, fine = torques + N;
     const int timing = M * (LEGS + 1) * (torques + 1) + LEGS * M * LEGS * M;
-    const int legs = timing + (U + 1) * (coarse + fine) + 14 * N + X * fine + LEGS * M * (M + 1);
+    const int samples = N + N + 2 * LEGS * N; /* times, pieces; angles predicted and read */
+    const int legs = timing + (U + 1) * (coarse + fine) + samples + X * fine + LEGS * M * (M + 1);
     return legs + X * (n + 1) * coarse + stewart_kalman_scratch(n, LEGS * M) + N;
 }
 

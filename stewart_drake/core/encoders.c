@@ -131,7 +131,7 @@ static int start_of_encoders(const stewart_sensing *sensing, const real *values,
         std[leg] = encoders->std;
         for (int i = 0; i < 6 && !known[leg]; i++)
             std[leg] = (i ? std[leg] : 0) + REAL(fabs)(J[6 * leg + i]) * encoders->motion[i];
-        inverse[7 * leg] = 1;
+        inverse[(LEGS + 1) * leg] = 1; /* identity, which `stewart_solve` turns into J^-1 */
     }
     if (!stewart_solve(6, LEGS, J, inverse))
         return 0;
@@ -292,8 +292,10 @@ void stewart_read(const stewart_encoders *encoders, const real *values, const re
         const int changes = changes_of(encoders, angles, last, leg);
         if (encoders->quantum > 0 && number) {
             information = (real)changes / (real)number;
-            if (!changes)
-                information = 1 / ((1 + unchanged[leg]) * (1 + unchanged[leg]) * (real)number);
+            if (!changes) { /* 1 / (1 + c)^2 of a sample, see encoders.h */
+                const real root = 1 + unchanged[leg];
+                information = 1 / (root * root * (real)number);
+            }
             information = information < 1 ? information : 1;
         }
         for (int j = 0; j < M; j++)
@@ -329,5 +331,6 @@ void stewart_node_residuals(const stewart_encoders *encoders, const stewart_read
 
 int stewart_encoder_scratch(const stewart_encoders *encoders)
 {
-    return 2 * LEGS * 6 + 48 + encoders->samples;
+    const int forward = LEGS * 6 + LEGS + 6; /* of `stewart_forward_kinematics` */
+    return 2 * LEGS * 6 + forward + encoders->samples; /* J, inverse; residuals of a leg */
 }

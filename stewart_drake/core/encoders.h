@@ -42,7 +42,10 @@ void stewart_count_unchanged(const stewart_sensing *sensing, const real *values,
 
    Rounding to codes of width q has the variance q^2 / 12, but it is not white: a leg within one code
    has the same value at each sample. N samples therefore count as many as there are code changes among
-   them; after c periods without a change, as 1 / (1 + c)^2 of a sample. */
+   them; after c periods without a change, as 1 / (1 + c)^2 of a sample. The filter adds these as if they were
+   independent, but they repeat one rounding error: all of them together count for less than one sample, as
+
+       sum over c >= 1 of 1 / (1 + c)^2 = pi^2 / 6 - 1. */
 typedef struct {
     real *angles;   /* (N, 6) rad; NaN where they are left out */
     real *fit;      /* (6, M, M) V(s) (V'V)^-1 of each leg */

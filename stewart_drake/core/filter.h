@@ -44,7 +44,9 @@ typedef struct {
     const stewart_sensing *sensing;
     const stewart_encoder_step *encoder_step; /* of encoders; NULL for a measurement of the sample alone */
     int offsets;            /* place in theta of the first of six encoders' offsets; -1 for none */
-    real gate;              /* largest nu' S^-1 nu of m values that are not an outlier */
+    real gate;              /* largest nu' S^-1 nu of m values that are not an outlier: the 1 - 1e-6 quantile of
+                               chi-squared, 38.26 for m = 6, 50.83 for m = 12. An `encoder_step` does not use it:
+                               it tests each value by STEWART_LEG_GATE */
     real timing_std;        /* s, of the timing of a torque, before innovations correct it */
     int learns_timing;      /* whether innovations correct it */
     const real *model_std;  /* (12) error of one step of the model */
@@ -53,7 +55,7 @@ typedef struct {
     const real *walk_std;   /* (p) change of a parameter in a period; 0 for a constant */
     const real *jump_std;   /* (p) sudden change of a parameter; 0 for a constant; NULL for none */
     const real *wander_std; /* (p) assumed change in a period, if innovations show one (noise.h) */
-    real forgetting;        /* factor on the information about the noise, per period */
+    real forgetting;        /* factor on the information about the noise, per period dt: exp(-dt / 5 s) */
     const real *lower;      /* (n), infinite for the state */
     const real *upper;
 } stewart_filter;

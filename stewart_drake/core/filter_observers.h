@@ -6,7 +6,9 @@
 #include "filter.h"
 #include "observers.h"
 
-#define STEWART_LEG_GATE 30 /* largest squared residual of a leg, over its variance, that is used */
+/* Largest e^2 / S of a leg at a node that is used. Noise exceeds it with probability 4.3e-8, so that one of the
+   18 values of three nodes does with 8e-7. It is for one value; `gate` of filter.h is for all m at once. */
+#define STEWART_LEG_GATE 30
 
 /* Settings at `law->estimation`. In `filter`, leave machine, sensing and encoder_step unset: the observer fills
    them in from the law. */
