@@ -11,7 +11,6 @@
 enum {
     STEWART_HYPOTHESIS = 11,    /* numbers of a hypothesis without its mean and root */
     STEWART_DELAY_NUMBERS = 16, /* numbers of the memory without its arrays */
-    STEWART_MAX_SCHEDULE = 8,  /* torques that act in a period, at a rate of the delay within bounds */
 };
 
 /* Places of eta and eta_dot in xi = [x; theta; eta; eta_dot] (n). */

@@ -11,7 +11,7 @@
 #include "reference.h"
 #include "short.h"
 
-#define MOST_COUNTED ((real)1e6)
+#define MOST_COUNTED ((real)1e6) /* counts stop here: beyond 2^24 a float does not count on */
 
 /* ---- the memory ------------------------------------------------------------------------------- */
 
@@ -407,22 +407,25 @@ int stewart_step_scratch(const stewart_law *law)
     const stewart_channel *channel = law->channel;
     const int queue = law->design ? in_flight_length(law) + law->rows : stewart_queue_length(law);
     const int rows = ROW * law->rows, parts = 2 * queue + 2, most_pending = law->design ? queue : 1;
+    /* Each torque of a schedule takes U + 1 numbers, with its duration; a state X more. */
     const int known_delay = 2 * queue + 2 + (U + 1) * (parts + 2); /* of `fixed_delay_outlook` */
-    const int lag = (X + U + 1) * 2 * (law->longest_wait + 1);
+    const int lag = (X + U + 1) * 2 * (law->longest_wait + 1); /* of `estimate`: two torques in a period */
     const int course = 2 * rows + X * (queue + 2); /* of `stewart_follow` */
     const int sent = channel ? channel->scratch(law) : 0;
     const int gain = stewart_gain_scratch(&law->cost, law->fraction > 0);
     const int design = stewart_linearize_scratch() + gain;
-    const int feedback = U * (X + 7 + U * most_pending) + U * (1 + most_pending) + X * (X + U) +
-                         X * (parts + 1) + design;
+    const int order = X + 6 + U * most_pending; /* largest `stewart_order`: error, integral, pending torques */
+    const int gains = U * (order + 1); /* K, and a torque */
+    const int feedback = gains + U * (1 + most_pending) + X * (X + U) + X * (parts + 1) + design;
     const int planner = law->planner ? law->planner->scratch(law) : 0;
     const int part = planner > sent ? planner : sent;
     const int own = feedback > course ? feedback : course;
     const int followed = 3 * rows + law->rows + (own > part ? own : part);
     const int predicted = shares_prediction(law) ? X * (queue + 1) : 0;
     const int observer = law->observer->scratch(law);
-    /* `delayed_outlook` takes times and torques of the prediction and of the last period. */
-    const int outlook = law->observer->outlook ? (U + 2) * law->rows + 2 * (U + 1) * 8 : known_delay;
+    /* `delayed_outlook` takes times and torques of the prediction, and torques of two periods. */
+    const int two_periods = 2 * (U + 1) * STEWART_MAX_SCHEDULE;
+    const int outlook = law->observer->outlook ? (U + 2) * law->rows + two_periods : known_delay;
     return law->num_values + outlook + lag + predicted +
            (followed > observer ? followed : observer);
 }

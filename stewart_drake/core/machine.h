@@ -34,6 +34,9 @@ typedef struct {
     int substeps;          /* for each of them; 0: by the largest torque */
 } stewart_schedule;
 
+/* Largest number of torques that act in a period under an estimated delay, at a rate within bounds. */
+#define STEWART_MAX_SCHEDULE 8
+
 /* Functions in Python for `stewart_predict`, `stewart_limit` and `stewart_at_limit`. */
 typedef struct stewart_own_machine {
     void (*predict)(const stewart_machine *machine, const real *theta, const stewart_schedule *schedule,
