@@ -49,8 +49,8 @@ static inline void put(int how, real s, real *c)
     *c = how == STEWART_SET ? s : how == STEWART_ADD ? *c + s : *c - s;
 }
 
-/* Twelve named sums at a time: a compiler keeps these in the 16 double registers of a Cortex-M, but not
-   sums in an array. The endless loop prevents vectors over p; vectors are for several j. */
+/* Six columns of two rows at a time, as twelve named sums: a compiler keeps these in the 16 double registers
+   of a Cortex-M, but not sums in an array. The endless loop prevents vectors over p; vectors are for several j. */
 void stewart_two_rows(int how, int k, const real *a0, const real *a1, int next, const real *b,
                       int m, int columns, real *c0, real *c1)
 {
@@ -159,7 +159,7 @@ int stewart_solve(int n, int m, real *A, real *restrict B)
                 B[m * i + j] -= f * B[m * k + j];
         }
     }
-    for (int i = n - 1; i >= 0; i--) {
+    for (int i = n - 1; i >= 0; i--) { /* back substitution */
         for (int k = i + 1; k < n; k++)
             for (int j = 0; j < m; j++)
                 B[m * i + j] -= A[n * i + k] * B[m * k + j];
@@ -191,8 +191,9 @@ int stewart_cholesky(int n, real *A)
 }
 
 /* With phi(A) = sum A^k / (k+1)!,  exp(A) = 1 + A phi(A) and S = phi(A) B. The sum is taken for
-   |A| / 2^s <= 1/2 up to k = 11, in blocks of three, and then doubled s times:
-   S <- (1 + Phi) S, Phi <- Phi^2. */
+   |A| / 2^s <= 1/2 up to k = 11; the rest is below 1/2^12 / 13! = 4e-14. It is taken in blocks of three, by
+   Horner's rule in A^3, and then doubled s times: S <- (1 + Phi) S, Phi <- Phi^2. */
+#define MOST_DOUBLINGS 60 /* ends the loop for an infinite A */
 void stewart_exponential(int n, int m, const real *A, const real *B, real *Phi, real *S,
                          stewart_scratch scratch)
 {
@@ -200,7 +201,8 @@ void stewart_exponential(int n, int m, const real *A, const real *B, real *Phi, 
                                         5040, 40320, 362880, 3628800, 39916800, 479001600};
     real *A1 = stewart_take(&scratch, n * n), *A2 = stewart_take(&scratch, n * n);
     real *A3 = stewart_take(&scratch, n * n), *sum = stewart_take(&scratch, n * n);
-    real *next = stewart_take(&scratch, n * (n > m ? n : m)), size = 0, scale = 1;
+    real *next = stewart_take(&scratch, n * (n > m ? n : m));
+    real size = 0, scale = 1; /* 1-norm of A, 2^-s */
     int doublings = 0;
     for (int j = 0; j < n; j++) {
         real column = 0;
@@ -208,13 +210,13 @@ void stewart_exponential(int n, int m, const real *A, const real *B, real *Phi, 
             column += REAL(fabs)(A[n * i + j]);
         size = column > size ? column : size;
     }
-    for (; size * scale > (real)0.5 && doublings < 60; doublings++)
+    for (; size * scale > (real)0.5 && doublings < MOST_DOUBLINGS; doublings++)
         scale /= 2;
     for (int i = 0; i < n * n; i++)
         A1[i] = scale * A[i];
     stewart_multiply(n, n, n, A1, A1, A2);
     stewart_multiply(n, n, n, A2, A1, A3);
-    for (int block = 9; block >= 0; block -= 3) {
+    for (int block = 9; block >= 0; block -= 3) { /* sum <- sum A^3 + 1/f_0 + A/f_1 + A^2/f_2 */
         const real *f = factorials + block;
         if (block < 9)
             stewart_multiply(n, n, n, sum, A3, next);

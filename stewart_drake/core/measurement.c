@@ -26,7 +26,7 @@ void stewart_apply_jacobian(const stewart_sensing *sensing, const real *J, int k
         stewart_multiply_by_transpose(sensing->size, X, k, J, A, JA);
         return;
     }
-    for (int i = 0; i < X; i++)
+    for (int i = 0; i < X; i++) /* J = 1 */
         for (int j = 0; j < k; j++)
             JA[k * i + j] = A[X * j + i];
 }
@@ -43,7 +43,7 @@ int stewart_innovation_root(const stewart_sensing *sensing, const real *state, i
         for (int j = 0; j <= i; j++)
             for (int l = 0; l < X && sensing->jacobian; l++)
                 C[m * i + j] += J[X * i + l] * std[l] * std[l] * J[X * j + l];
-        if (!sensing->jacobian)
+        if (!sensing->jacobian) /* J = 1 */
             C[(m + 1) * i] += std[i] * std[i];
         C[(m + 1) * i] += sensing->noise_std[i] * sensing->noise_std[i];
     }
@@ -56,7 +56,7 @@ void stewart_whiten(int m, int n, const real *C, real *B)
         real *row = B + n * i;
         for (int k = 0; k < i; k++) {
             const real c = C[m * i + k];
-            for (int j = 0; j < n && c != 0; j++)
+            for (int j = 0; j < n && c != 0; j++) /* C of a measured state is nearly diagonal */
                 row[j] -= c * B[n * k + j];
         }
         for (int j = 0; j < n; j++)
@@ -96,7 +96,7 @@ static int is_small(const stewart_measurement *a, const real *change, stewart_sc
     real *change_of_values = stewart_take(&scratch, m);
     stewart_apply_jacobian(a->sensing, a->J, 1, change, change_of_values);
     for (int i = 0; i < m; i++) {
-        real variance = 0;
+        real variance = 0; /* (C C')_ii */
         for (int j = 0; j <= i; j++)
             variance += a->C[m * i + j] * a->C[m * i + j];
         if (!(REAL(fabs)(change_of_values[i]) <= SMALL_CORRECTION * REAL(sqrt)(variance))) /* or NaN */
@@ -105,6 +105,8 @@ static int is_small(const stewart_measurement *a, const real *change, stewart_sc
     return 1;
 }
 
+/* End the iterations, with the linearised prediction, if the correction changes it little. Otherwise predict again,
+   and end them if that agrees with the linearised prediction: the old H then holds at `updated`, too. */
 int stewart_measurement_relinearize(void *context, const real *xi, const real *updated, stewart_scratch scratch)
 {
     const stewart_measurement *a = context;

@@ -56,6 +56,7 @@ static int state_observe(const stewart_law *law, real *memory, int number, const
     const int fault = sensing.fault(&sensing, law->machine.geometry, law->period, values, last);
     const int had_state = stewart_all_finite(X, state);
     stewart_keep_last(law->num_values, values, last);
+    /* Without a state before there is nothing to predict from: it stays NaN. `start` copies the values. */
     if ((fault || !sensing.start(&sensing, values, had_state ? state : NULL, state, root, scratch))
         && had_state)
         stewart_predict_nominal(law, number, torques, state, scratch);

@@ -2,7 +2,7 @@
 
 #include "legs.h"
 
-#define DEAD_CENTRE_SINE ((real)0.01) /* core/layout.py */
+#define DEAD_CENTRE_SINE ((real)0.01) /* least sine of a crank's angle off dead centre, as in core/layout.py */
 
 int stewart_within_reach(const real *geometry, const real *pose, int strictly)
 {
@@ -11,6 +11,8 @@ int stewart_within_reach(const real *geometry, const real *pose, int strictly)
         const Leg leg = leg_of(geometry, i);
         real arm[3], q[3];
         joint_of(&leg, &turn, pose, arm, q);
+        /* From the tip of the crank, on a circle of radius u about the z axis, to the joint q, rho off that axis:
+           (rho - u)^2 + q_z^2 <= rod^2 <= (rho + u)^2 + q_z^2. */
         const real rho = REAL(hypot)(q[0], q[1]), u = leg.crank, square = leg.rod * leg.rod;
         const real least = (rho - u) * (rho - u) + q[2] * q[2], most = least + 4 * rho * u;
         const real margin = REAL(fmin)(square - least, most - square);
