@@ -44,9 +44,8 @@ typedef struct {
     const stewart_sensing *sensing;
     const stewart_encoder_step *encoder_step; /* of encoders; NULL for a measurement of the sample alone */
     int offsets;            /* place in theta of the first of six encoders' offsets; -1 for none */
-    real gate;              /* largest nu' S^-1 nu of m values that are not an outlier: the 1 - 1e-6 quantile of
-                               chi-squared, 38.26 for m = 6, 50.83 for m = 12. An `encoder_step` does not use it:
-                               it tests each value by STEWART_LEG_GATE */
+    real gate;              /* largest nu' S^-1 nu of m values that are not an outlier; for one in a million, 38.26 for
+                               m = 6; `encoder_step` tests single values instead */
     real timing_std;        /* s, of the timing of a torque, before innovations correct it */
     int learns_timing;      /* whether innovations correct it */
     const real *model_std;  /* (12) error of one step of the model */
