@@ -403,6 +403,17 @@ def test_wrong_commands_of_the_programs_in_c_are_one_line(arguments, expected, f
     assert done.stderr.count("\n") == 1 and done.stderr.startswith(expected)
 
 
+def test_a_controller_in_c_that_is_not_started_keeps_an_old_log(folder, tmp_path):
+    log = tmp_path / "run.csv"
+    log.write_text("old\n")
+    command = [str(folder / "stewart_udp"), "127.0.0.1", str(free_port()), f"log={log}"]
+    done = subprocess.run([*command, "armed"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and log.read_text() == "old\n"
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1 and "not started: the machine does not answer" in done.stdout
+    assert log.read_text() == "old\n"
+
+
 @pytest.mark.parametrize("program", ["stewart_machine", "stewart_udp"])
 def test_the_programs_in_c_print_their_usage(program, folder):
     command = [str(folder / program), "--help"]

@@ -67,8 +67,12 @@ def test_a_controller_in_c_of_another_machine_is_refused_by_both(folder):
         process(c_controller(folder, port)) as driving,
     ):
         assert driving.end() == 1
+    line = (
+        "not started: different mechanism (machine: paper_clear; controller: paper): export or "
+        "start both ends from the same mechanism file"
+    )
+    assert line in driving.lines
     names = "mechanism paper_clear", "mechanism paper"
-    assert "the machine has {}; this controller is designed for {}".format(*names) in driving.said
     assert "is designed for {1}; this machine has {0}".format(*names) in running.said
     assert "0 sessions" in running.said
 
@@ -105,8 +109,8 @@ def test_a_machine_in_c_refuses_a_controller_of_another_mechanism(folder):
         "mechanism paper_clear" in driving.said
     )
     line = (
-        "refused a controller: it is designed for mechanism paper_clear; this machine has "
-        "mechanism paper"
+        "refused a controller: different mechanism (machine: paper; controller: paper_clear): "
+        "export or start both ends from the same mechanism file"
     )
     assert running.lines.count(line) == 1
 

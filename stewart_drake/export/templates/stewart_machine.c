@@ -24,7 +24,9 @@
 #define LAST_DATAGRAMS 3     /* datagrams at the end: some may be lost */
 #define HOLDS @"0" if network and not law.channel.holds else "1"@ /* a dry buffer holds the last torque, or puts out zero */
 
-enum { LINK = STEWART_LINK_COMMANDS + 7 * STEWART_HISTORY + 9 * WAITING }; /* numbers of its memory */
+/* Numbers of memory of the buffer, as `stewart_link_memory`: past commands with a time, waiting ones with time to
+   act, sequence and arrival. */
+enum { LINK = STEWART_LINK_COMMANDS + (1 + STEWART_MOTORS) * STEWART_HISTORY + (3 + STEWART_MOTORS) * WAITING };
 
 typedef struct {
     int socket;
@@ -147,14 +149,16 @@ static void begin(machine *m)
     }
     const stewart_law *c = &stewart_configuration;
     int number = board_flags & STEWART_SIMULATION ? stewart_queue_rows : 0;
-    double early = ((double)c->fraction - (number > c->steps)) * (double)m->period;
-    static double torques[6 * WAITING];
+    /* The torque of sample k acts from sample k + steps + fraction on. The oldest one in a queue of steps + 1 rows is
+       of k = -steps - 1: it has acted since before the begin. */
+    double oldest_acts = ((double)c->fraction - (number > c->steps)) * (double)m->period; /* ns from the begin */
+    static double torques[STEWART_MOTORS * WAITING];
     m->time = m->begin;
     m->running = 1;
     board_release(m->begin);
-    for (int i = 0; i < 6 * number; i++) /* in flight; a real machine has nothing */
+    for (int i = 0; i < STEWART_MOTORS * number; i++) /* in flight; a real machine has nothing */
         torques[i] = (double)stewart_queue[i];
-    stewart_link_preload(&m->buffer, m->link, floor((double)m->begin + early + 0.5), number, torques);
+    stewart_link_preload(&m->buffer, m->link, floor((double)m->begin + oldest_acts + 0.5), number, torques);
     printf("the run began at %.3f s\n", 1e-9 * (double)m->begin);
 }
 
@@ -196,7 +200,7 @@ static void say(machine *m, uint64_t sampled)
     s.acted_from = s.history ? (uint64_t)m->link[STEWART_LINK_COMMANDS] : STEWART_NEVER;
     board_measure(sampled, s.state);
     for (int i = 0; i < s.history; i++)
-        memcpy(s.acted[i], m->link + STEWART_LINK_COMMANDS + 7 * i + 1, sizeof s.acted[i]);
+        memcpy(s.acted[i], m->link + STEWART_LINK_COMMANDS + (1 + STEWART_MOTORS) * i + 1, sizeof s.acted[i]);
     m->sent += (unsigned)udp_put(m->socket, data, stewart_write_measured(&s, m->key, data), &m->driver);
 }
 
@@ -222,10 +226,8 @@ static int greet(machine *m, const stewart_plan *request, const struct sockaddr_
     if (head->nonce != nonce && !stewart_may_answer(&m->offers, now))
         return STEWART_RATE;
     if (stewart_differing(&stewart_own_identity, &request->identity)) {
-        char why[512], own[160], other[160];
-        udp_differing(&stewart_own_identity, &request->identity, own, sizeof own);
-        udp_differing(&request->identity, &stewart_own_identity, other, sizeof other);
-        snprintf(why, sizeof why, "it is designed for %s; this machine has %s", other, own);
+        char why[UDP_DIFFERING];
+        udp_differing(&stewart_own_identity, &request->identity, why);
         refuse_aloud(m, head->session, why);
         nonce = 0;
     }
@@ -382,8 +384,12 @@ int main(int argc, char **argv)
     m.offers.tokens = STEWART_AT_ONCE;
     m.started = udp_now();
     m.period = (uint64_t)((double)stewart_configuration.period * SECOND + 0.5);
-    m.buffer = (stewart_link){6, WAITING, STEWART_HISTORY, 0, HOLDS, (double)m.period, 0,
-                              stewart_configuration.machine.torque_limit};
+    m.buffer = (stewart_link){.size = STEWART_MOTORS,
+                              .max_waiting = WAITING,
+                              .history = STEWART_HISTORY,
+                              .hold_when_dry = HOLDS,
+                              .period = (double)m.period,
+                              .limit = stewart_configuration.machine.torque_limit};
     put_back(&m);
     printf("a %s machine at port %s, every %.4g ms; Ctrl-C ends it\n",
            board_flags & STEWART_SIMULATION ? "simulated" : "real", argv[1], 1e-6 * (double)m.period);

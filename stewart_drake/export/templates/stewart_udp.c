@@ -6,11 +6,13 @@
    period of the machine{% if wait %}, with the newest measurement{% else %}: when the measurement of the sample is there, or is taken as lost{% endif %}.
    It ends after 1 s without a usable measurement. Without a key it talks to this computer only; a machine
    that does not say that it is a simulation is driven with `arm` only. The log has a row per sample; `age`
-   is the number of periods before the sample at which the measurement was taken. */
+   is the number of periods before the sample at which the measurement was taken. An old log is replaced once a
+   machine has answered. */
 
 #define _POSIX_C_SOURCE 200809L
 
 #include <arpa/inet.h>
+#include <errno.h>
 #include <limits.h>
 #include <math.h>
 #include <stdio.h>
@@ -29,6 +31,9 @@
 #define KEPT @kept@u  /* number of the last samples that are kept, a power of two */
 #define FURTHEST 4096 /* samples that a measurement may be ahead */
 #define SPARE (SECOND / 500) /* ns of waiting for a measurement beyond the usual time */
+/* Longest wait for a step, in multiples of `longest`: from step to step the period and the usual lateness, which are
+   each within `longest`, and one more for SPARE. It limits the wait if the times of a machine are wrong. */
+#define MOST_LONGEST 3
 {% if network %}
 #define OFF 8 /* torques in a row that are reported a period early or late */
 {% else %}
@@ -102,6 +107,7 @@ typedef struct {
     unsigned samples, missing, missed;
     unsigned unusable, causes[3]; /* measurements in a row; those missing, frozen, rejected */
     double seconds;
+    const char *log_name;
     FILE *log;
 } controller;
 
@@ -464,6 +470,16 @@ static void note_head(const controller *c)
     fprintf(c->log, ",age[periods]\n");
 }
 
+/* Replace an old log, if there is to be one; return why not, or NULL. */
+static const char *begin_log(controller *c)
+{
+    if (c->log && !(c->log = freopen(c->log_name, "w", c->log)))
+        return "the log cannot be written any more";
+    if (c->log)
+        note_head(c);
+    return NULL;
+}
+
 /* Write a row: the values at the sample, and what was sent. */
 static void note(const controller *c, double t, int age)
 {
@@ -522,7 +538,7 @@ static void step(controller *c, unsigned k)
 /* Return why a machine is not driven, or NULL. */
 static const char *objection(const controller *c)
 {
-    static char text[512], own[160], other[160];
+    static char text[UDP_DIFFERING];
     if (c->other_version) {
         snprintf(text, sizeof text, "the machine speaks protocol version %d; expected %d",
                  c->other_version, STEWART_PROTOCOL);
@@ -531,9 +547,7 @@ static const char *objection(const controller *c)
     if (!c->offered)
         return NULL;
     if (stewart_differing(&stewart_own_identity, &c->identity)) {
-        udp_differing(&stewart_own_identity, &c->identity, own, sizeof own);
-        udp_differing(&c->identity, &stewart_own_identity, other, sizeof other);
-        snprintf(text, sizeof text, "the machine has %s; this controller is designed for %s", other, own);
+        udp_differing(&c->identity, &stewart_own_identity, text);
         return text;
     }
     if (fabs((double)c->last.period - SECOND * (double)DESIGN.period) > 1e-6 * (double)c->last.period) {
@@ -651,8 +665,8 @@ static const char *drive(controller *c)
     }
     for (unsigned k = 0; k < number; k++) {
         uint64_t sampled = c->begin + k * c->period;
-        uint64_t until = latest(c, sampled), furthest = udp_now() + whole(3 * c->longest);
-        until = until < furthest ? until : furthest; /* odd times of a machine do not stop the controller */
+        uint64_t until = latest(c, sampled), furthest = udp_now() + whole(MOST_LONGEST * c->longest);
+        until = until < furthest ? until : furthest;
 {% if wait %}
         for (receive(c); udp_now() < until && !udp_interrupted(); receive(c))
             udp_wait(c->socket, until);
@@ -698,21 +712,23 @@ static int understood(controller *c, int argc, char **argv)
             if (!(c->key = udp_key(text + 4)).size)
                 return 0;
         } else if (strncmp(text, "log=", 4) == 0) {
-            if (!(c->log = fopen(text + 4, "w"))) {
-                perror(text);
-                return 0;
-            }
-            note_head(c);
+            c->log_name = text + 4;
         } else if (strcmp(text, "arm") == 0) {
             c->flags = STEWART_ARMED;
         } else {
             usable = 0;
         }
     }
-    if (usable && (c->key.size || ntohl(c->machine.sin_addr.s_addr) >> 24 == 127))
-        return 1;
-    fprintf(stderr, "expected: " USAGE "\n");
-    return 0;
+    if (!usable || !(c->key.size || ntohl(c->machine.sin_addr.s_addr) >> 24 == 127)) {
+        fprintf(stderr, "expected: " USAGE "\n");
+        return 0;
+    }
+    /* To append, for now: `begin_log` replaces an old log. */
+    if (c->log_name && !(c->log = fopen(c->log_name, "a"))) {
+        fprintf(stderr, "log=%s: %s\n", c->log_name, strerror(errno));
+        return 0;
+    }
+    return 1;
 }
 
 int main(int argc, char **argv)
@@ -746,7 +762,10 @@ int main(int argc, char **argv)
     for (unsigned i = 0; i < KEPT; i++)
         c.acted[i].period = INT_MIN;
     const char *problem = c.socket < 0 ? "no socket" : greet(&c);
-    if (!problem) {
+    if (!problem)
+        problem = begin_log(&c);
+    const int begins = !problem;
+    if (begins) {
         printf("begins at %.3f s of the machine, round trip %.2f ms\n", 1e-9 * (double)c.begin,
                1e-6 * shortest_trip(&c.times));
         warn_of_link(&c);
@@ -755,8 +774,11 @@ int main(int argc, char **argv)
     }
     for (int i = 0; i < 3 && c.session.nonce; i++)
         say(&c, STEWART_STOP, 0, 0, 0);
-    printf("%s after %u samples, %u of them without a@" new" if wait@ measurement, %u late\n",
-           problem ? problem : "completed", c.samples, c.missing, c.missed);
+    if (!begins)
+        printf("not started: %s\n", problem);
+    else
+        printf("%s after %u samples, %u of them without a@" new" if wait@ measurement, %u late\n",
+               problem ? problem : "completed", c.samples, c.missing, c.missed);
     udp_tell(c.refused);
     if (c.log)
         fclose(c.log);

@@ -181,14 +181,32 @@ void udp_reason(const stewart_reason *reason, const stewart_reason *before, char
         snprintf(text + used, size - used, ")");
 }
 
-void udp_differing(const stewart_identity *one, const stewart_identity *other, char *text, size_t size)
+/* The name of a part, with its digest where the other end has the same name. */
+static int put_part(const stewart_part *part, const stewart_part *other, char *text, size_t size)
+{
+    char digest[2 * STEWART_DIGEST + 1];
+    if (strcmp(part->name, other->name) != 0)
+        return snprintf(text, size, "%s", part->name);
+    for (int i = 0; i < STEWART_DIGEST; i++)
+        snprintf(digest + 2 * i, 3, "%02x", part->digest[i]);
+    return snprintf(text, size, "%s with digest %s", part->name, digest);
+}
+
+void udp_differing(const stewart_identity *machine, const stewart_identity *controller, char text[UDP_DIFFERING])
 {
     static const char *const names[STEWART_PARTS] = {"mechanism", "period", "sensor", "actuator"};
-    unsigned differing = stewart_differing(one, other);
-    size_t used = 0;
-    text[0] = 0;
-    for (unsigned i = 0; i < STEWART_PARTS && used < size; i++)
-        if (differing >> i & 1u)
-            used += (size_t)snprintf(text + used, size - used, "%s%s %s", used ? ", " : "", names[i],
-                                     one->parts[i].name);
+    unsigned differing = stewart_differing(machine, controller);
+    char *at = text, *end = text + UDP_DIFFERING; /* enough for all parts, whose names have up to STEWART_NAME bytes */
+    for (unsigned i = 0; i < STEWART_PARTS; i++) {
+        const stewart_part *one = &machine->parts[i], *other = &controller->parts[i];
+        if (!(differing >> i & 1u))
+            continue;
+        at += snprintf(at, (size_t)(end - at), "%sdifferent %s (machine: ", at == text ? "" : ", ", names[i]);
+        at += put_part(one, other, at, (size_t)(end - at));
+        at += snprintf(at, (size_t)(end - at), "; controller: ");
+        at += put_part(other, one, at, (size_t)(end - at));
+        at += snprintf(at, (size_t)(end - at), ")");
+    }
+    snprintf(at, (size_t)(end - at), ": export or start both ends from the same %s",
+             differing == 1 ? "mechanism file" : "scenario");
 }

@@ -56,7 +56,8 @@ void udp_tell(const unsigned *refused);
 /* Why torques do not act, in words. */
 void udp_reason(const stewart_reason *reason, const stewart_reason *before, char *text, size_t size);
 
-/* The parts of an identity that differ from another one's, by name. */
-void udp_differing(const stewart_identity *one, const stewart_identity *other, char *text, size_t size);
+/* What differs between a machine and a controller, what each has, and what to do, in one line. */
+#define UDP_DIFFERING 768
+void udp_differing(const stewart_identity *machine, const stewart_identity *controller, char text[UDP_DIFFERING]);
 
 #endif
