@@ -108,6 +108,8 @@ def test_a_motion_that_jumps_where_a_torque_acts_is_repeated(tmp_path):
     (tmp_path / "board").mkdir()
     said = make(exported(tmp_path / "board", "paper", (reference,)), "test")
     assert said.startswith("passed: 51 steps")
+    configuration = (tmp_path / "board" / "stewart_config.c").read_text()
+    assert "  file: motion.csv\n" in configuration and str(tmp_path) not in configuration
 
 
 @pytest.mark.slow
@@ -431,12 +433,13 @@ DESCRIBED = {
 }
 
 
+@pytest.mark.parametrize("single", [False, True])
 @pytest.mark.parametrize("case", DESCRIBED)
-def test_the_readme_is_that_of_the_composition(case, tmp_path):
+def test_the_readme_is_that_of_the_composition(case, single, tmp_path):
     """Its words, its files, and its wiring, which compiles as C and as C++."""
     name, controller, settings, present = DESCRIBED[case]
     settings = ("plant.kind=exact", "duration=0.2", *settings)
-    files = export_c.exported(load_scenario(name, controller, settings), measured=False)
+    files = export_c.exported(load_scenario(name, controller, settings), single, measured=False)
     export_c.write(files, tmp_path)
     readme = files["README.md"]
     for words in present:
@@ -463,7 +466,7 @@ def test_the_readme_is_that_of_the_composition(case, tmp_path):
     all_headers = "\n".join([included, *(f'#include "{name}"' for name in own)])
     other = f'extern "C" {{\n{all_headers}\n{declared}}}\n{rest}'
     (tmp_path / "wiring.cpp").write_text(other, encoding="utf-8")
-    strict = ["-pedantic", "-Wall", "-Wextra", "-Werror", "-fsyntax-only"]
+    strict = ["-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-fsyntax-only"]
     commands = [[*c_compiler(), "-std=c99", *strict, "wiring.c"]]
     if shutil.which("g++") is not None:
         initial = "-Wno-missing-field-initializers"

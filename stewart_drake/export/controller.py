@@ -5,12 +5,13 @@ replays inputs of the law that were recorded in Python, and compares its outputs
 """
 
 import os
+import re
 import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
-from functools import partial
+from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -24,6 +25,7 @@ from stewart_drake.dynamics.workspace import LEAST, home_sign
 from stewart_drake.export.recording import Recorded, record
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import replacing
+from stewart_drake.files.yamlio import yaml_text
 from stewart_drake.law.channel import Packets
 from stewart_drake.law.compiled import Compiled, address_of
 from stewart_drake.law.core_law import CompiledLaw
@@ -38,7 +40,7 @@ from stewart_drake.loop.tuner import weights_source
 from stewart_drake.mechanism.trajectories import rows_along
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
-from stewart_drake.scenario.loading import scenario_yaml
+from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array, ArrayLike
@@ -83,6 +85,8 @@ class Clock(NamedTuple):
 
 CLOCKS: Final = {False: Clock("Cortex-M7", 400.0), True: Clock("Cortex-M4", 168.0)}
 """By whether numbers have single precision."""
+LINE: Final = 110
+"""Length from which on a comment is above its line."""
 MILLIONS: Final = {
     "plain": (1.8, 2.1),
     "estimator": (2.9, 8.2),
@@ -99,6 +103,9 @@ _MACHINE: Final[Accepted] = {
     "controller.delay_estimator": "none",
 }
 """Values of the fields that the machine in C supports."""
+_STRUCTURE: Final = re.compile(r"^(?:typedef )?struct ?(\w*) \{\n(.*?)^\} ?(\w*);", re.M | re.S)
+_FIELD: Final = re.compile(r"^    [\w ]+[ *](\w+)(?:\[[^\]]*\])*; *(/\*.*?\*/)", re.M | re.S)
+"""Fields with a comment, one declared at a time."""
 _UNMEASURED: Final = "Not compiled here: run `make size` and `make test`.\n"
 
 
@@ -135,7 +142,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "law": law,
         "scenario": scenario,
         "experiment": experiment,
-        "scenario_yaml": scenario_yaml(scenario).replace("*/", "* /").strip(),
+        "scenario_yaml": _described(scenario),
         "real": "float" if single else "double",
         "tolerance": f"{TOLERANCES['float' if single else 'double']:g}",
         "servos": servos,
@@ -177,6 +184,20 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     files |= {name: environment.get_template(name).render(values) for name in templates - {README}}
     values["measured_sizes"] = _sizes(files) if measured else _UNMEASURED
     return files | {README: environment.get_template(README).render(values)}
+
+
+def _described(scenario: Scenario) -> str:
+    """Return a scenario for a comment in C; its files lose their folders, which only exist here."""
+    data = _without_folders(scenario_to_dict(scenario))
+    return yaml_text(data).replace("*/", "* /").strip()
+
+
+def _without_folders(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {name: _without_folders(value) for name, value in data.items()}
+    if isinstance(data, list):
+        return [_without_folders(value) for value in data]
+    return Path(data).name if isinstance(data, str) and Path(data).is_absolute() else data
 
 
 def _kind(values: Mapping[str, Any]) -> str:
@@ -333,8 +354,28 @@ def _make(folder: str, command: Iterable[str], target: str) -> str:
     return done.stdout.rstrip().lstrip("\n")
 
 
+@cache
+def _comments() -> dict[tuple[str, str], str]:
+    """Return the comment of each field of the core's structures, by structure and field."""
+    found = {}
+    for path in sorted(FOLDER.glob("*.h")):
+        for tag, body, name in _STRUCTURE.findall(path.read_text("utf-8")):
+            for field, comment in _FIELD.findall(body):
+                found[name or tag, field] = " ".join(comment.split())
+    return found
+
+
+def _explained(text: str, comment: str, indent: str) -> str:
+    """Return a line of C with its comment behind it or, if that is too long, above it."""
+    if not comment or len(text) + len(comment) < LINE:
+        return f"{indent}{text} {comment}".rstrip()
+    return f"{indent}{comment}\n{indent}{text}"
+
+
 class Constants:
     """Initialiser of a C structure, and definitions of the data that it points to.
+
+    Fields that have a comment in the core's headers have it here, too.
 
     Args:
         targets: arrays and C structures that a pointer may refer to.
@@ -368,18 +409,24 @@ class Constants:
         self.before: list[str] = []
         self.text = self._struct(data, prefix)
 
-    def _struct(self, data: Any, name: str) -> str:
-        parts = (
-            f".{part} = {self._value(getattr(data, part), field.type, f'{name}_{part}')}"
-            for part, field in core().ffi.typeof(data).fields
-        )
-        return "{" + ", ".join(parts) + "}"
+    def _struct(self, data: Any, name: str, indent: str = "") -> str:
+        ctype, inner = core().ffi.typeof(data), indent + "    "
+        structure = ctype.cname.removeprefix("struct ")
+        comments = [_comments().get((structure, part), "") for part, _ in ctype.fields]
+        texts = [
+            f".{part} = {self._value(getattr(data, part), field.type, f'{name}_{part}', inner)}"
+            for part, field in ctype.fields
+        ]
+        if not any(comments):
+            return "{" + ", ".join(texts) + "}"
+        lines = (_explained(f"{a},", b, inner) for a, b in zip(texts, comments, strict=True))
+        return "{\n" + "\n".join(lines) + f"\n{indent}}}"
 
-    def _value(self, value: Any, ctype: Any, name: str) -> str:
+    def _value(self, value: Any, ctype: Any, name: str, indent: str) -> str:
         if ctype.kind == "struct":
-            return self._struct(value, name)
+            return self._struct(value, name, indent)
         if ctype.kind == "array":
-            return "{" + ", ".join(self._value(v, ctype.item, name) for v in value) + "}"
+            return "{" + ", ".join(self._value(v, ctype.item, name, indent) for v in value) + "}"
         if ctype.kind in ("pointer", "function"):
             return self._pointer(value, name)
         return number(value, self._suffix) if ctype.cname == "double" else str(int(value))

@@ -39,6 +39,10 @@ static real tuner_memory[STEWART_TUNER_MEMORY];
 {% endif %}
 {% if moves %}
 #include "stewart_motion.h"
+
+/* Period of the recorded run, s. It is 1e-14 of itself short: samples came just before the plant's step of the same
+   time, and a motion that jumps there is read before the jump. */
+#define SAMPLED @sampled|float@
 {% else %}
 static real preview[STEPS][@"STEWART_PREVIEW * " if not servos@STEWART_REFERENCE] = {
     @steps|map(attribute="preview")|rows@};
@@ -62,7 +66,7 @@ static int answer(int k, real *found)
 {
     stewart_sample sample = {.measurement = measurement[k], .age = age[k]};
 {% if moves %}
-    double now = k * @sampled|float@;
+    double now = k * SAMPLED;
     sample.reference = stewart_look_ahead;
     sample.goal = stewart_look_back;
     sample.context = &now;

@@ -1,4 +1,4 @@
-/* The configuration of one controller, of the scenario
+/* The configuration of one controller, of the scenario below. Its files are named without their folders.
 
 @scenario_yaml@
 */
