@@ -289,8 +289,8 @@ def test_the_steps_of_encoders_cause_no_plans():
     def error(seed, *settings):
         codes = f"sensor={{kind: encoders, bits: 14, seed: {seed}}}"
         settings = (*fast, *small, *heavy, codes, *settings)
-        scenario = sd.load_scenario("paper", controller="predictor_lqi", settings=settings)
-        return sd.simulate(scenario).accumulated_error
+        scenario = load_scenario("paper", controller="predictor_lqi", settings=settings)
+        return simulate(scenario).accumulated_error
 
     seeds = range(1, 5)
     planned = np.mean([error(seed) for seed in seeds])

@@ -388,7 +388,7 @@ def test_an_error_of_a_part_is_raised():
         law.step(memory, Measurement.of(home[:12]), preview, np.ones(2))
 
 
-SPARE, UNTOUCHED = 500, 12345.678
+SPARE, UNTOUCHED = 5000, 12345.678
 
 
 class Painted:
@@ -432,23 +432,38 @@ def test_a_step_takes_no_more_scratch_than_stated(settings, monkeypatch):
     assert max(np.count_nonzero(array != UNTOUCHED) for array in used) > stated / 5
 
 
-def test_servos_take_no_more_scratch_than_stated_after_lost_measurements(monkeypatch):
-    """The filter goes over ten periods of 20 torques, and keeps their whole transition only."""
-    experiment = prepare(load_scenario("reachy_mini", "servo_feedforward"))
+@pytest.mark.parametrize(
+    ("name", "controller", "settings", "most"),
+    [
+        ("reachy_mini", "servo_feedforward", (), 24_000),
+        ("paper", "servo_preview", ("actuator.kind=servo", "controller.estimate=[]"), 6_000),
+    ],
+)
+def test_servos_take_no_more_scratch_than_stated_after_lost_measurements(
+    name, controller, settings, most, monkeypatch
+):
+    """The observer goes over ten periods of 20 torques, and keeps their whole transition only.
+
+    Without estimates it does so for the first measurement with a fault after the lost ones.
+    """
+    experiment = prepare(load_scenario(name, controller, settings=settings))
     law, painted = compose_servo_law(experiment), Painted()
     stated, motion = CompiledLaw(law).scratch, Preview(law.preview_times, np.zeros((1, 18)))
     monkeypatch.setattr(CompiledLaw, "scratch", stated + SPARE)
     monkeypatch.setattr(core_law, "np", painted)
-    report = np.zeros(law.reports.size)
+    report, nothing = np.zeros(law.reports.size), np.full(law.reports.size, np.nan)
     memory, lost = law.initial_memory(np.zeros(18)), np.full(12, np.nan)
     for k in range(2 + law.reports.periods):
-        y = lost if 1 < k < 1 + law.reports.periods else experiment.start
-        memory = law.step(memory, Measurement.of(y), motion, report)
+        missing = 1 < k < 1 + law.reports.periods
+        y = lost if missing else experiment.start + (k > 1 and bool(settings))
+        given = Measurement.of(y)
+        memory = law.step(memory, given, motion, nothing if missing and settings else report)
     assert memory.counts.measurements_missing == law.reports.periods - 1
+    assert memory.counts.measurements_rejected == bool(settings)
     used = [array for array in painted.kept if array.shape == (stated + SPARE,)]
     assert all((array[stated:] == UNTOUCHED).all() for array in used)
     written = max(np.count_nonzero(array != UNTOUCHED) for array in used)
-    assert stated / 2 < written and stated < 24_000
+    assert stated / 2 < written and stated < most
 
 
 def test_a_missing_preview_over_a_network_leaves_the_torques_as_they_are():

@@ -136,9 +136,9 @@ static int filtered_scratch(const stewart_law *law)
 {
     const stewart_sensing sensing = stewart_sensing_of(law);
     const stewart_filter filter = filter_of(law, &sensing);
-    const int most = law->parts > 0 ? law->parts * STEWART_REPORTED : 2; /* torques in a period */
-    return law->num_values + X + estimated(law) + (U + 1) * most + stewart_nominal_scratch(law) +
-           stewart_filter_scratch(&filter, most);
+    const int most = stewart_most_acting(law);
+    const int nominal = stewart_nominal_scratch(law), filtered = stewart_filter_scratch(&filter, most);
+    return law->num_values + X + estimated(law) + (U + 1) * most + (nominal > filtered ? nominal : filtered);
 }
 
 const stewart_observer stewart_filter_observer = {

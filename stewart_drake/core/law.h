@@ -201,6 +201,9 @@ int stewart_limit(const stewart_machine *machine, const real *torque, real *limi
 stewart_schedule stewart_schedule_of(real period, real fraction, int periods, const real *torques,
                                      stewart_scratch *scratch);
 
+/* Return the largest number of torques that act in the periods since the last measurement. */
+int stewart_most_acting(const stewart_law *law);
+
 /* Return the schedule of the last `periods` periods under the assumed delay, from torques (number, 6). */
 stewart_interval stewart_last_periods(const stewart_law *law, int number, const real *torques, int periods,
                                       stewart_scratch *scratch);

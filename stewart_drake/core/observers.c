@@ -14,7 +14,7 @@ void stewart_predict_nominal(const stewart_law *law, int number, const real *tor
 
 int stewart_nominal_scratch(const stewart_law *law)
 {
-    return (X + U + 1) * (law->parts > 0 ? law->parts : 2) + 2;
+    return (X + U + 1) * stewart_most_acting(law) + 2;
 }
 
 void stewart_keep_last(int number, const real *values, real *last)

@@ -38,6 +38,11 @@ stewart_schedule stewart_schedule_of(real period, real fraction, int periods, co
     return schedule;
 }
 
+int stewart_most_acting(const stewart_law *law)
+{
+    return law->parts > 0 ? law->parts * STEWART_REPORTED : 2;
+}
+
 stewart_interval stewart_last_periods(const stewart_law *law, int number, const real *torques, int periods,
                                       stewart_scratch *scratch)
 {
