@@ -214,7 +214,7 @@ def main() -> int:
     if packages:
         print(f"make board: missing, expected from apt-get install {' '.join(packages)}")
         return 1
-    lines = [f"| {' | '.join(HEADER)} |", "| --- | --- |" + " ---: |" * (len(HEADER) - 2)]
+    lines = [f"| {' | '.join(HEADER)} |", "|---|---|" + "---:|" * (len(HEADER) - 2)]
     exceeded: list[str] = []
     print("\n".join(lines), flush=True)
     for row in ROWS:
