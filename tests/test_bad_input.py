@@ -121,3 +121,16 @@ def test_every_field_with_a_range_is_there():
 def test_another_unit_is_noticed(setting, said):
     with pytest.raises(ConfigError, match=said):
         load_scenario("paper", settings=[setting])
+
+
+def test_the_file_of_a_machine_is_no_scenario_and_the_other_way_round(tmp_path):
+    """Each message says what the file is, and what the other names."""
+    root = data_root()
+    machine, scenario = (
+        root / "models" / "paper.yaml",
+        root / "diagrams" / "scenarios" / "paper.yaml",
+    )
+    with pytest.raises(ConfigError, match=r"paper\.yaml: got a mechanism; expected a scenario"):
+        load_scenario(machine)
+    with pytest.raises(ConfigError, match=r"paper\.yaml: got a scenario; expected a mech.*: paper"):
+        load_mechanism(scenario)

@@ -14,6 +14,7 @@ antennas:
                           "body_yaw": 0.0}, ...]}
 """
 
+import math
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -21,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.errors import ConfigError, resembling
 from stewart_drake.files.jsonio import load_json
 from stewart_drake.files.yamlio import brief
 from stewart_drake.mechanism.files import load_mechanism
@@ -37,6 +38,10 @@ HEAD_HEIGHT = 0.177
 _ROUNDING = 1e-3  # rotation matrices of the SDK are written with three digits
 _EXPECTED: Final = "a recorded move of Reachy Mini: `time` and `set_target_data` of equal length"
 _MAX_BYTES: Final = 100_000_000
+_TARGET: Final = "head", "body_yaw", "antennas"
+_LONGEST_STEP: Final = (
+    1.0  # s, mean time between samples; the SDK records some 50 to 100 per second
+)
 
 
 @lru_cache(maxsize=1)
@@ -107,6 +112,12 @@ def read_move(path: str | Path) -> tuple[Array, Array]:
     poses = np.array([_pose(t, f"{path}: set_target_data[{i}]") for i, t in enumerate(targets)])
     poses = poses.reshape(-1, len(COORDINATE_NAMES))
     times -= times[:1].sum()  # of no sample 0
+    if len(times) > 1 and times[-1] / (len(times) - 1) > _LONGEST_STEP:
+        step = times[-1] / (len(times) - 1)
+        raise ConfigError(
+            f"{path}: time: got steps of {step:.3g} s; expected at most {_LONGEST_STEP:g} s, "
+            "with times in s"
+        )
     poses[:, ANGLES] = np.unwrap(poses[:, ANGLES], axis=0)
 
     def place(row: int, name: str) -> str:
@@ -125,7 +136,12 @@ def _number(value: Any, where: str) -> float:
 def _pose(target: Any, where: str) -> Array:
     if not isinstance(target, dict) or "head" not in target:
         raise ConfigError(f"{where}: got {brief(target)}; expected an object with `head`")
+    for name in target:
+        if name not in _TARGET and (close := resembling(name, _TARGET)):
+            raise ConfigError(f"{where}: got key {brief(name)}; did you mean {close[0]}?")
     yaw = _number(target.get("body_yaw", 0.0), f"{where}.body_yaw")
+    if abs(yaw) > math.pi:
+        raise ConfigError(f"{where}.body_yaw: got {yaw:g}; expected -pi to pi rad")
     try:
         return pose_of_head(np.array(target["head"], dtype=np.float64), yaw)
     except (ValueError, TypeError):  # ConfigError is a ValueError; ragged lists and words too

@@ -166,7 +166,13 @@ def as_mechanism(given: Mechanism | str | Path) -> Mechanism:
 def mechanism_spec(name_or_path: str | Path) -> MechanismSpec:
     """Return the content of a mechanism's file, as far as it is well formed."""
     path = resolve("mechanism", name_or_path)
-    return validate(MechanismSpec, load_yaml(path), str(path))
+    data = load_yaml(path)
+    if "mechanism" in data and "home" not in data:
+        raise ConfigError(
+            f"{path}: got a scenario; expected a mechanism, such as its field mechanism names: "
+            f"{data['mechanism']}"
+        )
+    return validate(MechanismSpec, data, str(path))
 
 
 def mechanism_yaml(mechanism: Mechanism) -> str:

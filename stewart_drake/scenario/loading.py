@@ -134,6 +134,10 @@ def read_scenario(
     """Read a scenario and check its fields one by one only."""
     path = resolve("scenario", name_or_path)
     data = load_yaml(path)
+    if "home" in data and "mechanism" not in data:
+        raise ConfigError(
+            f"{path}: got a mechanism; expected a scenario, whose field mechanism names this file"
+        )
     _drop_foreign_nulls(data)
     idle = {one.field for one in idle_fields(validate(Scenario, data, str(path)))}
     places = dict.fromkeys(_dotted_names(data), str(path))
