@@ -50,7 +50,8 @@ def test_simulate_prints_a_verdict_and_a_table_and_writes_everything(tmp_path, c
     lines = out.splitlines()
     assert lines[0].startswith("this loop is stable: linearised along the reference")
     assert "the delay of 0.8 s can be compensated: under any controller" in " ".join(lines)
-    for word in ("completed", "E_ac", "floor", "peak error", "torque", "controller step", "wall"):
+    errors = "E_ac", "floor", "peak error", "rms error"
+    for word in ("completed", *errors, "torque", "controller step", "wall"):
         assert word in out
     assert files(tmp_path) == RUN_FILES | {"parameters.png", "parameters.svg"}
     assert summary_in(tmp_path)["status"] == "completed"

@@ -12,6 +12,7 @@ from matplotlib.image import imread
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.loop.simulation import simulate
+from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.reporting.figures import draw_comparison, draw_run
 from stewart_drake.reporting.run import run_document
 from stewart_drake.reporting.style import (
@@ -131,6 +132,27 @@ def test_a_run_stopped_before_its_first_sample_can_be_drawn(run):
     assert list(drawn) == ["states", "errors", "torques"]
     assert draw_comparison({}) == {}
     assert "peak error" in run_document(nothing).plain()
+
+
+def test_the_rms_error_is_an_angle_and_a_distance_after_the_first_half(run):
+    """The plate is turned by 2 degrees about an axis of its own, and 3 mm away."""
+    turned = run.signals.copy(deep=True)
+    n = len(turned.time)
+    turned["reference"][:, :3], turned["reference"][:, 3:] = [0.3, -0.4, 1.2], [0, 0, 0.3]
+    axis, R = np.array([2.0, 1.0, -2.0]) / 3, rotation(np.array([0.3, -0.4, 1.2]))
+    K = np.cross(np.eye(3), -axis)  # K v = axis x v
+    angle = np.radians(2)
+    R = R @ (np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
+    roll, yaw = np.arctan2(R[2, 1], R[2, 2]), np.arctan2(R[1, 0], R[0, 0])
+    turned["pose"][: n // 2] = 1.0
+    turned["pose"][n // 2 :, :3] = [roll, np.arcsin(-R[2, 0]), yaw]
+    turned["pose"][n // 2 :, 3:] = [3e-3, 0, 0.3]
+    there = run_document(dataclasses.replace(run, signals=turned)).plain()
+    assert "rms error  2.0 deg, 3.0 mm in the second half" in re.sub(" {3,}", "  ", there)
+    turned["pose"][-1] = np.nan
+    assert "2.0 deg, 3.0 mm" in run_document(dataclasses.replace(run, signals=turned)).plain()
+    lost = dataclasses.replace(run, signals=turned, status="left_workspace")
+    assert "rms error" not in run_document(lost).plain()
 
 
 def test_rounding_is_no_motion(run):

@@ -137,7 +137,7 @@ def test_still_coordinates_do_not_dilute_the_error(amplitude, moved, words):
     assert mean_error(run) == pytest.approx(whole / moved / left, rel=1e-4)
     text, _ = report_document.verdict(collect_of(run.scenario, run=run))
     assert re.search(words, text)
-    still = run_document(run).plain().partition("peak error")[2].split("torque")[0]
+    still = run_document(run).plain().partition("peak error")[2].split("rms error")[0]
     assert still.count("deg") == 3 and still.count("mm") == (3 if moved == 6 else 2)
 
 

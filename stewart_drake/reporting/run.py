@@ -6,6 +6,7 @@ from dataclasses import fields
 from typing import Any, Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stewart_drake.loop.preparation import assemble, check_instants
 from stewart_drake.loop.results import LEAST_MEASURED, SimulationResult
@@ -68,6 +69,7 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
         run=result,
         s=s,
         peaks=", ".join(_peaks(result)),
+        second_half=_second_half(result),
         estimates=_estimates(result),
         least=LEAST_MEASURED,
         # the sum of others is left out
@@ -113,6 +115,23 @@ def _peaks(run: SimulationResult) -> list[str]:
         else f"{name} {number(round(FACTORS[k] * percent[k] / 100, 9))} {UNITS[k]}"
         for k, name in enumerate(COORDINATE_NAMES)
     ]
+
+
+def _second_half(run: SimulationResult) -> str:
+    """Return the rms errors of angle and distance in the second half; empty for a lost run.
+
+    The angle is that of the rotation between the reference and the plate.
+    """
+    both = np.stack([run.signals.pose.values, run.signals.reference.values])
+    later = both[:, both.shape[1] // 2 :]
+    poses, wanted = later[:, np.isfinite(later).all(axis=(0, 2))]  # live may miss measurements
+    if run.status != "completed" or not len(poses):
+        return ""
+    R, R_wanted = (Rotation.from_euler("xyz", one[:, ANGLES]) for one in (poses, wanted))
+    angles = (R_wanted.inv() * R).magnitude()
+    distances = np.linalg.norm(poses[:, POSITION] - wanted[:, POSITION], axis=1)
+    angle, distance = (math.sqrt(np.mean(error**2)) for error in (angles, distances))
+    return f"{number(math.degrees(angle), 2)} deg, {number(1e3 * distance, 2)} mm"
 
 
 def worst(run: SimulationResult) -> str:
