@@ -16,7 +16,7 @@ from stewart_drake.files.resources import data_root, shipped
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.reporting.results import ComparisonResult
-from stewart_drake.reporting.run import _shared_warnings
+from stewart_drake.reporting.run import _shared_warnings, comparison_document
 from stewart_drake.scenario.loading import load_comparison, load_scenario
 from stewart_drake.studies.compare import (
     ADAPTIVE,
@@ -69,6 +69,14 @@ def test_a_lost_run_of_a_stable_loop_is_explained(results):
     assert why not in ComparisonResult(results).table()
     lost = replace(results["predictor_lqi"], status="left_workspace")
     assert why in ComparisonResult(results | {"predictor_lqi": lost}).table()
+
+
+def test_controllers_of_torques_beside_servos_are_explained():
+    settings = ("plant.kind=exact", "duration=0.1")
+    for chosen, said in ((("servo_preview",), False), (("predictor_lqi", "servo_preview"), True)):
+        runs = compare("reachy_mini", settings, controllers=chosen)
+        text = " ".join(comparison_document(runs).plain().split())
+        assert ("torques are shown on the same machine with plain motors" in text) == said
 
 
 def test_saved_files_are_complete(results, tmp_path):

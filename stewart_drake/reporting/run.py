@@ -186,6 +186,7 @@ def comparison_document(
         runs=[_row(title, name, run) for title, name, run in runs],
         loops=[(name, label(name), loop_word(margin)) for name, margin in margins.items()],
         surprising=any(margin and margin["stable"] for margin in lost),
+        both=len({run.scenario.controller.command for run in results.values()}) > 1,
         cautions=[text for text in _shared_warnings(results) if text not in said],
         **context,
     )
