@@ -31,9 +31,9 @@ from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.logs import Precision, read_log
 from stewart_drake.law.belief import Estimate
+from stewart_drake.law.gaps import longest_gap, stays_within_reach
 from stewart_drake.law.stability import Margins
 from stewart_drake.live import contact as contacts
-from stewart_drake.live.checks import stays_within_reach
 from stewart_drake.live.contact import Contact, Link, address_of, await_free, call, open_endpoint
 from stewart_drake.live.design import Design, as_seen, check_controller, design
 from stewart_drake.live.endpoint import Endpoint
@@ -511,6 +511,10 @@ def test_without_forces_the_limit_is_where_three_deviations_of_a_rate_lead():
         estimate = Estimate(mean, covariance)
         within = stays_within_reach(made.plant, estimate, np.zeros(6), share * longest)
         assert within == (share < 1)
+    twice = Estimate(mean, 4 * covariance)
+    found = longest_gap(made.plant, twice, np.zeros(6), 0.2)
+    assert longest / 2 - 0.2 - 0.8 / 20 < found <= longest / 2 - 0.2 < 1.0
+    assert longest_gap(made.plant, estimate, np.zeros(6), 0.2) == 1.0
 
 
 def law_of(gravity):

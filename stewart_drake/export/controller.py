@@ -4,6 +4,7 @@ The sources are copies of those in core/ that the law uses. The configuration is
 replays inputs of the law that were recorded in Python, and compares its outputs.
 """
 
+import math
 import os
 import re
 import shutil
@@ -32,6 +33,7 @@ from stewart_drake.law.core_law import CompiledLaw
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ServoPreview
+from stewart_drake.loop.controller_margin import controller_margin
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.peer import FAULTS, MOST_ROWS, MOST_SAMPLES, identity_of
 from stewart_drake.loop.preparation import Experiment, prepare
@@ -43,6 +45,7 @@ from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.scenario.timing import event_time
+from stewart_drake.studies.verdict import loop_verdict
 from stewart_drake.types import Array, ArrayLike
 
 SOURCES: Final = (
@@ -115,7 +118,8 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     Args:
         scenario: of the controller.
         single: whether numbers have single precision.
-        measured: whether to compile and run it here, for the sizes in its README.
+        measured: whether to judge the loop, and to compile and run the controller here, for the
+            margins and the sizes in its README.
     """
     recorded, experiment = record(scenario), prepare(scenario)
     law, compiled, suffix = recorded.law, CompiledLaw(recorded.law), "f" if single else ""
@@ -156,6 +160,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "moves": recorded.moves,
         "sampled": event_time(law.timeline.period),
         "steps": recorded.steps,
+        "gap": math.floor(1e3 * recorded.gap) / 1e3,
         "queue": np.atleast_2d(recorded.first),
         "headers": [name for name in sources if name.endswith(".h") and name != "equations.h"],
         "objects": [f"{name[:-2]}.o" for name in (*sources, "stewart_config.c") if ".c" in name],
@@ -183,6 +188,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     environment = _environment(suffix)
     files |= {name: environment.get_template(name).render(values) for name in templates - {README}}
     values["measured_sizes"] = _sizes(files) if measured else _UNMEASURED
+    values["stability"] = loop_verdict(controller_margin(experiment)) if measured else ""
     return files | {README: environment.get_template(README).render(values)}
 
 

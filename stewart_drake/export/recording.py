@@ -11,6 +11,7 @@ from stewart_drake.files.resources import shipped
 from stewart_drake.files.schema import plain
 from stewart_drake.law.channel import Report
 from stewart_drake.law.coverage import uncovered
+from stewart_drake.law.gaps import LONGEST_GAP, longest_gap
 from stewart_drake.law.motion import Motion
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
@@ -26,6 +27,8 @@ EXPORTED: Final = (
 """Shipped controllers that are exported."""
 REPLAYED: Final = 10.0
 """Longest part of a run that the test replays, s."""
+_JUDGED: Final = 0.1
+"""Time between two samples at which the longest gap of measurements is judged, s."""
 
 
 class Step(NamedTuple):
@@ -48,6 +51,7 @@ class Recorded:
     steps: list[Step] = field(default_factory=list)  # of the first REPLAYED s
     # (n, 6) torques in flight at t = 0, or (18,) the command before the first sample
     first: Array = field(default_factory=lambda: np.empty(0))
+    gap: float = LONGEST_GAP  # longest without measurements in the second half of these steps, s
 
     @property
     def moves(self) -> bool:
@@ -75,9 +79,18 @@ class Recorded:
         if isinstance(law, PredictiveLqi):
             weights, report = given
             sent = after.plan.ravel()
+            self._judge_gap(after)
             self.steps.append(Step(*seen, after.torque, status, report, weights, sent))
         else:
             self.steps.append(Step(*seen, after.command, status, np.array(given[0])))
+
+    def _judge_gap(self, memory: Any) -> None:
+        law, period = self.law, self.law.timeline.period
+        often = max(1, round(_JUDGED / period))
+        half = min(self.duration, REPLAYED) / 2
+        if len(self.steps) * period >= half and len(self.steps) % often == 0:
+            estimate, eta = memory.belief.estimate, law.timeline.eta
+            self.gap = min(self.gap, longest_gap(law.plant, estimate, memory.torque, eta))
 
 
 def _recording(law: Any, record: Recorded) -> Any:
@@ -87,6 +100,7 @@ def _recording(law: Any, record: Recorded) -> Any:
     class Recording(kind):  # type: ignore[misc]
         def initial_memory(self, first: Array) -> Any:
             record.steps.clear()
+            record.gap = LONGEST_GAP
             record.first = first
             record.law = kind(**{f.name: getattr(self, f.name) for f in fields(kind)})
             return super().initial_memory(first)

@@ -1,64 +1,23 @@
-"""Checks of a live run, and references from where the plate is.
-
-*Gaps of measurements.* A torque that acts up to eta after the last measurement is based on it or on
-earlier ones, so that a gap of up to eta changes nothing. Later torques are based on a prediction
-over the gap and eta. With A and G of the last measurement's state held, its covariance P of state
-and parameters becomes
-
-    P(s) = F P F',   F = exp([[A, G], [0, 0]] s),   s = gap + eta,
-
-and the deviation of leg i's reach has the variance (J P J')_ii, J = d reach / d pose. The gap is
-too long if three standard deviations of a leg exceed its remaining reach.
-"""
+"""Checks of a live run, and references from where the plate is."""
 
 from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from scipy.linalg import expm
 
 from stewart_drake.dynamics.workspace import diagnose
-from stewart_drake.law.belief import Estimate
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.timeline import Timeline, TorqueSchedule
 from stewart_drake.live.governor import Steering
-from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE, NUM_TORQUES, POSE, RATES
+from stewart_drake.scenario.signals import NUM_TORQUES, POSE, RATES
 from stewart_drake.types import Array
 
-LONGEST_GAP: Final = 1.0
-"""Longest gap of measurements that is ever allowed, s."""
-_DEVIATIONS: Final = 3.0
-_STEP: Final = 1e-6
-"""Step of the differences for J, rad and m."""
 _ROWS: Final = 8
 """Number of consecutive torques reported a period off that count as an error."""
 _KEPT: Final = 64
 """Number of periods whose sent torques are kept."""
 REPLAN_ERROR: Final = 0.08
 """Smallest prediction error at which a new reference is planned, as a share of the motion."""
-
-
-def stays_within_reach(plant: NominalPlant, estimate: Estimate, torque: Array, span: float) -> bool:
-    """Return whether the legs surely reach the pose after `span` s without measurements.
-
-    Estimate and torque (6,) in N m are those at the last measurement; without a covariance the
-    answer is yes.
-    """
-    if not estimate.uncertain:
-        return True
-    x, mechanism = estimate.state, plant.mechanism
-    found = plant.dynamics.derivatives(x[POSE], x[RATES], torque, estimate.parameters)
-    rate = np.zeros_like(estimate.covariance)
-    rate[:NUM_STATE, :NUM_STATE], rate[:NUM_STATE, NUM_STATE:] = found.A, found.G
-    left = mechanism.reach_margins(x[POSE])
-    J = [
-        (mechanism.reach_margins(x[POSE] + _STEP * e) - left) / _STEP
-        for e in np.eye(NUM_COORDINATES)
-    ]
-    with np.errstate(all="ignore"):
-        to_legs = np.transpose(J) @ expm(rate * span)[POSE]
-        variance = np.einsum("ij,jk,ik->i", to_legs, estimate.covariance, to_legs)
-        return bool(np.all(_DEVIATIONS * np.sqrt(variance) <= left))
 
 
 class ReportCheck:

@@ -16,15 +16,9 @@ import numpy as np
 
 from stewart_drake.dynamics.workspace import Failure, margins
 from stewart_drake.law.channel import Report
+from stewart_drake.law.gaps import LONGEST_GAP, stays_within_reach
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.live.checks import (
-    LONGEST_GAP,
-    ReportCheck,
-    recovered,
-    replanned,
-    stays_within_reach,
-    until_next,
-)
+from stewart_drake.live.checks import ReportCheck, recovered, replanned, until_next
 from stewart_drake.live.contact import Contact
 from stewart_drake.live.design import Design
 from stewart_drake.live.endpoint import now

@@ -43,7 +43,7 @@
 /* Periods for which a late measurement is of use. */
 #define LONGEST_WAIT @"((int)KEPT - 1)" if servos else wait@
 #define PATIENCE (10ull * SECOND) /* for an answer, and for the begin, ns */
-#define LONGEST_GAP SECOND /* without a usable measurement, ns */
+#define LONGEST_GAP ((uint64_t)(STEWART_LONGEST_GAP * SECOND)) /* ns */
 #define CONTENT @"STEWART_CRANKS" if servos else "STEWART_TORQUES"@
 #define DESIGN stewart_configuration@".law" if servos@
 #define LAW (&c->law@".law" if servos@)
