@@ -7,7 +7,7 @@ from pydrake.systems.analysis import Simulator
 import stewart_drake as sd
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.belief import Innovations
+from stewart_drake.law.belief import TOLERATED, Innovations
 from stewart_drake.law.filter_settings import (
     FilterSettings,
     acceleration_noise,
@@ -116,7 +116,10 @@ def test_what_it_cannot_explain_is_told(cause):
     found, warnings = verdict_of(*NOISY, BIASED, *cause)
     assert found["verdict"] == "overconfident"
     [text] = [text for text in warnings if "overconfident" in text]
-    assert f"to {1 / np.sqrt(found['nis_ratio']):.2g} times its prediction errors" in text
+    ratio = found["nis_ratio"]
+    off = f"its uncertainty, to {1 / np.sqrt(ratio):.2g} times its prediction errors"
+    changed = "that of parameters that it took as constant, which had to change"
+    assert f"It has widened {off if ratio > TOLERATED else changed}: estimate" in text
     assert "controller.model_error" in text
 
 

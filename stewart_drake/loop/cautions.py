@@ -8,6 +8,7 @@ from collections.abc import Callable
 from itertools import product
 from typing import Final
 
+from stewart_drake.law.belief import TOLERATED
 from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.results import RunSummary
@@ -116,13 +117,17 @@ def overconfidence(summary: RunSummary) -> list[str]:
     consistency = summary["estimator_consistency"]
     if consistency["verdict"] != "overconfident":
         return []
-    factor = math.sqrt(consistency["nis_ratio"])
+    ratio = consistency["nis_ratio"]
+    widened = (
+        f"its uncertainty, to {1 / math.sqrt(ratio):.2g} times its prediction errors"
+        if ratio > TOLERATED
+        else "that of parameters that it took as constant, which had to change"
+    )
     return [
         "the estimator is overconfident: the machine does what its model cannot explain, as "
-        "friction, a payload off the centre, a push or a wrong delay do. It has widened its "
-        f"uncertainty, to {1 / factor:.2g} times its prediction errors: estimate the cause, with "
-        "coulomb, payload_position or wrench in controller.estimate, or raise "
-        "controller.model_error"
+        f"friction, a payload off the centre, a push or a wrong delay do. It has widened {widened}"
+        ": estimate the cause, with coulomb, payload_position or wrench in controller.estimate, or "
+        "raise controller.model_error"
     ]
 
 
