@@ -278,20 +278,3 @@ def test_own_systems_that_measure_the_state_are_refused(role):
     scenario = load_scenario("paper", settings=ENCODERS)
     with pytest.raises(ConfigError, match=f"got 'encoders' with a {role} of your own"):
         simulate(scenario, judge_stability=False, **{role: Own})
-
-
-def test_the_steps_of_encoders_cause_no_plans():
-    """A prediction trembles with the codes: a plan at each sample would add to the error."""
-    fast = ("controller.period=0.02", "delay.steps=5", "plant.kind=exact", "duration=4")
-    small = ("reference.amplitude=[0,0,0,0,0,0.02]", "reference.frequency=3")
-    heavy = ("plant.gravity=true", "start=rest", "queue=equilibrium")
-
-    def error(seed, *settings):
-        codes = f"sensor={{kind: encoders, bits: 14, seed: {seed}}}"
-        settings = (*fast, *small, *heavy, codes, *settings)
-        scenario = load_scenario("paper", controller="predictor_lqi", settings=settings)
-        return simulate(scenario).accumulated_error
-
-    seeds = range(1, 5)
-    planned = np.mean([error(seed) for seed in seeds])
-    assert planned < 1.25 * np.mean([error(seed, "controller.replan=0") for seed in seeds])

@@ -390,7 +390,10 @@ def test_a_killed_machine_in_c_ends_its_controller_and_the_next_one_drives_its_s
         (("udp", "127.0.0.1", "65536"), "PORT: got 65536; expected"),
         (("udp", "127.0.0.1", "47000", "seconds=-1"), "seconds: got -1; expected"),
         (("udp", "127.0.0.1", "47000", "log=no/log"), "log=no/log: No such file"),
-        (("udp", "127.0.0.1", "47000", "key=none"), "none: cannot be read; expected a file with a key"),
+        (
+            ("udp", "127.0.0.1", "47000", "key=none"),
+            "none: cannot be read; expected a file with a key",
+        ),
         (("udp", "127.0.0.1", "47000", "armed"), "expected: stewart_udp ADDRESS PORT"),
         (("udp", "10.0.0.1", "47000"), "expected: stewart_udp ADDRESS PORT"),
     ],

@@ -14,8 +14,7 @@ enum {
 #define EARLY ((real)0.5) /* part of the assumed delay before which no torque arrives */
 #define MOST_CAUTION 2 /* factor on the weight of torques above which no plan is made */
 #define MOST_SAMPLES ((real)1e6) /* largest count of samples since the start */
-/* Error of a predicted pose, over the motion, above which a plan is made: when the delay was just found, and
-   else. */
+/* Error of a prediction, over the motion, above which a plan is made: when the delay was just found, and else. */
 #define OFF_WHEN_FOUND ((real)0.02)
 #define OFF ((real)0.08)
 #define ROUNDING ((real)1e-3) /* samples; a time nearer to a sample than this is at the sample */
@@ -42,16 +41,10 @@ static void replan_start(const stewart_law *law, real *memory)
     stewart_fill(replan_memory(law), 0, memory);
 }
 
-/* Time until a torque that is computed at the next sample has acted for a period, s. */
-static real until_acted(const stewart_law *law, const stewart_outlook *outlook)
-{
-    return outlook->eta + 2 * law->period;
-}
-
-/* Whether the first torque has acted for a period; the first sample is number 1. */
+/* Whether the first torque has acted for a period. */
 static int has_acted(const stewart_law *law, const stewart_outlook *outlook, const real *memory)
 {
-    return memory[SINCE_START] >= until_acted(law, outlook) / law->period - ROUNDING;
+    return memory[SINCE_START] >= outlook->eta / law->period + 2 - ROUNDING;
 }
 
 /* Compute the rows of the plan, then of the goal; without a plan those of the caller's reference. */
@@ -127,13 +120,13 @@ static int is_sure(const stewart_machine *machine, const stewart_schedule *sched
     return 1;
 }
 
-/* Whether a predicted state (12) is so far off the wanted one that a plan is made. A rate counts by what it
-   moves the plate in `time` s. `found`: whether the delay was found at this sample. */
-static int is_off(const real *size, const real *state, const real *wanted, real time, int found)
+/* Whether a predicted state (12) is so far off the wanted one that a plan is made; `found`: whether the delay
+   was found at this sample. */
+static int is_off(const real *size, const real *state, const real *wanted, int found)
 {
     real most = 0;
     for (int i = 0; i < X; i++) {
-        const real away = REAL(fabs)(state[i] - wanted[i]) / size[i % 6] * (i < 6 ? 1 : time);
+        const real away = REAL(fabs)(state[i] - wanted[i]) / size[i % 6];
         if (isnan(away))
             return 0;
         most = away > most ? away : most;
@@ -163,8 +156,7 @@ static int replan_follow(const stewart_law *law, real *memory, const stewart_out
     /* A known delay counts as found from the sample at which the first torque has acted for a period
        until the next plan. */
     const int first = outlook->assumed && has_acted(law, outlook, memory) && !(memory[PLANNED] > 0);
-    if (!is_off(replan->size, states + X * outlook->until_next.number, wanted, until_acted(law, outlook),
-                outlook->found || first))
+    if (!is_off(replan->size, states + X * outlook->until_next.number, wanted, outlook->found || first))
         return 0;
     if (law->observer->uncertainty) {
         const int n = X + law->machine.estimated;
