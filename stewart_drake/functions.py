@@ -264,7 +264,7 @@ def setpoints(
         out: CSV file to write, if not None.
         plain: whether to send the angles of the reference, without compensation.
         start: (6,) pose at which the plate rests at first, rad and m; None is the reference's.
-        soft_end: whether the motion comes to rest at the end of the duration.
+        soft_end: whether the motion ends at rest.
         units: YAML file with the units of the servos (`export.setpoints.ServoUnits`), for `out`.
         controller: laid over the scenario's own; for a name or a path.
         settings: as `load_scenario` takes them; for a name or a path.

@@ -135,7 +135,7 @@ def test_a_run_stopped_before_its_first_sample_can_be_drawn(run):
 
 
 def test_the_rms_error_is_an_angle_and_a_distance_after_the_first_half(run):
-    """The plate is turned by 2 degrees about an axis of its own, and 3 mm away."""
+    """The plate is turned by 2 degrees about a slanted axis, and 3 mm away."""
     turned = run.signals.copy(deep=True)
     n = len(turned.time)
     turned["reference"][:, :3], turned["reference"][:, 3:] = [0.3, -0.4, 1.2], [0, 0, 0.3]

@@ -28,6 +28,8 @@ from stewart_drake.types import Array
 SHORTEST_BLEND: Final = 1.0
 """Shortest soft start, s; it is doubled until the motion keeps its limits."""
 _LARGEST_RATE: Final = 1000.0  # Hz
+_RESTING: Final = 0.02
+"""Crank speed of the last setpoint that counts as rest, as a share of the largest one."""
 _ROUNDING: Final = 1e-12
 _REVERSED: Final = np.repeat([1.0, -1.0, 1.0], 6)  # a motion (18,) backwards in time
 
@@ -71,10 +73,6 @@ def load_units(path: str | Path) -> ServoUnits:
     return units
 
 
-_RESTING: Final = 0.02
-"""Crank speed of the last setpoint that counts as rest, as a share of the largest one."""
-
-
 @dataclass(frozen=True)
 class Setpoints:
     """Setpoints, each to be held until the next one."""
@@ -86,8 +84,8 @@ class Setpoints:
     torques: Array  # (n, 6) that the motion takes there from the servos, N m
     steps: Array  # (n, 6) largest torques of servos that hold the setpoints, N m
     blend: float  # length of the soft start and the soft end, s; 0 without both
-    softens: str = "start"  # what is soft: "start", "end" or "start and end"
-    ends: float = math.inf  # end of a motion that has one, s
+    softens: str  # what is soft: "start", "end" or "start and end"; empty without both
+    ends: float  # of the motion, s; infinite for one without an end
 
     def __repr__(self) -> str:
         return f"Setpoints({len(self.times)} of six cranks)"
@@ -161,7 +159,7 @@ def make_setpoints(
         rate: of the setpoints, Hz.
         plain: whether to send the crank angles alone.
         start: (6,) pose at which the plate rests at t = 0, rad and m.
-        soft_end: whether the motion comes to rest at the end of the duration.
+        soft_end: whether the motion ends at rest.
 
     Raises:
         ConfigError: bad input, or a motion beyond reach, or beyond the range, speed or torque of a

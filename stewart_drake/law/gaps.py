@@ -10,6 +10,8 @@ and the deviation of leg i's reach has the variance (J P J')_ii, J = d reach / d
 too long if three standard deviations of a leg exceed its remaining reach.
 """
 
+from collections.abc import Callable
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -27,14 +29,12 @@ _STEP: Final = 1e-6
 """Step of the differences for J, rad and m."""
 
 
-def stays_within_reach(plant: NominalPlant, estimate: Estimate, torque: Array, span: float) -> bool:
-    """Return whether the legs surely reach the pose after `span` s without measurements.
-
-    Estimate and torque (6,) in N m are those at the last measurement; without a covariance the
-    answer is yes.
-    """
+def _within_reach(
+    plant: NominalPlant, estimate: Estimate, torque: Array
+) -> Callable[[float], bool]:
+    """Return `stays_within_reach` as a function of the span."""
     if not estimate.uncertain:
-        return True
+        return lambda span: True
     x, mechanism = estimate.state, plant.mechanism
     found = plant.dynamics.derivatives(x[POSE], x[RATES], torque, estimate.parameters)
     rate = np.zeros_like(estimate.covariance)
@@ -44,14 +44,27 @@ def stays_within_reach(plant: NominalPlant, estimate: Estimate, torque: Array, s
         (mechanism.reach_margins(x[POSE] + _STEP * e) - left) / _STEP
         for e in np.eye(NUM_COORDINATES)
     ]
-    with np.errstate(all="ignore"):
-        to_legs = np.transpose(J) @ expm(rate * span)[POSE]
-        variance = np.einsum("ij,jk,ik->i", to_legs, estimate.covariance, to_legs)
-        return bool(np.all(_DEVIATIONS * np.sqrt(variance) <= left))
+
+    def within(span: float) -> bool:
+        with np.errstate(all="ignore"):
+            to_legs = np.transpose(J) @ expm(rate * span)[POSE]
+            variance = np.einsum("ij,jk,ik->i", to_legs, estimate.covariance, to_legs)
+            return bool(np.all(_DEVIATIONS * np.sqrt(variance) <= left))
+
+    return within
+
+
+def stays_within_reach(plant: NominalPlant, estimate: Estimate, torque: Array, span: float) -> bool:
+    """Return whether the legs surely reach the pose after `span` s without measurements.
+
+    Estimate and torque (6,) in N m are those at the last measurement; without a covariance the
+    answer is yes.
+    """
+    return _within_reach(plant, estimate, torque)(span)
 
 
 def longest_gap(plant: NominalPlant, estimate: Estimate, torque: Array, eta: float) -> float:
     """Return the longest gap in s, from eta to `LONGEST_GAP`, after which the legs surely reach."""
+    within = _within_reach(plant, estimate, torque)
     gaps = np.linspace(min(eta, LONGEST_GAP), LONGEST_GAP, 21)
-    within = [stays_within_reach(plant, estimate, torque, gap + eta) for gap in gaps[1:]]
-    return float(gaps[within.index(False) if False in within else -1])
+    return float(next((a for a, b in pairwise(gaps) if not within(b + eta)), LONGEST_GAP))

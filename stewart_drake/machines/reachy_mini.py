@@ -39,9 +39,8 @@ _ROUNDING = 1e-3  # rotation matrices of the SDK are written with three digits
 _EXPECTED: Final = "a recorded move of Reachy Mini: `time` and `set_target_data` of equal length"
 _MAX_BYTES: Final = 100_000_000
 _TARGET: Final = "head", "body_yaw", "antennas"
-_LONGEST_STEP: Final = (
-    1.0  # s, mean time between samples; the SDK records some 50 to 100 per second
-)
+_LONGEST_STEP: Final = 1.0
+"""Largest mean time between samples, s; the SDK records some 50 to 100 per second."""
 
 
 @lru_cache(maxsize=1)
@@ -112,8 +111,8 @@ def read_move(path: str | Path) -> tuple[Array, Array]:
     poses = np.array([_pose(t, f"{path}: set_target_data[{i}]") for i, t in enumerate(targets)])
     poses = poses.reshape(-1, len(COORDINATE_NAMES))
     times -= times[:1].sum()  # of no sample 0
-    if len(times) > 1 and times[-1] / (len(times) - 1) > _LONGEST_STEP:
-        step = times[-1] / (len(times) - 1)
+    step = times[-1] / (len(times) - 1) if len(times) > 1 else 0.0
+    if step > _LONGEST_STEP:
         raise ConfigError(
             f"{path}: time: got steps of {step:.3g} s; expected at most {_LONGEST_STEP:g} s, "
             "with times in s"

@@ -10,6 +10,7 @@ must lie at distance l from the joint,
 Functions of `poses` take one pose (6,) or many (..., 6).
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,6 +76,15 @@ def rotation(angles: Array) -> Array:
         [cp * st * cf + sp * sf, sp * st * cf - cp * sf, ct * cf],
     ]
     return np.array(columns).T
+
+
+def turns_between(angles: Array, others: Array) -> Array:
+    """Return the angles (n,) of the rotations from one roll-pitch-yaw (n, 3) to another, rad.
+
+    With the Frobenius norm |R - R'|^2 = 2 tr(1 - R' R) = 4 (1 - cos t) = 8 sin^2(t / 2).
+    """
+    apart = np.linalg.norm(rotation(angles) - rotation(others), axis=(-2, -1))
+    return 2 * np.arcsin(np.minimum(apart / math.sqrt(8), 1.0))
 
 
 def angle_rate_map(angles: Array) -> Array:

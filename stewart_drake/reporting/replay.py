@@ -7,19 +7,17 @@ from typing import Final
 import numpy as np
 import xarray as xr
 from pydrake.geometry import Meshcat, MeshcatParams, Rgba
-from scipy.spatial.transform import Rotation
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.preparation import simulated_machine
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.scene import TORQUE_COLORS, Scene, crank_paths, full_color, torque_shares
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import rotation
+from stewart_drake.mechanism.kinematics import turns_between
 from stewart_drake.reporting.document import number
 from stewart_drake.reporting.page import environment
 from stewart_drake.scenario.run_log import EXPECTED, read_log, scenario_of
 from stewart_drake.scenario.signals import ANGLES, LEGS, POSITION
-from stewart_drake.types import Array
 
 _PATH_COLORS: Final = {"reference": Rgba(0.0, 0.62, 0.45), "plate": Rgba(0.0, 0.45, 0.70)}
 _VIEWPORT: Final = '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -92,10 +90,11 @@ def _html(signals: xr.Dataset, mechanism: Mechanism, title: str, outcome: str) -
     largest = np.abs(torque).max(axis=1, initial=0.0)
     full = full_color(largest)
     off = np.linalg.norm(shown.error.values[:, POSITION], axis=1)
+    turns = turns_between(shown.pose.values[:, ANGLES], shown.reference.values[:, ANGLES])
     data = {
         "time": np.round(shown.time.values, 4).tolist(),
         "position": np.round(1e3 * off, 4).tolist(),
-        "angle": np.round(np.rad2deg(_turns(shown)), 4).tolist(),
+        "angle": np.round(np.rad2deg(turns), 4).tolist(),
         "share": np.round(torque_shares(torque, full), 3).tolist(),
         "cranks": crank_paths(mechanism.name),
     }
@@ -135,9 +134,3 @@ def _quiet_meshcat() -> Meshcat:
 
 def _thinned(signals: xr.Dataset) -> xr.Dataset:
     return signals.isel(time=slice(None, None, -(-signals.sizes["time"] // _MAX_FRAMES) or 1))
-
-
-def _turns(signals: xr.Dataset) -> Array:
-    """Return the rotation angles (n,) of the plate against its reference, rad."""
-    plate, wanted = (rotation(signals[name].values[:, ANGLES]) for name in ("pose", "reference"))
-    return Rotation.from_matrix(wanted.swapaxes(-1, -2) @ plate).magnitude()

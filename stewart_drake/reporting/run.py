@@ -6,10 +6,10 @@ from dataclasses import fields
 from typing import Any, Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stewart_drake.loop.preparation import assemble, check_instants
 from stewart_drake.loop.results import LEAST_MEASURED, SimulationResult
+from stewart_drake.mechanism.kinematics import turns_between
 from stewart_drake.reporting.document import Document, counted, from_template, measured, number
 from stewart_drake.reporting.style import FACTORS, TORQUES, UNITS, unit_for
 from stewart_drake.scenario.config import Scenario
@@ -127,8 +127,7 @@ def _second_half(run: SimulationResult) -> str:
     poses, wanted = later[:, np.isfinite(later).all(axis=(0, 2))]  # live may miss measurements
     if run.status != "completed" or not len(poses):
         return ""
-    R, R_wanted = (Rotation.from_euler("xyz", one[:, ANGLES]) for one in (poses, wanted))
-    angles = (R_wanted.inv() * R).magnitude()
+    angles = turns_between(poses[:, ANGLES], wanted[:, ANGLES])
     distances = np.linalg.norm(poses[:, POSITION] - wanted[:, POSITION], axis=1)
     angle, distance = (math.sqrt(np.mean(error**2)) for error in (angles, distances))
     return f"{number(math.degrees(angle), 2)} deg, {number(1e3 * distance, 2)} mm"

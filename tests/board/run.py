@@ -61,7 +61,7 @@ class Row:
 
     Attributes:
         name: in the table.
-        settings: of `paper`, beside an exact plant.
+        settings: of `paper`; the plant is exact.
         median, most: bounds of a step, in million instructions.
         workspace: bound, in bytes.
     """

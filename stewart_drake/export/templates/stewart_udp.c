@@ -4,7 +4,7 @@
 
    It asks for a session, measures the link, chooses when to begin, and then steps the controller once a
    period of the machine{% if wait %}, with the newest measurement{% else %}: when the measurement of the sample is there, or is taken as lost{% endif %}.
-   It ends after 1 s without a usable measurement. Without a key it talks to this computer only; a machine
+   It ends after STEWART_LONGEST_GAP without a usable measurement. Without a key it talks to this computer only; a machine
    that does not say that it is a simulation is driven with `arm` only. The log has a row per sample; `age`
    is the number of periods before the sample at which the measurement was taken. An old log is replaced once a
    machine has answered. */
