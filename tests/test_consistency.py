@@ -117,9 +117,9 @@ def test_what_it_cannot_explain_is_told(cause):
     assert found["verdict"] == "overconfident"
     [text] = [text for text in warnings if "overconfident" in text]
     ratio = found["nis_ratio"]
-    off = f"its uncertainty, to {1 / np.sqrt(ratio):.2g} times its prediction errors"
-    changed = "that of parameters that it took as constant, which had to change"
-    assert f"It has widened {off if ratio > TOLERATED else changed}: estimate" in text
+    off = f"its prediction errors are {np.sqrt(ratio):.2g} times those that it states"
+    changed = "parameters that it takes as constant had to change"
+    assert f"and {off if ratio > TOLERATED else changed}" in text
     assert "controller.model_error" in text
 
 

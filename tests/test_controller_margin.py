@@ -1,6 +1,7 @@
 """The loop of a controller and its plant: stable or not, its margins, and what is said of it."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +27,7 @@ from stewart_drake.reporting.run import comparison_document
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE
 from stewart_drake.studies.compare import CONTROLLERS
 from stewart_drake.studies.delay import loop_margins
-from stewart_drake.studies.verdict import assess, fold
+from stewart_drake.studies.verdict import assess, fold, loop_verdict
 from tests.mechanisms import PAPER
 
 HOLD = ("reference.kind=hold", "plant.kind=exact")
@@ -331,6 +332,7 @@ def shrunk(folder, scale):
 def test_a_small_machine_is_warned_of_the_step_that_loses_it(tmp_path):
     """A plate of 80 mm: lost at 1 ms, followed at the step that is named."""
     small = shrunk(tmp_path, 1 / 3)
+    small.append("plant.kind=multibody")
     result = sd.simulate(scenario(*small, name="gravity"))
     assert result.status == "left_workspace"
     said = result.summary["warnings"][0]
@@ -351,18 +353,30 @@ def test_shipped_scenarios_are_warned_only_where_the_step_is_too_coarse():
         sc = scenario(name=name)
         assert sc.plant.kind == "multibody"
         assert coarse_step(prepare(sc), judged(sc)) is None
-    sc = scenario(name="gravity")
+    engine = "plant.kind=multibody"
+    sc = scenario(engine, name="gravity")
     said = coarse_step(prepare(sc), judged(sc))
     assert said is not None and "plant.time_step=0.0002 would do" in said
-    finer = scenario("plant.time_step=0.0002", name="gravity")
+    finer = scenario(engine, "plant.time_step=0.0002", name="gravity")
     assert coarse_step(prepare(finer), judged(finer)) is None
     # With a log of 0.75 ms, of which 0.2 ms are no part, nor 0.1.
-    logged = scenario("plant.time_step=0.00025", "log_period=0.00075", name="gravity")
+    logged = scenario(engine, "plant.time_step=0.00025", "log_period=0.00075", name="gravity")
     margin = replace(judged(logged), _growths={0.00025: 1e9, 0.0002: 1.0, 0.0001: 1.0, 5e-5: 1.0})
     said = coarse_step(prepare(logged), margin)
     assert said is not None and "plant.time_step=5e-05 would do" in said
     logged.plant.time_step = 5e-5
     logged.check()
+
+
+def test_a_range_without_room_is_called_so():
+    """With gravity an error of 1 us is multiplied by 1e8 over 0.8 s."""
+    said = loop_verdict(judged(scenario("plant.kind=exact", "plant.gravity=true", "duration=1")))
+    assert "stable in exact arithmetic only" in said and "-0 ms" not in said
+    said = loop_verdict(judged(scenario("plant.kind=exact", "duration=1")))
+    assert re.search(r"longer\), 0\.23 % of the delay, and", said)
+    assert said.endswith("; a larger controller.w_R widens it")
+    said = loop_verdict(judged(scenario("controller.w_R=1e4", "duration=1")))
+    assert "of the delay" in said and "widens" not in said
 
 
 def test_one_engine_step_is_semi_implicit_euler():

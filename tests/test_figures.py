@@ -155,6 +155,22 @@ def test_the_rms_error_is_an_angle_and_a_distance_after_the_first_half(run):
     assert "rms error" not in run_document(lost).plain()
 
 
+def test_a_run_counts_the_true_values_within_two_deviations(run):
+    """As many as the title of the figure says; a live run knows none."""
+    title = draw_run(run)["parameters"].legends[0].get_title().get_text()
+    count = re.search(r"(\d of 8) true values", title)[1]
+    told = " ".join(run_document(run).plain().split())
+    assert f"two estimated standard deviations; {count} true values are within)" in told
+    far = run.summary["estimates"] | {"payload_mass": {"value": 0.3, "std": 0.01}}
+    off = dataclasses.replace(run, summary=run.summary | {"estimates": far})
+    near = far | {"payload_mass": {"value": 0.3, "std": 0.06}}
+    on = dataclasses.replace(run, summary=run.summary | {"estimates": near})
+    counts = [int(re.search(r"(\d) of 8", run_document(one).plain())[1]) for one in (off, on)]
+    assert counts[1] == counts[0] + 1
+    live = dataclasses.replace(run, summary=run.summary | {"live": {}})
+    assert "true values" not in run_document(live).plain()
+
+
 def test_rounding_is_no_motion(run):
     """A coordinate that stays where it should gets no axis of 1e-14 deg."""
     still = run.signals.copy()

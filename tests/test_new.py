@@ -107,7 +107,9 @@ def test_what_it_proposes_runs_and_is_reported(tmp_path, capsys):
     said = capsys.readouterr().out
     assert said.startswith("yes: ") and not too_long(said)
     assert "(estimated: uniform disc)" in said and "the motors have 2" in said
-    assert re.search(r"known to [\d.]+ %: a margin below 5 % is small", " ".join(said.split()))
+    assert re.search(
+        r"[\d.]+ % of the delay, .*; a larger controller.w_R widens it", " ".join(said.split())
+    )
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["inertia_estimated"] == ["base", "plate", "crank", "rod"]
     scenario = sd.load_scenario(folder / "scenario.yaml")

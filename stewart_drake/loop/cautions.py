@@ -118,16 +118,16 @@ def overconfidence(summary: RunSummary) -> list[str]:
     if consistency["verdict"] != "overconfident":
         return []
     ratio = consistency["nis_ratio"]
-    widened = (
-        f"its uncertainty, to {1 / math.sqrt(ratio):.2g} times its prediction errors"
+    shown = (
+        f"its prediction errors are {math.sqrt(ratio):.2g} times those that it states"
         if ratio > TOLERATED
-        else "that of parameters that it took as constant, which had to change"
+        else "parameters that it takes as constant had to change; it widened their uncertainty"
     )
     return [
         "the estimator is overconfident: the machine does what its model cannot explain, as "
-        f"friction, a payload off the centre, a push or a wrong delay do. It has widened {widened}"
-        ": estimate the cause, with coulomb, payload_position or wrench in controller.estimate, or "
-        "raise controller.model_error"
+        f"friction, a payload off the centre, a push or a wrong delay do, and {shown}. Estimate "
+        "the cause, with coulomb, payload_position or wrench in controller.estimate, or raise "
+        "controller.model_error"
     ]
 
 

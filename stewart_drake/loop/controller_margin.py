@@ -100,6 +100,7 @@ class ControllerMargin:
         estimated: whether an estimator is assumed to have found the unknown parameters.
         delay_found: whether it is assumed to have found the delay too.
         tuned: whether a tuner changes the weights.
+        weighted: whether `controller.w_R` is a setting of the law.
         problem: why the loop was not judged, or empty.
         loops: the judged ones in the order of time, evenly over `span`; none with a `problem`.
         span: s.
@@ -115,6 +116,7 @@ class ControllerMargin:
     estimated: bool = False
     delay_found: bool = False
     tuned: bool = False
+    weighted: bool = False
     problem: str = ""
     loops: tuple[LinearLoop, ...] = field(default=(), repr=False)
     span: float = 0.0
@@ -129,6 +131,11 @@ class ControllerMargin:
     def delay_margin(self) -> float:
         """Error of the delay in s, of either sign, for which the loop is stable."""
         return min(self.margins.shorter, self.margins.longer)
+
+    @property
+    def share(self) -> float:
+        """This error as a share of the delay; infinite without a delay."""
+        return self.delay_margin / self.eta if self.eta else math.inf
 
     @property
     def growth(self) -> float:
@@ -236,6 +243,7 @@ def controller_margin(
         estimated=law.estimates,
         delay_found=law.finds_delay,
         tuned=experiment.tuned,
+        weighted=sc.controller.kind == "lqi",
         problem=problem,
         loops=tuple(loops),
         span=end,

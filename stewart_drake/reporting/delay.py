@@ -16,7 +16,7 @@ from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import DATA_INK, DATA_PAPER, line
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.studies.delay import Cell, DelayStudy, MotorMargins
-from stewart_drake.studies.verdict import FRAGILE, HARDLY, NO, loop_verdict, milliseconds
+from stewart_drake.studies.verdict import HARDLY, NO, fragile, loop_verdict, milliseconds
 
 _TONES: Final[dict[str, Tone]] = {"yes": "good", "hardly": "fair", "no": "bad"}
 _BANDWIDTH: Final = 10.0
@@ -38,7 +38,6 @@ def document(study: DelayStudy) -> Document:
         gains=gains_text,
         milliseconds=milliseconds,
         spoken=own and loop_verdict(own),
-        least=_is_fragile(study) and FRAGILE,
         growth=verdict and verdict.amplification,
         bandwidth=_BANDWIDTH,
         gives_way=1.0 / stiffness,
@@ -59,13 +58,7 @@ def _tone(study: DelayStudy) -> Tone:
     if study.verdict is None or study.assessment.obstacles or (loop and loop.stable is False):
         return "bad"
     tone = _TONES[study.verdict.beatable]
-    return "fair" if tone == "good" and loop and (loop.problem or _is_fragile(study)) else tone
-
-
-def _is_fragile(study: DelayStudy) -> bool:
-    """Return whether a small error of the delay makes the loop unstable."""
-    loop = study.controller
-    return loop is not None and bool(loop.delay_margin < FRAGILE * study.eta)
+    return "fair" if tone == "good" and loop and (loop.problem or fragile(loop)) else tone
 
 
 def _eta(study: DelayStudy, steps: int) -> float:

@@ -16,6 +16,7 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import (
     ANGLES,
     BIAS,
+    CONSTANTS,
     COORDINATE_NAMES,
     NUM_COORDINATES,
     PARAMETERS,
@@ -71,6 +72,7 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
         peaks=", ".join(_peaks(result)),
         second_half=_second_half(result),
         estimates=_estimates(result),
+        held=_held(result),
         least=LEAST_MEASURED,
         # the sum of others is left out
         events=[
@@ -94,6 +96,19 @@ def _estimates(run: SimulationResult) -> list[str]:
             width, value = measured(2 * factor * found["std"], factor * found["value"])
             shown.append(f"{name.replace('_', ' ')} {value} ± {width} {unit}")
     return shown
+
+
+def _held(run: SimulationResult) -> str:
+    """Return how many true values lie within two deviations; empty where none are known."""
+    found, true = run.summary["estimates"], run.scenario.plant_parameters
+    errors = [
+        abs(found[name]["value"] - value) / found[name]["std"]
+        for name, value in zip(CONSTANTS, true, strict=True)
+        if name in found and found[name]["std"] > 0
+    ]
+    if "live" in run.summary or not errors:
+        return ""
+    return f"; {sum(error <= 2 for error in errors)} of {len(errors)} true values are within"
 
 
 def span(poses: Array) -> Array:

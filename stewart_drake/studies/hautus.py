@@ -269,7 +269,7 @@ class System:
             parts.append(
                 f"not {' and not '.join(missed)}, from the rank of powers up to the {self.n - 1}th "
                 f"of a matrix with spectral radius {self.radius:.3g}, which span {decades:.0f} "
-                "decades, where a double holds 16"
+                "decades: rounding decides the rank"
             )
         if passed := [word for word in QUESTIONS if drake[word] and not ours[word]]:
             parts.append(f"{' and '.join(passed)}, taking anything above rounding for full rank")

@@ -38,7 +38,7 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COORDINATES
 from stewart_drake.studies.clearance import clearance_along
 from stewart_drake.studies.study_options import Measurements
-from stewart_drake.studies.verdict import FRAGILE, Verdict, loop_verdict
+from stewart_drake.studies.verdict import Verdict, loop_verdict
 from stewart_drake.studies.workspace_map import Measures, Travel, measure, travel
 from stewart_drake.types import Array
 
@@ -152,14 +152,7 @@ class NewMachine(NamedTuple):
     @property
     def findings(self) -> list[str]:
         """Sentences about torque, stability and delay."""
-        loop = self.margin
-        narrow = []
-        if loop.stable and loop.delay_margin < FRAGILE * loop.eta:
-            narrow.append(
-                f"the delay must be known to {100 * loop.delay_margin / loop.eta:.2g} %: a margin "
-                f"below {100 * FRAGILE:g} % is small, a larger controller.w_R widens it"
-            )
-        return [self.verdict, loop_verdict(loop), *narrow, str(Verdict.of(loop))]
+        return [self.verdict, loop_verdict(self.margin), str(Verdict.of(self.margin))]
 
     @property
     def summary(self) -> dict[str, Any]:

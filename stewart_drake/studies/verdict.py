@@ -70,6 +70,9 @@ NO: Final = 1e3
 FRAGILE: Final = 0.05
 """Smallest tolerable error of a good loop, as a share of the delay."""
 
+LEAST: Final = 1e-6
+"""Error of the delay below which no link stays, s."""
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -125,12 +128,24 @@ def loop_verdict(loop: ControllerMargin) -> str:
             f"{fold(loop.radius)} per period of {loop.period:g} s at t = {loop.time:.1f} s{assumed}"
         )
     m = loop.margins
+    if loop.delay_margin < LEAST:
+        return (
+            "this loop is stable in exact arithmetic only: linearised along the reference, an "
+            f"error of the delay of {milliseconds(LEAST)} makes it unstable{assumed}"
+        )
+    share = f", {100 * loop.share:.2g} % of the delay," if loop.share < math.inf else ""
     up = f"{m.gain_up:.4g}" if math.isfinite(m.gain_up) else "any"
+    widen = "; a larger controller.w_R widens it" if fragile(loop) and loop.weighted else ""
     return (
         "this loop is stable: linearised along the reference, for delay errors from "
-        f"-{milliseconds(m.shorter)} (true delay shorter) to +{milliseconds(m.longer)} (longer) "
-        f"and motor gains from {m.gain_down:.3g} to {up}{assumed}"
+        f"-{milliseconds(m.shorter)} (true delay shorter) to +{milliseconds(m.longer)} (longer)"
+        f"{share} and motor gains from {m.gain_down:.3g} to {up}{assumed}{widen}"
     )
+
+
+def fragile(loop: ControllerMargin) -> bool:
+    """Whether a small error of the delay makes a loop unstable; False where it is not judged."""
+    return loop.share < FRAGILE
 
 
 def fold(growth: float) -> str:
