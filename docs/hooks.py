@@ -63,7 +63,7 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
 def abbreviations() -> str:
     """Return the terms of docs/terms.md for the extension that explains them in each page."""
     text = (ROOT / "docs" / "terms.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| (.+?) \| (.+) \|$", text, re.MULTILINE)[2:]  # below the heading
+    rows = re.findall(r"^- \*\*(.+?)\*\*: (.+)$", text, re.MULTILINE)
     told = (f"*[{term}]: {meaning.replace('`', '')}" for term, meaning in rows)
     return "\n\n" + "\n".join(told)
 

@@ -290,7 +290,7 @@ def test_every_way_to_leave_the_workspace_has_its_fault():
 
 def test_the_documented_faults_are_those_of_the_table():
     text = (ROOT / "docs" / "protocol.md").read_text("utf-8").split("## Faults")[1]
-    rows = dict(re.findall(r"^\| (\d+) \| (.*) \|$", text.split("\n## ")[0], re.MULTILINE))
+    rows = dict(re.findall(r"^- (\d+): (.*)$", text.split("\n## ")[0], re.MULTILINE))
     words = {f: re.sub("{.*?}", "N", text) for f, text in FAULTS.items()} | {Fault.NONE: "none"}
     assert rows == {str(int(fault)): text for fault, text in words.items()}
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field
+from dataclasses import asdict, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -69,6 +69,7 @@ class Ranges:
 
 
 RANGE_UNITS: Final = units_of(Ranges)
+_DEFAULTS: Final = asdict(Ranges())
 
 
 class DelayOptions(Options):
@@ -116,8 +117,8 @@ class RobustnessOptions(JobOptions):
         Ranges | Mapping[str, Any] | None, one_message("a mapping of sizes by name")
     ] = option(
         None,
-        "Size of a variation, 0: none. "
-        + "; ".join(f"{name}: {unit}" for name, unit in RANGE_UNITS.items())
+        "Size of a variation, 0: none; in brackets the default. "
+        + "; ".join(f"{name}: {unit} ({_DEFAULTS[name]})" for name, unit in RANGE_UNITS.items())
         + ". torque_limit takes null too: as the scenario has it.",
         "NAME=VALUE",
         name="vary",
