@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
+import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve, shipped
@@ -397,6 +398,7 @@ def test_settings_that_are_no_list_of_texts_are_refused(settings):
     for load in (
         lambda: load_scenario("paper", settings=settings),
         lambda: load_comparison("paper", ["lqi"], settings),
+        lambda: sd.compare("paper", settings),
     ):
         with pytest.raises(ConfigError, match="expected a list of texts, such as") as caught:
             load()
