@@ -40,6 +40,10 @@ BAD_ARGUMENTS = [
     (["machine", "--watchdog=x"], "--watchdog: got 'x'; expected a number"),
     (["analyze", "link", "paper"], "link.kind: got 'wire'; expected 'network', which has a play"),
     (["simulate", "paper", "twice"], "twice"),
+    (
+        ["list", "scenario"],
+        "got 'scenario'; expected stewart-drake list alone, to list the shipped",
+    ),
     (["simulate", "--set", "plant.kind"], "plant.kind"),
     (["simulate", "--controller", "lqrr"], "lqr"),
     (["simulate", "./\udcff.yaml"], "UTF-8"),

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
+import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve, shipped
@@ -27,6 +28,7 @@ from stewart_drake.scenario.config import (
 )
 from stewart_drake.scenario.dependencies import idle_fields
 from stewart_drake.scenario.loading import (
+    load_comparison,
     load_compatible,
     load_controller,
     load_scenario,
@@ -213,6 +215,11 @@ BAD_FILES = {
         ["reference.offset", "6 numbers, not 5"],
     ),
     "text in a list": ("reference: {offset: [0, 0, 0, a, 0, 0]}", ["reference.offset[3]", "'a'"]),
+    "indentation": (
+        "controller:\n    period: 0.1\n  w_Q: 1\n",
+        ["line 3: the indentation does not fit the lines above"],
+    ),
+    "two colons": ("duration: 3: 4\n", ["line 1: mapping values are not allowed here"]),
     "no mechanism": ("mechanism: ''", ["mechanism: got ''"]),
 }
 
@@ -250,7 +257,17 @@ REFUSED = [
     ("duration=", "duration: got no value; expected a value, or null for none"),
     ("duration=[1", "duration: line 1"),
     ("controller.perid=1", "controller.perid: unknown key; did you mean controller.period?"),
-    ("controller=5", "controller: got 5; expected a mapping of fields"),
+    ("controller.tolerance=1", "tolerance: unknown key; did you mean controller.w_R?"),
+    ("controller.damper=1", "controller.damper: unknown key; expected one of kind, kp"),
+    ("controller=5", "controller: got 5; expected a mapping of fields: kind, kp, kd, period, "),
+    ("plant.push=1", "plant.push: got 1; expected a mapping of fields: wrench, from, to"),
+    ("controller.period=0.1s", "controller.period: got '0.1s'; expected a number, in s"),
+    ("plant.payload_mass=20 g", "plant.payload_mass: got '20 g'; expected a number, in kg"),
+    (
+        "controller.kind=predictor_lqi",
+        "got 'predictor_lqi'; expected 'lqi' or 'pd'; predictor_lqi is a shipped controller: --con",
+    ),
+    ("controller.kind=lqg", "controller.kind: got 'lqg'; expected 'lqi' or 'pd'"),
     ("duration.x=5", "duration: got {'x': 5}"),
     (
         "reference={kind: square}",
@@ -275,7 +292,16 @@ REFUSED = [
     ("reference={kind: hold, offset: [0, 1.6, 0, 0, 0, 0.38]}", "the pitch reaches 1.6 rad"),
     (
         "reference={amplitude: [0, 1, 0, 0, 0, 0], offset: [0, -0.6, 0, 0, 0, 0.38]}",
-        "reference.offset: the pitch reaches 1.6 rad; expected |offset| + |amplitude| below pi/2",
+        "reference.amplitude: the pitch reaches 1.6 rad; expected |offset| + |amplitude| below pi/",
+    ),
+    (
+        "reference.amplitude=[15, 15, 15, 20, 20, 80]",
+        "the pitch reaches 15 rad; expected |offset| + |amplitude| below pi/2, where roll and yaw "
+        "stay distinct (are these degrees and mm?)",
+    ),
+    (
+        "reference={kind: hold, offset: [15, 0, 0, 0, 0, 0.38]}",
+        "reference.offset: the roll reaches 15 rad; expected |offset| + |amplitude| below 2 pi (a",
     ),
     (
         "controller.delay_fraction=0.5",
@@ -365,6 +391,18 @@ def test_bad_settings_are_refused_in_one_line(row):
     with pytest.raises(ConfigError) as caught:
         load_scenario("paper", settings=settings)
     assert said in one_line(caught)
+
+
+@pytest.mark.parametrize("settings", ["plant.kind=exact", {"plant.kind": "exact"}, [{"a": 1}]])
+def test_settings_that_are_no_list_of_texts_are_refused(settings):
+    for load in (
+        lambda: load_scenario("paper", settings=settings),
+        lambda: load_comparison("paper", ["lqi"], settings),
+        lambda: sd.compare("paper", settings),
+    ):
+        with pytest.raises(ConfigError, match="expected a list of texts, such as") as caught:
+            load()
+        assert one_line(caught).startswith(f"settings: got {settings!r};")
 
 
 def test_a_file_may_end_in_yml_and_begin_with_a_byte_order_mark(tmp_path, monkeypatch):

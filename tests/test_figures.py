@@ -171,6 +171,23 @@ def test_a_run_counts_the_true_values_within_two_deviations(run):
     assert "true values" not in run_document(live).plain()
 
 
+def test_an_estimated_delay_is_comparable_with_its_deviation(run):
+    delay = {"true_s": 0.8, "estimated_s": 0.8001234, "std_s": 8.5e-5}
+    found = run_document(dataclasses.replace(run, summary={**run.summary, "delay": delay})).plain()
+    said = " ".join(found.split())
+    assert "800.12 ± 0.17 ms at the end (± two estimated standard deviations); true 800 ms" in said
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [([], True), (["queue=reference"], False), (["start=on_reference"], False)],
+)
+def test_the_delay_floor_is_named_for_a_plate_that_rests(settings, named, run):
+    scenario = load_scenario("paper", settings=settings)
+    shown = dataclasses.replace(run, scenario=scenario)
+    assert ("delay floor" in run_document(shown).plain()) == named
+
+
 def test_rounding_is_no_motion(run):
     """A coordinate that stays where it should gets no axis of 1e-14 deg."""
     still = run.signals.copy()

@@ -104,6 +104,13 @@ def test_a_bad_csv_log_is_reported_in_one_line(tmp_path, text, named):
     assert "expected" in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_a_summary_is_no_log(tmp_path):
+    path = tmp_path / "summary.json"
+    path.write_text('{"status": "completed",\n"counts": [1, 2]}')
+    with pytest.raises(ConfigError, match=r"summary.json: got a file of another kind; expected a"):
+        read(path)
+
+
 @pytest.fixture(scope="module")
 def lost(tmp_path_factory):
     """Return the log of a run whose delay is believed to be 0.8 s and is 0.93 s."""

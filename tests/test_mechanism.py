@@ -206,9 +206,10 @@ def test_a_file_in_millimetres_is_asked_for_metres(name, masses, load):
     ("fields", "named"),
     [
         (["rod.length"], "crank.length, rod.length"),
+        (["crank.length"], "crank.length"),
         (["pattern.base_radius", "pattern.plate_radius"], "pattern"),
     ],
-    ids=["rods", "radii"],
+    ids=["rods", "cranks", "radii"],
 )
 def test_some_lengths_in_millimetres_are_named(fields, named, load):
     contents = enlarged("desktop", 1, 1, 1)

@@ -107,9 +107,11 @@ def test_what_it_proposes_runs_and_is_reported(tmp_path, capsys):
     said = capsys.readouterr().out
     assert said.startswith("yes: ") and not too_long(said)
     assert "(estimated: uniform disc)" in said and "the motors have 2" in said
-    assert re.search(
-        r"[\d.]+ % of the delay, .*; a larger controller.w_R widens it", " ".join(said.split())
+    words = " ".join(said.split())
+    assert (
+        "assumed by default: --shaft-height 0 m, --upright 90, --cranks apart, --gravity;" in words
     )
+    assert re.search(r"[\d.]+ % of the delay, .*; a larger controller.w_R widens it", words)
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["inertia_estimated"] == ["base", "plate", "crank", "rod"]
     scenario = sd.load_scenario(folder / "scenario.yaml")
@@ -200,7 +202,8 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(tmp_path, capsys):
     before = (tmp_path / "machine.yaml").read_bytes()
     for given in (flags(rod=0.3), []):  # before anything is asked for
         assert main(["new", str(tmp_path), *given]) == 2
-        assert "machine.yaml: already exists" in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert "machine.yaml: already exists; expected a folder without it: another one, or" in said
     assert (tmp_path / "machine.yaml").read_bytes() == before
 
 

@@ -165,6 +165,28 @@ def test_a_mistake_in_a_system_is_an_exception():
         sd.simulate(scenario("duration=0.1"), controller=lambda: OfTime(mistake))
 
 
+@pytest.mark.parametrize(
+    ("size", "error", "note"),
+    [
+        (6, ZeroDivisionError, "in controller Own, with output torque (6), at t = 0.05 s"),
+        (5, IndexError, "in controller Own, with output torque (6), at t = 0 s"),
+    ],
+)
+def test_an_exception_of_a_system_names_it_and_the_time(size, error, note):
+    class Own(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorInputPort("measurement", 12)
+            self.DeclareVectorOutputPort("torque", 6, self.calc)
+
+        def calc(self, context, output):
+            output.SetFromVector([0 // (context.get_time() < 0.045)] * size)
+
+    with pytest.raises(error) as caught:
+        sd.simulate(scenario("duration=0.1"), controller=Own)
+    assert caught.value.__notes__ == [note]
+
+
 # ------------------------------------------------------------------ the border
 
 
@@ -172,7 +194,15 @@ def test_a_mistake_in_a_system_is_an_exception():
     ("given", "message"),
     [
         ({"controller": 3}, "controller: got a int; expected a Drake system"),
-        ({"controller": lambda: "x"}, "controller: got a str; expected a Drake system"),
+        (
+            {"controller": lambda: "x"},
+            "controller: got a str; expected a Drake system with inputs measurement (12), if want",
+        ),
+        (
+            {"controller": lambda x: x},
+            "controller: got a function (missing a required argument: 'x'); expected a Drake",
+        ),
+        ({"modify_law": lambda: 3}, "modify_law: got a function (too many positional arguments);"),
         (
             {"controller": lambda: controller((("measurement", 6),))},
             "got inputs measurement (6) and outputs torque (6); expected inputs measurement (12)",

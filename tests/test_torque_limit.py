@@ -10,9 +10,10 @@ import pytest
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import load_yaml
+from stewart_drake.loop.cautions import cautions_before
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.platforms import MultibodyStewart
-from stewart_drake.loop.preparation import assemble
+from stewart_drake.loop.preparation import assemble, prepare
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.scenario.loading import load_scenario, scenario_yaml
 from stewart_drake.studies.study_options import Ranges
@@ -168,6 +169,24 @@ def test_drawn_limits_are_never_above_the_motors(tmp_path):
     scales = scales_of(assemble(sc), 0.6559)
     limits = [draw(Ranges(), scales, sc, 0, i)["torque_limit"] for i in range(50)]
     assert 0.8 < max(limits) < 3 * 0.6559
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (
+            ["actuator.torque_limit=0.0001"],
+            ["the motion takes up to 13.3 mN m, the motors give 0.1 (actuator.torque_limit)"],
+        ),
+        (["actuator.torque_limit=0.0134"], []),
+        (["actuator.torque_limit=none"], []),
+        (["plant.payload_mass=4", "actuator.torque_limit=0.0134"], ["the motion takes up to"]),
+        (["actuator.kind=servo", "controller.command=cranks", "actuator.torque_limit=0.001"], []),
+    ],
+)
+def test_motors_too_weak_for_the_motion_are_warned_of(settings, said):
+    found = cautions_before(prepare(scenario(*settings)), None)
+    assert len(found) == len(said) and all(map(str.startswith, found, said))
 
 
 def test_motors_at_their_limit_for_a_second():

@@ -187,6 +187,7 @@ def test_two_waypoints_of_a_file_are_the_minimum_jerk_motion(tmp_path):
         ([0, 1], [HOME] * 3, ["poses: got 3 poses", "expected 2"]),
         ([0, 1], [HOME, [0, 1.6, 0, 0, 0, 0]], ["poses[1][1]: got 1.6 rad", "90 degrees"]),
         ([0, 1], [HOME, [0, 0, 3.5, 0, 0, 0]], ["poses[1][2]: got 3.5 rad", "unwrap"]),
+        ([0, 1], [HOME, [7, 0, 0, 0, 0, 0]], ["poses[1][0]: got 7 rad", "(are these degrees?)"]),
         ([0, 1], [HOME, [0, 0, 0, 2e3, 0, 0]], ["poses[1][3]: got 2000 m", "1000"]),
     ],
 )
@@ -280,7 +281,14 @@ BAD_CSV = {
     "late start": (changed(0, "0.05,0,0,0,0,0,0.38"), ["row 2", "time[s]", "0.05", "subtract"]),
     "time twice": (changed(2, "0.1,0,0,0,0,0,0.38"), ["row 4", "time[s]", "0.1 after 0.1"]),
     "gap": (changed(5, "9,0,0,0,0,0,0.38"), ["row 7", "time[s]", "8.6 s", "resampling"]),
-    "pitch in degrees": (changed(1, "0.1,0,5,0,0,0,0.38"), ["row 3", "pitch[rad]", "90 degrees"]),
+    "pitch in degrees": (
+        changed(1, "0.1,0,5,0,0,0,0.38"),
+        ["row 3", "pitch[rad]", "(are these degrees?)"],
+    ),
+    "roll in degrees": (
+        changed(1, "0.1,15,0,0,0,0,0.38"),
+        ["row 3, column roll[rad]: got 15 rad; expected an angle within", "(are these degrees?)"],
+    ),
     "yaw jumps in degrees": (
         changed(1, "0.1,0,0,355,0,0,0.38").replace("yaw[rad]", "yaw[deg]"),
         ["row 3", "yaw[deg]: got 355 deg after 0; expected no jump by a turn"],

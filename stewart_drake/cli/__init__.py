@@ -166,6 +166,9 @@ def _usage_message(error: Any, words: list[str]) -> str:
     if extra := re.fullmatch(r"Got unexpected extra argument[^ ]* \((.*)\)", message):
         hint = "a value with a blank needs quotes"
         message = f"got {extra[1]!r}, which is neither argument nor value; expected {usage}; {hint}"
+        if not command.params:
+            does = f"{command.help[:1].lower()}{command.help[1:].rstrip('.')}"
+            message = f"got {extra[1]!r}; expected {path} alone, to {does}"
     elif parameter in arguments and message.startswith("Missing"):
         message = f"{_shown(parameter)}: got none in {shlex.join(words)!r}; expected {usage}"
         message += f", {parameter.help[:1].lower()}{parameter.help[1:].rstrip('.')}"

@@ -126,6 +126,7 @@ def _new(
         made = NewMachine(*study.new_machine(measurements, _name_of(folder), folder))
     delivery.add_files(study.MACHINE, study.SCENARIO)
     delivery.say(made.table())
+    delivery.say_wrapped(*_assumptions(measurements))
     delivery.discard(PAGE)
     delivery.write(made.summary)
     text = ""
@@ -142,6 +143,19 @@ def _new(
     status = delivery.end(made.summary)
     delivery.say(f"next: stewart-drake simulate {folder / study.SCENARIO} --out {folder / 'run'}")
     return status, text or "The report could not be written; see the terminal."
+
+
+def _assumptions(measurements: Measurements) -> list[str]:
+    """Return a line on the options that have their defaults, or none."""
+    usual = []
+    for one in Measurements.described():
+        if one.required or getattr(measurements, one.name) != one.default:
+            continue
+        text = f"{one.default:g}" if isinstance(one.default, float) else str(one.default)
+        words = {None: f"no --{one.dashed}", True: f"--{one.dashed}"}
+        usual.append(words.get(one.default, f"--{one.dashed} {text} {one.unit or ''}".strip()))
+    line = f"assumed by default: {', '.join(usual)}; give those that differ on your machine"
+    return [line] if usual else []
 
 
 def _measured(given: Given, asking: bool) -> Measurements:

@@ -3,7 +3,7 @@
 import difflib
 import importlib
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Final
 
 
 class ConfigError(ValueError):
@@ -24,8 +24,12 @@ def optional(module: str, problem: str) -> Any:
         raise ConfigError(problem) from None
 
 
+_LEAST_ALIKE: Final = 0.7
+"""Least share of common letters, by `difflib`, of two names that resemble each other."""
+
+
 def resembling(name: str, names: Iterable[str]) -> list[str]:
     """Return the names that resemble `name`, the nearest first; case does not count."""
     spelled = {other.casefold(): other for other in names}
-    close = difflib.get_close_matches(name.casefold(), spelled, n=max(1, len(spelled)))
+    close = difflib.get_close_matches(name.casefold(), spelled, max(1, len(spelled)), _LEAST_ALIKE)
     return [spelled[one] for one in close]

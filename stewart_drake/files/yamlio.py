@@ -32,7 +32,16 @@ _MAX_DEPTH: Final = 20
 _MOST_PROBLEMS: Final = 5  # largest number of problems in one message
 _UNKNOWN: Final = ("extra_forbidden", "unexpected_keyword_argument")
 
-_ALIKE: Final = {"start": "from", "begin": "from", "end": "to", "until": "to"}  # in meaning only
+_ALIKE: Final = {  # in meaning only
+    **{"start": "from", "begin": "from", "end": "to", "until": "to"},
+    "tolerance": "w_R",
+}
+_INDENTED: Final = re.compile("expected <block end>, but found '<block (mapping|sequence) start>'")
+_SPELLED: Final = {
+    **{"s": "s", "ms": "s", "m": "m", "cm": "m", "mm": "m", "kg": "kg", "g": "kg"},
+    **{"Nm": "N m", "mNm": "N m", "rad": "rad", "Hz": "Hz", "rad/s": "rad/s"},
+}
+"""Unit of a field by that which was written after a number, without blanks."""
 
 _T = TypeVar("_T")
 
@@ -100,6 +109,8 @@ def parse_yaml(text: str, where: str) -> Any:
         line = f"line {mark.line + 1}: " if mark else "is not YAML: "
         text = getattr(error, "problem", None) or getattr(error, "context", None) or str(error)
         problem = (text.strip() or type(error).__name__).splitlines()[0]
+        if _INDENTED.fullmatch(problem):
+            problem = "the indentation does not fit the lines above"
         problem = _cut(problem.partition(", if necessary")[0], 160)  # advice to programmers
         raise ConfigError(f"{where}: {line}{problem}; expected plain YAML") from None
 
@@ -183,7 +194,11 @@ def _refusal(where: str, type_: type, data: Any, caught: pydantic.ValidationErro
     errors = caught.errors(include_url=False)
     unknown = [_explain_unknown(type_, data, one) for one in errors if one["type"] in _UNKNOWN]
     hidden = (*_UNKNOWN, "missing") if unknown else ()
-    problems = unknown + [explain(data, one) for one in errors if one["type"] not in hidden]
+    problems = unknown + [
+        explain(data, one) + _fields_of(type_, data, one)
+        for one in errors
+        if one["type"] not in hidden
+    ]
     if (more := len(problems) - _MOST_PROBLEMS) > 0:
         problems = [*problems[:_MOST_PROBLEMS], f"and {more} more"]
     return ConfigError(f"{where}: {'; '.join(problems)}")
@@ -311,7 +326,23 @@ def explain(data: Any, error: Any) -> str:
         return f"{place}.{error['loc'][-1]}: is missing".removeprefix(".")
     if error["type"] == "union_tag_invalid":
         place, value, expected = f"{place}.kind", error["ctx"]["tag"], error["ctx"]["expected_tags"]
+    with_unit = re.fullmatch(r"[-+.\deE]*\d\s*(\D+)", value) if isinstance(value, str) else None
+    if with_unit and (unit := _SPELLED.get(with_unit[1].replace(" ", ""))):
+        expected += f", in {unit}"
     return f"{place}: got {brief(value)}; expected {expected}".removeprefix(": ")
+
+
+def _fields_of(type_: type, data: Any, error: Any) -> str:
+    """Return the end of a message about a section that is no mapping: its fields, or ''."""
+    if not accepted(error["msg"]).endswith("a mapping of fields"):
+        return ""
+    above = re.sub(r"\[\d+\]", "", _place(data, error["loc"]))
+    names = dict.fromkeys(
+        name.rpartition(".")[2]
+        for name, _ in dotted_names(type_)
+        if name.rpartition(".")[0] == above
+    )
+    return _cut(f": {', '.join(names)}", 160)
 
 
 def _explain_unknown(type_: type, data: Any, error: Any) -> str:

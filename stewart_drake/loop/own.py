@@ -1,7 +1,9 @@
 """Systems, trajectory and law of the user, with checks before a run."""
 
+import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping
+from traceback import walk_tb
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple, TypeVar
 from weakref import WeakSet
@@ -106,6 +108,15 @@ class Own(NamedTuple):
             (role for role in ("controller", "sensor", "link") if role in self.systems), None
         )
 
+    def place(self, error: Exception) -> str:
+        """Return the system in which an error was raised, with its output, or an empty text."""
+        for frame, _ in walk_tb(error.__traceback__):
+            for role, system in self.systems.items():
+                if frame.f_locals.get("self") is system:
+                    outputs = _sizes(map(system.get_output_port, range(system.num_output_ports())))
+                    return f"in {role} {type(system).__name__}, with output {_listed(outputs)}, "
+        return ""
+
     def claim(self, scenario: Scenario) -> None:
         """Reserve the systems for one loop of a scenario."""
         for role in self.systems:
@@ -149,9 +160,11 @@ def take(given: Mapping[str, Any]) -> Own:
     for role, system in systems.items():
         _check(role, system)
     reference, law = given.get("reference"), given.get("modify_law")
-    if law is not None and not callable(law):
+    misfit = _misfit(law, None) if callable(law) else ""
+    if law is not None and (misfit or not callable(law)):
         raise ConfigError(
-            f"modify_law: got a {type(law).__name__}; expected a function of the scenario's law"
+            f"modify_law: got a {type(law).__name__}{misfit}; expected a function of the "
+            "scenario's law"
         )
     for other in ("modify_law", "tuner"):
         if "controller" in systems and other in given:
@@ -167,13 +180,34 @@ def take(given: Mapping[str, Any]) -> Own:
 
 
 def _make(what: str, given: Any, kind: type) -> Any:
-    made = given if isinstance(given, kind) or not callable(given) else given()
+    called = callable(given) and not isinstance(given, kind)
+    misfit = _misfit(given) if called else ""
+    made = given() if called and not misfit else given
     if not isinstance(made, kind):
-        name = "Drake system" if kind is System else "Drake trajectory"
+        name = f"system with {_ports(what)}" if kind is System else "trajectory"
         raise ConfigError(
-            f"{what}: got a {type(made).__name__}; expected a {name}, or a function that makes one"
+            f"{what}: got a {type(made).__name__}{misfit}; expected a Drake {name}, or a function "
+            "without arguments that makes one, such as its class"
         )
     return made
+
+
+def _misfit(function: Callable[..., Any], *arguments: Any) -> str:
+    """Return why a function cannot be called with these arguments, in brackets, or ''."""
+    try:
+        inspect.signature(function).bind(*arguments)
+    except TypeError as error:
+        return f" ({error})"
+    except ValueError:  # of C++
+        pass
+    return ""
+
+
+def _ports(role: str) -> str:
+    """Return the ports that a system in a role needs, and may have."""
+    needed, may, offered = ({n: _SIZES[n] for n in names.split()} for names in ROLES[role][:3])
+    wanted = f", if wanted {_listed(may)}" if may else ""
+    return f"inputs {_listed(needed)}{wanted}, and output {_listed(offered, ' or ')}"
 
 
 def _check(role: str, system: System) -> None:
@@ -187,11 +221,9 @@ def _check(role: str, system: System) -> None:
         found and found.items() <= offered.items()
     ):
         return
-    wanted = f", if wanted {_listed(may)}" if may else ""
     raise ConfigError(
         f"{role}: {type(system).__name__}: got inputs {_listed(inputs)} and outputs "
-        f"{_listed(outputs)}; expected inputs {_listed(needed)}{wanted}, and output "
-        f"{_listed(offered, ' or ')}"
+        f"{_listed(outputs)}; expected {_ports(role)}"
     )
 
 

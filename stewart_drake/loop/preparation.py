@@ -12,7 +12,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
 from stewart_drake.dynamics.workspace import Failure, Limits, Workspace, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
-from stewart_drake.law.startup import STILL, initial_queue
+from stewart_drake.law.startup import STILL, initial_queue, sizes
 from stewart_drake.loop.own import NOTHING, Own, own_motion, take
 from stewart_drake.machines import reachy_mini  # noqa: F401 registers its kind of reference
 from stewart_drake.mechanism.files import load_mechanism
@@ -23,6 +23,7 @@ from stewart_drake.mechanism.trajectories import (
     make_reference,
     motion_range,
     peak_to_peak,
+    poses_along,
 )
 from stewart_drake.scenario.calibration import (
     OFFSETS,
@@ -34,7 +35,9 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.loading import as_scenario
 from stewart_drake.scenario.signals import (
+    ANGLES,
     BIAS,
+    COORDINATE_NAMES,
     COULOMB,
     DAMPING,
     PARAMETERS,
@@ -53,6 +56,8 @@ MAX_FROZEN_ERROR = 10.0
 """Largest error of the paper's plant, which has no workspace, in peak-to-peaks of the reference."""
 REACH_CHECK_PERIOD = 0.02
 """s between the instants at which a reference is checked against the workspace."""
+_FAR = 20
+"""Share of the reach of a leg from which a position counts as one in another unit."""
 _ESTIMATED = {
     "torque_bias": PARAMETERS[BIAS],
     "payload": (PARAMETERS[PAYLOAD],),
@@ -197,9 +202,11 @@ def check_reach(experiment: Experiment) -> None:
     governed = experiment.scenario.controller.limits == "qp"
     if failure is not None and not (governed and failure.time > 0):
         first = experiment.reference.value(0.0)[:, 0]
+        file = getattr(experiment.scenario.reference, "file", None)
         short = failure.leg is not None and failure.margin < 0
         raise ConfigError(
-            f"reference: {failure.reason} at t = {failure.time:.2f} s"
+            (f"{file}: " if file and experiment.own.reference is None else "reference: ")
+            + f"{failure.reason} at t = {failure.time:.2f} s"
             + (f", short by {-1e3 * failure.margin:.3g} mm" if short else "")
             + "; expected a motion within reach"
             + (
@@ -207,7 +214,22 @@ def check_reach(experiment: Experiment) -> None:
                 if failure.time > 0
                 else f": {first_pose_text(first, experiment.mechanism)}"
             )
+            + _units_hint(experiment)
         )
+
+
+def _units_hint(experiment: Experiment) -> str:
+    """Return the end of a message about a motion out of reach that may be in deg or mm, or ''."""
+    poses = poses_along(experiment.reference, check_instants(experiment.scenario.duration))
+    largest = np.abs(poses).max(axis=0)
+    for part, most, unit, units in (
+        (ANGLES, math.pi, "rad", "degrees"),
+        (POSITION, _FAR * sizes(experiment.mechanism)[-1], "m", "millimetres"),
+    ):
+        name, value = COORDINATE_NAMES[part][largest[part].argmax()], largest[part].max()
+        if value > most:
+            return f"; {name} reaches {value:.3g} {unit} (are these {units}?)"
+    return ""
 
 
 def concrete(

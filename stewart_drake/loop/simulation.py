@@ -163,8 +163,10 @@ def _advance(
             # Without `progress`, whose RuntimeError is not Drake's.
             try:
                 left = _advance_to(t, simulator, recorder)
-            except RuntimeError as error:
-                if _raised_elsewhere(error):
+            except Exception as error:
+                if not isinstance(error, RuntimeError) or _raised_elsewhere(error):
+                    place = loop.experiment.own.place(error)
+                    error.add_note(f"{place}at t = {context.get_time():.6g} s")
                     raise
                 # Drake's solver fails where constraints and dynamics contradict each other.
                 return "solver_failed", Failure(context.get_time(), None, np.nan, _one_line(error))

@@ -233,6 +233,9 @@ def build_mechanism(spec: MechanismSpec) -> Mechanism:
             f"plate.mass: got {spec.plate.mass:g} kg on a radius of {plate_radius:g} m, lighter "
             "than paper; expected lengths in metres (are these millimetres?)"
         )
+    crank, rod = (float(np.max(link.length)) for link in (spec.crank, spec.rod))
+    if crank > _UNLIKE * rod:
+        raise _unlike({"crank.length": crank, "rod.length": rod})
     try:
         return Mechanism(
             **vars(legs),
@@ -251,17 +254,23 @@ def build_mechanism(spec: MechanismSpec) -> Mechanism:
     except UnreachablePoseError:
         anchors = "legs" if spec.pattern is None else "pattern"
         sizes = {
-            "crank.length, rod.length": max(np.max(spec.crank.length), np.max(spec.rod.length)),
+            "crank.length, rod.length": max(crank, rod),
             anchors: max(base_radius, plate_radius),
             "home": float(np.linalg.norm(spec.home[3:])),
         }
         largest, other, _ = sorted(sizes, key=lambda name: -sizes[name])
         if largest == "home" or sizes[largest] < _UNLIKE * sizes[other]:
             raise
-        raise ConfigError(
-            f"{largest}: got up to {sizes[largest]:g} m, {sizes[largest] / sizes[other]:.0f} times "
-            f"the size of {other}; expected metres (are these millimetres?)"
-        ) from None
+        raise _unlike({name: sizes[name] for name in (largest, other)}) from None
+
+
+def _unlike(sizes: dict[str, float]) -> ConfigError:
+    """Return the error about two lengths in m, of which the first one is in another unit."""
+    (name, length), (other, size) = sizes.items()
+    return ConfigError(
+        f"{name}: got up to {length:g} m, {length / size:.0f} times the size of {other}; expected "
+        "metres (are these millimetres?)"
+    )
 
 
 def _disc(spec: BodySpec, radius: float) -> Body:

@@ -18,7 +18,7 @@ from stewart_drake.reporting.results import (
     SimulationResult,
 )
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import as_scenario, title_of
+from stewart_drake.scenario.loading import as_scenario, setting_texts, title_of
 from stewart_drake.studies import compare as comparison
 from stewart_drake.studies.options import Options, takes
 
@@ -60,7 +60,7 @@ def report(
     from stewart_drake.reporting import report as report_document
     from stewart_drake.reporting.page import Provenance
 
-    settings, name = tuple(settings), title_of(scenario)
+    settings, name = setting_texts(settings), title_of(scenario)
     found = report_document.collect(scenario, settings, controller=controller)
     own = "" if controller is None else f", {str(controller)!r}"
     made = Provenance(f"sd.report({str(scenario)!r}, {list(settings)}{own})")

@@ -49,7 +49,7 @@ from stewart_drake.reporting.results import AnalysisResult
 from stewart_drake.reporting.run import comparison_document, moving, run_document, worst
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.link import link_text, number_sent
-from stewart_drake.scenario.loading import load_compatible, scenario_yaml
+from stewart_drake.scenario.loading import load_compatible, scenario_yaml, setting_texts
 from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.studies import compare
 from stewart_drake.studies.compare import LABELS, is_papers, label
@@ -134,7 +134,7 @@ def collect(
         ChildProcessError: a worker process died.
         KeyboardInterrupt: Ctrl-C.
     """
-    settings = tuple(settings)
+    settings = setting_texts(settings)
     scenario = load_compatible(scenario_name, controller, settings)
     failure = assemble(scenario).reference_failure()
     scenarios: dict[str, Scenario] = {}

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from stewart_drake.loop.preparation import assemble, check_instants
-from stewart_drake.loop.results import LEAST_MEASURED, SimulationResult
+from stewart_drake.loop.results import LEAST_MEASURED, SimulationResult, waits_at_rest
 from stewart_drake.mechanism.kinematics import turns_between
 from stewart_drake.reporting.document import Document, counted, from_template, measured, number
 from stewart_drake.reporting.style import FACTORS, TORQUES, UNITS, unit_for
@@ -71,6 +71,8 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
         s=s,
         peaks=", ".join(_peaks(result)),
         second_half=_second_half(result),
+        floor=waits_at_rest(result.scenario),
+        delay=measured(2e3 * s["delay"]["std_s"], 1e3 * s["delay"]["estimated_s"]),
         estimates=_estimates(result),
         held=_held(result),
         least=LEAST_MEASURED,
@@ -222,7 +224,8 @@ def _row(title: str, name: str, run: SimulationResult) -> dict[str, Any]:
     s, stopped = run.summary, run.stopped
     row = {"title": title, "name": name, "paper": _paper_error(name, run), "s": s}
     if stopped is None:
-        numbers = {"error": s["accumulated_error"], "floor": s["delay_floor"], "cost": s["cost"]}
+        floor = s["delay_floor"] if waits_at_rest(run.scenario) else "-"
+        numbers = {"error": s["accumulated_error"], "floor": floor, "cost": s["cost"]}
         return row | numbers | {"worst": worst(run)}
     leg = "" if stopped.leg is None else f",\nleg {stopped.leg}"
     ended = f"{run.status.replace('_', ' ')}\nat {stopped.time:.2f} s{leg}"

@@ -9,9 +9,11 @@ import math
 from dataclasses import field
 from typing import Annotated, Any, Final, Literal
 
+import pydantic
 from pydantic import AfterValidator, Field
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.files.resources import resolve, shipped
 from stewart_drake.files.schema import ByKind
 from stewart_drake.files.yamlio import brief, differences, exactly, rule, validate
 from stewart_drake.scenario.delay import Delay
@@ -229,6 +231,20 @@ def _check_estimate(names: list[str]) -> list[str]:
     return sorted(names, key=order.index)
 
 
+@pydantic.WrapValidator
+def _no_controllers_name(value: Any, accept: pydantic.ValidatorFunctionWrapHandler) -> Any:
+    """Accept a kind; name what the name of a shipped controller is for."""
+    try:
+        return accept(value)
+    except pydantic.ValidationError as error:
+        if value not in shipped("controller"):
+            raise
+        raise ValueError(
+            f"{error.errors()[0]['ctx']['expected']}; {value} is a shipped controller: "
+            f"--controller {value}, or a copy of {resolve('controller', value)} as your file"
+        ) from None
+
+
 _zero_or_long = rule(lambda s: not 0 < s < 1e-3, "0 for none, null, or at least 0.001 s")
 Estimate = Annotated[list[str], AfterValidator(_check_estimate)]
 """Names of estimated parameters, in a fixed order."""
@@ -309,7 +325,7 @@ class ControllerConfig:
         "rejoin": "replan",
         "known": "calibration",
     }
-    kind: Literal["lqi", "pd"] = "lqi"
+    kind: Annotated[Literal["lqi", "pd"], _no_controllers_name] = "lqi"
     kp: Annotated[float, Field(gt=0, le=1e9)] | None = None
     kd: Annotated[float, Field(gt=0, le=1e6)] | None = None
     period: Annotated[float, Field(ge=1e-4, le=10)] = 0.1

@@ -8,7 +8,7 @@ is dropped.
 
 import dataclasses
 import typing
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -146,7 +146,7 @@ def read_scenario(
         laid = load_controller(controller)
         places |= dict.fromkeys(_dotted_names({"controller": laid}), str(controller))
         data["controller"] = data.get("controller", {}) | laid
-    overlay = _parse_settings(settings, data)
+    overlay = _parse_settings(setting_texts(settings), data)
     places |= dict.fromkeys(_dotted_names(overlay), _SETTINGS)
     for name, change in overlay.items():
         data[name] = _laid_over(name, data.get(name), change)
@@ -196,7 +196,7 @@ def load_comparison(
         further: whether to add the rows of `compare` that are not among the controllers, in the
             file's order.
     """
-    settings = tuple(settings)
+    settings = setting_texts(settings)
     others = tuple(s for s in settings if not s.strip().startswith("controller.delay_"))
     read = read_scenario(name_or_path, settings=settings)
     read.scenario.check_rows(read.where)
@@ -270,6 +270,17 @@ def setting_choices() -> list[str]:
             values = ("true", "false") if inner is bool else values
             choices |= dict.fromkeys(f"{field}={value}" for value in values)
     return [*choices, *(f"{_OVERLAY}={name}" for name in shipped("overlay"))]
+
+
+def setting_texts(settings: Iterable[str]) -> tuple[str, ...]:
+    """Return settings; raise an error for what is no list of texts, such as a text or a mapping."""
+    given = () if isinstance(settings, str | Mapping) else tuple(settings)
+    if isinstance(settings, str | Mapping) or not all(isinstance(one, str) for one in given):
+        raise ConfigError(
+            f"{_SETTINGS}: got {brief(settings)}; expected a list of texts, such as "
+            "['plant.kind=exact']"
+        )
+    return given
 
 
 def _parse_settings(settings: Iterable[str], data: dict[str, Any]) -> dict[str, Any]:

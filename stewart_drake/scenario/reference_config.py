@@ -5,7 +5,7 @@
 
 import math
 from dataclasses import field
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
@@ -13,12 +13,33 @@ from stewart_drake.files.schema import ByKind
 from stewart_drake.files.yamlio import one_message
 from stewart_drake.scenario.field_types import Name, Row, Seconds, Six, section
 
+MOST_TURN: Final = 2 * math.pi
+"""Largest |roll| and |yaw| of a motion, rad: a plate on legs turns less."""
 
-def _pitch_problem(largest_pitch: float) -> str | None:
-    if largest_pitch < math.pi / 2:
-        return None
-    expected = "|offset| + |amplitude| below pi/2, where roll and yaw stay distinct"
-    return f"reference.offset: the pitch reaches {largest_pitch:.4g} rad; expected {expected}"
+
+def degrees_hint(angle: float) -> str:
+    """Return the end of a message about an angle in rad that may be one in degrees."""
+    return " (are these degrees?)" if abs(angle) > math.pi else ""
+
+
+def _angle_problem(offset: list[float], amplitude: list[float]) -> str | None:
+    for name, limit, expected, middle, swing in zip(
+        ("pitch", "roll", "yaw"),
+        (math.pi / 2, MOST_TURN, MOST_TURN),
+        ("pi/2, where roll and yaw stay distinct", "2 pi", "2 pi"),
+        *([abs(six[k]) for k in (1, 0, 2)] for six in (offset, amplitude)),
+        strict=True,
+    ):
+        if middle + swing >= limit:
+            field = "amplitude" if swing > middle else "offset"
+            hint = degrees_hint(middle + swing)
+            if hint and max(map(abs, amplitude[3:])) >= 1:
+                hint = " (are these degrees and mm?)"
+            return (
+                f"reference.{field}: the {name} reaches {middle + swing:.4g} rad; expected "
+                f"|offset| + |amplitude| below {expected}{hint}"
+            )
+    return None
 
 
 _Frequency = Annotated[float, Field(gt=0, le=1e4)]
@@ -56,7 +77,7 @@ class SineConfig:
 
     def problem(self) -> str | None:
         """Return the message of the first broken rule between fields, or None."""
-        return _pitch_problem(abs(self.amplitude[1]) + abs(self.offset[1]))
+        return _angle_problem(self.offset, self.amplitude)
 
 
 @section
@@ -71,7 +92,7 @@ class HoldConfig:
     offset: Six = field(default_factory=lambda: [0.0, 0.0, 0.0, 0.0, 0.0, 0.38])
 
     def problem(self) -> str | None:
-        return _pitch_problem(abs(self.offset[1]))
+        return _angle_problem(self.offset, [0.0] * 6)
 
 
 @section

@@ -16,7 +16,7 @@ from stewart_drake.files.csvio import ANGLE_UNITS, LENGTH_UNITS, read_table
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import load_yaml, validate
 from stewart_drake.scenario.field_types import STRICT, Row, Seconds
-from stewart_drake.scenario.reference_config import WaypointsConfig
+from stewart_drake.scenario.reference_config import MOST_TURN, WaypointsConfig, degrees_hint
 from stewart_drake.scenario.signals import COORDINATE_NAMES
 from stewart_drake.types import Array, Flags
 
@@ -148,6 +148,8 @@ def _check_samples(times: Array, poses: Array, place: Place, scales: Mapping[str
                 previous = f" after {poses[row - 1, axis] / scale:.6g}"
             got = f"{float(poses[row, axis]) / scale:.9g} {unit}{previous}"
             expected = problem.format(limit=f"{limit / scale:.6g} {unit}")
+            if unit == "rad":
+                expected += degrees_hint(poses[row, axis])
             raise ConfigError(f"{place(row, name)}: got {got}; expected {expected}")
 
     for row in 1 + np.flatnonzero(np.diff(times) < _MIN_STEP)[:1]:
@@ -156,6 +158,7 @@ def _check_samples(times: Array, poses: Array, place: Place, scales: Mapping[str
             "expected increasing times"
         )
     check(np.abs(poses) >= _MAX_SIZE, "a finite number below {limit}", _MAX_SIZE)
+    check(np.abs(poses[:, :3]) >= MOST_TURN, "an angle within {limit}, a turn", MOST_TURN)
     steep = np.abs(poses[:, :2]) >= [[math.inf, math.pi / 2]]
     check(steep, "a pitch within {limit}, 90 degrees", math.pi / 2)
     jumps = np.abs(np.diff(poses[:, :3], axis=0)) > math.pi

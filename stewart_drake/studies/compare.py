@@ -22,7 +22,12 @@ from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import load_comparison, load_compatible, read_scenario
+from stewart_drake.scenario.loading import (
+    load_comparison,
+    load_compatible,
+    read_scenario,
+    setting_texts,
+)
 from stewart_drake.studies.jobs import run_jobs
 
 ADAPTIVE: Final = "adaptive_lqi"
@@ -89,7 +94,7 @@ def compare(
         Results by controller, the shipped or given ones first, then your own. The name of a file
         is without its suffix.
     """
-    settings, chosen = tuple(settings), None
+    settings, chosen = setting_texts(settings), None
     makers: dict[str, Callable[[], System]] = {}
     if isinstance(controllers, Mapping):
         makers = dict(controllers)
@@ -141,7 +146,7 @@ def shown(
     To the latter ADAPTIVE is added if the others' delay is not the true one, or changes, and the
     scenario supports it; GRAVITY if gravity acts; SERVOS if the scenario's motors are servos.
     """
-    settings = tuple(settings)
+    settings = setting_texts(settings)
     if controllers is not None:
         return load_comparison(scenario_name, controllers, settings, further=False)
     rows, further = load_comparison(scenario_name, CONTROLLERS, settings, False), list[str]()

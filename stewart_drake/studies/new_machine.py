@@ -259,7 +259,10 @@ def refuse_existing(folder: Path) -> None:
     """Raise an error if a folder has one of MACHINE and SCENARIO."""
     for file in (MACHINE, SCENARIO):
         if (folder / file).exists():
-            raise ConfigError(f"{folder / file}: already exists; expected a folder without it")
+            raise ConfigError(
+                f"{folder / file}: already exists; expected a folder without it: another one, or "
+                f"this one after you delete {file}"
+            )
 
 
 def proposed(m: Measurements, name: str, machine: Path) -> MechanismCheck:
