@@ -106,7 +106,7 @@ def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bo
     It is that of a run: signals.nc, .mcap, .csv or a folder; else CSV of a machine, in which the
     motors' limit clips the torques. Precision and gravity are for CSV.
     """
-    if path.is_file() and path.suffix not in (".nc", ".mcap", ".csv"):
+    if path.is_file() and path.suffix in (".json", ".yaml", ".html", ".npz"):
         raise ConfigError(f"{path}: got a file of another kind; expected {EXPECTED}")
     if is_run(path):
         log = _of_run(path, mechanism)
