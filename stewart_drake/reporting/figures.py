@@ -43,7 +43,7 @@ _STATE_REACH: Final = 0.3
 _ERROR_REACH: Final = 0.5
 """Largest widening of an axis by a diverging run, as a share of the reference's peak to peak."""
 _LEAST_SPAN: Final = 0.02
-"""Least span of a coordinate's axis, as a share of the largest motion in its unit."""
+"""Least span of a coordinate's axis, as a share of the largest in its unit."""
 _ROUNDING: Final = 1e-6
 """Least span of a coordinate's axis, deg or mm: less is rounding."""
 _FINE: Final = 1e-3
@@ -127,8 +127,7 @@ def _poses(runs: _Runs) -> dict[str, Figure]:
 def _states(runs: _Runs, wanted: xarray.Dataset, held: bool) -> Figure:
     reference = FACTORS * wanted.reference.values
     spans = span(reference)
-    motion = np.repeat([spans[ANGLES].max(), spans[POSITION].max()], 3)
-    least = np.maximum(_LEAST_SPAN * motion, _FINE if held else _ROUNDING)
+    least = _least(spans, _FINE if held else _ROUNDING)
     time = wanted.time.values
     curves = [Curve(time, column, "reference", style.REFERENCE) for column in reference.T]
     title = "Pose of the plate and its reference"
@@ -151,8 +150,16 @@ def _errors(runs: _Runs, wanted: xarray.Dataset) -> Figure:
         title += f"; the largest is {', '.join(worst(run) for run, _ in runs.values())}"
     shares = [100 * np.mean(np.abs(r.signals.error.values) / scale, 1) for r, _ in runs.values()]
     mean = _sizes("mean error  [%]", _curves(runs, shares), _trusted(runs, shares), _times(runs))
-    least = np.full(6, _ROUNDING)
+    drawn = _trusted(runs, [FACTORS * r.signals.error.values for r, _ in runs.values()])
+    whole = np.concatenate([some[np.isfinite(some).all(axis=1)] for some in drawn])
+    least = _least(span(whole), _ROUNDING)
     return _coordinates(title, runs, "error", _ERROR_REACH * spans, least, below=[mean])
+
+
+def _least(spans: Array, least: float) -> Array:
+    """Return the least spans (6,) of the axes for spans (6,) of what is drawn."""
+    largest = np.repeat([spans[ANGLES].max(), spans[POSITION].max()], 3)
+    return np.maximum(_LEAST_SPAN * largest, least)
 
 
 def _sizes(
