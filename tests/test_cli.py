@@ -84,7 +84,7 @@ def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys):
     assert heads.split()[-3:] == ["sent", "applied", "var."] and "was commanded" in out
     # The LQI asked for a torque that never acted: the plate was gone before it arrived.
     assert [float(x) for x in rows[3].split()[-3:-1]] == [1.7, 0.13]
-    torques = {f"torques_{name}" for name in ("delay_lqr", "delay_lqi", "predictor_lqi")}
+    torques = {f"torques_{name}" for name in CONTROLLERS}
     assert files(tmp_path) == {
         *(f"{n}.{s}" for n in {"states", "errors", *torques} for s in ("png", "svg")),
         *(f"{name}.nc" for name in CONTROLLERS),

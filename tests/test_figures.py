@@ -93,8 +93,7 @@ def test_axes_name_their_units(run):
 
 def test_a_diverging_run_does_not_squash_the_others_and_ends_with_a_cross(comparison):
     drawn = draw_comparison(comparison)
-    torques = ["torques_delay_lqr", "torques_delay_lqi", "torques_predictor_lqi"]
-    assert list(drawn) == ["states", "errors", *torques]
+    assert list(drawn) == ["states", "errors", *(f"torques_{name}" for name in CONTROLLERS)]
     run = comparison["lqi"].signals
     shown = drawn["states"].axes[0]
     motion = np.rad2deg(np.ptp(run.reference.values[:, 0]))

@@ -73,7 +73,7 @@ def test_a_report_that_cannot_be_drawn_leaves_its_numbers(tmp_path, monkeypatch,
 
 @pytest.mark.slow
 def test_nothing_of_an_earlier_comparison_stays_beside_new_results(tmp_path, monkeypatch):
-    assert {*figures.TORQUE_CONTROLLERS, ADAPTIVE, *GRAVITY, *SERVOS} <= set(LABELS)
+    assert {*CONTROLLERS, ADAPTIVE, *GRAVITY, *SERVOS} <= set(LABELS)
     for name in LABELS:
         for old in (f"{name}.nc", f"torques_{name}.png", f"delay_{name}.svg", "weights.png"):
             (tmp_path / old).write_text("of an earlier comparison")

@@ -29,12 +29,8 @@ from stewart_drake.scenario.signals import (
     POSITION,
     WEIGHTS,
 )
-from stewart_drake.studies.compare import ADAPTIVE, GRAVITY, LABELS, SERVOS
 from stewart_drake.studies.compare import label as spoken
 from stewart_drake.types import Array
-
-TORQUE_CONTROLLERS: Final = ("delay_lqr", "delay_lqi", "predictor_lqi")
-"""Delay-aware controllers, with figures of their torques in a comparison."""
 
 _SYMBOLS: Final = dict(zip(COORDINATES, ("roll φ", "pitch θ", "yaw ψ", "x", "y", "z"), strict=True))
 _PARAMETER_GROUPS: Final = (slice(0, 6), slice(6, 7), slice(7, 8))
@@ -65,7 +61,7 @@ _Runs = Mapping[str, tuple[SimulationResult, Line]]
 
 
 def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure]:
-    """Return states, errors, and torques of each delay-aware controller, by name.
+    """Return states, errors, and the torques of each controller, by name.
 
     A controller that finds the delay adds a figure of it, a tuner one of its weights.
     """
@@ -73,15 +69,12 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
         return {}
     lines = style.controller_lines(results)
     runs = {spoken(name): (result, lines[name]) for name, result in results.items()}
-    own = (name for name in results if name not in LABELS)
-    shown = (*TORQUE_CONTROLLERS, ADAPTIVE, *GRAVITY, *SERVOS, *own)
-    aware = {name: results[name] for name in shown if name in results}
     figures = _poses(runs)
-    for name, result in aware.items():
+    for name, result in results.items():
         alone = lines[name]._replace(linestyle="-", marker="")
         figures[f"torques_{name}"] = _torques(result, spoken(name), alone)
-    figures |= {f"delay_{name}": _delay(one) for name, one in aware.items() if _finds_delay(one)}
-    tuned = {spoken(name): run for name, run in aware.items() if _is_tuned(run)}
+    figures |= {f"delay_{name}": _delay(one) for name, one in results.items() if _finds_delay(one)}
+    tuned = {spoken(name): run for name, run in results.items() if _is_tuned(run)}
     if tuned:
         figures["weights"] = weights_figure(tuned)
     return figures

@@ -35,7 +35,6 @@ from stewart_drake.reporting.document import (
     sentence,
 )
 from stewart_drake.reporting.figures import (
-    TORQUE_CONTROLLERS,
     draw_comparison,
     draw_run,
     has_packets,
@@ -61,6 +60,8 @@ from stewart_drake.tuner.network import DEFAULT
 ANALYSES: Final = ("delay", "hautus", "workspace")
 _OWN: Final = ""
 """Key of the scenario's own run; no row of a comparison has this name."""
+_WEIGHTED: Final = ("delay_lqr", "delay_lqi", "predictor_lqi")
+"""Controllers that the report also runs with a network's weights."""
 _TUNED: Final = "tuned-"
 GOOD: Final = 5.0
 POOR: Final = 25.0
@@ -146,7 +147,7 @@ def collect(
             scenarios[_OWN] = scenario
         if has_network(scenario):
             tuned = (*settings, "tuner.kind=ann")
-            for name in TORQUE_CONTROLLERS:
+            for name in _WEIGHTED:
                 scenarios[_TUNED + name] = load_compatible(scenario_name, name, tuned)
     done, analyses = _work(scenario, scenarios, progress)
     return ReportData(
@@ -154,7 +155,7 @@ def collect(
         failure=failure,
         run=next((done[key] for key, sc in scenarios.items() if sc == scenario), None),
         comparison={name: done[name] for name in scenarios if name in rows},
-        tuned={name: done[_TUNED + name] for name in TORQUE_CONTROLLERS if _TUNED + name in done},
+        tuned={name: done[_TUNED + name] for name in _WEIGHTED if _TUNED + name in done},
         analyses=analyses,
     )
 
