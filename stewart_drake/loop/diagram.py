@@ -60,7 +60,24 @@ _TUNER_INPUTS: Final = {
 """Outputs for the optional inputs of a tuner."""
 
 
-class ClosedLoop(Diagram):
+class Machine(Diagram):
+    """A diagram with the plant of an experiment."""
+
+    experiment: Experiment
+
+    def CreateDefaultContext(self) -> Context:
+        """Return a root context at t = 0 in the scenario's start state, all loops closed.
+
+        A `Simulator` without a context starts a multibody plant at rest, since Drake has no default
+        velocities. `StartCheck` warns about this.
+        """
+        context = super().CreateDefaultContext()
+        plant: Any = self.GetSubsystemByName("plant")
+        plant.set_state(plant.GetMyMutableContextFromRoot(context), self.experiment.start)
+        return context
+
+
+class ClosedLoop(Machine):
     """The closed loop; output ports are named after the signals.
 
     Subsystems, by name: `reference`, `sensor`, `controller`, `delay_chain`, `torque_bias`, `plant`,
@@ -83,19 +100,7 @@ class ClosedLoop(Diagram):
         catch_up: length of the blend onto the reference, s; 0 without one.
     """
 
-    experiment: Experiment
     catch_up: float
-
-    def CreateDefaultContext(self) -> Context:
-        """Return a root context at t = 0 in the scenario's start state, all loops closed.
-
-        A `Simulator` without a context starts a multibody plant at rest, since Drake has no default
-        velocities. `StartCheck` warns about this.
-        """
-        context = super().CreateDefaultContext()
-        plant: Any = self.GetSubsystemByName("plant")
-        plant.set_state(plant.GetMyMutableContextFromRoot(context), self.experiment.start)
-        return context
 
     def SetParameters(self, context: Context, **parameters: Any) -> None:
         """Change mass, payload and friction of the plant in the root context.
@@ -169,7 +174,7 @@ def build_closed_loop(
     return loop
 
 
-def build_machine(experiment: Experiment) -> Diagram:
+def build_machine(experiment: Experiment) -> Machine:
     """Build plant and sensor alone, for torques from elsewhere.
 
     | port | direction | size | unit |
@@ -189,8 +194,10 @@ def build_machine(experiment: Experiment) -> Diagram:
     builder.ExportInput(plant.GetInputPort("torque"), "torque")
     builder.ExportOutput(_output(builder, "plant.state"), "state")
     builder.ExportOutput(_output(builder, "sensor.measurement"), "measurement")
-    machine = builder.Build()
+    machine = Machine()
+    builder.BuildInto(machine)
     machine.set_name("machine")
+    machine.experiment = experiment
     return machine
 
 
