@@ -1,7 +1,7 @@
 """The closed loop of a scenario as a Drake diagram."""
 
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Unpack
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -30,7 +30,7 @@ from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.kinds import LINKS, PLANTS, SENSORS, wire
 from stewart_drake.loop.law_design import control_law, first_queue, followed_motion
 from stewart_drake.loop.link import LateMeasurements
-from stewart_drake.loop.own import OwnLaw, OwnReference, OwnSystem
+from stewart_drake.loop.own import OwnSystems
 from stewart_drake.loop.platforms import MultibodyStewart, StartCheck, add_to_torque
 from stewart_drake.loop.preparation import Experiment, concrete
 from stewart_drake.loop.push import Push
@@ -123,39 +123,24 @@ class ClosedLoop(Machine):
 def build_closed_loop(
     scenario: Scenario | str | Path | Experiment,
     *,
-    controller: OwnSystem | None = None,
-    reference: OwnReference | None = None,
-    disturbance: OwnSystem | None = None,
-    modify_law: OwnLaw | None = None,
-    sensor: OwnSystem | None = None,
-    link: OwnSystem | None = None,
-    tuner: OwnSystem | None = None,
     meshcat: Meshcat | None = None,
     true_mechanism: Mechanism | None = None,
+    **own: Unpack[OwnSystems],
 ) -> ClosedLoop:
     """Build the diagram of a scenario: reference, controller, limit, link, plant, sensor.
 
     Args:
         scenario: a scenario, prepared or not, or a shipped name or a path.
-        controller, reference, disturbance, modify_law, sensor, link, tuner: as of `simulate`.
         meshcat: shows the multibody plant during the simulation, or None.
         true_mechanism: as of `simulate`.
+        **own: `controller`, `reference`, `disturbance`, `modify_law`, `sensor`, `link`, `tuner`, as
+            of `simulate`.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
         TypeError: systems of the user with a prepared scenario, which has its own.
     """
-    experiment = concrete(
-        scenario,
-        true_mechanism,
-        controller=controller,
-        reference=reference,
-        disturbance=disturbance,
-        modify_law=modify_law,
-        sensor=sensor,
-        link=link,
-        tuner=tuner,
-    )
+    experiment = concrete(scenario, true_mechanism, **own)
     experiment.own.claim(experiment.scenario)
     builder = DiagramBuilder()
     sc, network = experiment.scenario, experiment.network
