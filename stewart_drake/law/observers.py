@@ -345,7 +345,7 @@ def _delay_belief(law: Any, memory: Array, timeline: Timeline, faults: tuple[str
     if it.known:
         best = c.lib.stewart_delay_hypothesis(p, m, num_in_flight, it, int(it.best))
         L = np.zeros((n, n))
-        c.lib.stewart_hypothesis_root(best, n, c.at(L))
+        c.lib.stewart_unpack_root(n, best.numbers + n, c.at(L))
         mean, root = np.array(c.ffi.unpack(best.numbers, n))[:-2], L[:-2, :-2]
         seen = Innovations(best.chi2, best.chi2_values)
         belief = replace(belief, estimate=Estimate(mean, root @ root.T), innovations=seen)
