@@ -303,7 +303,7 @@ class LimitedLqi(OuterLqi):
         error, states = state - wanted[0], []
         for j in range(self.limits.horizon):
             if j > 0:
-                regulated = np.concatenate([error, self.cost.regulated(integral)])
+                regulated = np.concatenate([error, integral])[:size]
                 torque = ahead.torques[j] - gain[:, :size] @ regulated
             if not np.abs(torque).max() <= motors.limit:
                 return False
