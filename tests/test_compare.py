@@ -148,6 +148,20 @@ def test_the_command_compares_the_chosen_controllers(own_file, capsys):
     assert list(json.loads(capsys.readouterr().out)["controllers"]) == ["delay_lqi", "mine"]
 
 
+@pytest.mark.parametrize("how", ["field", "section", "overlay"])
+def test_a_controller_that_assumes_no_delay_keeps_none(how, tmp_path):
+    file = tmp_path / "late.yaml"
+    file.write_text("controller: {delay_steps: 5}")
+    settings = {
+        "field": "controller.delay_steps=5",
+        "section": "controller={delay_steps: 5}",
+        "overlay": f"overlay={file}",
+    }
+    rows = load_comparison("paper", ("lqr", "delay_lqr"), [settings[how], "controller.w_Q=2"])
+    assert [row.controller.delay_steps for row in rows.values()][:2] == [0, 5]
+    assert {row.controller.w_Q for row in rows.values()} == {2}
+
+
 @pytest.mark.parametrize(
     ("chosen", "message"),
     [

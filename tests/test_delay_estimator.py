@@ -208,7 +208,7 @@ def guesses_of(belief):
     flights = OBSERVER.extra_torques(DT) + 1
     for place in range(1 + int(memory.cells)):
         g, root = c.lib.stewart_delay_hypothesis(8, 12, flights, memory, place), np.zeros((n, n))
-        c.lib.stewart_hypothesis_root(g, n, c.at(root))
+        c.lib.stewart_unpack_root(n, g.numbers + n, c.at(root))
         said = g.low, g.high, bool(g.fits), int(g.outliers), g.timing, g.weight
         found.append(Guess(g.numbers[n - 2], float(np.linalg.norm(root[-2])), *said))
     return found

@@ -57,6 +57,18 @@ def test_a_machine_in_real_time_is_pushed_between_the_two_times():
         np.testing.assert_allclose(moved(body), expected, atol=1e-7 * away)
 
 
+@pytest.mark.parametrize("kind", ["paper", "exact", "multibody"])
+def test_a_machine_by_drake_says_why_the_plate_left(kind):
+    body = DrakeBody(prepare(short(f"plant.kind={kind}")))
+    left = None
+    for time in np.arange(0.01, 2, 0.01):
+        left = body.advance(time, np.array([5, -3, 2, 1, 0, 4]))
+        if left is not None:
+            break
+    assert left is not None
+    assert ("peak to peak" in left.reason) == (kind == "paper")
+
+
 def test_the_multibody_engine_converges_to_it_with_its_step():
     expected, errors = pushed_by_hand(prepare(short()).start), []
     for step in (1e-3, 5e-4):

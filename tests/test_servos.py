@@ -382,6 +382,15 @@ def test_where_too_many_reports_are_lost_the_observer_begins_anew():
     assert np.allclose(memory.belief.state, AT_REST) and memory.lag == 0
 
 
+def test_counts_stop_while_single_precision_still_counts():
+    law, memory = law_and_memory()
+    memory.field("counts")[:] = 1e6
+    saturated = np.ones(law.reports.size)
+    for measured in (np.full(12, np.nan), AT_REST):
+        memory = law.step(memory, Measurement.of(measured), at_home, saturated)
+        assert max(memory.counts) == 10**6
+
+
 def test_a_command_is_finite_whatever_the_reference_is():
     law, memory = law_and_memory()
     state, report = Measurement.of(AT_REST), np.full(law.reports.size, np.nan)

@@ -37,9 +37,8 @@ int stewart_hypothesis_size(int p)
     return STEWART_HYPOTHESIS + n + n * (n + 1) / 2;
 }
 
-void stewart_hypothesis_root(const stewart_hypothesis *hypothesis, int n, real *L)
+void stewart_unpack_root(int n, const real *packed, real *L)
 {
-    const real *packed = hypothesis->numbers + n;
     for (int i = 0; i < n; packed += ++i) {
         stewart_copy(i + 1, packed, L + n * i);
         stewart_fill(n - i - 1, 0, L + n * i + i + 1);
@@ -53,10 +52,14 @@ void stewart_hypothesis_set_root(int n, const real *L, stewart_hypothesis *hypot
         stewart_copy(i + 1, L + n * i, packed);
 }
 
+real stewart_packed_std(int row, const real *packed)
+{
+    return stewart_norm(row + 1, packed + row * (row + 1) / 2);
+}
+
 real stewart_hypothesis_std(const stewart_hypothesis *hypothesis, int n)
 {
-    const int row = STEWART_ETA(n); /* of the packed lower triangle */
-    return stewart_norm(row + 1, hypothesis->numbers + n + row * (row + 1) / 2);
+    return stewart_packed_std(STEWART_ETA(n), hypothesis->numbers + n);
 }
 
 /* ---- one period ------------------------------------------------------------------------------- */
@@ -166,11 +169,28 @@ int stewart_period_at(const stewart_period *t, const real *xi, int fourth_order,
     return predict(t, xi, &path, state) && linearize_along(t, xi, &path, fourth_order, H, scratch);
 }
 
-/* Probability that a normal error of this standard deviation lies between two bounds. */
-static real probability_between(real low, real high, real std)
+int stewart_period_misfit(const stewart_period *t, const real *xi, const real *y, const real *C,
+                          real *cost, stewart_scratch scratch)
 {
-    const real part = SQRT_HALF / std;
-    return (real)0.5 * (REAL(erfc)(low * part) - REAL(erfc)(high * part));
+    const stewart_sensing *sensing = t->delay->filter.sensing;
+    const int m = sensing->size;
+    real *nu = stewart_take(&scratch, m), end[X];
+    if (!stewart_period_end(t, xi, end, scratch))
+        return 0;
+    stewart_predict_measurement(sensing, end, nu);
+    for (int i = 0; i < m; i++)
+        nu[i] = y[i] - nu[i];
+    stewart_whiten(m, 1, C, nu);
+    for (int i = 0; i < m; i++)
+        *cost += nu[i] * nu[i];
+    return 1;
+}
+
+real stewart_normal_between(real x, real y)
+{
+    const int mirrored = x + y < 0; /* far below the mean both values would round to 1 */
+    const real low = mirrored ? -y : x, high = mirrored ? -x : y;
+    return (real)0.5 * (REAL(erfc)(low * SQRT_HALF) - REAL(erfc)(high * SQRT_HALF));
 }
 
 /* A change of torque dT that comes early adds B dT to the rates at the period's end, per second, and moves
@@ -200,7 +220,7 @@ int stewart_period_late(const stewart_period *t, const real *xi, const real *sta
         at += path.durations[k];
         left = clamped(0, dt - at, dt);
         if (view.num_own > 0 && at >= first_own - STEWART_TIME_TOLERANCE)
-            late = std * REAL(sqrt)(REAL(fmax)(probability_between(-at, dt - at, std), 0));
+            late = std * REAL(sqrt)(REAL(fmax)(stewart_normal_between(-at / std, (dt - at) / std), 0));
         else
             ++*others;
         stewart_accelerate(&model, state, path.torques + U * (k + 1), after);
@@ -287,11 +307,11 @@ static int choose_delay(Model *a, const stewart_hypothesis *hypothesis, const re
                         stewart_scratch scratch)
 {
     const stewart_delay *d = a->period->delay;
-    const int n = a->n, m = a->m, known = n - 2;
+    const int n = a->n, known = n - 2;
     const real reach = (real)2.5 * std, eta = a->mean[STEWART_ETA(n)];
     const real low = hypothesis->low > eta - reach ? hypothesis->low : eta - reach;
     const real high = hypothesis->high < eta + reach ? hypothesis->high : eta + reach;
-    real *A = stewart_take(&scratch, known * X), *nu = stewart_take(&scratch, m), end[X];
+    real *A = stewart_take(&scratch, known * X);
     real *trial = stewart_take(&scratch, n), least = (real)INFINITY;
     for (int i = 0; i < X; i++) /* rows of (H L)' */
         for (int j = 0; j < known; j++) {
@@ -308,14 +328,9 @@ static int choose_delay(Model *a, const stewart_hypothesis *hypothesis, const re
         real cost = 0;
         trial[STEWART_ETA(n)] =
             k < DELAYS_TRIED - 1 ? low + (high - low) / (DELAYS_TRIED - 1) * (real)k : high;
-        if (!stewart_period_end(a->period, trial, end, scratch))
+        if (!stewart_period_misfit(a->period, trial, a->measurement.values, a->measurement.C, &cost,
+                                   scratch))
             return 0;
-        stewart_predict_measurement(d->filter.sensing, end, nu);
-        for (int i = 0; i < m; i++)
-            nu[i] = a->measurement.values[i] - nu[i];
-        stewart_whiten(m, 1, a->measurement.C, nu);
-        for (int i = 0; i < m; i++)
-            cost += nu[i] * nu[i];
         if (cost < least) {
             least = cost;
             xi[STEWART_ETA(n)] = trial[STEWART_ETA(n)];
@@ -510,7 +525,7 @@ static int jumped(Model *a, const stewart_hypothesis *hypothesis, real *L, const
             jump[i] = i < p ? factor * d->filter.jump_std[i] : 0;
         stewart_widen_root(n, jump, L, scratch);
         const int fits = attempt(a, hypothesis, L, y, 0, after, scratch);
-        stewart_hypothesis_root(hypothesis, n, L);
+        stewart_unpack_root(n, hypothesis->numbers + n, L);
         if (fits) {
             after->outliers = hypothesis->outliers + 1;
             return 1;
@@ -537,7 +552,7 @@ void stewart_delay_advance(const stewart_period *t, const stewart_hypothesis *hy
     a.measurement.H = stewart_take(&scratch, X * n);
     a.measurement.C = stewart_take(&scratch, m * m);
     a.measurement.J = stewart_take(&scratch, m * X);
-    stewart_hypothesis_root(hypothesis, n, L);
+    stewart_unpack_root(n, hypothesis->numbers + n, L);
     for (int i = 0; i < p; i++)
         if (!(d->filter.walk_std[i] > 0)
             && !(stewart_norm(n, L + n * (X + i)) <= KNOWN_PART * d->filter.usual_std[i])) /* or NaN */
@@ -554,7 +569,7 @@ void stewart_delay_advance(const stewart_period *t, const stewart_hypothesis *hy
                 after->outliers = hypothesis->outliers + 1; /* another one may be a jump of the delay */
                 return;
             }
-            stewart_hypothesis_root(hypothesis, n, L);
+            stewart_unpack_root(n, hypothesis->numbers + n, L);
         }
         if (d->filter.jump_std && hypothesis->measurements >= MEASURED_BEFORE_JUMP && hypothesis->outliers == 0
             && jumped(&a, hypothesis, L, y, after, scratch))

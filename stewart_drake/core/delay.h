@@ -49,8 +49,10 @@ typedef struct {
 
 int stewart_hypothesis_size(int p);
 
-/* Unpack and pack the lower triangular root (n, n) of the covariance; return the standard deviation of eta. */
-void stewart_hypothesis_root(const stewart_hypothesis *hypothesis, int n, real *L);
+/* Unpack and pack the lower triangular root (n, n) of the covariance; return the standard deviation of a row,
+   and that of eta. */
+void stewart_unpack_root(int n, const real *packed, real *L);
+real stewart_packed_std(int row, const real *packed);
 void stewart_hypothesis_set_root(int n, const real *L, stewart_hypothesis *hypothesis);
 real stewart_hypothesis_std(const stewart_hypothesis *hypothesis, int n);
 
@@ -72,6 +74,14 @@ int stewart_period_end(const stewart_period *period, const real *xi, real *state
    Returns 0 where they do not exist. */
 int stewart_period_at(const stewart_period *period, const real *xi, int fourth_order, real *state,
                       real *H, stewart_scratch scratch);
+
+/* Add to `cost` the square of the error of a measurement y (m) at the end, in units of its covariance CC'.
+   Returns 0 for too many torques. */
+int stewart_period_misfit(const stewart_period *period, const real *xi, const real *y, const real *C,
+                          real *cost, stewart_scratch scratch);
+
+/* Probability that a standard normal number is between x and y. */
+real stewart_normal_between(real x, real y);
 
 /* Compute rows K (k, 12): changes of the state at the end if the timing of a single torque is off by one
    standard deviation. The first `others` rows are of torques before the controller's own. The rest are of

@@ -93,10 +93,8 @@ static void delayed_parameters(const stewart_law *law, const real *memory, real 
     const real *mean = best_of(&s, memory);
     stewart_copy(s.p, mean ? mean + X : s.delay.prior, theta);
     stewart_fill(s.p, (real)NAN, std);
-    const real *row = mean ? mean + X + s.p + 2 : NULL; /* lower triangle, by rows */
-    for (int i = 0; mean && i < X + s.p; row += ++i)
-        if (i >= X)
-            std[i - X] = stewart_norm(i + 1, row);
+    for (int i = 0; mean && i < s.p; i++)
+        std[i] = stewart_packed_std(X + i, mean + X + s.p + 2);
 }
 
 static real delayed_uncertainty(const stewart_law *law, const real *memory, real *L)
@@ -107,12 +105,10 @@ static real delayed_uncertainty(const stewart_law *law, const real *memory, real
     stewart_delay_memory *m = (stewart_delay_memory *)(uintptr_t)(memory + X);
     const int place = m->known > 0 ? (int)m->best : 0;
     const stewart_hypothesis *best = stewart_delay_hypothesis(s.p, s.m, s.num_in_flight, m, place);
-    const real *row = best->numbers + n + 2; /* lower triangle, by rows; the last two are of the delay */
-    for (int i = 0; L && i < n; row += ++i) {
-        stewart_fill(n, m->known > 0 ? 0 : (real)NAN, L + n * i);
-        if (m->known > 0)
-            stewart_copy(i + 1, row, L + n * i);
-    }
+    if (L && m->known > 0)
+        stewart_unpack_root(n, best->numbers + n + 2, L); /* without the last two rows, of the delay */
+    else if (L)
+        stewart_fill(n * n, (real)NAN, L);
     return m->known > 0 ? REAL(sqrt)(best->timing) : 0;
 }
 

@@ -89,20 +89,12 @@ static real distance_of(int n, const stewart_hypothesis *a, const stewart_hypoth
 
 /* ---- the prior of the delay ------------------------------------------------------------------- */
 
-/* Probability that a standard normal number is between x and y. */
-static real probability(real x, real y)
-{
-    const int mirrored = x + y < 0; /* far below the mean both values would round to 1 */
-    const real low = mirrored ? -y : x, high = mirrored ? -x : y;
-    return (real)0.5 * (REAL(erfc)(low * SQRT_HALF) - REAL(erfc)(high * SQRT_HALF));
-}
-
 static real density(real x) { return REAL(exp)(-x * x / 2) / SQRT_2_PI; }
 
 /* Prior probability of a delay longer than t, up to the longest. */
 static real left_of_prior(const stewart_delay *d, real t)
 {
-    const real left = probability((t - d->delay_mean) / d->delay_std,
+    const real left = stewart_normal_between((t - d->delay_mean) / d->delay_std,
                                   (d->longest - d->delay_mean) / d->delay_std);
     return left > 0 ? left : 0;
 }
@@ -116,7 +108,7 @@ static void rest_of_prior(const stewart_delay *d, real t, real *mean, real *std)
 {
     const real from = t < d->longest ? t : d->longest;
     const real a = (from - d->delay_mean) / d->delay_std;
-    const real b = (d->longest - d->delay_mean) / d->delay_std, Z = probability(a, b);
+    const real b = (d->longest - d->delay_mean) / d->delay_std, Z = stewart_normal_between(a, b);
     if (Z < (real)1e-12) {
         *mean = (from + d->longest) / 2;
         *std = (d->longest - from) / SQRT_12;
@@ -149,7 +141,7 @@ static void spawn(Search *s, int k, stewart_scratch scratch)
     master->weight += REAL(log1p)(-share);
     cell->numbers[STEWART_ETA(n)] = (low + high) / 2;
     cell->numbers[STEWART_RATE(n)] = 0;
-    stewart_hypothesis_root(cell, n, L); /* its last two rows are 0 */
+    stewart_unpack_root(n, cell->numbers + n, L); /* its last two rows are 0 */
     L[(n + 1) * STEWART_ETA(n)] = d->period / SQRT_12;
     L[(n + 1) * STEWART_RATE(n)] = d->rate_std;
     stewart_hypothesis_set_root(n, L, cell);
@@ -306,7 +298,7 @@ static void begin_at(const Search *s, const stewart_hypothesis *from, real eta, 
     const int n = s->n, p = n - X - 2;
     real *L = stewart_take(&scratch, n * n), *R = stewart_take(&scratch, p * p);
     real *W = stewart_take(&scratch, (X + p) * p);
-    stewart_hypothesis_root(from, n, L);
+    stewart_unpack_root(n, from->numbers + n, L);
     stewart_fill(p * p, 0, R);
     for (int i = 0; i < p; i++)
         R[(p + 1) * i] = loosened * d->std[i];
@@ -332,13 +324,13 @@ static int add_costs(const Search *s, const stewart_period *t, const stewart_hyp
     const int n = s->n, m = s->m, known = n - 2;
     real *L = stewart_take(&scratch, n * n), *H = stewart_take(&scratch, X * n);
     real *xi = stewart_take(&scratch, n), *A = stewart_take(&scratch, X * (n + X));
-    real *C = stewart_take(&scratch, m * m), *nu = stewart_take(&scratch, m), end[X];
+    real *C = stewart_take(&scratch, m * m), end[X];
     stewart_copy(n, hypothesis->numbers, xi);
     stewart_copy(X, state, xi);
     xi[STEWART_RATE(n)] = 0;
     if (!stewart_period_at(t, xi, 0, end, H, scratch))
         return 0;
-    stewart_hypothesis_root(hypothesis, n, L);
+    stewart_unpack_root(n, hypothesis->numbers + n, L);
     for (int i = 0; i < X; i++) {
         stewart_copy(X, root + X * i, L + n * i);
         stewart_fill(n - X, 0, L + n * i + X);
@@ -353,14 +345,8 @@ static int add_costs(const Search *s, const stewart_period *t, const stewart_hyp
         return 0;
     for (int k = 0; k < number; k++) {
         xi[STEWART_ETA(n)] = (real)(k + 1) * GRID * d->period;
-        if (!stewart_period_end(t, xi, end, scratch))
+        if (!stewart_period_misfit(t, xi, y, C, cost + k, scratch))
             return 0;
-        stewart_predict_measurement(sensing, end, nu);
-        for (int i = 0; i < m; i++)
-            nu[i] = y[i] - nu[i];
-        stewart_whiten(m, 1, C, nu);
-        for (int i = 0; i < m; i++)
-            cost[k] += nu[i] * nu[i];
     }
     return 1;
 }

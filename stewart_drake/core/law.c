@@ -11,8 +11,6 @@
 #include "reference.h"
 #include "short.h"
 
-#define MOST_COUNTED ((real)1e6) /* counts stop here: beyond 2^24 a float does not count on */
-
 /* ---- the memory ------------------------------------------------------------------------------- */
 
 static int in_flight_length(const stewart_law *law)
@@ -486,7 +484,6 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
     if (memory[l->open_loop_samples.at] > 0 && !waiting)
         memory[l->open_loop_samples.at] -= 1;
     for (int i = 0; i < STEWART_CAUSES; i++)
-        if (status >> i & 1 && memory[l->counts.at + i] < MOST_COUNTED)
-            memory[l->counts.at + i] += 1;
+        stewart_count(status >> i & 1, memory + l->counts.at + i);
     return status;
 }

@@ -196,6 +196,9 @@ int stewart_planning_scratch(const stewart_law *law);
 /* Limit a torque (6). Returns whether that changed it. */
 int stewart_limit(const stewart_machine *machine, const real *torque, real *limited);
 
+/* Add to a count, which stops near a million: beyond 2^24 a float does not count on. */
+void stewart_count(int number, real *count);
+
 /* Return the schedule of `periods` periods. In each the older torque acts for `fraction` of it, then the
    next one. `torques` (periods + 1, 6) begin with the oldest. */
 stewart_schedule stewart_schedule_of(real period, real fraction, int periods, const real *torques,

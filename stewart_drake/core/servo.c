@@ -88,7 +88,7 @@ static int observe(const stewart_servo *servo, real *memory, const stewart_sampl
         const real *asked = report + stewart_servo_report(servo) - U;
         stewart_copy(U, asked, memory + l->torque.at);
         if (saturated > 0) /* one of them is counted by the status */
-            memory[l->counts.at + SATURATED] += (real)(saturated - 1);
+            stewart_count(saturated - 1, memory + l->counts.at + SATURATED);
     } else {
         if (stewart_all_finite(X, memory + l->state.at))
             law->observer->restart(law, observer);
@@ -182,6 +182,6 @@ int stewart_servo_step(const stewart_servo *servo, real *memory, real *scratch_m
     stewart_limit(&law->machine, memory + l->torque.at, memory + l->in_flight.at);
     status |= failure;
     for (int i = 0; i < STEWART_CAUSES; i++)
-        memory[l->counts.at + i] += (real)(status >> i & 1);
+        stewart_count(status >> i & 1, memory + l->counts.at + i);
     return status;
 }

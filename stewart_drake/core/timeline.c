@@ -1,4 +1,4 @@
-/* Torque schedules under a known delay, and the limit of the motors. See law.h. */
+/* Torque schedules under a known delay, the limit of the motors, and counts. See law.h. */
 
 #include "law.h"
 #include "short.h"
@@ -21,6 +21,12 @@ int stewart_limit(const stewart_machine *machine, const real *torque, real *limi
         saturated |= limited[i] != torque[i];
     }
     return saturated;
+}
+
+void stewart_count(int number, real *count)
+{
+    if (*count < (real)1e6)
+        *count += (real)number;
 }
 
 /* With a fraction each torque acts for the end of one period and the beginning of the next. */

@@ -9,20 +9,22 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from pydantic import Field
 
+from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.arguments import fixed
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_asked
 from stewart_drake.files.yamlio import load_yaml, one_message, validate
 from stewart_drake.law.learned import LearnedSignal
-from stewart_drake.law.servos import Stiffness, rise, turned
+from stewart_drake.law.servos import Stiffness, rise
 from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
 from stewart_drake.loop.servos import known_stiffness
+from stewart_drake.mechanism.kinematics import turned
 from stewart_drake.mechanism.trajectories import PlateTrajectory, evaluate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.field_types import Row, section
-from stewart_drake.scenario.signals import ACCELERATIONS, LEGS, NUM_TORQUES, POSE, RATES
+from stewart_drake.scenario.signals import ACCELERATIONS, LEGS, NUM_STATE, NUM_TORQUES, POSE, RATES
 from stewart_drake.types import Array
 
 SHORTEST_BLEND: Final = 1.0
@@ -307,7 +309,7 @@ def _along(
 ) -> Setpoints:
     """Return the setpoints of the motion, checked at the middle of each period."""
     mechanism, dynamics = experiment.mechanism, known_dynamics(experiment)
-    servo = known_stiffness(experiment.scenario)
+    servo, functions = known_stiffness(experiment.scenario), functions_of(mechanism)
     number = math.ceil(experiment.scenario.duration * rate - 1e-9)
     times, (cranks, rates, torques) = np.arange(number) / rate, np.empty((3, number, NUM_TORQUES))
     for k, t in enumerate(times):
@@ -315,9 +317,8 @@ def _along(
         x = soft.motion(evaluate(experiment.reference, middle), middle)
         if failure := diagnose(mechanism, middle, x[POSE]):
             raise _BrokenLimit(middle, f"motion: {failure.reason} at t = {middle:.2f} s")
-        angles = mechanism.crank_angles(x[POSE])
+        angles, rates[k] = np.split(functions.cranks(x[:NUM_STATE]), 2)
         cranks[k] = turned(angles, cranks[k - 1] if k else np.zeros(NUM_TORQUES))
-        rates[k] = mechanism.jacobian(x[POSE]) @ x[RATES]
         torques[k] = dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
     setpoints = cranks
     steps = np.abs(torques)

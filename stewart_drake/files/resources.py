@@ -49,24 +49,22 @@ def is_path(name_or_path: str | Path) -> bool:
     )
 
 
-def absolute_path(path: str | Path, relative_to: Path | None = None) -> Path:
-    """Return an absolute path, relative to a folder (default: the working directory)."""
-    return Path(os.path.abspath((relative_to or Path.cwd()) / path))
+def absolute_path(path: str | Path, folder: str | Path = "") -> Path:
+    """Return an absolute path; a relative one starts from a folder, by default the working one."""
+    return Path(os.path.abspath(Path(folder, path)))
 
 
-def resolve(kind: Kind, name_or_path: str | Path, relative_to: Path | None = None) -> Path:
+def resolve(kind: Kind, name_or_path: str | Path) -> Path:
     """Return the absolute path of an existing data file.
 
     Args:
-        kind: of the data.
         name_or_path: a shipped name, or the path of a file or of a folder with a file KIND.yaml.
-        relative_to: folder that relative paths start from; the working directory by default.
 
     Raises:
         ConfigError: no such name or file; the message lists what is shipped, nearest first.
     """
     if is_path(name_or_path):
-        path = absolute_path(name_or_path, relative_to)
+        path = absolute_path(name_or_path)
         if os.path.exists(inside := path / f"{kind}.yaml"):
             return inside
         if os.path.exists(path):
@@ -76,7 +74,7 @@ def resolve(kind: Kind, name_or_path: str | Path, relative_to: Path | None = Non
     path = data_root() / folder / f"{name}{suffix}"
     if not name or not path.exists():
         own = f"{name}/{kind}.yaml"  # of a folder, without a slash
-        nearest = f"{own}, " if name and absolute_path(own, relative_to).exists() else ""
+        nearest = f"{own}, " if name and absolute_path(own).exists() else ""
         raise ConfigError(
             f"{kind}: got {name!r}; expected {nearest}one of {_nearest(kind, name)}, or a path "
             "(with a slash, or ending in .yaml, .yml or .json)"

@@ -33,6 +33,7 @@ from stewart_drake.identification.model import (
     plan_steps,
 )
 from stewart_drake.identification.unknowns import DELAY, GEOMETRY, NUM_UNKNOWNS, OFFSETS, Unknowns
+from stewart_drake.mechanism.kinematics import turned
 from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array, Flags
 
@@ -169,7 +170,7 @@ class Problem:
                     sensitivities[..., legs] += by_geometry
                     J[:, :, ANGLES] = self._columns(sensitivities, np.eye(6))
             residual = self.values - predicted
-            residual[:, :, ANGLES] = np.remainder(residual[:, :, ANGLES] + np.pi, 2 * np.pi) - np.pi
+            residual[:, :, ANGLES] = turned(residual[:, :, ANGLES], 0.0)
             std = np.array([s.log.std for s in self.segments])
             residual /= std
         if sensitive:

@@ -57,9 +57,9 @@ from stewart_drake.identification import progress
 from stewart_drake.identification.innovations import Innovations
 from stewart_drake.identification.logs import in_effect
 from stewart_drake.identification.servo_logs import ServoLog
-from stewart_drake.law.servos import PositionServo, turned
+from stewart_drake.law.servos import PositionServo
 from stewart_drake.mechanism.geometry import Mechanism, with_rotors
-from stewart_drake.mechanism.kinematics import legs_along
+from stewart_drake.mechanism.kinematics import legs_along, turned
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
     BALL_JOINTS,

@@ -9,9 +9,8 @@ import numpy as np
 from stewart_drake.files.csvio import ANGLE_UNITS, Table, read_table
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.logs import in_effect
-from stewart_drake.law.servos import turned
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import ForwardKinematicsError
+from stewart_drake.mechanism.kinematics import ForwardKinematicsError, turned
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.types import Array, Flags
 

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.workspace import margin, margins
 from stewart_drake.files.csvio import csv_text
 from stewart_drake.files.errors import ConfigError
@@ -32,6 +33,7 @@ from stewart_drake.law.servos import Stiffness, rise
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.servos import known_stiffness
 from stewart_drake.mechanism.geometry import Mechanism
+from stewart_drake.mechanism.kinematics import turned
 from stewart_drake.mechanism.trajectories import poses_along
 from stewart_drake.scenario.signals import BALL_JOINTS, POSE, RATES
 from stewart_drake.types import Array
@@ -150,10 +152,7 @@ def plan_servos(
 
 def _cranks(mechanism: Mechanism, states: Array) -> Array:
     """Return crank angles and rates (n, 12) of states (n, 12)."""
-    rows = [
-        (mechanism.crank_angles(x[POSE]), mechanism.jacobian(x[POSE]) @ x[RATES]) for x in states
-    ]
-    return np.array([np.concatenate(row) for row in rows])
+    return np.array([functions_of(mechanism).cranks(x) for x in states])
 
 
 class _Planner:
@@ -235,6 +234,6 @@ class _Planner:
         torques = []
         for instants in (late, late - 1e-9):  # after and before a setpoint that arrives here
             setpoints = in_effect(log.times, log.setpoints, instants)
-            error = (setpoints - cranks[:, POSE] + np.pi) % (2 * np.pi) - np.pi
+            error = turned(setpoints - cranks[:, POSE], 0.0)
             torques.append(actuator.stiffness * error - actuator.velocity_gain * cranks[:, RATES])
         return float(np.abs(torques).max()), float(np.abs(cranks[:, RATES]).max())

@@ -23,13 +23,14 @@ class Cost(Protocol):
         """Whether the law has an integral."""
         ...
 
-    def regulated(self, integral: Array) -> Array:
-        """Return the part of an integral (6,) that the gain multiplies: all or nothing."""
-        ...
-
     def sampled(self, model: ContinuousModel, timeline: Timeline) -> DelayedModel:
-        """Return a model of error, rates and, if there is one, integral."""
-        ...
+        """Return a model of error, rates and, if there is one, integral.
+
+        Raises:
+            FloatingPointError: the model cannot be sampled.
+        """
+        period, steps, fraction = timeline.period, timeline.steps, timeline.fraction
+        return delayed_model(model, period, steps, fraction, integral=self.integrates)
 
     def gain(self, model: DelayedModel, weights: Array) -> Array:
         """Return the gain (6, n) for a model from `sampled` and w_Q and w_R (2,).
@@ -64,7 +65,7 @@ def law_gain(
 
 
 @dataclass(frozen=True)
-class QuadraticCost:
+class QuadraticCost(Cost):
     """w_Q [e; z]' Q [e; z] + w_R T' R T, with diagonal Q and R.
 
     Attributes:
@@ -86,9 +87,6 @@ class QuadraticCost:
     def integrates(self) -> bool:
         return self.integrals is not None
 
-    def regulated(self, integral: Array) -> Array:
-        return integral if self.integrates else np.empty(0)
-
     def matrices(self, weights: Array) -> tuple[Array, Array]:
         """Return w_Q Q and w_R R for w_Q and w_R (2,)."""
         Q, R = self._unweighted
@@ -98,15 +96,6 @@ class QuadraticCost:
     def _unweighted(self) -> tuple[Array, Array]:
         scales = [self.errors] if self.integrals is None else [self.errors, self.integrals]
         return np.diag(np.concatenate(scales)), np.diag(self.torques)
-
-    def sampled(self, model: ContinuousModel, timeline: Timeline) -> DelayedModel:
-        """Return `law.delay_model.delayed_model`, with the integral if there is one.
-
-        Raises:
-            FloatingPointError: the model cannot be sampled.
-        """
-        period, steps, fraction = timeline.period, timeline.steps, timeline.fraction
-        return delayed_model(model, period, steps, fraction, integral=self.integrates)
 
     def gain(self, model: DelayedModel, weights: Array) -> Array:
         """Return `law.riccati.reduced_gain` of a model from `sampled`.
@@ -132,7 +121,7 @@ def pd_gains(delay: float, pole: float = 0.0) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class PdGain:
+class PdGain(Cost):
     """Spring and damper on the error of the pose, in place of the LQI gain.
 
     With B the accelerations per torque, T = T_ff - B^-1 (kp e + kd e') gives every
@@ -168,13 +157,6 @@ class PdGain:
         positive("period", self.period)
 
     integrates = False  # not annotated: no field
-
-    def regulated(self, integral: Array) -> Array:
-        return np.empty(0)
-
-    def sampled(self, model: ContinuousModel, timeline: Timeline) -> DelayedModel:
-        steps, fraction = timeline.steps, timeline.fraction
-        return delayed_model(model, timeline.period, steps, fraction, integral=False)
 
     def gain(self, model: DelayedModel, weights: Array) -> Array:
         """Return B^-1 [kp, kd] (6, 12), with zeros for a torque that is still to act.

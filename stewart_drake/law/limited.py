@@ -144,7 +144,6 @@ class _Search:
 
         Args:
             plan: to begin with.
-            cost: of a plan.
             root: (6, n) of the covariance of the pose at the start, see `law.horizon.pose_root`.
             until: end of the time, s, as of `time.perf_counter`.
 
@@ -303,7 +302,7 @@ class LimitedLqi(OuterLqi):
         error, states = state - wanted[0], []
         for j in range(self.limits.horizon):
             if j > 0:
-                regulated = np.concatenate([error, self.cost.regulated(integral)])
+                regulated = np.concatenate([error, integral])[:size]
                 torque = ahead.torques[j] - gain[:, :size] @ regulated
             if not np.abs(torque).max() <= motors.limit:
                 return False

@@ -68,7 +68,6 @@ class Observer(Protocol):
             measurement: of this one, as it came.
             in_flight: (n, 6) torques, oldest first, before this sample's torque.
             sensing: model of the sensor.
-            plant: model of the plant.
 
         Returns:
             The new belief. Its state may be NaN until the first measurement without a fault; the
@@ -307,7 +306,6 @@ def belief_of(
     """Return the belief that the memory of an observer of the core holds.
 
     Args:
-        observer: the observer.
         law: `stewart_law *` with it.
         memory: of the observer, which the belief keeps.
         timeline: the assumed one.
@@ -345,7 +343,7 @@ def _delay_belief(law: Any, memory: Array, timeline: Timeline, faults: tuple[str
     if it.known:
         best = c.lib.stewart_delay_hypothesis(p, m, num_in_flight, it, int(it.best))
         L = np.zeros((n, n))
-        c.lib.stewart_hypothesis_root(best, n, c.at(L))
+        c.lib.stewart_unpack_root(n, best.numbers + n, c.at(L))
         mean, root = np.array(c.ffi.unpack(best.numbers, n))[:-2], L[:-2, :-2]
         seen = Innovations(best.chi2, best.chi2_values)
         belief = replace(belief, estimate=Estimate(mean, root @ root.T), innovations=seen)

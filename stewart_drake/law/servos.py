@@ -37,6 +37,7 @@ import numpy as np
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law.nominal import TorqueLimit
+from stewart_drake.mechanism.kinematics import turned
 from stewart_drake.scenario.signals import (
     MODEL_TORQUE,
     NUM_REFERENCE,
@@ -58,11 +59,6 @@ def mean_inertia(dynamics: StewartDynamics) -> float:
     """Return J, kg m^2."""
     mobility = crank_mobility(dynamics, dynamics.mechanism.home)
     return NUM_TORQUES / float(np.trace(mobility))
-
-
-def turned(angles: Array, near: Array) -> Array:
-    """Return the angles in rad, moved by whole turns to within half a turn of others."""
-    return near + (angles - near + np.pi) % (2 * np.pi) - np.pi
 
 
 @dataclass(frozen=True)

@@ -105,14 +105,11 @@ class Timeline:
         Raises:
             ValueError: fewer torques than that takes.
         """
-        torques, durations = self.schedule(self._since(in_flight, number))
-        n = number * self.per_period
-        return TorqueSchedule(torques[:n], durations[:n])
+        return self._first(number, self._since(in_flight, number))
 
     def next_period(self, queue: Array) -> TorqueSchedule:
         """Return the schedule of the period that the oldest of torques (n, 6) begins."""
-        torques, durations = self.schedule(queue)
-        return TorqueSchedule(torques[: self.per_period], durations[: self.per_period])
+        return self._first(1, queue)
 
     def last_period(self, in_flight: Array) -> tuple[TorqueSchedule, Array]:
         """Return the schedule since the last sample, and the torque (6,) that acts next.
@@ -126,9 +123,13 @@ class Timeline:
         if self.parts:
             parts = np.full(len(in_flight), self.period / self.parts)
             return TorqueSchedule(in_flight, parts), in_flight[-1]
-        torques, durations = self.schedule(self._since(in_flight, 1))
-        n = self.per_period
-        return TorqueSchedule(torques[:n], durations[:n]), torques[min(n, len(torques) - 1)]
+        since = self._since(in_flight, 1)
+        return self._first(1, since), since[min(1, len(since) - 1)]
+
+    def _first(self, periods: int, torques: Array) -> TorqueSchedule:
+        """Return the schedule of the periods that the oldest of torques (n, 6) begin."""
+        n = periods * self.per_period
+        return TorqueSchedule(*(part[:n] for part in self.schedule(torques)))
 
     def _since(self, in_flight: Array, periods: int) -> Array:
         """Return the torques (L + n, 6) that act from n = `periods` ago on."""

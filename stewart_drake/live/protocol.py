@@ -165,9 +165,6 @@ class MachineMessage:
     before: Reason = NO_FAULT  # fault that preceded it; its `leg` is 0
     cranks: bool = False  # whether the rows of `acted` are setpoints of the cranks, rad
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, MachineMessage) and encode(self) == encode(other)
-
     @property
     def why(self) -> str:
         """The reason in words, with the fault that preceded it."""
@@ -197,9 +194,6 @@ class ControllerMessage:
     # identity of the machine that the controller is designed for, in a request
     identity: Identity | None = None
     cranks: bool = False  # whether the rows of `torques` are setpoints of the cranks, rad
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, ControllerMessage) and encode(self) == encode(other)
 
 
 Message = MachineMessage | ControllerMessage

@@ -10,25 +10,25 @@ from dataclasses import replace
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
-from pydrake.systems.analysis import Simulator, SimulatorStatus
+from pydrake.systems.analysis import SimulatorStatus
 
 from stewart_drake.core.link import Link
 from stewart_drake.dynamics.open_loop import Course, Drive, IntegrationError, follow, integrate
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.dynamics.workspace import Failure, diagnose
+from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.protocol import MISSING, MOST_HISTORY, NEVER, SECOND, Refusal
 from stewart_drake.loop.bulk import LONGEST_STEP, SHARE
 from stewart_drake.loop.diagram import build_machine
-from stewart_drake.loop.exact import set_accuracy
 from stewart_drake.loop.peer import code_bits
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sensor import white_noise
 from stewart_drake.loop.servos import commands_in_flight, compose_servo_law, position_servo
+from stewart_drake.loop.simulation import failure_of, make_simulator, solver_failure
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.link import forward_times, return_times, sensor_times, torque_delays
-from stewart_drake.scenario.signals import BIAS, NUM_LEGS, NUM_TORQUES, POSE
+from stewart_drake.scenario.signals import NUM_CONSTANTS, NUM_LEGS, NUM_TORQUES, POSE
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.types import Array
 
@@ -213,14 +213,11 @@ class NativeBody:
     def __init__(self, experiment: Experiment) -> None:
         sc, sensor = experiment.scenario, experiment.scenario.sensor
         assert sensor.kind == "state"
-        parameters = np.array(sc.plant_parameters)
-        self._bias = parameters[BIAS].copy()
-        parameters[BIAS] = 0.0  # added to the torque that acts, as in the diagram
-        self._push = sc.plant.push
-        self._free, self._pushed = (
-            StewartDynamics(experiment.truth, sc.plant.gravity, np.append(parameters, wrench))
-            for wrench in ([0.0] * 6, self._push.wrench)
-        )
+        self._bias, self._push = np.array(sc.plant.torque_bias), sc.plant.push
+        # The bias is added to the torque that acts, as in the diagram.
+        self._free = experiment.true_dynamics(biased=False)
+        pushed = np.append(self._free.plant_parameters[:NUM_CONSTANTS], self._push.wrench)
+        self._pushed = StewartDynamics(experiment.truth, sc.plant.gravity, pushed)
         self._accuracy = SHARE * sc.plant.accuracy
         self._noise, self._seed = np.array(sensor.noise_std), sensor.seed
         self._period, self.state, self.time = sc.controller.period, experiment.start.copy(), 0.0
@@ -259,18 +256,11 @@ class DrakeBody:
     """Plant and sensor of the scenario's diagram."""
 
     def __init__(self, experiment: Experiment) -> None:
-        self._experiment, self.time = experiment, 0.0
-        self._bias = np.array(experiment.scenario.plant.torque_bias)
-        self._diagram: Any = build_machine(experiment)
-        context = self._diagram.CreateDefaultContext()
-        plant: Any = self._diagram.GetSubsystemByName("plant")
-        plant.set_state(plant.GetMyMutableContextFromRoot(context), experiment.start)
-        self._plant = plant
+        self.time, self._bias = 0.0, np.array(experiment.scenario.plant.torque_bias)
+        self._diagram = build_machine(experiment)
+        self._simulator = make_simulator(self._diagram)
         self._torque = self._diagram.GetInputPort("torque")
-        self._torque.FixValue(context, self._bias)
-        self._simulator = Simulator(self._diagram, context)
-        if experiment.scenario.plant.kind == "exact":
-            set_accuracy(self._simulator, experiment.scenario.plant.accuracy)
+        self._torque.FixValue(self._simulator.get_mutable_context(), self._bias)
         self._simulator.Initialize()
 
     @property
@@ -284,19 +274,13 @@ class DrakeBody:
         self._torque.FixValue(context, torque + self._bias)
         try:
             outcome = self._simulator.AdvanceTo(look_time(time))
-        except RuntimeError as error:  # Drake's solver: constraints contradict the dynamics
-            return Failure(context.get_time(), None, np.nan, " ".join(str(error).split()))
+        except RuntimeError as error:
+            return solver_failure(context, error)
         self.time = time
         if outcome.reason() != SimulatorStatus.ReturnReason.kReachedTerminationCondition:
             return None
         self.time = context.get_time()
-        cranks = None
-        if self._plant.HasOutputPort("crank_angles"):
-            own = self._plant.GetMyContextFromRoot(context)
-            cranks = self._plant.GetOutputPort("crank_angles").Eval(own)
-        found = diagnose(self._experiment.truth, self.time, self.state[POSE], cranks)
-        assert found is not None, "the simulation ended inside the workspace"
-        return found
+        return failure_of(self._diagram, context)
 
     def measurement(self) -> Array:
         context = self._simulator.get_context()

@@ -1,7 +1,7 @@
 """The closed loop of a scenario as a Drake diagram."""
 
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Unpack
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -30,7 +30,7 @@ from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.kinds import LINKS, PLANTS, SENSORS, wire
 from stewart_drake.loop.law_design import control_law, first_queue, followed_motion
 from stewart_drake.loop.link import LateMeasurements
-from stewart_drake.loop.own import OwnLaw, OwnReference, OwnSystem
+from stewart_drake.loop.own import OwnSystems
 from stewart_drake.loop.platforms import MultibodyStewart, StartCheck, add_to_torque
 from stewart_drake.loop.preparation import Experiment, concrete
 from stewart_drake.loop.push import Push
@@ -60,7 +60,24 @@ _TUNER_INPUTS: Final = {
 """Outputs for the optional inputs of a tuner."""
 
 
-class ClosedLoop(Diagram):
+class Machine(Diagram):
+    """A diagram with the plant of an experiment."""
+
+    experiment: Experiment
+
+    def CreateDefaultContext(self) -> Context:
+        """Return a root context at t = 0 in the scenario's start state, all loops closed.
+
+        A `Simulator` without a context starts a multibody plant at rest, since Drake has no default
+        velocities. `StartCheck` warns about this.
+        """
+        context = super().CreateDefaultContext()
+        plant: Any = self.GetSubsystemByName("plant")
+        plant.set_state(plant.GetMyMutableContextFromRoot(context), self.experiment.start)
+        return context
+
+
+class ClosedLoop(Machine):
     """The closed loop; output ports are named after the signals.
 
     Subsystems, by name: `reference`, `sensor`, `controller`, `delay_chain`, `torque_bias`, `plant`,
@@ -83,19 +100,7 @@ class ClosedLoop(Diagram):
         catch_up: length of the blend onto the reference, s; 0 without one.
     """
 
-    experiment: Experiment
     catch_up: float
-
-    def CreateDefaultContext(self) -> Context:
-        """Return a root context at t = 0 in the scenario's start state, all loops closed.
-
-        A `Simulator` without a context starts a multibody plant at rest, since Drake has no default
-        velocities. `StartCheck` warns about this.
-        """
-        context = super().CreateDefaultContext()
-        plant: Any = self.GetSubsystemByName("plant")
-        plant.set_state(plant.GetMyMutableContextFromRoot(context), self.experiment.start)
-        return context
 
     def SetParameters(self, context: Context, **parameters: Any) -> None:
         """Change mass, payload and friction of the plant in the root context.
@@ -118,39 +123,24 @@ class ClosedLoop(Diagram):
 def build_closed_loop(
     scenario: Scenario | str | Path | Experiment,
     *,
-    controller: OwnSystem | None = None,
-    reference: OwnReference | None = None,
-    disturbance: OwnSystem | None = None,
-    modify_law: OwnLaw | None = None,
-    sensor: OwnSystem | None = None,
-    link: OwnSystem | None = None,
-    tuner: OwnSystem | None = None,
     meshcat: Meshcat | None = None,
     true_mechanism: Mechanism | None = None,
+    **own: Unpack[OwnSystems],
 ) -> ClosedLoop:
     """Build the diagram of a scenario: reference, controller, limit, link, plant, sensor.
 
     Args:
         scenario: a scenario, prepared or not, or a shipped name or a path.
-        controller, reference, disturbance, modify_law, sensor, link, tuner: as of `simulate`.
         meshcat: shows the multibody plant during the simulation, or None.
         true_mechanism: as of `simulate`.
+        **own: `controller`, `reference`, `disturbance`, `modify_law`, `sensor`, `link`, `tuner`, as
+            of `simulate`.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
         TypeError: systems of the user with a prepared scenario, which has its own.
     """
-    experiment = concrete(
-        scenario,
-        true_mechanism,
-        controller=controller,
-        reference=reference,
-        disturbance=disturbance,
-        modify_law=modify_law,
-        sensor=sensor,
-        link=link,
-        tuner=tuner,
-    )
+    experiment = concrete(scenario, true_mechanism, **own)
     experiment.own.claim(experiment.scenario)
     builder = DiagramBuilder()
     sc, network = experiment.scenario, experiment.network
@@ -169,7 +159,7 @@ def build_closed_loop(
     return loop
 
 
-def build_machine(experiment: Experiment) -> Diagram:
+def build_machine(experiment: Experiment) -> Machine:
     """Build plant and sensor alone, for torques from elsewhere.
 
     | port | direction | size | unit |
@@ -189,8 +179,10 @@ def build_machine(experiment: Experiment) -> Diagram:
     builder.ExportInput(plant.GetInputPort("torque"), "torque")
     builder.ExportOutput(_output(builder, "plant.state"), "state")
     builder.ExportOutput(_output(builder, "sensor.measurement"), "measurement")
-    machine = builder.Build()
+    machine = Machine()
+    builder.BuildInto(machine)
     machine.set_name("machine")
+    machine.experiment = experiment
     return machine
 
 

@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from traceback import walk_tb
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, TypedDict, TypeVar
 from weakref import WeakSet
 
 import numpy as np
@@ -44,6 +44,18 @@ OwnLaw = Callable[[Any], Any]
 """Takes the scenario's law, a `PredictiveLqi`, or `ServoPreview` for servos; returns a law of that
 class."""
 AnyLaw = TypeVar("AnyLaw", PredictiveLqi, ServoPreview)
+
+
+class OwnSystems(TypedDict, total=False):
+    """What `loop.simulation.simulate` accepts in place of the scenario's."""
+
+    controller: OwnSystem | None
+    reference: OwnReference | None
+    disturbance: OwnSystem | None
+    modify_law: OwnLaw | None
+    sensor: OwnSystem | None
+    link: OwnSystem | None
+    tuner: OwnSystem | None
 
 
 _SIZES: Final[Mapping[str, int]] = {
@@ -153,7 +165,7 @@ def take(given: Mapping[str, Any]) -> Own:
     Args:
         given: values by the names of the arguments of `simulate`, None if not given.
     """
-    if unknown := given.keys() - {*ROLES, "reference", "modify_law"}:
+    if unknown := given.keys() - OwnSystems.__annotations__.keys():
         raise TypeError(f"got an unexpected keyword argument {min(unknown)!r}")
     given = {name: thing for name, thing in given.items() if thing is not None}
     systems = {role: _make(role, given[role], System) for role in ROLES if role in given}

@@ -242,7 +242,7 @@ def concrete(
     Args:
         scenario: a scenario, prepared or not, or a shipped name or a path.
         true_mechanism: the machine to simulate, that of the scenario's plant if None.
-        **own: see `loop.simulation.simulate`.
+        **own: see `loop.own.OwnSystems`.
 
     Raises:
         ConfigError: bad input, an unreachable reference.

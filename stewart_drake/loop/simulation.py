@@ -15,7 +15,7 @@ from stewart_drake.dynamics.native_functions import one_blas_thread
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.loop.cautions import cautions_after, cautions_before
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
-from stewart_drake.loop.diagram import ClosedLoop, build_closed_loop
+from stewart_drake.loop.diagram import ClosedLoop, Machine, build_closed_loop
 from stewart_drake.loop.exact import set_accuracy
 from stewart_drake.loop.own import OwnLaw, OwnReference, OwnSystem
 from stewart_drake.loop.preparation import Experiment, concrete
@@ -168,10 +168,9 @@ def _advance(
                     place = loop.experiment.own.place(error)
                     error.add_note(f"{place}at t = {context.get_time():.6g} s")
                     raise
-                # Drake's solver fails where constraints and dynamics contradict each other.
-                return "solver_failed", Failure(context.get_time(), None, np.nan, _one_line(error))
+                return "solver_failed", solver_failure(context, error)
             if left:
-                return "left_workspace", _failure(loop, context)
+                return "left_workspace", failure_of(loop, context)
             recorder.keep(context, instant)
             if progress is not None and instant.on_grid:
                 progress(t, recorder.current_error())
@@ -213,22 +212,23 @@ def _shown(simulator: Simulator, live: Live, progress: Progress | None) -> Progr
     return show
 
 
-def make_simulator(loop: ClosedLoop) -> Simulator:
-    """Return a simulator of the loop at its initial context, with the scenario's accuracy."""
-    plant = loop.experiment.scenario.plant
-    context = loop.CreateDefaultContext()
-    simulator = Simulator(loop, context)
+def make_simulator(machine: Machine) -> Simulator:
+    """Return a simulator at the initial context, with the scenario's accuracy."""
+    plant = machine.experiment.scenario.plant
+    simulator = Simulator(machine, machine.CreateDefaultContext())
     if plant.kind != "multibody":
         set_accuracy(simulator, plant.accuracy)
     return simulator
 
 
-def _failure(loop: ClosedLoop, context: Context) -> Failure:
-    plant: Any = loop.GetSubsystemByName("plant")
+def failure_of(machine: Machine, context: Context) -> Failure:
+    """Return why the plant ended its simulation."""
+    plant: Any = machine.GetSubsystemByName("plant")
     failure: Failure | None = plant.diagnose(plant.GetMyContextFromRoot(context))
     assert failure is not None, "the simulation ended inside the workspace"
     return failure
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+def solver_failure(context: Context, error: Exception) -> Failure:
+    """Return that Drake's solver failed: constraints contradict the dynamics."""
+    return Failure(context.get_time(), None, np.nan, " ".join(str(error).split()))

@@ -12,7 +12,14 @@ from typing import Literal
 import numpy as np
 
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import angle_rate_map, dot, leg_geometry, levers, rotation
+from stewart_drake.mechanism.kinematics import (
+    angle_rate_map,
+    dot,
+    leg_geometry,
+    levers,
+    rotation,
+    turned,
+)
 from stewart_drake.scenario.signals import ANGLES, POSITION
 from stewart_drake.types import Array
 
@@ -75,7 +82,7 @@ def joint_state(mechanism: Mechanism, pose: Array, rates: Array) -> JointState:
     y = now.R_WD[:, :, 1]
     theta_1 = np.arctan2(dot(np.cross(y_of_crank, y), axes), dot(y_of_crank, y))
     theta_2 = _elevation(now.R_WD, axes) - _elevation(home.R_WD, axes)
-    crank = (now.crank_angles - home.crank_angles + np.pi) % (2 * np.pi) - np.pi
+    crank = turned(now.crank_angles - home.crank_angles, 0.0)
 
     # Rates. The rod's length l is constant, so its axis r gives r . (v_Q - v_T) = 0, and from this
     # alpha_dot. Without spin the rod's angular velocity is r x (v_Q - v_T) / l. The rod turns about

@@ -78,6 +78,11 @@ def rotation(angles: Array) -> Array:
     return np.array(columns).T
 
 
+def turned(angles: Array, near: Array | float) -> Array:
+    """Return the angles in rad, moved by whole turns to within half a turn of others."""
+    return near + (angles - near + np.pi) % (2 * np.pi) - np.pi
+
+
 def turns_between(angles: Array, others: Array) -> Array:
     """Return the angles (n,) of the rotations from one roll-pitch-yaw (n, 3) to another, rad.
 

@@ -130,8 +130,14 @@ def read_scenario(
     name_or_path: str | Path,
     controller: str | Path | None = None,
     settings: Iterable[str] = (),
+    stays_blind: bool = False,
 ) -> Read:
-    """Read a scenario and check its fields one by one only."""
+    """Read a scenario and check its fields one by one only.
+
+    Args:
+        name_or_path, controller, settings: as of `load_scenario`.
+        stays_blind: whether settings of the assumed delay leave a controller that assumes none.
+    """
     path = resolve("scenario", name_or_path)
     data = load_yaml(path)
     if "home" in data and "mechanism" not in data:
@@ -142,11 +148,15 @@ def read_scenario(
     idle = {one.field for one in idle_fields(validate(Scenario, data, str(path)))}
     places = dict.fromkeys(_dotted_names(data), str(path))
     _make_paths_absolute(data, path.parent)
+    laid: dict[str, Any] = {}
     if controller is not None:
         laid = load_controller(controller)
         places |= dict.fromkeys(_dotted_names({"controller": laid}), str(controller))
         data["controller"] = data.get("controller", {}) | laid
     overlay = _parse_settings(setting_texts(settings), data)
+    if stays_blind and laid.get("delay_steps") == 0 and "controller" in overlay:
+        fields = overlay["controller"].items()
+        overlay["controller"] = {k: v for k, v in fields if not k.startswith("delay_")}
     places |= dict.fromkeys(_dotted_names(overlay), _SETTINGS)
     for name, change in overlay.items():
         data[name] = _laid_over(name, data.get(name), change)
@@ -197,7 +207,6 @@ def load_comparison(
             file's order.
     """
     settings = setting_texts(settings)
-    others = tuple(s for s in settings if not s.strip().startswith("controller.delay_"))
     read = read_scenario(name_or_path, settings=settings)
     read.scenario.check_rows(read.where)
     changes, rows = read.scenario.compare, {}
@@ -208,9 +217,7 @@ def load_comparison(
         where = f"{name_or_path}: compare.{row}"
         change = {} if is_path(given) else dict(changes.get(row, {}))
         controller, actuator = change.pop("controller", given), change.pop("actuator", {})
-        ignores_delay = load_controller(controller).get("delay_steps") == 0
-        own = others if ignores_delay else settings
-        scenario = read_scenario(name_or_path, controller, own).scenario
+        scenario = read_scenario(name_or_path, controller, settings, stays_blind=True).scenario
         changed = dataclasses.asdict(scenario.controller) | change
         scenario.controller = validate(ControllerConfig, changed, where)
         motors = compatible_actuator(scenario.controller.command, scenario.actuator)

@@ -64,11 +64,6 @@ class BurstChain:
         later[0] = self.begins * shares.sum()
         return later
 
-    def before(self, values: Array) -> Array:
-        """Return the expectation (..., burst + 1) of a function of the next state."""
-        without_burst = np.minimum(np.arange(self.burst + 1) + 1, self.burst)
-        return self.begins * values[..., :1] + (1 - self.begins) * values[..., without_burst]
-
     def probability_none_in_time(self, late: Array) -> float:
         """Return the probability that each of consecutive packets is lost or late.
 

@@ -279,15 +279,13 @@ def lacking_torques(
     limit = experiment.torque_limit
     sent = np.clip(signals.torque_commanded.values[rows], -limit, limit)
     in_flight = np.vstack([experiment.torques_in_flight(delay), sent])
-    acted = Timeline(dt, delay).schedule(in_flight)
-    parts = 1 if delay.fraction == 0 else 2
+    timeline = Timeline(dt, delay)
     times, found = [], []
     for k, (begin, end) in enumerate(itertools.pairwise(states), first):
         if np.all(np.isfinite([begin, end])):
-            part = slice(parts * k, parts * (k + 1))
-            schedule = TorqueSchedule(acted.torques[part], acted.durations[part])
             times.append(dt * (k + 0.5))
-            found.append(lacking_torque(dynamics, begin, end, schedule))
+            acted = timeline.next_period(in_flight[k : k + 2])
+            found.append(lacking_torque(dynamics, begin, end, acted))
     return np.array(times), np.reshape(found, (-1, 6))
 
 
