@@ -328,7 +328,7 @@ def test_data_of_a_family_go_on_where_they_stopped(tmp_path):
     again = make_data(family, tmp_path, workers=1)
     assert first.identical(again) and gone.read_bytes() == kept
     read = load_data(tmp_path)
-    curves = curves_of(read, "health")
+    curves = curves_of(read)
     assert curves.J.shape == (10, len(RATIOS))
     assert np.array_equal(curves.J.ravel(), first.J)
     seen = np.isfinite(curves.features).all(axis=-1)

@@ -10,6 +10,7 @@ import xarray as xr
 from scipy.optimize import least_squares
 
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.scenario.loading import load_scenario, scenario_to_dict
 from stewart_drake.scenario.signals import TUNER_INPUTS
 from stewart_drake.tuner.network import load_network, save_network
 from stewart_drake.tuner.source import ratio_of
@@ -243,7 +244,7 @@ def synthetic(number=60, seed=0):
 
 
 def network_of(one, theta):
-    return one.network(theta, "health", {})
+    return one.network(theta, {})
 
 
 def test_the_loss_is_the_regret_between_the_ratios():
@@ -281,24 +282,32 @@ def test_a_network_learns_to_lose_little_where_it_was_not_trained():
 
 
 def family_data(curves):
-    """Return a data set of these curves, with the features as densities."""
+    """Return a data set of these curves."""
     count, ratios, samples, _ = curves.features.shape
     runs = count * ratios
     half = np.tile(RATIOS / 2, count)
+    base = scenario_to_dict(load_scenario("paper"))
+    settings = {"family": "N2", "scenario": base, "draws": [{}] * count}
     return xr.Dataset(
         {
-            "density": (("run", "sample", "input"), curves.features.reshape(runs, samples, 18)),
+            "health": (("run", "sample", "input"), curves.features.reshape(runs, samples, 18)),
             "weights": (("run", "weight"), np.column_stack([10**half, 10**-half])),
             "J": ("run", curves.J.ravel()),
         },
-        attrs={"settings": json.dumps({"family": "N2"})},
+        attrs={"settings": json.dumps(settings)},
     )
 
 
 @pytest.mark.parametrize("start", [None, -1.5])
-def test_a_network_begins_where_it_is_asked_to(start, tmp_path):
+def test_a_network_begins_where_it_is_asked_to(start, tmp_path, monkeypatch):
     curves = synthetic(30)
-    found = train_by_regret(family_data(curves), tmp_path, features="densities", start=start)
+
+    def run(names, *_, **__):
+        return {k: {"J": curves.J[int(k)], "health": curves.features[int(k)]} for k in names}
+
+    monkeypatch.setattr(training, "vary", lambda *_: None)
+    monkeypatch.setattr(training, "run_jobs", run)
+    found = train_by_regret(family_data(curves), tmp_path, start=start)
     expected = curves.best_ratio if start is None else start
     assert ratio_of(found.network.start) == pytest.approx(expected)
     # Of ratios from 10^-4 to 10^2 with w_Q w_R = 1.

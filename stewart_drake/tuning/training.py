@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -58,7 +58,6 @@ from stewart_drake.tuning.families import FAULTY, RATIOS, vary
 from stewart_drake.tuning.options import Labels, Split
 from stewart_drake.types import Array, Flags
 
-FeatureName = Literal["densities", "health"]
 Indices = NDArray[np.intp]
 
 HIDDEN: Final = 10
@@ -348,13 +347,12 @@ class FeatureRows(NamedTuple):
     condition: Indices
 
 
-def curves_of(data: xr.Dataset, features: FeatureName) -> Curves:
-    values = {"densities": "density", "health": "health"}[features]
+def curves_of(data: xr.Dataset) -> Curves:
     ratios = np.log10(data.weights.values[:, 0] / data.weights.values[:, 1])
     whole = not len(ratios) % len(RATIOS)
     if (
         "J" not in data
-        or values not in data
+        or "health" not in data
         or not whole
         or not np.allclose(ratios.reshape(-1, len(RATIOS)), RATIOS)
     ):
@@ -363,7 +361,7 @@ def curves_of(data: xr.Dataset, features: FeatureName) -> Curves:
             "`tune dataset --family` since version 0.3"
         )
     shape = (-1, len(RATIOS))
-    recorded = data[values].values.astype(np.float32)
+    recorded = data.health.values.astype(np.float32)
     return Curves(data.J.values.reshape(shape), recorded.reshape(*shape, *recorded.shape[1:]))
 
 
@@ -378,7 +376,6 @@ def train_by_regret(
     data: xr.Dataset,
     directory: str | Path,
     *,
-    features: FeatureName = "health",
     seed: int = 0,
     start: float | None = None,
     workers: int | None = None,
@@ -387,65 +384,63 @@ def train_by_regret(
     """Train a network by regret, on data of a family with faults.
 
     The same arguments give the same network. The directory keeps its runs, so that a second start
-    continues. The second round is for `health` alone. In the end the network begins at a ratio
-    log10(w_Q / w_R), by default the best fixed one.
+    continues. In the end the network begins at the ratio log10(w_Q / w_R) `start`, by default the
+    best fixed one.
     """
     if start is not None and not RATIOS[0] <= start <= RATIOS[-1]:
         raise ConfigError(f"--start: got {start:g}; expected {RATIOS[0]:g} to {RATIOS[-1]:g}")
     settings = json.loads(data.attrs["settings"])
-    curves = curves_of(data, features)
+    curves = curves_of(data)
     begin = curves.best_ratio if start is None else start
     trainer = RegretTrainer(curves, seed)
     theta = trainer.fit(trainer.start, [trainer.rows], 1)
     about = {"family": settings["family"], "conditions": len(curves.J)}
-    best = first = trainer.network(theta, features, about)
-    more: dict[str, Any] = {}
-    if features == "health":
-        base = validate(Scenario, settings["scenario"], "data")
-        samples = data.sizes["sample"]
+    first = trainer.network(theta, about)
+    base = validate(Scenario, settings["scenario"], "data")
+    samples = data.sizes["sample"]
 
-        def own_runs(network: Network, chosen: Indices, number: int) -> Curves:
-            key = _key(network)
-            found = run_jobs(
-                {
-                    f"{i:05d}": (vary(FAULTY, base, settings["draws"][i]), network, samples)
-                    for i in chosen
-                },
-                roll_out,
-                Path(directory) / f"round{number}-{key[:8]}",
-                settings={
-                    "family": settings["family"],
-                    "scenario": scenario_to_dict(base),
-                    "network": key,
-                },
-                suffix=".npz",
-                read=partial(read_condition, samples=samples),
-                workers=workers,
-                progress=progress,
-            ).values()
-            J, health = (np.array([one[name] for one in found]) for name in ("J", "health"))
-            return Curves(J, health)
-
-        held, some = np.flatnonzero(trainer.held), np.flatnonzero(~trainer.held)[:: round(1 / OWN)]
-        chosen = np.sort(np.concatenate([held, some]))
-        own = own_runs(first, chosen, 1)
-        rows = feature_rows(own)
-        both = [trainer.rows, FeatureRows(rows.inputs, chosen[rows.condition])]
-        second = trainer.network(trainer.fit(theta, both, 2), features, about)
-        scores = [
-            float(own.log_J[np.isin(chosen, held)].mean()),
-            float(own_runs(second, held, 2).log_J.mean()),
-        ]
-        best, fixed = (first, second)[int(np.argmin(scores))], curves.log_J[held]
-        more = {
-            "start": begin,
-            "round": 1 + int(np.argmin(scores)),
-            "held_out_J": {
-                "rounds": np.exp(scores).tolist(),
-                "best_fixed": float(np.exp(fixed.mean(axis=0).min())),
-                "hindsight": float(np.exp(fixed.min(axis=1).mean())),
+    def own_runs(network: Network, chosen: Indices, number: int) -> Curves:
+        key = _key(network)
+        found = run_jobs(
+            {
+                f"{i:05d}": (vary(FAULTY, base, settings["draws"][i]), network, samples)
+                for i in chosen
             },
-        }
+            roll_out,
+            Path(directory) / f"round{number}-{key[:8]}",
+            settings={
+                "family": settings["family"],
+                "scenario": scenario_to_dict(base),
+                "network": key,
+            },
+            suffix=".npz",
+            read=partial(read_condition, samples=samples),
+            workers=workers,
+            progress=progress,
+        ).values()
+        J, health = (np.array([one[name] for one in found]) for name in ("J", "health"))
+        return Curves(J, health)
+
+    held, some = np.flatnonzero(trainer.held), np.flatnonzero(~trainer.held)[:: round(1 / OWN)]
+    chosen = np.sort(np.concatenate([held, some]))
+    own = own_runs(first, chosen, 1)
+    rows = feature_rows(own)
+    both = [trainer.rows, FeatureRows(rows.inputs, chosen[rows.condition])]
+    second = trainer.network(trainer.fit(theta, both, 2), about)
+    scores = [
+        float(own.log_J[np.isin(chosen, held)].mean()),
+        float(own_runs(second, held, 2).log_J.mean()),
+    ]
+    best, fixed = (first, second)[int(np.argmin(scores))], curves.log_J[held]
+    more = {
+        "start": begin,
+        "round": 1 + int(np.argmin(scores)),
+        "held_out_J": {
+            "rounds": np.exp(scores).tolist(),
+            "best_fixed": float(np.exp(fixed.mean(axis=0).min())),
+            "hindsight": float(np.exp(fixed.min(axis=1).mean())),
+        },
+    }
     network = replace(best, start=weights_of(begin), card=dict(best.card) | more)
     nothing = np.empty((0, NUM_OUTPUTS))
     return Training(network, np.array(trainer.curve), nothing, nothing)
@@ -521,7 +516,7 @@ class RegretTrainer:
         value = (1 - share) * lower + share * upper
         return value.mean() + OUTSIDE * ((ratio - within) ** 2).mean()
 
-    def network(self, theta: Array, features: FeatureName, about: dict[str, Any]) -> Network:
+    def network(self, theta: Array, about: dict[str, Any]) -> Network:
         """Return the network of theta with w_Q w_R = 1 at the same ratio."""
         W1, b1, W2, b2 = unpack(theta, NUM_INPUTS, HIDDEN)
         half = np.array([[0.5, -0.5], [-0.5, 0.5]])
@@ -542,7 +537,7 @@ class RegretTrainer:
             b2=half @ b2,
             bounds=np.sort(ends, axis=0),
             output="log_weights",
-            features=features,
+            features="health",
             start=weights_of(self._curves.best_ratio),
             card=card,
         )
