@@ -262,11 +262,8 @@ def _demo_machine(chosen: Chosen, eta: float) -> Iterator[str]:
     here, there = context.Pipe(duplex=False)
     chosen = chosen._replace(settings=[*chosen.settings, "plant.kind=exact", link])
     process = context.Process(target=_serve, args=(there, chosen), daemon=True)
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the controller
-    try:
+    with _handled(signal.SIG_IGN, signal.SIGINT):  # Ctrl-C is for the controller
         process.start()
-    finally:
-        signal.signal(signal.SIGINT, before)
     there.close()
     try:
         # Imported while the machine starts, which takes as long.
@@ -296,12 +293,19 @@ def _ending() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         asked = True
 
-    before = [(number, signal.signal(number, ask)) for number in _REQUESTS]
-    try:
+    with _handled(ask, *_REQUESTS):
         yield lambda: asked
+
+
+@contextlib.contextmanager
+def _handled(handler: Any, *numbers: signal.Signals) -> Iterator[None]:
+    """Handle signals in another way for a while."""
+    before = [(number, signal.signal(number, handler)) for number in numbers]
+    try:
+        yield
     finally:
-        for number, handler in before:
-            signal.signal(number, handler)
+        for number, former in before:
+            signal.signal(number, former)
 
 
 # ---------------------------------------------------------------- the machine
@@ -324,21 +328,19 @@ def machine(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
             delivery.say_wrapped(
                 f"simulated link: {network}; the controller chooses the delay of the loop"
             )
-        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+        moved = f"simulated by {running.simulated_by}"
+        if options.reachy is not None:
+            moved = f"drives the robot behind {options.reachy}"
         try:
-            moved = f"simulated by {running.simulated_by}"
-            if options.reachy is not None:
-                moved = f"drives the robot behind {options.reachy}"
-            delivery.say_wrapped(
-                f"machine {chosen.scenario} at {address[0]}:{address[1]}: {moved}, "
-                f"every {1e-6 * running.period:g} ms",
-                "waits for a controller; Ctrl-C ends it",
-            )
-            running.run(options.duration or math.inf)
+            with _handled(signal.default_int_handler, signal.SIGTERM):
+                delivery.say_wrapped(
+                    f"machine {chosen.scenario} at {address[0]}:{address[1]}: {moved}, "
+                    f"every {1e-6 * running.period:g} ms",
+                    "waits for a controller; Ctrl-C ends it",
+                )
+                running.run(options.duration or math.inf)
         except KeyboardInterrupt:
             interrupted = True
-        finally:
-            signal.signal(signal.SIGTERM, before)
     if options.log is not None:
         delivery.say(f"log written to {options.log}")
     s: Any = running.summary()

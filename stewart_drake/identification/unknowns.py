@@ -15,6 +15,7 @@ from stewart_drake.core.layout import LEG_NUMBERS
 from stewart_drake.identification.model import LEG_PLACES, NUM_DYNAMIC, NUM_GEOMETRY, Numbers
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.mechanism.geometry import Mechanism, drawing_of, geometry_of, plate_radius
+from stewart_drake.scenario import calibration
 from stewart_drake.scenario.signals import (
     BALL_JOINT_FRICTION_SPEED,
     BIAS,
@@ -46,8 +47,7 @@ _OF_A_LEG: Final = (
 NAMES: Final = (
     *CONSTANTS,
     *(f"{name}_{leg}" for leg in LEGS for name in _OF_A_LEG),
-    *(f"offset_A{leg}" for leg in LEGS),
-    "delay",
+    *(*calibration.OFFSETS, calibration.DELAY),
 )
 UNITS: Final = (*CONSTANT_UNITS, *("m",) * NUM_GEOMETRY, *("rad",) * NUM_LEGS, "s")
 ONE_SIDED: Final = (DAMPING, COULOMB)  # unknowns that are not negative

@@ -211,18 +211,18 @@ class Watch:
                 self._silent_since = contact.heard
                 self.report(k, f"the machine has been silent for {silent:.1f} s; waiting")
             if silent > PATIENCE:
-                return self._end("lost_machine", k, f"the machine was silent for {PATIENCE:g} s")
+                return self.end("lost_machine", k, f"the machine was silent for {PATIENCE:g} s")
         elif self._silent_since:
             gone = (contact.heard - self._silent_since) / SECOND
             self._silent_since = 0
             self.report(k, f"the machine is heard again, after {gone:.1f} s")
         if contact.machine.reason.fault == Fault.ENDED:
-            return self._end("lost_machine", k, contact.machine.why)
+            return self.end("lost_machine", k, contact.machine.why)
         if message is None:
             return None
         before, self._flags = self._flags, message.flags
         if MachineFlags.LEFT in message.flags:
-            return self._end("left_workspace", k, message.why, message.reason.leg or None)
+            return self.end("left_workspace", k, message.why, message.reason.leg or None)
         self.safe = message.why if MachineFlags.SAFE in message.flags else None
         if MachineFlags.SAFE in message.flags & ~before:
             self.report(k, f"the machine is at its safe torque: {self.safe}")
@@ -242,5 +242,5 @@ class Watch:
     def report(self, k: int, text: str) -> None:
         self._say(f"at {k * self._period:.1f} s: {text}")
 
-    def _end(self, status: str, k: int, reason: str, leg: int | None = None) -> End:
+    def end(self, status: str, k: int, reason: str, leg: int | None = None) -> End:
         return End(status, Failure(k * self._period, leg, math.nan, reason))

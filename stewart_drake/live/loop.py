@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from stewart_drake.dynamics.workspace import Failure, margins
+from stewart_drake.dynamics.workspace import margins
 from stewart_drake.law.channel import Report
 from stewart_drake.law.gaps import LONGEST_GAP, stays_within_reach
 from stewart_drake.law.sensing import Measurement
@@ -149,11 +149,11 @@ class LiveLoop:
                 k += 1
             if end.status == "completed":
                 if not self._complete(k, duration):
-                    end = self._end("interrupted", k, "ended")
+                    end = self._watch.end("interrupted", k, "ended")
                 end = self._come_to_rest(k, ending) or end
         except KeyboardInterrupt:
             if not self._complete(k, duration):
-                end = self._end("interrupted", k, "stopped")
+                end = self._watch.end("interrupted", k, "stopped")
         self.exchange.stop()
         if end.status in ("completed", "interrupted"):
             end = end._replace(then=f"now {self._design.left_alone(self.exchange.contact.machine)}")
@@ -163,9 +163,6 @@ class LiveLoop:
 
     def _complete(self, k: int, duration: float) -> bool:
         return k * self._period >= duration - 1e-9 or self._viewer.finished()
-
-    def _end(self, status: str, k: int, reason: str) -> End:
-        return End(status, Failure(k * self._period, None, math.nan, reason))
 
     def _step(self, k: int) -> End:
         if self._viewer.stopped():
@@ -215,7 +212,7 @@ class LiveLoop:
             acted = self._acted(message)
             problem = self._check.problem(acted) if design.sends else None
             if problem is not None:
-                return self._end("refused", k, problem)
+                return self._watch.end("refused", k, problem)
             report = self._heard(k, acted)
         if not self._leads:
             if not measurement.complete and not self._parked:  # the pose is unknown
@@ -223,7 +220,7 @@ class LiveLoop:
                 return self._lost(k)
             refused = self._start(t, measurement, message)
             if refused is not None:
-                return self._end("refused", k, refused)
+                return self._watch.end("refused", k, refused)
             self._leads = True
         counts = self.memory.counts
         request = self._viewer.request() if self._recording else Request(rest=True)
@@ -258,7 +255,7 @@ class LiveLoop:
         contact = self.exchange.contact
         silent = contact.machine.rate * (now() - contact.heard) / SECOND
         if silent >= gap - self._period:
-            return self._end("lost_machine", k, f"the machine was silent for {silent:.3g} s")
+            return self._watch.end("lost_machine", k, f"the machine was silent for {silent:.3g} s")
         before, after = self._known.counts._asdict(), self.memory.counts._asdict()
         causes = [
             f"{after[name] - before[name]} {name.removeprefix('measurements_')}"
@@ -268,7 +265,7 @@ class LiveLoop:
         if late := self.exchange.overtaken - self._late:
             causes.append(f"{late} came too late")
         reason = f"no usable measurement for {gap:.3g} s ({', '.join(causes) or 'none came'})"
-        return self._end("lost_contact", k, reason)
+        return self._watch.end("lost_contact", k, reason)
 
     def _may_miss(self, gap: float) -> bool:
         """Return whether the run goes on after `gap` s without a usable measurement."""

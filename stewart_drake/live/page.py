@@ -5,7 +5,6 @@ listen on this computer only (`reporting.local_page`).
 """
 
 import json
-import logging
 import multiprocessing
 import threading
 import time
@@ -141,14 +140,11 @@ def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
     """Serve the page until the loop closes the connection."""
     import signal
 
-    from pydrake.geometry import Meshcat, MeshcatParams
-
     from stewart_drake.loop.scene import Scene
-    from stewart_drake.reporting.replay import scene_page
+    from stewart_drake.reporting.replay import quiet_meshcat, scene_page
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the loop, which closes this
-    logging.getLogger("drake").setLevel(logging.WARNING)  # hides Meshcat's own address
-    meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    meshcat = quiet_meshcat()
     scene, readouts = Scene(mechanism, meshcat), Readouts()
     lock, (low, high) = threading.Lock(), slider_range(mechanism)
 

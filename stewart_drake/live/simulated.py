@@ -28,7 +28,7 @@ from stewart_drake.loop.simulation import failure_of, make_simulator, solver_fai
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.link import forward_times, return_times, sensor_times, torque_delays
-from stewart_drake.scenario.signals import BIAS, NUM_LEGS, NUM_TORQUES, POSE
+from stewart_drake.scenario.signals import NUM_CONSTANTS, NUM_LEGS, NUM_TORQUES, POSE
 from stewart_drake.scenario.timing import look_time
 from stewart_drake.types import Array
 
@@ -213,14 +213,11 @@ class NativeBody:
     def __init__(self, experiment: Experiment) -> None:
         sc, sensor = experiment.scenario, experiment.scenario.sensor
         assert sensor.kind == "state"
-        parameters = np.array(sc.plant_parameters)
-        self._bias = parameters[BIAS].copy()
-        parameters[BIAS] = 0.0  # added to the torque that acts, as in the diagram
-        self._push = sc.plant.push
-        self._free, self._pushed = (
-            StewartDynamics(experiment.truth, sc.plant.gravity, np.append(parameters, wrench))
-            for wrench in ([0.0] * 6, self._push.wrench)
-        )
+        self._bias, self._push = np.array(sc.plant.torque_bias), sc.plant.push
+        # The bias is added to the torque that acts, as in the diagram.
+        self._free = experiment.true_dynamics(biased=False)
+        pushed = np.append(self._free.plant_parameters[:NUM_CONSTANTS], self._push.wrench)
+        self._pushed = StewartDynamics(experiment.truth, sc.plant.gravity, pushed)
         self._accuracy = SHARE * sc.plant.accuracy
         self._noise, self._seed = np.array(sensor.noise_std), sensor.seed
         self._period, self.state, self.time = sc.controller.period, experiment.start.copy(), 0.0

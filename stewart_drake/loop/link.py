@@ -7,7 +7,7 @@ plant that steps at t feels the torque released at t.
 
 import math
 from abc import abstractmethod
-from typing import Final, Literal
+from typing import Literal
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
@@ -16,15 +16,12 @@ from stewart_drake.core.link import NO_ROOM, Link
 from stewart_drake.files.arguments import fixed, of_kind, one_of, positive, whole
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import brief
-from stewart_drake.loop.sampling import declare_constant, update_every, weak
+from stewart_drake.loop.sampling import ONCE, declare_constant, update_every, weak
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link import SIMULTANEOUS, releases
 from stewart_drake.scenario.signals import CARRIED, NUM_TORQUES, PACKETS, Carried
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
-
-_ONCE: Final = 1e9
-"""Period of an event that occurs once, s: longer than any run."""
 
 
 class LinkSystem(LeafSystem):
@@ -245,7 +242,7 @@ class VaryingDelay(Wire):
         # The sample itself is the event of a torque that arrives as it is sent.
         for time in times[(times > 0) & (times != period * numbers)].tolist():
             arrive = weak(self._arrive, time)
-            self.DeclarePeriodicUnrestrictedUpdateEvent(_ONCE, event_time(time), arrive)
+            self.DeclarePeriodicUnrestrictedUpdateEvent(ONCE, event_time(time), arrive)
 
     def _arrival(self, number: int) -> float:
         return float(number * self._period + self._delays[min(number, len(self._delays) - 1)])

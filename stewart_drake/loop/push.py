@@ -1,17 +1,13 @@
 """A wrench on the plate for a while, as a Drake system."""
 
 import math
-from typing import Final
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
-from stewart_drake.loop.sampling import weak
+from stewart_drake.loop.sampling import ONCE, weak
 from stewart_drake.scenario.config import PushConfig
 from stewart_drake.scenario.timing import event_time
-
-_ONCE: Final = 1e9
-"""Period of an event that happens once in any run, s."""
 
 
 class Push(LeafSystem):
@@ -35,7 +31,7 @@ class Push(LeafSystem):
         for time, share in ((push.start, 1.0), (push.end, 0.0)):
             if 0 < time < math.inf:
                 change = weak(self._change, share)
-                self.DeclarePeriodicDiscreteUpdateEvent(_ONCE, event_time(time), change)
+                self.DeclarePeriodicDiscreteUpdateEvent(ONCE, event_time(time), change)
 
     def _change(self, share: float, context: Context, state: DiscreteValues) -> EventStatus:
         state.get_mutable_vector().SetFromVector(share * self._wrench)

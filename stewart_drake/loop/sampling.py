@@ -27,6 +27,8 @@ from stewart_drake.files.arguments import positive
 from stewart_drake.scenario.timing import event_time
 from stewart_drake.types import Array
 
+ONCE: Final = 1e9
+"""Period of an event that occurs once, s: longer than any run."""
 _NOTES: Final = "_pydrake_internal_ref_cycle_peers"
 
 

@@ -30,7 +30,7 @@ def replay(signals: xr.Dataset, mechanism: Mechanism, meshcat: Meshcat | None = 
 
     `StaticHtml()` of the returned Meshcat plays without a server.
     """
-    meshcat = meshcat or _quiet_meshcat()
+    meshcat = meshcat or quiet_meshcat()
     scene, shown = Scene(mechanism, meshcat), _thinned(signals)
     for name, signal in (("reference", "reference"), ("plate", "pose")):
         path = shown[signal].values[:, POSITION].T
@@ -121,7 +121,7 @@ def scene_page(meshcat: Meshcat, overlay: str, title: str) -> str:
     return whole.replace("<head>", f"<head>{_VIEWPORT}", 1)
 
 
-def _quiet_meshcat() -> Meshcat:
+def quiet_meshcat() -> Meshcat:
     """Return a Meshcat without printing its address."""
     log = logging.getLogger("drake")
     level = log.level
