@@ -116,7 +116,6 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     """Return the text of the files of an export, by name.
 
     Args:
-        scenario: of the controller.
         single: whether numbers have single precision.
         measured: whether to judge the loop, and to compile and run the controller here, for the
             margins and the sizes in its README.
@@ -387,7 +386,6 @@ class Constants:
         targets: arrays and C structures that a pointer may refer to.
         tables: names of the core's tables of functions, by address.
         suffix: of a number, `f` in single precision.
-        data: the structure.
         prefix: beginning of the names of its targets.
         number_type: type in C of the numbers that it points to.
 

@@ -58,7 +58,6 @@ def resolve(kind: Kind, name_or_path: str | Path) -> Path:
     """Return the absolute path of an existing data file.
 
     Args:
-        kind: of the data.
         name_or_path: a shipped name, or the path of a file or of a folder with a file KIND.yaml.
 
     Raises:

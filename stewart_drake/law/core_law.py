@@ -76,7 +76,6 @@ class CompiledLaw:
         more: number of torques to keep in flight beyond those of the law.
 
     Attributes:
-        law: the law.
         data: `stewart_law *`, or of servos `stewart_servo *`.
         torques_law: `stewart_law *`, of servos the one in `data`.
         fields: (place, rows, columns) of each field of the memory.

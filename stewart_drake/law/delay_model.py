@@ -182,7 +182,6 @@ def chain(model: DelayedModel, *, always_extra: bool = False) -> ChainModel:
     """Return the delay chain (37)-(39) as one undelayed system.
 
     Args:
-        model: the delayed model.
         always_extra: carry T_{k-mu-1} also when eta0 = 0, as the paper does.
     """
     n, m = model.B_new.shape

@@ -68,7 +68,6 @@ class HoldModel:
     Derivatives by the torque are those by the torque bias, which `stewart_transitions` has.
 
     Args:
-        plant: model of the plant.
         parameters: (p,) free parameters of its dynamics, as estimated.
         period: of a hold, s.
     """
@@ -154,7 +153,6 @@ def pose_root(
     both, W W' = H C H'. Without a covariance W is zero.
 
     Args:
-        plant: model of the plant.
         belief: now.
         schedule: torques (k, 6) of the prediction.
         states: (k, 12) predicted after each of them.

@@ -144,7 +144,6 @@ class _Search:
 
         Args:
             plan: to begin with.
-            cost: of a plan.
             root: (6, n) of the covariance of the pose at the start, see `law.horizon.pose_root`.
             until: end of the time, s, as of `time.perf_counter`.
 

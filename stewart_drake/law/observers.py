@@ -68,7 +68,6 @@ class Observer(Protocol):
             measurement: of this one, as it came.
             in_flight: (n, 6) torques, oldest first, before this sample's torque.
             sensing: model of the sensor.
-            plant: model of the plant.
 
         Returns:
             The new belief. Its state may be NaN until the first measurement without a fault; the
@@ -307,7 +306,6 @@ def belief_of(
     """Return the belief that the memory of an observer of the core holds.
 
     Args:
-        observer: the observer.
         law: `stewart_law *` with it.
         memory: of the observer, which the belief keeps.
         timeline: the assumed one.

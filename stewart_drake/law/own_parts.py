@@ -56,7 +56,6 @@ class OwnParts:
     """Function tables for the parts of a law that are written in Python.
 
     Args:
-        law: the law.
         data: its `stewart_law *`, in which each method for a part sets the table of that part.
 
     Attributes:

@@ -46,8 +46,6 @@ class Planner(Protocol):
             path: pieces (n, 38) planned before, or None.
             belief: estimate at this sample.
             in_flight: (n, 6) torques sent before this sample.
-            motion: the requested motion.
-            plant: model of the plant.
         """
         ...
 

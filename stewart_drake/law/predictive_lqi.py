@@ -42,7 +42,6 @@ class PredictiveLqi:
     Attributes:
         timeline: clock of the controller, with the delay that is assumed at the start. Later the
             observer's belief has the delay.
-        plant: model of the plant.
         sensing: model of the sensor.
         observer: estimates state, parameters and delay.
         predictor: error and integral where the next torque acts.

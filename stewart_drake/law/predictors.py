@@ -42,7 +42,6 @@ class Predictor(Protocol):
             integral: (6,) of the pose error, now.
             queue: (L, 6) torques in flight, oldest first.
             wanted: (1 + s, 12) reference now and at `samples`.
-            plant: model of the plant.
         """
         ...
 

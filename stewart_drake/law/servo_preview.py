@@ -30,7 +30,6 @@ class ServoPreview:
 
     Attributes:
         timeline: clock and delay; `parts` as of the reports.
-        plant: model of the plant.
         sensing: model of the sensor.
         observer: estimates state and parameters, with the reported torques.
         feedforward: the torque T_ff of a command.

@@ -388,7 +388,6 @@ def run_loop(
     Args:
         experiment: with a scenario that is not `uncovered`.
         when: `instants_of` its duration and period.
-        controller: the controller.
         law: law of the controller, for packets and reports; if None, single torques are sent.
 
     Raises:

@@ -46,7 +46,6 @@ class ClearanceScene:
     """A machine alone in a scene, for distances between its parts.
 
     Args:
-        mechanism: the machine.
         base: whether to include pairs with its base, motors and posts.
 
     Attributes:

@@ -175,7 +175,6 @@ class DelayLqiController(_RecordedLaw):
     periods; packets of n planned torques and r of earlier samples (`law.channel.Packets`).
 
     Args:
-        law: the control law.
         queue: (L, 6) assumed torques in flight at t = 0 in N m, oldest first.
         motion: the planned motion and the reference, for a law that reads them at any instant;
             otherwise it follows `preview`.
@@ -262,7 +261,6 @@ class ServoController(_RecordedLaw):
     | the others | output | as of `DelayLqiController` | | held |
 
     Args:
-        law: the control law.
         command: (18,) sent before t = 0.
     """
 

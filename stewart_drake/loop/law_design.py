@@ -212,7 +212,6 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     """Compose the law of a scenario from parts, with the factories of `loop.kinds`.
 
     Args:
-        experiment: of the scenario.
         sizing: `sizing_of` the experiment, computed if None.
 
     Raises:
@@ -295,7 +294,6 @@ def estimated_parameters(
     """Return the estimated parameters and their prior.
 
     Args:
-        experiment: of the scenario.
         torque_scale: of machine and motion, N m.
         motion_torque: largest torque that the motion takes, N m. It sets the scale of a wrench: the
             moment, and the force at the tip of the shortest crank.
@@ -539,7 +537,6 @@ class DesignedLaw:
         """Add the law, connected with its reference and weights.
 
         Args:
-            builder: of the diagram.
             name: of the controller; its reference is `NAME_reference`, its weights `NAME_weights`.
             weights: w_Q and w_R (2,) of a tuner in the diagram; constant ones if None.
 

@@ -378,7 +378,6 @@ class LateMeasurements(LeafSystem):
     Args:
         period: dt in s.
         times: (n,) tau_j in s, infinite for a lost one; further ones are lost.
-        size: of the measurement.
     """
 
     def __init__(self, period: float, times: Array, size: int) -> None:

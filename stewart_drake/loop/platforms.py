@@ -98,7 +98,6 @@ def add_model(
     The plate floats on a roll-pitch-yaw joint with the pose as its positions.
 
     Args:
-        plant: the plant.
         mechanism: the machine; the name of a second one gets a number.
         payload_mass: kg, a point mass.
         payload_position: m, in the plate's frame, from its COM.
@@ -319,7 +318,6 @@ class StewartPlatform:
     workspace, as the exact one does, if one of the outputs is used.
 
     Attributes:
-        mechanism: the machine.
         plant: an `ExactPlant` or a `MultibodyPlant`.
         model: its model in the MultibodyPlant, None for an exact plant.
         scene_graph: added with a MultibodyPlant, else None.
@@ -502,7 +500,6 @@ def AddStewartPlatform(
     diagram with exact plants needs `sd.set_accuracy`.
 
     Args:
-        builder: builder of the diagram.
         mechanism: the machine, or a name or path for `load_mechanism`.
         config: kind, gravity, time step and loads, as a scenario's `plant`, by default without
             gravity; with a `plant`, `time_step` is that plant's, and gravity is switched off for
@@ -590,7 +587,6 @@ class MultibodyStewart(Diagram):
     | query | output | SceneGraph query object | - |
 
     Args:
-        mechanism: the machine.
         time_step: s.
         meshcat: shows it, or None.
         start: (6,) pose by default, home if None.

@@ -38,7 +38,6 @@ class Record:
     """Record of a run, in simulation or in real time.
 
     Args:
-        experiment: the experiment.
         logs: to be written while the run goes on.
 
     Attributes:

@@ -107,7 +107,6 @@ class Servos(SteppedLaw):
         dynamics: of the true machine, for kinematics and the limit at the crank.
         command: (18,) held until the first one arrives.
         period: of the commands, s, a multiple of that of the loops.
-        reports: layout of the report.
     """
 
     def __init__(
@@ -183,7 +182,6 @@ class PositionServos(LeafSystem):
         dynamics: of the true machine, for its geometry.
         command: (18,) held until the first one arrives.
         period: of the commands, s.
-        reports: layout of the report.
     """
 
     def __init__(

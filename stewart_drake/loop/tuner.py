@@ -106,7 +106,6 @@ class AnnTuner(SteppedLaw):
     | weights | output | 2 | w_Q, w_R | direct feedthrough |
 
     Args:
-        network: the network.
         fixed: (2,) w_Q and w_R at the first sample and after fallbacks.
         period: dt in s.
     """
@@ -156,7 +155,6 @@ class LawTuner(SteppedLaw):
     | weights | output | 2 | w_Q, w_R | held |
 
     Args:
-        source: the tuner.
         first: memory of the law before its first sample.
         period: dt in s.
     """
