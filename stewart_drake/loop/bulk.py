@@ -86,7 +86,7 @@ COVERED: Final[Accepted] = {
     "sensor.faults": [],
 }
 """Values of the fields that the loop in C covers."""
-_DRAWN: Final = (
+_OF_A_RUN: Final = (
     *(("plant", name) for name in ("payload_mass", "torque_bias", "joint_damping")),
     *(("plant", name) for name in ("coulomb_friction", "push")),
     *(("sensor", name) for name in ("noise_std", "seed", "loss")),
@@ -175,7 +175,7 @@ class Prepared(NamedTuple):
 
 
 class Preparation:
-    """Common part of the runs of scenarios that differ in `_DRAWN` and the true machine only.
+    """Common part of the runs of scenarios that differ in `_OF_A_RUN` and the true machine only.
 
     Attributes:
         when: instants of a run.
@@ -232,7 +232,7 @@ def preparation_of(scenario: Scenario) -> Preparation:
 def _key(scenario: Scenario) -> tuple[Any, ...]:
     """Return a key that is equal for scenarios with the same preparation."""
     fields, believed = scenario_to_dict(scenario), believed_delay(scenario)
-    for section, name in _DRAWN:
+    for section, name in _OF_A_RUN:
         del fields[section][name]
     del fields["tuner"]
     fields["delay"] = believed.steps, believed.fraction

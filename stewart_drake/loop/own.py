@@ -73,7 +73,7 @@ class Role(NamedTuple):
     """Place of a system in the loop, with the names of its ports."""
 
     inputs: str  # required
-    may: str  # optional inputs
+    optional: str  # inputs
     outputs: str  # at least one of them required
     accepted: Accepted = MappingProxyType({})  # values of the scenario's fields
 
@@ -189,17 +189,17 @@ def _make(what: str, given: Any, kind: type) -> Any:
 
 
 def _check(role: str, system: System) -> None:
-    needed, may, offered = (
+    needed, optional, offered = (
         {name: _SIZES[name] for name in names.split()} for names in ROLES[role][:3]
     )
     inputs = _sizes(map(system.get_input_port, range(system.num_input_ports())))
     outputs = _sizes(map(system.get_output_port, range(system.num_output_ports())))
     found = {name: size for name, size in outputs.items() if name in offered}
-    if needed.items() <= inputs.items() <= (needed | may).items() and (
+    if needed.items() <= inputs.items() <= (needed | optional).items() and (
         found and found.items() <= offered.items()
     ):
         return
-    wanted = f", if wanted {_listed(may)}" if may else ""
+    wanted = f", if wanted {_listed(optional)}" if optional else ""
     raise ConfigError(
         f"{role}: {type(system).__name__}: got inputs {_listed(inputs)} and outputs "
         f"{_listed(outputs)}; expected inputs {_listed(needed)}{wanted}, and output "
