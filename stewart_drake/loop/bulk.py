@@ -558,13 +558,9 @@ def _refused_start(experiment: Experiment) -> Ending | None:
     failure = diagnose(experiment.truth, 0.0, experiment.start[POSE])
     if failure is None:
         return None
-    counts, unknown = _summary(Counts()), Figures(*[np.nan] * len(Figures._fields))
+    counts, unknown = Counts().summary(), Figures(*[np.nan] * len(Figures._fields))
     samples, weights, rows = (np.empty((0, n)) for n in (len(TUNER_INPUTS), len(WEIGHTS), 0))
     return Ending("left_workspace", failure, unknown, counts, samples, np.nan, weights, rows, "")
-
-
-def _summary(counts: Counts, fallbacks: int = 0) -> dict[str, int]:
-    return counts.summary() | {"tuner_fallbacks": fallbacks}
 
 
 def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
@@ -590,13 +586,12 @@ def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
         *(time, error[grid], experiment.scale, error[sampled]),
         *(asked, sent, experiment.scenario.controller, done),
     )
+    counts = controller.counts.plus(*["saturated_steps"] * course.saturated)
     return Ending(
         status="completed" if done else "left_workspace",
         stopped=course.stopped,
         figures=found,
-        counts=_summary(
-            controller.counts.plus(*["saturated_steps"] * course.saturated), controller.fallbacks
-        ),
+        counts=counts.summary(controller.fallbacks),
         samples=np.hstack([measured - wanted[:taken], asked]),
         error_so_far=accumulated_error(time, error[grid], experiment.scale),
         weights=weights.reshape(taken, len(WEIGHTS)),
