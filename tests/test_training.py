@@ -244,7 +244,7 @@ def synthetic(number=60, seed=0):
 
 
 def network_of(one, theta):
-    return one.network(theta, "health", {})
+    return one.network(theta, {})
 
 
 def test_the_loss_is_the_regret_between_the_ratios():

@@ -45,13 +45,13 @@ static const double A[16][15] = {
      0.3567271874552811, 0, 0, 0, -0.0013990241651590145, 2.9475147891527724, -9.15095847217987},
 };
 
-/* What the method of third order has otherwise; that of fifth order below. */
+/* Weights of the slopes in the error by the embedded method of third order. */
 static const double E3[12] = {
     -0.18980075407240762, 0, 0, 0, 0, 4.450312892752409, 1.8915178993145003, -5.801203960010585,
     -0.4226823213237919, -0.1521609496625161, 0.20136540080403034, 0.02265179219836082,
 };
 
-/* Of the stages that make the step. */
+/* The same by that of fifth order. */
 static const double E5[12] = {
     0.01312004499419488, 0, 0, 0, 0, -1.2251564463762044, -0.4957589496572502,
     1.6643771824549864, -0.35032884874997366, 0.3341791187130175, 0.08192320648511571,

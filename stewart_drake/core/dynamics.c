@@ -11,11 +11,6 @@
 #error "dynamics.h and equations.h are of different equations"
 #endif
 
-#define SUMS 28 /* numbers of `equations.Sums`, symmetric matrices as triangles */
-#define BIAS_FORCE 21 /* place of h (6) among them */
-#define BALL_JOINTS 13 /* place of the ball joints' three parameters */
-#define COMMON (LEGS * LEG_NUMBERS) /* place of the numbers after those of the legs */
-
 /* `equations.slip` of six cranks. */
 static void slips(const real *crank_rates, const real *parameters, real *slip)
 {

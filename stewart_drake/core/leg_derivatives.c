@@ -9,11 +9,6 @@
 #include "equations.h"
 #include "short.h"
 
-#define SUMS 28 /* as in dynamics.c */
-#define BIAS_FORCE 21
-#define COMMON (LEGS * LEG_NUMBERS)
-#define DAMPING 7 /* place of the cranks' viscous friction among the parameters */
-
 /* The part (6) of each leg in F, from the sums, arms and rates of `leg_motion`. */
 static void forces_of_legs(const real *parameters, const real *nu_dot, const real *torque, const real *sums,
                            const real *arms, const real *rates, real force[LEGS][6])

@@ -91,13 +91,13 @@ OF_BALL_JOINTS: Final = (BALL_FRICTION, BALL_DAMPING)
 WEAK: Final = 0.2
 """Half width of an interval, as a share of the value, above which a number is weak."""
 WEAK_DELAY: Final = 3e-3  # s
-CODES: Final = 3.0
+BEYOND_ROUNDING: Final = 3.0
 """Residual over that of rounding above which friction of the ball joints is tried."""
-GAIN: Final = 0.9
+KEPT: Final = 0.9
 """Share of the residual that must remain at most, for ball joints to be kept."""
 SLOW: Final = 2.0
 """Crank speed over s below which friction is unknown; tanh is 0.96 there."""
-FITS: Final = 1.5
+GOOD_MISFIT: Final = 1.5
 """Root mean square of the innovations above which the first fit counts."""
 WRONG: Final = 0.3
 """Residual over the servos' deviation u(t - d) - a above which the fit is wrong."""
@@ -431,19 +431,19 @@ def identify_servos(
     model = ServoModel(log, mechanism, math.inf if limit is None else limit, gravity)
     progress.phase("servos")
     found = _fitted(model, regression(model, False), np.arange(BALL_FRICTION), rounding)
-    if found.residual >= CODES * rounding:
+    if found.residual >= BEYOND_ROUNDING * rounding:
         progress.phase("friction of the ball joints")
         start = regression(model, True)
         start[ARMATURE] = found.theta[ARMATURE]  # a motor without inertia takes short steps
         rubbing = _fitted(model, start, np.arange(len(NAMES)), rounding)
-        better = rubbing.residual < GAIN * found.residual
+        better = rubbing.residual < KEPT * found.residual
         found = rubbing if better else replace(found, ball_joints_tried=True)
     if not found.right:
         return found
     progress.phase("friction of slow cranks unknown")
     white = model.innovations(found.theta, rounding)
     again = _fitted(model, found.theta, found.free, rounding, white)
-    kept = again if again.misfit <= FITS else found
+    kept = again if again.misfit <= GOOD_MISFIT else found
     change = again.theta - found.theta if again.misfit > 1 else kept.change
     return replace(kept, change=change, ball_joints_tried=found.ball_joints_tried)
 

@@ -60,8 +60,8 @@ class CatchUp:
     ) -> None:
         self._least = None if least is None else cache(least)
         self._reference, self._period = reference, period
-        self._begin = reference, start, t_start, period
-        self._planned = cache(partial(Model(dynamics).plan, *self._begin))
+        self._from = reference, start, t_start, period
+        self._planned = cache(partial(Model(dynamics).plan, *self._from))
         self._motion, self._improved = cache(self._follow), cache(self._improve)
 
     def plan(self, duration: float | None, torque_limit: float | None) -> tuple[Trajectory, float]:
@@ -100,10 +100,10 @@ class CatchUp:
         """Return the plan of least error in place of the shortest one, or None without one."""
         assert self._least is not None
         limit = LEAST_ERROR_SHARE * torque_limit
-        pieces = self._least().pieces(self._motion(periods), *self._begin, periods, limit)
+        pieces = self._least().pieces(self._motion(periods), *self._from, periods, limit)
         if pieces is None:
             return None
-        return self._through(pieces), float(pieces[-1, 1]) - self._begin[2]
+        return self._through(pieces), float(pieces[-1, 1]) - self._from[2]
 
     def _through(self, pieces: Array) -> Trajectory:
         """Return the motion along pieces (n, 38), then the reference."""

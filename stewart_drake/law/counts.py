@@ -45,6 +45,7 @@ class Counts(NamedTuple):
         """Measurements, by cause, that the model replaced in whole or in part."""
         return self.measurements_missing + self.measurements_frozen + self.measurements_rejected
 
-    def summary(self) -> dict[str, int]:
-        """Return every count by its name, with `bad_measurements`."""
-        return self._asdict() | {"bad_measurements": self.bad_measurements}
+    def summary(self, tuner_fallbacks: int = 0) -> dict[str, int]:
+        """Return every count by its name, with `bad_measurements` and fallbacks of the tuner."""
+        more = {"bad_measurements": self.bad_measurements, "tuner_fallbacks": tuner_fallbacks}
+        return self._asdict() | more

@@ -56,7 +56,7 @@ class LearnedMemory(OuterMemory):
         in_flight: (n, 6) as sent, oldest first.
         torque: (6,) sum, without limit.
         samples: number of samples so far.
-        saturated_steps: as of `law.memory.Counts`, of the sum.
+        saturated_steps: as of `law.counts.Counts`, of the sum.
     """
 
     in_flight: Array

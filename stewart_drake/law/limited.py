@@ -83,7 +83,7 @@ class LimitedMemory(OuterMemory):
     Attributes:
         free: memory of the law without limits, with the torques that were sent.
         plan: last plan, where the limits did bind at the last sample, else None.
-        limited_steps, qp_failures, qp_late: as of `law.memory.Counts`.
+        limited_steps, qp_failures, qp_late: as of `law.counts.Counts`.
     """
 
     plan: Plan | None = None

@@ -131,7 +131,7 @@ def stop_pose(state: Array, pace: float) -> Array:
     return q - (2 * c2 - a - 2 * pace * v) / pace**2
 
 
-def _turns(states: Array) -> Array:
+def _reversals(states: Array) -> Array:
     """Return the number of sign changes (6,) of each rate along states (n, 18)."""
     signs = [np.sign(v[np.abs(v) > _ZERO_RATE]) for v in states[:, RATES].T]
     return np.array([np.count_nonzero(np.diff(sign)) for sign in signs])
@@ -143,7 +143,7 @@ class GovernorState(NamedTuple):
     state: Array  # pose, rates and accelerations (18,) of the reference, rad, m and per s, s^2
     applied: Array  # applied target g (6,), at which the reference ends at rest
     limit: str | None = None  # limit that keeps g from the target, in words, or None
-    turn: int = 0  # coordinate that moves alone next if all together cannot
+    alone: int = 0  # coordinate that moves alone next if all together cannot
     pace: float = PACE  # pole w, 1/s
 
 
@@ -226,9 +226,9 @@ class Governor:
         share = self._share(governed, step)
         if share == 0:  # try one coordinate alone, another one each time
             alone = np.zeros(NUM_COORDINATES)
-            alone[governed.turn] = step[governed.turn]
+            alone[governed.alone] = step[governed.alone]
             step, share = alone, self._share(governed, alone)
-            governed = governed._replace(turn=(governed.turn + 1) % NUM_COORDINATES)
+            governed = governed._replace(alone=(governed.alone + 1) % NUM_COORDINATES)
         moved = governed._replace(applied=governed.applied + share * step, limit=limit)
         return moved._replace(pace=next(self._possible(moved, self.paces), moved.pace))
 
@@ -237,10 +237,10 @@ class Governor:
 
         A slower one than the present one is left out if it makes a rate change its sign.
         """
-        turns = _turns(self.future(*governed[:2], governed.pace))
+        reversals = _reversals(self.future(*governed[:2], governed.pace))
         for pace in paces:
             states = self.future(*governed[:2], pace)
-            no_more = pace >= governed.pace or np.all(_turns(states) <= turns)
+            no_more = pace >= governed.pace or np.all(_reversals(states) <= reversals)
             if no_more and self._within(states):
                 yield pace
 

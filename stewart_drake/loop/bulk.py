@@ -86,7 +86,7 @@ COVERED: Final[Accepted] = {
     "sensor.faults": [],
 }
 """Values of the fields that the loop in C covers."""
-_DRAWN: Final = (
+_OF_A_RUN: Final = (
     *(("plant", name) for name in ("payload_mass", "torque_bias", "joint_damping")),
     *(("plant", name) for name in ("coulomb_friction", "push")),
     *(("sensor", name) for name in ("noise_std", "seed", "loss")),
@@ -175,7 +175,7 @@ class Prepared(NamedTuple):
 
 
 class Preparation:
-    """Common part of the runs of scenarios that differ in `_DRAWN` and the true machine only.
+    """Common part of the runs of scenarios that differ in `_OF_A_RUN` and the true machine only.
 
     Attributes:
         when: instants of a run.
@@ -232,7 +232,7 @@ def preparation_of(scenario: Scenario) -> Preparation:
 def _key(scenario: Scenario) -> tuple[Any, ...]:
     """Return a key that is equal for scenarios with the same preparation."""
     fields, believed = scenario_to_dict(scenario), believed_delay(scenario)
-    for section, name in _DRAWN:
+    for section, name in _OF_A_RUN:
         del fields[section][name]
     del fields["tuner"]
     fields["delay"] = believed.steps, believed.fraction
@@ -558,13 +558,9 @@ def _refused_start(experiment: Experiment) -> Ending | None:
     failure = diagnose(experiment.truth, 0.0, experiment.start[POSE])
     if failure is None:
         return None
-    counts, unknown = _summary(Counts()), Figures(*[np.nan] * len(Figures._fields))
+    counts, unknown = Counts().summary(), Figures(*[np.nan] * len(Figures._fields))
     samples, weights, rows = (np.empty((0, n)) for n in (len(TUNER_INPUTS), len(WEIGHTS), 0))
     return Ending("left_workspace", failure, unknown, counts, samples, np.nan, weights, rows, "")
-
-
-def _summary(counts: Counts, fallbacks: int = 0) -> dict[str, int]:
-    return counts.summary() | {"tuner_fallbacks": fallbacks}
 
 
 def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
@@ -590,13 +586,12 @@ def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
         *(time, error[grid], experiment.scale, error[sampled]),
         *(asked, sent, experiment.scenario.controller, done),
     )
+    counts = controller.counts.plus(*["saturated_steps"] * course.saturated)
     return Ending(
         status="completed" if done else "left_workspace",
         stopped=course.stopped,
         figures=found,
-        counts=_summary(
-            controller.counts.plus(*["saturated_steps"] * course.saturated), controller.fallbacks
-        ),
+        counts=counts.summary(controller.fallbacks),
         samples=np.hstack([measured - wanted[:taken], asked]),
         error_so_far=accumulated_error(time, error[grid], experiment.scale),
         weights=weights.reshape(taken, len(WEIGHTS)),

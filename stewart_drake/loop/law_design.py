@@ -100,7 +100,7 @@ from stewart_drake.types import Array, ArrayLike
 LONGEST_REPLAN = 0.4
 """Longest plan back onto the reference where `controller.replan` is null, s."""
 REPLAN_SHARE = 0.2
-"""The same as a share of the assumed delay: the error is still small."""
+"""Longest one as a share of the assumed delay, too: the error is still small."""
 LIMITED_REPLAN = 0.5
 """Longest plan under a torque limit, over the catch-up from rest. Longer ones start the way anew
 where feedback alone would arrive earlier."""

@@ -75,7 +75,7 @@ class Role(NamedTuple):
     """Place of a system in the loop, with the names of its ports."""
 
     inputs: str  # required
-    may: str  # optional inputs
+    optional: str  # inputs
     outputs: str  # at least one of them required
     accepted: Accepted = MappingProxyType({})  # values of the scenario's fields
 
@@ -215,21 +215,24 @@ def _misfit(function: Callable[..., Any], *arguments: Any) -> str:
     return ""
 
 
+def _roles_ports(role: str) -> list[dict[str, int]]:
+    """Return the sizes of the ports that a system in a role needs, may have, and offers."""
+    return [{name: _SIZES[name] for name in names.split()} for names in ROLES[role][:3]]
+
+
 def _ports(role: str) -> str:
     """Return the ports that a system in a role needs, and may have."""
-    needed, may, offered = ({n: _SIZES[n] for n in names.split()} for names in ROLES[role][:3])
-    wanted = f", if wanted {_listed(may)}" if may else ""
+    needed, optional, offered = _roles_ports(role)
+    wanted = f", if wanted {_listed(optional)}" if optional else ""
     return f"inputs {_listed(needed)}{wanted}, and output {_listed(offered, ' or ')}"
 
 
 def _check(role: str, system: System) -> None:
-    needed, may, offered = (
-        {name: _SIZES[name] for name in names.split()} for names in ROLES[role][:3]
-    )
+    needed, optional, offered = _roles_ports(role)
     inputs = _sizes(map(system.get_input_port, range(system.num_input_ports())))
     outputs = _sizes(map(system.get_output_port, range(system.num_output_ports())))
     found = {name: size for name, size in outputs.items() if name in offered}
-    if needed.items() <= inputs.items() <= (needed | may).items() and (
+    if needed.items() <= inputs.items() <= (needed | optional).items() and (
         found and found.items() <= offered.items()
     ):
         return

@@ -230,7 +230,7 @@ def summarize(
         },
         "estimates": recorder.estimates,
         "wall_s": wall,
-        "counts": recorder.counts.summary() | {"tuner_fallbacks": recorder.tuner_fallbacks},
+        "counts": recorder.counts.summary(recorder.tuner_fallbacks),
         "link": plain(sc.assumed_link),
         "packets": {
             name: int(number)

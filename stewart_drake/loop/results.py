@@ -213,7 +213,7 @@ class RunSummary(TypedDict):
     wall_s: float
     """Computing time of the run, s."""
     counts: dict[str, int]
-    """Number of survived problems by name (`law.memory.Counts`, `tuner_fallbacks`)."""
+    """Number of survived problems by name (`law.counts.Counts`, `tuner_fallbacks`)."""
     link: dict[str, Any]
     """The assumed link with all its numbers (`Scenario.assumed_link`)."""
     packets: dict[str, int]

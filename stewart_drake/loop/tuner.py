@@ -33,7 +33,7 @@ from stewart_drake.types import Array
 
 
 class DensityWindow(SteppedLaw):
-    """Window of the last 31 samples, with the densities (45) of the newest.
+    """Window of the last 31 samples, with its densities, equation (45).
 
     With s_k = [y_k - r_k; T_k], y the measured or else the estimated state, r the reference's pose
     and rates, T_k the torque computed at t = k dt:

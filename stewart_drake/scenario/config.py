@@ -17,7 +17,7 @@ from stewart_drake.files.resources import resolve, shipped
 from stewart_drake.files.schema import ByKind
 from stewart_drake.files.yamlio import brief, differences, exactly, rule, validate
 from stewart_drake.scenario.delay import Delay
-from stewart_drake.scenario.dependencies import contradiction
+from stewart_drake.scenario.dependencies import ESTIMABLE, contradiction
 from stewart_drake.scenario.field_types import (
     MOST_PERIODS,
     AngleRange,
@@ -223,12 +223,11 @@ ESTIMATED: Final = ["torque_bias", "payload", "damping"]  # parameters that are 
 
 
 def _check_estimate(names: list[str]) -> list[str]:
-    order = [*ESTIMATED, "payload_position", "coulomb", "wrench", "offsets"]
-    if not (len({*names}) == len(names) and {*names} <= {*order}):
-        raise ValueError(f"[], or some of {', '.join(order)}")
+    if not (len({*names}) == len(names) and {*names} <= {*ESTIMABLE}):
+        raise ValueError(f"[], or some of {', '.join(ESTIMABLE)}")
     if "payload_position" in names and "payload" not in names:
         raise ValueError("payload_position with payload")
-    return sorted(names, key=order.index)
+    return sorted(names, key=ESTIMABLE.index)
 
 
 @pydantic.WrapValidator

@@ -14,9 +14,10 @@ Accepted = Mapping[str, Any]
 """Accepted value by field, dotted as in files; a tuple holds several; a list has one as an item."""
 
 _DELAYS: Final = ("constant", "drifting")
-_CONSTANTS: Final = (
-    *("torque_bias", "payload", "payload_position", "damping", "coulomb", "wrench", "offsets"),
+ESTIMABLE: Final = (
+    *("torque_bias", "payload", "damping", "payload_position", "coulomb", "wrench", "offsets"),
 )
+"""Names of `controller.estimate`, in their order."""
 REQUIRES: Final[tuple[tuple[str, Any, Accepted], ...]] = (
     ("controller.delay_steps", None, {"controller.delay_fraction": None}),
     ("controller.prediction", "linear", {"controller.delay_estimator": "none"}),
@@ -120,7 +121,7 @@ NEEDS: Final = (
     Needs("prior.payload", "controller.estimate", "payload"),
     Needs("prior.payload_position", "controller.estimate", "payload_position"),
     Needs("prior.damping", "controller.estimate", "damping"),
-    Needs("prior.rates model_error timing_std", "controller.estimate", _CONSTANTS),
+    Needs("prior.rates model_error timing_std", "controller.estimate", ESTIMABLE),
     Needs("prior.rates", "sensor.kind", "encoders"),
     Needs("timing_std", "controller.command", "torque"),
     Needs("prior.offsets", "controller.estimate", "offsets"),
@@ -136,7 +137,7 @@ NEEDS: Final = (
     ),
     Needs("catch_up open_loop_start", "start", "rest"),
     Needs("replan", "link.kind", "wire", known_delay=True),
-    Needs("replan", "controller.estimate", _CONSTANTS, known_delay=True),
+    Needs("replan", "controller.estimate", ESTIMABLE, known_delay=True),
     Needs("replan", "controller.limits", "ignore"),
 )
 """Fields that have an effect only with certain values of another field."""
