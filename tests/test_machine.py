@@ -9,10 +9,11 @@ import pytest
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.endpoint import Endpoint
-from stewart_drake.live.machine import Settings, check_scenario
+from stewart_drake.live.machine import Machine, Settings, check_scenario
 from stewart_drake.live.protocol import (
     MISSING,
     NEVER,
+    NOTHING,
     SECOND,
     VERSION,
     ControllerFlags,
@@ -202,6 +203,26 @@ def test_limits_are_kept_to_here():
     run.at(time + 10 * period + 1)
     np.testing.assert_array_equal(torque_of(run), [0.25, -0.25, 0.2, 0, 0, 0])
     assert messages(run)[-1].torque_limit == 0.25
+
+
+def test_a_real_machine_begins_for_armed_controllers_only(monkeypatch):
+    real = Machine._flags
+    monkeypatch.setattr(Machine, "_flags", lambda one: real(one) & ~MachineFlags.SIMULATION)
+    run = together(EXACT)
+    driver, period = run.driver, run.driver.period
+    time = 0
+    while not driver.session.nonce:
+        driver.say(time)
+        time += period
+        run.at(time)
+        driver.receive(time)
+    for flags, begun in ((NOTHING, False), (NOTHING, False), (ControllerFlags.ARMED, True)):
+        driver.begin = time + 10 * period
+        driver.say(time, flags)
+        time += period
+        run.at(time)
+        assert (run.machine.begin != NEVER) == begun
+    assert sum("not armed" in line for line in run.said) == 1
 
 
 def test_a_plate_that_leaves_stops_and_a_new_session_begins_at_rest():

@@ -259,6 +259,49 @@ def test_live_drives_a_board_of_ones_own_once_it_is_armed(folder, tmp_path):
     assert np.nanmax(error[-15:]) < 0.02
 
 
+FAULT = """
+stewart_reason board_fault(uint64_t time, uint64_t *left_at)
+{
+    stewart_reason fault = {time < 4000000000u ? STEWART_NO_FAULT : STEWART_DRIVE, 0, 0};
+    *left_at = time;
+    return fault;
+}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("flags", "held"), [("0", False), ("STEWART_SAFE_HOLDS", True)])
+def test_a_real_board_goes_safe_at_a_fault_and_begins_for_armed_controllers_only(
+    folder, tmp_path, flags, held
+):
+    """Its drive fails at 4 s; a controller that does not ask whether it is armed is refused."""
+    own = shutil.copytree(folder, tmp_path / "own")
+    board, udp = own / "stewart_board.c", own / "stewart_udp.c"
+    text = board.read_text().replace("STEWART_SIMULATION | STEWART_RESETS;", f"{flags};")
+    text = text.replace("#include <math.h>", "#include <math.h>\n#include <stdio.h>")
+    text = text[: text.index("stewart_reason board_fault")] + FAULT
+    at = text.index("    follow(time);\n    for")
+    board.write_text(text[:at] + '    printf("drive %a\\n", torque[0]);\n' + text[at:])
+    objection = "STEWART_SIMULATION) && !(c->flags & STEWART_ARMED)"
+    assert objection in udp.read_text()
+    udp.write_text(udp.read_text().replace(objection, "STEWART_SIMULATION) && 0"))
+    make(own, "udp", f"CFLAGS={' '.join(SANITIZED)}")
+    with machine_in_c(own, kind="real") as (there, port):
+        with process(c_controller(own, port, "seconds=2")) as controller:
+            there.until("refused a controller: it is not armed")
+            controller.end(signal.SIGINT)
+        with process(c_controller(own, port, "seconds=20", "arm")) as controller:
+            before = ["drive 0x0p+0"]
+            there.until("the run began")
+            while "stopped" not in (line := there.until("drive|stopped")):
+                before.append(line.strip())
+            assert line.startswith("a fault at 4.") and "a drive of the machine failed" in line
+            after = there.until("drive").strip()
+            assert after == (before[-1] if held else "drive 0x0p+0")
+            assert before[-1] != "drive 0x0p+0"
+            controller.popen.wait(timeout=60)
+
+
 @pytest.mark.slow
 @in_real_time
 def test_both_ends_in_c(folder, tmp_path):

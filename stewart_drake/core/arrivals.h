@@ -19,7 +19,7 @@
    torques in `other_torques` act, one per period from now. */
 typedef struct {
     real period;    /* dt, s */
-    real eta;       /* of a torque that arrives now, s; infinite for none ever */
+    real eta;       /* of a torque that arrives now, s; STEWART_NO_ARRIVAL or more (delay.h): none arrives */
     real rate;      /* of eta, s/s */
     int num_own;    /* number of the controller's own torques in flight, the newest ones */
     int num_others; /* number of `other_torques` */

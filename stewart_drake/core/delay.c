@@ -146,7 +146,7 @@ static int linearize_along(const stewart_period *t, const real *xi, const Path *
         stewart_copy(known, by_known + known * i, H + n * i);
         H[n * i + STEWART_ETA(n)] = H[n * i + STEWART_RATE(n)] = 0;
     }
-    if (!(xi[STEWART_ETA(n)] < STEWART_NEVER))
+    if (!(xi[STEWART_ETA(n)] < STEWART_NO_ARRIVAL))
         return 1;
     stewart_copy(n, xi, moved);
     moved[STEWART_ETA(n)] = xi[STEWART_ETA(n)] + DIFFERENCE;
@@ -397,7 +397,7 @@ static int update_timing(Model *a, const real *L, real used, stewart_hypothesis 
 /* Whether the effect of a single torque can be separated from that of the delay. */
 static int is_precise(const stewart_delay *d, const stewart_hypothesis *hypothesis, int n, real std)
 {
-    return std < d->period / 50 && hypothesis->numbers[STEWART_ETA(n)] < STEWART_NEVER;
+    return std < d->period / 50 && hypothesis->numbers[STEWART_ETA(n)] < STEWART_NO_ARRIVAL;
 }
 
 /* Correct xi and the root of its covariance by a measurement; 0 where it does not fit. */
@@ -440,7 +440,7 @@ static int correct(Model *a, const stewart_hypothesis *hypothesis, const real *L
     after->outliers = 0;
     after->chi2 += distance;
     after->chi2_values += (real)m;
-    after->measurements += hypothesis->numbers[STEWART_ETA(n)] < STEWART_NEVER;
+    after->measurements += hypothesis->numbers[STEWART_ETA(n)] < STEWART_NO_ARRIVAL;
     if (is_precise(d, hypothesis, n, std)) {
         const int result = update_timing(a, L, used, after, scratch);
         if (!result)
@@ -482,7 +482,7 @@ static int attempt(Model *a, const stewart_hypothesis *hypothesis, const real *L
     if (after->measurements > 0)
         added = REAL(fmax)(0, (timing_of(d, after) - timing) / after->measurements);
     stewart_copy(n - X - 2, d->filter.walk_std, walk);
-    if (hypothesis->numbers[STEWART_ETA(n)] < STEWART_NEVER) {
+    if (hypothesis->numbers[STEWART_ETA(n)] < STEWART_NO_ARRIVAL) {
         walk[STEWART_ETA(n) - X] = REAL(sqrt)(added + d->walk * d->walk * dt);
         walk[STEWART_RATE(n) - X] = d->rate_walk * REAL(sqrt)(dt);
     }

@@ -6,7 +6,7 @@
 #include "arrivals.h"
 #include "filter.h"
 
-#define STEWART_NEVER 1000000 /* s; the delay of torques that do not arrive */
+#define STEWART_NO_ARRIVAL 1000000 /* s; the delay of torques that do not arrive */
 
 enum {
     STEWART_HYPOTHESIS = 11,    /* numbers of a hypothesis without its mean and root */
@@ -44,7 +44,7 @@ typedef struct {
     real chi2_values;    /* number of values in them */
     real numbers[];      /* mean of xi = [x; theta; eta; eta_dot] (n), then the lower triangle of the
                             root of its covariance, by rows; its last two rows are 0, and eta is
-                            STEWART_NEVER, where no own torque has arrived */
+                            STEWART_NO_ARRIVAL, where no own torque has arrived */
 } stewart_hypothesis;
 
 int stewart_hypothesis_size(int p);

@@ -195,7 +195,7 @@ static void begin(Search *s, const real *y, const real *near, stewart_scratch sc
     master->fits = 1;
     master->timing = d->filter.timing_std * d->filter.timing_std;
     master->torques = FIRST_TORQUES;
-    set_hypothesis(s->n, state, root, d->prior, d->filter.prior_root, STEWART_NEVER, 0, 0, L, master);
+    set_hypothesis(s->n, state, root, d->prior, d->filter.prior_root, STEWART_NO_ARRIVAL, 0, 0, L, master);
     s->memory->known = s->memory->searching = 1;
     s->memory->cells = s->memory->best = 0;
     for (int k = 1; k <= s->last_period.view.num_own && (real)(k - 1) * d->period < d->longest; k++)
@@ -495,7 +495,7 @@ static void report(Search *s, int measured)
     const stewart_hypothesis *hypothesis = hypothesis_at(s, (int)memory->best);
     const real eta = hypothesis->numbers[STEWART_ETA(s->n)];
     const int settled = !(memory->searching > 0) && !(memory->deferred > 0);
-    const int open_loop = memory->open_loop > 0 && !settled, no_arrival = !(eta < STEWART_NEVER);
+    const int open_loop = memory->open_loop > 0 && !settled, no_arrival = !(eta < STEWART_NO_ARRIVAL);
     memory->rejected = measured && !(hypothesis->fits > 0);
     memory->settled = (real)settled;
     memory->open_loop = (real)open_loop;

@@ -425,6 +425,11 @@ class Machine:
             self._refuse(Refusal.MALFORMED)
             return
         if message.begin != NEVER and self.begin == NEVER:
+            real = MachineFlags.SIMULATION not in self._flags()
+            if real and ControllerFlags.ARMED not in message.flags:
+                why = "refused a controller that is not armed: this machine is real"
+                self._refuse_aloud(message.head.session, why)
+                return
             asked = max(message.begin, time + 1)
             self.begin = -(-asked // self.period) * self.period
             if not self._running:

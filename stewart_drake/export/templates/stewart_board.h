@@ -6,7 +6,9 @@
 
 #include "protocol.h"
 
-extern const uint32_t board_flags; /* for each datagram: STEWART_SIMULATION, STEWART_RESETS */
+/* Flags of each datagram. A real machine has at most STEWART_SAFE_HOLDS: its safe torque is the last one, else
+   zero. STEWART_SIMULATION: controllers need not be armed. STEWART_RESETS: `board_park` puts the plate back. */
+extern const uint32_t board_flags;
 
 /* Put the plate at its start, and the brakes on. */
 void board_park(void);
@@ -17,10 +19,11 @@ void board_release(uint64_t time);
 /* Apply torques (6), N m, within their limits, from now on. */
 void board_drive(uint64_t time, const double *torque);
 
-/* Measure pose and rates (12), rad, m, rad/s and m/s, as roll, pitch, yaw, x, y, z. */
+/* Measure pose and rates (12), rad, m, rad/s and m/s, as roll, pitch, yaw, x, y, z; NAN for what is lost. */
 void board_measure(uint64_t time, double *state);
 
-/* Return why the plate left its workspace, and set the time of that; STEWART_NO_FAULT if it did not. */
+/* Return why the machine must stop (the plate left its workspace, STEWART_DRIVE), and set the time of that;
+   else STEWART_NO_FAULT. After a fault the safe torque acts until a new session: put brakes on here. */
 stewart_reason board_fault(uint64_t time, uint64_t *left_at);
 
 #endif

@@ -80,7 +80,9 @@ static const char *why(const machine *m)
     return text;
 }
 
-/* Stop if the plate left its workspace by a time. */
+static void go_safe(machine *m, uint64_t time);
+
+/* Stop if the plate left its workspace, or the machine failed, by a time: the safe torque acts from then on. */
 static void watch(machine *m, uint64_t time)
 {
     uint64_t left_at = time;
@@ -90,7 +92,10 @@ static void watch(machine *m, uint64_t time)
     if (fault.fault) {
         m->left = 1;
         fail(m, fault.fault, fault.leg, fault.lasted, left_at);
-        printf("the plate left its workspace at %.3f s: %s; stopped\n", 1e-9 * (double)left_at, why(m));
+        printf("%s at %.3f s: %s; stopped\n",
+               fault.fault == STEWART_DRIVE ? "a fault" : "the plate left its workspace", 1e-9 * (double)left_at,
+               why(m));
+        go_safe(m, time);
     }
     m->time = time > m->time ? time : m->time;
 }
@@ -106,6 +111,8 @@ static uint64_t next_change(const machine *m)
 static void change(machine *m, uint64_t time)
 {
     watch(m, time);
+    if (m->left)
+        return;
     stewart_link_change(&m->buffer, m->link, (double)time);
     board_drive(time, stewart_link_current(m->link));
     if (m->safe && m->link[STEWART_LINK_FED] > 0) {
@@ -118,7 +125,7 @@ static void change(machine *m, uint64_t time)
 static void go_safe(machine *m, uint64_t time)
 {
     watch(m, time);
-    stewart_link_reset(&m->buffer, m->link, (double)time, 0);
+    stewart_link_reset(&m->buffer, m->link, (double)time, (board_flags & STEWART_SAFE_HOLDS) != 0);
     board_drive(time, stewart_link_current(m->link));
     m->safe = 1;
 }
@@ -249,6 +256,10 @@ static int plan_ahead(machine *m, const stewart_plan *plan, uint64_t now)
         (plan->begin != STEWART_NEVER && plan->begin > now + FURTHEST))
         return STEWART_MALFORMED;
     if (plan->begin != STEWART_NEVER && m->begin == STEWART_NEVER && !m->running) {
+        if (!((board_flags & STEWART_SIMULATION) || (plan->head.flags & STEWART_ARMED))) {
+            refuse_aloud(m, plan->head.session, "it is not armed, and this machine is real");
+            return STEWART_TAKEN;
+        }
         uint64_t asked = plan->begin > now + 1 ? plan->begin : now + 1;
         m->begin = (asked + m->period - 1) / m->period * m->period;
     }

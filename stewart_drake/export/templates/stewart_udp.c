@@ -614,6 +614,7 @@ static const char *fault(const controller *c)
 static const char *greet(controller *c)
 {
     uint64_t patience = udp_now() + PATIENCE;
+    int told = 0;
     while (c->last.begin == STEWART_NEVER || c->begin == STEWART_NEVER || c->period == 0) {
         if (udp_interrupted() || udp_now() > patience)
             return c->busy ? in_use(c)
@@ -624,6 +625,11 @@ static const char *greet(controller *c)
         while (udp_now() < next) {
             udp_wait(c->socket, next);
             receive(c);
+        }
+        if (c->busy && !told) {
+            printf("waiting: %s\n", in_use(c));
+            fflush(stdout);
+            told = 1;
         }
         c->buffered = !(c->last.head.flags & STEWART_WIRE);
         const char *problem = objection(c);
