@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from functools import cache, partial
 from hashlib import sha256
+from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -137,6 +138,10 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     }
     templates = {path.name for path in TEMPLATES.iterdir()} - omitted
     files = {name: (FOLDER / name).read_text("utf-8") for name in copied}
+    package = distribution("stewart-drake")
+    files["LICENSE"] = (
+        package.read_text("licenses/LICENSE") or package.metadata["License-Expression"]
+    )
     if single:
         del recorded.steps[MOST_IN_SINGLE:]
         defined = "#define STEWART_FLOAT\n\n#include"
@@ -146,6 +151,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "scenario": scenario,
         "experiment": experiment,
         "scenario_yaml": _described(scenario),
+        "version": package.version,
         "real": "float" if single else "double",
         "tolerance": f"{TOLERANCES['float' if single else 'double']:g}",
         "servos": servos,
