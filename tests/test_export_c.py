@@ -455,7 +455,8 @@ def test_the_readme_is_that_of_the_composition(case, single, tmp_path):
     included, _, rest = code.partition("\n\n")
     assert included in readme.split("```cpp\n")[1]
     declared = "extern void read_plate(real *), read_encoders(real *);\n"
-    declared += "extern void drive(const real *), send(const real *), send_packet(const real *);\n"
+    declared += "extern void drive(const real *), send_torques(const real *);\n"
+    declared += "extern void send_packet(const real *);\n"
     report = "stewart_report" if "stewart_report" in rest else "real"
     declared += f"extern int read_report({report} *);\nvoid setup(void), every_period(void);\n"
     declared += "extern int age_of_measurement(void);\nextern void stop_safely(void);\n"
