@@ -768,6 +768,10 @@ int main(int argc, char **argv)
     for (unsigned i = 0; i < KEPT; i++)
         c.acted[i].period = INT_MIN;
     const char *problem = c.socket < 0 ? "no socket" : greet(&c);
+{% if not servos %}
+    if (!(c.last.head.flags & (STEWART_SIMULATION | STEWART_SAFE_HOLDS)))
+        stewart_start(&c.law, c.memory, 0, stewart_queue); /* a real machine has no torque before the first of the law */
+{% endif %}
     if (!problem)
         problem = begin_log(&c);
     const int begins = !problem;
