@@ -123,6 +123,9 @@ def test_servos_are_found_from_the_log_of_a_simulation(tmp_path, capsys):
     assert found["delay"]["value"] == pytest.approx(0.04, abs=1e-3)
     capsys.readouterr()
     head, *rows = log.read_text().splitlines()
+    log.write_text("\n".join([head, *rows[::2]]))
+    assert main(["identify", str(log), "--mechanism", "reachy_mini"]) == 2
+    assert "got a step of 0.04 s, longer than the controller's 0.02 s" in capsys.readouterr().err
     log.write_text("\n".join([head, *(row.rsplit(",", 12)[0] + "," * 12 for row in rows)]))
     assert main(["identify", str(log), "--mechanism", "reachy_mini"]) == 2
     assert "as a log of `machine`; expected" in capsys.readouterr().err
