@@ -116,7 +116,7 @@ def identify(
 
 def refuse_for_runs(logs: Iterable[str | Path], options: Mapping[str, object]) -> None:
     """Refuse options of a CSV log that are not None if all logs are of runs."""
-    if all(is_run(Path(log)) for log in logs):
+    if all(is_run(Path(log)) and not is_servo_log(Path(log)) for log in logs):
         refuse(options, "with logs of runs, which contain it; expected it with an own CSV log")
 
 

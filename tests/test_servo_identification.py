@@ -109,6 +109,28 @@ def test_servos_of_a_run_in_drake_are_found(drake_log, tmp_path, capsys):
     assert sc.eta == pytest.approx(value[0], abs=1e-6)
 
 
+@pytest.mark.slow
+def test_servos_are_found_from_the_log_of_a_simulation(tmp_path, capsys):
+    log, out = tmp_path / "log.csv", tmp_path / "out"
+    assert main(["simulate", "reachy_mini", "--log", str(log), "--quiet"]) == 0
+    plate = sd.read_log(log).pose.values
+    cranks = read_servo_log(log, ROBOT).cranks
+    assert np.allclose(cranks[7], ROBOT.crank_angles(plate[7]), atol=1e-12)
+    known = ["--mechanism", "reachy_mini", "--bits", "14", "--out", str(out)]
+    assert main(["identify", str(log), *known]) == 0
+    found = json.loads((out / "summary.json").read_text())["parameters"]
+    assert found["stiffness"]["value"] == pytest.approx(10, rel=0.01)
+    assert found["delay"]["value"] == pytest.approx(0.04, abs=1e-3)
+    capsys.readouterr()
+    head, *rows = log.read_text().splitlines()
+    log.write_text("\n".join([head, *rows[::2]]))
+    assert main(["identify", str(log), "--mechanism", "reachy_mini"]) == 2
+    assert "got a step of 0.04 s, longer than the controller's 0.02 s" in capsys.readouterr().err
+    log.write_text("\n".join([head, *(row.rsplit(",", 12)[0] + "," * 12 for row in rows)]))
+    assert main(["identify", str(log), "--mechanism", "reachy_mini"]) == 2
+    assert "as a log of `machine`; expected" in capsys.readouterr().err
+
+
 def test_the_regression_is_a_start(drake_log):
     times, setpoints, cranks = drake_log
     log = servo_log("log", times, setpoints, cranks, ROBOT)

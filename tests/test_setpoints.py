@@ -1,5 +1,7 @@
 """Setpoints of position servos: the file, the checks, the soft start, the units."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import compose_servo_law
 from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.signals import POSE, RATES
+from tests.screen import too_long
 
 ROBOT = sd.load_mechanism("reachy_mini")
 ON = "start=on_reference"
@@ -187,6 +190,30 @@ def test_a_move_that_is_cut_in_motion_says_so(duration, says):
     said = str(sd.setpoints(scenario))
     assert ("the last setpoint is in motion" in said) == says
     assert ("the motion goes on to 6 s, beyond the duration" in said) == says
+
+
+@pytest.mark.parametrize("soft_end", [False, True])
+def test_a_first_setpoint_in_motion_is_said(soft_end):
+    assert "the first setpoint is in motion (1 rad/s)" in str(made(ON, soft_end=soft_end))
+    assert "the first" not in str(made(soft_end=soft_end))
+
+
+def test_setpoints_too_rare_for_the_torque_are_said():
+    said = str(sd.setpoints("reachy_mini", 5))
+    assert "  more than their 0.8 N m: raise --rate" in said and not too_long(said)
+    assert "raise" not in str(made())
+
+
+@pytest.mark.parametrize(
+    ("pose", "hint"),
+    [([10, 0, 0, 0, 0, 0.2], "degrees"), ([10, 0, 0, 0, 0, 230], "degrees and mm"),
+     ([0, 0, 0, 0, 0, 230], "mm"), ([0, 0, 0, 0, 0, 0.4], "")],
+)  # fmt: skip
+def test_a_pose_out_of_reach_gets_that_of_home(pose, hint):
+    end = f" (are these {hint}?)" if hint else ""
+    words = f"as home 0,0,0,2.469e-05,-0.0008951,0.2327{end}"
+    with pytest.raises(ConfigError, match=re.escape(words) + "$"):
+        made(start=pose)
 
 
 @pytest.mark.parametrize("start", ["on_reference", "rest"])

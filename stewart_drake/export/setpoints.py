@@ -24,14 +24,24 @@ from stewart_drake.mechanism.kinematics import turned
 from stewart_drake.mechanism.trajectories import PlateTrajectory, evaluate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.field_types import Row, section
-from stewart_drake.scenario.signals import ACCELERATIONS, LEGS, NUM_STATE, NUM_TORQUES, POSE, RATES
+from stewart_drake.scenario.reference_config import degrees_hint
+from stewart_drake.scenario.signals import (
+    ACCELERATIONS,
+    ANGLES,
+    LEGS,
+    NUM_STATE,
+    NUM_TORQUES,
+    POSE,
+    POSITION,
+    RATES,
+)
 from stewart_drake.types import Array
 
 SHORTEST_BLEND: Final = 1.0
 """Shortest soft start, s; it is doubled until the motion keeps its limits."""
 _LARGEST_RATE: Final = 1000.0  # Hz
 _RESTING: Final = 0.02
-"""Crank speed of the last setpoint that counts as rest, as a share of the largest one."""
+"""Crank speed of the first or last setpoint that counts as rest, as a share of the largest one."""
 _ROUNDING: Final = 1e-12
 _REVERSED: Final = np.repeat([1.0, -1.0, 1.0], 6)  # a motion (18,) backwards in time
 
@@ -88,6 +98,7 @@ class Setpoints:
     blend: float  # length of the soft start and the soft end, s; 0 without both
     softens: str  # what is soft: "start", "end" or "start and end"; empty without both
     ends: float  # of the motion, s; infinite for one without an end
+    torque_limit: float  # N m
 
     def __repr__(self) -> str:
         return f"Setpoints({len(self.times)} of six cranks)"
@@ -103,14 +114,21 @@ class Setpoints:
         end = self.times[-1] + self.times[1]
         text = f"every limit kept: largest torque {torque:.3g} N m, crank speed {speed:.3g} rad/s"
         if step > torque:
-            text += f"\nservos that hold each setpoint give up to {step:.3g} N m where it changes"
+            much = step > self.torque_limit
+            text += "\nwarning: " if much else "\n"
+            text += f"servos that hold each setpoint give up to {step:.3g} N m where it changes"
+            text += (
+                f",\n  more than their {self.torque_limit:.3g} N m: raise --rate" if much else ""
+            )
         if self.blend:
             text += f"\nsoft {self.softens}: {self.blend:g} s"
         if self.ends < end - _ROUNDING:
             text += f"\nthe motion ends at {self.ends:.6g} s: its last pose is held up to {end:g} s"
         if math.inf > self.ends > end + _ROUNDING:
             text += f"\nwarning: the motion goes on to {self.ends:.6g} s, beyond the duration"
-        last = np.abs(self.crank_rates[-1]).max()
+        first, last = np.abs(self.crank_rates[[0, -1]]).max(axis=1)
+        if first > _RESTING * speed and "start" not in self.softens:
+            text += f"\nwarning: the first setpoint is in motion ({first:.2g} rad/s): see --from"
         if last > _RESTING * speed and "end" not in self.softens:
             text += f"\nwarning: the last setpoint is in motion ({last:.2g} rad/s): see --soft-end"
         return text
@@ -238,7 +256,15 @@ class _BrokenLimit(ConfigError):
 def _checked(start: Sequence[float] | Array, experiment: Experiment) -> Array:
     pose = fixed("start", start, (6,))
     if failure := diagnose(experiment.mechanism, 0.0, pose):
-        raise ConfigError(f"start: got a pose where {failure.reason}; expected one within reach")
+        angle, length = (float(np.abs(pose[part]).max()) for part in (ANGLES, POSITION))
+        hint = degrees_hint(angle)
+        if length >= 1:
+            hint = " (are these degrees and mm?)" if hint else " (are these mm?)"
+        home = ",".join(f"{value:.4g}" for value in experiment.mechanism.home)
+        raise ConfigError(
+            f"start: got a pose where {failure.reason}; expected one within reach, as home "
+            f"{home}{hint}"
+        )
     return pose
 
 
@@ -334,7 +360,8 @@ def _along(
     samples = course.times if isinstance(course, PlateTrajectory) else np.empty(0)
     ends = float(samples[-1]) if len(samples) else math.inf
     found = Setpoints(
-        *(times, setpoints, cranks, rates, torques, steps, soft.blend), soft.name, ends
+        *(times, setpoints, cranks, rates, torques, steps, soft.blend),
+        *(soft.name, ends, experiment.torque_limit),
     )
     _check(found, servo, experiment, rate)
     return found

@@ -67,6 +67,7 @@ def read_table(
     *,
     prefix: str | None = None,
     optional: Iterable[str] = (),
+    others: bool = False,
 ) -> Table:
     """Read a table.
 
@@ -78,6 +79,7 @@ def read_table(
         prefix: that the names in `units` may have in the file. If only columns with the prefix
             are in `units`, apart from `time`, all columns without it are ignored.
         optional: names of columns whose cells may be empty, or nan.
+        others: whether to ignore columns that are not in `units`.
 
     Raises:
         ConfigError: one line that begins with the path, and the row and column if there are any.
@@ -105,7 +107,7 @@ def read_table(
     first = cells.iloc[0].tolist()
     columns: dict[str, Array] = {}
     labels, scales = {}, {}
-    for column, name, scale in _columns(path, first, header, units, prefix):
+    for column, name, scale in _columns(path, first, header, units, prefix, others):
         labels[name], scales[name] = first[column], scale
         texts = cells[column].iloc[lines[1:] - 1]
         # Converted by Python's float: that of pandas may round the last digit wrongly.
@@ -123,7 +125,7 @@ def read_table(
 
 
 def _columns(
-    path: Path, first: list[str], header: str, units: Units, prefix: str | None
+    path: Path, first: list[str], header: str, units: Units, prefix: str | None, others: bool
 ) -> list[tuple[int, str, float]]:
     """Return index, name and factor to SI units of the columns to read."""
     for separator in (";", "\t"):
@@ -144,6 +146,8 @@ def _columns(
         if only_prefixed and label not in prefixed and label != "time":
             continue
         name = label.removeprefix(prefix or "")
+        if others and name not in units:
+            continue
         if name not in units or name in columns:
             problem = "a second" if name in columns else "an unknown"
             raise ConfigError(

@@ -11,6 +11,8 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.logs import in_effect
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import ForwardKinematicsError, turned
+from stewart_drake.scenario.run_log import is_run, scenario_of
+from stewart_drake.scenario.run_log import read_log as read_run
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.types import Array, Flags
 
@@ -49,9 +51,16 @@ def is_servo_log(path: Path) -> bool:
 
 
 def read_servo_log(path: Path, mechanism: Mechanism) -> ServoLog:
-    table = read_table(path, _EXPECTED, _HEADER, _UNITS)
+    run = is_run(path)
+    lacking = (*SETPOINTS, *CRANKS) if run else ()
+    table = read_table(path, _EXPECTED, _HEADER, _UNITS, optional=lacking, others=run)
     times = table.stacked(["time"])[:, 0]
     setpoints, cranks = table.stacked(SETPOINTS), table.stacked(CRANKS)
+    if not np.isfinite([setpoints, cranks]).all():
+        raise ConfigError(
+            f"{path}: lacks setpoints or cranks, as a log of `machine`; expected that of its "
+            "controller, from `live --log`"
+        )
     gaps = np.diff(times)
     for bad in 1 + np.flatnonzero(~((gaps > 0) & (gaps <= _LONGEST_GAP)))[:1]:
         raise ConfigError(
@@ -61,6 +70,13 @@ def read_servo_log(path: Path, mechanism: Mechanism) -> ServoLog:
     if len(times) < 2 or times[-1] - times[0] < LEAST_LENGTH:
         length = float(np.ptp(times)) if len(times) else 0.0
         raise ConfigError(f"{path}: got {length:.3g} s; expected at least {LEAST_LENGTH:g} s")
+    if run:
+        period, step = scenario_of(read_run(path), path).controller.period, float(np.median(gaps))
+        if step > period * (1 + 1e-6):
+            raise ConfigError(
+                f"{path}: log_period: got a step of {step:.4g} s, longer than the controller's "
+                f"{period:g} s; expected each of its samples in the log"
+            )
     return servo_log(str(path), times, setpoints, cranks, mechanism, table)
 
 

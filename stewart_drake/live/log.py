@@ -84,7 +84,7 @@ class LiveRecord(Record):
         say: Callable[[str], None],
         logs: Sequence[RunLog] = (),
     ) -> None:
-        super().__init__(experiment, logs)
+        super().__init__(experiment, logs, experiment.mechanism)
         self._held = held_by(experiment.nominal)
         self._period, self._limit = experiment.scenario.controller.period, limit
         self._waits = max(1, min(_WAITS, round(_LATEST / self._period)))
@@ -143,6 +143,7 @@ class LiveRecord(Record):
             "density": np.full(len(TUNER_INPUTS), math.nan),
             "delay_true": np.array([self._eta]),
             "packets": packets,
+            "setpoint": self.setpoint,
             "step": np.array([seconds, late]),
         }
         self._rows[number] = row

@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 from pydrake.systems.framework import Context
 
+from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.schema import plain
 from stewart_drake.files.versions import versions
@@ -18,10 +19,12 @@ from stewart_drake.loop.diagram import ClosedLoop
 from stewart_drake.loop.preparation import Experiment, estimated_names
 from stewart_drake.loop.results import DelaySummary, EstimateSummary, RunSummary, waits_at_rest
 from stewart_drake.loop.tuner import AnnTuner, LawTuner
+from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.loading import scenario_to_dict, scenario_yaml
 from stewart_drake.scenario.run_log import RunLog, dataset_of
 from stewart_drake.scenario.signals import (
     NUM_STATE,
+    NUM_TORQUES,
     PACKETS,
     POSE,
     exported_ports,
@@ -39,6 +42,7 @@ class Record:
 
     Args:
         logs: to be written while the run goes on.
+        mechanism: whose cranks are logged with position servos.
 
     Attributes:
         on_grid: rows (7,) of time and pose error on the metric's grid and at the end.
@@ -52,10 +56,15 @@ class Record:
         tuner_fallbacks: number of fallbacks of the tuner.
         delay: at the last sample, s: true, assumed or estimated, standard deviation.
         packets: last counts (5,) of `scenario.signals.PACKETS`.
+        setpoint: crank angles (6,) sent last to servos, rad.
     """
 
-    def __init__(self, experiment: Experiment, logs: Sequence[RunLog] = ()) -> None:
+    def __init__(
+        self, experiment: Experiment, logs: Sequence[RunLog], mechanism: Mechanism
+    ) -> None:
         self._logs, self._scenario = logs, experiment.scenario
+        self._functions = functions_of(mechanism)
+        self.setpoint: Array = np.full(NUM_TORQUES, np.nan)
         samples = experiment.scenario.sensor.samples
         self._recorded = [one for one in run_signals(samples).values() if one.source]
         self._log, self.on_grid, self.samples = list[Array](), list[Array](), list[Array]()
@@ -82,6 +91,7 @@ class Record:
         self._belief = belief
         self.innovations = Innovations() if belief is None else belief.innovations
         self.counts, self.sampled = memory.counts, self.sampled + 1
+        self.setpoint = getattr(memory, "command", self.setpoint)[:NUM_TORQUES]
         self.measured += usable
         return usable
 
@@ -108,6 +118,9 @@ class Record:
     def mirror(self, time: float, seen: Mapping[str, Array]) -> None:
         """Write a row to the logs: a time in s, and the value of each exported port."""
         row = {signal.name: seen[signal.exported][signal.part] for signal in self._recorded}
+        if self._logs and self._scenario.actuator.kind == "position_servo":
+            row["setpoint"] = seen.get("setpoint", self.setpoint)
+            row["crank"] = self._functions.crank_angles(row["pose"])
         for log in self._logs:
             log.write(time, row)
 
@@ -117,7 +130,7 @@ class Recorder(Record):
 
     def __init__(self, loop: ClosedLoop, logs: Sequence[RunLog] = ()) -> None:
         controller: Any = loop.GetSubsystemByName("controller")
-        super().__init__(loop.experiment, logs)
+        super().__init__(loop.experiment, logs, loop.experiment.truth)
         self._loop, self._controller = loop, controller
         self._ports: dict[str, Any] = {}
         tuner = loop.GetSubsystemByName("tuner") if loop.HasSubsystemNamed("tuner") else None

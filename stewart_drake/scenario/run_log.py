@@ -4,6 +4,8 @@ A log has a channel for each signal of `scenario.signals`, with a field for each
 the messages are JSON with a JSON schema, as Foxglove, rerun and PlotJuggler read them, and the
 metadata record `stewart_drake` has the scenario. A CSV file has one column per component, and its
 scenario in a file of the same name that ends in .yaml. A killed run leaves a readable file.
+
+With position servos a log ends with SERVO_CHANNELS, for `identification.servo_logs`.
 """
 
 import contextlib
@@ -35,6 +37,7 @@ from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.scenario.signals import (
     COORDINATE_NAMES,
     COORDINATES,
+    LEGS,
     NUM_LEGS,
     run_dimensions,
     run_signals,
@@ -79,12 +82,32 @@ def channels_of(samples: int | None) -> list[Channel]:
     return found
 
 
+def logged(scenario: Scenario) -> list[Channel]:
+    """Return the channels of a log, with setpoints and cranks of position servos."""
+    servos = scenario.actuator.kind == "position_servo"
+    return channels_of(scenario.sensor.samples) + (SERVO_CHANNELS if servos else [])
+
+
 def _field(label: str | int) -> str:
     """Return a label as the name of a JSON field: `roll`, `rate_roll`, `leg_1`, `A1_0`."""
     if isinstance(label, int):
         return f"leg_{label}"
     words = "_".join(_NAMES.get(word, word) for word in label.split("_"))
     return re.sub(r"\W+", "_", words).strip("_")
+
+
+SERVO_CHANNELS: Final = [
+    Channel(
+        name,
+        tuple(_field(leg) for leg in LEGS),
+        tuple(headings(name, LEGS, ["rad"] * NUM_LEGS)),
+        meaning,
+    )
+    for name, meaning in (
+        ("setpoint", "crank angles sent at the last sample"),
+        ("crank", "crank angles of the pose"),
+    )
+]
 
 
 class RunLog(Protocol):
@@ -132,7 +155,7 @@ class McapLog:
         about = {"scenario": scenario_yaml(scenario), "versions": json.dumps(versions())}
         self._writer.add_metadata(_METADATA, about)
         self._channels: dict[str, tuple[int, Channel]] = {}
-        for channel in channels_of(scenario.sensor.samples):
+        for channel in logged(scenario):
             properties = {"time": {"type": "number", "description": "s"}}
             for field, head in zip(channel.fields, channel.heads, strict=True):
                 unit = head.partition("[")[2].removesuffix("]")
@@ -202,7 +225,7 @@ class CsvLog:
     """A CSV file, which is replaced, with a line per instant; its scenario is in a .yaml."""
 
     def __init__(self, path: Path, scenario: Scenario) -> None:
-        self._channels, companion = channels_of(scenario.sensor.samples), path.with_suffix(".yaml")
+        self._channels, companion = logged(scenario), path.with_suffix(".yaml")
         if companion.exists() and not path.exists():
             raise ConfigError(
                 f"{path}: its scenario would replace {companion.name}, which is of no log; "
@@ -231,7 +254,7 @@ class UdpMirror:
     """JSON over UDP, one datagram per instant, for PlotJuggler's UDP server."""
 
     def __init__(self, address: tuple[str, int], scenario: Scenario) -> None:
-        self._channels = {one.name: one for one in channels_of(scenario.sensor.samples)}
+        self._channels = {one.name: one for one in logged(scenario)}
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._address = address
