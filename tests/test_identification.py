@@ -483,6 +483,11 @@ def test_an_end_that_no_machine_explains_is_left_out():
     assert found.right and abs(found.values[DELAY] - 0.93) < 1e-3
     assert found.summary["fitted_until_s"] == [pytest.approx(2.0, abs=0.05)]
     assert "sine: left out 2 to 8 s: the search found no machine that explains the whole" in told
+    prior = np.where(found.unknowns.free == OFFSETS.start + 2, 5.0, 0.0)
+    fit = found.fit._replace(residuals=found.fit.residuals._replace(prior=prior))
+    told = " ".join(document(dataclasses.replace(found, fit=fit)).plain().split())
+    assert "encoder zeros more than 8 mrad (four tolerances) off: leg 3" in told
+    assert "is the drawing right?" not in told
 
 
 @pytest.mark.slow
