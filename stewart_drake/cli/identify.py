@@ -66,7 +66,7 @@ def identify(
 ) -> int:
     """Find delay, friction and geometry in a log.
 
-    It takes seconds to two minutes. The run may have ended early. With --out, writes
+    It takes seconds to three minutes. The run may have ended early. With --out, writes
     mechanism.yaml, calibration.yaml, a page, and found.yaml, which reads both, for --set
     overlay=FILE. A CSV log has the columns time[s], torque_1[N m] to torque_6 (commanded), and
     angle_1[rad] to angle_6, roll[rad] to z[m], or both.

@@ -148,9 +148,9 @@ def _cautions(found: Identification) -> list[str]:
     far = found.unknowns.free[np.abs(found.fit.residuals.prior) > 4]
     zeros = [k for k in far if OFFSETS.start <= k < OFFSETS.stop]
     if zeros:
-        legs = ", ".join(str(LEGS[k - OFFSETS.start]) for k in zeros)
+        legs = ", ".join(f"leg {LEGS[k - OFFSETS.start]}" for k in zeros)
         limit = f"{4e3 * found.unknowns.std[OFFSETS.start]:.3g}"
-        cautions.append(f"encoder zeros more than {limit} mrad (four tolerances) off: leg {legs}")
+        cautions.append(f"encoder zeros more than {limit} mrad (four tolerances) off: {legs}")
     if others := [NAMES[k] for k in far if k not in zeros][:5]:
         cautions.append(
             f"more than four tolerances off: {', '.join(others)}; is the drawing right?"
