@@ -185,7 +185,8 @@ def _write_machine(found: identification.Identification, folder: Path) -> list[s
     calibration = found.calibration(load_mechanism(folder / MECHANISM))
     save_calibration(folder / CALIBRATION, calibration)
     files = {"mechanism": MECHANISM, "controller": {"calibration": CALIBRATION}}
-    fields = files | {"plant": found.plant} if found.right else None
+    like = {"plant": found.plant} | ({"sensor": found.sensor} if found.sensor else {})
+    fields = files | like if found.right else None
     return [MECHANISM, CALIBRATION, *_write_overlay(folder / FOUND, fields)]
 
 

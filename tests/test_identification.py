@@ -473,6 +473,24 @@ def test_a_drawing_that_is_trusted_too_much_is_refused(log_and_truth):
 
 
 @pytest.mark.slow
+def test_an_end_that_no_machine_explains_is_left_out():
+    log = sine_log(off_drawing(1), PARAMETERS, 0.93, duration=8.0)
+    values, late = log.values.copy(), log.times > 2.1
+    values[late] = values[late][::-1]
+    log = dataclasses.replace(log, values=values)
+    found = identify([log], PAPER, Tolerances(delay=0.02), delay=0.92)
+    told = " ".join(document(found).plain().split())
+    assert found.right and abs(found.values[DELAY] - 0.93) < 1e-3
+    assert found.summary["fitted_until_s"] == [pytest.approx(2.0, abs=0.05)]
+    assert "sine: left out 2 to 8 s: the search found no machine that explains the whole" in told
+    prior = np.where(found.unknowns.free == OFFSETS.start + 2, 5.0, 0.0)
+    fit = found.fit._replace(residuals=found.fit.residuals._replace(prior=prior))
+    told = " ".join(document(dataclasses.replace(found, fit=fit)).plain().split())
+    assert "encoder zeros more than 8 mrad (four tolerances) off: leg 3" in told
+    assert "is the drawing right?" not in told
+
+
+@pytest.mark.slow
 def test_two_logs_tell_more_than_one(log_and_truth):
     log, true = log_and_truth
     half = len(log.times) // 4

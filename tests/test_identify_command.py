@@ -11,7 +11,7 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
-from stewart_drake.identification.unknowns import DELAY
+from stewart_drake.identification.unknowns import DELAY, OFFSETS
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import fingerprint
@@ -251,6 +251,30 @@ def test_logs_of_one_name_are_distinguished_by_their_folders():
     assert told("a/signals.nc", "b/signals.nc") == ["a/signals.nc", "b/signals.nc"]
     assert told("x/a/s.nc", "y/a/s.nc", "b/s.nc")[:2] == ["x/a/s.nc", "y/a/s.nc"]
     assert told("a/s.nc", "a/s.nc") == ["s.nc", "s.nc"]
+
+
+@pytest.mark.slow
+def test_an_identified_machine_has_the_encoder_offsets_of_the_true_one(tmp_path):
+    offset = [4e-3, -3e-3, 2e-3, 0.0, 3e-3, -2e-3]
+    encoders = ("plant.kind=exact", "sensor.kind=encoders", "sensor.samples=10", "duration=6")
+    scenario = sd.load_scenario("paper", settings=(*encoders, f"sensor.offset={offset}"))
+    sd.simulate(scenario, judge_stability=False).save(tmp_path)
+    result = sd.identify(tmp_path, "paper", delay=0.8)
+    result.save(tmp_path / "found")
+    told = " ".join(str(result).split())
+    assert "Encoder offsets of legs 1 to 6 (reading less crank angle), mrad: " in told
+    overlay = f"overlay={tmp_path / 'found' / 'found.yaml'}"
+    followed = (*encoders, "start=on_reference", "queue=reference", overlay)
+    like = sd.load_scenario("paper", settings=followed)
+    std = result.study.std[OFFSETS]
+    assert np.all(np.abs(np.subtract(like.sensor.offset, offset)) < 4 * std)
+    without = sd.load_scenario("paper", settings=(*followed, f"sensor.offset={[0.0] * 6}"))
+    runs = [sd.simulate(one, judge_stability=False) for one in (like, without)]
+    errors = [run.summary["accumulated_error"] for run in runs]
+    assert errors[0] < 0.3 < 3 * errors[0] < errors[1]
+    words = ["identify", str(tmp_path), "--mechanism", "paper", "--out", str(tmp_path / "found")]
+    assert main([*words, "--delay", "0.7", "--tolerance", "delay=0"]) == 1
+    assert not (tmp_path / "found" / "found.yaml").exists()
 
 
 @pytest.mark.slow

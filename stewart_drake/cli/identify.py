@@ -1,6 +1,7 @@
 """Command identify: a machine from its logs, and the plan of a log."""
 
 import re
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,11 @@ from stewart_drake.studies.options import refuse
 if TYPE_CHECKING:
     from stewart_drake.identification.logs import Precision
 
-_UNITS = "; ".join(f"{name}: {unit}" for name, unit in TOLERANCE_UNITS.items())
+_DEFAULTS = asdict(Tolerances())
+_UNITS = "; ".join(
+    f"{name}: {unit} ({'depends' if _DEFAULTS[name] is None else f'{_DEFAULTS[name]:g}'})"
+    for name, unit in TOLERANCE_UNITS.items()
+)
 
 
 @command(without=("scenario", "controller"))
@@ -41,7 +46,8 @@ def identify(
     tolerance: list[str] | None = typer.Option(
         None,
         metavar="NAME=VALUE",
-        help=f"Standard deviation of an unknown, 0: known. Repeatable. {_UNITS}.",
+        help=f"Standard deviation of an unknown, 0: known. Repeatable. {_UNITS}. Those "
+        "that depend do so on the log's torques and speeds, and on the plate.",
     ),
     bits: int | None = typer.Option(
         None,
@@ -60,7 +66,7 @@ def identify(
 ) -> int:
     """Find delay, friction and geometry in a log.
 
-    It takes seconds to two minutes. The run may have ended early. With --out, writes
+    It takes seconds to three minutes. The run may have ended early. With --out, writes
     mechanism.yaml, calibration.yaml, a page, and found.yaml, which reads both, for --set
     overlay=FILE. A CSV log has the columns time[s], torque_1[N m] to torque_6 (commanded), and
     angle_1[rad] to angle_6, roll[rad] to z[m], or both.
@@ -117,7 +123,8 @@ def identify(
                 logs or [], mechanism or "", delay=delay, gravity=gravity is not False, **more
             )
         delivery.discard(functions.MECHANISM, functions.CALIBRATION, functions.SERVOS)
-    return delivery.answer(found, *found.write_files(delivery.out))
+    unexplained = plan is None and not found.study.right
+    return delivery.answer(found, *found.write_files(delivery.out)) or int(unexplained)
 
 
 def _precision(bits: int | None, pose_std: str | None) -> "Precision":

@@ -3,10 +3,12 @@
 A fit predicts the motion in segments of the logs. Its start needs a delay that is nearly right, so
 `identify` tries several delays and lengths of segments. For each it first fits the half of the
 segments that the start predicts best, then all of them, and takes the first fit that is not wrong.
+If all are far from it, it fits the beginning of the logs: their ends may tremble or be lost.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
@@ -26,7 +28,7 @@ from stewart_drake.identification.fit import (
     without_diverged,
 )
 from stewart_drake.identification.judgement import PoseUncertainty, pose_uncertainty, unseen
-from stewart_drake.identification.logs import ANGLES, Log
+from stewart_drake.identification.logs import ANGLES, POSE, Log
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.identification.unknowns import (
     DELAY,
@@ -59,6 +61,7 @@ class Identification:
     unknowns: Unknowns  # prior
     fit: Solution
     middle: Array  # (6,) median of the measured poses, rad and m
+    ends: Sequence[float]  # of the logs in s, before their ends were left out
 
     @cached_property
     def chi2(self) -> dict[str, float]:
@@ -124,6 +127,14 @@ class Identification:
             "coulomb_friction": max(value[COULOMB], 0.0),
         }
 
+    @property
+    def sensor(self) -> dict[str, str | list[float]] | None:
+        """Fields of a scenario's sensor that is like the machine's; None without found offsets."""
+        if any(log.measures(POSE) for log in self.logs) or not self.unknowns.std[OFFSETS].any():
+            return None
+        offset = [float(f"{x:.6g}") for x in self.values[OFFSETS]]
+        return {"kind": "encoders", "offset": offset}
+
     @cached_property
     def unseen(self) -> tuple[int, list[str]]:
         """Number and names of the directions that the logs do not show."""
@@ -162,6 +173,7 @@ class Identification:
             "unseen": {"directions": self.unseen[0], "names": self.unseen[1]},
             "segments": len(self.fit.problem.segments),
             "left_out": self.fit.left_out,
+            "fitted_until_s": [float(log.times[-1]) for log in self.logs],
             "iterations": self.fit.iterations,
         }
 
@@ -193,13 +205,30 @@ def identify(
     pairs = [(log, start.measured_poses(log, mechanism)) for log in logs]
     unknowns = _unknowns(pairs, mechanism, tolerances, believed)
     middle = np.nanmedian(np.vstack([poses for _, poses in pairs]), axis=0)
-    longest_log = max(float(log.times[-1] - log.times[0]) for log in logs)
-    if tolerances.delay > 0 and longest_log < short_logs.length_needed(unknowns):
-        return Identification(logs, unknowns, short_logs.fit_short(pairs, unknowns, WRONG), middle)
+    ends = [float(log.times[-1]) for log in logs]
+    if tolerances.delay > 0 and _longest(pairs) < short_logs.length_needed(unknowns):
+        short = short_logs.fit_short(pairs, unknowns, WRONG)
+        return Identification(logs, unknowns, short, middle, ends)
+    found = _search(pairs, unknowns)
+    # A drawing that is off explains nothing as badly, but perhaps a half of the log.
+    if found.chi2 > UNEXPLAINED and (beginning := _beginning(pairs, unknowns)) is not None:
+        pairs, found = beginning
+    return Identification([log for log, _ in pairs], unknowns, found, middle, ends)
+
+
+class _FirstFit(NamedTuple):
+    chi2: float  # per value of the fitted segments; infinite if all of them diverge
+    whole: Problem  # all segments
+    guess: Guess  # fitted values, and the measured first states of all segments
+
+
+def _search(pairs: Sequence[start.Pair], unknowns: Unknowns) -> Solution:
+    """Return the first fit that explains the logs, else that from the best start."""
+    believed, std = float(unknowns.mean[DELAY]), float(unknowns.std[DELAY])
     starts = [(believed, 1.0)]
-    if tolerances.delay > 0:
+    if std > 0:
         longest = max(pairs, key=lambda pair: len(pair[0].times))
-        coarse = start.coarse_delay(*longest, mechanism, believed, tolerances.delay)
+        coarse = start.coarse_delay(*longest, unknowns.mechanism, believed, std)
         # Where the plate was lost, long trajectories diverge. The coarse delay may be wrong.
         starts = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5), (coarse, _SHORT_SHARE)]
     first_fits = list[_FirstFit]()
@@ -216,13 +245,33 @@ def identify(
     progress.phase("shorter steps")
     while (halved := with_half_step(found.problem, found.guess)) is not None:
         found = found.refitted(halved)
-    return Identification(logs, unknowns, found, middle)
+    return found
 
 
-class _FirstFit(NamedTuple):
-    chi2: float  # per value of the fitted segments; infinite if all of them diverge
-    whole: Problem  # all segments
-    guess: Guess  # fitted values, and the measured first states of all segments
+def _beginning(
+    pairs: Sequence[start.Pair], unknowns: Unknowns
+) -> tuple[list[start.Pair], Solution] | None:
+    """Return the first half or quarter of the logs with its fit, if one explains it."""
+    for share in (0.5, 0.25):
+        parts = [_until(*pair, share) for pair in pairs]
+        if _longest(parts) < short_logs.length_needed(unknowns):
+            break
+        with suppress(ConfigError):  # one of several logs is too short
+            found = _search(parts, unknowns)
+            if found.chi2 <= WRONG:
+                return parts, found
+    return None
+
+
+def _until(log: Log, poses: Array, share: float) -> start.Pair:
+    """Return this share of a log, its beginning."""
+    kept = log.times <= log.times[0] + share * (log.times[-1] - log.times[0])
+    return replace(log, times=log.times[kept], values=log.values[kept]), poses[kept]
+
+
+def _longest(pairs: Sequence[start.Pair]) -> float:
+    """Return the length of the longest log in s."""
+    return max(float(log.times[-1] - log.times[0]) for log, _ in pairs)
 
 
 def _fit_nearest(

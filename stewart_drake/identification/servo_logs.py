@@ -27,6 +27,7 @@ _LONGEST_GAP: Final = 0.1  # s
 _LATEST: Final = 0.4  # s, of an angle after its setpoint: delay and lag
 _FOLLOWS: Final = 0.2
 """Least correlation of a crank with its setpoint. Weak servos with joints that stick have 0.45."""
+_AGAINST: Final = -0.5  # largest correlation of a crank whose sign is wrong
 _SHARES: Final = (0.05, 7.5)
 """Range of the motion of a crank over its setpoint's. Friction leaves 0.15; degrees are 57."""
 _STILL: Final = 0.01  # rad; what moves less is judged later
@@ -131,8 +132,10 @@ def _check_following(name: str, times: Array, setpoints: Array, cranks: Array) -
     fit = np.array(fits)[np.argmax(np.sum(fits, axis=1, where=judged))]
     bad = judged & (fit < _FOLLOWS)
     if bad.any():
-        least = np.min(fits, axis=0)
-        against = bool(np.all(least[bad] < -0.5))
+        least = np.array(fits)[np.argmin(np.sum(fits, axis=1, where=bad))]
+        against = bool(np.all(least[bad] < _AGAINST))
+        if against:  # name those that hardly move, too
+            bad |= least < _AGAINST
         raise ConfigError(
             f"{name}: got cranks that {'move against' if against else 'do not follow'} their "
             f"setpoints, correlation {_listed(CRANKS, least if against else fit, bad)}; expected "

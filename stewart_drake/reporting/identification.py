@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from stewart_drake.identification.identify import WRONG, Identification
 from stewart_drake.identification.logs import ANGLES, KINDS, Log
 from stewart_drake.identification.plan import MOTION, Plan
-from stewart_drake.identification.unknowns import DELAY, GEOMETRY, NAMES
+from stewart_drake.identification.unknowns import DELAY, GEOMETRY, NAMES, OFFSETS
 from stewart_drake.identification.unknowns import UNITS as SI_UNITS
 from stewart_drake.reporting.document import (
     Document,
@@ -36,6 +36,7 @@ _UNITS: Final = {
     "s": ("ms", 1e3),
 }
 """Unit in which an unknown is shown and the factor to it, by SI unit."""
+_ADJACENT: Final = 0.1  # s between segments that are one stretch
 _WEAK: Final = 0.5
 """Standard deviation after the log, relative to that before, above which an unknown is weak."""
 _VALUE_NAMES: Final = {
@@ -61,6 +62,7 @@ def document(found: Identification) -> Document:
         segments=len(found.fit.problem.segments),
         cautions=cautions,
         found=_table(found, geometry=False),
+        offsets=_offsets(found) if right else "",
         geometry=_table(found, geometry=True),
         chi2=found.chi2,
         fits=[("tolerances" if k == "prior" else k, chi2) for k, chi2 in found.chi2.items()],
@@ -95,7 +97,9 @@ def plan_document(plan: Plan) -> Document:
         plan=plan,
         logs=(),
         segments="",
-        **dict.fromkeys(("cautions", "weak", "outside", "fits", "residuals", "geometry")),
+        **dict.fromkeys(
+            ("cautions", "weak", "outside", "fits", "residuals", "geometry", "offsets")
+        ),
         **_shared(plan),
     )
 
@@ -140,14 +144,43 @@ def _cautions(found: Identification) -> list[str]:
             f"plate.mass to {plate:.4g} kg and identify again, since plant.payload_mass is at "
             "least 0"
         )
-    if left_out := found.fit.left_out:
-        stretches = "1 stretch" if left_out == 1 else f"{left_out} stretches"
-        cautions.append(f"{stretches} of the logs left out: no trajectory fits there")
-    far = np.abs(found.fit.residuals.prior) > 4
-    if far.any():
-        names = ", ".join(NAMES[k] for k in found.unknowns.free[far][:5])
-        cautions.append(f"more than four tolerances off: {names}; is the drawing right?")
+    cautions += _left_out(found)
+    far = found.unknowns.free[np.abs(found.fit.residuals.prior) > 4]
+    zeros = [k for k in far if OFFSETS.start <= k < OFFSETS.stop]
+    if zeros:
+        legs = ", ".join(f"leg {LEGS[k - OFFSETS.start]}" for k in zeros)
+        limit = f"{4e3 * found.unknowns.std[OFFSETS.start]:.3g}"
+        cautions.append(f"encoder zeros more than {limit} mrad (four tolerances) off: {legs}")
+    if others := [NAMES[k] for k in far if k not in zeros][:5]:
+        cautions.append(
+            f"more than four tolerances off: {', '.join(others)}; is the drawing right?"
+        )
     return cautions
+
+
+def _left_out(found: Identification) -> list[str]:
+    """Return the parts of the logs that the fit leaves out, in s."""
+    told, kept = [], {id(segment) for segment in found.fit.problem.segments}
+    for log, name, end in zip(found.logs, file_names(found.logs), found.ends, strict=True):
+        spans = list[list[float]]()
+        for segment in found.fit.whole.segments:
+            if segment.log.name != log.name or id(segment) in kept:
+                continue
+            if spans and spans[-1][1] >= segment.start - _ADJACENT:
+                spans[-1][1] = log.times[segment.rows[-1]]
+            else:
+                spans.append([segment.start, log.times[segment.rows[-1]]])
+        if spans:
+            listed = ", ".join(f"{a:.4g} to {b:.4g} s" for a, b in spans[:5])
+            more = f" and {len(spans) - 5} more" if len(spans) > 5 else ""
+            told.append(f"{name}: left out {listed}{more}: no trajectory fits there")
+        if log.times[-1] < end:
+            told.append(
+                f"{name}: left out {log.times[-1]:.4g} to {end:.4g} s: the search found no machine "
+                "that explains the whole log; did the plate tremble later, or was it lost? Cut the "
+                "log before that to use more of it"
+            )
+    return told
 
 
 def _weak(found: Identification) -> list[str]:
@@ -155,6 +188,16 @@ def _weak(found: Identification) -> list[str]:
     before = found.unknowns.std
     others = (k for k in found.unknowns.free if not _of_geometry(k))
     return [NAMES[k].replace("_", " ") for k in others if found.std[k] > _WEAK * before[k]]
+
+
+def _offsets(found: Identification) -> str:
+    """Return the encoders' offsets in mrad, or nothing if they are known."""
+    pairs = [
+        measured(1e3 * std, 1e3 * value)
+        for std, value in zip(found.std[OFFSETS], found.values[OFFSETS], strict=True)
+        if std > 0
+    ]
+    return ", ".join(f"{value} ± {std}" for std, value in pairs)
 
 
 def _of_geometry(k: int) -> bool:
