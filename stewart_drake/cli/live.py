@@ -185,7 +185,9 @@ def _delivered(
     end = End(result.status, result.stopped)
     if result.stopped is not None:
         advice = end.advice
-        if delivery.out is not None and LOG in logs:
+        if LOG not in logs:
+            advice = advice and advice.partition(" With --out the log")[0]
+        elif delivery.out is not None:
             advice = advice.replace("With --out the log", "The log")
             advice = advice.replace("LOG", shlex.quote(str(delivery.out / LOG)))
         delivery.say_wrapped(*filter(None, (end.words, advice)))
@@ -203,7 +205,9 @@ def _delivered(
         f"the machine had {commands} for {counted(s['periods_played'], 'periods')}, and none (dry) "
         f"for {s['periods_dry']}, with those of coming to rest",
     )
-    if result.stopped is not None and s["periods_dry"] > _MANY_DRY * s["periods_played"]:
+    # Before the first torque can act, the buffer is dry in any run.
+    dry = s["periods_dry"] - math.ceil(result.scenario.eta / result.scenario.controller.period)
+    if result.stopped is not None and dry > _MANY_DRY * s["periods_played"]:
         delivery.say_wrapped(
             f"{commands} came too late or not at all for many periods: a larger link.playout or "
             "controller.packet_repeats bridges more; stewart-drake analyze link compares bounds"
@@ -241,8 +245,8 @@ def _serve(address: Connection, chosen: Chosen, low: float, high: float) -> None
     try:
         options, loaded = MachineOptions(port=0), chosen.load()
         network = loaded.link if loaded.link.kind == "network" else NetworkConfig()
-        back = PacketsConfig(low=low, high=high, loss=_LOST)
-        loaded.link = replace(network, low=low, high=high, loss=_LOST, back=back)
+        loaded.link = replace(network, low=low, high=high, loss=_LOST)
+        loaded.link.back = PacketsConfig(low=low, high=high, loss=_LOST)
         loaded.check()
         with open_chosen(loaded, options, lambda _: None) as (running, where):
             address.send("{}:{}".format(*where))
@@ -339,7 +343,7 @@ def machine(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
             with _handled(signal.default_int_handler, signal.SIGTERM):
                 delivery.say_wrapped(
                     f"machine {chosen.scenario} at {address[0]}:{address[1]}: {moved}, "
-                    f"every {1e-6 * running.period:g} ms",
+                    f"a sample every {1e-6 * running.period:g} ms",
                     "waits for a controller; Ctrl-C ends it",
                 )
                 running.run(options.duration or math.inf)
