@@ -243,6 +243,17 @@ def test_learning_leaves_to_the_estimator_what_it_finds():
 
 
 @pytest.mark.slow
+def test_estimated_friction_is_not_learned_a_second_time():
+    """With encoders; before, the second repetition had 4.4."""
+    settings = ("plant.coulomb_friction=1e-4", "sensor.kind=encoders", "sensor.bits=14")
+    sc = scenario(*settings, "controller.estimate=[coulomb]")
+    found = study_learn(sc, LearnOptions(repetitions=2))
+    assert max(one.error for one in found.repetitions) < 0.1
+    assert found.competing == []
+    assert found.estimable == "controller.estimate=[coulomb,payload_position]"
+
+
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_the_command_writes_what_a_run_uses(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)

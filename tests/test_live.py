@@ -628,7 +628,9 @@ def test_a_link_that_takes_longer_than_the_delay_is_refused(offer):
     with pytest.raises(ConfigError, match=r"^delay\.steps: got 0\.1 s .* delay\.steps=4$"):
         as_seen(scenario_of("delay.steps=1"), link, message)
     network = ("link.kind=network", "link.burst=3")
-    with pytest.raises(ConfigError, match=r"^link\.playout: got 0\.2 s .* link\.playout=0\.3$"):
+    with pytest.raises(
+        ConfigError, match=r"^link\.playout: got 0\.1 s, with 1 repetition 0\.2 s, .*=0\.3$"
+    ):
         as_seen(scenario_of(*network, "link.playout=0.1"), link, message)
     # Where many packets are lost, the default bound leaves out the longest trips.
     link = replace(link, trips=deque([0.01, 0.38]), sent=100, lost=40)
@@ -720,6 +722,7 @@ def test_the_jitter_stands_beside_the_margin_and_asks(settings, asks):
         else:
             assert "this loop is unstable; " in told
         assert ("play-out buffer absorbs" in told) == (not asks)
+        assert ("ms: --set delay.steps sets a shorter delay" in told) == (not asks)
         assert ("Remedies: " in told) == asks
         if asks:
             with pytest.raises(ConfigError, match=r"^--yes: not given, and (round trips|the loop)"):
@@ -827,7 +830,9 @@ def test_nobody_there_is_reported(monkeypatch):
     monkeypatch.setattr(contacts, "_PATIENCE", 0.3)
     endpoint = Endpoint(ControllerMessage, "127.0.0.1", 0)
     try:
-        with pytest.raises(ConfigError, match="where nothing answers"):
+        with pytest.raises(
+            ConfigError, match="where nothing answers, or a machine with another key"
+        ):
             prepare_session(scenario_of(), endpoint.address)
     finally:
         endpoint.close()

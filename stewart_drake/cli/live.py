@@ -9,6 +9,7 @@ import signal
 import sys
 import webbrowser
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any, Final
 
@@ -184,7 +185,9 @@ def _delivered(
     end = End(result.status, result.stopped)
     if result.stopped is not None:
         advice = end.advice
-        if delivery.out is not None and LOG in logs:
+        if LOG not in logs:
+            advice = advice and advice.partition(" With --out the log")[0]
+        elif delivery.out is not None:
             advice = advice.replace("With --out the log", "The log")
             advice = advice.replace("LOG", shlex.quote(str(delivery.out / LOG)))
         delivery.say_wrapped(*filter(None, (end.words, advice)))
@@ -202,7 +205,9 @@ def _delivered(
         f"the machine had {commands} for {counted(s['periods_played'], 'periods')}, and none (dry) "
         f"for {s['periods_dry']}, with those of coming to rest",
     )
-    if result.stopped is not None and s["periods_dry"] > _MANY_DRY * s["periods_played"]:
+    # Before the first torque can act, the buffer is dry in any run.
+    dry = s["periods_dry"] - math.ceil(result.scenario.eta / result.scenario.controller.period)
+    if result.stopped is not None and dry > _MANY_DRY * s["periods_played"]:
         delivery.say_wrapped(
             f"{commands} came too late or not at all for many periods: a larger link.playout or "
             "controller.packet_repeats bridges more; stewart-drake analyze link compares bounds"
@@ -229,16 +234,21 @@ def _delivered(
     return delivery.end(result.summary, result.status == "interrupted") or int(end.failed)
 
 
-def _serve(address: Connection, chosen: Chosen) -> None:
-    """Simulate a machine in this process; send its address, or why there is none."""
+def _serve(address: Connection, chosen: Chosen, low: float, high: float) -> None:
+    """Simulate a machine in this process, `low` to `high` s away; send its address or problem."""
     if sys.platform == "linux":
         set_death_signal = 1
         ctypes.CDLL(None).prctl(set_death_signal, signal.SIGTERM)  # it ends with its parent
     from stewart_drake.live.reachy import open_chosen
+    from stewart_drake.scenario.link_config import NetworkConfig, PacketsConfig
 
     try:
-        options = MachineOptions(port=0)
-        with open_chosen(chosen.load(), options, lambda _: None) as (running, where):
+        options, loaded = MachineOptions(port=0), chosen.load()
+        network = loaded.link if loaded.link.kind == "network" else NetworkConfig()
+        loaded.link = replace(network, low=low, high=high, loss=_LOST)
+        loaded.link.back = PacketsConfig(low=low, high=high, loss=_LOST)
+        loaded.check()
+        with open_chosen(loaded, options, lambda _: None) as (running, where):
             address.send("{}:{}".format(*where))
             running.run()
     except ConfigError as error:
@@ -256,12 +266,10 @@ def transit_times(eta: float) -> tuple[float, float]:
 def _demo_machine(chosen: Chosen, eta: float) -> Iterator[str]:
     """Simulate a machine in another process, over another link; yield its address."""
     low, high = transit_times(eta)
-    way = f"low: {low:g}, high: {high:g}, loss: {_LOST}"
-    link = f"link={{kind: network, {way}, return: {{{way}}}}}"
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe(duplex=False)
-    chosen = chosen._replace(settings=[*chosen.settings, "plant.kind=exact", link])
-    process = context.Process(target=_serve, args=(there, chosen), daemon=True)
+    chosen = chosen._replace(settings=[*chosen.settings, "plant.kind=exact"])
+    process = context.Process(target=_serve, args=(there, chosen, low, high), daemon=True)
     with _handled(signal.SIG_IGN, signal.SIGINT):  # Ctrl-C is for the controller
         process.start()
     there.close()
@@ -335,7 +343,7 @@ def machine(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
             with _handled(signal.default_int_handler, signal.SIGTERM):
                 delivery.say_wrapped(
                     f"machine {chosen.scenario} at {address[0]}:{address[1]}: {moved}, "
-                    f"every {1e-6 * running.period:g} ms",
+                    f"a sample every {1e-6 * running.period:g} ms",
                     "waits for a controller; Ctrl-C ends it",
                 )
                 running.run(options.duration or math.inf)

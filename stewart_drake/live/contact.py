@@ -301,9 +301,10 @@ def call(contact: Contact) -> MachineMessage:
                     f"{VERSION}, of the same release on both sides"
                 )
         if not first and now() - began > _PATIENCE * SECOND:
+            silent = _refusals(contact) or ", or a machine with another key"
             raise ConfigError(
                 f"--machine: got {where.removeprefix('machine at ')}, where nothing "
-                f"answers{_refusals(contact)}; expected a machine of protocol version {VERSION} "
+                f"answers{silent}; expected a machine of protocol version {VERSION} "
                 "with the same --key, such as stewart-drake machine SCENARIO --port PORT"
             )
         known = len(contact.link.trips) >= _ENOUGH_TRIPS or now() - first > _LONGEST_CALL * SECOND

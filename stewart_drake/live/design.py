@@ -32,6 +32,7 @@ from stewart_drake.loop.peer import MOST_ROWS
 from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
 from stewart_drake.loop.servos import commands_in_flight, servo_law
 from stewart_drake.mechanism.trajectories import evaluate
+from stewart_drake.reporting.document import counted
 from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.link_config import NetworkConfig, WireConfig
@@ -133,12 +134,16 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
     if not chosen:  # the default bound may be shorter than the longest trip
         eta = max(eta, least * period)
     elif eta < longest:
-        field, enough = "link.playout", f"link.playout={least * period:g}"
         if scenario.link.kind == "wire":
             repeats = 0 if c.command == "cranks" else c.packet_repeats
-            field, enough = "delay.steps", f"delay.steps={least + repeats}"
+            got, enough = f"delay.steps: got {eta:g} s", f"delay.steps={least + repeats}"
+        else:
+            enough = f"link.playout={least * period:g}"
+            got = f"link.playout: got {scenario.link.playout:g} s"
+            if c.packet_repeats:
+                got += f", with {counted(c.packet_repeats, 'repetitions')} {eta:g} s,"
         raise ConfigError(
-            f"{field}: got {eta:g} s from a measurement to its torque; the link takes "
+            f"{got} from a measurement to its torque; the link takes "
             f"{link.shortest:.3g} to {longest:.3g} s there and back and loses "
             f"{100 * link.loss_there:.2g} and {100 * link.loss_back:.2g} %: expected at least "
             f"--set {enough}"

@@ -260,7 +260,7 @@ class TorqueLessons(Viewer):
         self._target = self._left + share * (self.experiment.start[POSE] - self._left)
         if self._lacking is None:
             if self._whole:
-                self._judge()
+                self._judge(snapshot)
             return
         more = list(islice(self._lacking, _EACH))
         self._found += more
@@ -293,7 +293,7 @@ class TorqueLessons(Viewer):
         least = t + self._span
         return least + (self._slowest - least) % self._period
 
-    def _judge(self) -> None:
+    def _judge(self, snapshot: Snapshot) -> None:
         """Take the error of the last period, unless too much of it was not measured."""
         measured = list(self._measured())
         if not self._arrivals.suffice(len(self.learning.errors) + 1, len(measured)):
@@ -307,7 +307,7 @@ class TorqueLessons(Viewer):
         k = len(self.learning.errors)
         self._say(f"repetition {k}: E of one period is {error:.3g} % s")
         self.done = k == self._number or self.learning.ended
-        self._lacking = self._lacking_torques(measured)
+        self._lacking = self._lacking_torques(measured, snapshot.estimates)
 
     def _measured(self) -> Iterator[_Step]:
         """Yield the controller's periods with a measurement at both ends."""
@@ -319,10 +319,12 @@ class TorqueLessons(Viewer):
                 acted = np.array([row["torque_applied"], after["torque_applied"]])
                 yield _Step(time, states, acted)
 
-    def _lacking_torques(self, measured: Iterable[_Step]) -> Iterator[tuple[float, Array]]:
+    def _lacking_torques(
+        self, measured: Iterable[_Step], last: Mapping[str, float]
+    ) -> Iterator[tuple[float, Array]]:
         """Yield the middles of periods, s, and the torques (6,) that the model lacks there."""
         parameters = np.array([row["parameters"] for _, row in self._rows])
-        dynamics = estimated(self.experiment, parameters)
+        dynamics = estimated(self.experiment, parameters, last)
         timeline = Timeline(self._dt, self.experiment.scenario.true_delay)
         for time, (begin, end), acted in measured:
             schedule = timeline.next_period(acted)

@@ -416,6 +416,7 @@ class LiveLoop:
             by_hand=self._by_hand,
             limit=self._steering.limit,
             resting=not self._recording,
+            estimates={name: one["value"] for name, one in self.record.estimates.items()},
         )
 
 

@@ -41,7 +41,7 @@ from stewart_drake.live.simulated import (
     body_of,
     first_rows,
 )
-from stewart_drake.loop.peer import FAULTS, MOST_SAMPLES, Fault, Reason, identity_of, in_words
+from stewart_drake.loop.peer import FAULTS, Fault, Reason, check_samples, identity_of, in_words
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing
@@ -61,12 +61,7 @@ def check_scenario(scenario: Scenario) -> None:
     """Refuse a scenario that the protocol does not cover."""
     if found := differing(scenario, {"actuator.kind": ("torque", "position_servo")}):
         raise ConfigError(found.problem("for a machine", ", which a controller sends"))
-    samples = scenario.sensor.samples
-    if samples is not None and samples > MOST_SAMPLES:
-        raise ConfigError(
-            f"sensor.samples: got {samples}; expected at most {MOST_SAMPLES}, which a datagram "
-            "holds"
-        )
+    check_samples(scenario)
 
 
 def reason_of(failure: Failure) -> Reason:

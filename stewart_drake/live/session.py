@@ -36,7 +36,7 @@ from stewart_drake.live.protocol import (
 from stewart_drake.live.viewer import Viewer
 from stewart_drake.loop.cautions import delays_apart, overconfidence
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
-from stewart_drake.loop.peer import identity_of
+from stewart_drake.loop.peer import check_samples, identity_of
 from stewart_drake.loop.preparation import Experiment, known_dynamics
 from stewart_drake.loop.recording import summarize
 from stewart_drake.loop.results import LEAST_MEASURED, LiveSummary, SimulationResult
@@ -58,6 +58,9 @@ class Ready(NamedTuple):
     contact: Contact
     design: Design  # law for the scenario over the link that was found
     margin: ControllerMargin  # stability margin of the loop with a constant delay eta
+    # field of the scenario that sets a shorter delay, and whether the link's times set this one
+    sets_delay: str = "link.playout"
+    measured: bool = True
 
     @property
     def simulated(self) -> bool:
@@ -93,6 +96,7 @@ def prepare_session(
     Raises:
         ConfigError: no machine there, or one that does not fit the scenario.
     """
+    check_samples(scenario)
     endpoint = open_endpoint(address, key)
     try:
         contact = Contact(endpoint, address, identity_of(scenario))
@@ -100,11 +104,14 @@ def prepare_session(
         await_free(contact)  # before the design, which takes seconds
         machine = contact.machine
         check_controller(scenario)
+        wire = scenario.link.kind == "wire"
+        sets_delay = "delay.steps" if wire else "link.playout"
+        measured = scenario.link.kind == "network" and scenario.link.playout is None
         with one_blas_thread:
             scenario, read = read_learned(scenario)
             made = design(as_seen(scenario, contact.link, machine), machine, learned or read)
             margin = _margin(made.experiment)
-        return Ready(endpoint, contact, made, margin)
+        return Ready(endpoint, contact, made, margin, sets_delay, measured)
     except BaseException:
         endpoint.close()
         raise

@@ -294,7 +294,7 @@ def body_of(experiment: Experiment) -> tuple[Callable[[], Body], str]:
         return lambda: NativeBody(experiment), "DOP853"
     if experiment.scenario.controller.command == "cranks":
         raise ConfigError(found.problem("for a machine with servos"))
-    return lambda: DrakeBody(experiment), f"Drake ({found.field})"
+    return lambda: DrakeBody(experiment), f"Drake because of {found.field}"
 
 
 class MeasurementFields:

@@ -1,5 +1,6 @@
 """Viewers of a live run: what they are shown, and what they request."""
 
+from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from stewart_drake.dynamics.workspace import Failure
@@ -61,6 +62,7 @@ class Snapshot(NamedTuple):
     by_hand: bool  # whether the target is set by hand
     limit: str | None  # limit that prevents the requested motion, or None
     resting: bool = False  # whether the run is over and the plate comes to rest, or is held there
+    estimates: Mapping[str, float] = {}  # estimated parameters by name
 
 
 class Viewer:

@@ -4,6 +4,7 @@ import hashlib
 from enum import IntEnum
 from typing import Final, NamedTuple
 
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.geometry import drawing_of
 from stewart_drake.scenario.config import EncoderSensorConfig, Scenario, StateSensorConfig
@@ -125,6 +126,16 @@ def identity_of(scenario: Scenario) -> Identity:
         _part(f"sensor {read}", read),
         _part(f"actuator {scenario.actuator.kind}", scenario.actuator.kind),
     )
+
+
+def check_samples(scenario: Scenario) -> None:
+    """Refuse more encoder readings a period than a datagram holds."""
+    samples = scenario.sensor.samples
+    if samples is not None and samples > MOST_SAMPLES:
+        raise ConfigError(
+            f"sensor.samples: got {samples}; expected at most {MOST_SAMPLES}, which a datagram "
+            "holds"
+        )
 
 
 def machine_identity(scenario: Scenario) -> bytes:

@@ -22,6 +22,7 @@ def document(study: LinkStudy) -> Document:
     own = best is not None and all(one is None or one.completed == 1 for one in (best, checked))
     same = [f"{bound:g}" for bound, excess in study.alike.items() if excess < NEGLIGIBLE]
     undecided = {bound: excess for bound, excess in study.alike.items() if not excess < NEGLIGIBLE}
+    short = len(study.bounds) - len(study.usable)
     unsure = ", ".join(f"{bound:g}" for bound in study.unconfirmed_losses)
     return from_template(
         "link",
@@ -32,6 +33,7 @@ def document(study: LinkStudy) -> Document:
         same=", ".join(same),
         undecided=undecided,
         unsure=unsure,
+        short_better=best and any(cell.mean < best.mean for cell in study.bounds[:short]),
         most=lambda cell: max(cell.errors, default=math.nan),
         assured=_ASSURED,
         wanted=math.ceil(math.log(1 - CONFIDENCE) / math.log(_ASSURED)),

@@ -21,7 +21,7 @@ and g(c) would be right at once. In general c = g(c) is solved by Anderson's met
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, NamedTuple
@@ -38,8 +38,8 @@ from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import SimulationResult, accumulated_error
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.calibration import believed_delay
-from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.signals import NUM_PARAMETERS, POSE, RATES
+from stewart_drake.scenario.config import ControllerConfig, Scenario
+from stewart_drake.scenario.signals import CONSTANTS, NUM_PARAMETERS, POSE, RATES
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.study_options import LearnOptions
 from stewart_drake.types import Array
@@ -52,6 +52,8 @@ _DEPTH: Final = 3
 """Largest number of differences of repetitions in a step of Anderson's method."""
 _POINTS: Final = 100
 """Instants of a period at which a learned torque or angle is looked at."""
+_CAUSES: Final = ("payload_position", "coulomb")
+"""What an estimator finds better than a repetition does."""
 _PATIENCE: Final = 2
 """Repetitions without a smaller error, one after the other, that end learning."""
 
@@ -103,11 +105,25 @@ class LearnStudy:
 
     @property
     def competing(self) -> list[str]:
-        """Settings that keep the controller from taking a part of the lacking torque."""
-        controller = self.experiment.scenario.controller
+        """Settings that keep the controller from taking a part of the lacking torque.
+
+        None with encoders, where rates need the estimator, and the integral alone hardly matters.
+        """
+        sc = self.experiment.scenario
+        controller = sc.controller
         estimator = ["controller.estimate=[]"] if controller.estimate else []
         integral = ["controller.integral=false"] if controller.integral else []
-        return [] if self.setpoints else estimator + integral
+        return estimator + integral if sc.sensor.measures_state and not self.setpoints else []
+
+    @property
+    def estimable(self) -> str | None:
+        """Setting by which an estimator that encoders need finds friction and payload, or None."""
+        sc = self.experiment.scenario
+        present = sc.controller.estimate or ControllerConfig().estimate
+        more = [one for one in _CAUSES if one not in present]
+        if self.setpoints or sc.sensor.measures_state or not more:
+            return None
+        return f"controller.estimate=[{','.join([*present, *more])}]"
 
     @property
     def stopped(self) -> bool:
@@ -275,7 +291,8 @@ def lacking_torques(
     sc = experiment.scenario
     dt, delay = sc.controller.period, believed_delay(sc)
     signals, (first, rows, states) = result.signals, _last_samples(experiment, result, period)
-    dynamics = estimated(experiment, signals.parameters.values[rows[first:]])
+    last = {name: one["value"] for name, one in result.summary["estimates"].items()}
+    dynamics = estimated(experiment, signals.parameters.values[rows[first:]], last)
     limit = experiment.torque_limit
     sent = np.clip(signals.torque_commanded.values[rows], -limit, limit)
     in_flight = np.vstack([experiment.torques_in_flight(delay), sent])
@@ -289,9 +306,16 @@ def lacking_torques(
     return np.array(times), np.reshape(found, (-1, 6))
 
 
-def estimated(experiment: Experiment, parameters: Array) -> StewartDynamics:
-    """Return the controller's model with the mean of estimated parameters (n, p)."""
+def estimated(
+    experiment: Experiment, parameters: Array, last: Mapping[str, float]
+) -> StewartDynamics:
+    """Return the controller's model with the mean of estimated parameters (n, p).
+
+    `last` has the last estimate of each, by name, also of those that are not in `parameters`.
+    """
     known = experiment.nominal.plant_parameters.copy()
+    for name in CONSTANTS[NUM_PARAMETERS:]:
+        known[CONSTANTS.index(name)] = last.get(name, known[CONSTANTS.index(name)])
     known[:NUM_PARAMETERS] = np.mean(parameters, axis=0)
     return StewartDynamics(experiment.mechanism, experiment.scenario.plant.gravity, known)
 
