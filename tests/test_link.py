@@ -12,8 +12,8 @@ from scipy.integrate import solve_ivp
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.bulk import preparation_of
+from stewart_drake.loop.cautions import idle_delay
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.link import DelayChain, VaryingDelay
@@ -258,10 +258,10 @@ def test_without_times_packets_take_about_the_scenarios_delay(tmp_path):
     assert times(network()) == (0.64, 0.96)
     assert times(network("delay.steps=4")) == (0.32, 0.48)
     assert times(network("delay.steps=4", "delay.fraction=0.5")) == pytest.approx((0.36, 0.54))
-    given = ("link.low=0.5", "link.high=0.9")
-    assert times(network(*given)) == (0.5, 0.9)
-    with pytest.raises(ConfigError, match=r"delay.steps: got 4 with link.low 0.5, where"):
-        network(*given, "delay.steps=4")
+    assert times(network("link.low=0.5", "link.high=0.9", "delay.steps=4")) == (0.5, 0.9)
+    apart = network("link.low=0.5", "link.high=0.9", "link.playout=0.9", "delay.steps=4")
+    assert "0.4 s, have no effect" in idle_delay(apart) and "the delay 1 s" in idle_delay(apart)
+    assert idle_delay(network("delay.steps=4")) is None
     under_way = forward_times(network("link.loss=0"), 2000)
     assert 0.64 <= under_way.min() < 0.645 and 0.955 < under_way.max() <= 0.96
     # They follow the delay wherever it is changed, and in a file that is read back.

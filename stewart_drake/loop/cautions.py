@@ -15,7 +15,8 @@ from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.results import RunSummary
 from stewart_drake.loop.servos import quickest_crank
 from stewart_drake.scenario.calibration import believed_delay
-from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.config import DelayConfig, Scenario
+from stewart_drake.scenario.delay import Delay
 
 TOLERABLE: Final = 1e5
 """Growth of an error along the motion, by a step of the plant, above which there is a warning.
@@ -28,7 +29,10 @@ should, from 5e6 on they are lost or wrong by a hundred times the exact plant's 
 
 def cautions_before(experiment: Experiment, margin: ControllerMargin | None) -> list[str]:
     """Return the warnings before a run; `margin` is None for a loop that was not judged."""
-    said = (weak_motors(experiment), stiff_friction(experiment), _of_loop(experiment, margin))
+    said = (
+        *(weak_motors(experiment), stiff_friction(experiment), idle_delay(experiment.scenario)),
+        _of_loop(experiment, margin),
+    )
     return [line for line in said if line is not None]
 
 
@@ -69,6 +73,20 @@ def weak_motors(experiment: Experiment) -> str | None:
     return (
         f"the motion takes up to {factor * needed:.3g} {unit}, the motors give "
         f"{factor * limit:.3g} ({'actuator.torque_limit' if own else 'motor.effort_limit'})"
+    )
+
+
+def idle_delay(scenario: Scenario) -> str | None:
+    """Return a warning about a delay that a network with times of its own does without, or None."""
+    link, delay = scenario.link, scenario.delay
+    if link.kind != "network" or link.follows_delay or delay == DelayConfig():
+        return None
+    given = Delay(delay.steps, delay.fraction).eta(scenario.controller.period)
+    if math.isclose(given, scenario.eta):
+        return None
+    return (
+        f"delay.steps and delay.fraction, {given:.4g} s, have no effect: the times of link are "
+        f"given, and link.playout makes the delay {scenario.eta:.4g} s"
     )
 
 

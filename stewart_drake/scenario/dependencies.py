@@ -207,25 +207,6 @@ def idle_fields(scenario: Any) -> list[Idle]:
     return found
 
 
-def idle_delays(scenario: Any) -> dict[str, str]:
-    """Return messages about the fields of `delay` that a network with given times does without.
-
-    By the fields' dotted names. They are refused as settings only: one file serves a wire and a
-    network.
-    """
-    link, delay = scenario.link, scenario.delay
-    if link.kind == "wire" or link.follows_delay:
-        return {}
-    times = "low" if link.median is None else "median"
-    condition = f"with link.{times} {_spelled(getattr(link, times))}, where it has no effect"
-    expected = "link.playout, which sets the delay there, or link.kind 'wire'"
-    return {
-        f"delay.{name}": f"delay.{name}: got {_spelled(value)} {condition}; expected {expected}"
-        for name, value in vars(delay).items()
-        if value != _default(delay, name)
-    }
-
-
 def reset_idle(scenario: Any) -> None:
     """Set the fields without an effect to their defaults."""
     for idle in idle_fields(scenario):

@@ -22,7 +22,7 @@ from stewart_drake.scenario.config import (
     compatible_actuator,
     with_actuator,
 )
-from stewart_drake.scenario.dependencies import Idle, idle_delays, idle_fields, reset_idle
+from stewart_drake.scenario.dependencies import Idle, idle_fields, reset_idle
 
 _SETTINGS = "settings"
 _FILES = {"file", "calibration", "learned"}  # always a path; others may be a shipped name
@@ -49,24 +49,13 @@ def load_scenario(
     Raises:
         ConfigError: the first problem, in one line.
     """
-    settings = setting_texts(settings)
     read = read_scenario(name_or_path, controller, settings)
     read.scenario.check(read.where)
     for idle in idle_fields(read.scenario):
         if place := read.place_to_mend(idle):
             raise ConfigError(f"{place}: {idle.problem}")
-    _check_delays(read.scenario, settings)
     reset_idle(read.scenario)
     return read.scenario
-
-
-def _check_delays(scenario: Scenario, settings: Iterable[str]) -> None:
-    """Refuse settings of a delay without an effect; an overlay counts as a file."""
-    idle = idle_delays(scenario)
-    typed = (one for one in settings if one.partition("=")[0].strip() != _OVERLAY)
-    for name in (name for one in typed for name in _dotted_names(_parse_setting(one))):
-        if name in idle:
-            raise ConfigError(f"{_SETTINGS}: {idle[name]}")
 
 
 def as_scenario(
@@ -243,8 +232,6 @@ def load_comparison(
     for one in idle_fields(read.scenario) if refuse_idle else ():
         if one.field in everywhere and (place := read.place_to_mend(one)):
             raise ConfigError(f"{place}: {one.problem}")
-    if refuse_idle:
-        _check_delays(read.scenario, settings)
     return rows
 
 
