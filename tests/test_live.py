@@ -395,8 +395,9 @@ def test_a_plate_is_led_back_where_the_law_would_hardly_do_it(settings, unknown,
 @pytest.mark.slow
 @in_real_time
 def test_a_loss_with_more_jitter_than_the_loop_is_stable_for_says_so(capsys):
+    """Here the steps of the engine lose it, which the controller cannot know."""
     margin = 1e3 * min(sd.controller_margin("gravity").summary["delay_margin_s"])
-    with running_machine(load_scenario("gravity")) as running:
+    with running_machine(load_scenario("gravity", settings=("plant.kind=multibody",))) as running:
         machine = "{}:{}".format(*running.address)
         words = ["--yes", "--no-browser", "--duration", "4", "--machine", machine]
         assert main(["live", "gravity", *words]) == 1
