@@ -92,7 +92,8 @@ def test_delay_of_the_paper(tmp_path, capsys):
     for limit in summary["largest_delay"]:
         growth = math.exp(limit["delay"] * fastest["fastest_pole"])
         assert growth == pytest.approx(limit["amplification"])
-    assert "can be compensated" in told and "%: a margin below 5 % is small." in told
+    assert "can be compensated" in told and "a larger controller.w_R widens it." in told
+    assert "0.19 % of the delay" in told
     for part in ("1.64 ms longer", "21.0", "left 1.00", "no reach 1.00"):
         assert part in told
     assert page.count("<img") == 3
