@@ -317,7 +317,7 @@ def test_the_stack_is_not_deeper_than_stated(tmp_path, compiler):
     command = [*compiler, "-O2", *own, "-lm", "-pthread", "-o", "painted"]
     subprocess.run(command, cwd=folder, check=True)
     said = subprocess.run(["./painted"], cwd=folder, capture_output=True, text=True, check=True)
-    told = int((folder / "README.md").read_text().split("takes up to ")[1].split(" kB")[0])
+    told = int((folder / "README.md").read_text().split("less than ")[1].split(" kB")[0])
     used = int(said.stdout.split("stack ")[1])
     assert 5000 < used < 1000 * told
 
