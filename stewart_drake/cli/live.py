@@ -9,7 +9,6 @@ import signal
 import sys
 import webbrowser
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any, Final
 
@@ -234,21 +233,16 @@ def _delivered(
     return delivery.end(result.summary, result.status == "interrupted") or int(end.failed)
 
 
-def _serve(address: Connection, chosen: Chosen, low: float, high: float) -> None:
-    """Simulate a machine in this process, `low` to `high` s away; send its address or problem."""
+def _serve(address: Connection, chosen: Chosen) -> None:
+    """Simulate a machine in this process; send its address, or why there is none."""
     if sys.platform == "linux":
         set_death_signal = 1
         ctypes.CDLL(None).prctl(set_death_signal, signal.SIGTERM)  # it ends with its parent
     from stewart_drake.live.reachy import open_chosen
-    from stewart_drake.scenario.link_config import NetworkConfig, PacketsConfig
 
     try:
-        options, loaded = MachineOptions(port=0), chosen.load()
-        network = loaded.link if loaded.link.kind == "network" else NetworkConfig()
-        loaded.link = replace(network, low=low, high=high, loss=_LOST)
-        loaded.link.back = PacketsConfig(low=low, high=high, loss=_LOST)
-        loaded.check()
-        with open_chosen(loaded, options, lambda _: None) as (running, where):
+        options = MachineOptions(port=0)
+        with open_chosen(chosen.load(), options, lambda _: None) as (running, where):
             address.send("{}:{}".format(*where))
             running.run()
     except ConfigError as error:
@@ -266,10 +260,12 @@ def transit_times(eta: float) -> tuple[float, float]:
 def _demo_machine(chosen: Chosen, eta: float) -> Iterator[str]:
     """Simulate a machine in another process, over another link; yield its address."""
     low, high = transit_times(eta)
+    way = f"low: {low:g}, high: {high:g}, loss: {_LOST}"
+    link = f"link={{kind: network, {way}, return: {{{way}}}}}"
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe(duplex=False)
-    chosen = chosen._replace(settings=[*chosen.settings, "plant.kind=exact"])
-    process = context.Process(target=_serve, args=(there, chosen, low, high), daemon=True)
+    chosen = chosen._replace(settings=[*chosen.settings, "plant.kind=exact", link])
+    process = context.Process(target=_serve, args=(there, chosen), daemon=True)
     with _handled(signal.SIG_IGN, signal.SIGINT):  # Ctrl-C is for the controller
         process.start()
     there.close()

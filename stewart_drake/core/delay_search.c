@@ -95,7 +95,7 @@ static real density(real x) { return REAL(exp)(-x * x / 2) / SQRT_2_PI; }
 static real left_of_prior(const stewart_delay *d, real t)
 {
     const real left = stewart_normal_between((t - d->delay_mean) / d->delay_std,
-                                  (d->longest - d->delay_mean) / d->delay_std);
+                                             (d->longest - d->delay_mean) / d->delay_std);
     return left > 0 ? left : 0;
 }
 

@@ -114,12 +114,12 @@ class Setpoints:
         end = self.times[-1] + self.times[1]
         text = f"every limit kept: largest torque {torque:.3g} N m, crank speed {speed:.3g} rad/s"
         if step > torque:
-            much = step > self.torque_limit
-            text += "\nwarning: " if much else "\n"
-            text += f"servos that hold each setpoint give up to {step:.3g} N m where it changes"
-            text += (
-                f",\n  more than their {self.torque_limit:.3g} N m: raise --rate" if much else ""
-            )
+            said = f"servos that hold each setpoint give up to {step:.3g} N m where it changes"
+            if step > self.torque_limit:
+                said = (
+                    f"warning: {said},\n  more than their {self.torque_limit:.3g} N m: raise --rate"
+                )
+            text += f"\n{said}"
         if self.blend:
             text += f"\nsoft {self.softens}: {self.blend:g} s"
         if self.ends < end - _ROUNDING:
@@ -257,9 +257,7 @@ def _checked(start: Sequence[float] | Array, experiment: Experiment) -> Array:
     pose = fixed("start", start, (6,))
     if failure := diagnose(experiment.mechanism, 0.0, pose):
         angle, length = (float(np.abs(pose[part]).max()) for part in (ANGLES, POSITION))
-        hint = degrees_hint(angle)
-        if length >= 1:
-            hint = " (are these degrees and mm?)" if hint else " (are these mm?)"
+        hint = degrees_hint(angle, length) or (" (are these mm?)" if length >= 1 else "")
         home = ",".join(f"{value:.4g}" for value in experiment.mechanism.home)
         raise ConfigError(
             f"start: got a pose where {failure.reason}; expected one within reach, as home "

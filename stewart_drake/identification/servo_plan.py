@@ -152,7 +152,8 @@ def plan_servos(
 
 def _cranks(mechanism: Mechanism, states: Array) -> Array:
     """Return crank angles and rates (n, 12) of states (n, 12)."""
-    return np.array([functions_of(mechanism).cranks(x) for x in states])
+    functions = functions_of(mechanism)
+    return np.array([functions.cranks(x) for x in states])
 
 
 class _Planner:

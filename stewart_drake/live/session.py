@@ -42,7 +42,7 @@ from stewart_drake.loop.recording import summarize
 from stewart_drake.loop.results import LEAST_MEASURED, LiveSummary, SimulationResult
 from stewart_drake.reporting.document import templates
 from stewart_drake.scenario.config import DelayConfig, Scenario
-from stewart_drake.scenario.link_config import WireConfig
+from stewart_drake.scenario.link_config import NetworkConfig, WireConfig
 from stewart_drake.scenario.run_log import Background, RunLog, UdpMirror, open_log
 from stewart_drake.studies.verdict import Verdict, milliseconds
 from stewart_drake.types import Array
@@ -58,9 +58,7 @@ class Ready(NamedTuple):
     contact: Contact
     design: Design  # law for the scenario over the link that was found
     margin: ControllerMargin  # stability margin of the loop with a constant delay eta
-    # field of the scenario that sets a shorter delay, and whether the link's times set this one
-    sets_delay: str = "link.playout"
-    measured: bool = True
+    link: WireConfig | NetworkConfig  # of the scenario, before the one that was found
 
     @property
     def simulated(self) -> bool:
@@ -104,14 +102,12 @@ def prepare_session(
         await_free(contact)  # before the design, which takes seconds
         machine = contact.machine
         check_controller(scenario)
-        wire = scenario.link.kind == "wire"
-        sets_delay = "delay.steps" if wire else "link.playout"
-        measured = scenario.link.kind == "network" and scenario.link.playout is None
+        link = scenario.link
         with one_blas_thread:
             scenario, read = read_learned(scenario)
             made = design(as_seen(scenario, contact.link, machine), machine, learned or read)
             margin = _margin(made.experiment)
-        return Ready(endpoint, contact, made, margin, sets_delay, measured)
+        return Ready(endpoint, contact, made, margin, link)
     except BaseException:
         endpoint.close()
         raise

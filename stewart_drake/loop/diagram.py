@@ -60,7 +60,7 @@ _TUNER_INPUTS: Final = {
 """Outputs for the optional inputs of a tuner."""
 
 
-class Machine(Diagram):
+class PlantDiagram(Diagram):
     """A diagram with the plant of an experiment."""
 
     experiment: Experiment
@@ -77,7 +77,7 @@ class Machine(Diagram):
         return context
 
 
-class ClosedLoop(Machine):
+class ClosedLoop(PlantDiagram):
     """The closed loop; output ports are named after the signals.
 
     Subsystems, by name: `reference`, `sensor`, `controller`, `delay_chain`, `torque_bias`, `plant`,
@@ -159,7 +159,7 @@ def build_closed_loop(
     return loop
 
 
-def build_machine(experiment: Experiment) -> Machine:
+def build_machine(experiment: Experiment) -> PlantDiagram:
     """Build plant and sensor alone, for torques from elsewhere.
 
     | port | direction | size | unit |
@@ -179,7 +179,7 @@ def build_machine(experiment: Experiment) -> Machine:
     builder.ExportInput(plant.GetInputPort("torque"), "torque")
     builder.ExportOutput(_output(builder, "plant.state"), "state")
     builder.ExportOutput(_output(builder, "sensor.measurement"), "measurement")
-    machine = Machine()
+    machine = PlantDiagram()
     builder.BuildInto(machine)
     machine.set_name("machine")
     machine.experiment = experiment

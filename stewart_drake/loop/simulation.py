@@ -15,7 +15,7 @@ from stewart_drake.dynamics.native_functions import one_blas_thread
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.loop.cautions import cautions_after, cautions_before
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
-from stewart_drake.loop.diagram import ClosedLoop, Machine, build_closed_loop
+from stewart_drake.loop.diagram import ClosedLoop, PlantDiagram, build_closed_loop
 from stewart_drake.loop.exact import set_accuracy
 from stewart_drake.loop.own import OwnLaw, OwnReference, OwnSystem
 from stewart_drake.loop.preparation import Experiment, concrete
@@ -212,7 +212,7 @@ def _shown(simulator: Simulator, live: Live, progress: Progress | None) -> Progr
     return show
 
 
-def make_simulator(machine: Machine) -> Simulator:
+def make_simulator(machine: PlantDiagram) -> Simulator:
     """Return a simulator at the initial context, with the scenario's accuracy."""
     plant = machine.experiment.scenario.plant
     simulator = Simulator(machine, machine.CreateDefaultContext())
@@ -221,7 +221,7 @@ def make_simulator(machine: Machine) -> Simulator:
     return simulator
 
 
-def failure_of(machine: Machine, context: Context) -> Failure:
+def failure_of(machine: PlantDiagram, context: Context) -> Failure:
     """Return why the plant ended its simulation."""
     plant: Any = machine.GetSubsystemByName("plant")
     failure: Failure | None = plant.diagnose(plant.GetMyContextFromRoot(context))

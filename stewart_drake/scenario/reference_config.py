@@ -17,9 +17,13 @@ MOST_TURN: Final = 2 * math.pi
 """Largest |roll| and |yaw| of a motion, rad: a plate on legs turns less."""
 
 
-def degrees_hint(angle: float) -> str:
-    """Return the end of a message about an angle in rad that may be one in degrees."""
-    return " (are these degrees?)" if abs(angle) > math.pi else ""
+def degrees_hint(angle: float, length: float = 0.0) -> str:
+    """Return the end of a message about an angle in rad that may be one in degrees, or ''.
+
+    A length beside it, in m, may then be one in mm.
+    """
+    units = "degrees and mm" if length >= 1 else "degrees"
+    return f" (are these {units}?)" if abs(angle) > math.pi else ""
 
 
 def _angle_problem(offset: list[float], amplitude: list[float]) -> str | None:
@@ -32,9 +36,7 @@ def _angle_problem(offset: list[float], amplitude: list[float]) -> str | None:
     ):
         if middle + swing >= limit:
             field = "amplitude" if swing > middle else "offset"
-            hint = degrees_hint(middle + swing)
-            if hint and max(map(abs, amplitude[3:])) >= 1:
-                hint = " (are these degrees and mm?)"
+            hint = degrees_hint(middle + swing, max(map(abs, amplitude[3:])))
             return (
                 f"reference.{field}: the {name} reaches {middle + swing:.4g} rad; expected "
                 f"|offset| + |amplitude| below {expected}{hint}"

@@ -80,7 +80,13 @@ static const char *why(const machine *m)
     return text;
 }
 
-static void go_safe(machine *m, uint64_t time);
+/* Let the safe torque act from a time on. */
+static void drive_safely(machine *m, uint64_t time)
+{
+    stewart_link_reset(&m->buffer, m->link, (double)time, (board_flags & STEWART_SAFE_HOLDS) != 0);
+    board_drive(time, stewart_link_current(m->link));
+    m->safe = 1;
+}
 
 /* Stop if the plate left its workspace, or the machine failed, by a time: the safe torque acts from then on. */
 static void watch(machine *m, uint64_t time)
@@ -95,7 +101,7 @@ static void watch(machine *m, uint64_t time)
         printf("%s at %.3f s: %s; stopped\n",
                fault.fault == STEWART_DRIVE ? "a fault" : "the plate left its workspace", 1e-9 * (double)left_at,
                why(m));
-        go_safe(m, time);
+        drive_safely(m, time);
     }
     m->time = time > m->time ? time : m->time;
 }
@@ -125,9 +131,7 @@ static void change(machine *m, uint64_t time)
 static void go_safe(machine *m, uint64_t time)
 {
     watch(m, time);
-    stewart_link_reset(&m->buffer, m->link, (double)time, (board_flags & STEWART_SAFE_HOLDS) != 0);
-    board_drive(time, stewart_link_current(m->link));
-    m->safe = 1;
+    drive_safely(m, time);
 }
 
 /* ---------------------------------------------------------------- the run */
