@@ -432,9 +432,9 @@ def test_controller_output_and_forced_update_are_steps_of_the_law(own):
             assert np.array_equal(controller.GetOutputPort(name).Eval(context), value)
 
 
-def short_loop(plant, *settings):
+def short_loop(plant, *settings, controller=None):
     usual = ["duration=1.0", f"plant.kind={plant}", "start=on_reference", "queue=reference"]
-    return build_closed_loop(load_scenario("paper", settings=[*usual, *settings]))
+    return build_closed_loop(load_scenario("paper", controller, [*usual, *settings]))
 
 
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
@@ -475,4 +475,33 @@ def test_two_contexts_of_one_diagram_do_not_know_of_each_other(plant):
     other.AdvanceTo(0.4)
     interrupted.AdvanceTo(0.5)
     for expected, found in zip(outcome(whole), outcome(interrupted), strict=True):
+        assert np.array_equal(expected, found)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ("delay.steps=2", "delay.fraction=0.3"),
+        ("link.kind=network", "link.low=0.1", "link.high=0.2"),
+        ("delay.steps=1", "sensor.kind=encoders", "sensor.delay=0.04", "sensor.samples=2"),
+        ("delay.steps=1", "actuator.kind=servo"),
+    ],
+)
+def test_a_simulator_that_is_initialised_again_takes_no_further_sample(settings):
+    """At the start, between samples, at a sample, and as a new simulator of a cloned context."""
+    controller = "servo_preview" if "actuator.kind=servo" in settings else None
+    loop = short_loop("multibody", *settings, controller=controller)
+    whole, again = make_simulator(loop), make_simulator(loop)
+    again.Initialize()
+    again.Initialize()
+    for time in (0.25, 0.3):
+        again.AdvanceTo(time)
+        again.Initialize()
+    again = Simulator(loop, again.get_context().Clone())
+    for simulator in (whole, again):
+        simulator.AdvanceTo(0.55)
+    for name in ("state", "torque_commanded", "torque_applied"):
+        expected, found = (
+            loop.GetOutputPort(name).Eval(simulator.get_context()) for simulator in (whole, again)
+        )
         assert np.array_equal(expected, found)

@@ -7,6 +7,7 @@ it. A thousand runs would leak up to a gigabyte. `weak` makes callbacks without 
 `dispose` breaks the other circle of a diagram that is no longer needed.
 """
 
+import math
 import time
 import weakref
 from abc import abstractmethod
@@ -75,7 +76,8 @@ def update_every(
 
     The first call is at initialisation, before all periodic events and a plant's first step. Later
     calls come slightly early (`scenario.timing.event_time`). Updates of one instant read the values
-    from before it.
+    from before it. The time of the last call is an abstract state: a simulator that is initialised
+    again in the middle of a run, as after a change of its integrator, makes no further call.
 
     Args:
         system: the system, in its constructor.
@@ -83,11 +85,19 @@ def update_every(
         update: takes a Context and the State to be changed.
         when: the lead, a function in `scenario.timing`.
     """
-    call, early = weak(update), when(positive("period", period))
+    change, early = weak(update), when(positive("period", period))
+    last = int(system.DeclareAbstractState(Value(math.inf)))
+
+    def call(context: Context, state: Any) -> EventStatus:
+        state.get_mutable_abstract_state(last).set_value(context.get_time())
+        change(context, state)
+        return EventStatus.Succeeded()
 
     def first(context: Context, state: Any) -> EventStatus:
-        call(context, state)
-        return EventStatus.Succeeded()
+        called: Any = context.get_abstract_state(last)
+        if called.get_value() <= context.get_time():
+            return EventStatus.DidNothing()
+        return call(context, state)
 
     system.DeclareInitializationUnrestrictedUpdateEvent(first)
     system.DeclarePeriodicUnrestrictedUpdateEvent(early, early, call)
