@@ -9,7 +9,6 @@ from pydrake.trajectories import PiecewisePolynomial
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.loop.link import DelayChain
 from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.mechanism.trajectories import make_reference
 from stewart_drake.scenario.calibration import Calibration, save_calibration
@@ -48,7 +47,7 @@ def test_it_is_the_law_of_the_scenario(fraction):
     own = builder.AddSystem(ConstantVectorSource(law.weights)) if fraction else None
     weights = None if own is None else own.get_output_port()
     controller = law.AddToBuilder(builder, weights=weights)
-    chain = builder.AddSystem(DelayChain(0.1, 4, fraction, law.queue))
+    chain = builder.AddSystem(law.delay_chain())
     builder.Connect(platform.GetOutputPort("state"), controller.GetInputPort("measurement"))
     builder.Connect(controller.GetOutputPort("torque"), chain.get_input_port())
     builder.Connect(chain.get_output_port(), platform.GetInputPort("torque"))
@@ -173,3 +172,8 @@ def test_the_names_to_estimate_are_those_of_the_options_or_of_the_dynamics():
     assert free(usual, free=("payload_mass",)) == ("payload_mass",)
     with pytest.raises(ConfigError, match=r"options.estimate: got torque_bias_1, .* are free"):
         free(["torque_bias"], free=("payload_mass",))
+
+
+def test_motors_that_are_too_weak_for_the_motion_are_warned_of():
+    with pytest.warns(UserWarning, match=r"takes up to .* give 0.5 \(torque_limit\)"):
+        law_of(sd.load_scenario("gravity"), torque_limit=0.5)

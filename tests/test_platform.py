@@ -155,8 +155,9 @@ def test_a_robot_beside_it_does_not_change_its_motion():
     assert np.abs(simulated[:6] - PAPER.home).max() > 1e-3
 
 
-LOADS = {"payload_mass": 0.3, "payload_position": [0.05, -0.03, 0.1], "joint_damping": 0.01}
-LOADS |= {"coulomb_friction": 0.02, "coulomb_speed": 0.5}
+LOADS = {"payload_mass": 0.3, "payload_position": np.array([0.05, -0.03, 0.1])}
+LOADS |= {"joint_damping": 0.01}
+LOADS |= {"coulomb_friction": 0.02, "coulomb_speed": np.float64(0.5)}
 HEAVY = replace(PAPER, plate=replace(PAPER.plate, mass=5.0))
 
 
@@ -229,6 +230,8 @@ def test_derivatives_by_parameters_are_exact():
         ({"payload": 1.0}, "parameter: got 'payload'; expected plate_mass, payload_mass"),
         ({"payload_mass": -1.0}, "payload_mass: got -1"),
         ({"payload_mass": np.nan}, "payload_mass: got nan"),
+        ({"payload_position": 0.1}, "payload_position: got 0.1; expected a list"),
+        ({"plate_mass": "x"}, "plate_mass: got 'x'; expected numbers"),
         ({"plate_mass": 0.0}, "plate.mass: got 0 kg"),
     ],
 )
@@ -308,6 +311,11 @@ def own_plant(builder, finalized, time_step=1e-3):
         (lambda b: set_state(b, [np.nan] * 12), "state: got [nan"),
         (lambda b: set_state(b, [0.0] * 6), "state: got shape (6,)"),
         (lambda b: sd.StewartDynamics("no_such_machine"), "no_such_machine"),
+        (lambda b: sd.ExactPlant("paper"), "dynamics: got 'paper'; expected a StewartDynamics"),
+        (
+            lambda b: sd.AddStewartPlatform(b, PAPER, sd.PlantConfig(ball_joint_friction=0.1)),
+            "plant.ball_joint_friction: got 0.1; expected 0, or plant.kind exact",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(use, message):

@@ -171,23 +171,29 @@ def in_one_line(type_: Any) -> Any:
     names = [one.name for one in dataclasses.fields(type_)]
     make, assign = type_.__init__, type_.__setattr__
 
-    def checked(call: Callable[..., None], given: dict[str, Any], *arguments: Any) -> None:
+    def checked(call: Callable[..., None], given: dict[str, Any]) -> None:
         try:
-            call(*arguments)
+            call()
         except pydantic.ValidationError as caught:
             raise _refusal(type_.__name__, type_, given, caught) from None
 
     @functools.wraps(make)
     def init(self: Any, *args: Any, **kwargs: Any) -> None:
-        given = dict(zip(names, args, strict=False))
-        rest = args[len(names) :]
-        checked(functools.partial(make, self, *rest, **given, **kwargs), given | kwargs)
+        given = {k: _as_list(v) for k, v in (*zip(names, args, strict=False), *kwargs.items())}
+        checked(functools.partial(make, self, *args[len(names) :], **given), given)
 
     def setattr_(self: Any, name: str, value: Any) -> None:
-        checked(assign, {name: value}, self, name, value)
+        checked(functools.partial(assign, self, name, _as_list(value)), {name: value})
 
     type_.__init__, type_.__setattr__ = init, setattr_
     return type_
+
+
+def _as_list(value: Any) -> Any:
+    """Return a tuple or an array of Python as the list that a file has."""
+    if hasattr(value, "tolist"):  # of numpy, which is not imported here
+        return value.tolist()
+    return [_as_list(one) for one in value] if isinstance(value, list | tuple) else value
 
 
 def _refusal(where: str, type_: type, data: Any, caught: pydantic.ValidationError) -> ConfigError:
@@ -302,6 +308,7 @@ _PLAIN: Final = {
     "an object": "a mapping of fields",
     "a valid dictionary": "a mapping",
     "a valid tuple": "a list of numbers",
+    "a valid list": "a list",
     "a valid array": "a list",
     "greater than or equal to": "at least",
     "less than or equal to": "at most",

@@ -9,7 +9,6 @@ from itertools import product
 from typing import Final
 
 from stewart_drake.law.belief import TOLERATED
-from stewart_drake.law.startup import reference_torque
 from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.results import RunSummary
@@ -30,7 +29,7 @@ should, from 5e6 on they are lost or wrong by a hundred times the exact plant's 
 def cautions_before(experiment: Experiment, margin: ControllerMargin | None) -> list[str]:
     """Return the warnings before a run; `margin` is None for a loop that was not judged."""
     said = (
-        *(weak_motors(experiment), stiff_friction(experiment), idle_delay(experiment.scenario)),
+        *(experiment.weak_motors(), stiff_friction(experiment), idle_delay(experiment.scenario)),
         _of_loop(experiment, margin),
     )
     return [line for line in said if line is not None]
@@ -57,22 +56,6 @@ def delays_apart(experiment: Experiment, margin: ControllerMargin) -> str | None
         "the loop is unstable, and its controller assumes the delay of controller.calibration, "
         f"{assumed:.6g} s, where that of the scenario is {sc.eta:.6g} s: expected the same, by "
         "delay.steps and delay.fraction"
-    )
-
-
-def weak_motors(experiment: Experiment) -> str | None:
-    """Return a warning about a motion that takes more torque than the motors give, or None."""
-    sc, limit = experiment.scenario, experiment.torque_limit
-    if math.isinf(limit) or sc.controller.command != "torque":
-        return None
-    needed = reference_torque(experiment.true_dynamics(), experiment.reference, sc.duration)
-    if not needed > limit:  # NaN beyond the reach, where the law keeps the limits
-        return None
-    factor, unit = (1e3, "mN m") if needed < 1 else (1.0, "N m")
-    own = sc.actuator.torque_limit is not None
-    return (
-        f"the motion takes up to {factor * needed:.3g} {unit}, the motors give "
-        f"{factor * limit:.3g} ({'actuator.torque_limit' if own else 'motor.effort_limit'})"
     )
 
 

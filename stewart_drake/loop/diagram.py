@@ -26,7 +26,7 @@ from stewart_drake.loop.controller import (
     ServoController,
     reported,
 )
-from stewart_drake.loop.exact import ExactPlant
+from stewart_drake.loop.exact import ExactPlant, Loads
 from stewart_drake.loop.kinds import LINKS, PLANTS, SENSORS, wire
 from stewart_drake.loop.law_design import control_law, first_queue, followed_motion
 from stewart_drake.loop.link import LateMeasurements
@@ -102,7 +102,9 @@ class ClosedLoop(PlantDiagram):
 
     catch_up: float
 
-    def SetParameters(self, context: Context, **parameters: Any) -> None:
+    def SetParameters(
+        self, context: Context, *, plate_mass: float | None = None, **loads: Unpack[Loads]
+    ) -> None:
         """Change mass, payload and friction of the plant in the root context.
 
         The controller does not know of it. Arguments and errors are those of
@@ -115,9 +117,10 @@ class ClosedLoop(PlantDiagram):
         if (kind := self.experiment.scenario.plant.kind) == "paper":
             raise ConfigError(f"plant.kind: got {kind}; expected exact or multibody")
         if isinstance(plant, ExactPlant):
-            plant.set_parameters(plant.GetMyMutableContextFromRoot(context), **parameters)
+            own = plant.GetMyMutableContextFromRoot(context)
+            plant.set_parameters(own, plate_mass=plate_mass, **loads)
         else:
-            plant.platform.SetParameters(context, **parameters)
+            plant.platform.SetParameters(context, plate_mass=plate_mass, **loads)
 
 
 def build_closed_loop(

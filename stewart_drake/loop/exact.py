@@ -5,6 +5,7 @@
 import math
 import sys
 from dataclasses import replace
+from typing import TypedDict, Unpack
 
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
@@ -22,7 +23,7 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, Limits, Workspace
-from stewart_drake.files.arguments import fixed
+from stewart_drake.files.arguments import fixed, of_kind
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.sampling import weak
 from stewart_drake.mechanism.geometry import Body, Mechanism
@@ -38,25 +39,32 @@ from stewart_drake.scenario.signals import (
 from stewart_drake.scenario.timing import METRIC_PERIOD
 from stewart_drake.types import ArrayLike
 
-CHANGEABLE = (
-    *("payload_mass", "payload_position", "joint_damping"),
-    *("coulomb_friction", "coulomb_speed"),
-)
-"""Fields of `PlantConfig` that `set_parameters` of every plant accepts."""
+
+class Loads(TypedDict, total=False):
+    """Fields of `PlantConfig` that `set_parameters` of every plant accepts."""
+
+    payload_mass: float  # kg
+    payload_position: ArrayLike  # (3,) m, in the plate's frame, from its COM
+    joint_damping: float  # N m s/rad
+    coulomb_friction: float  # N m
+    coulomb_speed: float  # rad/s
 
 
-def checked_loads(loads) -> PlantConfig:
+def checked_loads(loads: Loads) -> PlantConfig:
     """Return the checked changes of a plant's parameters."""
     for name in loads:
-        if name not in CHANGEABLE:
-            expected = ", ".join(("plate_mass", *CHANGEABLE))
+        if name not in Loads.__annotations__:
+            expected = ", ".join(("plate_mass", *Loads.__annotations__))
             raise ConfigError(f"parameter: got {name!r}; expected {expected}")
-    return PlantConfig(**loads)
+    try:
+        return PlantConfig(**loads)
+    except ConfigError as error:
+        raise ConfigError(str(error).replace("PlantConfig: ", "", 1)) from None
 
 
 def plate_of_mass(mechanism: Mechanism, mass: float) -> Body:
     """Return the plate with another mass in kg and the same moments of inertia."""
-    plate = replace(mechanism.plate, mass=float(mass))
+    plate = replace(mechanism.plate, mass=float(fixed("plate_mass", mass, ())))
     if (problem := plate.problem("plate")) is not None:
         raise ConfigError(problem)
     return plate
@@ -87,8 +95,8 @@ def ExactPlant_(T):
         | 0 | 22 | `scenario.signals.PLANT_PARAMETERS`: friction, payload, torque bias and so on |
         | 1 | 4 | mass of the plate, kg, and its moments of inertia, kg m^2 |
 
-        In a diagram of your own, call `set_accuracy` on its simulator. Drake isolates the witness
-        only if the accuracy is set on the context too, and stops with an error otherwise. With
+        In a diagram of your own, call `set_accuracy` on its simulator: without an accuracy in the
+        context Drake stops with an error. With
         AutoDiffXd, derivatives by state, inputs and parameter 0 are exact and end at first order.
 
         Args:
@@ -107,6 +115,7 @@ def ExactPlant_(T):
             converter=None,
         ) -> None:
             super().__init__(converter=converter)
+            of_kind("dynamics", dynamics, StewartDynamics)
             self.dynamics = dynamics
             self.limits = Workspace(dynamics.mechanism) if limits is None else limits
             self._initial = np.concatenate([dynamics.mechanism.home, np.zeros(6)])
@@ -197,13 +206,13 @@ def ExactPlant_(T):
             """Put the plate, in this system's context, into [pose; rates] (12,)."""
             context.SetContinuousState(state)
 
-        def set_parameters(self, context, *, plate_mass=None, **loads) -> None:
+        def set_parameters(self, context, *, plate_mass=None, **loads: Unpack[Loads]) -> None:
             """Change parameters in this system's context; others stay.
 
             Args:
                 context: of this system.
                 plate_mass: kg; the plate's moments of inertia stay.
-                **loads: fields of `PlantConfig`, out of `CHANGEABLE`.
+                **loads: `Loads`.
 
             Raises:
                 ConfigError: another name, or a value out of its bounds.

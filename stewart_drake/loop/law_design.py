@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, NamedTuple
@@ -61,6 +62,7 @@ from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import DelayLqiController, Reference
 from stewart_drake.loop.kinds import LINKS, REPORTS, SENSORS
 from stewart_drake.loop.learned import learned_signal
+from stewart_drake.loop.link import DelayChain
 from stewart_drake.loop.own import Own, own_motion
 from stewart_drake.loop.preparation import (
     Experiment,
@@ -528,6 +530,12 @@ class DesignedLaw:
         motion = followed_motion(self.law, self.planned, self.reference)
         return DelayLqiController(self.law, self.queue, motion)
 
+    def delay_chain(self) -> DelayChain:
+        """Return the delay that the law assumes as a LeafSystem, with `queue` under way."""
+        timeline = self.law.timeline
+        steps, fraction = timeline.delay.steps, timeline.delay.fraction
+        return DelayChain(timeline.period, steps, fraction, self.queue)
+
     def AddToBuilder(
         self,
         builder: DiagramBuilder,
@@ -653,6 +661,8 @@ def design_law(
     check_reach(experiment)
     if outside := diagnose(dynamics.mechanism, 0.0, at[POSE]):
         raise ConfigError(f"start: got a pose where {outside.reason}; expected one within reach")
+    if weak := experiment.weak_motors():
+        warnings.warn(weak.replace("actuator.", ""), stacklevel=2)
     law, planned, _ = control_law(experiment)
     c = scenario.controller
     flying = first_queue(experiment, law)

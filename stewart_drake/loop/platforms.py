@@ -3,7 +3,7 @@
 import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, Final, cast
+from typing import Any, Final, Unpack, cast
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
@@ -43,7 +43,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose, measures_at
 from stewart_drake.files.arguments import fixed, of_kind
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.loop.exact import ExactPlant, checked_loads, plate_of_mass
+from stewart_drake.loop.exact import ExactPlant, Loads, checked_loads, plate_of_mass
 from stewart_drake.loop.sampling import weak
 from stewart_drake.mechanism.assembly import joint_state
 from stewart_drake.mechanism.files import as_mechanism
@@ -318,6 +318,7 @@ class StewartPlatform:
     workspace, as the exact one does, if one of the outputs is used.
 
     Attributes:
+        dynamics: its equations of motion, with its gravity and loads, for `sd.design_law`.
         plant: an `ExactPlant` or a `MultibodyPlant`.
         model: its model in the MultibodyPlant, None for an exact plant.
         scene_graph: added with a MultibodyPlant, else None.
@@ -327,14 +328,15 @@ class StewartPlatform:
         self,
         builder: DiagramBuilder,
         mechanism: Mechanism,
+        config: PlantConfig,
         plant: Any,
         model: ModelInstanceIndex | None = None,
         scene_graph: SceneGraph | None = None,
-        config: PlantConfig | None = None,
     ) -> None:
         self.mechanism, self.plant, self.model = mechanism, plant, model
         self.scene_graph = scene_graph
-        self._builder, self._config = builder, PlantConfig() if config is None else config
+        self.dynamics = StewartDynamics(mechanism, config.gravity, config.parameters)
+        self._builder, self._config = builder, config
         self._added: dict[str, Any] = {}
 
     def __repr__(self) -> str:
@@ -396,7 +398,7 @@ class StewartPlatform:
             set_pose(self.plant, own, self.mechanism, x[POSE], x[RATES], self.model)
 
     def SetParameters(
-        self, context: Context, *, plate_mass: float | None = None, **loads: Any
+        self, context: Context, *, plate_mass: float | None = None, **loads: Unpack[Loads]
     ) -> None:
         """Change mass, payload and friction in the diagram's root context; others stay.
 
@@ -406,8 +408,8 @@ class StewartPlatform:
         Args:
             context: root context.
             plate_mass: kg; the plate's moments of inertia stay.
-            **loads: fields of `PlantConfig`: payload_mass, payload_position, joint_damping,
-                coulomb_friction, coulomb_speed.
+            **loads: payload_mass (kg), payload_position ((3,) m), joint_damping (N m s/rad),
+                coulomb_friction (N m), coulomb_speed (rad/s).
 
         Raises:
             ConfigError: another name, a value out of its bounds, or Coulomb friction of a multibody
@@ -524,6 +526,10 @@ def AddStewartPlatform(
         raise ConfigError(
             "plant.kind: got 'paper', a model without legs; expected 'multibody' or 'exact'"
         )
+    if config.kind == "multibody":
+        for name in ("ball_joint_damping", "ball_joint_friction"):
+            if value := getattr(config, name):
+                raise ConfigError(f"plant.{name}: got {value:g}; expected 0, or plant.kind exact")
     if any(config.push.wrench):
         raise ConfigError(
             f"plant.push.wrench: got {config.push.wrench} for a platform in your own diagram; "
@@ -539,7 +545,7 @@ def AddStewartPlatform(
         dynamics = StewartDynamics(machine, config.gravity, config.parameters)
         exact = ExactPlant(dynamics, np.concatenate([pose, np.zeros(6)]), wrench=True)
         exact.set_name(machine.name)
-        return StewartPlatform(builder, machine, builder.AddSystem(exact))
+        return StewartPlatform(builder, machine, config, builder.AddSystem(exact))
     scene_graph = None
     if plant is not None:
         of_kind("plant", plant, MultibodyPlant)
@@ -570,7 +576,7 @@ def AddStewartPlatform(
         plant.set_gravity_enabled(model, False)
     if own:
         plant.Finalize()
-    return StewartPlatform(builder, machine, plant, model, scene_graph, config)
+    return StewartPlatform(builder, machine, config, plant, model, scene_graph)
 
 
 class MultibodyStewart(Diagram):

@@ -12,7 +12,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics, plant_parameters
 from stewart_drake.dynamics.workspace import Failure, Limits, Workspace, diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
-from stewart_drake.law.startup import STILL, initial_queue, sizes
+from stewart_drake.law.startup import STILL, initial_queue, reference_torque, sizes
 from stewart_drake.loop.own import NOTHING, Own, own_motion, take
 from stewart_drake.machines import reachy_mini  # noqa: F401 registers its kind of reference
 from stewart_drake.mechanism.files import load_mechanism
@@ -137,6 +137,21 @@ class Experiment(NamedTuple):
         parameters = np.array(self.scenario.plant_parameters)
         parameters[BIAS] *= biased
         return type(self.nominal)(self.truth, plant.gravity, parameters)
+
+    def weak_motors(self) -> str | None:
+        """Return a warning about a motion that takes more torque than the motors give, or None."""
+        sc, limit = self.scenario, self.torque_limit
+        if math.isinf(limit) or sc.controller.command != "torque":
+            return None
+        needed = reference_torque(self.true_dynamics(), self.reference, sc.duration)
+        if not needed > limit:  # NaN beyond the reach, where the law keeps the limits
+            return None
+        factor, unit = (1e3, "mN m") if needed < 1 else (1.0, "N m")
+        own = sc.actuator.torque_limit is not None
+        return (
+            f"the motion takes up to {factor * needed:.3g} {unit}, the motors give "
+            f"{factor * limit:.3g} ({'actuator.torque_limit' if own else 'motor.effort_limit'})"
+        )
 
     def torques_in_flight(self, delay: Delay) -> Array:
         """Return the torques (L, 6) in N m in flight at t = 0 for a delay, within the limit."""
