@@ -194,12 +194,15 @@ def test_a_machine_in_c_plays_rows_in_time_on_one_grid_from_the_begin_on(folder)
 @pytest.mark.slow
 @in_real_time
 def test_the_farewell_of_a_machine_in_c_is_not_refused(folder):
-    """It ends when the torques of a sample have come."""
-    port = free_port()
+    """It ends soon after a sample, woken by datagrams of another sender."""
+    port, other = free_port(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     with process(c_controller(folder, port)) as driving:
-        with machine_in_c(folder, "3.001", port=port) as (running, _):
-            assert running.end() == 0
+        with machine_in_c(folder, "3.03", port=port) as (running, _):
+            while running.popen.poll() is None:
+                other.sendto(b"", ("127.0.0.1", port))
+                time.sleep(0.005)
         assert driving.end() == 1
+    other.close()
     assert "the machine was ended after" in driving.said
     assert driving.lines[-1].endswith("0 foreign, 0 replayed, 0 late, 0 rate")
 
