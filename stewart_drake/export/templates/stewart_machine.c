@@ -16,7 +16,8 @@
 #include "udp.h"
 
 #define USAGE "stewart_machine PORT [SECONDS [KEYFILE]]"
-#define WAITING 1024         /* largest number of waiting torques */
+/* Largest number of waiting torques, one a period: for twice the delay of this controller, and four datagrams. */
+#define WAITING (@2 * law.timeline.steps@ + 4 * STEWART_ROWS)
 #define WATCHDOG SECOND      /* ns of silence */
 #define FURTHEST (3600ull * SECOND) /* longest time ahead for a begin or a plan */
 #define STALL (SECOND / 5)   /* delay of the process that is reported, ns */
