@@ -289,10 +289,7 @@ class Machine:
         self._follow(time)
         self._motors.change(time)
         if not self._motors.is_wire and self._motors.dry_for(time) >= self.watchdog:
-            self._motors.safe(time, self._settings.safe == "hold", keeps=True)
-            self._safe = True
-            self._fail(Reason(Fault.DRY, lasted=self.watchdog), time)
-            self._report_safe(time, str(self.reason))
+            self._starve(Fault.DRY, time)
         if self._safe and self._motors.fed:
             self._precede(self.reason, time)
             self._safe, self.reason = False, Reason()
@@ -336,17 +333,21 @@ class Machine:
 
     def _silence(self, time: int) -> None:
         self.counts["silences"] += 1
-        self._go_safe(time)
-        self._fail(Reason(Fault.SILENCE, lasted=self.watchdog), time)
+        self._starve(Fault.SILENCE, time)
+
+    def _starve(self, fault: Fault, time: int) -> None:
+        """Go to the safe torque because nothing usable came for the time of the watchdog."""
+        self._go_safe(time, keeps=fault == Fault.DRY)
+        self._fail(Reason(fault, lasted=self.watchdog), time)
         self._report_safe(time, str(self.reason))
 
     def _report_safe(self, time: int, why: str) -> None:
         safe = f"the safe torque ({self._settings.safe}) acts"
         self._report(time, f"{why}: {'the cranks are held' if self._motors.cranks else safe}")
 
-    def _go_safe(self, time: int) -> None:
+    def _go_safe(self, time: int, keeps: bool = False) -> None:
         self._follow(time)
-        self._motors.safe(time, self._settings.safe == "hold")
+        self._motors.safe(time, self._settings.safe == "hold", keeps)
         self._safe = True
 
     def _refuse(self, refusal: Refusal | None, detail: str = "") -> bool:
