@@ -99,13 +99,14 @@ class Machine:
         if self.begin <= tick:
             rows = {n: (tick - at) // self.period for n, (at, _) in self.plans.items()}
             there = [n for n, row in rows.items() if 0 <= row < len(self.plans[n][1])]
-            self.torque, dry = np.zeros(6), not there or self.safe(tick)
+            self.torque, safe = np.zeros(6), self.safe(tick)
+            dry = not there or safe
             if not dry:
                 newest = max(there)
                 wanted = self.plans[newest][1][rows[newest]]
                 self.torque = np.clip(wanted, -self.limit, self.limit)
             self.played += not dry
-            self.dry += dry and self.played > 0  # counted from the first play-out on
+            self.dry += dry and self.played > 0 and not safe  # from the first play-out on
             self.acted = [self.torque, *self.acted[:7]]
             self.plans = {n: plan for n, plan in self.plans.items() if n in there or rows[n] < 0}
         if self.address is not None:

@@ -24,6 +24,7 @@ from stewart_drake.live.protocol import (
     encode,
 )
 from stewart_drake.live.simulated import Motors, Plan
+from stewart_drake.loop.peer import Fault
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.loading import load_scenario
 from tests.live_driver import Driver, Together
@@ -173,6 +174,55 @@ def test_a_suspended_machine_was_safe_in_time_and_no_torque_acts_in_the_past():
     assert "stood still for" in run.said[-3] and "nothing was heard" in run.said[-2]
     assert times[1] == pytest.approx((heard + run.machine.watchdog) / SECOND, abs=1e-3)
     assert "torques act again" in run.said[-1] and times[2] >= woken / SECOND - 1e-3
+
+
+@pytest.mark.parametrize(("safe", "held"), [("zero", 0.0), ("hold", 1e-4)])
+def test_rows_that_are_always_late_end_in_the_safe_torque(safe, held):
+    """A row in time acts again, also one that waited while the buffer was dry."""
+    run = begun("link={kind: network, low: 0, high: 0, loss: 0}", safe=safe, watchdog=0.5)
+    driver, machine = run.driver, run.machine
+    for k in range(40):
+        time = driver.begin + k * driver.period
+        rows = np.full((1, 6), 1e-4)
+        ahead = 2 if k < 10 else 5 if k == 16 else -5
+        driver.say(time, sampled=time, playout=time + ahead * driver.period, torques=rows)
+        run.at(time + driver.period - 1)
+        assert machine._safe == (17 <= k < 21 or k >= 27), k
+        if machine._safe:
+            assert str(machine.reason) == "no torque or setpoint came in time for 0.5 s"
+            np.testing.assert_array_equal(torque_of(run), held)
+    assert run.ear.refused == {Refusal.LATE: 29} and machine.counts["silences"] == 0
+    times = [m.acted_from for m in messages(run) if m.begin <= m.sampled and len(m.acted)]
+    assert not np.any(np.array(times) % driver.period)
+
+
+def test_rows_for_times_before_the_begin_do_nothing():
+    run = together(EXACT, "link={kind: network, low: 0, high: 0, loss: 0}", "queue=equilibrium")
+    driver, period = run.driver, run.driver.period
+    run.greet(3 * period, 20 * period)
+    for k in range(run.machine.time() // period + 1, 20):
+        run.at(k * period)
+        driver.say(k * period, playout=(k + 2) * period, torques=np.full((3, 6), 1e-4))
+    run.at(26 * period)
+    early = [m for m in messages(run) if m.sampled < driver.begin]
+    assert early and not any(len(m.acted) for m in early)
+    last = driver.got[-1]
+    assert last.played == 4 and last.before.fault == Fault.NONE
+    assert len(last.acted) == 6 and np.all(last.acted == 1e-4)
+    assert run.ear.refused[Refusal.LATE] > 0 and run.machine.counts["stood still"] == 0
+
+
+def test_rows_off_the_grid_of_those_before_are_malformed():
+    run = begun("link={kind: network, low: 0, high: 0, loss: 0}")
+    driver, period = run.driver, run.driver.period
+    for k, shift in enumerate([0.25, 0.25, 0.75, 0.0, 0.25]):
+        time = driver.begin + k * period
+        playout = time + round((1 + shift) * period)
+        driver.say(time, sampled=time, playout=playout, torques=np.full((1, 6), 1e-4))
+        run.at(time + period)
+    assert run.ear.refused == {Refusal.MALFORMED: 2}
+    run.at(time + 3 * period)
+    assert messages(run)[-1].played == 3
 
 
 def test_stop_is_the_safe_torque_and_the_end_of_the_session():

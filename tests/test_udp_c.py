@@ -7,14 +7,15 @@ import subprocess
 import threading
 import time
 
+import numpy as np
 import pytest
 
 from stewart_drake.live.endpoint import LONGEST_KEY, SHORTEST_KEY, now
-from stewart_drake.live.protocol import ControllerMessage, MachineMessage, encode
+from stewart_drake.live.protocol import ControllerMessage, MachineFlags, MachineMessage, encode
 from stewart_drake.loop.peer import FAULTS, Fault
 from stewart_drake.scenario.loading import load_scenario
 from tests.building import make
-from tests.live_driver import Driver
+from tests.live_driver import Driver, in_real_time
 from tests.test_machine_process import (
     DRAKE,
     SETTINGS,
@@ -142,6 +143,70 @@ def test_a_machine_in_c_is_not_locked_by_replayed_requests(folder, tmp_path):
     assert connected == sum("a session begins" in line for line in running.lines) == 4
 
 
+def greeted(port):
+    """Return a driver to which a machine has offered a session."""
+    driver = Driver(load_scenario("paper", settings=SETTINGS), ("127.0.0.1", port))
+    while not driver.session.nonce:
+        driver.say(now())
+        time.sleep(0.1)
+        driver.receive(now())
+    return driver
+
+
+@pytest.mark.slow
+@in_real_time
+def test_a_machine_in_c_plays_rows_in_time_on_one_grid_from_the_begin_on(folder):
+    """As the one in Python, see tests/test_machine.py. Without such a row it goes safe."""
+
+    def send(number, ahead):
+        """Send a row at each of a number of measurements, for `ahead` periods after it."""
+        for _ in range(number):
+            before = len(driver.got)
+            while len(driver.got) == before:
+                time.sleep(0.002)
+                driver.receive(now())
+            sampled = driver.got[-1].sampled
+            playout = sampled + round(ahead * driver.period)
+            driver.say(now(), sampled=sampled, playout=playout, torques=np.full((1, 6), 1e-4))
+        return driver.got[-1]
+
+    with machine_in_c(folder) as (running, port):
+        driver = greeted(port)
+        driver.begin = (driver.got[-1].head.time // driver.period + 10) * driver.period
+        driver.say(now())
+        assert send(5, 2).flags & MachineFlags.PARKED
+        while send(1, 2).sampled < driver.begin:
+            pass
+        last = send(3, 2)
+        assert last.before.fault == Fault.NONE and last.acted_from >= driver.begin
+        assert last.played <= 4 and last.refused >= 5
+        refused = send(2, 2).refused
+        last = send(2, 2.5)
+        assert last.refused >= refused + 1 and last.acted_from % driver.period == 0
+        last = send(16, -5)
+        assert last.reason.fault == Fault.DRY and MachineFlags.SAFE in last.flags
+        assert not last.acted[0].any()
+        assert MachineFlags.SAFE not in send(5, 2).flags
+    assert "no torque or setpoint came in time for 1 s: the safe torque acts" in running.said
+    assert re.search(r"refused: 2 malformed, .* 2\d late, 0 rate", running.lines[-1])
+
+
+@pytest.mark.slow
+@in_real_time
+def test_the_farewell_of_a_machine_in_c_is_not_refused(folder):
+    """It ends soon after a sample, woken by datagrams of another sender."""
+    port, other = free_port(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    with process(c_controller(folder, port)) as driving:
+        with machine_in_c(folder, "3.03", port=port) as (running, _):
+            while running.popen.poll() is None:
+                other.sendto(b"", ("127.0.0.1", port))
+                time.sleep(0.005)
+        assert driving.end() == 1
+    other.close()
+    assert "the machine was ended after" in driving.said
+    assert driving.lines[-1].endswith("0 foreign, 0 replayed, 0 late, 0 rate")
+
+
 @pytest.mark.slow
 def test_a_machine_in_c_says_why_it_stopped(folder):
     """Silence and its end, in its datagrams; a controller of version 1 is told the version."""
@@ -154,11 +219,7 @@ def test_a_machine_in_c_says_why_it_stopped(folder):
         answer = old.recv(2000)
         old.close()
         assert len(answer) == 60 and answer[:5] == b"STWM\3"
-        driver = Driver(load_scenario("paper", settings=SETTINGS), ("127.0.0.1", port))
-        while not driver.session.nonce:
-            driver.say(now())
-            time.sleep(0.1)
-            driver.receive(now())
+        driver = greeted(port)
         driver.begin = driver.got[-1].head.time + 4 * driver.period
         driver.say(now())
         running.until("nothing was heard from the controller for 1 s: the safe torque acts")

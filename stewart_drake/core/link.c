@@ -150,6 +150,7 @@ void stewart_link_change(const stewart_link *link, double *memory, double time)
         memory[STEWART_LINK_NEWEST] = best[SEQUENCE];
         memory[STEWART_LINK_FED] = best[SEQUENCE] > 0; /* else it was preloaded */
         memory[STEWART_LINK_PLAYED] += best[SEQUENCE] > 0;
+        memory[STEWART_LINK_SUPPLIED] = time + link->period;
     } else if (!link->is_wire) {
         memory[STEWART_LINK_DRY]++;
         memory[STEWART_LINK_FED] = 0;
@@ -163,11 +164,17 @@ void stewart_link_change(const stewart_link *link, double *memory, double time)
     }
 }
 
-void stewart_link_reset(const stewart_link *link, double *memory, double time, int holds)
+void stewart_link_reset(const stewart_link *link, double *memory, double time, int holds, int keeps)
 {
-    memory[STEWART_LINK_WAITING] = memory[STEWART_LINK_COUNTS] = memory[STEWART_LINK_FED] = 0;
-    memory[STEWART_LINK_NEWEST] = -(double)HUGE_VAL; /* a new session counts anew */
+    memory[STEWART_LINK_COUNTS] = memory[STEWART_LINK_FED] = 0;
+    if (!keeps) {
+        memory[STEWART_LINK_WAITING] = 0;
+        memory[STEWART_LINK_NEWEST] = -(double)HUGE_VAL; /* a new session counts anew */
+    }
     if (time > memory[STEWART_LINK_LAST])
         memory[STEWART_LINK_LAST] = time;
-    act(link, memory, holds ? stewart_link_current(memory) : NULL, time);
+    if (acted(memory)[0] != time)
+        act(link, memory, holds ? stewart_link_current(memory) : NULL, time);
+    else if (!holds) /* in place of what has acted for no time */
+        memset(acted(memory) + 1, 0, (size_t)link->size * sizeof(double));
 }

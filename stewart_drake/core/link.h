@@ -36,6 +36,7 @@ enum {
     STEWART_LINK_FED,      /* 1 if the acting command came from `take` */
     STEWART_LINK_PLAYED,   /* number of commands from `take` that have acted */
     STEWART_LINK_DRY,      /* number of periods of a buffer without a command */
+    STEWART_LINK_SUPPLIED, /* end of the period of the last command */
     STEWART_LINK_OFFERED,  /* number of plans that found room, late ones too */
     STEWART_LINK_WAITING,  /* number of waiting commands */
     STEWART_LINK_ACTED,    /* number of past commands in memory, at most `history` */
@@ -73,8 +74,9 @@ double stewart_link_next(const stewart_link *link, const double *memory);
    A buffer without one goes dry: it holds the last command, or puts out zero. */
 void stewart_link_change(const stewart_link *link, double *memory, double time);
 
-/* Drop the waiting commands. Until another is taken, hold the last command (`holds`) or put out zero. */
-void stewart_link_reset(const stewart_link *link, double *memory, double time, int holds);
+/* Hold the last command (`holds`) or put out zero until another command acts. Drop the waiting commands
+   unless `keeps`. */
+void stewart_link_reset(const stewart_link *link, double *memory, double time, int holds, int keeps);
 
 /* Return the acting command (size). */
 const double *stewart_link_current(const double *memory);

@@ -93,9 +93,9 @@ class Link:
         """Let the newest command that is due at a time act; a buffer without one goes dry."""
         self._call("change", memory, time)
 
-    def reset(self, memory: Array, time: float, holds: bool) -> None:
-        """Drop waiting commands, and hold the last command or put out zero."""
-        self._call("reset", memory, time, holds)
+    def reset(self, memory: Array, time: float, holds: bool, keeps: bool = False) -> None:
+        """Hold the last command or put out zero; drop the waiting commands unless `keeps`."""
+        self._call("reset", memory, time, holds, keeps)
 
     def acted(self, memory: Array) -> Array:
         """Return a view (h, 1 + size) of past commands, each after its time, the newest first."""

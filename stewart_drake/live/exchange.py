@@ -148,7 +148,8 @@ class Exchange:
 
     def _take(self, message: MachineMessage) -> None:
         """Keep a measurement until its sample."""
-        if message.begin == NEVER or message.sampled < message.begin:
+        ended = message.reason.fault == Fault.ENDED  # it is of no sample
+        if message.begin == NEVER or message.sampled < message.begin or ended:
             return
         values, refuse = message.values, self.contact.endpoint.refuse
         if values is not None and values.size != self._size:

@@ -128,6 +128,7 @@ class Machine:
         self._body: Body = self._make()
         self._motors: Motors = self._new_motors()
         self.begin = self._origin = NEVER
+        self._phase: int | None = None
         self.failure: Failure | None = None
         self._running = False
         self.reason = self.before = Reason()
@@ -273,7 +274,7 @@ class Machine:
         if time != self.begin or self._running:
             return
         if not self._alive(time):
-            self.begin = NEVER
+            self.begin, self._motors = NEVER, self._new_motors()
             self._say("no controller was heard at the begin of the run: still parked")
             return
         sc, delay = self._experiment.scenario, self._experiment.scenario.true_delay
@@ -287,6 +288,8 @@ class Machine:
     def _change(self, time: int) -> None:
         self._follow(time)
         self._motors.change(time)
+        if not self._motors.is_wire and self._motors.dry_for(time) >= self.watchdog:
+            self._starve(Fault.DRY, time)
         if self._safe and self._motors.fed:
             self._precede(self.reason, time)
             self._safe, self.reason = False, Reason()
@@ -330,17 +333,21 @@ class Machine:
 
     def _silence(self, time: int) -> None:
         self.counts["silences"] += 1
-        self._go_safe(time)
-        self._fail(Reason(Fault.SILENCE, lasted=self.watchdog), time)
+        self._starve(Fault.SILENCE, time)
+
+    def _starve(self, fault: Fault, time: int) -> None:
+        """Go to the safe torque because nothing usable came for the time of the watchdog."""
+        self._go_safe(time, keeps=fault == Fault.DRY)
+        self._fail(Reason(fault, lasted=self.watchdog), time)
         self._report_safe(time, str(self.reason))
 
     def _report_safe(self, time: int, why: str) -> None:
         safe = f"the safe torque ({self._settings.safe}) acts"
         self._report(time, f"{why}: {'the cranks are held' if self._motors.cranks else safe}")
 
-    def _go_safe(self, time: int) -> None:
+    def _go_safe(self, time: int, keeps: bool = False) -> None:
         self._follow(time)
-        self._motors.safe(time, self._settings.safe == "hold")
+        self._motors.safe(time, self._settings.safe == "hold", keeps)
         self._safe = True
 
     def _refuse(self, refusal: Refusal | None, detail: str = "") -> bool:
@@ -404,7 +411,7 @@ class Machine:
         else:
             self._go_safe(time)
             self.reason = self.before = Reason()
-        self.begin = NEVER
+        self.begin, self._phase = NEVER, None
         self._report(time, f"session {self.counts['sessions']}, of {host}:{port}, {where}")
 
     def _obey(self, message: ControllerMessage, time: int) -> None:
@@ -432,10 +439,22 @@ class Machine:
         if len(message.torques) and message.cranks != self._motors.cranks:
             self._refuse(Refusal.MALFORMED, "torques for servos, or crank angles for motors")
         elif self.failure is None and self.begin != NEVER and len(message.torques):
-            sample = max(0, round((message.sampled - self.begin) / self.period))
-            rows = message.torques
-            plan = Plan(message.head.sequence, message.sampled, sample, message.playout, rows)
-            self._refuse(self._motors.take(plan, time))
+            self._refuse(*self._take(message, time))
+
+    def _take(self, message: ControllerMessage, time: int) -> tuple[Refusal | None, str]:
+        """Take the rows of a message; return why they are refused, or None.
+
+        The first rows of a session that are taken set the phase of the changes of the torque.
+        """
+        phase = message.playout % self.period
+        if not self._motors.is_wire and self._phase not in (None, phase):
+            return Refusal.MALFORMED, "a playout off the grid of the rows before it"
+        sample = max(0, round((message.sampled - self.begin) / self.period))
+        numbers = message.sampled, sample, message.playout, message.torques
+        refusal = self._motors.take(Plan(message.head.sequence, *numbers), time, self.begin)
+        if refusal is None:
+            self._phase = phase
+        return refusal, ""
 
     # -------------------------------------------------------------- messages
 

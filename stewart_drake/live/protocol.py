@@ -100,7 +100,7 @@ class MachineFlags(IntFlag):
     RUNNING = 4
     """The run has begun and torques act."""
     SAFE = 8
-    """The safe torque acts, after a silence of `watchdog` or a stop of the controller."""
+    """The safe torque acts: after a stop, or `watchdog` without a datagram or a row in time."""
     LEFT = 16
     """The plate has left its workspace; the machine has stopped."""
     HOLDS = 32

@@ -150,12 +150,21 @@ class Motors:
         self._begun = True
         self._link.preload(self._memory, queue.playout, queue.torques)
 
-    def take(self, plan: Plan, time: int) -> Refusal | None:
-        """Take a plan that has arrived; return why it is refused, or None."""
-        first = plan.playout
+    def take(self, plan: Plan, time: int, begin: int = 0) -> Refusal | None:
+        """Take the rows of a plan from `begin` on; return why it is refused, or None.
+
+        The plan has arrived at `time`.
+        """
+        first, since = plan.playout, max(time, begin)
         if self._delay_of is not None:
             first = max(time, plan.sampled + self._delay_of(plan.sample))
-        return _REFUSALS[self._link.take(self._memory, time, plan.sequence, first, plan.torques)]
+            if first < begin:
+                return Refusal.LATE
+        return _REFUSALS[self._link.take(self._memory, since, plan.sequence, first, plan.torques)]
+
+    def dry_for(self, time: int) -> int:
+        """Return for how long the buffer has been dry at a change of the torque, ns."""
+        return time - self._number("supplied")
 
     @property
     def next_change(self) -> int:
@@ -167,9 +176,9 @@ class Motors:
         """Change the torque at `next_change`."""
         self._link.change(self._memory, time)
 
-    def safe(self, time: int, holds: bool) -> None:
-        """Drop what waits; hold the torque, or output zero, until the next plan."""
-        self._link.reset(self._memory, time, holds or self.cranks)
+    def safe(self, time: int, holds: bool, keeps: bool = False) -> None:
+        """Hold the torque, or output zero, until the next row; drop what waits unless `keeps`."""
+        self._link.reset(self._memory, time, holds or self.cranks, keeps)
 
 
 def first_rows(experiment: Experiment) -> Array:

@@ -36,6 +36,7 @@ class Fault(IntEnum):
     STOOD = 8
     ENDED = 9
     DRIVE = 10
+    DRY = 11
 
 
 FAULTS: Final = {
@@ -50,6 +51,7 @@ FAULTS: Final = {
     Fault.STOOD: "the machine stood still for {:.2f} s",
     Fault.ENDED: "the machine was ended",
     Fault.DRIVE: "a drive of the machine failed",
+    Fault.DRY: "no torque or setpoint came in time for {:g} s",
 }
 """Texts of the faults, for `live`, its page, `machine` and C. The number is the leg or s."""
 

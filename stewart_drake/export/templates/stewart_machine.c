@@ -16,7 +16,8 @@
 #include "udp.h"
 
 #define USAGE "stewart_machine PORT [SECONDS [KEYFILE]]"
-#define WAITING 1024         /* largest number of waiting torques */
+/* Largest number of waiting torques, one a period: for twice the delay of this controller, and four datagrams. */
+#define WAITING (@2 * law.timeline.steps@ + 4 * STEWART_ROWS)
 #define WATCHDOG SECOND      /* ns of silence */
 #define FURTHEST (3600ull * SECOND) /* longest time ahead for a begin or a plan */
 #define STALL (SECOND / 5)   /* delay of the process that is reported, ns */
@@ -42,6 +43,7 @@ typedef struct {
     stewart_link buffer;
     double link[LINK];
     uint64_t begin, sample;
+    uint64_t phase; /* ns from a multiple of the period to a change of the torque */
     int running, safe, left;
     stewart_reason reason, before; /* why torques do not act, and the fault before that */
     uint64_t preceded, stalled_until; /* time of `before`; end of the last stall */
@@ -80,10 +82,10 @@ static const char *why(const machine *m)
     return text;
 }
 
-/* Let the safe torque act from a time on. */
-static void drive_safely(machine *m, uint64_t time)
+/* Let the safe torque act from a time on, until the next row does; empty the buffer unless `keeps`. */
+static void drive_safely(machine *m, uint64_t time, int keeps)
 {
-    stewart_link_reset(&m->buffer, m->link, (double)time, (board_flags & STEWART_SAFE_HOLDS) != 0);
+    stewart_link_reset(&m->buffer, m->link, (double)time, (board_flags & STEWART_SAFE_HOLDS) != 0, keeps);
     board_drive(time, stewart_link_current(m->link));
     m->safe = 1;
 }
@@ -101,7 +103,7 @@ static void watch(machine *m, uint64_t time)
         printf("%s at %.3f s: %s; stopped\n",
                fault.fault == STEWART_DRIVE ? "a fault" : "the plate left its workspace", 1e-9 * (double)left_at,
                why(m));
-        drive_safely(m, time);
+        drive_safely(m, time, 0);
     }
     m->time = time > m->time ? time : m->time;
 }
@@ -114,12 +116,24 @@ static uint64_t next_change(const machine *m)
     return isfinite(next) ? (uint64_t)next : STEWART_NEVER;
 }
 
+/* Go to the safe torque because nothing usable came from the controller for the time of the watchdog. */
+static void starve(machine *m, uint8_t fault, uint64_t time, int keeps)
+{
+    drive_safely(m, time, keeps);
+    fail(m, fault, 0, WATCHDOG, time);
+    printf("%s: the safe torque acts at %.3f s\n", why(m), 1e-9 * (double)time);
+}
+
 static void change(machine *m, uint64_t time)
 {
     watch(m, time);
     if (m->left)
         return;
     stewart_link_change(&m->buffer, m->link, (double)time);
+    if ((double)time >= m->link[STEWART_LINK_SUPPLIED] + (double)WATCHDOG) {
+        starve(m, STEWART_DRY, time, 1);
+        return;
+    }
     board_drive(time, stewart_link_current(m->link));
     if (m->safe && m->link[STEWART_LINK_FED] > 0) {
         precede(m, m->reason, time);
@@ -131,7 +145,7 @@ static void change(machine *m, uint64_t time)
 static void go_safe(machine *m, uint64_t time)
 {
     watch(m, time);
-    drive_safely(m, time);
+    drive_safely(m, time, 0);
 }
 
 /* ---------------------------------------------------------------- the run */
@@ -140,7 +154,7 @@ static void put_back(machine *m)
 {
     board_park();
     stewart_link_start(&m->buffer, m->link);
-    m->begin = STEWART_NEVER;
+    m->begin = m->phase = STEWART_NEVER;
     m->running = m->safe = m->left = 0;
     m->preceded = 0;
     m->reason = m->before = (stewart_reason){0, 0, 0};
@@ -156,6 +170,7 @@ static void begin(machine *m)
     if (!alive(m, m->begin)) {
         printf("no controller was heard at the begin of the run: still parked\n");
         m->begin = STEWART_NEVER;
+        stewart_link_start(&m->buffer, m->link); /* what waits is for times before the next begin */
         return;
     }
     const stewart_law *c = &stewart_configuration;
@@ -163,13 +178,15 @@ static void begin(machine *m)
     /* The torque of sample k acts from sample k + steps + fraction on. The oldest one in a queue of steps + 1 rows is
        of k = -steps - 1: it has acted since before the begin. */
     double oldest_acts = ((double)c->fraction - (number > c->steps)) * (double)m->period; /* ns from the begin */
-    static double torques[STEWART_MOTORS * WAITING];
+    double first = floor((double)m->begin + oldest_acts + 0.5), torque[STEWART_MOTORS];
     m->time = m->begin;
     m->running = 1;
     board_release(m->begin);
-    for (int i = 0; i < STEWART_MOTORS * number; i++) /* in flight; a real machine has nothing */
-        torques[i] = (double)stewart_queue[i];
-    stewart_link_preload(&m->buffer, m->link, floor((double)m->begin + oldest_acts + 0.5), number, torques);
+    for (int row = 0; row < number; row++) { /* in flight; a real machine has nothing */
+        for (int i = 0; i < STEWART_MOTORS; i++)
+            torque[i] = (double)stewart_queue[STEWART_MOTORS * row + i];
+        stewart_link_preload(&m->buffer, m->link, first + row * (double)m->period, 1, torque);
+    }
     printf("the run began at %.3f s\n", 1e-9 * (double)m->begin);
 }
 
@@ -268,10 +285,16 @@ static int plan_ahead(machine *m, const stewart_plan *plan, uint64_t now)
         m->begin = (asked + m->period - 1) / m->period * m->period;
     }
     static const int causes[] = {STEWART_TAKEN, STEWART_MALFORMED, STEWART_LATE};
-    if (m->left)
+    if (m->left || !plan->rows)
         return STEWART_TAKEN;
-    return causes[stewart_link_take(&m->buffer, m->link, (double)now, (double)plan->head.sequence, 0,
-                                    (double)plan->playout, (int)plan->rows, plan->torques[0])];
+    /* The first rows that are taken set the phase. */
+    const uint64_t phase = plan->playout % m->period, since = now > m->begin ? now : m->begin;
+    if (m->phase != STEWART_NEVER && m->phase != phase)
+        return STEWART_MALFORMED;
+    int cause = causes[stewart_link_take(&m->buffer, m->link, (double)since, (double)plan->head.sequence, 0,
+                                         (double)plan->playout, (int)plan->rows, plan->torques[0])];
+    m->phase = cause ? m->phase : phase;
+    return cause;
 }
 
 static int obey(machine *m, const stewart_plan *plan, uint64_t now)
@@ -360,9 +383,8 @@ static uint64_t advance(machine *m, uint64_t now)
         }
         if (next == silent) {
             m->silences++;
-            go_safe(m, silent);
-            fail(m, STEWART_SILENCE, 0, WATCHDOG, silent);
-            printf("%s: the safe torque acts at %.3f s\n", why(m), 1e-9 * (double)silent);
+            watch(m, silent);
+            starve(m, STEWART_SILENCE, silent, 0);
         } else if (next == starts) {
             begin(m);
         } else if (next == m->sample) {

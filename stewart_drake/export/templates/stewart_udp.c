@@ -257,7 +257,8 @@ static int keep(controller *c, const stewart_measured *m)
 {
     double values[STEWART_VALUES];
     int number = stewart_values(m, values);
-    if (c->period == 0 || m->begin != c->begin || m->sampled < m->begin)
+    const int farewell = m->reason.fault == STEWART_ENDED; /* its measurement is of no sample */
+    if (c->period == 0 || m->begin != c->begin || m->sampled < m->begin || farewell)
         return STEWART_TAKEN;
     uint64_t sample = (m->sampled - m->begin + c->period / 2) / c->period;
     if ((number && number != STEWART_MEASURED) || sample > c->samples + FURTHEST)
