@@ -104,6 +104,20 @@ static void run(oddity o)
     expect(isfinite(memory[l->state.at]), "the state is no number at the end", -1);
 }
 
+/* A step on memory that nobody started. */
+static void forget_start(real value)
+{
+    const stewart_law *law = &stewart_configuration;
+    real torque[STEWART_MOTORS], measurement[STEWART_MEASURED] = {0}, limited[STEWART_MOTORS];
+    stewart_sample sample = {.measurement = measurement, .reference = ask, .weights = {1, 1}};
+    for (int i = 0; i < STEWART_MEMORY; i++)
+        memory[i] = value;
+    expect(stewart_step(law, memory, scratch, &sample, torque) == STEWART_NOT_STARTED, "started", 0);
+    stewart_limit(&law->machine, torque, limited);
+    for (int i = 0; i < STEWART_MOTORS; i++)
+        expect(torque[i] == 0 && limited[i] == 0, "a torque without a start", i);
+}
+
 int main(void)
 {
     const stewart_law *law = &stewart_configuration;
@@ -113,6 +127,8 @@ int main(void)
         measurement[i] = (real)NAN;
     start();
     stewart_step(law, memory, scratch, &first, torque);
+    for (int v = 0; v < ODD; v++)
+        forget_start(odd[v]);
     for (int v = 0; v < ODD; v++)
         for (int at = 0; at < 2; at++) {
             oddity o = none;
