@@ -1,7 +1,6 @@
 /* The configuration of one controller. */
 
-#ifndef STEWART_CONFIG_H
-#define STEWART_CONFIG_H
+#pragma once
 
 #include "@"tuner" if tuner else "servo" if servos else "law"@.h"
 
@@ -22,5 +21,3 @@ extern const int stewart_queue_rows;
 extern const stewart_tuner stewart_own_tuner;
 #define STEWART_TUNER_MEMORY @tuner_memory@ /* numbers that the tuner remembers */
 {% endif %}
-
-#endif
