@@ -108,7 +108,7 @@ static void run(oddity o)
 static void forget_start(real value)
 {
     const stewart_law *law = &stewart_configuration;
-    real torque[STEWART_MOTORS], measurement[STEWART_MEASURED] = {0}, limited[STEWART_MOTORS];
+    real torque[STEWART_MOTORS], measurement[STEWART_MEASUREMENT_SIZE] = {0}, limited[STEWART_MOTORS];
     stewart_sample sample = {.measurement = measurement, .reference = ask, .weights = {1, 1}};
     for (int i = 0; i < STEWART_MEMORY; i++)
         memory[i] = value;
@@ -121,9 +121,9 @@ static void forget_start(real value)
 int main(void)
 {
     const stewart_law *law = &stewart_configuration;
-    real torque[STEWART_MOTORS], row[STEWART_REFERENCE], measurement[STEWART_MEASURED];
+    real torque[STEWART_MOTORS], row[STEWART_REFERENCE], measurement[STEWART_MEASUREMENT_SIZE];
     stewart_sample first = {.measurement = measurement, .reference = ask, .weights = {1, 1}};
-    for (int i = 0; i < STEWART_MEASURED; i++)
+    for (int i = 0; i < STEWART_MEASUREMENT_SIZE; i++)
         measurement[i] = (real)NAN;
     start();
     stewart_step(law, memory, scratch, &first, torque);

@@ -6,7 +6,7 @@
 
 #define STEWART_MEMORY @memory@ /* numbers of the state that the law keeps between samples */
 #define STEWART_SCRATCH @scratch@ /* numbers of the workspace of a step */
-#define STEWART_MEASURED @sizes.num_values@ /* numbers of a measurement */
+#define STEWART_MEASUREMENT_SIZE @sizes.num_values@ /* numbers of a measurement */
 #define STEWART_LONGEST_GAP @gap@ /* s without a usable measurement, then stop safely */
 #define STEWART_PREVIEW @sizes.rows@ /* largest number of instants of a preview */
 
