@@ -104,15 +104,31 @@ static void run(oddity o)
     expect(isfinite(memory[l->state.at]), "the state is no number at the end", -1);
 }
 
+/* A step on memory that nobody started. */
+static void forget_start(real value)
+{
+    const stewart_law *law = &stewart_configuration;
+    real torque[STEWART_MOTORS], measurement[STEWART_MEASUREMENT_SIZE] = {0}, limited[STEWART_MOTORS];
+    stewart_sample sample = {.measurement = measurement, .reference = ask, .weights = {1, 1}};
+    for (int i = 0; i < STEWART_MEMORY; i++)
+        memory[i] = value;
+    expect(stewart_step(law, memory, scratch, &sample, torque) == STEWART_NOT_STARTED, "started", 0);
+    stewart_limit(&law->machine, torque, limited);
+    for (int i = 0; i < STEWART_MOTORS; i++)
+        expect(torque[i] == 0 && limited[i] == 0, "a torque without a start", i);
+}
+
 int main(void)
 {
     const stewart_law *law = &stewart_configuration;
-    real torque[STEWART_MOTORS], row[STEWART_REFERENCE], measurement[STEWART_MEASURED];
+    real torque[STEWART_MOTORS], row[STEWART_REFERENCE], measurement[STEWART_MEASUREMENT_SIZE];
     stewart_sample first = {.measurement = measurement, .reference = ask, .weights = {1, 1}};
-    for (int i = 0; i < STEWART_MEASURED; i++)
+    for (int i = 0; i < STEWART_MEASUREMENT_SIZE; i++)
         measurement[i] = (real)NAN;
     start();
     stewart_step(law, memory, scratch, &first, torque);
+    for (int v = 0; v < ODD; v++)
+        forget_start(odd[v]);
     for (int v = 0; v < ODD; v++)
         for (int at = 0; at < 2; at++) {
             oddity o = none;

@@ -20,6 +20,7 @@ from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.law_design import compose_law, control_law
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import compose_servo_law
+from stewart_drake.loop.tuner import weights_source
 from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.types import Array
@@ -478,6 +479,37 @@ def test_a_missing_preview_over_a_network_leaves_the_torques_as_they_are():
             peak[name, k < 40] = max(peak.get((name, k < 40), 0.0), size)
     for name in ("python", "core"):
         assert peak[name, False] < 2 * peak[name, True]
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf, 1e300])
+@pytest.mark.parametrize("settings", [(), ("tuner.kind=rule",), ("actuator.kind=servo",)])
+def test_memory_that_was_never_started_gives_zeros(settings, value):
+    controller = "servo_preview" if "actuator.kind=servo" in settings else None
+    experiment, c = prepare(load_scenario("paper", controller, settings)), core()
+    servos = controller is not None
+    law = (compose_servo_law if servos else compose_law)(experiment)
+    compiled = CompiledLaw(law)
+    y, rows = experiment.start.copy(), np.zeros((len(law.preview_times), 18))
+    sample = c.ffi.new("stewart_sample *", {"measurement": c.at(y), "context": c.at(rows)})
+    sample.reference, sample.weights = c.lib.stewart_given_rows, [1.0, 1.0]
+    memory, scratch = np.full(compiled.data.memory, value), np.zeros(100_000)
+    before, output = memory.copy(), np.full(18 if servos else 6, np.nan)
+    given = c.at(memory), c.at(scratch), sample
+    if servos:
+        report = np.zeros(law.reports.size)
+        status = c.lib.stewart_servo_step(compiled.data, *given, c.at(report), c.at(output))
+    elif settings:
+        tuner = weights_source(experiment, law).compiled.pointer
+        own = np.full(c.lib.stewart_tuner_memory(tuner), np.nan)
+        c.lib.stewart_tuner_start(tuner, c.at(own))
+        status = c.lib.stewart_tuned_step(
+            *(compiled.data, tuner, c.at(memory), c.at(own), c.at(scratch), sample),
+            *(c.at(rows[0]), c.at(output)),
+        )
+    else:
+        status = c.lib.stewart_step(compiled.data, *given, c.at(output))
+    assert status == c.lib.STEWART_NOT_STARTED and np.array_equal(output, np.zeros_like(output))
+    assert np.array_equal(memory, before, equal_nan=True)
 
 
 def test_a_measurement_that_is_too_old_or_repeated_is_missing():

@@ -25,7 +25,7 @@ from stewart_drake.cli.options import command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.reporting.document import PAGE, Caution
-from stewart_drake.reporting.terminal import count_bar, echo, progress_bars
+from stewart_drake.reporting.terminal import count_bar, echo, phase_bar, progress_bars
 from stewart_drake.scenario.loading import load_compatible
 
 if TYPE_CHECKING:
@@ -165,7 +165,9 @@ def export_c(
     from stewart_drake.export.controller import changed
 
     check_writable(out)
-    files = sd.export_c(chosen.scenario, out, *chosen[1:], single=single)
+    with phase_bar("export-c", False) as show:
+        show("simulating the run, compiling and replaying it")
+        files = sd.export_c(chosen.scenario, out, *chosen[1:], single=single)
     echo(f"written to {out}: {len(files)} files; make test replays the run")
     if kept := changed(out):
         echo(f"kept, as changed since the last export: {', '.join(kept)}; delete to write anew")

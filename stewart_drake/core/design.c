@@ -205,7 +205,7 @@ int stewart_gain(const stewart_cost *cost, real period, real fraction, const rea
     m.Q = stewart_take(&scratch, n * n);
     m.R = stewart_take(&scratch, U * U);
     sample(cost, period, fraction, weights, A, B, &m, scratch);
-    return solve_gain(&m, fraction > 0, K, scratch);
+    return solve_gain(&m, fraction > 0, K, scratch) ? 0 : STEWART_RICCATI_FAILURE;
 }
 
 void stewart_feed_back(const stewart_cost *cost, const real *K, const real *error,

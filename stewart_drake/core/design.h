@@ -43,7 +43,8 @@ int stewart_linearize(const stewart_machine *machine, const real *theta, real pe
                       const real *state, const stewart_feedforward *held, real *A, real *B, real *error,
                       stewart_scratch scratch);
 
-/* Gain K (6, order) of a linear model, for weights w_Q and w_R. Returns 0 where there is none. */
+/* Compute the gain K (6, order) of a linear model, for weights w_Q and w_R. Returns 0, or the cause of
+   failure. */
 int stewart_gain(const stewart_cost *cost, real period, real fraction, const real *A, const real *B,
                  const real *weights, real *K, stewart_scratch scratch);
 

@@ -6,7 +6,7 @@
 
 #define STEWART_PARAMETERS 22 /* of the equations, see scenario/signals.py */
 #define STEWART_GEOMETRY 133 /* numbers of a machine, see core/layout.py */
-#define STEWART_MEASURES 8   /* of the workspace */
+#define STEWART_NUM_MEASURES 8   /* of the workspace */
 
 typedef struct stewart_joint_friction stewart_joint_friction;
 

@@ -119,7 +119,7 @@ static int newton(const real *geometry, const real *angles, real *pose, stewart_
 /* Sign of the measure of parallel singularity. */
 static int side_of(const real *geometry, const real *pose)
 {
-    real measures[STEWART_MEASURES];
+    real measures[STEWART_NUM_MEASURES];
     stewart_measures(geometry, pose, NULL, measures);
     return (measures[LEGS] > 0) - (measures[LEGS] < 0);
 }

@@ -52,6 +52,7 @@ void stewart_prepare(stewart_law *law)
     l->channel = place(law, 1, law->channel ? law->channel->memory(law) : 0);
     l->planner = place(law, 1, law->planner ? law->planner->memory(law) : 0);
     l->counts = place(law, 1, STEWART_CAUSES);
+    l->started = place(law, 1, 1);
 }
 
 static void copy_finite_torque(const real *torque, real *to)
@@ -86,6 +87,7 @@ void stewart_start(const stewart_law *law, real *memory, int number, const real 
     memory[l->gap.at] = 0;
     stewart_fill(X + 2, 0, memory + l->blend.at);
     stewart_fill(STEWART_CAUSES, 0, memory + l->counts.at);
+    memory[l->started.at] = STEWART_STARTED;
 }
 
 void stewart_note_acted(const stewart_law *law, real *memory, int ago, int number, const real *torques)
@@ -315,9 +317,9 @@ int stewart_design_feedback(const stewart_law *law, const stewart_outlook *outlo
     real *A = stewart_take(&scratch, X * X), *B = stewart_take(&scratch, X * U);
     const int failure =
         stewart_linearize(&law->machine, theta, h, fraction, state, &held, A, B, error, scratch);
-    if (failure || !weights || stewart_gain(&law->cost, h, fraction, A, B, weights, K, scratch))
+    if (failure || !weights)
         return failure;
-    return STEWART_RICCATI_FAILURE;
+    return stewart_gain(&law->cost, h, fraction, A, B, weights, K, scratch);
 }
 
 /* Whether the last good gain has n numbers; under another delay it may have more or fewer. */
@@ -438,6 +440,10 @@ int stewart_step(const stewart_law *law, real *memory, real *scratch_memory,
     stewart_outlook outlook;
     stewart_predicted ahead;
     stewart_course c;
+    if (memory[l->started.at] != STEWART_STARTED) {
+        stewart_fill(U, 0, torque);
+        return STEWART_NOT_STARTED;
+    }
     if (law->channel)
         law->channel->update(law, sent, sample->report, in_flight, scratch);
     estimate(law, memory, sample, &outlook, &scratch);

@@ -17,6 +17,7 @@
 #pragma once
 
 #define STEWART_REPORTED 10 /* periods in a report of torques, at the most */
+#define STEWART_STARTED 22499 /* in memory that was started; any number that others hardly have */
 
 #include "design.h"
 #include "observer.h"
@@ -49,6 +50,7 @@ typedef struct {
     stewart_field channel;     /* packets that were sent */
     stewart_field planner;     /* memory of the planner */
     stewart_field counts;      /* samples with each bit of `stewart_status` */
+    stewart_field started;     /* STEWART_STARTED */
 } stewart_layout;
 
 /* Prediction to the time at which the next torque begins to act; a channel plans further torques from it. */
@@ -123,11 +125,11 @@ struct stewart_law {
     int memory;        /* numbers of the memory; `stewart_prepare` sets this and `layout` */
     stewart_layout layout;
     const stewart_observer *observer;
-    const stewart_design *design;     /* NULL: prediction and gain of the core */
+    const stewart_design *design;     /* prediction and gain in Python; NULL in an export */
     const void *estimation;           /* settings of the observer */
     const void *sensing;              /* settings of the sensor, argument of `make_sensing` */
     stewart_sensing (*make_sensing)(const void *sensing);
-    const stewart_sensing *own_sensing; /* a sensor model in Python, or NULL */
+    const stewart_sensing *own_sensing; /* a sensor model in Python; NULL in an export */
     const stewart_channel *channel;   /* NULL: every torque arrives, after the delay */
     const stewart_packets *packets;   /* settings of the channel */
     const stewart_planner *planner;   /* NULL: the law follows the caller's reference */

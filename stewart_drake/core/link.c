@@ -10,14 +10,16 @@ static int width(const stewart_link *link) { return COMMAND + link->size; }
 
 static double *acted(double *memory) { return memory + STEWART_LINK_COMMANDS; }
 
-static double *waiting(const stewart_link *link, double *memory)
+static int waiting_at(const stewart_link *link)
 {
-    return acted(memory) + link->history * (1 + link->size);
+    return STEWART_LINK_COMMANDS + link->history * (1 + link->size);
 }
+
+static double *waiting(const stewart_link *link, double *memory) { return memory + waiting_at(link); }
 
 int stewart_link_memory(const stewart_link *link)
 {
-    return STEWART_LINK_COMMANDS + link->history * (1 + link->size) + link->max_waiting * width(link);
+    return waiting_at(link) + link->max_waiting * width(link);
 }
 
 void stewart_link_start(const stewart_link *link, double *memory)
@@ -122,7 +124,7 @@ int stewart_link_take(const stewart_link *link, double *memory, double now, doub
 
 double stewart_link_next(const stewart_link *link, const double *memory)
 {
-    const double *row = waiting(link, (double *)memory);
+    const double *row = memory + waiting_at(link);
     double next = HUGE_VAL;
     for (int i = 0; i < (int)memory[STEWART_LINK_WAITING]; i++, row += width(link))
         if (row[AT] < next)

@@ -23,7 +23,7 @@ typedef struct stewart_machine {
     int place[STEWART_MAX_ESTIMATED];    /* of each of them in `parameters`, or -1 */
     const real *acceleration_per_torque; /* (6, 6), of a machine with accelerations = this (torque + bias) at
                                             any pose; NULL: the equations of motion */
-    const struct stewart_own_machine *own; /* motion and limit in Python; NULL: of the core */
+    const struct stewart_own_machine *own; /* motion and limit in Python; NULL in an export */
 } stewart_machine;
 
 /* Torque schedule: torques that act one after the other, each for its duration. */

@@ -16,7 +16,8 @@ enum stewart_status {
     STEWART_MEASUREMENT_REJECTED = 32, /* not one of the machine, or an outlier */
     STEWART_SATURATED = 64,           /* a torque is at the limit */
     STEWART_REFERENCE_MISSING = 128,  /* NaN or infinity in the preview, filled in */
-    STEWART_MEASUREMENT_PARTIAL = 256 /* with a bit of a measurement: a part of it was used; not counted */
+    STEWART_MEASUREMENT_PARTIAL = 256, /* with a bit of a measurement: a part of it was used; not counted */
+    STEWART_NOT_STARTED = 512 /* alone: the memory was never started, the output is zero; not counted */
 };
 #define STEWART_CAUSES 8 /* number of bits that are counted */
 #define STEWART_CAUSES_AT 3 /* shift from a `fault` of `stewart_sensing` to these bits */

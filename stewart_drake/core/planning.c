@@ -20,10 +20,10 @@
 
 real stewart_margin(const real *geometry, const real *pose, real sign, const real *least)
 {
-    real measures[STEWART_MEASURES], margin = (real)HUGE_VAL;
+    real measures[STEWART_NUM_MEASURES], margin = (real)HUGE_VAL;
     stewart_measures(geometry, pose, NULL, measures);
     measures[6] *= sign;
-    for (int i = 0; i < STEWART_MEASURES; i++) {
+    for (int i = 0; i < STEWART_NUM_MEASURES; i++) {
         const real above = measures[i] - least[i];
         if (above < margin || isnan(above))
             margin = above;
@@ -197,7 +197,7 @@ static void guess(const real *start, const real *end, Plan *p)
 
 static int is_inside(const Plan *p, const real *pose)
 {
-    static const real least[STEWART_MEASURES] = { /* dynamics/workspace.py */
+    static const real least[STEWART_NUM_MEASURES] = { /* dynamics/workspace.py */
         (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)0.01, (real)1e-3,
         (real)-1.4835298641951802};
     return stewart_margin(p->model->plant.geometry, pose, p->sign, least) > 0;

@@ -24,7 +24,7 @@ int stewart_within_reach(const real *geometry, const real *pose, int strictly)
 
 int stewart_is_workable(const real *geometry, const real *pose)
 {
-    real measures[STEWART_MEASURES];
+    real measures[STEWART_NUM_MEASURES];
     if (!stewart_within_reach(geometry, pose, 1))
         return 0;
     stewart_measures(geometry, pose, NULL, measures);

@@ -30,6 +30,7 @@ void stewart_servo_prepare(stewart_servo *servo)
     l->torque = place(servo, U);
     l->in_flight = place(servo, U);
     l->counts = place(servo, STEWART_CAUSES);
+    l->started = place(servo, 1);
 }
 
 int stewart_servo_scratch(const stewart_servo *servo)
@@ -53,6 +54,7 @@ void stewart_servo_start(const stewart_servo *servo, real *memory, const real *c
     const stewart_servo_layout *l = &servo->layout;
     stewart_fill(servo->memory, 0, memory);
     stewart_copy(STEWART_COMMAND, command, memory + l->command.at);
+    memory[l->started.at] = STEWART_STARTED;
     servo->law.observer->start(&servo->law, memory + l->observer.at);
     stewart_fill(servo->law.num_values, (real)NAN, memory + l->measurement.at);
     take_estimate(servo, memory);
@@ -161,6 +163,10 @@ int stewart_servo_step(const stewart_servo *servo, real *memory, real *scratch_m
     const stewart_law *law = &servo->law;
     const stewart_servo_layout *l = &servo->layout;
     const stewart_scratch scratch = {scratch_memory};
+    if (memory[l->started.at] != STEWART_STARTED) {
+        stewart_fill(STEWART_COMMAND, 0, command);
+        return STEWART_NOT_STARTED;
+    }
     const real ahead = servo->stiff.stiffness > 0 ? (real)0.5 : 1;
     const real time = ((real)law->steps + law->fraction + ahead) * law->period;
     const int lag = (int)memory[l->lag.at] + 1;

@@ -31,6 +31,7 @@ typedef struct {
     stewart_field torque;      /* torque of the servos at their last report, before the limit */
     stewart_field in_flight;   /* the same within the limit */
     stewart_field counts;      /* samples with each bit of `stewart_status` */
+    stewart_field started;     /* STEWART_STARTED */
 } stewart_servo_layout;
 
 /* Servos given by their stiffness; k = 0: the other kind. */

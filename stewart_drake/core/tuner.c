@@ -381,6 +381,8 @@ int stewart_tuned_step(const stewart_law *law, const stewart_tuner *t, real *mem
     int fell_back = stewart_decide(t, tuner_memory, sample->weights);
     stewart_copy(law->memory, memory, before);
     int status = stewart_step(law, memory, scratch.next, sample, torque);
+    if (status == STEWART_NOT_STARTED)
+        return status;
     stewart_tuner_input input = {
         .machine = &law->machine,
         .state = before + l->state.at,

@@ -34,7 +34,7 @@ from stewart_drake.law.core_law import CompiledLaw
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ServoPreview
-from stewart_drake.loop.controller_margin import controller_margin
+from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.peer import FAULTS, MOST_ROWS, MOST_SAMPLES, identity_of
 from stewart_drake.loop.preparation import Experiment, prepare
@@ -96,11 +96,25 @@ MILLIONS: Final = {
     "estimator": (2.9, 8.2),
     "network": (5.0, 5.5),
     "delay estimator": (3.0, 42.0),
+    "servos": (0.03, 0.03),
+    "servos, estimator": (5.8, 140.0),
 }
-"""Million instructions of a step of `paper`, median and most, from the table of `make board`.
+"""Million instructions of a step, median and most, from the table of `make board`.
 
-That table lacks the most of the last kind: it is of a new search for the delay.
+That table lacks the most of a delay estimator: it is of a new search for the delay. Servos are
+those of `reachy_mini`, other kinds control `paper`.
 """
+STACKS: Final = {
+    "plain": 13,
+    "estimator": 14,
+    "network": 14,
+    "delay estimator": 17,
+    "servos": 5,
+    "servos, estimator": 14,
+}
+"""Stack of a step in double precision, kB, from the same table."""
+TIGHT: Final = 1e-4, 0.01
+"""Errors of the delay, s, and of motor gains; a warning if a loop is unstable within them."""
 _MACHINE: Final[Accepted] = {
     "sensor.kind": "state",
     "actuator.kind": "torque",
@@ -179,9 +193,14 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "least": LEAST,
         "home_sign": home_sign(experiment.mechanism),
         "clock": CLOCKS[single],
+        "single": single,
+        "mechanism": Path(str(scenario.mechanism)).name,
+        "machine": compiled.torques_law.machine,
         "period_ms": 1e3 * law.timeline.period,
     }
-    values["millions"] = MILLIONS[_kind(values)]
+    kind = _kind(values)
+    values |= {"millions": MILLIONS[kind], "stack": STACKS[kind]}
+    values["clocked"] = "reachy_mini" if servos else "paper"
     if tuner is not None:
         values |= _tuner(tuner, compiled, recorded, experiment, suffix)
     if has_motion:
@@ -193,8 +212,19 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     environment = _environment(suffix)
     files |= {name: environment.get_template(name).render(values) for name in templates - {README}}
     values["measured_sizes"] = _sizes(files) if measured else _UNMEASURED
-    values["stability"] = loop_verdict(controller_margin(experiment)) if measured else ""
+    margin = controller_margin(experiment) if measured and not servos else None
+    values["stability"] = "" if margin is None else loop_verdict(margin)
+    values["tight"] = margin is not None and _is_tight(margin)
     return files | {README: environment.get_template(README).render(values)}
+
+
+def _is_tight(margin: ControllerMargin) -> bool:
+    """Whether a small error of the delay or of the motors' gain makes a stable loop unstable."""
+    delay, gain = TIGHT
+    m = margin.margins
+    return bool(margin.stable) and (
+        margin.delay_margin < delay or m.gain_down > 1 - gain or m.gain_up < 1 + gain
+    )
 
 
 def _described(scenario: Scenario) -> str:
@@ -213,6 +243,8 @@ def _without_folders(data: Any) -> Any:
 
 def _kind(values: Mapping[str, Any]) -> str:
     """Return the kind of a law in MILLIONS, from the values of the templates."""
+    if values["servos"]:
+        return "servos" if values["law"].observer.settings is None else "servos, estimator"
     if values["finds_delay"]:
         return "delay estimator"
     if values["network"]:

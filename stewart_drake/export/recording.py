@@ -147,6 +147,8 @@ def record(scenario: Scenario) -> Recorded:
     result = simulate(scenario, modify_law=recorded, judge_stability=False)
     if result.failure is not None:
         raise ConfigError(
-            f"scenario: {result.failure}; expected one whose run the test can replay to its end"
+            f"scenario: {result.failure}; expected one whose run the test can replay to its end. "
+            "`simulate` loses it, too: try queue=reference with a shorter delay.steps or "
+            "controller.period"
         )
     return found[-1]

@@ -28,7 +28,7 @@ PACKAGES: Final = {
     "make": "make",
 }
 """Debian's packages of each command."""
-OPTIMISED: Final = "-O2 -ffunction-sections -fdata-sections"
+OPTIMISED: Final = "-O2"
 HEADER: Final = (
     *("controller", "processor", "flash, kB", "state, B", "workspace, B", "stack, B"),
     *("million instructions per step, median", "most", "most, ms", "error / peak"),
@@ -61,9 +61,10 @@ class Row:
 
     Attributes:
         name: in the table.
-        settings: of `paper`; the plant is exact.
+        settings: of the scenario; the plant is exact.
         median, most: bounds of a step, in million instructions.
         workspace: bound, in bytes.
+        scenario, controller: names; None is the scenario's own controller.
     """
 
     name: str
@@ -72,6 +73,8 @@ class Row:
     median: float = float("inf")
     most: float = float("inf")
     workspace: float = float("inf")
+    scenario: str = "paper"
+    controller: str | None = None
 
 
 OUTLIERS: Final = "sensor.faults=[{kind: spike, size: 0.02, share: 0.3, from: 3.0, to: 10.0}]"
@@ -80,6 +83,9 @@ WITHOUT: Final = ("controller.estimate=[]",)
 ENCODERS: Final = ("sensor.kind=encoders",)
 DELAY: Final = ("controller.delay_estimator=constant", "controller.delay_steps=6")
 NETWORK: Final = ("link.kind=network", "link.loss=0.1")
+SHORT: Final = ("duration=2.0",)
+SERVOS: Final = {"scenario": "reachy_mini"}
+LEARNS: Final = {**SERVOS, "controller": "servo_feedforward"}
 ROWS: Final = (
     Row("ideal", M7, median=2.1, workspace=67248),
     Row("ideal, outliers", M7, (*FOLLOWS, OUTLIERS), most=5),
@@ -91,6 +97,8 @@ ROWS: Final = (
     Row("delay estimator", M7, DELAY, most=20),
     Row("delay estimator", M4, DELAY),
     Row("network", M7, NETWORK),
+    Row("servos", M7, SHORT, **SERVOS),
+    Row("servos, estimator", M7, SHORT, **LEARNS),
 )
 
 
@@ -140,12 +148,12 @@ def counted(row: Row, folder: Path) -> Counted:
     """Export, compile without a warning, and replay."""
     processor = row.processor
     settings = ("plant.kind=exact", *row.settings)
-    scenario = load_scenario("paper", settings=settings)
+    scenario = load_scenario(row.scenario, row.controller, settings)
     export_c.write(export_c.exported(scenario, processor.single, measured=False), folder)
     for name in ("startup", "meter"):
         shutil.copy(HERE / f"{name}.c", folder / f"board_{name}.c")
     compiler = f"arm-none-eabi-gcc -mthumb {processor.options}"
-    link = f"-nostartfiles --specs=rdimon.specs -T {HERE / 'mps2.ld'} -Wl,--gc-sections"
+    link = f"-nostartfiles --specs=rdimon.specs -T {HERE / 'mps2.ld'}"
     emulator = (
         f"qemu-system-arm -M {processor.machine} -icount shift=0 -display none -monitor none "
         "-serial none -semihosting-config enable=on,target=native -kernel"

@@ -23,7 +23,7 @@ static struct {
 static stewart_reason left(void)
 {
     stewart_reason fault = {STEWART_NO_FAULT, 0, 0};
-    real measures[STEWART_MEASURES];
+    real measures[STEWART_NUM_MEASURES];
     int worst = 0;
     for (int i = 0; i < STEWART_STATES; i++)
         if (!isfinite(plate.state[i]))

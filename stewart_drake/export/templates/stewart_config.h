@@ -1,13 +1,12 @@
 /* The configuration of one controller. */
 
-#ifndef STEWART_CONFIG_H
-#define STEWART_CONFIG_H
+#pragma once
 
 #include "@"tuner" if tuner else "servo" if servos else "law"@.h"
 
 #define STEWART_MEMORY @memory@ /* numbers of the state that the law keeps between samples */
 #define STEWART_SCRATCH @scratch@ /* numbers of the workspace of a step */
-#define STEWART_MEASURED @sizes.num_values@ /* numbers of a measurement */
+#define STEWART_MEASUREMENT_SIZE @sizes.num_values@ /* numbers of a measurement */
 #define STEWART_LONGEST_GAP @gap@ /* s without a usable measurement, then stop safely */
 #define STEWART_PREVIEW @sizes.rows@ /* largest number of instants of a preview */
 
@@ -22,5 +21,3 @@ extern const int stewart_queue_rows;
 extern const stewart_tuner stewart_own_tuner;
 #define STEWART_TUNER_MEMORY @tuner_memory@ /* numbers that the tuner remembers */
 {% endif %}
-
-#endif

@@ -4,7 +4,7 @@
 
 const real stewart_weights[2] = @scenario.controller.weights|c@;
 const real stewart_first_state[STEWART_STATES] = @experiment.start|c@;
-const real stewart_least[STEWART_MEASURES] = @least|c@;
+const real stewart_least[STEWART_NUM_MEASURES] = @least|c@;
 const real stewart_home_sign = @home_sign|c@;
 const stewart_identity stewart_own_identity = {{
 {% for part in identity %}

@@ -8,7 +8,7 @@
 
 extern const real stewart_weights[2];                  /* of errors and of torques */
 extern const real stewart_first_state[STEWART_STATES]; /* of the plate */
-extern const real stewart_least[STEWART_MEASURES];     /* lower limits of the workspace measures */
+extern const real stewart_least[STEWART_NUM_MEASURES];     /* lower limits of the workspace measures */
 extern const real stewart_home_sign;                   /* of the measure of parallel singularity */
 
 /* Identity that both sides must agree on. */

@@ -16,7 +16,7 @@
 #endif
 #define TOLERANCE @tolerance@
 
-static const real measurement[STEPS][STEWART_MEASURED] = {
+static const real measurement[STEPS][STEWART_MEASUREMENT_SIZE] = {
     @steps|map(attribute="measurement")|rows@};
 static const int age[STEPS] = {@steps|map(attribute="age")|join(", ")@};
 

@@ -61,7 +61,7 @@ typedef struct {
 typedef struct {
     int there, measured; /* whether a datagram is there, and a measurement in it */
     unsigned sample;
-    double values[STEWART_MEASURED];
+    double values[STEWART_MEASUREMENT_SIZE];
 } kept_measurement;
 
 typedef struct {
@@ -93,12 +93,12 @@ typedef struct {
     uint32_t flags;
     unsigned refused[STEWART_REFUSALS];
     @"stewart_servo" if servos else "stewart_law"@ law; /* within the machine's torque limit */
-    real memory[STEWART_MEMORY], scratch[STEWART_SCRATCH], measured[STEWART_MEASURED];
+    real memory[STEWART_MEMORY], scratch[STEWART_SCRATCH], measured[STEWART_MEASUREMENT_SIZE];
 {% if network %}
     real arrived[KEPT], told[KEPT][STEWART_MOTORS];
     stewart_report report; /* of these */
 {% else %}
-    real ahead[STEWART_MEMORY], nothing[STEWART_MEASURED]; /* for plans: a copy, and NaN */
+    real ahead[STEWART_MEMORY], nothing[STEWART_MEASUREMENT_SIZE]; /* for plans: a copy, and NaN */
 {% endif %}
 {% if tuner %}
     real tuner[STEWART_TUNER_MEMORY];
@@ -261,7 +261,7 @@ static int keep(controller *c, const stewart_measured *m)
     if (c->period == 0 || m->begin != c->begin || m->sampled < m->begin || farewell)
         return STEWART_TAKEN;
     uint64_t sample = (m->sampled - m->begin + c->period / 2) / c->period;
-    if ((number && number != STEWART_MEASURED) || sample > c->samples + FURTHEST)
+    if ((number && number != STEWART_MEASUREMENT_SIZE) || sample > c->samples + FURTHEST)
         return STEWART_MALFORMED;
     kept_measurement *kept = &c->came[sample % KEPT];
     if (LONGEST_WAIT == 0 && sample < c->samples)
@@ -328,14 +328,14 @@ static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playou
 static int take(controller *c, unsigned k)
 {
     int age = @-1 if network else 0@, found = 0;
-    for (int i = 0; i < STEWART_MEASURED; i++)
+    for (int i = 0; i < STEWART_MEASUREMENT_SIZE; i++)
         c->measured[i] = (real)NAN;
     for (int a = 0; !found && a <= LONGEST_WAIT && (unsigned)a + c->next <= k; a++) {
         const kept_measurement *kept = &c->came[(k - (unsigned)a) % KEPT];
         if (!kept->there || kept->sample != k - (unsigned)a)
             continue;
         found = kept->measured;
-        for (int i = 0; found && i < STEWART_MEASURED; i++)
+        for (int i = 0; found && i < STEWART_MEASUREMENT_SIZE; i++)
             c->measured[i] = (real)kept->values[i];
 {% if network %}
         age = age < 0 || found ? a : age;
@@ -486,7 +486,7 @@ static void note(const controller *c, double t, int age)
 {
     const real *sent = newest_row(c, c->memory);
     fprintf(c->log, "%.9g", t);
-    for (int i = @"STEWART_MEASURED - STEWART_MOTORS" if encoders else "0"@; i < STEWART_MEASURED; i++)
+    for (int i = @"STEWART_MEASUREMENT_SIZE - STEWART_MOTORS" if encoders else "0"@; i < STEWART_MEASUREMENT_SIZE; i++)
         fprintf(c->log, ",%.17g", (double)c->measured[i]);
     for (int i = 0; i < STEWART_MOTORS; i++)
         fprintf(c->log, ",%.17g", (double)sent[i]);
@@ -763,7 +763,7 @@ int main(int argc, char **argv)
 {% if network %}
     c.checked = -1;
 {% else %}
-    for (int i = 0; i < STEWART_MEASURED; i++)
+    for (int i = 0; i < STEWART_MEASUREMENT_SIZE; i++)
         c.nothing[i] = (real)NAN;
 {% endif %}
     for (unsigned i = 0; i < KEPT; i++)
