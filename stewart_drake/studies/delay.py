@@ -149,7 +149,12 @@ class DelayStudy:
         if not self.poles:
             return None
         worst = max(self.poles, key=lambda point: point.moving)
-        return Verdict(self.eta, worst.moving, worst.time)
+        return Verdict(
+            self.eta,
+            worst.moving,
+            worst.time,
+            self.assessment.experiment.scenario.controller.period,
+        )
 
     @property
     def loop(self) -> LoopMargins | None:
