@@ -102,7 +102,7 @@ def test_delay_of_the_paper(tmp_path, capsys):
 def test_delay_under_gravity(tmp_path, capsys):
     summary, _, told = analyze(capsys, "delay", tmp_path, *settings("plant.gravity=true"))
     assert summary["beatable"] == "no"
-    assert "The delay of 0.8 s cannot be compensated: under any controller," in told
+    assert "The delay of 0.8 s (8 periods) cannot be compensated: under any controller," in told
     checks = summary["growth_checks"]
     assert len(checks) == 5
     for check in checks:

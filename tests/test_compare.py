@@ -60,7 +60,8 @@ def test_a_warning_names_its_controllers_by_one_word_each(results):
     runs = {
         name: replace(results["lqr"], summary={"warnings": texts}) for name, texts in about.items()
     }
-    assert _shared_warnings(runs) == ["all", "lqi, delay_lqi: one"]
+    assert _shared_warnings(runs, []) == ["all runs: all", "lqi, delay_lqi: one"]
+    assert _shared_warnings(runs, ["all", "one"]) == ["lqi, delay_lqi: one"]
 
 
 def test_a_lost_run_of_a_stable_loop_is_explained(results):
@@ -168,7 +169,7 @@ def test_a_controller_that_assumes_no_delay_keeps_none(how, tmp_path):
         (["lqi", "lqi"], "controllers: got 'lqi' twice; expected different names"),
         (["nothing"], "controller: got 'nothing'; expected one of adaptive_lqi, "),
         (["a/lqi.yaml"], "controllers: got 'a/lqi.yaml', named as a shipped controller"),
-        ([], "controllers: got \\[\\]; expected a list of names or files, or a mapping"),
+        ([], "controllers: got \\[\\]; expected a list of names, files, or mappings"),
         ("lqi", "controllers: got 'lqi'; expected a list"),
         ([7], "controllers: got 7; expected a list"),
     ],

@@ -243,7 +243,7 @@ def test_the_first_line_is_about_the_loop(capsys, monkeypatch):
     first, *others = capsys.readouterr().out.splitlines()
     assert first.startswith("This loop is unstable: linearised along the reference")
     alone = " ".join("".join(others).split())
-    assert "The delay of 0.8 s can be compensated: under any controller" in alone
+    assert "The delay of 0.8 s (8 periods) can be compensated: under any controller" in alone
     run = ["simulate", "paper", "--controller", "lqi", "--set", "plant.kind=exact"]
     assert main(run) == 0
     first, *others = capsys.readouterr().out.splitlines()

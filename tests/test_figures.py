@@ -98,13 +98,14 @@ def test_a_diverging_run_does_not_squash_the_others_and_ends_with_a_cross(compar
     shown = drawn["states"].axes[0]
     motion = np.rad2deg(np.ptp(run.reference.values[:, 0]))
     assert np.ptp(limits(shown)) < 2 * motion
-    crosses = [line for line in shown.lines if line.get_marker() == "x"]
+    crosses = [line for line in shown.lines if line.get_marker() in ("v", "^")]
     assert [line.get_xdata()[0] for line in crosses] == [0.43]
     assert limits(shown)[0] <= crosses[0].get_ydata()[0] <= limits(shown)[1]
     title = drawn["states"].legends[0].get_title().get_text()
     assert title.endswith(f": 1 of {len(comparison)} runs ended early")
     legend = [text.get_text() for text in drawn["states"].legends[0].get_texts()]
-    assert legend == ["reference", *(LABELS[name] for name in CONTROLLERS), "run ended"]
+    assert legend == ["reference", *(LABELS[name] for name in CONTROLLERS), legend[-1]]
+    assert legend[-1] == "run ended (triangle: beyond the axis)"
 
 
 def test_the_title_of_torques_has_the_largest_and_its_motor(comparison):

@@ -115,21 +115,9 @@ def test_a_name_and_an_option_of_0_2_lead_to_todays():
             "ranges: payload: got 2.0; expected less than 1",
         ),
         (lambda: sd.analyze_robustness("paper", also=["adaptive"]), "controller: got 'adaptive'"),
-        (
-            lambda: sd.analyze_robustness(sd.Scenario(), also=["lqi"]),
-            "scenario: got a Scenario with the controller 'lqi'; expected a name",
-        ),
         (lambda: sd.identify("log.csv", "paper", delay=np.nan), "delay: got nan"),
         (lambda: sd.identify("run.nc", "paper", gravity=False), "gravity: got False with logs of"),
         (lambda: sd.setpoints("reachy_mini", units="u.yaml"), "units: got u.yaml without out"),
-        (
-            lambda: sd.setpoints(sd.Scenario(), settings=("duration=1",)),
-            "settings: got ('duration=1',) with a Scenario; expected none",
-        ),
-        (
-            lambda: sd.export_c(sd.Scenario(), "none", "lqi"),
-            "controller: got 'lqi' with a Scenario; expected none",
-        ),
         (lambda: sd.linear_models("paper", time="1"), "time: got '1'; expected numbers"),
         (lambda: sd.controller_margin("paper", until=np.nan), "until: got nan; expected"),
     ],
@@ -336,7 +324,7 @@ def test_compare_takes_own_controllers_and_disturbances(tmp_path):
 @pytest.mark.parametrize(
     ("name", "make", "message"),
     [
-        ("controllers", lambda: {"adaptive_lqi": Still}, "got 'adaptive_lqi', a shipped one"),
+        ("controllers", lambda: {"adaptive_lqi": Still}, "got 'adaptive_lqi' for a system"),
         ("disturbance", Push, "got an instance, which serves one run"),
         (
             "reference",

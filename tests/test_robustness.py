@@ -625,6 +625,14 @@ def test_two_causes_that_only_work_together_are_found_as_a_pair(opposite):
         assert "No single quantity is significant for completing." in told
 
 
+def test_no_cause_is_named_from_a_few_failures():
+    noise = sorted(one["noise"] for one in made_up(20).draws)[-4]
+    study = with_failures(lambda one, luck: one["noise"] >= noise, 20)
+    told = told_of(study)
+    assert "Too few failures (4) to name a cause." in told and "4 of 20 runs failed" in told
+    assert "Significant for completing" not in told and study.explanation.found
+
+
 @pytest.mark.slow
 def test_failures_by_chance_are_explained_by_nothing():
     """But for the one in twenty that chance is allowed, for single quantities and for pairs."""

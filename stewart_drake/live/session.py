@@ -143,7 +143,7 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
             contact=contact,
             machine=contact.machine,
             margin=ready.margin,
-            delay=Verdict(ready.margin.eta, ready.margin.pole, ready.margin.pole_time),
+            delay=Verdict.of(ready.margin),
             duration=duration,
             scenario=scenario,
             period=made.experiment.scenario.controller.period,

@@ -46,16 +46,19 @@ def _of_loop(experiment: Experiment, margin: ControllerMargin | None) -> str | N
 
 
 def delays_apart(experiment: Experiment, margin: ControllerMargin) -> str | None:
-    """Return a warning about an unstable loop whose calibrated delay is not the scenario's."""
+    """Return a warning about an unstable loop whose assumed delay is not the scenario's."""
     sc = experiment.scenario
     assumed = believed_delay(sc).eta(sc.controller.period)
-    known = margin.delay_found or sc.controller.delay_steps is not None
-    if margin.stable or known or math.isclose(assumed, sc.eta):
+    chosen, blind = sc.controller.delay_steps is not None, sc.controller.delay_steps == 0
+    if margin.stable or margin.delay_found or blind or math.isclose(assumed, sc.eta):
         return None
+    source, remedy = "controller.calibration", "the same, by delay.steps and delay.fraction"
+    if chosen:
+        source = "controller.delay_steps and controller.delay_fraction"
+        remedy = "the same, as without both, or a controller.delay_estimator"
     return (
-        "the loop is unstable, and its controller assumes the delay of controller.calibration, "
-        f"{assumed:.6g} s, where that of the scenario is {sc.eta:.6g} s: expected the same, by "
-        "delay.steps and delay.fraction"
+        f"the loop is unstable, and its controller assumes the delay of {source}, "
+        f"{assumed:.6g} s, where that of the scenario is {sc.eta:.6g} s: expected {remedy}"
     )
 
 
@@ -141,11 +144,17 @@ def overconfidence(summary: RunSummary) -> list[str]:
         if ratio > TOLERATED
         else "parameters that it takes as constant had to change; it widened their uncertainty"
     )
+    delay, margin = summary["delay"], summary["controller_margin"]
+    wrong = not math.isclose(delay["estimated_s"], delay["true_s"], rel_tol=1e-6)
+    likely = (
+        f"Most likely it is the delay, which the controller takes for {delay['estimated_s']:.4g} s "
+        f"and which is {delay['true_s']:.4g} s: the loop is unstable with this error. "
+    ) * bool(wrong and margin and margin["stable"] is False)
     return [
         "the estimator is overconfident: the machine does what its model cannot explain, as "
-        f"friction, a payload off the centre, a push or a wrong delay do, and {shown}. Estimate "
-        "the cause, with coulomb, payload_position or wrench in controller.estimate, or raise "
-        "controller.model_error"
+        f"friction, a payload off the centre, a push or a wrong delay do, and {shown}. {likely}"
+        "Estimate the cause, with controller.delay_estimator, or with coulomb, payload_position or "
+        "wrench in controller.estimate, or raise controller.model_error"
     ]
 
 
@@ -165,8 +174,8 @@ def cautions_after(experiment: Experiment, summary: RunSummary) -> list[str]:
         )
     if broken := summary["counts"]["nonfinite_torque"]:
         found.append(
-            f"the controller's torque was not finite at {broken} samples, which sent the one "
-            "before again"
+            f"the controller's torque was not finite at {broken} samples, which sent the last "
+            "finite one, or zero"
         )
     found += overconfidence(summary)
     margin = summary["controller_margin"]

@@ -1,6 +1,7 @@
 """A scenario with its machine, plant, reference and start state, checked against each other."""
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -250,6 +251,7 @@ def _units_hint(experiment: Experiment) -> str:
 def concrete(
     scenario: Scenario | str | Path | Experiment,
     true_mechanism: Mechanism | None = None,
+    settings: Iterable[str] = (),
     **own: Any,
 ) -> Experiment:
     """Prepare a scenario with the user's systems, or return an Experiment as it is.
@@ -257,6 +259,7 @@ def concrete(
     Args:
         scenario: a scenario, prepared or not, or a shipped name or a path.
         true_mechanism: the machine to simulate, that of the scenario's plant if None.
+        settings: as `load_scenario` takes them.
         **own: see `loop.own.OwnSystems`.
 
     Raises:
@@ -264,8 +267,9 @@ def concrete(
         TypeError: systems of the user with an Experiment, which already has its own.
     """
     if not isinstance(scenario, Experiment):
-        return prepare(as_scenario(scenario), true_mechanism, take(own))
-    for name, thing in ({"true_mechanism": true_mechanism} | own).items():
+        return prepare(as_scenario(scenario, settings=settings), true_mechanism, take(own))
+    given = {"true_mechanism": true_mechanism, "settings": settings or None}
+    for name, thing in (given | own).items():
         if thing is not None:
             raise TypeError(f"{name}: got one with an Experiment, which has its own; expected None")
     return scenario

@@ -1,7 +1,7 @@
 """Simulation of a scenario."""
 
 import time as clock
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from traceback import walk_tb
 from typing import Any, Final
@@ -35,6 +35,7 @@ Progress = Callable[[float, float], None]
 
 def simulate(
     scenario: Scenario | Experiment | str | Path,
+    settings: Iterable[str] = (),
     *,
     controller: OwnSystem | None = None,
     reference: OwnReference | None = None,
@@ -59,6 +60,7 @@ def simulate(
 
     Args:
         scenario: a scenario, prepared or not, or a shipped name or file as for `load_scenario`.
+        settings: as `load_scenario` takes them.
         controller: a Drake system that replaces the shipped controller, with the inputs
             `measurement` (12: measured pose and rates, rad, m and per s) and optionally `reference`
             (18: present pose, rates, accelerations), and the output `torque` (6, N m), which is
@@ -98,6 +100,7 @@ def simulate(
         experiment = concrete(
             scenario,
             true_mechanism,
+            settings,
             controller=controller,
             reference=reference,
             disturbance=disturbance,

@@ -36,7 +36,7 @@ _each_once = rule(lambda order: len(set(order)) == len(order), "each of 0 to 5 o
 Coordinate = Annotated[float, _in_metres]
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 Radius = Annotated[float, Field(ge=_SHORTEST), _in_metres]
-Mass = Annotated[float, Field(ge=0, le=1e6)]
+Mass = Annotated[float, Field(le=1e6)]  # `Body.problem` has the lower limit
 Point = Annotated[list[Coordinate], exactly(3)]
 Moments = Annotated[list[Annotated[float, Field(le=1e6)]], exactly(3)]
 Six = Annotated[list[Coordinate], exactly(6)]
@@ -254,7 +254,7 @@ def build_mechanism(spec: MechanismSpec) -> Mechanism:
     except UnreachablePoseError:
         anchors = "legs" if spec.pattern is None else "pattern"
         sizes = {
-            "crank.length, rod.length": max(crank, rod),
+            "crank.length" if crank > rod else "rod.length": max(crank, rod),
             anchors: max(base_radius, plate_radius),
             "home": float(np.linalg.norm(spec.home[3:])),
         }

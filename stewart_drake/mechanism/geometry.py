@@ -47,7 +47,9 @@ class Body:
         moments, nothing = self.inertia, massless and self.mass == 0
         got = f"{field}.inertia: got {listed(moments)} kg m^2"
         if not (0 < self.mass < np.inf or nothing):
-            return f"{field}.mass: got {self.mass:g} kg; expected a positive mass"
+            return (
+                f"{field}.mass: got {self.mass:g} kg; expected a positive mass{' or 0' * massless}"
+            )
         if np.any(moments <= 0) and not nothing:
             return f"{got}; expected positive moments"
         # A moment larger than the sum of the other two needs negative mass somewhere.

@@ -45,12 +45,14 @@ controller_margin = _with(ControllerMargin, ControllerMargin.of, margins.control
 
 
 def report(
-    scenario: str | Path, settings: Iterable[str] = (), controller: str | Path | None = None
+    scenario: Scenario | str | Path,
+    settings: Iterable[str] = (),
+    controller: str | Path | None = None,
 ) -> AnalysisResult:
     """Run, compare and analyse a scenario, as one page.
 
     Args:
-        scenario: a shipped name or a path.
+        scenario: a Scenario, a shipped name or a path.
         settings: as `load_scenario` takes them.
         controller: replaces the scenario's own, see `reporting.report.collect`.
 
@@ -63,7 +65,8 @@ def report(
     settings, name = setting_texts(settings), title_of(scenario)
     found = report_document.collect(scenario, settings, controller=controller)
     own = "" if controller is None else f", {str(controller)!r}"
-    made = Provenance(f"sd.report({str(scenario)!r}, {list(settings)}{own})")
+    shown = repr(scenario) if isinstance(scenario, Scenario) else repr(str(scenario))
+    made = Provenance(f"sd.report({shown}, {list(settings)}{own})")
     return report_document.result(found, name, report_document.film(found, name), made)
 
 

@@ -11,6 +11,7 @@ from matplotlib.patches import Rectangle
 
 from stewart_drake.law.servos import mean_inertia
 from stewart_drake.law.stability import Margins
+from stewart_drake.loop.controller_margin import ControllerMargin
 from stewart_drake.reporting.document import Document, Table, Tone, from_template, number
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import DATA_INK, DATA_PAPER, line
@@ -46,6 +47,7 @@ def document(study: DelayStudy) -> Document:
         growth_figure=study.poles and partial(growth_figure, study),
         floor=study.floors[steps],
         margins=loop if loop is not None and loop.radius < 1 else None,
+        choices=[(w_R, one, _fading(one)) for w_R, one in study.choices.items()],
         loop_figure=any(one.radius < 1 for one in study.loops) and partial(loop_figure, study),
         cells=study.cells and _map_table(study),
         failed=any(cell.status != "completed" for cell in study.cells),
@@ -59,6 +61,11 @@ def _tone(study: DelayStudy) -> Tone:
         return "bad"
     tone = _TONES[study.verdict.beatable]
     return "fair" if tone == "good" and loop and (loop.problem or fragile(loop)) else tone
+
+
+def _fading(loop: ControllerMargin) -> float:
+    """Return the time in s in which the slowest error of a loop fades to 1/e."""
+    return -loop.period / math.log(loop.radius)
 
 
 def _eta(study: DelayStudy, steps: int) -> float:

@@ -47,6 +47,8 @@ _FINE: Final = 1e-3
 _TORQUES: Final = ("torque_commanded", "torque_applied")
 _TORQUE_DIGITS: Final = 9
 """Decimals of torques in N m: smaller ones are rounding."""
+_LARGE_START: Final = 4.0
+"""Range of the torques over that of the second half from which the axes cut off the start."""
 _FEW_TICKS: Final = 0.01
 """Span of an axis of sizes from which powers of ten are enough ticks."""
 _DECADES: Final = 5
@@ -203,13 +205,17 @@ def _coordinates(
 def _torques(run: SimulationResult, label: str, line: Line, commanded: bool = False) -> Figure:
     signals, panels, xlim = run.signals, [], (0.0, shown_until(run))
     asked, acted = (np.round(signals[name].values, _TORQUE_DIGITS) for name in _TORQUES)
-    unit, factor = style.unit_for([acted, asked] if commanded else acted, style.TORQUES)
+    drawn = np.hstack([acted, asked]) if commanded else acted
+    late = drawn[signals.time.values >= xlim[1] / 2]
+    cut = run.stopped is None and bool(np.ptp(drawn) > _LARGE_START * np.ptp(late) > 0)
+    unit, factor = style.unit_for(late if cut else drawn, style.TORQUES)
+    ylim = _limits([factor * late.ravel()], [], 0.0) if cut else None
     for k, leg in enumerate(LEGS):
         wanted = factor * asked[:, k]
         curves = [Curve(signals.time.values, wanted, "commanded", style.COMMANDED, steps=True)]
         applied = _curve(run, factor * acted[:, k], label, line, steps=True)
         name = f"motor {leg}{'' if commanded else ' applied'}  [{unit}]"
-        panels.append(Panel(name, [*curves * commanded, applied], xlim=xlim))
+        panels.append(Panel(name, [*curves * commanded, applied], xlim=xlim, ylim=ylim))
     if commanded and (acted.any() or asked.any()):
         sizes = [np.abs(factor * torque).max(axis=1) for torque in (asked, acted)]
         first = Curve(signals.time.values, sizes[0], "commanded", style.COMMANDED, steps=True)
@@ -222,8 +228,9 @@ def _torques(run: SimulationResult, label: str, line: Line, commanded: bool = Fa
     if np.isfinite(acted).any():
         peaks = np.nanmax(np.abs(factor * acted), axis=0)
         most = int(np.nanargmax(peaks))
-        most_text = f"at most {peaks[most]:.2g} {unit} acted, by motor {LEGS[most]}"
+        most_text = f"at most {number(peaks[most], 2)} {unit} acted, by motor {LEGS[most]}"
         title += f": {most_text if peaks[most] > 0 else 'none acted'}"
+    title += "; the motors' axes fit the second half" * cut
     return draw(panels, 2, down=True, sharey=True, title=title)
 
 

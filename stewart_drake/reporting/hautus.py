@@ -27,6 +27,9 @@ def document(study: HautusStudy) -> Document:
     useless = [
         s.name for s in study.systems if not (s.answers["stabilizable"] and s.answers["detectable"])
     ]
+    # At home the plant without gravity is the error model.
+    chain = "chain under gravity" if sc.plant.gravity else "minimal chain"
+    own = (s for s in study.family(chain) if s.steps == sc.true_delay.steps)
     skipped: dict[str, list[str]] = {}
     for name, reason in study.skipped.items():
         skipped.setdefault(reason, []).append(name)
@@ -36,6 +39,7 @@ def document(study: HautusStudy) -> Document:
         study=study,
         sc=sc,
         useless=useless,
+        own=next(own, None),
         least=min(study.systems, key=lambda s: s.margins["stabilizable"], default=None),
         chains=chains and shown,
         chains_fail=_deficiencies(chains),

@@ -26,6 +26,8 @@ _HANDLE, _CHARACTER = 0.62, 0.079
 """Height of a legend's line, width of an entry without its text, and of a character, inches."""
 _LABELS: Final = 0.45
 """Height of tick labels and name of a horizontal axis, inches."""
+_BEYOND: Final = ("v", "^")
+"""Markers of a run that ended below or above its axis."""
 _CROSS: Final = Line2D([], [], ls="", marker="x", color="#666666", ms=7, mew=2)
 
 
@@ -154,8 +156,11 @@ def _fill(ax: Axes, panel: Panel, last: bool, named: bool) -> None:
     for one in panel.curves:
         values = np.asarray(one.y)
         if one.ended is not None and len(values):
-            end = np.clip(values[-1], *ax.get_ylim())
-            ax.plot(one.ended, end, "x", color=one.line.color, ms=7, mew=2, clip_on=False)
+            low, high = ax.get_ylim()
+            end, marker = np.clip(values[-1], low, high), "x"
+            if end != values[-1]:
+                marker = _BEYOND[int(end == high)]
+            ax.plot(one.ended, end, marker, color=one.line.color, ms=7, mew=2, clip_on=False)
     ax.set(ylabel=panel.y if named else "", xlabel=panel.x if last else "", title=panel.title)
     ax.tick_params(labelbottom=last, labelleft=named)
     if panel.legend == "inside":
@@ -189,7 +194,8 @@ def _legend(figure: Figure, panels: Sequence[Panel], title: str) -> int:
             for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
                 handles.setdefault(label, handle)
     if any(curve.ended is not None for panel in panels for curve in panel.curves):
-        handles["run ended"] = _CROSS
+        beyond = any(one.get_marker() in _BEYOND for ax in figure.axes for one in ax.lines)
+        handles["run ended (triangle: beyond the axis)" if beyond else "run ended"] = _CROSS
     labels = list(handles)
     for lines in range(1, len(labels) + 1):
         columns = math.ceil(len(labels) / lines)

@@ -45,7 +45,7 @@ from stewart_drake.reporting.mechanism import mechanism_figure
 from stewart_drake.reporting.page import Provenance
 from stewart_drake.reporting.replay import replay_html
 from stewart_drake.reporting.results import AnalysisResult
-from stewart_drake.reporting.run import comparison_document, moving, run_document, worst
+from stewart_drake.reporting.run import comparison_document, moving, run_document, torqueless, worst
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.link import link_text, number_sent
 from stewart_drake.scenario.loading import load_compatible, scenario_yaml, setting_texts
@@ -116,7 +116,7 @@ class ReportData:
 
 
 def collect(
-    scenario_name: str | Path,
+    scenario_name: Scenario | str | Path,
     settings: Iterable[str] = (),
     progress: Progress | None = None,
     controller: str | Path | None = None,
@@ -124,7 +124,7 @@ def collect(
     """Run and analyse a scenario on all cores. A reference out of reach is analysed only.
 
     Args:
-        scenario_name: a shipped name or a path.
+        scenario_name: a Scenario, a shipped name or a path.
         settings: as `load_scenario` takes them.
         progress: called for every finished run or analysis.
         controller: replaces the scenario's own in its run and the analyses; a shipped name or a
@@ -319,10 +319,10 @@ def verdict(found: ReportData) -> tuple[str, Tone]:
     if floor > 0:
         text += (
             f"{error} % s, {number(floor)} % s of it before any torque can act"
-            f"{_second_half(run)}. Once torques act the mean error is {average}."
+            f"{_second_half(run)}. Once torques act the error averages {average}."
         )
     else:
-        text += f"{error} % s, {average}."
+        text += f"{error} % s; the error averages {average}."
     text += f" Largest error: {worst(run).replace('%', '% of its motion')}."
     if fair:
         text += f" Caution: {fair}."
@@ -342,7 +342,9 @@ def _findings(run: SimulationResult) -> list[tuple[Tone, str]]:
         text = f"{wrong} of {samples} samples without a new and usable measurement"
         found.append(("bad" if wrong > MANY_BAD * samples else "fair", text))
     failed = sum(counts[name] for name in ("riccati_failures", "unreachable", "nonfinite_torque"))
-    if failed:
+    if torqueless(run):
+        found.append(("bad", "the controller never had a finite torque"))
+    elif failed:
         found.append(("fair", f"{failed} of {samples} samples without a new gain or torque"))
     if not mean <= GOOD:  # or NaN
         text = f"a mean error of {number(mean, 2)} % of peak to peak"
@@ -356,11 +358,9 @@ def _averaged(run: SimulationResult) -> str:
     """Return the unit and the coordinates of `mean_error`."""
     moved = moving(run)
     if not moved.any():
-        return "of 1 rad and 1 m on average, as no coordinate moves"
+        return "of 1 rad and 1 m, as no coordinate moves"
     names = ", ".join(np.array(COORDINATE_NAMES)[moved])
-    return "of peak to peak on average" + (
-        "" if moved.all() else f" over moving coordinates ({names})"
-    )
+    return "of peak to peak" + ("" if moved.all() else f" over moving coordinates ({names})")
 
 
 def _second_half(run: SimulationResult) -> str:

@@ -39,6 +39,9 @@ _WORST: Final = 10
 """Rows of the table of the worst runs."""
 _FEW: Final = 3
 """Fewest failures that are compared with the other runs, and whose times are drawn."""
+_ENOUGH: Final = 10
+"""Fewest failing and other runs from which causes are named: with fewer, Holm's correction holds the
+rate of false ones, but which are found changes from seed to seed."""
 _NAMED: Final = 3
 """Number of quantities, or pairs, in a sentence."""
 _GREY: Final = "#666666"
@@ -66,12 +69,15 @@ def document(study: RobustnessStudy) -> Document:
         third=_third,
         where=_where,
         spans=_spans(study),
-        few=_FEW,
+        enough=_ENOUGH,
+        fewer=min(found.failing, found.others),
         singles=found.failing >= _FEW and found.singles,
         pairs=found.failing >= _FEW and found.pairs,
         kept=lambda one: int(np.sum(~one.failed)),
-        strong=[title(one.factor) for one in found.found if found.failing >= _FEW],
-        for_error=list(dict.fromkeys(title(one.factor.strip("|")) for one in errors)),
+        strong=[title(one.factor) for one in found.found],
+        for_error=list(dict.fromkeys(title(one.factor.strip("|")) for one in errors))
+        if found.others >= _ENOUGH
+        else [],
         others=study.also and {"as asked": study, **study.also}.items(),
         quantiles=[(q, study.quantile(q)) for q in QUANTILES],
         distribution_figure=partial(distribution_figure, study),

@@ -13,6 +13,7 @@ from stewart_drake.mechanism.kinematics import turns_between
 from stewart_drake.reporting.document import Document, counted, from_template, measured, number
 from stewart_drake.reporting.style import FACTORS, TORQUES, UNITS, unit_for
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.link import number_sent
 from stewart_drake.scenario.signals import (
     ANGLES,
     BIAS,
@@ -64,10 +65,11 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
 
     Warnings in `said` were printed before and are left out.
     """
-    s = result.summary
+    s, unmeasured = result.summary, 100 * (1 - result.summary["measured_share"])
     return from_template(
         "run",
         run=result,
+        torqueless=torqueless(result),
         s=s,
         peaks=", ".join(_peaks(result)),
         second_half=_second_half(result),
@@ -77,7 +79,9 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
         held=_held(result),
         least=LEAST_MEASURED,
         # the sum of others is left out
-        events=[
+        events=[f"{unmeasured:.1f} % of the samples without a usable measurement"]
+        * (unmeasured > 0.05)
+        + [
             counted(n, _EVENTS.get(name, name.replace("_", " ")))
             for name, n in s["counts"].items()
             if n and name != "bad_measurements"
@@ -86,6 +90,12 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
         packets=[(n, name) for name, n in s["packets"].items()],
         cautions=[text for text in s["warnings"] if text not in said],
     )
+
+
+def torqueless(run: SimulationResult) -> bool:
+    """Return whether a run completed without one finite torque of its controller."""
+    samples = number_sent(run.scenario.duration, run.scenario.controller.period)
+    return run.status == "completed" and run.summary["counts"]["nonfinite_torque"] >= samples
 
 
 def _estimates(run: SimulationResult) -> list[str]:
@@ -198,25 +208,29 @@ def comparison_document(
         verdict=_best({name: run for _, name, run in runs}),
         table_two=table_two and [_two_row(name, run, results) for name, run in paper.items()],
         papers=not table_two
-        and any(is_papers(run.scenario, any_size=True) for run in results.values()),
+        and any(is_papers(run.scenario, any_size=True) for run in paper.values()),
+        weighted=len({tuple(run.scenario.controller.weights) for _, _, run in runs}) > 1,
         runs=[_row(title, name, run) for title, name, run in runs],
         loops=[(name, label(name), loop_word(margin)) for name, margin in margins.items()],
         surprising=any(margin and margin["stable"] for margin in lost),
         both=len({run.scenario.controller.command for run in results.values()}) > 1,
-        cautions=[text for text in _shared_warnings(results) if text not in said],
+        cautions=_shared_warnings(results, said),
         **context,
     )
 
 
 def _best(runs: _Runs) -> str:
-    """Return which run has the least error, and which ended early."""
+    """Return which run has the least error, and which ended early or had no torque."""
+    idle = [name for name, run in runs.items() if torqueless(run)]
     early = [name for name, run in runs.items() if run.stopped is not None]
     if len(early) == len(runs):
         return "no run completed"
     errors = {n: e for n, run in runs.items() if math.isfinite(e := run.accumulated_error)}
+    errors = {name: error for name, error in errors.items() if name not in idle}
     least = min(errors, key=errors.__getitem__, default="")
     parts = [f"least error: {least}, E_ac {number(errors[least])} % s"] if least else []
-    return "; ".join([*parts, *([f"ended early: {', '.join(early)}"] if early else [])])
+    ends = {"ended early": early, "no finite torque": idle}
+    return "; ".join([*parts, *(f"{end}: {', '.join(some)}" for end, some in ends.items() if some)])
 
 
 def _row(title: str, name: str, run: SimulationResult) -> dict[str, Any]:
@@ -232,15 +246,17 @@ def _row(title: str, name: str, run: SimulationResult) -> dict[str, Any]:
     return row | {"error": ended, "worst": "-", "floor": "-", "cost": "-"}
 
 
-def _shared_warnings(results: _Runs) -> list[str]:
-    """Return every warning once, with the controllers concerned unless these are all."""
+def _shared_warnings(results: _Runs, said: Collection[str]) -> list[str]:
+    """Return every warning once, with the runs concerned; those of all in `said` are left out."""
     about: dict[str, list[str]] = {}
     for name, result in results.items():
         for text in result.summary["warnings"]:
             about.setdefault(text, []).append(name)
+    every = "all runs: " * (len(results) > 1)
     return [
-        text if len(names) == len(results) else f"{', '.join(names)}: {text}"
+        (every if len(names) == len(results) else f"{', '.join(names)}: ") + text
         for text, names in about.items()
+        if len(names) < len(results) or text not in said
     ]
 
 

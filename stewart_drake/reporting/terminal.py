@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from stewart_drake.files.resources import Kind
 
 _COLORS: Final = {
-    "green": r"\bcompleted\b|(?<=s )can be compensated|(?<=loop is )stable(?=:)",
+    "green": r"\bcompleted\b|(?<=[s)] )can be compensated|(?<=loop is )stable(?=:)",
     "yellow": r"can hardly be compensated|stable in exact arithmetic only|\bwarning:"
     r"|\binterrupted( at [\d.]+ s)?",
     "red": r"cannot be compensated|\bunstable\b|^error:"

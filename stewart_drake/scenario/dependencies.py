@@ -90,6 +90,8 @@ _HINTS: Final[dict[str | tuple[str, str], str]] = {
     ("actuator.kind", "plant.coulomb_friction"): "; the servos have their own, actuator.friction",
     ("link.kind", "controller.delay_estimator"): ", as of the controller predictor_lqi, or "
     "link.kind 'wire': the play-out bound sets the delay",
+    ("controller.delay_steps", "controller.delay_fraction"): ", or a number in "
+    "controller.delay_steps",
     "controller.delay_steps": ": the play-out bound sets the delay, and 0 is a controller without "
     "one",
 }

@@ -31,7 +31,7 @@ _KINDS = sections(Scenario)
 
 
 def load_scenario(
-    name_or_path: str | Path,
+    name_or_path: Scenario | str | Path,
     controller: str | Path | None = None,
     settings: Iterable[str] = (),
 ) -> Scenario:
@@ -65,34 +65,27 @@ def as_scenario(
 ) -> Scenario:
     """Return a scenario as it is, or load it by its shipped name or path.
 
+    A controller and settings are laid over a Scenario, too.
+
     Raises:
         TypeError: another type.
-        ConfigError: bad input; a controller or settings for a scenario that is loaded already.
+        ConfigError: bad input.
     """
-    if isinstance(given, str | Path):
-        return load_scenario(given, controller, settings)
-    if not isinstance(given, Scenario):
-        raise TypeError(
-            f"scenario: got a {type(given).__name__}; expected a Scenario, or the name or path of "
-            "one"
-        )
-    for name, value in (("controller", controller), ("settings", settings)):
-        if value:
-            raise ConfigError(
-                f"{name}: got {brief(value)} with a Scenario; expected none: give them to "
-                "load_scenario"
-            )
-    return given
+    if isinstance(given, Scenario) and controller is None and not settings:
+        return given
+    return load_scenario(given, controller, settings)
 
 
-def title_of(scenario: str | Path) -> str:
+def title_of(scenario: Scenario | str | Path) -> str:
     """Return the name of a scenario in titles: its file's, or the folder's of scenario.yaml."""
+    if isinstance(scenario, Scenario):
+        return "scenario"
     path = Path(scenario)
     return path.stem if path.stem != "scenario" else path.resolve().parent.name
 
 
 def load_compatible(
-    name_or_path: str | Path,
+    name_or_path: Scenario | str | Path,
     controller: str | Path | None = None,
     settings: Iterable[str] = (),
 ) -> Scenario:
@@ -127,7 +120,7 @@ class Read(NamedTuple):
 
 
 def read_scenario(
-    name_or_path: str | Path,
+    name_or_path: Scenario | str | Path,
     controller: str | Path | None = None,
     settings: Iterable[str] = (),
     stays_blind: bool = False,
@@ -135,11 +128,20 @@ def read_scenario(
     """Read a scenario and check its fields one by one only.
 
     Args:
-        name_or_path, controller, settings: as of `load_scenario`.
+        name_or_path: as of `load_scenario`, or a Scenario, like a file of all its fields.
+        controller, settings: as of `load_scenario`.
         stays_blind: whether settings of the assumed delay leave a controller that assumes none.
     """
-    path = resolve("scenario", name_or_path)
-    data = load_yaml(path)
+    if isinstance(name_or_path, Scenario):
+        path, data = Path("scenario"), scenario_to_dict(name_or_path)
+    elif isinstance(name_or_path, str | Path):
+        path = resolve("scenario", name_or_path)
+        data = load_yaml(path)
+    else:
+        raise TypeError(
+            f"scenario: got a {type(name_or_path).__name__}; expected a Scenario, or the name or "
+            "path of one"
+        )
     if "home" in data and "mechanism" not in data:
         raise ConfigError(
             f"{path}: got a mechanism; expected a scenario, whose field mechanism names this file"
@@ -187,7 +189,7 @@ def load_controller(name_or_path: str | Path) -> dict[str, Any]:
 
 
 def load_comparison(
-    name_or_path: str | Path,
+    name_or_path: Scenario | str | Path,
     controllers: Iterable[str | Path],
     settings: Iterable[str] = (),
     refuse_idle: bool = True,
@@ -214,7 +216,7 @@ def load_comparison(
     everywhere = {one.field for one in idle_fields(read.scenario)}
     for row in dict.fromkeys([*named, *(changes if further else ())]):
         given = named.get(row, row)
-        where = f"{name_or_path}: compare.{row}"
+        where = f"{read.path}: compare.{row}"
         change = {} if is_path(given) else dict(changes.get(row, {}))
         controller, actuator = change.pop("controller", given), change.pop("actuator", {})
         scenario = read_scenario(name_or_path, controller, settings, stays_blind=True).scenario

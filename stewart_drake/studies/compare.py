@@ -59,17 +59,18 @@ PAPER_DELAY: Final = 0.8
 Progress = Callable[[str, float, float], None]
 """Called with a controller's name, its simulated time in s and its error in % of peak to peak."""
 
+_Systems = Mapping[str, Callable[[], System]]
 _NO_KEY: Final = re.compile(r"[^A-Za-z0-9_+-]")
 _POLL = 0.1
 """Interval of progress reports, s."""
 
 
 def compare(
-    scenario_name: str | Path,
+    scenario_name: Scenario | str | Path,
     settings: Iterable[str] = (),
     progress: Progress | None = None,
     *,
-    controllers: Mapping[str, Callable[[], System]] | Sequence[str | Path] | None = None,
+    controllers: _Systems | Sequence[str | Path | _Systems] | None = None,
     reference: OwnReference | None = None,
     disturbance: Callable[[], System] | None = None,
 ) -> dict[str, SimulationResult]:
@@ -82,24 +83,22 @@ def compare(
     with a note that names the controller.
 
     Args:
-        scenario_name: a shipped name or a path; its start, plant and tuner stay as they are.
+        scenario_name: a Scenario, a shipped name or a path; its start, plant and tuner stay as they
+            are.
         settings: as `load_scenario` takes them.
         progress: called for each running simulation, ten times a second, with the controller's
             name, simulated time in s and error in % of peak to peak.
         controllers: names or files, to compare these in this order; or a mapping of names to your
             own systems, with the ports listed at `simulate`, which are added to the shipped ones.
+            A list with such a mapping has its systems and the named ones, and no other.
         reference, disturbance: for all runs, as of `simulate`.
 
     Returns:
         Results by controller, the shipped or given ones first, then your own. The name of a file
         is without its suffix.
     """
-    settings, chosen = setting_texts(settings), None
-    makers: dict[str, Callable[[], System]] = {}
-    if isinstance(controllers, Mapping):
-        makers = dict(controllers)
-    elif controllers is not None:
-        chosen = _chosen(controllers)
+    settings = setting_texts(settings)
+    chosen, makers = _chosen(controllers)
     scenarios = shown(scenario_name, settings, chosen)
     _check_makers(makers, reference, disturbance, taken={*LABELS, *scenarios})
     scenarios |= {name: load_compatible(scenario_name, settings=settings) for name in makers}
@@ -137,7 +136,7 @@ def compare(
 
 
 def shown(
-    scenario_name: str | Path,
+    scenario_name: Scenario | str | Path,
     settings: Iterable[str] = (),
     controllers: Sequence[str | Path] | None = None,
 ) -> dict[str, Scenario]:
@@ -162,15 +161,19 @@ def shown(
     return load_comparison(scenario_name, (*CONTROLLERS, *further), settings)
 
 
-def _chosen(controllers: Sequence[str | Path]) -> Sequence[str | Path]:
+def _chosen(controllers: Any) -> tuple[list[str | Path] | None, dict[str, Callable[[], System]]]:
+    """Return chosen names and files, None for the shipped controllers, and the user's systems."""
+    if controllers is None or isinstance(controllers, Mapping):
+        return None, dict(controllers or {})
     few = isinstance(controllers, str) or len(controllers) == 0
-    wrong = [] if few else [one for one in controllers if not isinstance(one, str | Path)]
+    wrong = [] if few else [one for one in controllers if not isinstance(one, str | Path | Mapping)]
     if few or wrong:
         raise ConfigError(
             f"controllers: got {brief(wrong[0] if wrong else controllers)}; expected a list of "
-            "names or files, or a mapping of names to systems"
+            "names, files, or mappings of names to systems, or one mapping"
         )
-    return controllers
+    makers = [pair for one in controllers if isinstance(one, Mapping) for pair in one.items()]
+    return [one for one in controllers if not isinstance(one, Mapping)], dict(makers)
 
 
 def label(name: str) -> str:
@@ -183,14 +186,19 @@ def _check_makers(
     for name in controllers:
         if name in taken:
             raise ConfigError(
-                f"controllers: got {name!r}, a shipped one or one of the scenario's; expected "
-                "another name"
+                f"controllers: got {name!r} for a system, the name of a shipped controller or of "
+                "the scenario's; expected another name, and shipped ones by name in a list"
             )
     systems = {f"controllers[{name!r}]": maker for name, maker in controllers.items()}
     for what, maker in (systems | {"disturbance": disturbance}).items():
         if isinstance(maker, System):
             raise ConfigError(
                 f"{what}: got an instance, which serves one run; expected a function that makes one"
+            )
+        if not (maker is None or callable(maker)):
+            raise ConfigError(
+                f"{what}: got {brief(maker)}; expected a function that makes a system, and shipped "
+                "controllers by name in a list"
             )
     if isinstance(reference, Trajectory):
         try:
@@ -203,7 +211,7 @@ def _check_makers(
 
 
 def is_papers(scenario: Scenario, *, any_size: bool = False) -> bool:
-    """Return whether a scenario has the mechanism, motion and delay of the paper's numbers.
+    """Return whether a scenario has the paper's machine, motion, duration and delay.
 
     With `any_size` the motion may be a multiple of the paper's: E_ac is relative to it.
     """
@@ -212,8 +220,11 @@ def is_papers(scenario: Scenario, *, any_size: bool = False) -> bool:
         shares = np.divide(motion.amplitude, own.reference.amplitude)
         if np.allclose(shares, shares[0], rtol=1e-6) and shares[0] > 0:
             motion = replace(motion, amplitude=own.reference.amplitude)
+    engine = {name: getattr(own.plant, name) for name in ("kind", "time_step", "accuracy")}
     return (
-        resolve("mechanism", scenario.mechanism) == resolve("mechanism", own.mechanism)
+        replace(scenario.plant, **engine) == own.plant
+        and scenario.duration == own.duration
+        and resolve("mechanism", scenario.mechanism) == resolve("mechanism", own.mechanism)
         and motion == own.reference
         and math.isclose(scenario.eta, PAPER_DELAY)
     )

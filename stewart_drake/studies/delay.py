@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any, Final, NamedTuple
 
@@ -43,6 +43,8 @@ TOLERABLE: Final = (2.0, 10.0, 100.0, 1000.0)
 """Growths of prediction errors for which the largest delay is given."""
 DELAYS: Final = (0, 1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 25, 30)
 """Delays in periods for which the loop is judged; the scenario's is added."""
+WEIGHTS: Final = (1.0, 10.0, 100.0, 1000.0)
+"""Values of controller.w_R for which the loop is judged; the scenario's is added."""
 FACTORS: Final = (0.5, 0.75, 1.0, 1.25)
 """Factors on the reference's amplitude that are simulated."""
 _CHECKS: Final = 5
@@ -142,6 +144,8 @@ class DelayStudy:
     loop_problem: str  # why the closed loop was not judged, or empty
     cells: list[Cell]  # simulations by delay and amplitude
     interrupted: bool  # whether Ctrl-C ended the simulations early
+    # the stable loops by controller.w_R; empty if the scenario's is not stable, or has no such weight
+    choices: dict[float, ControllerMargin] = field(default_factory=dict)
 
     @property
     def verdict(self) -> Verdict | None:
@@ -149,7 +153,12 @@ class DelayStudy:
         if not self.poles:
             return None
         worst = max(self.poles, key=lambda point: point.moving)
-        return Verdict(self.eta, worst.moving, worst.time)
+        return Verdict(
+            self.eta,
+            worst.moving,
+            worst.time,
+            self.assessment.experiment.scenario.controller.period,
+        )
 
     @property
     def loop(self) -> LoopMargins | None:
@@ -226,9 +235,10 @@ def study_delay(
             )
             for steps in {delay.steps, *map_delays(delay.steps)}
         }
+        own = controller_margin(found.experiment, found.followed_until) if poles else None
         return DelayStudy(
             assessment=found,
-            controller=controller_margin(found.experiment, found.followed_until) if poles else None,
+            controller=own,
             eta=scenario.eta,
             poles=poles,
             growths=_growths(found, poles, scenario.eta),
@@ -237,6 +247,7 @@ def study_delay(
             loop_problem=problem,
             cells=cells,
             interrupted=interrupted,
+            choices=_choices(found) if own and own.stable and own.weighted else {},
         )
 
 
@@ -326,6 +337,17 @@ def loop_margins(found: Assessment, delays: Iterable[int] = DELAYS) -> list[Loop
         delay = Delay(steps, sc.delay.fraction)
         judged.append(_margins_of(stability.LinearLoop(plant, K, c.period, delay, cost.integrates)))
     return judged
+
+
+def _choices(found: Assessment) -> dict[float, ControllerMargin]:
+    """Return the loop along the reference by w_R, as far as it is stable."""
+    sc, loops = found.experiment.scenario, dict[float, ControllerMargin]()
+    for w_R in sorted({*WEIGHTS, sc.controller.weights[1]}):
+        other = replace(sc, controller=replace(sc.controller, w_R=w_R))
+        loops[w_R] = controller_margin(
+            found.experiment._replace(scenario=other), found.followed_until
+        )
+    return {w_R: loop for w_R, loop in loops.items() if loop.stable}
 
 
 def _margins_of(loop: stability.LinearLoop) -> LoopMargins:

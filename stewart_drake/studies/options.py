@@ -8,7 +8,6 @@ import inspect
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -202,11 +201,6 @@ def takes(
 def _load(scenario: Any, controller: str) -> "Scenario":
     from stewart_drake.scenario.loading import load_compatible
 
-    if not isinstance(scenario, str | Path):
-        raise ConfigError(
-            f"scenario: got a {type(scenario).__name__} with the controller {controller!r}; "
-            "expected a name or a path, or the controller as a scenario too"
-        )
     return load_compatible(scenario, controller)
 
 

@@ -81,10 +81,11 @@ class Verdict:
     eta: float  # true total delay, s
     pole: float  # fastest unstable pole of the open loop along the reference, 1/s; 0 without one
     time: float  # of that pole, s
+    period: float = math.inf  # of the controller, s; infinite to leave out periods
 
     @classmethod
     def of(cls, margin: ControllerMargin) -> "Verdict":
-        return cls(margin.eta, margin.pole, margin.pole_time)
+        return cls(margin.eta, margin.pole, margin.pole_time, margin.period)
 
     @property
     def amplification(self) -> float:
@@ -105,8 +106,9 @@ class Verdict:
                 f"e^(p eta) = {_power(self.pole * self.eta)} fold at t = {self.time:.1f} s "
                 f"(pole {self.pole:.3g} /s)"
             )
+        periods = f" ({self.eta / self.period:.4g} periods)" if self.period < math.inf else ""
         return (
-            f"the delay of {self.eta:.4g} s {can} be compensated: under any controller, "
+            f"the delay of {self.eta:.4g} s{periods} {can} be compensated: under any controller, "
             f"prediction errors grow {growth} over it"
         )
 
@@ -165,7 +167,8 @@ def loop_word(margin: MarginSummary | None) -> str:
 def delay_verdict(experiment: Experiment) -> Verdict:
     """Judge the scenario's true delay by the open loop's poles along its reference."""
     sc = experiment.scenario
-    return Verdict(sc.eta, *fastest_in_motion(experiment, experiment.true_dynamics(), sc.duration))
+    fastest = fastest_in_motion(experiment, experiment.true_dynamics(), sc.duration)
+    return Verdict(sc.eta, *fastest, sc.controller.period)
 
 
 def milliseconds(seconds: float) -> str:
