@@ -63,7 +63,7 @@ def delays_apart(experiment: Experiment, margin: ControllerMargin) -> str | None
 def weak_motors(experiment: Experiment) -> str | None:
     """Return a warning about a motion that takes more torque than the motors give, or None."""
     sc, limit = experiment.scenario, experiment.torque_limit
-    if math.isinf(limit) or sc.controller.command != "torque":
+    if math.isinf(limit) or sc.actuator.kind == "servo":
         return None
     needed = reference_torque(experiment.true_dynamics(), experiment.reference, sc.duration)
     if not needed > limit:  # NaN beyond the reach, where the law keeps the limits

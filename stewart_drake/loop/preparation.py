@@ -210,7 +210,7 @@ def check_reach(experiment: Experiment) -> None:
             + (f", short by {-1e3 * failure.margin:.3g} mm" if short else "")
             + "; expected a motion within reach"
             + (
-                ", such as one of smaller amplitude"
+                (", edit the file or move lower" if file else ", such as one of smaller amplitude")
                 if failure.time > 0
                 else f": {first_pose_text(first, experiment.mechanism)}"
             )

@@ -3,6 +3,7 @@
 Progress is a bar per run on a terminal, and a line every ten seconds in a log or pipe.
 """
 
+import json
 import os
 import re
 import sys
@@ -49,11 +50,13 @@ def shipped_table(kind: "Kind") -> str:
     """Return the shipped files of a kind, each with the first sentence of its opening comment."""
     from stewart_drake.files.resources import resolve, shipped
 
-    return rows({f"  {name}": _description(resolve(kind, name)) for name in shipped(kind)})
+    return rows({f"  {name}": _description(kind, resolve(kind, name)) for name in shipped(kind)})
 
 
-def _description(path: Path) -> str:
-    if path.suffix == ".json":  # a network, without comments
+def _description(kind: "Kind", path: Path) -> str:
+    if kind == "move":
+        return str(json.loads(path.read_text(encoding="utf-8"))["description"]).rstrip(".")
+    if kind == "weights":  # a network, without comments
         from stewart_drake.tuner.network import NUM_INPUTS, NUM_OUTPUTS, load_network
 
         network = load_network(path)

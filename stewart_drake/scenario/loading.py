@@ -382,5 +382,7 @@ def _make_paths_absolute(data: dict[str, Any], folder: Path) -> None:
     resolved(data.get("plant", {}), "mechanism")
     for fields in (data.get("controller", {}), *data.get("compare", {}).values()):
         resolved(fields, "calibration", "learned", "controller")  # the latter in a row of `compare`
-    resolved(data.get("reference", {}), "file")
+    reference = data.get("reference", {})
+    if reference.get("file") not in shipped("move") or reference.get("kind") != "reachy_move":
+        resolved(reference, "file")
     resolved(data.get("tuner", {}), "weights")
