@@ -50,7 +50,6 @@ LABELS: Final = {
     "lqr_gravity": "LQR + gravity",
     "servo_preview": "servos",
     "servo_feedforward": "servos + torque",
-    "as_given": "the scenario's",
 }
 PAPER_ERRORS: Final = {"lqr": None, "lqi": None, "delay_lqr": 225.0, "delay_lqi": 80.0}
 """E_ac in % s of the paper's Table II, None for a failure."""
