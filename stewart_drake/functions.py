@@ -45,7 +45,8 @@ from stewart_drake.reporting.results import (
 from stewart_drake.scenario.calibration import save_calibration
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import as_scenario, scenario_yaml
-from stewart_drake.scenario.run_log import is_run
+from stewart_drake.scenario.run_log import is_run, scenario_of
+from stewart_drake.scenario.run_log import read_log as read_run
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.new_machine import check_mechanism, new_machine
 from stewart_drake.studies.options import refuse, takes
@@ -69,6 +70,7 @@ def identify(
     tolerances: Tolerances | Mapping[str, float] | None = None,
     precision: Precision | Mapping[str, float] | None = None,
     gravity: bool = True,
+    velocity_gain: float | None = None,
     command: str = "",
 ) -> AnalysisResult:
     """Find delay, friction and geometry in logs of one machine.
@@ -87,6 +89,8 @@ def identify(
         precision: of a CSV log, such as `{"angle": 1e-4}`; the defaults for others, with 12 bits
             for one of setpoints.
         gravity: whether gravity acted in a CSV log.
+        velocity_gain: of the position servos, N m s/rad, which a log does not tell from damping;
+            by default that of the log's scenario, or 0.
         command: that the page names; by default the call of this function.
     """
     tolerances, precision = _expected(tolerances, precision)
@@ -104,11 +108,21 @@ def identify(
                 f"{paths[0]}: got more than one log of setpoints, a delay or tolerances; expected "
                 "one log, whose delay is found without any"
             )
-        log = read_servo_log(Path(paths[0]), machine)
+        path = Path(paths[0])
+        log = read_servo_log(path, machine)
+        if velocity_gain is None:
+            run = scenario_of(read_run(path), path).actuator if is_run(path) else None
+            velocity_gain = getattr(run, "velocity_gain", 0.0)
+        if not 0 <= velocity_gain < 1e6:
+            raise ConfigError(
+                f"velocity_gain: got {velocity_gain:g}; expected 0 or more, N m s/rad"
+            )
         std = _STD_12_BITS if precision is None else precision.angle
         g = DEFAULT_GRAVITY if gravity else 0.0
-        find_servos = partial(identify_servos, log, machine, std, g)
+        find_servos = partial(identify_servos, log, machine, std, g, velocity_gain)
         return analysis_result(find_servos, servo_identification.document, typed, _write_servos)
+    if velocity_gain is not None:
+        raise ConfigError("velocity_gain: got one; expected none without a log of setpoints")
     read = [read_log(Path(path), machine, precision or Precision(), gravity) for path in paths]
     find = partial(identification.identify, read, machine, tolerances, delay)
     return analysis_result(find, document, typed, _write_machine)

@@ -1,5 +1,6 @@
 """Requests, offers, identities and faults, as both sides say them."""
 
+import math
 import re
 import socket
 import threading
@@ -17,7 +18,7 @@ from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live import contact as contacts
 from stewart_drake.live import session as sessions
-from stewart_drake.live.checks import ReportCheck
+from stewart_drake.live.checks import ReportCheck, WireCheck
 from stewart_drake.live.contact import Contact, await_free, call, open_endpoint
 from stewart_drake.live.endpoint import ANSWERS, ANSWERS_AT_ONCE
 from stewart_drake.live.machine import Machine
@@ -230,6 +231,17 @@ def test_reports_that_are_a_period_off_are_named(off, word):
             assert number < 12
             return
     raise AssertionError
+
+
+@pytest.mark.parametrize("steps", [2, 13])
+def test_another_delay_of_a_simulated_wire_is_reported(steps):
+    check, said, P = WireCheck(math.inf, 0.26, 0.02), list[str](), SECOND // 50
+    for k in range(30):
+        check.sent(k * P, np.full(6, float(k)))
+        if k >= steps:
+            said.append(check.warning(k * P, np.full(6, float(k - steps))))
+    expected = "commands act 0.04 s after their measurement, and this end expects 0.26 s"
+    assert any(expected in line for line in said) == (steps == 2)
 
 
 @pytest.mark.slow

@@ -180,7 +180,7 @@ def test_a_printed_result_begins_with_its_conclusion(tmp_path):
         (sd.controller_margin("paper", until=1.0), "This loop is stable: linearised along"),
         (sd.check_model("paper"), "yes: it stands at home"),
         (made, "yes: it stands at home"),
-        (sd.setpoints("reachy_mini"), "every limit kept: largest torque"),
+        (sd.setpoints("reachy_mini"), "limits kept; the motion needs"),
     ):
         assert str(found) == found.table() and str(found).startswith(opening)
         assert max(map(len, str(found).splitlines())) <= 80 and "array" not in repr(found)

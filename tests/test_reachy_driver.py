@@ -2,9 +2,11 @@
 
 import json
 import re
+import runpy
 import threading
 import time
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import pytest
 import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.identification.servo_logs import read_servo_log
 from stewart_drake.law.servos import Stiffness
 from stewart_drake.live.options import MachineOptions
 from stewart_drake.live.protocol import (
@@ -261,6 +264,38 @@ def test_setpoints_go_ahead_by_the_delay_of_the_robot(ahead):
         assert angles == pytest.approx(planned(meant), abs=1e-9)
     last = wire.said[-1]
     assert last.acted[0] == pytest.approx(planned(last.acted_from), abs=1e-12)
+
+
+# ---------------------------------------------------------------- setpoints of a file
+
+
+@pytest.mark.slow
+@in_real_time
+def test_a_file_of_setpoints_is_sent_and_logged(daemon, tmp_path, capsys):
+    send = runpy.run_path(str(Path(__file__).parents[1] / "analysis/reachy_send.py"))["main"]
+    file, log = tmp_path / "setpoints.csv", tmp_path / "log.csv"
+    chosen = ("duration=5", "reference.frequency=3")
+    made = sd.setpoints("reachy_mini", 50, file, plain=True, settings=chosen)
+    send([str(file), "--reachy", f"127.0.0.1:{daemon.port}", "--log", str(log)])
+    assert "sent 250 setpoints" in capsys.readouterr().out
+    joints = np.array([one for _, one in daemon.sent])
+    assert np.all(joints[:, 0] == 0.1)  # the body keeps its yaw
+    assert np.abs(np.diff(joints[:, 1:], axis=0, prepend=[SLEEP])).max() < 0.05
+    assert joints[-250:, 1:] == pytest.approx(made.angles, abs=1e-8)
+    logged = read_servo_log(log, ROBOT)
+    assert logged.times == pytest.approx(made.times, abs=0.015)
+    assert logged.setpoints == pytest.approx(made.angles, abs=1e-8)
+    assert logged.cranks[1:] == pytest.approx(logged.setpoints[:-1], abs=0.05)
+
+
+def test_a_robot_is_not_moved_without_consent(daemon, tmp_path, monkeypatch):
+    monkeypatch.setitem(STATUS, "simulation_enabled", False)
+    send = runpy.run_path(str(Path(__file__).parents[1] / "analysis/reachy_send.py"))["main"]
+    file = tmp_path / "setpoints.csv"
+    sd.setpoints("reachy_mini", 50, file)
+    with pytest.raises(SystemExit, match="--arm: not given"):
+        send([str(file), "--reachy", f"127.0.0.1:{daemon.port}", "--log", str(tmp_path / "l")])
+    assert not daemon.sent
 
 
 # ---------------------------------------------------------------- a whole run

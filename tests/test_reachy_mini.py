@@ -60,6 +60,8 @@ def test_poses_of_the_head_return():
 def test_what_is_no_pose_is_refused(head):
     with pytest.raises(ConfigError, match="head: got"):
         pose_of_head(head)
+    with pytest.raises(ConfigError, match="body_yaw: got 50; expected -pi to pi rad"):
+        pose_of_head(np.eye(4), 50)
 
 
 def test_forward_kinematics_from_home_finds_every_pose():
@@ -180,18 +182,18 @@ def test_a_head_that_turns_past_half_a_turn_does_not_jump(tmp_path):
 
 def test_a_move_within_reach_gives_setpoints_and_one_beyond_is_refused():
     def setpoints(name):
-        chosen = f"reference={{kind: reachy_move, file: {MOVES / name}}}"
+        chosen = f"reference={{kind: reachy_move, file: {name}}}"
         return sd.setpoints("reachy_mini", settings=(chosen, "duration=2"), plain=True)
 
     times, poses = read_move(MOVES / "look_around.json")
     k = int(np.argmin(np.abs(times - 1.8)))
     cranks = legs_along(ROBOT, poses[k][None]).crank_angles[0]
-    found = setpoints("look_around.json").angles[[89, 90]].mean(axis=0)  # around 1.8 s
+    found = setpoints("look_around").angles[[89, 90]].mean(axis=0)  # around 1.8 s
     assert found == pytest.approx(cranks, abs=1e-3)
     with pytest.raises(
         ConfigError, match=r"^[^\n]*leg 3 reached the end of its reach at t = 1\.36 s[^\n]*$"
     ):
-        setpoints("tall_bow.json")
+        setpoints(MOVES / "tall_bow.json")
 
 
 def changed(data, name, value, row=7):
@@ -208,7 +210,7 @@ def changed(data, name, value, row=7):
         ("head", [1.0] * 15, r"set_target_data\[7\].head: got .*; expected 4 rows"),
         ("head", [[1.0], [2.0, 3.0]], r"set_target_data\[7\].head"),
         ("head", ["a"] * 16, r"set_target_data\[7\].head"),
-        ("head", [0.0] * 16, r"set_target_data\[7\].head"),
+        ("head", [0.0] * 16, r"set_target_data\[7\].head: got rows that are no rotation"),
         ("head", None, r"set_target_data\[7\].head"),
         ("head", head_of_pose(ROBOT.home + [0, 0.5, 0, 0, 0, 0]).tolist(), "sample 7, pitch: got"),
         ("body_yaw", "left", r"set_target_data\[7\].body_yaw: got 'left'; expected a finite"),
@@ -229,6 +231,17 @@ def test_a_bad_move_is_refused_in_one_line(tmp_path, name, value, message):
     with pytest.raises(ConfigError, match=message) as said:
         make_reference(reference, 2.0)
     assert str(said.value).startswith(str(path)) and "\n" not in str(said.value)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "right"), [("haed", "head"), ("times", "time"), ("set_target_dat", "set_target_data")]
+)
+def test_a_misspelt_key_is_named(tmp_path, wrong, right):
+    path = tmp_path / "nod.json"
+    move(path, *nod())
+    path.write_text(path.read_text().replace(f'"{right}"', f'"{wrong}"'))
+    with pytest.raises(ConfigError, match=f"got key '{wrong}'; did you mean {right}"):
+        read_move(path)
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"time": [], "set_target_data": []}'])

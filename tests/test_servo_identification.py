@@ -90,7 +90,8 @@ def as_csv(path, times, setpoints, cranks):
 def test_servos_of_a_run_in_drake_are_found(drake_log, tmp_path, capsys):
     path = as_csv(tmp_path / "log.csv", *drake_log)
     out = tmp_path / "out"
-    assert main(["identify", str(path), "--mechanism", "reachy_mini", "--out", str(out)]) == 0
+    words = ["identify", str(path), "--mechanism", "reachy_mini", "--velocity-gain", "0.02"]
+    assert main([*words, "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert not too_long(said)
     assert "mass of 0.280 kg is taken as known" in " ".join(said.split())
@@ -106,7 +107,10 @@ def test_servos_of_a_run_in_drake_are_found(drake_log, tmp_path, capsys):
     assert np.all(np.abs(value - TRUE)[:6] < 2 * widths)
     sc = sd.load_scenario("reachy_mini", None, (f"overlay={out / 'servos.yaml'}",))
     assert sc.actuator.stiffness == pytest.approx(value[1], rel=1e-5)
-    assert sc.eta == pytest.approx(value[0], abs=1e-6)
+    assert sc.actuator.velocity_gain == 0.02
+    assert sc.actuator.crank_damping == pytest.approx(value[2] - 0.02, abs=1e-5)
+    over = ("delay.steps=13", f"overlay={out / 'servos.yaml'}")
+    assert sd.load_scenario("reachy_mini", None, over).eta == 0.26
 
 
 @pytest.mark.slow
@@ -121,6 +125,7 @@ def test_servos_are_found_from_the_log_of_a_simulation(tmp_path, capsys):
     found = json.loads((out / "summary.json").read_text())["parameters"]
     assert found["stiffness"]["value"] == pytest.approx(10, rel=0.01)
     assert found["delay"]["value"] == pytest.approx(0.04, abs=1e-3)
+    assert yaml.safe_load((out / "servos.yaml").read_text())["actuator"]["velocity_gain"] == 0.1
     capsys.readouterr()
     head, *rows = log.read_text().splitlines()
     log.write_text("\n".join([head, *rows[::2]]))

@@ -71,6 +71,16 @@ def test_a_soft_start_begins_at_rest_where_the_head_is():
     assert made("actuator.speed_limit=1.8", start=low, plain=True).blend == 2.0
 
 
+def test_a_motion_that_begins_at_rest_where_the_head_is_needs_no_soft_start():
+    move = "reference={kind: reachy_move, file: look_around}"
+    soft, on = (made(move, f"start={start}", plain=True) for start in ("rest", "on_reference"))
+    assert soft.blend == 0 and np.array_equal(soft.angles, on.angles)
+    assert "no soft start: the motion begins at rest" in str(soft)
+    assert "warning: the motion goes on to 6 s, beyond the duration: --set duration=6" in str(soft)
+    assert len(sd.setpoints("reachy_mini", 50, settings=(move,)).times) == 300  # up to its end
+    assert made(move, start=ROBOT.home + [0, 0.1, 0, 0, 0, 0], plain=True).blend == 1.0
+
+
 def test_the_soft_start_has_the_rates_of_its_pose():
     rng, h, start = np.random.default_rng(2), 1e-6, np.zeros(6)
     amplitude = rng.standard_normal(6)
@@ -89,9 +99,9 @@ def test_the_soft_start_has_the_rates_of_its_pose():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (("actuator.torque_limit=0.2",), r"motor \d at t = [\d.]+ s: got a torque of .*0\.2 N m"),
-        (("actuator.speed_limit=0.5",), r"motor \d at t = .* speed of the setpoint .* rad/s"),
-        (("actuator.angle_range=[-0.6, 1.0]",), r"motor \d at t = .* setpoint of .* -0\.6 to 1"),
+        (("actuator.torque_limit=0.2",), r"motor 4 needs a torque of .* N m \(t = 1\.98 s\)"),
+        (("actuator.speed_limit=0.5",), r"motor \d needs a speed .* at most 0\.5 rad/s"),
+        (("actuator.angle_range=[-0.6, 1.0]",), r"motor \d needs a setpoint of .* -0\.6 to 1 rad"),
         (("reference.amplitude=[0.9, 0, 0, 0, 0, 0]",), r"leg \d reached the end .* at t"),
         (("actuator.kind=torque", "controller.command=torque"), "actuator.kind: got 'torque'"),
     ],
@@ -235,4 +245,4 @@ def test_the_torque_of_a_held_setpoint():
     stiffness = sd.load_scenario("reachy_mini").actuator.stiffness
     step = stiffness * np.abs(np.diff(made.angles, axis=0)).max() / 2
     assert step == pytest.approx((made.steps - np.abs(made.torques)).max(), rel=0.1)
-    assert f"up to {made.steps.max():.3g} N m where it changes" in str(made)
+    assert f"up to {made.steps.max():.3g} N m where they change" in str(made)

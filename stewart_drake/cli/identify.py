@@ -59,6 +59,11 @@ def identify(
         metavar="RAD,M",
         help="Errors of measured poses; 1e-4,2e-5 in a CSV log. With --plan: measure poses.",
     ),
+    velocity_gain: float | None = typer.Option(
+        None,
+        metavar="N",
+        help="Velocity gain of position servos, N m s/rad, which a log shows within the damping.",
+    ),
     gravity: bool | None = typer.Option(
         None, help="Gravity acts on the machine of a CSV log, or is balanced."
     ),
@@ -84,10 +89,12 @@ def identify(
         "tolerance": tolerance,
         "bits": bits,
         "pose-std": pose_std,
+        "velocity-gain": velocity_gain,
         "out": delivery.out,
     }
     if plan is not None:
         of_scenario = {"--mechanism": mechanism, "--delay": delay, "--gravity": gravity}
+        of_scenario |= {"--velocity-gain": velocity_gain}
         refuse(of_scenario, "with --plan; expected it in the scenario, or as --set")
     else:
         refuse({"--set": chosen.settings}, "without --plan; expected it with --plan")
@@ -115,12 +122,16 @@ def identify(
         more["command"] = command_line("identify", *words, options=options)
         with (
             on_interrupt(stopped),
-            named(delay="--delay"),
+            named(delay="--delay", velocity_gain="--velocity-gain"),
             phase_bar("identify", delivery.quiet) as show,
             shown_by(show),
         ):
             found = functions.identify(
-                logs or [], mechanism or "", delay=delay, gravity=gravity is not False, **more
+                *(logs or [], mechanism or ""),
+                delay=delay,
+                gravity=gravity is not False,
+                velocity_gain=velocity_gain,
+                **more,
             )
         delivery.discard(functions.MECHANISM, functions.CALIBRATION, functions.SERVOS)
     unexplained = plan is None and not found.study.right

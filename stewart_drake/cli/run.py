@@ -73,7 +73,9 @@ def simulate(
     viewer = Meshcat() if meshcat else None
     delivery.say_link(experiment.scenario)
     margin = controller_margin(experiment)
-    delivery.say_wrapped(loop_verdict(margin), str(Verdict.of(margin)))
+    delivery.say_wrapped(loop_verdict(margin))
+    if experiment.scenario.controller.command == "torque":
+        delivery.say_wrapped(str(Verdict.of(margin)))
     said = cautions_before(experiment, margin)
     for text in said:
         if not margin.problem or margin.problem not in text:  # which the verdict has

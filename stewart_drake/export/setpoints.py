@@ -21,7 +21,7 @@ from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
 from stewart_drake.loop.servos import known_stiffness
 from stewart_drake.mechanism.kinematics import turned
-from stewart_drake.mechanism.trajectories import PlateTrajectory, evaluate
+from stewart_drake.mechanism.trajectories import PlateTrajectory, evaluate, rows_along
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.field_types import Row, section
 from stewart_drake.scenario.reference_config import degrees_hint
@@ -43,6 +43,8 @@ _LARGEST_RATE: Final = 1000.0  # Hz
 _RESTING: Final = 0.02
 """Crank speed of the first or last setpoint that counts as rest, as a share of the largest one."""
 _ROUNDING: Final = 1e-12
+_SAME_POSE: Final = 1e-6
+"""Largest difference of two poses that count as one, rad and m."""
 _REVERSED: Final = np.repeat([1.0, -1.0, 1.0], 6)  # a motion (18,) backwards in time
 
 
@@ -99,6 +101,7 @@ class Setpoints:
     softens: str  # what is soft: "start", "end" or "start and end"; empty without both
     ends: float  # of the motion, s; infinite for one without an end
     torque_limit: float  # N m
+    from_rest: bool  # whether the motion itself begins at rest where the plate is
 
     def __repr__(self) -> str:
         return f"Setpoints({len(self.times)} of six cranks)"
@@ -112,22 +115,29 @@ class Setpoints:
             np.abs(values).max() for values in (self.torques, self.crank_rates, self.steps)
         )
         end = self.times[-1] + self.times[1]
-        text = f"every limit kept: largest torque {torque:.3g} N m, crank speed {speed:.3g} rad/s"
+        text = (
+            f"limits kept; the motion needs {torque:.3g} N m at most, crank speed {speed:.3g} rad/s"
+        )
         if step > torque:
-            said = f"servos that hold each setpoint give up to {step:.3g} N m where it changes"
+            said = f"held setpoints need up to {step:.3g} N m where they change"
             if step > self.torque_limit:
                 said = (
                     f"warning: {said},\n  more than their {self.torque_limit:.3g} N m: raise --rate"
                 )
             text += f"\n{said}"
+        if self.from_rest:
+            text += "\nno soft start: the motion begins at rest where the plate is"
         if self.blend:
             text += f"\nsoft {self.softens}: {self.blend:g} s"
         if self.ends < end - _ROUNDING:
             text += f"\nthe motion ends at {self.ends:.6g} s: its last pose is held up to {end:g} s"
         if math.inf > self.ends > end + _ROUNDING:
-            text += f"\nwarning: the motion goes on to {self.ends:.6g} s, beyond the duration"
+            text += (
+                f"\nwarning: the motion goes on to {self.ends:.6g} s, beyond the duration: "
+                f"--set duration={self.ends:.6g}"
+            )
         first, last = np.abs(self.crank_rates[[0, -1]]).max(axis=1)
-        if first > _RESTING * speed and "start" not in self.softens:
+        if first > _RESTING * speed and not (self.from_rest or "start" in self.softens):
             text += f"\nwarning: the first setpoint is in motion ({first:.2g} rad/s): see --from"
         if last > _RESTING * speed and "end" not in self.softens:
             text += f"\nwarning: the last setpoint is in motion ({last:.2g} rad/s): see --soft-end"
@@ -167,7 +177,7 @@ def make_setpoints(
     `controller.calibration` replace those of the plant.
 
     A motion that does not begin at rest where the plate is, starts softly. From the pose x_0, which
-    is `start`, or for `start: rest` the first pose of the reference r, the motion is
+    is `start`, or for `start: rest` that of the scenario, to the reference r the motion is
 
         x(t) = x_0 + g(t / T) (r(t) - x_0),   g(s) = 10 s^3 - 15 s^4 + 6 s^5 up to s = 1, then 1.
 
@@ -204,8 +214,11 @@ def make_setpoints(
         start = _checked(start, experiment)
     elif scenario.start == "rest":
         start = experiment.start[POSE]
+    from_rest = start is not None and _rests(experiment, start)
+    if from_rest:
+        start = None
     if start is None and not soft_end:
-        return _along(experiment, _Soft(), rate, plain, learned)
+        return replace(_along(experiment, _Soft(), rate, plain, learned), from_rest=from_rest)
     stop = evaluate(experiment.reference, scenario.duration)[POSE] if soft_end else None
     soft = _Soft(start, stop, SHORTEST_BLEND, scenario.duration)
     if scenario.duration < soft.blend:
@@ -215,7 +228,8 @@ def make_setpoints(
         )
     while True:
         try:
-            return _along(experiment, soft, rate, plain, learned)
+            found = _along(experiment, soft, rate, plain, learned)
+            return replace(found, from_rest=from_rest)
         except _BrokenLimit as broken:
             # A slower start or end does not mend what the motion between them breaks.
             if not soft.at(broken.time) or 2 * soft.blend > scenario.duration:
@@ -243,6 +257,15 @@ def _check_learned(scenario: Scenario, rate: float, plain: bool) -> None:
             f"rate: got {rate:g} Hz; expected {1 / c.period:g} Hz, that of controller.period, for "
             "which the setpoints were learned"
         )
+
+
+def _rests(experiment: Experiment, pose: Array) -> bool:
+    """Return whether the reference begins at rest at a pose (6,)."""
+    sc, reference = experiment.scenario, experiment.reference
+    first = evaluate(reference, 0.0)
+    speeds = np.abs(rows_along(reference, np.linspace(0.0, sc.duration, 501))[:, RATES])
+    still = np.abs(first[RATES]) <= _RESTING * speeds.max(axis=0) + _ROUNDING
+    return bool(np.all(still) and np.abs(first[POSE] - pose).max() < _SAME_POSE)
 
 
 class _BrokenLimit(ConfigError):
@@ -359,14 +382,14 @@ def _along(
     ends = float(samples[-1]) if len(samples) else math.inf
     found = Setpoints(
         *(times, setpoints, cranks, rates, torques, steps, soft.blend),
-        *(soft.name, ends, experiment.torque_limit),
+        *(soft.name, ends, experiment.torque_limit, False),
     )
     _check(found, servo, experiment, rate)
     return found
 
 
 def _check(found: Setpoints, servo: Stiffness | None, experiment: Experiment, rate: float) -> None:
-    """Raise _BrokenLimit for the first setpoint beyond a limit."""
+    """Raise _BrokenLimit for the setpoint furthest beyond a limit."""
     speed = getattr(experiment.scenario.actuator, "speed_limit", None) or math.inf
     low, high = (-math.inf, math.inf) if servo is None else (servo.low, servo.high)
     moved = np.diff(found.angles, axis=0, prepend=found.angles[:1]) * rate
@@ -378,14 +401,14 @@ def _check(found: Setpoints, servo: Stiffness | None, experiment: Experiment, ra
     )
     for name, unit, values, least, most in limits:
         excess = np.maximum(values - most, least - values)
-        if np.any(excess > _ROUNDING):
-            k = int(np.argmax(np.any(excess > _ROUNDING, axis=1)))
-            motor = int(np.argmax(excess[k]))
-            ends = (float(np.broadcast_to(end, NUM_TORQUES)[motor]) for end in (least, most))
+        if excess.max() > _ROUNDING:
+            k, motor = np.unravel_index(excess.argmax(), excess.shape)
+            low, high = (float(np.broadcast_to(end, NUM_TORQUES)[motor]) for end in (least, most))
+            value, allowed = float(values[k, motor]), f"{low:.3g} to {high:.3g} {unit}"
+            if low == -high:
+                value, allowed = abs(value), f"at most {high:.3g} {unit}"
             raise _BrokenLimit(
                 float(found.times[k]),
-                f"motor {LEGS[motor]} at t = {found.times[k]:.2f} s: got a {name} of "
-                f"{values[k, motor]:.3g} {unit}; expected "
-                + " to ".join(f"{end:.3g}" for end in ends)
-                + f" {unit}",
+                f"motor {LEGS[motor]} needs a {name} of up to {value:.3g} {unit} (t = "
+                f"{found.times[k]:.2f} s); expected {allowed}",
             )

@@ -9,7 +9,7 @@ from typing import Final, Literal
 
 from stewart_drake.files.errors import ConfigError, resembling
 
-Kind = Literal["mechanism", "scenario", "controller", "overlay", "weights"]
+Kind = Literal["mechanism", "scenario", "controller", "overlay", "weights", "move"]
 
 KINDS: Final[dict[Kind, tuple[str, str, str]]] = {
     "mechanism": ("mechanisms", "models", ".yaml"),
@@ -17,6 +17,7 @@ KINDS: Final[dict[Kind, tuple[str, str, str]]] = {
     "controller": ("controllers", "diagrams/controllers", ".yaml"),
     "overlay": ("overlays", "diagrams/overlays", ".yaml"),
     "weights": ("tuner weights", "models/weights", ".json"),
+    "move": ("moves of Reachy Mini", "diagrams/moves", ".json"),
 }
 """Kinds of shipped data, with plural, folder and suffix."""
 

@@ -267,15 +267,18 @@ def rule(holds: Callable[[Any], bool], expected: str = "") -> pydantic.AfterVali
     return pydantic.AfterValidator(check)
 
 
-def exactly(number: int, what: str = "numbers") -> pydantic.AfterValidator:
+def exactly(number: int, what: str = "numbers") -> pydantic.WrapValidator:
     """Return an annotation of a list with a fixed length, with one message for both bounds."""
 
-    def check(values: list[Any]) -> list[Any]:
+    def check(value: Any, accept: pydantic.ValidatorFunctionWrapHandler) -> Any:
+        if isinstance(value, int | float | str):
+            raise ValueError(f"a list of {number} {what}")
+        values = accept(value)
         if len(values) != number:
             raise ValueError(f"{number} {what}, not {len(values)}")
         return values
 
-    return pydantic.AfterValidator(check)
+    return pydantic.WrapValidator(check)
 
 
 def brief(value: object) -> str:

@@ -60,7 +60,6 @@ from stewart_drake.identification.servo_logs import ServoLog
 from stewart_drake.law.servos import PositionServo
 from stewart_drake.mechanism.geometry import Mechanism, with_rotors
 from stewart_drake.mechanism.kinematics import legs_along, turned
-from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
     BALL_JOINTS,
     DEFAULT_BALL_JOINT_SPEED,
@@ -238,6 +237,7 @@ class ServoIdentification:
     iterations: int  # of the fit
     # (8,) of theta from the first fit to the second, 0 if that explains the log
     change: Array = field(default_factory=lambda: np.zeros(len(NAMES)))
+    velocity_gain: float = 0.0  # known, a part of the damping, N m s/rad
 
     @property
     def misfit(self) -> float:
@@ -321,16 +321,19 @@ class ServoIdentification:
 
     @property
     def overlay(self) -> dict[str, Any]:
-        """Fields of a scenario with the numbers found, for `--set overlay=FILE`."""
+        """Fields of a scenario with the numbers found, for `--set overlay=FILE`.
+
+        Without the delay: in `live` that includes the link's.
+        """
         period = float(np.median(np.diff(self.model.log.times)))
         value = [float(f"{x:.6g}") for x in self.theta]
-        delay = Delay.of(value[D], period)
+        gain = min(self.velocity_gain, value[DAMPING])
         return {
             "actuator": {
                 "kind": "position_servo",
                 "stiffness": value[K],
-                "velocity_gain": 0.0,
-                "crank_damping": value[DAMPING],
+                "velocity_gain": gain,
+                "crank_damping": float(f"{value[DAMPING] - gain:.6g}"),
                 "friction": value[FRICTION],
                 "friction_speed": value[SPEED],
                 "armature": value[ARMATURE],
@@ -339,7 +342,6 @@ class ServoIdentification:
                 "ball_joint_friction": value[BALL_FRICTION],
                 "ball_joint_damping": value[BALL_DAMPING],
             },
-            "delay": {"steps": delay.steps, "fraction": float(f"{delay.fraction:.6g}")},
             "controller": {"period": float(f"{period:.6g}")},
         }
 
@@ -417,8 +419,11 @@ def identify_servos(
     mechanism: Mechanism,
     rounding: float,
     gravity: float = DEFAULT_GRAVITY,
+    velocity_gain: float = 0.0,
 ) -> ServoIdentification:
     """Return the servos that explain a log best.
+
+    A log shows the sum of velocity gain and damping only; the `overlay` has both.
 
     Friction of the ball joints is fitted if residuals without it are more than rounding, and kept
     if it explains a part of them. `effort_limit` of the mechanism is the motors' torque limit,
@@ -438,6 +443,7 @@ def identify_servos(
         rubbing = _fitted(model, start, np.arange(len(NAMES)), rounding)
         better = rubbing.residual < KEPT * found.residual
         found = rubbing if better else replace(found, ball_joints_tried=True)
+    found = replace(found, velocity_gain=velocity_gain)
     if not found.right:
         return found
     progress.phase("friction of slow cranks unknown")
@@ -445,7 +451,8 @@ def identify_servos(
     again = _fitted(model, found.theta, found.free, rounding, white)
     kept = again if again.misfit <= GOOD_MISFIT else found
     change = again.theta - found.theta if again.misfit > 1 else kept.change
-    return replace(kept, change=change, ball_joints_tried=found.ball_joints_tried)
+    tried = found.ball_joints_tried
+    return replace(kept, change=change, ball_joints_tried=tried, velocity_gain=velocity_gain)
 
 
 class _Spent(Exception):

@@ -1,5 +1,6 @@
 """Checks of a live run, and references from where the plate is."""
 
+from collections import deque
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -9,6 +10,7 @@ from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.timeline import Timeline, TorqueSchedule
 from stewart_drake.live.governor import Steering
+from stewart_drake.live.protocol import SECOND
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE, RATES
 from stewart_drake.types import Array
 
@@ -55,6 +57,33 @@ class ReportCheck:
 
     def _was_sent(self, number: int, torque: Array) -> bool:
         return any(np.array_equal(row, torque) for row in self._sent.get(number, []))
+
+
+class WireCheck:
+    """Compares the time after which commands act with the design's, over a simulated wire."""
+
+    def __init__(self, limit: float, eta: float, period: float) -> None:
+        self._limit, self._eta, self._period = limit, eta, period
+        self._sent: deque[tuple[int, Array]] = deque(maxlen=_KEPT)
+        self._last = self._off = 0
+
+    def sent(self, sampled: int, row: Array) -> None:
+        """Note the command (6,) of the measurement taken at `sampled`, ns."""
+        self._sent.append((sampled, np.clip(row, -self._limit, self._limit)))
+
+    def warning(self, acted_from: int, row: Array) -> str:
+        """Return a warning for commands that act another time than designed; mostly empty."""
+        times = [sampled for sampled, sent in self._sent if np.array_equal(sent, row)]
+        if acted_from == self._last or len(times) != 1:  # known before, or ambiguous at rest
+            return ""
+        self._last, took = acted_from, (acted_from - times[0]) / SECOND
+        self._off = self._off + 1 if abs(took - self._eta) > self._period / 2 else 0
+        if self._off < _ROWS:
+            return ""
+        return (
+            f"commands act {took:.3g} s after their measurement, and this end expects "
+            f"{self._eta:.3g} s: give machine and live the same delay.steps"
+        )
 
 
 # ---------------------------------------------------------------- new references

@@ -18,7 +18,7 @@ from stewart_drake.dynamics.workspace import margins
 from stewart_drake.law.channel import Report
 from stewart_drake.law.gaps import LONGEST_GAP, stays_within_reach
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.live.checks import ReportCheck, recovered, replanned, until_next
+from stewart_drake.live.checks import ReportCheck, WireCheck, recovered, replanned, until_next
 from stewart_drake.live.contact import Contact
 from stewart_drake.live.design import Design
 from stewart_drake.live.endpoint import now
@@ -74,6 +74,7 @@ class LiveLoop:
         memory: memory of the law after the last sample.
         recoveries: number of new references that were planned.
         taken_over: whether the plate was not at the scenario's start.
+        delay_warning: text about a simulated wire with another delay, or empty.
         missed: number of steps whose delay exceeded a period and the usual jitter.
         resting: delays of the steps that bring the plate to rest, which are not recorded, s. A
             delay is from the earliest arrival of the measurement until its torques were sent. It
@@ -108,7 +109,10 @@ class LiveLoop:
         self.exchange = Exchange(contact, self._period, design.law.sensing.size)
         self._watch = Watch(self.exchange, self._period, say)
         self.record = LiveRecord(design.experiment, design.torque_limit, log, say, logs)
-        self._check = ReportCheck(math.inf if design.cranks else design.torque_limit)
+        limit = math.inf if design.cranks else design.torque_limit
+        self._check, self.delay_warning = ReportCheck(limit), ""
+        self._wire = WireCheck(limit, design.law.timeline.eta, self._period)
+        self._estimates_delay = design.experiment.scenario.controller.delay_estimator != "none"
         self._parked = self._leads = False
         self._recording, self._hold = True, hold
         self._max_missing = max_missing
@@ -213,6 +217,8 @@ class LiveLoop:
             problem = self._check.problem(acted) if design.sends else None
             if problem is not None:
                 return self._watch.end("refused", k, problem)
+            if not (design.sends or self._estimates_delay or self.delay_warning):
+                self._compare_delays(message)
             report = self._heard(k, acted)
         if not self._leads:
             if not measurement.complete and not self._parked:  # the pose is unknown
@@ -304,11 +310,20 @@ class LiveLoop:
             rows = self._learned.packet(k, memory, rows, self._by_hand)
         return rows, k - self._design.repeats
 
+    def _compare_delays(self, message: MachineMessage) -> None:
+        if message.acted_from == NEVER or not len(message.acted):
+            return
+        when = message.acted_from - message.begin
+        self.delay_warning = self._wire.warning(when, message.acted[0])
+        if self.delay_warning:
+            self._say(f"warning: {self.delay_warning}")
+
     def _send(self, k: int, packet: Array, first: int) -> None:
         P, timeline = round(self._period * SECOND), self._design.law.timeline
         eta = round(self.memory.belief.timeline.eta * SECOND)
         self.exchange.send(k, packet, first, eta, self._design.cranks)
         self._check.sent(first + round((eta - timeline.fraction * P) / P), packet)
+        self._wire.sent(k * P, packet[0])
 
     def _as_sent(self, k: int) -> Any:
         """Return the memory for the record, with the torque as it was sent."""

@@ -198,7 +198,7 @@ def controller_margin(
     end = sc.duration if until is None else float(fixed("until", until, (), 0.0))
     if sc.controller.command != "torque":
         # The loops of servos are checked where the servos are made.
-        problem = "servos close theirs at the machine, and nothing is fed back across the delay"
+        problem = "the servos close their own loops, the delay is outside"
         return ControllerMargin(sc.controller.period, sc.eta, problem=problem, span=end)
     truth, law = _parts(loop, experiment)
     truth = truth if machine is None else machine

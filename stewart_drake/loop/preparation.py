@@ -142,7 +142,7 @@ class Experiment(NamedTuple):
     def weak_motors(self) -> str | None:
         """Return a warning about a motion that takes more torque than the motors give, or None."""
         sc, limit = self.scenario, self.torque_limit
-        if math.isinf(limit) or sc.controller.command != "torque":
+        if math.isinf(limit) or sc.actuator.kind == "servo":
             return None
         needed = reference_torque(self.true_dynamics(), self.reference, sc.duration)
         if not needed > limit:  # NaN beyond the reach, where the law keeps the limits
@@ -226,7 +226,7 @@ def check_reach(experiment: Experiment) -> None:
             + (f", short by {-1e3 * failure.margin:.3g} mm" if short else "")
             + "; expected a motion within reach"
             + (
-                ", such as one of smaller amplitude"
+                (", edit the file or move lower" if file else ", such as one of smaller amplitude")
                 if failure.time > 0
                 else f": {first_pose_text(first, experiment.mechanism)}"
             )

@@ -39,7 +39,7 @@ from stewart_drake.law.servos import (
     mean_inertia,
     still,
 )
-from stewart_drake.law.startup import INSTANTS
+from stewart_drake.law.startup import INSTANTS, reference_torque
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.law_design import compose_law, one_step_sizing
 from stewart_drake.loop.learned import learned_signal
@@ -374,7 +374,16 @@ def servo_law(experiment: Experiment) -> tuple[ServoPreview, Trajectory, float]:
                 return False
         return True
 
-    periods = shortest(possible, period, sc.controller.catch_up, experiment.planned_limit)
+    try:
+        periods = shortest(possible, period, sc.controller.catch_up, experiment.planned_limit)
+    except ConfigError:
+        needed = reference_torque(experiment.nominal, reference, sc.duration)
+        if needed <= experiment.torque_limit:
+            raise
+        raise ConfigError(
+            f"reference: needs up to {needed:.3g} N m of a motor; expected at most "
+            f"{experiment.torque_limit:.3g} N m, a slower or smaller motion"
+        ) from None
     return (law, reference, 0.0) if periods is None else (law, blend(periods), periods * period)
 
 

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from stewart_drake.files.errors import ConfigError, resembling
 from stewart_drake.files.jsonio import load_json
+from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import brief
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.mechanism.kinematics import rotation
@@ -38,6 +39,7 @@ HEAD_HEIGHT = 0.177
 _ROUNDING = 1e-3  # rotation matrices of the SDK are written with three digits
 _EXPECTED: Final = "a recorded move of Reachy Mini: `time` and `set_target_data` of equal length"
 _MAX_BYTES: Final = 100_000_000
+_MOVE: Final = "time", "set_target_data"
 _TARGET: Final = "head", "body_yaw", "antennas"
 _LONGEST_STEP: Final = 1.0
 """Largest mean time between samples, s; the SDK records some 50 to 100 per second."""
@@ -61,11 +63,15 @@ def pose_of_head(head: ArrayLike, body_yaw: float = 0.0) -> Array:
     """
     matrix = np.asarray(head, dtype=np.float64)
     X_WH = matrix.reshape(4, 4) if matrix.size == 16 else matrix
-    if X_WH.shape != (4, 4) or not np.all(np.isfinite([*X_WH.ravel(), body_yaw])):
+    if X_WH.shape != (4, 4) or not np.all(np.isfinite(X_WH)):
         raise ConfigError(f"head: got shape {matrix.shape}; expected (4, 4), finite numbers")
     R = X_WH[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > _ROUNDING or np.linalg.det(R) < 0:
-        raise ConfigError("head: got no rotation in its first three rows; expected one")
+        raise ConfigError(
+            "head: got rows that are no rotation; expected a rotation and a translation in m"
+        )
+    if not abs(body_yaw) <= math.pi:
+        raise ConfigError(f"body_yaw: got {body_yaw:g}; expected -pi to pi rad")
     turn = rotation(np.array([0.0, 0.0, -body_yaw]))
     R = turn @ R
     position = turn @ (X_WH[:3, 3] + [0.0, 0.0, HEAD_HEIGHT]) + R @ _center()
@@ -87,9 +93,9 @@ def head_of_pose(pose: Array, body_yaw: float = 0.0) -> Array:
 
 
 def read_move(path: str | Path) -> tuple[Array, Array]:
-    """Read a recorded move.
+    """Read a recorded move, a shipped name or a path.
 
-    The first sample is at time 0. Antennas and the description are ignored, and a missing
+    Time begins at the first sample. Antennas and the description are ignored, and a missing
     `body_yaw` is 0.
 
     Returns:
@@ -98,9 +104,10 @@ def read_move(path: str | Path) -> tuple[Array, Array]:
     Raises:
         ConfigError: no such file, or samples that are refused in a CSV file of a motion too.
     """
-    path = Path(path)
+    path = resolve("move", path)
     data = load_json(path, _MAX_BYTES, _EXPECTED)
     stamps, targets = data.get("time"), data.get("set_target_data")
+    _check_spelling(data, _MOVE, str(path))
     if not (isinstance(stamps, list) and isinstance(targets, list)):
         raise ConfigError(f"{path}: got keys {brief(sorted(data))}; expected {_EXPECTED}")
     if len(stamps) != len(targets):
@@ -133,21 +140,30 @@ def _number(value: Any, where: str) -> float:
 
 
 def _pose(target: Any, where: str) -> Array:
+    if isinstance(target, dict):
+        _check_spelling(target, _TARGET, where)
     if not isinstance(target, dict) or "head" not in target:
         raise ConfigError(f"{where}: got {brief(target)}; expected an object with `head`")
-    for name in target:
-        if name not in _TARGET and (close := resembling(name, _TARGET)):
-            raise ConfigError(f"{where}: got key {brief(name)}; did you mean {close[0]}?")
     yaw = _number(target.get("body_yaw", 0.0), f"{where}.body_yaw")
-    if abs(yaw) > math.pi:
-        raise ConfigError(f"{where}.body_yaw: got {yaw:g}; expected -pi to pi rad")
     try:
-        return pose_of_head(np.array(target["head"], dtype=np.float64), yaw)
-    except (ValueError, TypeError):  # ConfigError is a ValueError; ragged lists and words too
+        head = np.array(target["head"], dtype=np.float64)
+        if head.size != 16 or not np.all(np.isfinite(head)):
+            raise ValueError
+    except (ValueError, TypeError):  # ragged lists and words
         raise ConfigError(
             f"{where}.head: got {brief(target['head'])}; expected 4 rows of 4 numbers, or 16, of a "
             "rotation and a translation in m"
         ) from None
+    try:
+        return pose_of_head(head, yaw)
+    except ConfigError as error:
+        raise ConfigError(f"{where}.{error}") from None
+
+
+def _check_spelling(given: dict[str, Any], names: tuple[str, ...], where: str) -> None:
+    for name in given:
+        if name not in names and (close := resembling(name, names)):
+            raise ConfigError(f"{where}: got key {brief(name)}; did you mean {close[0]}?")
 
 
 @make_reference.register

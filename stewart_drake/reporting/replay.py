@@ -16,6 +16,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import turns_between
 from stewart_drake.reporting.document import number
 from stewart_drake.reporting.page import environment
+from stewart_drake.reporting.run import late_error
 from stewart_drake.scenario.run_log import EXPECTED, read_log, scenario_of
 from stewart_drake.scenario.signals import ANGLES, LEGS, POSITION
 
@@ -56,7 +57,9 @@ def replay_html(result: SimulationResult, mechanism: Mechanism, title: str) -> s
     if result.stopped is not None:
         outcome += f" at {result.stopped.time:.2f} s"
     else:
-        outcome += f", E_ac {number(result.accumulated_error)} % s"
+        late = late_error(result) if result.scenario.actuator.kind == "position_servo" else ""
+        error = late and f"rms error {late} in the second half"  # E_ac is that of the soft start
+        outcome += f", {error or f'E_ac {number(result.accumulated_error)} % s'}"
     return _html(result.signals, mechanism, title, outcome)
 
 

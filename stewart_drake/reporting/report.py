@@ -45,7 +45,14 @@ from stewart_drake.reporting.mechanism import mechanism_figure
 from stewart_drake.reporting.page import Provenance
 from stewart_drake.reporting.replay import replay_html
 from stewart_drake.reporting.results import AnalysisResult
-from stewart_drake.reporting.run import comparison_document, moving, run_document, torqueless, worst
+from stewart_drake.reporting.run import (
+    comparison_document,
+    late_error,
+    moving,
+    run_document,
+    torqueless,
+    worst,
+)
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.link import link_text, number_sent
 from stewart_drake.scenario.loading import load_compatible, scenario_yaml, setting_texts
@@ -58,6 +65,7 @@ from stewart_drake.studies.verdict import fold
 from stewart_drake.tuner.network import DEFAULT
 
 ANALYSES: Final = ("delay", "hautus", "workspace")
+AS_GIVEN: Final = "as_given"
 _OWN: Final = ""
 """Key of the scenario's own run; no row of a comparison has this name."""
 _WEIGHTED: Final = ("delay_lqr", "delay_lqi", "predictor_lqi")
@@ -145,6 +153,9 @@ def collect(
         rows = set(scenarios)
         if scenario not in scenarios.values():
             scenarios[_OWN] = scenario
+            if scenario.actuator.kind == "position_servo":  # its rows are few, so this one, too
+                scenarios = {AS_GIVEN: scenarios.pop(_OWN), **scenarios}
+                rows.add(AS_GIVEN)
         if has_network(scenario):
             tuned = (*settings, "tuner.kind=ann")
             for name in _WEIGHTED:
@@ -162,7 +173,8 @@ def collect(
 
 def has_network(scenario: Scenario) -> bool:
     """Return whether the report adds runs with a network's weights."""
-    return scenario.tuner.kind != "ann" and DEFAULT in shipped("weights")
+    servos = scenario.actuator.kind == "position_servo"
+    return scenario.tuner.kind != "ann" and not servos and DEFAULT in shipped("weights")
 
 
 def _work(
@@ -228,7 +240,7 @@ def document(found: ReportData, name: str, replay: str = "") -> Document:
         replay=replay and Frame(replay),
         run=own,
         comparison=found.comparison
-        and _blocks(comparison_document(found.comparison, found.tuned, said)),
+        and _blocks(comparison_document(found.comparison, found.tuned, said, found.run)),
         papers=is_papers(found.scenario),
         no_weights="weights" not in compared,
         compared=[
@@ -314,6 +326,8 @@ def verdict(found: ReportData) -> tuple[str, Tone]:
     text = f"The plate follows its reference for {duration}: E_ac is "
     if bad:
         text = f"Not reliable: {bad}. The run completed {duration}: E_ac is "
+    if run.scenario.actuator.kind == "position_servo" and (late := late_error(run)):
+        text = text.replace(": E_ac", f": rms error {late} in the second half. With the start E_ac")
     error, floor = number(round(s["accumulated_error"], 9)), s["delay_floor"]
     average = f"{number(round(mean_error(run), 9), 2)} % {_averaged(run)}"
     if floor > 0:

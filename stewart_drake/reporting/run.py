@@ -72,7 +72,7 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
         torqueless=torqueless(result),
         s=s,
         peaks=", ".join(_peaks(result)),
-        second_half=_second_half(result),
+        second_half=late_error(result),
         floor=waits_at_rest(result.scenario),
         delay=measured(2e3 * s["delay"]["std_s"], 1e3 * s["delay"]["estimated_s"]),
         estimates=_estimates(result),
@@ -144,7 +144,7 @@ def _peaks(run: SimulationResult) -> list[str]:
     ]
 
 
-def _second_half(run: SimulationResult) -> str:
+def late_error(run: SimulationResult) -> str:
     """Return the rms errors of angle and distance in the second half; empty for a lost run.
 
     The angle is that of the rotation between the reference and the plate.
@@ -173,9 +173,12 @@ def worst(run: SimulationResult) -> str:
 
 
 def comparison_document(
-    results: _Runs, tuned: _Runs | None = None, said: Collection[str] = ()
+    results: _Runs,
+    tuned: _Runs | None = None,
+    said: Collection[str] = (),
+    own: SimulationResult | None = None,
 ) -> Document:
-    """Return a row per controller, the tuner's runs last.
+    """Return a row per controller, the tuner's runs last; that of the run `own` is marked.
 
     A first section has the paper's Table II, if the scenario is the paper's and adds rows of its
     controllers. Warnings in `said` were printed before and are left out.
@@ -197,7 +200,8 @@ def comparison_document(
             "overshoot": math.hypot(1, sc.eta),
             "room": largest_factor(whole.mechanism, whole.reference, instants).value,
         }
-    runs = [(label(name), name, run) for name, run in results.items()]
+    mark = {id(own): ", this run"}
+    runs = [(label(name) + mark.get(id(run), ""), name, run) for name, run in results.items()]
     runs += [
         (f"{label(name)}, tuned", f"{name}, tuned", run) for name, run in (tuned or {}).items()
     ]
@@ -213,6 +217,7 @@ def comparison_document(
         runs=[_row(title, name, run) for title, name, run in runs],
         loops=[(name, label(name), loop_word(margin)) for name, margin in margins.items()],
         surprising=any(margin and margin["stable"] for margin in lost),
+        servos=all(run.scenario.actuator.kind == "position_servo" for run in results.values()),
         both=len({run.scenario.controller.command for run in results.values()}) > 1,
         cautions=_shared_warnings(results, said),
         **context,
@@ -236,7 +241,8 @@ def _best(runs: _Runs) -> str:
 def _row(title: str, name: str, run: SimulationResult) -> dict[str, Any]:
     """Return a row of the comparison; a run that ended early shows how, not its errors."""
     s, stopped = run.summary, run.stopped
-    row = {"title": title, "name": name, "paper": _paper_error(name, run), "s": s}
+    late = late_error(run).partition(" deg")[0] or "-"
+    row = {"late": late, "title": title, "name": name, "paper": _paper_error(name, run), "s": s}
     if stopped is None:
         floor = s["delay_floor"] if waits_at_rest(run.scenario) else "-"
         numbers = {"error": s["accumulated_error"], "floor": floor, "cost": s["cost"]}

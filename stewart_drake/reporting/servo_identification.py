@@ -67,6 +67,7 @@ def _document(identified: ServoIdentification, tone: Tone, **more: object) -> Do
         right=identified.right,
         weak=identified.weak,
         mechanism=identified.model.mechanism.name,
+        gain=identified.velocity_gain and number(identified.velocity_gain),
         limit="none" if np.isinf(limit) else f"{limit:g} N m",
         mass=number(identified.model.mechanism.plate.mass),
         stiffness=number(identified.theta[K]),

@@ -3,6 +3,7 @@
 Progress is a bar per run on a terminal, and a line every ten seconds in a log or pipe.
 """
 
+import json
 import os
 import re
 import sys
@@ -30,6 +31,8 @@ _COLORS: Final = {
     "red": r"cannot be compensated|\bunstable\b|^error:"
     r"|\b(left workspace|solver failed)( at [\d.]+ s(, leg \d)?)?",
 }
+_FEWEST: Final = 4
+"""Pieces after whose end their pace tells the time left."""
 EVERY: Final = 10.0
 """Time between two lines of progress without a terminal, s."""
 
@@ -49,11 +52,13 @@ def shipped_table(kind: "Kind") -> str:
     """Return the shipped files of a kind, each with the first sentence of its opening comment."""
     from stewart_drake.files.resources import resolve, shipped
 
-    return rows({f"  {name}": _description(resolve(kind, name)) for name in shipped(kind)})
+    return rows({f"  {name}": _description(kind, resolve(kind, name)) for name in shipped(kind)})
 
 
-def _description(path: Path) -> str:
-    if path.suffix == ".json":  # a network, without comments
+def _description(kind: "Kind", path: Path) -> str:
+    if kind == "move":
+        return str(json.loads(path.read_text(encoding="utf-8"))["description"]).rstrip(".")
+    if kind == "weights":  # a network, without comments
         from stewart_drake.tuner.network import NUM_INPUTS, NUM_OUTPUTS, load_network
 
         network = load_network(path)
@@ -107,7 +112,7 @@ def count_bar(
             # The pace is measured from here: an earlier start may have done some of them.
             bars.reset(task, total=total, completed=done)
             bars.advance(task, 0)
-        _update(bars, task, done, f"{done} of {total}")
+        _update(bars, task, done, f"{done} of {total}", done >= _FEWEST)
 
     with _bars(quiet, lambda: f"{name}: {bars.tasks[0].fields['state']}") as bars:
         task = bars.add_task(name, total=None, state=first)
@@ -122,10 +127,14 @@ def phase_bar(name: str, quiet: bool) -> Iterator[Callable[[str], None]]:
         yield lambda text: bars.update(task, state=text)
 
 
-def _update(bars: "Progress", task: "TaskID", completed: float, text: str) -> None:
-    """Advance a bar and show its text with the estimated time left."""
+def _update(
+    bars: "Progress", task: "TaskID", completed: float, text: str, estimated: bool = True
+) -> None:
+    """Advance a bar and show its text, with the estimated time left."""
     bars.update(task, completed=completed)
-    left = next(one.time_remaining for one in bars.tasks if one.id == task)
+    left = None
+    if estimated:
+        left = next(one.time_remaining for one in bars.tasks if one.id == task)
     text += "" if left is None else f", about {_duration(left)} left"
     bars.update(task, state=text)
 

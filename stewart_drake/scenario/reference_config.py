@@ -148,7 +148,8 @@ class ReachyMoveConfig:
     """A recorded move of Reachy Mini, in the format of its SDK.
 
     Attributes:
-        file: JSON of `time` and `set_target_data`, see `machines.reachy_mini.read_move`.
+        file: a shipped move, or JSON of `time` and `set_target_data`, see
+            `machines.reachy_mini.read_move`.
     """
 
     kind: Literal["reachy_move"] = "reachy_move"

@@ -142,12 +142,16 @@ def shown(
 ) -> dict[str, Scenario]:
     """Return scenarios by controller: the given ones, or the shipped and those of `compare`.
 
-    To the latter ADAPTIVE is added if the others' delay is not the true one, or changes, and the
-    scenario supports it; GRAVITY if gravity acts; SERVOS if the scenario's motors are servos.
+    The latter are SERVOS for servos given by their stiffness. For others ADAPTIVE is added if the
+    delay is not the true one, or changes, and the scenario supports it; GRAVITY if gravity acts;
+    SERVOS if the motors are servos.
     """
     settings = setting_texts(settings)
     if controllers is not None:
         return load_comparison(scenario_name, controllers, settings, further=False)
+    motors = read_scenario(scenario_name, settings=settings).scenario.actuator.kind
+    if motors == "position_servo":
+        return load_comparison(scenario_name, SERVOS, settings)
     rows, further = load_comparison(scenario_name, CONTROLLERS, settings, False), list[str]()
     aware = rows["predictor_lqi"]
     known = aware.delay.constant and believed_delay(aware) == aware.true_delay
@@ -156,7 +160,7 @@ def shown(
         further.append(ADAPTIVE)
     if aware.plant.gravity:
         further += GRAVITY
-    if read_scenario(scenario_name, settings=settings).scenario.actuator.kind != "torque":
+    if motors != "torque":
         further += SERVOS
     return load_comparison(scenario_name, (*CONTROLLERS, *further), settings)
 

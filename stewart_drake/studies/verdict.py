@@ -116,7 +116,7 @@ class Verdict:
 def loop_verdict(loop: ControllerMargin) -> str:
     """Return one sentence: stability and margins of this controller on this plant."""
     if loop.problem:
-        return f"this loop is not judged: {loop.problem}"
+        return f"no stability check of this loop: {loop.problem}"
     assumptions = []
     if loop.estimated:
         found = "payload, friction and delay" if loop.delay_found else "payload and friction"
