@@ -286,5 +286,5 @@ def test_the_command_names_the_links_that_cross(tmp_path, capsys):
     assert found["least"]["distance"] == min(one["distance"] for one in found["touching"])
     assert len(found["pairs"]) == len(ClearanceScene(PAPER).pairs)
     assert found["base"]["distance"] < 0
-    assert " base," not in told and "into a base that is a full disc; cutouts" in told
+    assert " base," not in told and "below the base: cut it out" in told
     assert told.count("crosses a base that is a full disc") == 1  # its rows are on the page

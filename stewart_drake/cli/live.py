@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import math
 import multiprocessing
+import os
 import shlex
 import signal
 import sys
@@ -57,7 +58,7 @@ def live(
         "--demo",
         help="Start a simulated machine too, with up to 0.4 of the delay each way.",
     ),
-    no_browser: bool = typer.Option(False, "--no-browser", help="Open no page."),
+    no_browser: bool = typer.Option(False, "--no-browser", help="Serve no page."),
     given: Given,
     delivery: Delivery,
 ) -> int:
@@ -103,8 +104,7 @@ def live(
         where = machine or running.enter_context(_demo_machine(chosen, loaded.eta))
         from stewart_drake.live import session
 
-        delivery.say(f"calling {where}")
-        ready = session.prepare_session(loaded, address_of(where), key)
+        ready = session.prepare_session(loaded, address_of(where), key, say=delivery.say)
         delivery.say_wrapped(*session.plans(ready, span, name))
         session.check_armed(ready, options.armed)
         # The demo's machine is simulated and needs no consent.
@@ -197,8 +197,7 @@ def _delivered(
     delivery.say_wrapped(
         f"{counted(s['samples'], 'samples')} with those of coming to rest, "
         f"{counted(s['deadlines_missed'], 'deadlines missed')}; {commands} were sent "
-        f"{late['median']:.0f} ms (99 %: {late['p99']:.0f}, worst {late['worst']:.0f}) after the "
-        "earliest arrival of their measurement"
+        f"{late['median']:.0f} ms (worst {late['worst']:.0f}) after their measurement came"
         if s["samples"]
         else "no sample, nothing was sent",
         f"the machine had {commands} for {counted(s['periods_played'], 'periods')}, and none (dry) "
@@ -235,6 +234,7 @@ def _delivered(
 
 def _serve(address: Connection, chosen: Chosen) -> None:
     """Simulate a machine in this process; send its address, or why there is none."""
+    os.setsid()  # a signal to the group is for the controller, which needs the machine to end
     if sys.platform == "linux":
         set_death_signal = 1
         ctypes.CDLL(None).prctl(set_death_signal, signal.SIGTERM)  # it ends with its parent

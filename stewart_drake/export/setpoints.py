@@ -203,8 +203,8 @@ def make_setpoints(
         )
     if not plain and scenario.actuator.kind != "position_servo":
         raise ConfigError(
-            f"actuator.kind: got {scenario.actuator.kind!r}; expected 'position_servo', whose "
-            "stiffness the setpoints compensate, or plain setpoints (`--plain`, plain=True)"
+            f"actuator.kind: got {scenario.actuator.kind!r}; expected position_servo, or plain "
+            "setpoints, --plain"
         )
     experiment = prepare(scenario)
     learned = learned_signal(experiment)
@@ -359,13 +359,14 @@ def _along(
     servo, functions = known_stiffness(experiment.scenario), functions_of(mechanism)
     number = math.ceil(experiment.scenario.duration * rate - 1e-9)
     times, (cranks, rates, torques) = np.arange(number) / rate, np.empty((3, number, NUM_TORQUES))
+    last = functions.crank_angles(mechanism.home)  # whole turns are those of `model check`
     for k, t in enumerate(times):
         middle = t + 0.5 / rate
         x = soft.motion(evaluate(experiment.reference, middle), middle)
         if failure := diagnose(mechanism, middle, x[POSE]):
             raise _BrokenLimit(middle, f"motion: {failure.reason} at t = {middle:.2f} s")
         angles, rates[k] = np.split(functions.cranks(x[:NUM_STATE]), 2)
-        cranks[k] = turned(angles, cranks[k - 1] if k else np.zeros(NUM_TORQUES))
+        last = cranks[k] = turned(angles, last)
         torques[k] = dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
     setpoints = cranks
     steps = np.abs(torques)

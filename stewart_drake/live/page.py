@@ -6,6 +6,7 @@ listen on this computer only (`reporting.local_page`).
 
 import json
 import multiprocessing
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -138,12 +139,10 @@ class Readouts:
 
 def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
     """Serve the page until the loop closes the connection."""
-    import signal
-
     from stewart_drake.loop.scene import Scene
     from stewart_drake.reporting.replay import quiet_meshcat, scene_page
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the loop, which closes this
+    os.setsid()  # Ctrl-C and signals to the group end the loop, which closes this
     meshcat = quiet_meshcat()
     scene, readouts = Scene(mechanism, meshcat), Readouts()
     lock, (low, high) = threading.Lock(), slider_range(mechanism)

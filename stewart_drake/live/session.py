@@ -86,6 +86,7 @@ def prepare_session(
     address: Address,
     key: bytes | None = None,
     learned: Learned = None,
+    say: Callable[[str], None] | None = None,
 ) -> Ready:
     """Find a machine, measure the link and design the law for it.
 
@@ -96,6 +97,8 @@ def prepare_session(
     """
     check_samples(scenario)
     endpoint = open_endpoint(address, key)
+    if say is not None:
+        say("calling {}:{}".format(*address))
     try:
         contact = Contact(endpoint, address, identity_of(scenario))
         call(contact)

@@ -52,11 +52,11 @@ class Scene:
         self._context = self._diagram.CreateDefaultContext()
         self._tree = self._plant.GetMyMutableContextFromRoot(self._context)
         self._disc, radius = _drawn_plate(self._diagram, self._plant)
-        self._diagram.ForcedPublish(self._context)
         arrange(meshcat, mechanism)
         shapes: dict[str, Any] = {"ring": ring(radius), "pointer": pointer(radius)}
         for name, (vertices, faces) in shapes.items():
             meshcat.SetTriangleMesh(f"{_GHOST}/{name}", vertices, faces, _GHOST_COLOR)
+        self.show(mechanism.home, mechanism.home)
 
     def show(self, pose: Array, wanted: Array, time: float = 0.0) -> bool:
         """Put the plate at a pose (6,) and the ring at another; return False if out of reach.

@@ -327,7 +327,9 @@ class ControllerConfig:
     kind: Annotated[Literal["lqi", "pd"], _no_controllers_name] = "lqi"
     kp: Annotated[float, Field(gt=0, le=1e9)] | None = None
     kd: Annotated[float, Field(gt=0, le=1e6)] | None = None
-    period: Annotated[float, Field(ge=1e-4, le=10)] = 0.1
+    period: Annotated[
+        float, Field(ge=1e-4), rule(lambda s: s <= 10, "at most 10 s; 20 ms is 0.02")
+    ] = 0.1
     integral: bool = True
     delay_steps: Steps | None = None
     delay_fraction: Fraction | None = None

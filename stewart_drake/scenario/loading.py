@@ -143,10 +143,7 @@ def read_scenario(
             f"scenario: got a {type(name_or_path).__name__}; expected a Scenario, or the name or "
             "path of one"
         )
-    if "home" in data and "mechanism" not in data:
-        raise ConfigError(
-            f"{path}: got a mechanism; expected a scenario, whose field mechanism names this file"
-        )
+    _refuse_mechanism(path, data)
     _drop_foreign_nulls(data)
     idle = {one.field for one in idle_fields(validate(Scenario, data, str(path)))}
     places = dict.fromkeys(_dotted_names(data), str(path))
@@ -170,6 +167,13 @@ def read_scenario(
         data["duration"] = float(read_move(move["file"])[0][-1])
     where = f"{path} with settings" if overlay else str(path)
     return Read(validate(Scenario, data, str(path)), where, places, idle, str(path))
+
+
+def _refuse_mechanism(path: Path, data: dict[str, Any]) -> None:
+    if "home" in data and "mechanism" not in data:
+        raise ConfigError(
+            f"{path}: got a mechanism; expected a scenario, whose field mechanism names this file"
+        )
 
 
 def _dotted_names(data: dict[str, Any], above: str = "") -> Iterator[str]:
@@ -325,6 +329,7 @@ def _parse_setting(setting: str) -> dict[str, Any]:
     if key.strip() == _OVERLAY and text:
         path = resolve("overlay", text.strip())
         overlay = load_yaml(path)
+        _refuse_mechanism(path, overlay)
         validate(Scenario, overlay, str(path))
         _make_paths_absolute(overlay, path.parent)
         return overlay

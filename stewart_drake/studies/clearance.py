@@ -77,8 +77,7 @@ class ClearanceAlong(NamedTuple):
         if disc is not None and disc.distance < 0:
             deep = f"{-1e3 * disc.distance:.3g} mm"
             found.append(
-                f"{disc.pair.second} would reach {deep} into a base that is a full disc; "
-                "cutouts may clear it"
+                f"{disc.pair.second} dips {deep} below the base: cut it out, or raise the shafts"
             )
         return found
 

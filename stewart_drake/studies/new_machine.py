@@ -38,7 +38,7 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import COORDINATES
 from stewart_drake.studies.clearance import clearance_along
 from stewart_drake.studies.study_options import Measurements
-from stewart_drake.studies.verdict import Verdict, loop_verdict
+from stewart_drake.studies.verdict import Verdict, loop_verdict, milliseconds
 from stewart_drake.studies.workspace_map import Measures, Travel, measure, travel
 from stewart_drake.types import Array
 
@@ -128,6 +128,8 @@ _FAST_PERIOD: Final = 0.02
 _SLOW_PERIOD: Final = 0.1
 """Sampling periods of the controller, s: the slow one for a delay beyond _MAX_STEPS fast ones."""
 _MAX_STEPS: Final = 25
+_CLOSE: Final = 0.1
+"""Error of the delay that the user is told to keep to, in periods."""
 
 
 class NewMachine(NamedTuple):
@@ -152,7 +154,13 @@ class NewMachine(NamedTuple):
     @property
     def findings(self) -> list[str]:
         """Sentences about torque, stability and delay."""
-        return [self.verdict, loop_verdict(self.margin), str(Verdict.of(self.margin))]
+        found = [self.verdict, loop_verdict(self.margin), str(Verdict.of(self.margin))]
+        if self.margin.stable and self.margin.delay_margin < _CLOSE * self.margin.period:
+            found.append(
+                f"know the delay to {milliseconds(self.margin.delay_margin)}, or raise "
+                "controller.w_R"
+            )
+        return found
 
     @property
     def summary(self) -> dict[str, Any]:

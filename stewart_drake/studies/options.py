@@ -123,7 +123,10 @@ class Options(BaseModel):
             errors = caught.errors(include_url=False)
             wrong = [error for error in errors if error["type"] != "missing"]
             kind = ConfigError if wrong else MissingOption
-            raise kind(explain(values, (wrong or errors)[0])) from None
+            first = (wrong or errors)[0]
+            units = {one.name: one.unit for one in type(self).described() if one.unit and wrong}
+            unit = units.get(str(first["loc"][0]), "")
+            raise kind(f"{explain(values, first)} {unit}".rstrip()) from None
 
     def check_scenario(self, scenario: "Scenario") -> None:
         """Refuse a scenario that the study does not cover."""

@@ -233,7 +233,12 @@ class Measurements(Options):
         None, "Torque limit of each motor, N m.", unit="N m", gt=0, lt=1e6
     )
     delay: float = option(
-        0.1, "Time from computing a torque to its action, s.", unit="s", ge=0, le=5
+        0.1,
+        "Time from a measurement until the torque computed from it acts, s; over a radio the "
+        "longest round trip, a period, and computing.",
+        unit="s",
+        ge=0,
+        le=5,
     )
     gravity: bool = option(True, "Gravity acts; not on a counterbalanced plate.")
 

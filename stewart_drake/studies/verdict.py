@@ -100,16 +100,13 @@ class Verdict:
 
     def __str__(self) -> str:
         can = {"yes": "can", "hardly": "can hardly", "no": "cannot"}[self.beatable]
-        growth = f"by a factor of {self.amplification:.1f}"
+        growth = f"{self.amplification:.1f}"
         if self.beatable != "yes":
-            growth = (
-                f"e^(p eta) = {_power(self.pole * self.eta)} fold at t = {self.time:.1f} s "
-                f"(pole {self.pole:.3g} /s)"
-            )
+            growth = _power(self.pole * self.eta)
         periods = f" ({self.eta / self.period:.4g} periods)" if self.period < math.inf else ""
         return (
             f"the delay of {self.eta:.4g} s{periods} {can} be compensated: under any controller, "
-            f"prediction errors grow {growth} over it"
+            f"prediction errors grow by a factor of {growth} over it"
         )
 
 
@@ -119,8 +116,8 @@ def loop_verdict(loop: ControllerMargin) -> str:
         return f"no stability check of this loop: {loop.problem}"
     assumptions = []
     if loop.estimated:
-        found = "payload, friction and delay" if loop.delay_found else "payload and friction"
-        assumptions.append(f"without the estimator, which can reduce this range; {found} known")
+        found = "payload, friction, delay" if loop.delay_found else "payload, friction"
+        assumptions.append(f"estimator off; {found} known")
     if loop.tuned:
         assumptions.append("with the weights that the tuner starts from")
     assumed = f" ({'; '.join(assumptions)})" if assumptions else ""
