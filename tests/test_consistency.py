@@ -117,7 +117,7 @@ def test_what_it_cannot_explain_is_told(cause):
     assert found["verdict"] == "overconfident"
     [text] = [text for text in warnings if "overconfident" in text]
     ratio = found["nis_ratio"]
-    off = f"its prediction errors are {np.sqrt(ratio):.2g} times those that it states"
+    off = f"the squares of its prediction errors are {ratio:.3g} times those that it states"
     changed = "parameters that it takes as constant had to change"
     assert f"and {off if ratio > TOLERATED else changed}" in text
     assert "controller.model_error" in text

@@ -50,6 +50,7 @@ from stewart_drake.identification.unknowns import (
     OFFSETS,
     unknowns_of,
 )
+from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.reporting.identification import document
 from stewart_drake.scenario.loading import load_scenario
@@ -457,6 +458,18 @@ def test_a_machine_is_found_from_encoders_of_14_bit(log_and_truth):
     assert "set its plate.mass to 3.6 kg and identify again" in told
     for name, size in {"torque_bias_1": 1e-4, "payload_mass": 0.02, "joint_damping": 1e-4}.items():
         assert abs(found.values[NAMES.index(name)] - true[NAMES.index(name)]) < size
+
+
+@pytest.mark.slow
+def test_the_fit_ends_at_the_minimum_of_a_curved_valley(tmp_path):
+    """With gravity, payload and cranks are hardly distinguished, and damped steps gain little."""
+    settings = ["plant.payload_mass=0.1", "sensor.kind=encoders", "duration=3", "plant.kind=exact"]
+    scenario = load_scenario("gravity", settings=settings)
+    simulate(scenario, judge_stability=False).save(tmp_path)
+    mechanism = load_mechanism(scenario.mechanism)
+    fit = identify([read_log(tmp_path / "signals.nc", mechanism, Precision())], mechanism).fit
+    _, normal = fit.problem.normal(fit.guess)
+    assert normal.promised(normal.step(0.0)) < CONVERGED
 
 
 @pytest.mark.slow

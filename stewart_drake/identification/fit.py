@@ -4,13 +4,18 @@ Minimised over the unknowns p and the first state x_i of every segment is
 
     chi^2 = sum |(y - h(x(t); p)) / sigma|^2 + |(p - p_0) / sigma_0|^2,
 
-measurements and prior. A step solves J'J d = -J'r with J'J + lambda diag(J'J) in the place of J'J.
-A first state affects the measurements of one segment only, so that J'J is an arrow,
+measurements and prior. A step d from a guess decreases chi^2 + lambda d'D d, where D_p = sigma_0^-2
+and D_i = 1e-6 diag(N_ii): directions that the log shows are hardly damped, and first states follow
+the unknowns. A first state affects the measurements of one segment only, so that J'J is an arrow,
 
     J'J = [N_pp, N_pi; N_ip, N_ii],   d_i = -N_ii^-1 (g_i + N_ip d_p),
     (N_pp - sum N_pi N_ii^-1 N_ip) d_p = -(g_p - sum N_pi N_ii^-1 g_i),
 
 and the inverse of the last matrix, without damping, is the covariance of p for any x_i.
+
+The valley of chi^2 is curved: along directions that the log hardly shows, residuals are far from
+linear. So the gradient at the end of a step gives a correction of it, with the same J. A small gain
+of a damped step is no sign of the minimum. Iterations end when an undamped step promises no gain.
 """
 
 from dataclasses import dataclass, replace
@@ -38,7 +43,7 @@ from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array, Flags
 
 MAX_DELAY_CHANGE: Final = 0.1  # in one iteration, s
-CONVERGED: Final = 0.01  # gain of chi^2 below which an iteration is the last
+CONVERGED: Final = 0.01  # promised gain of chi^2 below which there is no further iteration
 MOST_ITERATIONS: Final = 60
 # chi^2 per value above which no similar machine explains a segment; a drawing that is a millimetre
 # off causes some fifty
@@ -47,6 +52,8 @@ _SENSITIVITY_STEP: Final = 0.02  # step of the integration of sensitivities, s
 _STEP_ERROR: Final = 0.05  # RMS error of the integration in standard deviations of a measurement
 _SHORTEST_STEP: Final = 1e-3  # s
 _DAMPING: Final = (1e-3, 1e-9, 1e12)  # first, least and largest
+_OF_FIRST: Final = 1e-6  # damping of the first states, relative to that of the unknowns
+_CORRECTED: Final = 2  # largest number of corrections of a step
 
 
 class Guess(NamedTuple):
@@ -68,9 +75,17 @@ class Residuals(NamedTuple):
         return total if np.isfinite(total) else np.inf
 
 
+class Change(NamedTuple):
+    """Change of a guess."""
+
+    unknown: Array  # (k,) of the free unknowns
+    first: Array  # (n, 12) of the first states
+
+
 class Normal(NamedTuple):
     """J'J and J'r, segment by segment; columns: k free unknowns, then a first state."""
 
+    slopes: Array  # J' (n, k + 12, values)
     of_segments: Array  # (n, k + 12, k + 12)
     gradients: Array  # (n, k + 12)
     of_prior: Array  # (k,) on the diagonal
@@ -88,6 +103,42 @@ class Normal(NamedTuple):
         """N_ip (n, 12, k) and N_ii (n, 12, 12)."""
         k = len(self.of_prior)
         return self.of_segments[:, k:, :k], self.of_segments[:, k:, k:]
+
+    def with_residuals(self, residuals: Residuals) -> "Normal":
+        """Return these equations with the gradient of other residuals, with the same J."""
+        gradients = (self.slopes @ _columns_of(residuals))[:, :, 0]
+        prior_gradient = np.sqrt(self.of_prior) * residuals.prior
+        return self._replace(gradients=gradients, prior_gradient=prior_gradient)
+
+    def step(self, damping: float, so_far: Change | None = None) -> Change:
+        """Return the next part of a damped step, `so_far` of which is done."""
+        k, (N_pp, g) = len(self.of_prior), self.joined
+        N_ip, N_ii = self.of_first
+        scales = np.einsum("nii->ni", N_ii) * damping * _OF_FIRST
+        g_first = self.gradients[:, k:]
+        if so_far is not None:
+            g = g + damping * self.of_prior * so_far.unknown
+            g_first = g_first + scales * so_far.first
+        damped = N_ii + scales[:, :, None] * np.eye(NUM_STATE)
+        eliminated = np.linalg.solve(damped, np.dstack([N_ip, g_first[:, :, None]]))
+        N_pi = N_ip.transpose(0, 2, 1)
+        reduced = N_pp + damping * np.diag(self.of_prior) - (N_pi @ eliminated[:, :, :k]).sum(0)
+        right = g - (N_pi @ eliminated[:, :, k:]).sum(0)[:, 0]
+        std = 1 / np.sqrt(self.of_prior)
+        unknown = -std * np.linalg.solve(std[:, None] * reduced * std, std * right)
+        return Change(unknown, -(eliminated[:, :, k] + eliminated[:, :, :k] @ unknown))
+
+    def promised(self, change: Change) -> float:
+        """Return the gain of chi^2 by a step."""
+        k = len(self.of_prior)
+        of_first = float(np.sum(self.gradients[:, k:] * change.first))
+        return -float(self.joined[1] @ change.unknown) - of_first
+
+
+def _columns_of(residuals: Residuals) -> Array:
+    """Return the residuals (n, values, 1) of each segment."""
+    measured = residuals.measured.transpose(1, 0, 2)
+    return measured.reshape(len(measured), -1, 1)
 
 
 @dataclass(frozen=True)
@@ -138,11 +189,14 @@ class Problem:
         # Points and values of a segment in one column.
         _, n, _, columns = J.shape
         rows = J.transpose(1, 0, 2, 3).reshape(n, -1, columns)
-        r = residuals.measured.transpose(1, 0, 2).reshape(n, -1, 1)
-        transposed = rows.transpose(0, 2, 1)
+        slopes = rows.transpose(0, 2, 1)
         weight = 1 / self.unknowns.std[self.unknowns.free]
         normal = Normal(
-            transposed @ rows, (transposed @ r)[:, :, 0], weight**2, weight * residuals.prior
+            slopes,
+            slopes @ rows,
+            (slopes @ _columns_of(residuals))[:, :, 0],
+            weight**2,
+            weight * residuals.prior,
         )
         return residuals, normal
 
@@ -273,21 +327,17 @@ def solve(
     """
     guess, damping, iterations = start, _DAMPING[0], 0
     residuals, normal = problem.normal(guess)
-    gained = np.inf
-    while iterations < most and gained >= CONVERGED:
+    while iterations < most and not normal.promised(normal.step(_DAMPING[1])) < CONVERGED:
         iterations += 1
         progress.iteration(iterations, most)
-        before, gained = residuals.chi2, 0.0
-        while damping < _DAMPING[2] and gained == 0.0:
-            trial = _moved(guess, *_step(normal, damping), problem.unknowns.free)
-            chi2 = problem.residuals(trial).chi2
-            if chi2 < before:
-                guess, gained = trial, before - chi2
-            else:
-                damping *= 10
-        if gained > 0.0:
-            damping = max(damping / 10, _DAMPING[1])
-            residuals, normal = problem.normal(guess)
+        before = guess
+        while damping < _DAMPING[2] and guess is before:
+            guess = _best_of_step(problem, guess, residuals, normal, damping)
+            damping *= 10
+        if guess is before:
+            break
+        damping = max(damping / 100, _DAMPING[1])
+        residuals, normal = problem.normal(guess)
     found = guess, residuals, covariance(normal), iterations
     return Solution(problem if whole is None else whole, problem, start, *found)
 
@@ -308,27 +358,32 @@ def with_half_step(problem: Problem, guess: Guess, residual: float = 1.0) -> Pro
     return halved if np.sqrt(np.mean((coarse - fine) ** 2)) > _STEP_ERROR * residual else None
 
 
-def _moved(guess: Guess, unknown: Array, first: Array, free: NDArray[np.intp]) -> Guess:
+def _best_of_step(
+    problem: Problem, guess: Guess, residuals: Residuals, normal: Normal, damping: float
+) -> Guess:
+    """Return the best guess along a step and its corrections; the same one if none is better."""
+    best, least = guess, residuals.chi2
+    change = normal.step(damping)
+    enough = residuals.chi2 - normal.promised(change) / 2
+    for _ in range(1 + _CORRECTED):
+        trial = _moved(guess, change, problem.unknowns.free)
+        tried = problem.residuals(trial)
+        if tried.chi2 < least:
+            best, least = trial, tried.chi2
+        if least <= enough or not np.isfinite(tried.chi2):
+            break
+        more = normal.with_residuals(tried).step(damping, change)
+        change = Change(change.unknown + more.unknown, change.first + more.first)
+    return best
+
+
+def _moved(guess: Guess, change: Change, free: NDArray[np.intp]) -> Guess:
     values, before = guess.values.copy(), guess.values[DELAY]
-    values[free] += unknown
+    values[free] += change.unknown
     values[DELAY] = np.clip(
         values[DELAY], max(0.0, before - MAX_DELAY_CHANGE), before + MAX_DELAY_CHANGE
     )
-    return Guess(values, guess.first + first)
-
-
-def _step(normal: Normal, damping: float) -> tuple[Array, Array]:
-    """Return the changes of the free unknowns (k,) and of the first states (n, 12)."""
-    k, (N_pp, g) = len(normal.of_prior), normal.joined
-    N_ip, N_ii = normal.of_first
-    damped = N_ii + damping * np.einsum("nij,ij->nij", N_ii, np.eye(NUM_STATE))
-    eliminated = np.linalg.solve(damped, np.dstack([N_ip, normal.gradients[:, k:, None]]))
-    N_pi = N_ip.transpose(0, 2, 1)
-    reduced = N_pp + damping * np.diag(np.diag(N_pp)) - (N_pi @ eliminated[:, :, :k]).sum(0)
-    right = g - (N_pi @ eliminated[:, :, k:]).sum(0)[:, 0]
-    unknown = -np.linalg.solve(reduced, right)
-    first = -(eliminated[:, :, k] + eliminated[:, :, :k] @ unknown)
-    return unknown, first
+    return Guess(values, guess.first + change.first)
 
 
 def covariance(normal: Normal) -> Array:

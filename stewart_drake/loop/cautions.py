@@ -140,7 +140,7 @@ def overconfidence(summary: RunSummary) -> list[str]:
         return []
     ratio = consistency["nis_ratio"]
     shown = (
-        f"its prediction errors are {math.sqrt(ratio):.2g} times those that it states"
+        f"the squares of its prediction errors are {ratio:.3g} times those that it states"
         if ratio > TOLERATED
         else "parameters that it takes as constant had to change; it widened their uncertainty"
     )
