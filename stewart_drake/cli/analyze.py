@@ -52,7 +52,9 @@ def _callback(name: str) -> Callable[..., int | None]:
             )
         there = len(list((out / "runs").glob("run[0-9]*.json"))) if out else 0
         if there > found.summary.get("runs", there):
-            delivery.say(f"this report is of {found.summary['runs']} runs; {there} are kept in {out}/runs")
+            delivery.say(
+                f"this report is of {found.summary['runs']} runs; {there} are kept in {out}/runs"
+            )
         files, interrupted = (getattr(found.study, key, ()) for key in ("files", "interrupted"))
         files = (*files, *found.write_files(out))
         return delivery.answer(found, *files, interrupted=bool(interrupted))

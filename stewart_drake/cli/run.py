@@ -73,12 +73,11 @@ def simulate(
     viewer = Meshcat() if meshcat else None
     delivery.say_link(experiment.scenario)
     margin = judged = controller_margin(experiment)
-    given = ""
+    condition = ""
     if margin.problem and experiment.scenario.link.kind == "network":
-        judged, given = controller_margin(in_time(experiment)), "if every packet is in time, "
-    delivery.say_wrapped(
-        f"{'' if judged.problem else given}{loop_verdict(judged)}", str(Verdict.of(judged))
-    )
+        judged = controller_margin(in_time(experiment))
+        condition = "" if judged.problem else "if every packet is in time, "
+    delivery.say_wrapped(f"{condition}{loop_verdict(judged)}", str(Verdict.of(judged)))
     said = cautions_before(experiment, margin)
     for text in said:
         if not margin.problem or margin.problem not in text:  # which the verdict has

@@ -90,8 +90,12 @@ def run_scenarios(
     with nullcontext(directory) if directory else TemporaryDirectory() as folder:
         try:
             jobs = {key: (scenario,) for key, scenario in scenarios.items()}
-            kept = {"settings": settings or {}, "progress": progress}
-            run_jobs(jobs, run_scenario, folder, read=read_outcome, **kept)
+            run_jobs(
+                *(jobs, run_scenario, folder),
+                settings=settings or {},
+                read=read_outcome,
+                progress=progress,
+            )
         except KeyboardInterrupt:
             interrupted = True
         paths = {key: Path(folder) / f"{key}.json" for key in scenarios}
