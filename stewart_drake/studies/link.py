@@ -90,6 +90,10 @@ class LinkStudy:
     interrupted: bool  # whether Ctrl-C ended it early
 
     @property
+    def files(self) -> list[str]:
+        return ["runs/"]
+
+    @property
     def best(self) -> Cell | None:
         """Usable cell of the least mean E_ac among those with the most completed runs, or None."""
         return best_of(self.bounds)
