@@ -167,7 +167,10 @@ def analyze_hautus(
     scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
 ) -> stewart_drake.reporting.results.AnalysisResult: ...
 def analyze_link(
-    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, runs: int = 5
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+    runs: int = 5,
+    *,
+    directory: str | pathlib.Path | None = None,
 ) -> stewart_drake.reporting.results.AnalysisResult: ...
 def analyze_robustness(
     scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,

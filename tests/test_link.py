@@ -262,6 +262,13 @@ def test_without_times_packets_take_about_the_scenarios_delay(tmp_path):
     apart = network("link.low=0.5", "link.high=0.9", "link.playout=0.9", "delay.steps=4")
     assert "0.4 s, have no effect" in idle_delay(apart) and "the delay 1 s" in idle_delay(apart)
     assert idle_delay(network("delay.steps=4")) is None
+    # The link of an overlay overrides a file's delay.
+    file, overlay = tmp_path / "scenario.yaml", tmp_path / "radio.yaml"
+    file.write_text("mechanism: paper\ndelay: {steps: 4}\n")
+    overlay.write_text("link: {kind: network, low: 0.5, high: 0.9, playout: 0.9}\n")
+    assert idle_delay(sd.load_scenario(file, settings=[f"overlay={overlay}"])) is None
+    file.write_text(file.read_text() + overlay.read_text())
+    assert idle_delay(sd.load_scenario(file)) is not None
     under_way = forward_times(network("link.loss=0"), 2000)
     assert 0.64 <= under_way.min() < 0.645 and 0.955 < under_way.max() <= 0.96
     # They follow the delay wherever it is changed, and in a file that is read back.
@@ -315,6 +322,11 @@ def test_commands_state_the_link_and_count_packets(command, tmp_path, capsys):
     if command == ["simulate"]:
         assert summary["packets"] == {"sent": 4, "lost": 0, "late": 0, "played": 0, "dry": 0}
         assert "packets 4 sent, 0 lost, 0 late, 0 played, 0 dry" in printed
+        assert "if every packet is in time, this loop is stable: linearised" in printed
+    if "link" in command:  # it goes on from its runs
+        assert main([*command, "paper", *WORDS, "--out", str(tmp_path)]) == 0
+        again = json.loads((tmp_path / "summary.json").read_text())
+        assert again == summary and len(list((tmp_path / "runs").glob("bound*.json"))) > 10
 
 
 def test_a_wire_says_that_it_is_one():

@@ -779,7 +779,9 @@ with _demo_machine(Chosen(), 0.8):
     with subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         child = int(process.stdout.readline())
+        group = os.getpgid(child)
         process.kill()
+    assert group == child, "a signal to the controller's group does not reach it"
     for _ in range(100):
         state = Path(f"/proc/{child}/stat")
         if not state.exists() or " Z " in state.read_text():
@@ -1008,6 +1010,7 @@ def test_after_a_run_the_page_says_what_becomes_of_the_plate(tab, viewer):
     assert tab.evaluate("document.getElementById('error').textContent") == "< 0.01 %"
     viewer.ended(End("completed", None, "now the motors have no torque"))
     tab.wait("document.body.classList.contains('over')")
+    tab.wait("document.querySelector('iframe').style.visibility === 'visible'")
     note = "document.getElementById('note')"
     assert tab.evaluate(f"{note}.textContent") == "completed. Now the motors have no torque."
     assert not tab.evaluate(f"{note}.classList.contains('warn')")

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -52,7 +53,7 @@ def test_check_tells_what_the_dynamics_say(name, tmp_path, capsys):
 
 def test_check_marks_moments_that_nobody_measured(tmp_path, capsys):
     path = tmp_path / "mine.yaml"
-    text = (data_root() / "models" / "paper.yaml").read_text()
+    text = (data_root() / "models/paper.yaml").read_text()
     path.write_text(text.replace(", inertia: [30.0e-4, 30.0e-4, 60.0e-4]", ""))
     told = " ".join(said(capsys, "model", "check", path, "--out", tmp_path).split())
     assert "plate 0.0144, 0.0144, 0.0288 (estimated: uniform disc); crank 1e-06, " in told
@@ -75,6 +76,15 @@ def test_a_singular_machine_gets_a_verdict_and_can_be_viewed(machine, why, tmp_p
     with contextlib.closing(PoseViewer(machine, Meshcat())) as viewer:
         assert place(machine, viewer.values()).failure is not None
     assert summary_in(tmp_path / "out")["torque"] == []
+
+
+def test_one_crank_the_wrong_way_is_reported(tmp_path):
+    turned = tmp_path / "turned.yaml"
+    text = (data_root() / "models/paper.yaml").read_text()
+    turned.write_text(re.sub(r"(branches: \[)(-?1)", lambda m: f"{m[1]}{-int(m[2])}", text))
+    check = check_mechanism(load_mechanism(turned))
+    assert check.unlike.startswith("not alike, though drawn alike: torques to hold")
+    assert check_mechanism(load_mechanism("paper_clear")).unlike == ""
 
 
 def test_motors_that_cannot_hold_the_plate_are_reported():

@@ -479,7 +479,7 @@ def known_outcomes(monkeypatch):
             return Outcome("left_workspace", "left", time=1.0)
         return Outcome("completed", error=1 + abs(run.link.playout - 0.43) + 0.01 * run.link.seed)
 
-    def runs(wanted, progress):
+    def runs(wanted, progress, **_):
         if progress is not None:
             progress(len(wanted), len(wanted))
         return {key: outcome(run) for key, run in wanted.items()}, False

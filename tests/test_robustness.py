@@ -744,11 +744,16 @@ def test_another_controller_that_fails_undisturbed_is_named(tmp_path):
 
 
 def test_ctrl_c(tmp_path, monkeypatch, capsys):
-    def interrupted(*_, **__):
+    one = robustness.run_jobs
+
+    def interrupted(jobs, *args, progress=None, **options):
+        if progress is None:  # undisturbed
+            return one(jobs, *args, **options)
+        progress(0, 12)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(robustness, "run_jobs", interrupted)
     assert main(["analyze", "robustness", "--out", str(tmp_path)]) == 130
-    assert "finished runs are kept" in capsys.readouterr().err
+    assert "stopped; 0 of 12 finished; finished runs are kept" in capsys.readouterr().err
     assert main(["analyze", "robustness"]) == 130
     assert "nothing is kept without --out" in capsys.readouterr().err

@@ -10,7 +10,13 @@ import pytest
 from pydrake.geometry import Meshcat, MeshcatParams
 
 import stewart_drake as sd
-from stewart_drake.loop.scene import crank_paths, full_color, torque_color, torque_shares
+from stewart_drake.loop.scene import (
+    Scene,
+    crank_paths,
+    full_color,
+    torque_color,
+    torque_shares,
+)
 from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.reporting.replay import replay
 from stewart_drake.scenario.signals import LEGS
@@ -36,6 +42,13 @@ def value(meshcat, path, name):
 
 def crank(leg):
     return "/" + "/".join(crank_paths("paper")[LEGS.index(leg)][0]) + "/<object>"
+
+
+def test_the_ring_begins_around_the_plate_at_home(meshcat):
+    scene = Scene(PAPER, meshcat)
+    np.testing.assert_allclose(transform(meshcat, "/reference")[:2, 3], PAPER.home[3:5], atol=1e-9)
+    assert transform(meshcat, "/reference")[2, 3] == pytest.approx(PAPER.home[5], abs=0.05)
+    scene.close()
 
 
 @pytest.mark.parametrize("kind", ["exact", "multibody"])

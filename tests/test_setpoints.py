@@ -54,6 +54,15 @@ def test_plain_setpoints_are_the_crank_angles_of_the_motion():
     assert np.allclose(difference, expected, atol=1e-12)
 
 
+def test_they_begin_in_the_turn_of_model_check():
+    """Cranks of paper_clear are at -188 degrees at home."""
+    settings = ("mechanism=paper_clear", "duration=2")
+    clear, home = sd.load_mechanism("paper_clear"), sd.load_mechanism("paper_clear").home
+    assert np.abs(clear.crank_angles(home)).max() > np.pi
+    first = sd.setpoints("paper", 50, plain=True, settings=settings).angles[0]
+    assert first == pytest.approx(clear.crank_angles(home), abs=0.1)
+
+
 def test_known_friction_of_ball_joints_is_compensated():
     rubbing = made(ON, "plant.ball_joint_friction=0.05")
     assert np.abs(rubbing.angles - made(ON).angles).max() > 1e-3

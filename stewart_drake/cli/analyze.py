@@ -1,7 +1,7 @@
 """Commands of `reporting.analyses.ANALYSES`: analyze hautus, delay and so on, and layout."""
 
-import contextlib
 from collections.abc import Callable
+from contextlib import nullcontext
 from tempfile import TemporaryDirectory
 
 import typer
@@ -40,12 +40,20 @@ def _callback(name: str) -> Callable[..., int | None]:
         first = "preparing" if row.counts else "computing"
         with (
             TemporaryDirectory() as scratch,
-            on_interrupt(kept) if row.keeps else contextlib.nullcontext(),
-            count_bar(row.counts or name, delivery.quiet, first) as progress,
+            on_interrupt(kept) if row.keeps else nullcontext(lambda show: show) as counted,
+            count_bar(row.counts or name, delivery.quiet, first) as bar,
         ):
             delivery.say_link(loaded)
             found = analyze(
-                name, loaded, options, command=line, directory=out or scratch, progress=progress
+                *(name, loaded, options),
+                command=line,
+                directory=out or scratch,
+                progress=counted(bar),
+            )
+        there = len(list((out / "runs").glob("run[0-9]*.json"))) if out else 0
+        if there > found.summary.get("runs", there):
+            delivery.say(
+                f"this report is of {found.summary['runs']} runs; {there} are kept in {out}/runs"
             )
         files, interrupted = (getattr(found.study, key, ()) for key in ("files", "interrupted"))
         files = (*files, *found.write_files(out))

@@ -23,6 +23,8 @@ from stewart_drake.scenario.loading import load_scenario, setting_choices, title
 if TYPE_CHECKING:
     from stewart_drake.reporting.results import AnalysisResult
 
+Progress = Callable[[int, int], None]
+"""Called with the number of finished pieces and of all."""
 INTERRUPTED: Final = 130
 """Exit status after Ctrl-C."""
 
@@ -193,12 +195,26 @@ def _remove_empty(directories: list[Path]) -> None:
 
 
 @contextlib.contextmanager
-def on_interrupt(text: str) -> Iterator[None]:
-    """Print `text` and end the command on Ctrl-C."""
+def on_interrupt(text: str) -> Iterator[Callable[[Progress], Progress]]:
+    """On Ctrl-C print what is finished and `text`, and end the command.
+
+    Yields:
+        A function that returns a progress which counts what is finished.
+    """
+    finished = ""
+
+    def counted(show: Progress) -> Progress:
+        def count(done: int, total: int) -> None:
+            nonlocal finished
+            finished = f"{done} of {total} finished; "
+            show(done, total)
+
+        return count
+
     try:
-        yield
+        yield counted
     except KeyboardInterrupt:
-        echo(f"stopped; {text}", error=True)
+        echo(f"stopped; {finished}{text}", error=True)
         raise typer.Exit(INTERRUPTED) from None
 
 

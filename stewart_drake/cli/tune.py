@@ -27,11 +27,11 @@ def dataset(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
 
     with (
         given.named(),
-        on_interrupt(RESUMABLE),
-        count_bar("conditions", delivery.quiet) as progress,
+        on_interrupt(RESUMABLE) as counted,
+        count_bar("conditions", delivery.quiet) as bar,
     ):
         found = functions.make_tuner_data(
-            delivery.folder, *chosen, progress=progress, options=given.options()
+            delivery.folder, *chosen, progress=counted(bar), options=given.options()
         )
     delivery.write(found.summary)
     delivery.say(found.table())
@@ -68,8 +68,12 @@ def train(
         bar, first, interrupted = "own runs", "training", RESUMABLE
     else:
         bar, first, interrupted = "training", "computing", "nothing written"
-    with given.named(), on_interrupt(interrupted), count_bar(bar, delivery.silent, first) as shown:
-        found = functions.train_tuner(data, out, progress=shown, options=options)
+    with (
+        given.named(),
+        on_interrupt(interrupted) as counted,
+        count_bar(bar, delivery.silent, first) as shown,
+    ):
+        found = functions.train_tuner(data, out, progress=counted(shown), options=options)
     delivery.discard()  # the summary of an earlier training in this folder
     delivery.add_files(out.name, *([f"{out.stem}-runs/"] if options.regret else []))
     delivery.write(found.summary)
@@ -104,14 +108,14 @@ def evaluate(
     line = command_line("tune", "evaluate", *weights, settings=chosen.settings, options=typed)
     with (
         given.named(),
-        on_interrupt(RESUMABLE),
-        count_bar("conditions", delivery.quiet) as progress,
+        on_interrupt(RESUMABLE) as counted,
+        count_bar("conditions", delivery.quiet) as bar,
     ):
         found = functions.evaluate_tuner(
             delivery.folder,
             weights,
             *chosen._replace(scenario=scenario),
-            progress=progress,
+            progress=counted(bar),
             command=line,
             options=options,
         )

@@ -35,13 +35,13 @@ from stewart_drake.live.protocol import (
 )
 from stewart_drake.live.viewer import Viewer
 from stewart_drake.loop.cautions import delays_apart, overconfidence
-from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
+from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin, in_time
 from stewart_drake.loop.peer import check_samples, identity_of
 from stewart_drake.loop.preparation import Experiment, known_dynamics
 from stewart_drake.loop.recording import summarize
 from stewart_drake.loop.results import LEAST_MEASURED, LiveSummary, SimulationResult
 from stewart_drake.reporting.document import templates
-from stewart_drake.scenario.config import DelayConfig, Scenario
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.link_config import NetworkConfig, WireConfig
 from stewart_drake.scenario.run_log import Background, RunLog, UdpMirror, open_log
 from stewart_drake.studies.verdict import Verdict, milliseconds
@@ -119,19 +119,7 @@ def prepare_session(
 def _margin(experiment: Experiment) -> ControllerMargin:
     """Judge the loop; a calibrated machine counts instead of the scenario's plant."""
     calibrated = None if experiment.calibration is None else known_dynamics(experiment)
-    return controller_margin(_in_time(experiment), machine=calibrated)
-
-
-def _in_time(experiment: Experiment) -> Experiment:
-    """Return the experiment with a constant delay, as if every packet came in time."""
-    sc = experiment.scenario
-    if sc.link.kind == "wire":
-        return experiment
-    eta = sc.true_delay
-    controller = replace(sc.controller, delay_steps=eta.steps, delay_fraction=eta.fraction)
-    delay = DelayConfig(steps=eta.steps, fraction=eta.fraction)
-    scenario = replace(sc, link=WireConfig(), delay=delay, controller=controller)
-    return experiment._replace(scenario=scenario)
+    return controller_margin(in_time(experiment), machine=calibrated)
 
 
 def plans(ready: Ready, duration: float, scenario: str) -> list[str]:

@@ -55,7 +55,8 @@ from stewart_drake.loop.law_design import DesignedLaw, compose_law, longest_wait
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.mechanism.trajectories import evaluate, poses_along
-from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.config import DelayConfig, Scenario
+from stewart_drake.scenario.link_config import WireConfig
 from stewart_drake.scenario.loading import as_scenario
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
@@ -251,6 +252,18 @@ def controller_margin(
         loops=tuple(loops),
         span=end,
     )
+
+
+def in_time(experiment: Experiment) -> Experiment:
+    """Return the experiment with a constant delay, as if every packet came in time."""
+    sc = experiment.scenario
+    if sc.link.kind == "wire":
+        return experiment
+    eta = sc.true_delay
+    controller = replace(sc.controller, delay_steps=eta.steps, delay_fraction=eta.fraction)
+    delay = DelayConfig(steps=eta.steps, fraction=eta.fraction)
+    scenario = replace(sc, link=WireConfig(), delay=delay, controller=controller)
+    return experiment._replace(scenario=scenario)
 
 
 def _order(radii: list[float]) -> list[int]:

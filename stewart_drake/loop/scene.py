@@ -52,11 +52,12 @@ class Scene:
         self._context = self._diagram.CreateDefaultContext()
         self._tree = self._plant.GetMyMutableContextFromRoot(self._context)
         self._disc, radius = _drawn_plate(self._diagram, self._plant)
+        self._diagram.ForcedPublish(self._context)
         arrange(meshcat, mechanism)
         shapes: dict[str, Any] = {"ring": ring(radius), "pointer": pointer(radius)}
         for name, (vertices, faces) in shapes.items():
             meshcat.SetTriangleMesh(f"{_GHOST}/{name}", vertices, faces, _GHOST_COLOR)
-        self.show(mechanism.home, mechanism.home)
+        self._place_ring(mechanism.home)
 
     def show(self, pose: Array, wanted: Array, time: float = 0.0) -> bool:
         """Put the plate at a pose (6,) and the ring at another; return False if out of reach.
@@ -67,9 +68,7 @@ class Scene:
             pose, wanted: rad and m.
             time: s, of the frame of a Meshcat recording.
         """
-        angles, position = cast(Any, wanted[ANGLES]), cast(Any, wanted[POSITION])
-        placed = RigidTransform(RollPitchYaw(angles), position)
-        self._meshcat.SetTransform(_GHOST, placed @ self._disc, time)
+        self._place_ring(wanted, time)
         try:
             set_pose(self._plant, self._tree, self._mechanism, pose, np.zeros(6))
         except UnreachablePoseError:
@@ -77,6 +76,11 @@ class Scene:
         self._context.SetTime(time)
         self._diagram.ForcedPublish(self._context)
         return True
+
+    def _place_ring(self, wanted: Array, time: float = 0.0) -> None:
+        angles, position = cast(Any, wanted[ANGLES]), cast(Any, wanted[POSITION])
+        placed = RigidTransform(RollPitchYaw(angles), position)
+        self._meshcat.SetTransform(_GHOST, placed @ self._disc, time)
 
     def close(self) -> None:
         """Dispose of the diagram; the scene is unusable afterwards.

@@ -40,10 +40,12 @@ ANALYSES: Final = {
     ),
     "link": Analysis(
         "Find the best play-out bound of a network.\n\n"
-        "Simulates 10 to 25 bounds and losses, --runs times each: a minute for paper.\n"
-        "Needs --set link.kind=network or a scenario with a network.",
+        "Simulates 10 to 25 bounds and losses, --runs times each: minutes for paper.\n"
+        "Needs --set link.kind=network or a scenario with a network. With --out the same command\n"
+        "continues an interrupted study.",
         ("analyze link paper --set link.kind=network --out out/link",),
         counts="simulations",
+        keeps="runs",
         controller=True,
         second="runs",
     ),

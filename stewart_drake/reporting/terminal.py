@@ -108,6 +108,8 @@ def count_bar(
     """
 
     def show(done: int, total: int) -> None:
+        if done and bars.tasks[0].total is None and not quiet:
+            echo(f"{name}: {total}, {done} from before", error=True)
         if bars.tasks[0].total != total:
             # The pace is measured from here: an earlier start may have done some of them.
             bars.reset(task, total=total, completed=done)

@@ -3,6 +3,7 @@
 They are drawn before the run from a seed, so that the same scenario gives the same run.
 """
 
+import math
 from typing import Final
 
 import numpy as np
@@ -11,11 +12,13 @@ from numpy.typing import NDArray
 from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.link_config import ASSUMED_TIMES, PacketsConfig
-from stewart_drake.scenario.packets import BACK, SENSOR, packet_times
+from stewart_drake.scenario.packets import BACK, SENSOR, packet_times, times_under_way
 from stewart_drake.types import Array, Flags
 
 SIMULTANEOUS: Final = 1e-9
 """Share of a period; events that are closer count as simultaneous."""
+_MOST: Final = 0.99
+"""Share of the measurements whose age is stated."""
 
 
 def number_sent(duration: float, period: float) -> int:
@@ -124,4 +127,11 @@ def link_text(scenario: Scenario, bound: bool = True) -> str | None:
     bursts = f" in bursts of {link.burst}" if link.burst > 1 else ""
     back = "measurements without delay" if link.back is None else "measurements over a network too"
     playout = f", play-out bound {link.playout:g} s" if bound else ""
+    if bound and link.back is not None:
+        period = scenario.controller.period
+        age = period * math.ceil(times_under_way(link.back).ppf(_MOST) / period - SIMULTANEOUS)
+        back += (
+            f"; torques act {scenario.eta:g} s after they are computed, up to "
+            f"{scenario.eta + age:g} s after their measurement"
+        )
     return f"network, packets take {times}, {100 * link.loss:g} % lost{bursts}{playout}; {back}"

@@ -18,6 +18,7 @@ from stewart_drake.files.schema import field_names, plain, sections, spelling
 from stewart_drake.files.yamlio import brief, load_yaml, parse_value, validate, yaml_text
 from stewart_drake.scenario.config import (
     ControllerConfig,
+    DelayConfig,
     Scenario,
     compatible_actuator,
     with_actuator,
@@ -56,7 +57,11 @@ def load_scenario(
         if place := read.place_to_mend(idle):
             raise ConfigError(f"{place}: {idle.problem}")
     reset_idle(read.scenario)
-    return read.scenario
+    sc, places = read.scenario, read.places
+    overridden = places.get("link") == _SETTINGS != places.get("delay")
+    if overridden and sc.link.kind == "network" and not sc.link.follows_delay:
+        sc.delay = DelayConfig()  # without effect; see `loop.cautions.idle_delay`
+    return sc
 
 
 def as_scenario(

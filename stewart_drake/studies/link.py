@@ -14,6 +14,7 @@ import math
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from scipy import stats
 
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.link_config import NetworkConfig
+from stewart_drake.scenario.loading import scenario_to_dict
 from stewart_drake.scenario.packets import default_bound, in_time, times_under_way, torque_missing
 from stewart_drake.studies.jobs import Progress, part_of
 from stewart_drake.studies.runs import run_scenarios
@@ -86,6 +88,10 @@ class LinkStudy:
     default: float  # bound of a scenario with `playout: null`, s
     left_out: tuple[float, ...]  # bounds in s that the multibody plant's time_step does not divide
     interrupted: bool  # whether Ctrl-C ended it early
+
+    @property
+    def files(self) -> list[str]:
+        return ["runs/"]
 
     @property
     def best(self) -> Cell | None:
@@ -166,11 +172,14 @@ class LinkStudy:
 
 
 def study_link(
-    scenario: Scenario, options: LinkOptions, progress: Progress | None = None
+    scenario: Scenario,
+    options: LinkOptions,
+    progress: Progress | None = None,
+    directory: str | Path | None = None,
 ) -> LinkStudy:
     """Simulate a scenario with a network on the exact plant over bounds, then over losses.
 
-    The scenario's own `playout` is not used.
+    The scenario's own `playout` is not used. A later call continues from the runs in `directory`.
     """
     options.check_scenario(scenario)
     link = scenario.assumed_link
@@ -178,13 +187,15 @@ def study_link(
     runs, period = options.runs, scenario.controller.period
     base = replace(scenario, link=link, plant=scenario.plant.without_engine)
     losses = sorted({*LOSSES, link.loss})
+    kept: Any = {"settings": {"scenario": scenario_to_dict(base)}}
+    kept["directory"] = None if directory is None else Path(directory) / "runs"
 
     def run(
         base: Scenario, wanted: list[tuple[float, float]], following: int
     ) -> tuple[list[Cell], bool]:
         """Simulate pairs of bound and loss; about `following` more are left, for the progress."""
         before, total = runs * len(found), runs * (len(found) + len(wanted) + following)
-        return _simulated(base, wanted, runs, part_of(progress, before, total))
+        return _simulated(base, wanted, runs, kept, part_of(progress, before, total))
 
     wanted, left_out, found = bounds_for(link, period), set[float](), list[Cell]()
     for step in (1.0, 0.5, 0.0):  # periods between the best bound and the next ones to try
@@ -232,13 +243,17 @@ def _possible(scenario: Scenario, link: NetworkConfig, bound: float) -> bool:
 
 
 def _simulated(
-    base: Scenario, wanted: list[tuple[float, float]], runs: int, progress: Progress | None
+    base: Scenario,
+    wanted: list[tuple[float, float]],
+    runs: int,
+    kept: dict[str, Any],
+    progress: Progress | None,
 ) -> tuple[list[Cell], bool]:
     """Return a cell for each bound and loss, and whether Ctrl-C ended it early."""
     link, c = base.link, base.controller
     assert link.kind == "network"
     keys = {
-        (bound, loss): [f"bound{bound:g}-loss{loss:g}-seed{seed}" for seed in range(runs)]
+        (bound, loss): [f"bound{bound:g}-loss{loss:g}-seed{link.seed + k}" for k in range(runs)]
         for bound, loss in wanted
     }
     variants = {
@@ -250,7 +265,7 @@ def _simulated(
         for (bound, loss), labels in keys.items()
         for seed, key in enumerate(labels)
     }
-    results, stopped = run_scenarios(variants, progress) if variants else ({}, False)
+    results, stopped = run_scenarios(variants, progress, **kept) if variants else ({}, False)
     cells = []
     for (bound, loss), labels in keys.items():
         finished = [results[key] for key in labels if key in results]

@@ -45,6 +45,10 @@ from stewart_drake.types import Array
 BODIES: Final = ("base", "plate", "crank", "rod")
 
 
+_SAME: Final = 1e-3
+"""Largest relative difference of what counts as equal."""
+
+
 class MechanismCheck(NamedTuple):
     mechanism: Mechanism
     # why the home pose is unusable: torque, poles and travel are then empty; or None
@@ -68,6 +72,22 @@ class MechanismCheck(NamedTuple):
                 f"of {limit:.3g} N m"
             )
         return "yes: it stands at home, every leg in reach and off its dead centre"
+
+    @property
+    def unlike(self) -> str:
+        """Finding that every second leg differs at home though drawn alike, or empty."""
+        m, torque = self.mechanism, np.abs(self.torque)
+        radii = [np.linalg.norm(points[:, :2], axis=1) for points in (m.p_WS, m.p_PQ)]
+        drawn = (*radii, m.crank_lengths, m.rod_lengths)
+        regular = all(np.ptp(one) < _SAME * one.max() for one in drawn)
+        if not regular or m.home[:5].any() or torque.size == 0:
+            return ""
+        if np.ptp(torque.reshape(3, 2), axis=0).max() < _SAME * torque.max():
+            return ""
+        return (
+            f"not alike, though drawn alike: torques to hold {torque.min():.3g} to "
+            f"{torque.max():.3g} N m; check branches and plate_order"
+        )
 
     @property
     def summary(self) -> dict[str, Any]:

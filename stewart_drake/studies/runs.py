@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final, Literal, TypeVar
@@ -75,14 +76,26 @@ def run_scenario(scenario: Scenario) -> bytes:
 
 
 def run_scenarios(
-    scenarios: Mapping[str, Scenario], progress: Progress | None = None
+    scenarios: Mapping[str, Scenario],
+    progress: Progress | None = None,
+    *,
+    directory: Path | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> tuple[dict[str, Outcome], bool]:
-    """Return outcomes of runs on all cores, as far as they finished, and whether Ctrl-C came."""
+    """Return outcomes of runs on all cores, as far as they finished, and whether Ctrl-C came.
+
+    A directory keeps the runs of the same `settings`.
+    """
     interrupted = False
-    with TemporaryDirectory() as folder:
+    with nullcontext(directory) if directory else TemporaryDirectory() as folder:
         try:
             jobs = {key: (scenario,) for key, scenario in scenarios.items()}
-            run_jobs(jobs, run_scenario, folder, settings={}, progress=progress)
+            run_jobs(
+                *(jobs, run_scenario, folder),
+                settings=settings or {},
+                read=read_outcome,
+                progress=progress,
+            )
         except KeyboardInterrupt:
             interrupted = True
         paths = {key: Path(folder) / f"{key}.json" for key in scenarios}
