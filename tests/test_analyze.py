@@ -73,6 +73,7 @@ def test_hautus_of_the_paper(tmp_path, capsys):
         assert not extra["drake"]["observable"]
         assert systems[f"minimal chain, mu = {steps}"]["observable"]
     assert "All 30 models are stabilisable and detectable" in told
+    assert "This loop" not in told, "its chain of 8 periods is not among these"
     assert "Paper's chain: 3 of 3 models are not observable, such as" in told
     assert unbroken("stewart-drake analyze hautus paper --out") in page
     assert page.count("<img") == 2
@@ -94,6 +95,7 @@ def test_delay_of_the_paper(tmp_path, capsys):
         assert growth == pytest.approx(limit["amplification"])
     assert "can be compensated" in told and "a larger controller.w_R widens it." in told
     assert "0.19 % of the delay" in told
+    assert "1 (here) 1.72 1.51" in told and "1000 35.5 32.8" in told, "which w_R"
     for part in ("1.64 ms longer", "21.0", "left 1.00", "no reach 1.00"):
         assert part in told
     assert page.count("<img") == 3

@@ -255,6 +255,10 @@ def test_a_calibrated_delay_that_makes_the_loop_unstable_is_named(file):
         found = experiment(f"controller.calibration={file}", "plant.kind=exact")
         lines = cautions_before(found, sd.controller_margin(found))
         assert len(lines) == len(said) and all(map(str.__contains__, lines, said))
+    found = experiment("controller.delay_steps=7", "plant.kind=exact")
+    lines = cautions_before(found, sd.controller_margin(found))
+    assert len(lines) == 1 and "0.7 s, where that of the scenario is 0.8 s" in lines[0]
+    assert "a controller.delay_estimator" in lines[0]
 
 
 def test_what_is_known_is_worth_something(file):

@@ -49,7 +49,9 @@ def test_simulate_prints_a_verdict_and_a_table_and_writes_everything(tmp_path, c
     out = said(capsys, "simulate", *SHORT, "--out", tmp_path)
     lines = out.splitlines()
     assert lines[0].startswith("this loop is stable: linearised along the reference")
-    assert "the delay of 0.8 s (8 periods) can be compensated: under any controller" in " ".join(lines)
+    assert "the delay of 0.8 s (8 periods) can be compensated: under any controller" in " ".join(
+        lines
+    )
     errors = "E_ac", "floor", "peak error", "rms error"
     for word in ("completed", *errors, "torque", "controller step", "wall"):
         assert word in out

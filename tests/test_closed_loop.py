@@ -80,6 +80,14 @@ def test_the_tuner_does_not_save_the_faithful_controllers(controller, start, sec
     assert result.stopped.time == pytest.approx(seconds, abs=0.0051)
 
 
+@pytest.mark.slow
+def test_a_catch_up_in_long_periods_is_predicted():
+    """Its torques move the plate far in a step: one Runge-Kutta step each is too coarse."""
+    found = run(EXACT, "controller.period=0.15", "duration=9.75")
+    assert found.summary["counts"]["measurements_rejected"] == 0
+    assert found.accumulated_error < 47.5  # 50.9 with the measurement rejected
+
+
 def test_theory_tells_what_corrected_holds_reach():
     """Rows "corrected" of section 12, four of their columns; tolerance a is w_R = (a/0.03)^2."""
     text = (data_root() / "docs" / "theory.md").read_text(encoding="utf-8")

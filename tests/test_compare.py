@@ -17,7 +17,7 @@ from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.reporting.results import ComparisonResult
 from stewart_drake.reporting.run import _shared_warnings, comparison_document
-from stewart_drake.scenario.loading import load_comparison, load_scenario
+from stewart_drake.scenario.loading import load_comparison, load_compatible, load_scenario
 from stewart_drake.studies.compare import (
     ADAPTIVE,
     CONTROLLERS,
@@ -177,6 +177,14 @@ def test_a_controller_that_assumes_no_delay_keeps_none(how, tmp_path):
 def test_controllers_that_cannot_be_compared_are_refused_in_one_line(chosen, message):
     with pytest.raises(ConfigError, match=message):
         compare("paper", SHORT, controllers=chosen)
+
+
+@pytest.mark.parametrize("name", ["paper", "table2", "gravity", "reachy_mini"])
+def test_a_scenario_is_compared_as_its_file(name):
+    assert shown(load_scenario(name)) == shown(name)
+    settings = ["duration=0.3"]
+    found = load_compatible(load_scenario(name), "lqr", settings)
+    assert found == load_compatible(name, "lqr", settings)
 
 
 # ---------------------------------------------------------------- the verdict

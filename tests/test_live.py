@@ -335,7 +335,11 @@ def test_an_error_of_which_half_was_measured_is_none():
     assert result.summary["measured_share"] == pytest.approx(0.5, abs=0.1)
     share = f"{100 * (1 - result.summary['measured_share']):.1f} % of the samples without a usable"
     said = " ".join(run_document(result).plain().split())
-    assert share in said and "none: it needs measurements at 90 %" in said and "bad measurements" not in said
+    assert (
+        share in said
+        and "none: it needs measurements at 90 %" in said
+        and "bad measurements" not in said
+    )
 
 
 @pytest.mark.slow

@@ -152,6 +152,9 @@ def test_what_is_no_number_is_sent_as_before_and_counted():
     counts = result.summary["counts"]
     assert counts["nonfinite_torque"] == 3 and counts["measurements_missing"] == 2
     assert any("not finite at 3 samples" in said for said in result.summary["warnings"])
+    assert "without a finite torque" not in result.table()
+    never = sd.simulate(scenario("duration=0.1"), controller=lambda: OfTime(lambda t: np.nan))
+    assert "completed, without a finite torque" in " ".join(never.table().split())
     assert (result.signals.torque_commanded == 1e-3).all()
     for name in ("integral", "weights", "parameters", "state_estimate"):
         assert np.isnan(result.signals[name]).all()

@@ -319,12 +319,16 @@ def test_compare_takes_own_controllers_and_disturbances(tmp_path):
     assert "nothing" in table and max(map(len, table.splitlines())) <= 80
     assert "torques_nothing" in results.plot()
     assert "nothing: completed" in repr(results)
+    loaded = sd.load_scenario("paper", settings=SHORT)
+    chosen = sd.compare(loaded, controllers=["lqi", {"nothing": Still}])
+    assert list(chosen) == ["lqi", "nothing"]
 
 
 @pytest.mark.parametrize(
     ("name", "make", "message"),
     [
         ("controllers", lambda: {"adaptive_lqi": Still}, "got 'adaptive_lqi' for a system"),
+        ("controllers", lambda: {"x": "lqi"}, "shipped controllers by name in a list"),
         ("disturbance", Push, "got an instance, which serves one run"),
         (
             "reference",

@@ -16,7 +16,7 @@ from stewart_drake.reporting.results import ComparisonResult
 from stewart_drake.reporting.run import comparison_document
 from stewart_drake.scenario.config import PlantConfig
 from stewart_drake.scenario.loading import load_comparison
-from stewart_drake.studies.compare import CONTROLLERS, label
+from stewart_drake.studies.compare import CONTROLLERS, is_papers, label
 from stewart_drake.studies.workspace_map import largest_factor
 from tests.mechanisms import PAPER
 
@@ -118,11 +118,12 @@ def test_the_verdict_names_the_least_error_and_the_runs_that_ended_early():
     assert comparison_document({"lqr": found["lqr"]}).verdict == "no run completed"
 
 
-def test_it_is_shown_once_and_every_row_is_in_the_summary(short):
-    text = short.table()
+def test_it_is_shown_once_and_every_row_is_in_the_summary(rows):
+    found = ComparisonResult({name: run(name) for name in rows})
+    text = found.table()
     assert text.count("Table II") == 1 and max(map(len, text.splitlines())) <= 80
-    assert list(ComparisonResult(short).summary["controllers"]) == list(short)
-    table, _ = of_the_paper(short)
+    assert list(found.summary["controllers"]) == list(rows)
+    table, _ = of_the_paper(found)
     assert [row[0] for row in table.rows] == [
         *(label(name) for name in CONTROLLERS[:4]),
         "delay_lqi_sum: integral_weight 100",
@@ -137,6 +138,25 @@ def test_other_comparisons_have_no_such_table(short):
         load_comparison("table2", (), settings)["delay_lqi_sum"], judge_stability=False
     )
     assert len(comparison_document({"delay_lqi_sum": other}).sections) == 1
+
+
+@pytest.mark.parametrize("setting", ["duration=3", "plant.payload_mass=0.4", "delay.steps=4"])
+def test_the_papers_numbers_stand_beside_its_own_experiment_only(setting):
+    assert is_papers(sd.load_scenario("paper", settings=["plant.kind=exact"]))
+    assert not is_papers(sd.load_scenario("paper", settings=[setting]))
+
+
+def test_the_legend_says_whether_rows_have_weights_of_their_own(short):
+    def legend(*weights):
+        runs = dict(zip("abc", weights, strict=False))
+        for name, w_R in runs.items():
+            c = replace(short["lqr"].scenario.controller, w_R=w_R)
+            scenario = replace(short["lqr"].scenario, controller=c)
+            runs[name] = replace(short["lqr"], scenario=scenario)
+        return " ".join(ComparisonResult(runs).table().split())
+
+    own = "Cost: each row with its own weights."
+    assert own in legend(1.0, 4.0) and own not in legend(1.0, 1.0)
 
 
 def test_more_room_alone_is_not_enough(tmp_path):

@@ -121,6 +121,8 @@ POSITION_SHARE = 0.15
 """Prior standard deviation of the payload's position, as a share of the plate's radius."""
 GENTLE = 3.0
 """Largest torque for which the default substeps suffice, over the torque scale of the law."""
+_GENTLE_PERIOD = 0.1
+"""Longest period for which that holds, s; beyond it a torque moves the plate further in a step."""
 _MOST = 0.999
 """Share of the measurements that arrive within the longest delay of `longest_wait`."""
 _POSES = 500
@@ -249,9 +251,10 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     waits = longest_wait(sc)
     channel = link.channel(sc.link, experiment, timeline, waits)
     motors = TorqueLimit(experiment.torque_limit)
+    gentle = GENTLE * min(1.0, _GENTLE_PERIOD / c.period) ** 2
     law = PredictiveLqi(
         timeline=timeline,
-        plant=NominalPlant(nominal, substeps, GENTLE * torque_scale, motors),
+        plant=NominalPlant(nominal, substeps, gentle * torque_scale, motors),
         sensing=sensor.sensing(sc.sensor, experiment),
         observer=observer,
         predictor=_PREDICTORS[c.prediction],

@@ -40,8 +40,8 @@ _WORST: Final = 10
 _FEW: Final = 3
 """Fewest failures that are compared with the other runs, and whose times are drawn."""
 _ENOUGH: Final = 10
-"""Fewest failing and other runs from which causes are named: with fewer, Holm's correction holds the
-rate of false ones, but which are found changes from seed to seed."""
+"""Fewest failing and other runs from which causes are named. With fewer, Holm's correction still
+limits false causes, but the causes found change from seed to seed."""
 _NAMED: Final = 3
 """Number of quantities, or pairs, in a sentence."""
 _GREY: Final = "#666666"

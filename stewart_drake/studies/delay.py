@@ -144,7 +144,7 @@ class DelayStudy:
     loop_problem: str  # why the closed loop was not judged, or empty
     cells: list[Cell]  # simulations by delay and amplitude
     interrupted: bool  # whether Ctrl-C ended the simulations early
-    # the stable loops by controller.w_R; empty if the scenario's is not stable, or has no such weight
+    # the stable loops by controller.w_R; empty if the scenario's is unstable or has no such weight
     choices: dict[float, ControllerMargin] = field(default_factory=dict)
 
     @property

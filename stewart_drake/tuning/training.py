@@ -15,10 +15,10 @@ r = log10(w_Q / w_R), known at 13 ratios and linear in between, f minimises by A
 
     mean over rows of R_i(r(u; theta)) + OUTSIDE |r - nearest in bounds|^2 + DECAY mean theta^2.
 
-If any ratio will do, a label is noise, but a regret is not. Rows are first those of the runs with
-fixed ratios. A network leads to features that no fixed ratio does: in a second round half of the
-rows are of runs with the network. Excluded conditions, and with them motions, decide when to stop,
-and which round was better, in the loop.
+Where all ratios are equal, labels are noise and regrets are 0. Rows are first those of the runs
+with fixed ratios. A network leads to features that no fixed ratio does: in a second round half of
+the rows are of runs with the network. Excluded conditions, and with them motions, decide when to
+stop, and which round was better, in the loop.
 """
 
 import json
