@@ -48,6 +48,7 @@ from stewart_drake.types import Array
 
 WRONG: Final = 1.5  # chi^2 per value above which a fit is wrong and its intervals have no meaning
 USUAL_DELAY: Final = 0.1  # believed delay without any other information, s
+_FIRST_STEP: Final = 0.02  # longest integration step of the first fit, s
 _FIRST_ITERATIONS: Final = 15  # largest number of iterations of a first fit
 _COARSE_ERROR: Final = 0.1  # error of the coarse delay, s
 _SHORT_SHARE: Final = 0.2  # length of the segments that are tried last, by the usual length
@@ -220,10 +221,14 @@ class _FirstFit(NamedTuple):
     chi2: float  # per value of the fitted segments; infinite if all of them diverge
     whole: Problem  # all segments
     guess: Guess  # fitted values, and the measured first states of all segments
+    step: float  # longest integration step of the next fit, s
 
 
-def _search(pairs: Sequence[start.Pair], unknowns: Unknowns) -> Solution:
-    """Return the first fit that explains the logs, else that from the best start."""
+def _search(pairs: Sequence[start.Pair], unknowns: Unknowns, part: str = "") -> Solution:
+    """Return the first fit that explains the logs, else that from the best start.
+
+    `part` begins the names of its phases.
+    """
     believed, std = float(unknowns.mean[DELAY]), float(unknowns.std[DELAY])
     starts = [(believed, 1.0)]
     if std > 0:
@@ -231,19 +236,25 @@ def _search(pairs: Sequence[start.Pair], unknowns: Unknowns) -> Solution:
         coarse = start.coarse_delay(*longest, unknowns.mechanism, believed, std)
         # Where the plate was lost, long trajectories diverge. The coarse delay may be wrong.
         starts = [(coarse, 1.0), (coarse, 0.5), (believed, 0.5), (coarse, _SHORT_SHARE)]
-    first_fits = list[_FirstFit]()
+    first_fits, step = list[_FirstFit](), _FIRST_STEP
     for number, (first_delay, share) in enumerate(starts, start=1):
-        progress.phase(f"start {number} of at most {len(starts)}")
-        first_fit = _fit_nearest(unknowns.at_delay(first_delay), share, pairs, unknowns)
+        name = f"{part}start {number} of at most {len(starts)}"
+        progress.phase(name)
+        first_fit = _fit_nearest(unknowns.at_delay(first_delay), share, pairs, unknowns, step)
         if share == _SHORT_SHARE:  # a wrong drawing explains short segments, too
-            first_fit = _fit_nearest(first_fit.guess.values, 1.0, pairs, unknowns)
+            progress.phase(f"{name}, whole segments")
+            values, step = first_fit.guess.values, first_fit.step
+            first_fit = _fit_nearest(values, 1.0, pairs, unknowns, step)
         first_fits.append(first_fit)
+        progress.phase(f"{name}, whole log")
         if first_fit.chi2 <= WRONG and (found := _fit_all(first_fit)).chi2 <= WRONG:
             break
+        step = first_fit.step
     else:
+        progress.phase(f"{part}best start, whole log")
         found = _fit_all(min(first_fits, key=lambda one: one.chi2))
-    progress.phase("shorter steps")
     while (halved := with_half_step(found.problem, found.guess)) is not None:
+        progress.phase(f"{part}steps of {1e3 * halved.longest_step:.2g} ms")
         found = found.refitted(halved)
     return found
 
@@ -257,7 +268,7 @@ def _beginning(
         if _longest(parts) < short_logs.length_needed(unknowns):
             break
         with suppress(ConfigError):  # one of several logs is too short
-            found = _search(parts, unknowns)
+            found = _search(parts, unknowns, f"first {100 * share:g} %, ")
             if found.chi2 <= WRONG:
                 return parts, found
     return None
@@ -275,20 +286,24 @@ def _longest(pairs: Sequence[start.Pair]) -> float:
 
 
 def _fit_nearest(
-    values: Array, share: float, pairs: Sequence[start.Pair], unknowns: Unknowns
+    values: Array, share: float, pairs: Sequence[start.Pair], unknowns: Unknowns, step: float
 ) -> _FirstFit:
     """Fit the half of the segments that the start predicts best.
 
     The segments have a share of the usual length; `values` are those of the unknowns at the start.
+    Strong Coulomb friction needs steps shorter than `step` from the start on, as nothing is
+    explained without them.
     """
     late = _COARSE_ERROR if unknowns.std[DELAY] > 0 else 0.0
-    whole, first = start.problem_of(pairs, unknowns, values, late, share=share)
+    whole, first = start.problem_of(pairs, unknowns, values, late, share=share, step=step)
     problem, guess = without_diverged(whole, first)
     if not problem.segments:
-        return _FirstFit(np.inf, whole, first)
+        return _FirstFit(np.inf, whole, first, step)
     near, guess = nearest_half(problem, guess)
     fit = solve(near, guess, _FIRST_ITERATIONS)
-    return _FirstFit(fit.chi2, whole, Guess(fit.guess.values, first.first))
+    if fit.chi2 > WRONG and (halved := with_half_step(near, fit.guess)) is not None:
+        step = halved.longest_step
+    return _FirstFit(fit.chi2, whole, Guess(fit.guess.values, first.first), step)
 
 
 def _fit_all(first_fit: _FirstFit) -> Solution:
@@ -298,7 +313,6 @@ def _fit_all(first_fit: _FirstFit) -> Solution:
     right and that of all segments is wrong, the worst segments are left out one by one, as long as
     more than half remain.
     """
-    progress.phase("whole log")
     problem, guess = without_diverged(first_fit.whole, first_fit.guess)
     if not problem.segments:
         name = first_fit.whole.unknowns.mechanism.name
