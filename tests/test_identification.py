@@ -553,7 +553,9 @@ def up_to(log, end):
 
 @pytest.mark.slow
 def test_a_log_that_ends_before_its_torques_act_is_refused(short_run_log):
-    message = r"got a log of 0\.9 s.* expected one delay.* at least 1\.9 s \(.* of motion\)\. If the"
+    message = (
+        r"got a log of 0\.9 s.* expected one delay.* at least 1\.9 s \(.* of motion\)\. If the"
+    )
     said = list[str]()
     with pytest.raises(ConfigError, match=message), shown_by(said.append):
         identify([up_to(short_run_log, 0.9)], PAPER)
