@@ -4,6 +4,7 @@ import csv
 import functools
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -452,6 +453,7 @@ def test_the_summary_counts_runs_by_what_ran_them(tmp_path, changes, loop):
 
 def test_the_text_says_around_what_the_torque_limit_is_drawn():
     told = " ".join(document(made_up(20)).plain().split())
+    assert re.search(r"Drawn errors: lengths up to \S+ mm \(rms\), delay up to \S+ ms; mach", told)
     assert "from 1 to 3 times the largest torque of the undisturbed run, 0.660 N m" in told
 
 

@@ -71,10 +71,10 @@ def identify(
 ) -> int:
     """Find delay, friction and geometry in a log.
 
-    It takes seconds to three minutes. The run may have ended early. With --out, writes
-    mechanism.yaml, calibration.yaml, a page, and found.yaml, which reads both, for --set
-    overlay=FILE. A CSV log has the columns time[s], torque_1[N m] to torque_6 (commanded), and
-    angle_1[rad] to angle_6, roll[rad] to z[m], or both.
+    It takes seconds to some minutes, longest with strong friction. The run may have been lost. With
+    --out, writes mechanism.yaml, calibration.yaml, a page, and found.yaml, which reads both, for
+    --set overlay=FILE. A CSV log has the columns time[s], torque_1[N m] to torque_6 (commanded),
+    and angle_1[rad] to angle_6, roll[rad] to z[m], or both.
 
     A CSV log with time[s], setpoint_1[rad] to setpoint_6 and crank_1[rad] to crank_6 shows the
     numbers of position servos. With --out, writes servos.yaml, for --set overlay=FILE.

@@ -51,7 +51,7 @@ UNEXPLAINED: Final = 1e3
 _SENSITIVITY_STEP: Final = 0.02  # longest step of the integration of sensitivities, s
 _STEP_ERROR: Final = 0.05  # RMS error of the integration in standard deviations of a measurement
 _SHORTEST_STEP: Final = 1e-3  # s
-_DAMPING: Final = (1e-3, 1e-9, 1e12)  # first, least and largest
+_DAMPING: Final = (1.0, 1e-9, 1e12)  # first, least and largest
 _OF_FIRST: Final = 1e-6  # damping of the first states, relative to that of the unknowns
 _CORRECTED: Final = 2  # largest number of corrections of a step
 
@@ -180,8 +180,8 @@ class Problem:
     def normal(self, guess: Guess) -> tuple[Residuals, Normal]:
         """Return the residuals and the normal equations of a guess.
 
-        Slopes are integrated with longer steps than trajectories: they cost ten times as much. Twice
-        as long ones are stable with the Coulomb friction for which the steps were halved.
+        Slopes are integrated with longer steps than trajectories: they cost ten times as much.
+        Twice as long ones are stable with the Coulomb friction for which the steps were halved.
         """
         residuals = self.residuals(guess)
         sensitivity_step = min(_SENSITIVITY_STEP, 2 * self.longest_step)
@@ -279,6 +279,7 @@ class Solution(NamedTuple):
     residuals: Residuals
     covariance: Array  # (k, k) of the free unknowns
     iterations: int
+    promised: float  # gain of chi^2 that a further step promises
 
     @property
     def delay(self) -> float:
@@ -338,7 +339,8 @@ def solve(
             break
         damping = max(damping / 100, _DAMPING[1])
         residuals, normal = problem.normal(guess)
-    found = guess, residuals, covariance(normal), iterations
+    promised = normal.promised(normal.step(_DAMPING[1]))
+    found = guess, residuals, covariance(normal), iterations, promised
     return Solution(problem if whole is None else whole, problem, start, *found)
 
 

@@ -24,7 +24,7 @@ from stewart_drake.reporting.document import (
 from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import FACTORS, LEG_LINES, UNITS
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, PAYLOAD
-from stewart_drake.studies.verdict import loop_verdict
+from stewart_drake.studies.verdict import loop_verdict, milliseconds
 from stewart_drake.types import Array
 
 _UNITS: Final = {
@@ -76,14 +76,14 @@ def document(found: Identification) -> Document:
         weak=_weak(found) if right else [],
         poses=found.pose_uncertainty if right else None,
         outside=right and found.pose_uncertainty is None,
-        **dict.fromkeys(("plan", "reduced", "motion")),
+        **dict.fromkeys(("plan", "reduced", "motion", "risk", "heavier")),
         **_shared(found),
     )
 
 
 def plan_document(plan: Plan) -> Document:
     free = [k for k in plan.unknowns.free if not _of_geometry(k)]
-    columns = {"now ±": plan.unknowns.std, "after ±": plan.std}
+    columns = {"now ± 1 σ": plan.unknowns.std, "after ± 1 σ": plan.std}
     return from_template(
         "identification",
         interval=number(1e3 * plan.std[DELAY], 2),
@@ -93,6 +93,8 @@ def plan_document(plan: Plan) -> Document:
         poses=plan.pose_uncertainty,
         reduced=plan.share < 1,
         loop=loop_verdict(plan.margin),
+        risk=_risk(plan),
+        heavier=f"{max(100.0, 10 * plan.scenario.controller.weights[1]):g}",
         angles=number(1e3 * plan.measured[ANGLES].max(), 2),
         plan=plan,
         logs=(),
@@ -102,6 +104,13 @@ def plan_document(plan: Plan) -> Document:
         ),
         **_shared(plan),
     )
+
+
+def _risk(plan: Plan) -> str:
+    """Return the delay error that the loop tolerates if it is less than the log leaves."""
+    margin = plan.margin
+    small = margin.stable and margin.weighted and margin.delay_margin < plan.std[DELAY]
+    return milliseconds(margin.delay_margin) if plan.kept and small else ""
 
 
 def _shared(study: Identification | Plan) -> dict[str, Any]:
@@ -143,6 +152,11 @@ def _cautions(found: Identification) -> list[str]:
             "a negative payload: the plate is lighter than the mechanism file says; set its "
             f"plate.mass to {plate:.4g} kg and identify again, since plant.payload_mass is at "
             "least 0"
+        )
+    if found.right and not found.fit.promised < 1:
+        cautions.append(
+            "the search ended before the minimum: values may be wrong by several of the stated "
+            "deviations; log a motion with less friction, or the motion of --plan"
         )
     cautions += _left_out(found)
     far = found.unknowns.free[np.abs(found.fit.residuals.prior) > 4]
@@ -210,23 +224,23 @@ def _table(found: Identification, geometry: bool) -> Table:
     std = found.std if found.right else np.full(len(found.values), np.nan)
     head = "off the drawing" if geometry else "found"
     values = found.values - found.unknowns.mean if geometry else found.values
-    columns = {head: values, "±": std, "± before": found.unknowns.std}
+    columns = {head: values, "± 1 σ": std, "± 1 σ before": found.unknowns.std}
     return _unknowns(free, columns, brief=not geometry)
 
 
 def _unknowns(free: Sequence[int], columns: dict[str, Array], brief: bool) -> Table:
     """Return a table of unknowns: name, unit, and their numbers by the head of the column.
 
-    If there is a column `±`, the numbers of the first column have as many decimals as it.
+    If there is a column `± 1 σ`, the numbers of the first column have as many decimals as it.
     """
     rows = []
     for k in free:
         unit, factor = _UNITS[SI_UNITS[k]]
         values = {head: factor * column[k] for head, column in columns.items()}
         texts = {head: number(value) for head, value in values.items()}
-        if np.isfinite(values.get("±", np.nan)):
+        if np.isfinite(values.get("± 1 σ", np.nan)):
             first = next(iter(columns))
-            texts["±"], texts[first] = measured(values["±"], values[first])
+            texts["± 1 σ"], texts[first] = measured(values["± 1 σ"], values[first])
         rows.append((NAMES[k].replace("_", " "), unit, *texts.values()))
     return Table(("unknown", "unit", *columns), rows, brief=brief)
 

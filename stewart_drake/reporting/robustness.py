@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.reporting.document import Document, Table, from_template, number
 from stewart_drake.reporting.panels import Curve, Panel, draw, limit
 from stewart_drake.reporting.style import LIMIT, RUN, TRUTH
@@ -71,6 +72,8 @@ def document(study: RobustnessStudy) -> Document:
         spans=_spans(study),
         enough=_ENOUGH,
         fewer=min(found.failing, found.others),
+        errors=_errors(study),
+        usual=1e3 * Tolerances().lengths,
         singles=found.failing >= _FEW and found.singles,
         pairs=found.failing >= _FEW and found.pairs,
         kept=lambda one: int(np.sum(~one.failed)),
@@ -93,6 +96,12 @@ def document(study: RobustnessStudy) -> Document:
         ),
         worst=_worst_table(study),
     )
+
+
+def _errors(study: RobustnessStudy) -> dict[str, float]:
+    """Return the largest drawn errors of lengths in mm and of the delay in ms."""
+    values = factor_values(study.draws)
+    return {name: float(np.abs(values[name]).max()) for name in ("lengths", "delay")}
 
 
 def title(factor: str) -> str:
