@@ -86,7 +86,6 @@ def test_a_motion_that_begins_at_rest_where_the_head_is_needs_no_soft_start():
     assert soft.blend == 0 and np.array_equal(soft.angles, on.angles)
     assert "no soft start: the motion begins at rest" in str(soft)
     assert "warning: the motion goes on to 6 s, beyond the duration: --set duration=6" in str(soft)
-    assert len(sd.setpoints("reachy_mini", 50, settings=(move,)).times) == 300  # up to its end
     assert made(move, start=ROBOT.home + [0, 0.1, 0, 0, 0, 0], plain=True).blend == 1.0
 
 

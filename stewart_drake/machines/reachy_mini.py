@@ -93,7 +93,7 @@ def head_of_pose(pose: Array, body_yaw: float = 0.0) -> Array:
 
 
 def read_move(path: str | Path) -> tuple[Array, Array]:
-    """Read a recorded move, a shipped name or a path.
+    """Read a recorded move.
 
     Time begins at the first sample. Antennas and the description are ignored, and a missing
     `body_yaw` is 0.
@@ -104,7 +104,7 @@ def read_move(path: str | Path) -> tuple[Array, Array]:
     Raises:
         ConfigError: no such file, or samples that are refused in a CSV file of a motion too.
     """
-    path = resolve("move", path)
+    path = Path(path)
     data = load_json(path, _MAX_BYTES, _EXPECTED)
     stamps, targets = data.get("time"), data.get("set_target_data")
     _check_spelling(data, _MOVE, str(path))
@@ -170,4 +170,4 @@ def _check_spelling(given: dict[str, Any], names: tuple[str, ...], where: str) -
 def _recorded(config: ReachyMoveConfig, duration: float) -> PlateTrajectory:
     if config.file is None:
         raise ConfigError(config.problem() or "")
-    return through_samples(*read_move(config.file), duration, config.file)
+    return through_samples(*read_move(resolve("move", config.file)), duration, config.file)

@@ -44,8 +44,7 @@ def load_scenario(
         controller: a shipped name or a YAML file, laid over the scenario's own.
         settings: `section.field=value`, `field=value` or deeper, the value in YAML, e.g.
             `plant.gravity=true`; paths start from the working directory. A setting of a section's
-            kind also drops the file's fields of another kind; that of a recorded move sets its
-            `duration`, too, unless a setting does. `overlay=dirty` lays the fields of a
+            kind also drops the file's fields of another kind. `overlay=dirty` lays the fields of a
             shipped overlay or a YAML file over the scenario.
 
     Raises:
@@ -165,11 +164,6 @@ def read_scenario(
     places |= dict.fromkeys(_dotted_names(overlay), _SETTINGS)
     for name, change in overlay.items():
         data[name] = _laid_over(name, data.get(name), change)
-    move = overlay.get("reference", {})
-    if move.get("kind") == "reachy_move" and move.get("file") and "duration" not in overlay:
-        from stewart_drake.machines.reachy_mini import read_move
-
-        data["duration"] = float(read_move(move["file"])[0][-1])
     where = f"{path} with settings" if overlay else str(path)
     return Read(validate(Scenario, data, str(path)), where, places, idle, str(path))
 
