@@ -389,7 +389,7 @@ def test_architecture_shows_the_loop_as_it_is():
     preview = diagram.GetSubsystemByName("controller").GetInputPort("preview").size()
 
     def named(system, port):
-        # Drake's own blocks have one port each way, which the table leaves out.
+        # Drake's own blocks have one port each way, which the list leaves out.
         one = system.get_name() in ("saturation", "torque_bias", "weights")
         return system.get_name() if one else f"{system.get_name()}.{port.get_name()}"
 
@@ -398,7 +398,7 @@ def test_architecture_shows_the_loop_as_it_is():
         + (source.get_output_port(i).size(),)
         for (target, j), (source, i) in diagram.connection_map().items()
     }
-    rows = re.findall(r"^\| `([\w.]+)` \| `([\w.]+)` \| (18 p|\d+) \|", text, re.MULTILINE)
+    rows = re.findall(r"^- `([\w.]+)` → `([\w.]+)` \((18 p|\d+)\)", text, re.MULTILINE)
     shown = {(a, b, preview if size == "18 p" else int(size)) for a, b, size in rows}
     assert shown == built
     assert preview % 18 == 0

@@ -316,6 +316,5 @@ def test_rows_of_a_comparison_may_change_these_servos():
     softer = "compare={softer: {controller: servo_preview, actuator: {stiffness: 5.0}}}"
     rows = shown("paper", (*servos, softer))
     assert rows["softer"].actuator.stiffness == 5.0
-    assert {"servo_preview", "servo_feedforward"} <= set(rows)
-    assert rows["predictor_lqi"].actuator.kind == "torque"
+    assert {"servo_preview", "servo_feedforward", "softer"} == set(rows), "only what servos can run"
     assert rows["servo_preview"].actuator.stiffness == 10.0
