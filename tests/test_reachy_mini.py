@@ -210,7 +210,7 @@ def changed(data, name, value, row=7):
         ("head", [1.0] * 15, r"set_target_data\[7\].head: got .*; expected 4 rows"),
         ("head", [[1.0], [2.0, 3.0]], r"set_target_data\[7\].head"),
         ("head", ["a"] * 16, r"set_target_data\[7\].head"),
-        ("head", [0.0] * 16, r"set_target_data\[7\].head: got rows that are no rotation"),
+        ("head", [0.0] * 16, r"set_target_data\[7\].head: got rows that are not a rotation"),
         ("head", None, r"set_target_data\[7\].head"),
         ("head", head_of_pose(ROBOT.home + [0, 0.5, 0, 0, 0, 0]).tolist(), "sample 7, pitch: got"),
         ("body_yaw", "left", r"set_target_data\[7\].body_yaw: got 'left'; expected a finite"),

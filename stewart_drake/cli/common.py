@@ -196,10 +196,10 @@ def _remove_empty(directories: list[Path]) -> None:
 
 @contextlib.contextmanager
 def on_interrupt(text: str) -> Iterator[Callable[[Progress], Progress]]:
-    """On Ctrl-C print what is finished and `text`, and end the command.
+    """End the command on Ctrl-C, and print the finished part and `text`.
 
     Yields:
-        A function that returns a progress which counts what is finished.
+        A function that returns a progress which counts the finished part.
     """
     finished = ""
 

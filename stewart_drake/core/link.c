@@ -177,6 +177,6 @@ void stewart_link_reset(const stewart_link *link, double *memory, double time, i
         memory[STEWART_LINK_LAST] = time;
     if (acted(memory)[0] != time)
         act(link, memory, holds ? stewart_link_current(memory) : NULL, time);
-    else if (!holds) /* in place of what has acted for no time */
+    else if (!holds) /* a torque set at this instant has not acted */
         memset(acted(memory) + 1, 0, (size_t)link->size * sizeof(double));
 }

@@ -14,8 +14,8 @@ the unknowns. A first state affects the measurements of one segment only, so tha
 and the inverse of the last matrix, without damping, is the covariance of p for any x_i.
 
 The valley of chi^2 is curved: along directions that the log hardly shows, residuals are far from
-linear. So the gradient at the end of a step gives a correction of it, with the same J. A small gain
-of a damped step is no sign of the minimum. Iterations end when an undamped step promises no gain.
+linear. So the gradient at the end of a step gives a correction of it, with the same J. A damped
+step can gain little far from the minimum: iterations end when an undamped step promises little.
 """
 
 from dataclasses import dataclass, replace
@@ -43,7 +43,7 @@ from stewart_drake.scenario.signals import NUM_STATE
 from stewart_drake.types import Array, Flags
 
 MAX_DELAY_CHANGE: Final = 0.1  # in one iteration, s
-CONVERGED: Final = 0.01  # promised gain of chi^2 below which there is no further iteration
+CONVERGED: Final = 0.01  # promised gain of chi^2 below which iterations end
 MOST_ITERATIONS: Final = 60
 # chi^2 per value above which no similar machine explains a segment; a drawing that is a millimetre
 # off causes some fifty
@@ -111,7 +111,7 @@ class Normal(NamedTuple):
         return self._replace(gradients=gradients, prior_gradient=prior_gradient)
 
     def step(self, damping: float, so_far: Change | None = None) -> Change:
-        """Return the next part of a damped step, `so_far` of which is done."""
+        """Return the next part of a damped step that follows `so_far`."""
         k, (N_pp, g) = len(self.of_prior), self.joined
         N_ip, N_ii = self.of_first
         scales = np.einsum("nii->ni", N_ii) * damping * _OF_FIRST

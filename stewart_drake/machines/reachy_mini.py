@@ -68,7 +68,7 @@ def pose_of_head(head: ArrayLike, body_yaw: float = 0.0) -> Array:
     R = X_WH[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > _ROUNDING or np.linalg.det(R) < 0:
         raise ConfigError(
-            "head: got rows that are no rotation; expected a rotation and a translation in m"
+            "head: got rows that are not a rotation; expected a rotation and a translation in m"
         )
     if not abs(body_yaw) <= math.pi:
         raise ConfigError(f"body_yaw: got {body_yaw:g}; expected -pi to pi rad")

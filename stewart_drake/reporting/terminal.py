@@ -32,7 +32,7 @@ _COLORS: Final = {
     r"|\b(left workspace|solver failed)( at [\d.]+ s(, leg \d)?)?",
 }
 _FEWEST: Final = 4
-"""Pieces after whose end their pace tells the time left."""
+"""Number of finished pieces from which the time left is estimated."""
 EVERY: Final = 10.0
 """Time between two lines of progress without a terminal, s."""
 

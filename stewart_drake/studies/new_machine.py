@@ -46,7 +46,7 @@ BODIES: Final = ("base", "plate", "crank", "rod")
 
 
 _SAME: Final = 1e-3
-"""Largest relative difference of what counts as equal."""
+"""Largest relative difference of equal numbers."""
 
 
 class MechanismCheck(NamedTuple):
@@ -149,7 +149,7 @@ _SLOW_PERIOD: Final = 0.1
 """Sampling periods of the controller, s: the slow one for a delay beyond _MAX_STEPS fast ones."""
 _MAX_STEPS: Final = 25
 _CLOSE: Final = 0.1
-"""Error of the delay that the user is told to keep to, in periods."""
+"""Delay margin below which a warning is printed, in periods."""
 
 
 class NewMachine(NamedTuple):
