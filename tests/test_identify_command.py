@@ -330,6 +330,15 @@ def test_a_plan_counts_with_the_encoders_of_its_scenario():
 
 
 @pytest.mark.slow
+def test_a_plan_says_that_its_loop_tolerates_less_than_the_log_leaves():
+    encoders = "sensor={kind: encoders, bits: 8, samples: 1}"
+    found = sd.plan_identification(sd.load_scenario("gravity", settings=("duration=2", encoders)))
+    assert found.study.margin.delay_margin < found.study.std[DELAY]
+    words = "tolerates an error of the delay of 0.00831 ms only. Plan again with --set controller"
+    assert words in " ".join(str(found).split())
+
+
+@pytest.mark.slow
 def test_the_steps_of_the_multibody_plant_are_no_wrong_machine(tmp_path):
     scenario = sd.load_scenario("paper", settings=("duration=4",))
     sd.simulate(scenario, judge_stability=False).save(tmp_path)
