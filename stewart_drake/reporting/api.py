@@ -93,7 +93,7 @@ def analysis_function(name: str) -> Callable[..., AnalysisResult]:
     kept = [one for one in own.parameters.values() if row.keeps or one.name != "directory"]
     call.__signature__ = own.replace(parameters=kept)  # type: ignore[attr-defined]
     folder = f"\n    directory: folder of the {row.keeps}, from which a second call continues."
-    exact = "; the runs take the exact plant for Drake's engine"
+    exact = "; the exact plant replaces Drake's engine"
     call.__name__ = call.__qualname__ = words
     call.__doc__ = f"""{row.help.partition(chr(10))[0]}
 
