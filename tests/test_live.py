@@ -989,7 +989,9 @@ def test_after_a_loss_the_page_shows_reason_last_seconds_and_advice(tab, viewer)
     last = tab.evaluate("document.getElementById('last').textContent")
     span = float(last.split("last ")[1].split(" s:")[0])
     assert 4.5 < span <= 5.0, "not the last seconds"
-    assert "at most 5.8" in last and "at most 0.500 N m" in last and "measured until 5.8 s" in last
+    # A busy page may skip one picture, as the loop above does not wait for the last.
+    shown = re.search(r"at most (5\.[68])0? %; measured until (5\.[68]) s", last)
+    assert shown is not None and shown[1] == shown[2] and "at most 0.500 N m" in last
     points = tab.evaluate("document.querySelector('#last polyline').points.length")
     assert points > 20
     for width in (400, 1280):
