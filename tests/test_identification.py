@@ -449,7 +449,11 @@ def test_a_machine_is_found_from_encoders_of_14_bit(log_and_truth):
     less = dataclasses.replace(found.unknowns, std=np.minimum(found.unknowns.std, 1.5 * found.std))
     told = document(dataclasses.replace(found, unknowns=less)).plain()
     assert "Weak, hardly better known than before: torque bias 1, torque" in " ".join(told.split())
-    assert "negative payload" not in told
+    assert "negative payload" not in told and "more than noise explains" not in told
+    measured = 1.15 * found.fit.residuals.measured
+    fit = found.fit._replace(residuals=found.fit.residuals._replace(measured=measured))
+    told = " ".join(document(dataclasses.replace(found, fit=fit)).plain().split())
+    assert "is more than noise explains: true errors may be several of the stated" in told
     less, payload = found.fit.guess.values.copy(), NAMES.index("payload_mass")
     less[payload] = -0.4
     fit = found.fit._replace(guess=found.fit.guess._replace(values=less))

@@ -37,6 +37,7 @@ _UNITS: Final = {
 }
 """Unit in which an unknown is shown and the factor to it, by SI unit."""
 _ADJACENT: Final = 0.1  # s between segments that are one stretch
+_DOUBTFUL: Final = 1.2  # chi^2 per value of a log that noise does not explain alone
 _WEAK: Final = 0.5
 """Standard deviation after the log, relative to that before, above which an unknown is weak."""
 _VALUE_NAMES: Final = {
@@ -152,6 +153,11 @@ def _cautions(found: Identification) -> list[str]:
             "a negative payload: the plate is lighter than the mechanism file says; set its "
             f"plate.mass to {plate:.4g} kg and identify again, since plant.payload_mass is at "
             "least 0"
+        )
+    if found.right and (ratio := found.chi2["all"]) > _DOUBTFUL:
+        cautions.append(
+            f"chi²/n of {ratio:.2f} is more than noise explains: true errors may be several of the "
+            "stated deviations; log the motion of --plan"
         )
     if found.right and not found.fit.promised < 1:
         cautions.append(
