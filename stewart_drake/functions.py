@@ -45,8 +45,7 @@ from stewart_drake.reporting.results import (
 from stewart_drake.scenario.calibration import save_calibration
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.loading import as_scenario, scenario_yaml
-from stewart_drake.scenario.run_log import is_run, scenario_of
-from stewart_drake.scenario.run_log import read_log as read_run
+from stewart_drake.scenario.run_log import is_run
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.new_machine import check_mechanism, new_machine
 from stewart_drake.studies.options import refuse, takes
@@ -108,11 +107,10 @@ def identify(
                 f"{paths[0]}: got more than one log of setpoints, a delay or tolerances; expected "
                 "one log, whose delay is found without any"
             )
-        path = Path(paths[0])
-        log = read_servo_log(path, machine)
+        log = read_servo_log(Path(paths[0]), machine)
         if velocity_gain is None:
-            run = scenario_of(read_run(path), path).actuator if is_run(path) else None
-            velocity_gain = getattr(run, "velocity_gain", 0.0)
+            servos = log.scenario and log.scenario.actuator
+            velocity_gain = getattr(servos, "velocity_gain", 0.0)
         if not 0 <= velocity_gain < 1e6:
             raise ConfigError(
                 f"velocity_gain: got {velocity_gain:g}; expected 0 or more, N m s/rad"

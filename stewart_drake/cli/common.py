@@ -22,9 +22,8 @@ from stewart_drake.scenario.loading import load_scenario, setting_choices, title
 
 if TYPE_CHECKING:
     from stewart_drake.reporting.results import AnalysisResult
+    from stewart_drake.studies.jobs import Progress
 
-Progress = Callable[[int, int], None]
-"""Called with the number of finished pieces and of all."""
 INTERRUPTED: Final = 130
 """Exit status after Ctrl-C."""
 
@@ -195,7 +194,7 @@ def _remove_empty(directories: list[Path]) -> None:
 
 
 @contextlib.contextmanager
-def on_interrupt(text: str) -> Iterator[Callable[[Progress], Progress]]:
+def on_interrupt(text: str) -> Iterator[Callable[["Progress"], "Progress"]]:
     """End the command on Ctrl-C, and print the finished part and `text`.
 
     Yields:
@@ -203,7 +202,7 @@ def on_interrupt(text: str) -> Iterator[Callable[[Progress], Progress]]:
     """
     finished = ""
 
-    def counted(show: Progress) -> Progress:
+    def counted(show: "Progress") -> "Progress":
         def count(done: int, total: int) -> None:
             nonlocal finished
             finished = f"{done} of {total} finished; "

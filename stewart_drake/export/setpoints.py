@@ -218,9 +218,9 @@ def make_setpoints(
     if from_rest:
         start = None
     if start is None and not soft_end:
-        return replace(_along(experiment, _Soft(), rate, plain, learned), from_rest=from_rest)
+        return _along(experiment, _Soft(from_rest=from_rest), rate, plain, learned)
     stop = evaluate(experiment.reference, scenario.duration)[POSE] if soft_end else None
-    soft = _Soft(start, stop, SHORTEST_BLEND, scenario.duration)
+    soft = _Soft(start, stop, SHORTEST_BLEND, scenario.duration, from_rest)
     if scenario.duration < soft.blend:
         raise ConfigError(
             f"duration: got {scenario.duration:g} s; expected at least {soft.blend:g} s, the "
@@ -228,8 +228,7 @@ def make_setpoints(
         )
     while True:
         try:
-            found = _along(experiment, soft, rate, plain, learned)
-            return replace(found, from_rest=from_rest)
+            return _along(experiment, soft, rate, plain, learned)
         except _BrokenLimit as broken:
             # A slower start or end does not mend what the motion between them breaks.
             if not soft.at(broken.time) or 2 * soft.blend > scenario.duration:
@@ -316,6 +315,7 @@ class _Soft:
     stop: Array | None = None
     blend: float = 0.0  # s
     end: float = math.inf  # of the motion, s
+    from_rest: bool = False  # whether the motion itself begins at rest where the plate is
 
     @property
     def name(self) -> str:
@@ -383,7 +383,7 @@ def _along(
     ends = float(samples[-1]) if len(samples) else math.inf
     found = Setpoints(
         *(times, setpoints, cranks, rates, torques, steps, soft.blend),
-        *(soft.name, ends, experiment.torque_limit, False),
+        *(soft.name, ends, experiment.torque_limit, soft.from_rest),
     )
     _check(found, servo, experiment, rate)
     return found

@@ -11,6 +11,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.logs import in_effect
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import ForwardKinematicsError, turned
+from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.run_log import is_run, scenario_of
 from stewart_drake.scenario.run_log import read_log as read_run
 from stewart_drake.scenario.signals import LEGS
@@ -41,6 +42,7 @@ class ServoLog(NamedTuple):
     setpoints: Array  # (n, 6) rad, each until the next one
     cranks: Array  # (n, 6) rad
     poses: Array  # (n, 6) of the plate, from the cranks; rad and m
+    scenario: Scenario | None = None  # of a run
 
 
 def is_servo_log(path: Path) -> bool:
@@ -71,14 +73,16 @@ def read_servo_log(path: Path, mechanism: Mechanism) -> ServoLog:
     if len(times) < 2 or times[-1] - times[0] < LEAST_LENGTH:
         length = float(np.ptp(times)) if len(times) else 0.0
         raise ConfigError(f"{path}: got {length:.3g} s; expected at least {LEAST_LENGTH:g} s")
-    if run:
-        period, step = scenario_of(read_run(path), path).controller.period, float(np.median(gaps))
+    scenario = scenario_of(read_run(path), path) if run else None
+    if scenario is not None:
+        period, step = scenario.controller.period, float(np.median(gaps))
         if step > period * (1 + 1e-6):
             raise ConfigError(
                 f"{path}: log_period: got a step of {step:.4g} s, longer than the controller's "
                 f"{period:g} s; expected each of its samples in the log"
             )
-    return servo_log(str(path), times, setpoints, cranks, mechanism, table)
+    log = servo_log(str(path), times, setpoints, cranks, mechanism, table)
+    return log._replace(scenario=scenario)
 
 
 def servo_log(

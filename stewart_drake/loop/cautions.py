@@ -1,6 +1,7 @@
-"""Warnings about results that may be wrong: the only place where they are made, one line each.
+"""Warnings about results that may be wrong, one line each.
 
-Those known before a run are printed then. All are in `summary.json` as `warnings`.
+All but `Experiment.weak_motors`, which `design_law` needs too, are made here. Those known before a
+run are printed then. All are in `summary.json` as `warnings`.
 """
 
 import math

@@ -247,7 +247,7 @@ def study_delay(
             loop_problem=problem,
             cells=cells,
             interrupted=interrupted,
-            choices=_choices(found) if own and own.stable and own.weighted else {},
+            choices=_choices(found, own) if own and own.stable and own.weighted else {},
         )
 
 
@@ -339,15 +339,16 @@ def loop_margins(found: Assessment, delays: Iterable[int] = DELAYS) -> list[Loop
     return judged
 
 
-def _choices(found: Assessment) -> dict[float, ControllerMargin]:
-    """Return the loop along the reference by w_R, as far as it is stable."""
-    sc, loops = found.experiment.scenario, dict[float, ControllerMargin]()
-    for w_R in sorted({*WEIGHTS, sc.controller.weights[1]}):
+def _choices(found: Assessment, own: ControllerMargin) -> dict[float, ControllerMargin]:
+    """Return the loop along the reference by w_R, as far as it is stable, with the `own` one."""
+    sc = found.experiment.scenario
+    loops = {sc.controller.weights[1]: own}
+    for w_R in {*WEIGHTS} - loops.keys():
         other = replace(sc, controller=replace(sc.controller, w_R=w_R))
         loops[w_R] = controller_margin(
             found.experiment._replace(scenario=other), found.followed_until
         )
-    return {w_R: loop for w_R, loop in loops.items() if loop.stable}
+    return {w_R: loop for w_R, loop in sorted(loops.items()) if loop.stable}
 
 
 def _margins_of(loop: stability.LinearLoop) -> LoopMargins:
