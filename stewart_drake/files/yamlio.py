@@ -343,7 +343,7 @@ def explain(data: Any, error: Any) -> str:
 
 
 def _fields_of(type_: type, data: Any, error: Any) -> str:
-    """Return the end of a message about a section that is no mapping: its fields, or ''."""
+    """Return the end of a message about a section other than a mapping: its fields, or ''."""
     if not accepted(error["msg"]).endswith("a mapping of fields"):
         return ""
     above = re.sub(r"\[\d+\]", "", _place(data, error["loc"]))

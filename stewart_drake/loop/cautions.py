@@ -64,7 +64,7 @@ def delays_apart(experiment: Experiment, margin: ControllerMargin) -> str | None
 
 
 def idle_delay(scenario: Scenario) -> str | None:
-    """Return a warning about a delay that a network with times of its own does without, or None."""
+    """Return a warning about a delay without effect, as the network's times are given, or None."""
     link, delay = scenario.link, scenario.delay
     if link.kind != "network" or link.follows_delay or delay == DelayConfig():
         return None
