@@ -5,6 +5,7 @@
 
 #include "arrivals.h"
 #include "filter.h"
+#include "observer.h"
 
 #define STEWART_NO_ARRIVAL 1000000 /* s; the delay of torques that do not arrive */
 
@@ -133,3 +134,13 @@ void stewart_delay_start(const stewart_delay *delay, int num_in_flight, stewart_
 void stewart_delay_observe(const stewart_delay *delay, int num_in_flight, const real *in_flight,
                            const real *y, const real *near, stewart_delay_memory *memory,
                            stewart_scratch scratch);
+
+/* Settings of the observer of an unknown delay at `law->estimation`: `delay` without machine and
+   sensing, which are the law's, as in `stewart_filter_settings`. */
+typedef struct {
+    stewart_delay delay;
+    int values; /* of one sample */
+    int most;   /* torques that act until the next one does, at the most */
+} stewart_delay_settings;
+
+extern const stewart_observer stewart_delay_observer;

@@ -1,9 +1,10 @@
-/* See delay_observer.h. The memory has the state, the belief about the delay, and the last measurement
+/* The observer of an unknown delay. Its memory has the state, the belief about the delay, and the last measurement
    (of one sample). */
 
 #include <stdint.h>
 
-#include "delay_observer.h"
+#include "delay.h"
+#include "law.h"
 #include "short.h"
 
 typedef struct {

@@ -2,7 +2,6 @@
 
 #include "encoders.h"
 #include "filter_attempt.h"
-#include "filter_observers.h"
 #include "short.h"
 
 #define MAX_ROWS 18 /* six legs at three nodes */

@@ -13,9 +13,13 @@
 
 #include "measurement.h"
 #include "noise.h"
+#include "observer.h"
 
 #define STEWART_PATIENCE 3 /* consecutive outliers that agree with each other and restart the estimate */
 #define STEWART_MAX_JUMP ((real)100) /* largest factor on the `jump_std` of parameters that is tried */
+/* Largest e^2 / S of a leg at a node that is used. Noise exceeds it with probability 4.3e-8, so that one of the
+   18 values of three nodes does with 8e-7. It is for one value; `gate` is for all m at once. */
+#define STEWART_LEG_GATE 30
 
 /* An estimate of xi = [x; theta] (n = 12 + p), from measurements (m): views of one vector of
    `stewart_posterior_size` numbers, in this order. */
@@ -100,3 +104,16 @@ void stewart_filter_advance(const stewart_filter *filter, const stewart_interval
 
 /* Numbers of scratch memory for both, with at most `torques` in a period. */
 int stewart_filter_scratch(const stewart_filter *filter, int torques);
+
+/* Settings of the observers with this filter, for a known delay, at `law->estimation`. In `filter`, leave
+   machine, sensing and encoder_step unset: the observer fills them in from the law. */
+typedef struct {
+    stewart_filter filter;
+    const real *prior; /* (p) initial estimate of the parameters */
+} stewart_filter_settings;
+
+extern const stewart_observer stewart_filter_observer; /* of the measured state, or of encoders */
+extern const stewart_observer stewart_gap_observer;    /* of the state, re-linearised over gaps */
+
+extern const stewart_encoder_step stewart_encoder_filter_step; /* filter step with encoders, see filter_attempt.h */
+stewart_sensing stewart_encoder_filter_sensing(const void *sensor); /* with that step; `stewart_encoders` */

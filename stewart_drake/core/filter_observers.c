@@ -1,7 +1,8 @@
-/* See filter_observers.h. */
+/* Observers with a filter, for a known delay. Their memory is an estimate, the last measurement, and the number
+   of periods for which the code of each leg has been constant. */
 
 #include "filter_attempt.h"
-#include "filter_observers.h"
+#include "observers.h"
 #include "short.h"
 
 /* Number of estimated parameters. */

@@ -1,5 +1,3 @@
-/* See kalman.h. */
-
 #include "kalman.h"
 #include "short.h"
 
@@ -19,42 +17,31 @@ static void reflect(int n, int m, real v, const real *f, real beta, real *row, r
         W[n * i] -= f[n * i] * s;
 }
 
-/* The same for six columns at once. Named sums stay in registers, see stewart_two_rows. */
+/* The same for six columns at once. Unrolled, the sums stay in registers, see stewart_two_rows. */
 static void reflect_six(int n, int m, real v, const real *f, real beta, real *row, real *W)
 {
     const real *last = f + n * (m - 1), *g = f, *w = W;
-    real s0 = v * row[0], s1 = v * row[1], s2 = v * row[2];
-    real s3 = v * row[3], s4 = v * row[4], s5 = v * row[5];
+    real s[6];
+#pragma GCC unroll 6
+    for (int i = 0; i < 6; i++)
+        s[i] = v * row[i];
     for (;; g += n, w += n) {
-        s0 += *g * w[0];
-        s1 += *g * w[1];
-        s2 += *g * w[2];
-        s3 += *g * w[3];
-        s4 += *g * w[4];
-        s5 += *g * w[5];
+#pragma GCC unroll 6
+        for (int i = 0; i < 6; i++)
+            s[i] += *g * w[i];
         if (g == last)
             break;
     }
-    s0 /= beta;
-    s1 /= beta;
-    s2 /= beta;
-    s3 /= beta;
-    s4 /= beta;
-    s5 /= beta;
-    row[0] -= v * s0;
-    row[1] -= v * s1;
-    row[2] -= v * s2;
-    row[3] -= v * s3;
-    row[4] -= v * s4;
-    row[5] -= v * s5;
+#pragma GCC unroll 6
+    for (int i = 0; i < 6; i++) {
+        s[i] /= beta;
+        row[i] -= v * s[i];
+    }
     for (;; f += n, W += n) {
         const real g0 = *f;
-        W[0] -= g0 * s0;
-        W[1] -= g0 * s1;
-        W[2] -= g0 * s2;
-        W[3] -= g0 * s3;
-        W[4] -= g0 * s4;
-        W[5] -= g0 * s5;
+#pragma GCC unroll 6
+        for (int i = 0; i < 6; i++)
+            W[i] -= g0 * s[i];
         if (f == last)
             break;
     }

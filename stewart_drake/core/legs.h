@@ -41,6 +41,13 @@ static inline Turn turn_of(const real *angles)
 
 static inline real dot(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
+static inline void cross(const real *a, const real *b, real *c)
+{
+    c[0] = a[1] * b[2] - a[2] * b[1];
+    c[1] = a[2] * b[0] - a[0] * b[2];
+    c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
 /* Compute arm = p_PQ in W, and q = p_SQ in the motor's frame. */
 static inline void joint_of(const Leg *leg, const Turn *turn, const real *pose, real *arm, real *q)
 {
@@ -64,21 +71,13 @@ static inline real angle_of(const Leg *leg, const real *q)
 /* row (6) = [(arm x along)' E, along'] / scale. */
 static inline void row_of(const Turn *turn, const real *arm, const real *along, real scale, real *row)
 {
-    const real moment[3] = {arm[1] * along[2] - arm[2] * along[1],
-                            arm[2] * along[0] - arm[0] * along[2],
-                            arm[0] * along[1] - arm[1] * along[0]};
+    real moment[3];
+    cross(arm, along, moment);
     for (int j = 0; j < 3; j++) {
         row[j] = (moment[0] * turn->E[0][j] + moment[1] * turn->E[1][j] + moment[2] * turn->E[2][j])
                  / scale;
         row[3 + j] = along[j] / scale;
     }
-}
-
-static inline void cross(const real *a, const real *b, real *c)
-{
-    c[0] = a[1] * b[2] - a[2] * b[1];
-    c[1] = a[2] * b[0] - a[0] * b[2];
-    c[2] = a[0] * b[1] - a[1] * b[0];
 }
 
 /* A leg of a moving plate; unit vectors in W. */

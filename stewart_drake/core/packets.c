@@ -123,30 +123,25 @@ static real lateness(const stewart_packets *p, const Evidence *c, int i, int d)
     return late < c->absent[i] ? late : c->absent[i];
 }
 
-static void sources(const stewart_packets *p, const Evidence *c, int d, real *chances)
-{
-    real *newer = c->states, chance = begins(p), none = 0;
-    for (int a = 0; a <= p->burst; a++)
-        newer[a] = 1;
-    for (int i = 0; i < c->n; i++) {
-        const real late = lateness(p, c, i, d), unlost = newer[p->burst];
-        chances[i] = unlost * c->not_lost[i] * (c->absent[i] - late) / c->evidence[i];
-        for (int a = 0; a < p->burst; a++)
-            newer[a] = has_arrived(c, i) ? 0 : newer[a] / c->evidence[i];
-        newer[p->burst] = late / c->evidence[i] * unlost;
-        if (i < c->n - 1)
-            before(p, newer);
-    }
-    for (int a = 0; a < p->burst; a++, chance *= 1 - begins(p))
-        none += newer[a] * chance;
-    chances[c->n] = none + newer[p->burst] * (1 - p->loss);
-}
-
 int stewart_packet_chances(const stewart_packets *p, int known, const real *arrived, int since,
                            int last, int d, real *chances, stewart_scratch scratch)
 {
     const Evidence c = condition(p, known, arrived, since, last, &scratch);
-    sources(p, &c, d, chances);
+    real *newer = c.states, chance = begins(p), none = 0;
+    for (int a = 0; a <= p->burst; a++)
+        newer[a] = 1;
+    for (int i = 0; i < c.n; i++) {
+        const real late = lateness(p, &c, i, d), unlost = newer[p->burst];
+        chances[i] = unlost * c.not_lost[i] * (c.absent[i] - late) / c.evidence[i];
+        for (int a = 0; a < p->burst; a++)
+            newer[a] = has_arrived(&c, i) ? 0 : newer[a] / c.evidence[i];
+        newer[p->burst] = late / c.evidence[i] * unlost;
+        if (i < c.n - 1)
+            before(p, newer);
+    }
+    for (int a = 0; a < p->burst; a++, chance *= 1 - begins(p))
+        none += newer[a] * chance;
+    chances[c.n] = none + newer[p->burst] * (1 - p->loss);
     return c.n;
 }
 
@@ -212,12 +207,12 @@ void stewart_packets_update(const stewart_packets *p, real *memory, const stewar
     last = last < number - 1 ? last : number - 1;
     if (!known) /* all torques in flight are from before the first sample */
         return;
-    const Evidence c = condition(p, known, arrived + num_packets - known, since, last, &scratch);
-    real *chances = stewart_take(&scratch, c.n + 1);
+    real *chances = stewart_take(&scratch, known + 1);
     for (int d = (last < known ? last : known) - 1; d >= 0; d--) {
         real *flying = newest - U * d;
-        sources(p, &c, d, chances);
-        const real *torque = expected(p, packets + size * (num_packets - 1), chances, c.n, d);
+        const int n = stewart_packet_chances(p, known, arrived + num_packets - known, since, last, d, chances,
+                                             scratch);
+        const real *torque = expected(p, packets + size * (num_packets - 1), chances, n, d);
         if (torque)
             stewart_copy(U, torque, flying);
         else if (p->holds)

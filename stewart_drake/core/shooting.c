@@ -1,12 +1,69 @@
-/* See shooting.h. */
-
 #include <string.h>
 
 #include "matrix.h"
 #include "shooting.h"
+
+/* Only two functions of equations.h are used here. */
+#pragma GCC diagnostic ignored "-Wunused-function"
+#include "equations.h"
 #include "short.h"
 
 #define MAX_COLUMNS (X + STEWART_CONSTANTS + LEGS * STEWART_PER_LEG + 1) /* of S; the last: the delay */
+
+/* The part (6) of each leg in F, from the sums, arms and rates of `leg_motion`. */
+static void forces_of_legs(const real *parameters, const real *nu_dot, const real *torque, const real *sums,
+                           const real *arms, const real *rates, real force[LEGS][6])
+{
+    static const int entry[6][6] = {{0, 1, 3, 6, 9, 12},     {1, 2, 4, 7, 10, 13},
+                                    {3, 4, 5, 8, 11, 14},    {6, 7, 8, 15, 16, 18},
+                                    {9, 10, 11, 16, 17, 19}, {12, 13, 14, 18, 19, 20}};
+    for (int leg = 0; leg < LEGS; leg++) {
+        const real resisted = parameters[DAMPING] * rates[leg] +
+                              parameters[COULOMB] * REAL(tanh)(rates[leg] / parameters[COULOMB_SPEED]);
+        const real at_shaft = torque[leg] + parameters[leg] - resisted;
+        for (int i = 0; i < 6; i++) {
+            force[leg][i] = sums[LEGS * (BIAS_FORCE + i) + leg] - arms[LEGS * i + leg] * at_shaft;
+            for (int j = 0; j < 6; j++)
+                force[leg][i] += sums[LEGS * entry[i][j] + leg] * nu_dot[j];
+        }
+    }
+}
+
+/* dF (6) by crank, rod, plate joint (3) and shaft (3) of each leg, leg by leg (6, 48), of F of dynamics.h by
+   central differences. A leg's numbers change its own part only, so that one difference serves all six. */
+static void derivatives_by_legs(const stewart_plant *plant, const real *pose, const real *rates,
+                                const real *accelerations, const real *torque, real *dF_dlegs)
+{
+    static const int places[8] = {0, 1, 12, 13, 14, 15, 16, 17};
+    const real *common = plant->geometry + COMMON, *p = plant->parameters;
+    const real st = REAL(sin)(pose[1]), ct = REAL(cos)(pose[1]), h = (real)1e-5 * plant->geometry[0];
+    const real sp = REAL(sin)(pose[2]), cp = REAL(cos)(pose[2]), *a = accelerations, *r = rates;
+    /* nu_dot = [E a + E_dot r; a] */
+    const real nu_dot[6] = {
+        cp * ct * a[0] - sp * a[1] - (sp * ct * r[2] + cp * st * r[1]) * r[0] - cp * r[2] * r[1],
+        sp * ct * a[0] + cp * a[1] + (cp * ct * r[2] - sp * st * r[1]) * r[0] - sp * r[2] * r[1],
+        a[2] - st * a[0] - ct * r[1] * r[0],
+        a[3],
+        a[4],
+        a[5],
+    };
+    real moving[21], alone[SUMS], legs[COMMON], force[2][LEGS][6];
+    plate_motion(pose, rates, p, plant->gravity, common, moving, alone);
+    memcpy(legs, plant->geometry, sizeof legs);
+    for (int k = 0; k < 8; k++) {
+        for (int side = 0; side < 2; side++) {
+            real sums[SUMS * LEGS], arms[36], crank_rates[LEGS];
+            for (int i = LEGS * places[k]; i < LEGS * (places[k] + 1); i++)
+                legs[i] = plant->geometry[i] + (side ? h : -h);
+            leg_motion(moving, common, legs, sums, arms, crank_rates);
+            forces_of_legs(p, nu_dot, torque, sums, arms, crank_rates, force[side]);
+        }
+        memcpy(legs, plant->geometry, sizeof legs);
+        for (int leg = 0; leg < LEGS; leg++)
+            for (int i = 0; i < 6; i++)
+                dF_dlegs[6 * (8 * leg + k) + i] = (force[1][leg][i] - force[0][leg][i]) / (2 * h);
+    }
+}
 
 static int numbers_of(int legs) { return STEWART_CONSTANTS + (legs ? LEGS * STEWART_PER_LEG : 0); }
 
@@ -20,7 +77,7 @@ void stewart_slopes(const stewart_plant *plant, int legs, const double *state, c
     stewart_accelerations(plant, state, state + 6, torque, accelerations);
     stewart_residual_derivatives(plant, state, state + 6, accelerations, torque, by_x, by_p, M, B);
     if (legs)
-        stewart_leg_derivatives(plant, state, state + 6, accelerations, torque, by_legs);
+        derivatives_by_legs(plant, state, state + 6, accelerations, torque, by_legs);
     stewart_transpose(6, M);
     for (int i = 0; i < 6; i++) {
         double *row = slopes + columns * i;
@@ -37,14 +94,15 @@ void stewart_slopes(const stewart_plant *plant, int legs, const double *state, c
     }
 }
 
-/* Time derivatives of x, and of S (12, columns). */
-static void time_derivatives(const stewart_plant *plant, int legs, int columns, const double *x,
-                             const double *S, const double *torque, double *dx, double *dS)
+/* Compute the time derivative of z = [x; S], S (12, columns). */
+static void change(const stewart_plant *plant, int legs, int columns, const double *z, const double *torque,
+                   double *dz)
 {
     const int numbers = numbers_of(legs);
-    double A[6 * X], P[6 * MAX_COLUMNS];
-    stewart_copy(6, x + 6, dx);
-    stewart_slopes(plant, legs, x, torque, dx + 6, A, P);
+    const double *S = z + X;
+    double A[6 * X], P[6 * MAX_COLUMNS], *dS = dz + X;
+    stewart_copy(6, z + 6, dz);
+    stewart_slopes(plant, legs, z, torque, dz + 6, A, P);
     stewart_copy(6 * columns, S + 6 * columns, dS);
     stewart_multiply(6, X, columns, A, S, dS + 6 * columns);
     for (int i = 0; i < 6; i++)
@@ -52,30 +110,20 @@ static void time_derivatives(const stewart_plant *plant, int legs, int columns, 
             dS[columns * (6 + i) + X + j] += P[numbers * i + j];
 }
 
-/* Add the increment of a classical Runge-Kutta step of h to x (size), from the slopes k of its stages. */
-static void add_increment(int size, double h, const double *const k[4], double *x)
-{
-    for (int i = 0; i < size; i++)
-        x[i] += h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
-}
-
-static void step(const stewart_plant *plant, int legs, int columns, const double *torque, double h,
-                 double *x, double *S)
+/* Advance z by a step of the classical Runge-Kutta method. */
+static void step(const stewart_plant *plant, int legs, int columns, const double *torque, double h, double *z)
 {
     static const double part[3] = {0.5, 0.5, 1};
-    const int size = X * columns;
-    double k[4][X], K[4][X * MAX_COLUMNS], y[X], Y[X * MAX_COLUMNS];
-    stewart_copy(X, x, y);
-    stewart_copy(size, S, Y);
+    const int size = X + X * columns;
+    double k[4][X + X * MAX_COLUMNS], at[X + X * MAX_COLUMNS];
+    stewart_copy(size, z, at);
     for (int stage = 0; stage < 4; stage++) {
-        time_derivatives(plant, legs, columns, y, Y, torque, k[stage], K[stage]);
-        for (int i = 0; stage < 3 && i < X; i++)
-            y[i] = x[i] + part[stage] * h * k[stage][i];
+        change(plant, legs, columns, at, torque, k[stage]);
         for (int i = 0; stage < 3 && i < size; i++)
-            Y[i] = S[i] + part[stage] * h * K[stage][i];
+            at[i] = z[i] + part[stage] * h * k[stage][i];
     }
-    add_increment(X, h, (const double *const[4]){k[0], k[1], k[2], k[3]}, x);
-    add_increment(size, h, (const double *const[4]){K[0], K[1], K[2], K[3]}, S);
+    for (int i = 0; i < size; i++)
+        z[i] += h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
 }
 
 void stewart_shoot(const stewart_plant *plant, int legs, long number, const double *h,
@@ -83,14 +131,14 @@ void stewart_shoot(const stewart_plant *plant, int legs, long number, const doub
                    double *states, double *slopes)
 {
     const int columns = slopes ? X + numbers_of(legs) + 1 : 0;
-    double x[X], S[X * MAX_COLUMNS] = {0}, before[6], then[6];
+    double x[X + X * MAX_COLUMNS] = {0}, *S = x + X, before[6], then[6];
     stewart_copy(X, first, x);
     for (int i = 0; columns && i < X; i++)
         S[columns * i + i] = 1;
     for (long k = 0; k < number; k++) {
         const double *torque = torques + U * k, *next = after + U * k;
         if (columns)
-            step(plant, legs, columns, torque, h[k], x, S);
+            step(plant, legs, columns, torque, h[k], x);
         else
             stewart_runge_kutta_step(plant, torque, h[k], x);
         if (columns && memcmp(torque, next, U * sizeof *torque)) {

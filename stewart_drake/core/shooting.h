@@ -7,11 +7,6 @@
 #define STEWART_CONSTANTS 16  /* parameters of the dynamics that are unknowns */
 #define STEWART_PER_LEG 8     /* crank, rod, plate joint (3), shaft (3): unknowns of a leg */
 
-/* dF (6) by crank, rod, plate joint (3) and shaft (3) of each leg, leg by leg (6, 48), of F of dynamics.h
-   by central differences. */
-void stewart_leg_derivatives(const stewart_plant *plant, const real *pose, const real *rates,
-                             const real *accelerations, const real *torque, real *dF_dlegs);
-
 /* Accelerations (6) of a state, their slopes by it (6, 12), by the constants and, if `legs`, by the numbers
    of the legs, leg by leg (6, 16 + 48 or 16), all by rows. They are NaN where M is singular. */
 void stewart_slopes(const stewart_plant *plant, int legs, const double *state, const double *torque,

@@ -302,9 +302,7 @@ static void innovate(const stewart_tuner_input *in, real *innovation, real *late
 /* x . y, 0 if that is not finite. */
 static real known_product(const real *x, const real *y)
 {
-    real sum = 0;
-    for (int i = 0; i < 6; i++)
-        sum += x[i] * y[i];
+    const real sum = stewart_dot(6, x, y);
     return isfinite(sum) ? sum : 0;
 }
 
