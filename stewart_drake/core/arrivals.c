@@ -1,5 +1,3 @@
-/* See arrivals.h. */
-
 #include "arrivals.h"
 #include "short.h"
 

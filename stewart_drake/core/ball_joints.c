@@ -1,5 +1,3 @@
-/* See ball_joints.h. */
-
 #include "ball_joints.h"
 #include "legs.h"
 

@@ -1,5 +1,3 @@
-/* See design.h. */
-
 #include "design.h"
 #include "kinematics.h"
 #include "observer.h"

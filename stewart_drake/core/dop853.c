@@ -26,7 +26,7 @@ static void combine(const dop853 *s, const double *row, int stages, double h, do
 static void stage(dop853 *s, int number, double h, double *x)
 {
     combine(s, A[number], number, h, x);
-    s->slope(s->system, s->before + C[number] * h, x, s->slopes[number]);
+    s->slope(s->system, x, s->slopes[number]);
     s->evaluations++;
 }
 
@@ -56,7 +56,7 @@ static double first_step(dop853 *s)
     double h = d0 < 1e-5 || d1 < 1e-5 ? 1e-6 : 0.01 * d0 / d1;
     for (int i = 0; i < STATES; i++)
         x[i] = s->x[i] + h * now[i];
-    s->slope(s->system, s->time + h, x, slope);
+    s->slope(s->system, x, slope);
     s->evaluations++;
     for (int i = 0; i < STATES; i++)
         change[i] = (slope[i] - now[i]) / h;
@@ -67,7 +67,7 @@ static double first_step(dop853 *s)
 
 void dop853_begin(dop853 *s)
 {
-    s->slope(s->system, s->time, s->x, s->slopes[LAST]);
+    s->slope(s->system, s->x, s->slopes[LAST]);
     s->evaluations++;
     if (s->next_step == 0.)
         s->next_step = first_step(s);
@@ -112,7 +112,7 @@ int dop853_step(dop853 *s, double end)
         if (wrong <= 1.) {
             s->time = parts > 1. ? s->before + h : end;
             memcpy(s->x, x, sizeof x);
-            s->slope(s->system, s->time, x, s->slopes[LAST]);
+            s->slope(s->system, x, s->slopes[LAST]);
             s->evaluations++;
             s->steps++;
             /* A step that `end` cut short does not shorten the next one. */

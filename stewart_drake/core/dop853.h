@@ -1,12 +1,12 @@
-/* Runge-Kutta steps of order 8 with error control, and a polynomial of order 7 within each step. */
+/* Runge-Kutta steps of order 8 for dx/dt = f(x), with error control, and a polynomial of order 7 within each step. */
 
 #pragma once
 
 #define STATES 12
 #define STAGES 16
 
-/* dx/dt of a system at a time in s. */
-typedef void (*slope_function)(void *system, double time, const double *x, double *slope);
+/* dx/dt of a system. */
+typedef void (*slope_function)(void *system, const double *x, double *slope);
 
 typedef struct {
     slope_function slope;

@@ -2,13 +2,6 @@
    Solving Ordinary Differential Equations I, second edition, section II.10). Stages 0 to 11 make the
    step, 12 is its end, 13 to 15 are for the polynomial within it. */
 
-/* Where a stage is, in steps. */
-static const double C[16] = {
-    0, 0.05260015195876773, 0.0789002279381516, 0.1183503419072274, 0.2816496580927726,
-    0.3333333333333333, 0.25, 0.3076923076923077, 0.6512820512820513, 0.6, 0.8571428571428571,
-    1., 1., 0.1, 0.2, 0.7777777777777778,
-};
-
 /* Slopes of earlier stages that take the state to a stage; row 12 is the step itself. */
 static const double A[16][15] = {
     {0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0},

@@ -1,5 +1,3 @@
-/* See encoders.h. */
-
 #include "encoders.h"
 #include "short.h"
 

@@ -1,5 +1,3 @@
-/* See filter.h. */
-
 #include "filter_attempt.h"
 #include "short.h"
 

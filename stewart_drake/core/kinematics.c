@@ -1,5 +1,3 @@
-/* See kinematics.h. */
-
 #include "legs.h"
 
 #define NEWTON_STEPS 50

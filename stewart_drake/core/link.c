@@ -1,5 +1,3 @@
-/* See link.h. */
-
 #include <string.h>
 
 #include "link.h"

@@ -1,5 +1,3 @@
-/* See machine.h. */
-
 #include "machine.h"
 #include "short.h"
 

@@ -1,5 +1,3 @@
-/* See matrix.h. */
-
 #include <string.h>
 
 #include "matrix.h"

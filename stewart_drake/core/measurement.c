@@ -1,5 +1,3 @@
-/* See measurement.h. */
-
 #include "measurement.h"
 #include "short.h"
 

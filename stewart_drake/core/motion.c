@@ -1,5 +1,3 @@
-/* See motion.h. */
-
 #include "motion.h"
 #include "short.h"
 

@@ -1,5 +1,3 @@
-/* See noise.h. */
-
 #include "noise.h"
 #include "short.h"
 

@@ -1,5 +1,3 @@
-/* See observers.h. */
-
 #include "observers.h"
 #include "short.h"
 

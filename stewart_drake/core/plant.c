@@ -1,8 +1,7 @@
-/* See plant.h. */
-
 #include <string.h>
 
 #include "dop853.h"
+#include "legs.h"
 #include "planning.h"
 #include "plant.h"
 #include "reference.h"
@@ -17,19 +16,31 @@ const char *stewart_source(void) { return SOURCE; }
 /* The plant of a run with the source of its torque. */
 typedef struct {
     stewart_run *run;
-    const stewart_drive *drive; /* of a torque that changes with time, else NULL */
     const stewart_position_servo *servo; /* turns setpoints into torques, NULL for none */
     double torque[U], setpoint[U], bias[U];
     int at_limit; /* whether a servo has reached its limit since the last sample */
 } DrivenPlant;
 
-/* Set the torque that the servos and the bias apply in a state. */
-static void set_servo_torque(DrivenPlant *d, const double *x)
+void stewart_position_torque(const stewart_position_servo *servo, const double *geometry,
+                             const double *setpoint, const double *state, double *asked, double *torque)
 {
-    double asked[U];
-    stewart_position_torque(d->servo, d->run->plant->geometry, d->setpoint, x, asked, d->torque);
-    for (int i = 0; i < U; i++)
-        d->torque[i] += d->bias[i];
+    const double *rates = state + 6, limit = servo->torque_limit;
+    const Turn turn = turn_of(state);
+    /* Angular velocity of the plate. */
+    const double w[3] = {dot(turn.E[0], rates), dot(turn.E[1], rates), dot(turn.E[2], rates)};
+    for (int i = 0; i < LEGS; i++) {
+        const Leg leg = leg_of(geometry, i);
+        const LegMotion motion = leg_motion_of(&leg, &turn, state, w, rates + 3);
+        /* `remainder` is within half a turn: whole turns do not count. */
+        const double error = remainder(setpoint[i] - motion.angle, TURN);
+        asked[i] = servo->stiffness * error - servo->velocity_gain * motion.rate;
+        torque[i] = fmax(-limit, fmin(limit, asked[i]));
+    }
+}
+
+static void servo_torques(const DrivenPlant *d, const double *x, double *asked, double *torque)
+{
+    stewart_position_torque(d->servo, d->run->plant->geometry, d->setpoint, x, asked, torque);
 }
 
 /* Note whether a servo is at its limit. This is not done in `slope`, whose step may be rejected. */
@@ -38,24 +49,29 @@ static void note_limit(DrivenPlant *d, const double *x)
     double asked[U], torque[U];
     if (!d->servo)
         return;
-    stewart_position_torque(d->servo, d->run->plant->geometry, d->setpoint, x, asked, torque);
+    servo_torques(d, x, asked, torque);
     for (int i = 0; i < U; i++)
         d->at_limit |= fabs(asked[i]) > d->servo->torque_limit;
 }
 
-static void set_torque(DrivenPlant *d, const stewart_drive *drive, double time)
+/* Let a command (6) act: a torque, or a setpoint of the servos. */
+static void hold(DrivenPlant *d, const double *command)
 {
-    for (int i = 0; i < U; i++)
-        d->torque[i] = drive->constant[i] + drive->amplitude[i] * sin(drive->frequency * time + drive->phase[i]);
+    for (int i = 0; i < U; i++) {
+        d->setpoint[i] = command[i];
+        d->torque[i] = command[i] + d->bias[i];
+    }
 }
 
-static void slope(void *system, double time, const double *x, double *rate)
+static void slope(void *system, const double *x, double *rate)
 {
     DrivenPlant *d = system;
-    if (d->drive)
-        set_torque(d, d->drive, time);
-    if (d->servo)
-        set_servo_torque(d, x);
+    if (d->servo) {
+        double asked[U];
+        servo_torques(d, x, asked, d->torque);
+        for (int i = 0; i < U; i++)
+            d->torque[i] += d->bias[i];
+    }
     stewart_change(d->run->plant, x, d->torque, rate);
 }
 
@@ -80,7 +96,7 @@ static int leave(dop853 *s, const stewart_run *r, double from, double to)
     return STEWART_LEFT;
 }
 
-/* Advance to `end`, up to which the torque is smooth, and record the states at the run's times. */
+/* Advance to `end`, up to which the command is constant, and record the states at the run's times. */
 static int advance(dop853 *s, stewart_run *r, double end)
 {
     for (; r->recorded < r->number && r->times[r->recorded] <= s->time; r->recorded++)
@@ -124,31 +140,14 @@ static int finish(stewart_run *r, const dop853 *s, int outcome)
     return outcome;
 }
 
-int stewart_open_loop(stewart_run *r, const stewart_drive *drives, long number)
-{
-    DrivenPlant d = {.run = r};
-    dop853 s = integrator(&d);
-    int outcome = STEWART_INSIDE;
-    for (long i = 0; i < number && outcome == STEWART_INSIDE; i++) {
-        const stewart_drive *drive = drives + i;
-        int constant = 1;
-        for (int j = 0; j < U; j++)
-            constant &= drive->amplitude[j] == 0. || drive->frequency == 0.;
-        d.drive = constant ? NULL : drive;
-        set_torque(&d, drive, s.time);
-        outcome = advance(&s, r, i + 1 < number ? fmin(drive[1].from, r->end) : r->end);
-    }
-    return finish(r, &s, outcome);
-}
-
-int stewart_servo_run(stewart_run *r, const stewart_position_servo *servo, long number,
-                      const double *from, const double *setpoints)
+int stewart_open_loop(stewart_run *r, const stewart_position_servo *servo, long number,
+                      const double *from, const double *commands)
 {
     DrivenPlant d = {.run = r, .servo = servo};
     dop853 s = integrator(&d);
     int outcome = STEWART_INSIDE;
     for (long i = 0; i < number && outcome == STEWART_INSIDE; i++) {
-        stewart_copy(U, setpoints + U * i, d.setpoint);
+        hold(&d, commands + U * i);
         outcome = advance(&s, r, i + 1 < number ? fmin(from[i + 1], r->end) : r->end);
     }
     return finish(r, &s, outcome);
@@ -204,7 +203,7 @@ static int sample(const dop853 *s, stewart_loop *o, long k, stewart_controller l
     if (o->servo && k > 0) { /* at k = 0 no setpoint has acted */
         double limited[U];
         DrivenPlant *d = s->system;
-        stewart_position_torque(o->servo, d->run->plant->geometry, d->setpoint, s->x, torque, limited);
+        servo_torques(d, s->x, torque, limited);
         o->saturated += d->at_limit;
         d->at_limit = 0;
     }
@@ -239,9 +238,7 @@ int stewart_closed_loop(stewart_run *r, stewart_loop *o, stewart_controller law,
     dop853 s = integrator(&d);
     stewart_copy(U, o->bias, d.bias);
     for (long k = 0;;) {
-        stewart_copy(U, stewart_link_current(o->memory), d.setpoint);
-        for (int i = 0; i < U; i++)
-            d.torque[i] = stewart_link_current(o->memory)[i] + o->bias[i];
+        hold(&d, stewart_link_current(o->memory));
         double sampled = k < o->samples ? o->sampled[k] : HUGE_VAL;
         double released = stewart_link_next(o->link, o->memory);
         int is_sample = sampled <= released + o->link->time_tolerance, outcome = STEWART_INSIDE;

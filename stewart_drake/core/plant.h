@@ -9,7 +9,6 @@
 #include "kinematics.h"
 #include "link.h"
 #include "motion.h"
-#include "position_servo.h"
 #include "servo.h"
 #include "tuner.h"
 
@@ -32,14 +31,26 @@ typedef struct {
     long most_steps; /* after which it ends with STEWART_TOO_SHORT_STEPS; 0 for no such limit */
 } stewart_run;
 
-/* Torque constant + amplitude sin(frequency t + phase) from the time `from` on, s. */
-typedef struct {
-    double constant[STEWART_MOTORS], amplitude[STEWART_MOTORS], phase[STEWART_MOTORS];
-    double frequency, from;
-} stewart_drive;
+/* Position servos by stiffness: the torque at each crank is
 
-/* Run under drives (number), the first from the start on. Returns how the run has ended. */
-int stewart_open_loop(stewart_run *run, const stewart_drive *drives, long number);
+       clip(k (u - alpha) - k_v alpha_dot, limit),
+
+   u the setpoint, alpha the crank's angle; whole turns do not count. Beyond the workspace it stays finite.
+   Damping, Coulomb friction and armature of a servo are the plant's, see dynamics.h. */
+typedef struct {
+    double stiffness;     /* k, N m/rad */
+    double velocity_gain; /* k_v, N m s/rad */
+    double torque_limit;  /* N m, infinite for none */
+} stewart_position_servo;
+
+/* Torques (6) of six servos at a state (12), for setpoints (6), and those without limit in `asked` (6). */
+void stewart_position_torque(const stewart_position_servo *servo, const double *geometry,
+                             const double *setpoint, const double *state, double *asked, double *torque);
+
+/* Run under commands (number, 6), each from its time on (number) in s, the first one from the start on: torques
+   without a servo, else its setpoints. Returns how the run has ended. */
+int stewart_open_loop(stewart_run *run, const stewart_position_servo *servo, long number,
+                      const double *from, const double *commands);
 
 /* Controller at a sample: write its torque (6) without limit, and the command (rows, 6) that it sends.
    The sample has measurement, age and report only. Returns 0, or 1 to end the run. */
@@ -90,10 +101,5 @@ typedef struct {
     int rows; /* torques of a command */
     const double *report; /* of servos, of NaN */
 } stewart_law_in_loop;
-
-/* Run under setpoints (number, 6) of servos, each from its time on (number) in s, the first one from the
-   start on. Returns how the run has ended. */
-int stewart_servo_run(stewart_run *run, const stewart_position_servo *servo, long number,
-                      const double *from, const double *setpoints);
 
 int stewart_closed_loop_of_law(stewart_run *run, stewart_loop *loop, stewart_law_in_loop *law);

@@ -1,5 +1,3 @@
-/* See reference.h. */
-
 #include "kinematics.h"
 #include "reference.h"
 #include "short.h"

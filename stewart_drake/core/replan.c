@@ -1,5 +1,3 @@
-/* See replan.h. */
-
 #include "replan.h"
 #include "short.h"
 

@@ -1,5 +1,3 @@
-/* See sensing.h. */
-
 #include "kinematics.h"
 #include "sensing.h"
 #include "short.h"

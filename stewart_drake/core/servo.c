@@ -1,5 +1,3 @@
-/* See servo.h. */
-
 #include "servo.h"
 #include "short.h"
 

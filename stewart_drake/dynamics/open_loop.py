@@ -5,9 +5,8 @@ torques to the next and stops where the plate leaves its workspace (docs/theory.
 """
 
 import math
-from collections.abc import Sequence
 from enum import IntEnum
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,10 +14,8 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import LEAST, Failure, diagnose, home_sign
 from stewart_drake.mechanism.geometry import geometry_of
-from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, POSE, WRENCH
+from stewart_drake.scenario.signals import NUM_STATE, POSE, WRENCH
 from stewart_drake.types import Array, ArrayLike
-
-_NONE: Final = (0.0,) * NUM_TORQUES
 
 
 class IntegrationError(ArithmeticError):
@@ -75,6 +72,12 @@ class NativePlant:
         """Run by a function of plant.h with its further arguments."""
         return Ended(getattr(core().lib, f"stewart_{name}")(self.run, *arguments))
 
+    def hold(self, begins: ArrayLike, commands: ArrayLike, servo: Any = None) -> Ended:
+        """Run under commands (n, 6), each from its time in `begins` (n,) on, s, as `integrate`."""
+        c, first, held = core(), np.array(begins, np.float64), np.array(commands, np.float64)
+        servo = c.ffi.NULL if servo is None else servo
+        return self.call("open_loop", servo, len(first), c.at(first), c.at(held))
+
     def failure(self, ended: Ended) -> Failure | None:
         """Return why the plate left its workspace, None if it did not.
 
@@ -95,21 +98,6 @@ class NativePlant:
         return np.array(list(self.run.state))
 
 
-class Drive(NamedTuple):
-    """Motor torques constant + amplitude sin(frequency t + phase) in N m, from `start` in s on."""
-
-    constant: ArrayLike = _NONE
-    amplitude: ArrayLike = _NONE
-    frequency: float = 0.0
-    phase: ArrayLike = _NONE
-    start: float = 0.0
-
-    def torque(self, time: float) -> Array:
-        """Return the torques (6,) in N m at a time in s."""
-        swing = np.sin(self.frequency * time + np.asarray(self.phase))
-        return np.asarray(np.asarray(self.constant) + np.asarray(self.amplitude) * swing)
-
-
 class Course(NamedTuple):
     """Result of `integrate`."""
 
@@ -124,10 +112,11 @@ class Course(NamedTuple):
 def integrate(
     dynamics: StewartDynamics,
     start: ArrayLike,
-    drives: Sequence[Drive],
+    command: ArrayLike,
     times: ArrayLike,
     accuracy: float = 1e-9,
     longest_step: float = math.inf,
+    servo: Any = None,
 ) -> Course:
     """Integrate the exact plant from t = 0 to the last of `times`, or out of its workspace.
 
@@ -137,49 +126,17 @@ def integrate(
     Args:
         dynamics: equations of motion, with the true parameters.
         start: (12,) state at t = 0, in the workspace.
-        drives: torques, each until the next one starts, the first at t = 0.
+        command: (6,) motor torques, N m, or setpoints of `servo`, rad.
         times: (n,) s, ascending, at which states are wanted.
         accuracy: error of a step in a coordinate x, in units of 1 + |x| (rad, m, and per s).
         longest_step: s.
+        servo: a `stewart_position_servo *`, or None.
 
     Raises:
         IntegrationError: no step is short enough for the accuracy.
     """
-    x0, looks = np.array(start, dtype=np.float64), np.array(times, dtype=np.float64)
-    plant = NativePlant(dynamics, x0, looks, accuracy, longest_step)
-    return _course(plant, plant.call("open_loop", *in_c(drives)), looks)
-
-
-def follow(
-    dynamics: StewartDynamics,
-    start: Array,
-    servo: Any,
-    setpoint: Array,
-    end: float,
-    accuracy: float,
-    longest_step: float,
-) -> Course:
-    """Integrate the exact plant up to `end` in s under servos, as `integrate`.
-
-    The servos, a `stewart_position_servo *`, have a constant setpoint (6,), rad.
-    """
-    looks, held, at = np.array([end]), np.array(setpoint, np.float64), core().at
+    looks = np.array(times, dtype=np.float64)
     plant = NativePlant(dynamics, np.array(start), looks, accuracy, longest_step)
-    ended = plant.call("servo_run", servo, 1, at(np.zeros(1)), at(held))
-    return _course(plant, ended, looks)
-
-
-def _course(plant: NativePlant, ended: Ended, looks: Array) -> Course:
-    failure, run = plant.failure(ended), plant.run
+    failure, run = plant.failure(plant.hold([0.0], command, servo)), plant.run
     kept = looks[: run.recorded], plant.states[: run.recorded]
     return Course(*kept, run.time, plant.final, failure, run.steps)
-
-
-def in_c(drives: Sequence[Drive]) -> tuple[Any, int]:
-    """Return drives as arguments of `stewart_open_loop`."""
-    rows = [
-        (*(list(np.asarray(one, np.float64)) for one in (d.constant, d.amplitude, d.phase)),)
-        + (d.frequency, d.start)
-        for d in drives
-    ]
-    return core().ffi.new("stewart_drive[]", rows), len(rows)

@@ -49,7 +49,6 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.stats import t as student
 
 from stewart_drake.core.layout import DEFAULT_GRAVITY
-from stewart_drake.core.library import core
 from stewart_drake.dynamics.open_loop import Ended, NativePlant
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
@@ -141,10 +140,7 @@ class ServoModel:
         plant.run.most_steps = round(_RUN_STEPS * times[-1])
         servo = PositionServo(theta[K], 0.0, self.torque_limit)
         # The first setpoint acts from the start on.
-        acts, setpoints = times + theta[D], np.ascontiguousarray(self.log.setpoints)
-        ended = plant.call(
-            "servo_run", servo.compiled, len(acts), core().at(acts), core().at(setpoints)
-        )
+        ended = plant.hold(times + theta[D], self.log.setpoints, servo.compiled)
         self.steps.append(plant.run.steps)
         return plant.states if ended == Ended.INSIDE else None
 

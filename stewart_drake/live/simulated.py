@@ -13,7 +13,7 @@ import numpy as np
 from pydrake.systems.analysis import SimulatorStatus
 
 from stewart_drake.core.link import Link
-from stewart_drake.dynamics.open_loop import Course, Drive, IntegrationError, follow, integrate
+from stewart_drake.dynamics.open_loop import IntegrationError, integrate
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
@@ -242,18 +242,14 @@ class NativeBody:
             return None
         dynamics = self._pushed if any(push.at(self.time)) else self._free
         try:
-            course = self._course(dynamics, torque, time - self.time)
+            command = torque if self._servo is not None else torque + self._bias
+            how = (time - self.time,), self._accuracy, LONGEST_STEP, self._servo
+            course = integrate(dynamics, self.state, command, *how)
         except IntegrationError as error:
             return Failure(self.time, None, np.nan, str(error))
         began, left = self.time, course.failure
         self.state, self.time = course.final, time if left is None else began + course.end
         return None if left is None else left._replace(time=began + left.time)
-
-    def _course(self, dynamics: StewartDynamics, torque: Array, span: float) -> Course:
-        how = self._accuracy, LONGEST_STEP
-        if self._servo is not None:
-            return follow(dynamics, self.state, self._servo, torque, span, *how)
-        return integrate(dynamics, self.state, (Drive(torque + self._bias),), (span,), *how)
 
     def measurement(self) -> Array:
         if not self._noise.any():
