@@ -57,13 +57,13 @@ static void delayed_start(const stewart_law *law, real *memory)
     stewart_delay_start(&s.delay, s.num_in_flight, (stewart_delay_memory *)(memory + X));
 }
 
-/* Mean of the most probable hypothesis, followed by the root; NULL before the first measurement. */
-static const real *best_of(const Sizes *s, const real *memory)
+/* The most probable hypothesis; NULL before the first measurement. */
+static const stewart_hypothesis *best_of(const Sizes *s, const real *memory)
 {
     stewart_delay_memory *m = (stewart_delay_memory *)(uintptr_t)(memory + X);
     if (!(m->known > 0))
         return NULL;
-    return stewart_delay_hypothesis(s->p, s->m, s->num_in_flight, m, (int)m->best)->numbers;
+    return stewart_delay_hypothesis(s->p, s->m, s->num_in_flight, m, (int)m->best);
 }
 
 static int delayed_observe(const stewart_law *law, real *memory, int number, const real *torques,
@@ -81,9 +81,9 @@ static int delayed_observe(const stewart_law *law, real *memory, int number, con
         if (isfinite(values[i]))
             last[i] = values[i];
     stewart_delay_observe(&s.delay, number, torques, fault ? NULL : values, state, delay, scratch);
-    const real *best = best_of(&s, memory);
+    const stewart_hypothesis *best = best_of(&s, memory);
     if (best)
-        stewart_copy(X, best, state);
+        stewart_copy(X, best->numbers, state);
     return delay->rejected > 0 ? STEWART_MEASUREMENT_REJECTED : fault << STEWART_CAUSES_AT;
 }
 
@@ -91,11 +91,11 @@ static void delayed_parameters(const stewart_law *law, const real *memory, real 
 {
     Sizes s;
     sizes_of(law, &s);
-    const real *mean = best_of(&s, memory);
-    stewart_copy(s.p, mean ? mean + X : s.delay.prior, theta);
+    const stewart_hypothesis *best = best_of(&s, memory);
+    stewart_copy(s.p, best ? best->numbers + X : s.delay.prior, theta);
     stewart_fill(s.p, (real)NAN, std);
-    for (int i = 0; mean && i < s.p; i++)
-        std[i] = stewart_packed_std(X + i, mean + X + s.p + 2);
+    for (int i = 0; best && i < s.p; i++)
+        std[i] = stewart_packed_std(X + i, best->numbers + X + s.p + 2);
 }
 
 static real delayed_uncertainty(const stewart_law *law, const real *memory, real *L)
@@ -103,14 +103,12 @@ static real delayed_uncertainty(const stewart_law *law, const real *memory, real
     Sizes s;
     sizes_of(law, &s);
     const int n = X + s.p;
-    stewart_delay_memory *m = (stewart_delay_memory *)(uintptr_t)(memory + X);
-    const int place = m->known > 0 ? (int)m->best : 0;
-    const stewart_hypothesis *best = stewart_delay_hypothesis(s.p, s.m, s.num_in_flight, m, place);
-    if (L && m->known > 0)
+    const stewart_hypothesis *best = best_of(&s, memory);
+    if (L && best)
         stewart_unpack_root(n, best->numbers + n + 2, L); /* without the last two rows, of the delay */
     else if (L)
         stewart_fill(n * n, (real)NAN, L);
-    return m->known > 0 ? REAL(sqrt)(best->timing) : 0;
+    return best ? REAL(sqrt)(best->timing) : 0;
 }
 
 static void delayed_last_period(const stewart_law *law, const real *memory, int number,

@@ -1,6 +1,13 @@
 #include "kalman.h"
 #include "short.h"
 
+/* Unrolled, a loop over six columns keeps its sums in registers, see stewart_two_rows. */
+#if defined(__GNUC__) && !defined(__clang__)
+#define UNROLLED _Pragma("GCC unroll 6")
+#else
+#define UNROLLED
+#endif
+
 #define BOUND_TOLERANCE ((real)1e-9) /* standard deviations; less out of bounds counts as rounding */
 
 /* A reflection of one column x of [row; W], rows of W being n numbers apart, by v = [v; f]:
@@ -17,29 +24,29 @@ static void reflect(int n, int m, real v, const real *f, real beta, real *row, r
         W[n * i] -= f[n * i] * s;
 }
 
-/* The same for six columns at once. Unrolled, the sums stay in registers, see stewart_two_rows. */
+/* The same for six columns at once. */
 static void reflect_six(int n, int m, real v, const real *f, real beta, real *row, real *W)
 {
     const real *last = f + n * (m - 1), *g = f, *w = W;
     real s[6];
-#pragma GCC unroll 6
+    UNROLLED
     for (int i = 0; i < 6; i++)
         s[i] = v * row[i];
     for (;; g += n, w += n) {
-#pragma GCC unroll 6
+        UNROLLED
         for (int i = 0; i < 6; i++)
             s[i] += *g * w[i];
         if (g == last)
             break;
     }
-#pragma GCC unroll 6
+    UNROLLED
     for (int i = 0; i < 6; i++) {
         s[i] /= beta;
         row[i] -= v * s[i];
     }
     for (;; f += n, W += n) {
         const real g0 = *f;
-#pragma GCC unroll 6
+        UNROLLED
         for (int i = 0; i < 6; i++)
             W[i] -= g0 * s[i];
         if (f == last)

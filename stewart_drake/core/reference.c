@@ -74,8 +74,12 @@ static void consider(Neighbours *n, real later, const real *row)
     }
 }
 
-void stewart_complete(const real *geometry, real period, real eta, const stewart_preview *given,
-                      real since, const stewart_preview *last, real *rows)
+/* Write `rows`: the given reference with its missing numbers filled in. Rows before `since` s count as
+   missing. The neighbours in time, of this preview or of the last one (a period earlier), are
+   interpolated; a single one is continued to rest. Without a complete row numbers stay missing.
+   `eta`: s until the next torque acts; `geometry` NULL: any pose is within reach. */
+static void complete(const real *geometry, real period, real eta, const stewart_preview *given,
+                     real since, const stewart_preview *last, real *rows)
 {
     real found[ROW];
     for (int i = 0; i < given->number; i++)
@@ -114,7 +118,8 @@ void stewart_complete(const real *geometry, real period, real eta, const stewart
     }
 }
 
-void stewart_interpolate(const stewart_preview *reference, real time, real *row)
+/* Interpolate at a time between the rows before and after it. */
+static void interpolate(const stewart_preview *reference, real time, real *row)
 {
     int before = 0, after = 0;
     real earlier = -(real)HUGE_VAL, later = (real)HUGE_VAL;
@@ -233,13 +238,13 @@ static void return_after_gap(const stewart_course_input *m, const stewart_course
     const int early = ended || 2 * (real)blend->holds * h >= CATCH_UP;
     const int predicted = !known || (early && !c->missing && m->open_loop);
     if (!predicted) {
-        stewart_complete(geometry, h, eta, &reference, acts, &followed_before, before);
+        complete(geometry, h, eta, &reference, acts, &followed_before, before);
         if (ended) { /* without a step in what is followed */
             real *continued = stewart_take(&scratch, ROW * c->number);
             const stewart_preview went_on = {c->number, c->times, continued};
             stewart_add_offset(*blend, h, 0, reached);
-            stewart_complete(geometry, h, eta, &reference, (real)HUGE_VAL, &given_before, continued);
-            stewart_interpolate(&went_on, eta, wanted);
+            complete(geometry, h, eta, &reference, (real)HUGE_VAL, &given_before, continued);
+            interpolate(&went_on, eta, wanted);
             for (int i = 0; i < X; i++)
                 reached[i] += wanted[i];
         }
@@ -250,7 +255,7 @@ static void return_after_gap(const stewart_course_input *m, const stewart_course
         return;
     }
     if (ended || predicted) {
-        stewart_interpolate(&reference, eta, wanted);
+        interpolate(&reference, eta, wanted);
         for (int i = 0; i < X; i++)
             reached[i] -= wanted[i];
         if (ended || !known)
@@ -273,7 +278,7 @@ void stewart_follow(const stewart_course_input *m, const stewart_course *last, c
     const real *geometry = m->machine->acceleration_per_torque ? NULL : m->machine->geometry;
     const stewart_preview now = {c->number, c->times, given};
     const stewart_preview before = {last->number, last->times, last->reference};
-    stewart_complete(geometry, m->period, m->eta, &now, -(real)HUGE_VAL, &before, c->reference);
+    complete(geometry, m->period, m->eta, &now, -(real)HUGE_VAL, &before, c->reference);
     stewart_copy(ROW * c->number, c->reference, c->followed);
     c->missing = !stewart_all_finite(ROW * c->number, given);
     c->gap = !stewart_all_finite(ROW, given + ROW * (c->number - 1));

@@ -22,16 +22,6 @@ typedef struct {
 /* Interpolate at s in [0, 1] between two rows h seconds apart, by the polynomial of fifth order. */
 void stewart_between(const real *from, const real *to, real h, real s, real *row);
 
-/* Interpolate at a time between the rows before and after it. */
-void stewart_interpolate(const stewart_preview *reference, real time, real *row);
-
-/* Write `rows`: the given reference with its missing numbers filled in. Rows before `since` s count as
-   missing. The neighbours in time, of this preview or of the last one (a period earlier), are
-   interpolated; a single one is continued to rest. Without a complete row numbers stay missing.
-   `eta`: s until the next torque acts; `geometry` NULL: any pose is within reach. */
-void stewart_complete(const real *geometry, real period, real eta, const stewart_preview *given,
-                      real since, const stewart_preview *last, real *rows);
-
 /* Begin a blend from an offset, with `queue` torques in flight. */
 void stewart_begin_blend(const real *offset, real period, int queue, stewart_blend *blend);
 
