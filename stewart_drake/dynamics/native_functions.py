@@ -29,12 +29,11 @@ Call = Callable[..., Sequence[Array]]
 
 
 class Buffers(NamedTuple):
-    """Places of arguments and results, a call that evaluates, and the memory that it uses."""
+    """Places of arguments and results, and a call that evaluates."""
 
     arguments: list[Array]
     results: list[Array]
     evaluate: Callable[[], object]
-    owner: object
 
 
 class NativeFunction:
@@ -51,7 +50,7 @@ class NativeFunction:
         self._name, self._geometry, self._own = name, geometry, threading.local()
 
     def __call__(self, *arguments: ArrayLike) -> Sequence[Array]:
-        places, results, evaluate, _ = self.own_buffers()
+        places, results, evaluate = self.own_buffers()
         for place, argument in zip(places, arguments, strict=True):
             place[...] = argument
         evaluate()
@@ -75,7 +74,7 @@ class NativeFunction:
         no_angles = [c.ffi.NULL] if self._name == "measures" else []
         function = getattr(c.lib, f"stewart_{self._name.removesuffix('_of_tree')}")
         call = partial(function, first, *inputs, *no_angles, *map(c.at, results))
-        return Buffers(given, results, call, first)
+        return Buffers(given, results, call)
 
 
 class NativeFunctions:
@@ -101,7 +100,7 @@ class NativeFunctions:
 
     def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
         """Return d[pose; rates]/dt (12,), in half the time of a `Call`."""
-        places, results, evaluate, _ = self._change.own_buffers()
+        places, results, evaluate = self._change.own_buffers()
         places[0][...], places[1][...] = state, torque
         places[2][...], places[3][...] = parameters, gravity
         evaluate()

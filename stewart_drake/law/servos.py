@@ -110,7 +110,7 @@ class ServoLoop:
 
 @dataclass(frozen=True)
 class PositionServo:
-    """The six servos of a machine, given by their stiffness (core/position_servo.h)."""
+    """The six servos of a machine, given by their stiffness (core/plant.h)."""
 
     stiffness: float  # k, N m/rad
     velocity_gain: float  # k_v, N m s/rad
