@@ -124,20 +124,6 @@ static void tag_of(stewart_key key, const uint8_t *data, size_t size, uint8_t *t
 
 /* ---------------------------------------------------------------- numbers */
 
-static void put(uint8_t **at, uint64_t value, size_t bytes)
-{
-    for (size_t i = 0; i < bytes; i++)
-        *(*at)++ = (uint8_t)(value >> 8 * i);
-}
-
-static uint64_t get(const uint8_t **at, size_t bytes)
-{
-    uint64_t value = 0;
-    for (size_t i = 0; i < bytes; i++)
-        value |= (uint64_t)*(*at)++ << 8 * i;
-    return value;
-}
-
 /* A datagram up to here, to write to, or with `to` NULL to read from. */
 typedef struct {
     uint8_t *to;
@@ -191,11 +177,10 @@ static const field HEAD[] = {OF(session), OF(nonce), OF(sequence), OF(acknowledg
 /* Write a head. */
 static datagram put_head(uint8_t *data, const char *magic, stewart_head *h, stewart_key key)
 {
-    datagram d = {data + 4, NULL};
+    datagram d = {data + 8, NULL};
     memcpy(data, magic, 4);
-    put(&d.to, STEWART_PROTOCOL, 1);
-    put(&d.to, key.size ? STEWART_TAG : 0, 1);
-    put(&d.to, 0, 2); /* the length, once it is known */
+    data[4] = STEWART_PROTOCOL;
+    data[5] = key.size ? STEWART_TAG : 0; /* then the length, once it is known */
     PASS(&d, h, HEAD);
     return d;
 }
@@ -203,8 +188,8 @@ static datagram put_head(uint8_t *data, const char *magic, stewart_head *h, stew
 static size_t finish(uint8_t *data, datagram d, stewart_key key)
 {
     size_t size = (size_t)(d.to - data) + (key.size ? STEWART_TAG : 0);
-    uint8_t *length = data + 6;
-    put(&length, size, 2);
+    data[6] = (uint8_t)size;
+    data[7] = (uint8_t)(size >> 8);
     if (key.size)
         tag_of(key, data, (size_t)(d.to - data), d.to);
     return size;
@@ -225,8 +210,8 @@ static int get_head(const char *magic, size_t least, const uint8_t *data, size_t
         return STEWART_MALFORMED;
     if (data[4] != STEWART_PROTOCOL)
         return STEWART_VERSION;
-    *d = (datagram){NULL, data + 5};
-    size_t tag = (size_t)get(&d->from, 1), length = (size_t)get(&d->from, 2);
+    *d = (datagram){NULL, data + 8};
+    size_t tag = data[5], length = data[6] | (size_t)data[7] << 8;
     if (length != size || !(tag == 0 || tag == STEWART_TAG) || size < STEWART_HEAD + tag)
         return STEWART_MALFORMED;
     if ((tag != 0) != (key.size != 0))
@@ -247,9 +232,12 @@ static int get_head(const char *magic, size_t least, const uint8_t *data, size_t
 
 size_t stewart_write_version(const uint8_t *data, uint8_t *answer)
 {
-    const uint8_t *session = data + 8, *sequence = data + 24;
+    datagram d = {NULL, data + 8};
     stewart_key none = {NULL, 0};
-    stewart_head head = {get(&session, 8), 0, 1, (uint32_t)get(&sequence, 4), 0, 0, 0, 0};
+    stewart_head read, head = {.sequence = 1};
+    PASS(&d, &read, HEAD);
+    head.session = read.session;
+    head.acknowledged = read.sequence;
     return finish(answer, put_head(answer, "STWM", &head, none), none);
 }
 
@@ -443,14 +431,16 @@ stewart_head stewart_next(stewart_session *s, uint64_t now, uint32_t flags)
 uint64_t stewart_nonce(const stewart_offers *offers, uint64_t session, uint32_t address, uint16_t port)
 {
     stewart_key key = {offers->secret, STEWART_SECRET};
-    uint8_t data[18], digest[32], *at = data;
-    const uint8_t *from = digest;
-    put(&at, session, 8);
-    put(&at, address, 4);
-    put(&at, port, 2);
-    put(&at, offers->sessions, 4);
+    uint8_t data[18], digest[32];
+    uint32_t sessions = offers->sessions;
+    uint64_t nonce;
+    datagram hashed = {data, NULL}, made = {NULL, digest};
+    pass(&hashed, &session, sizeof session, 1);
+    pass(&hashed, &address, sizeof address, 1);
+    pass(&hashed, &port, sizeof port, 1);
+    pass(&hashed, &sessions, sizeof sessions, 1);
     hmac(key, data, sizeof data, digest);
-    uint64_t nonce = get(&from, 8);
+    pass(&made, &nonce, sizeof nonce, 1);
     return nonce ? nonce : 1;
 }
 

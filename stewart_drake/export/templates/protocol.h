@@ -1,8 +1,7 @@
 /* The datagrams between a machine and its controller: docs/protocol.md of stewart_drake defines
    every byte. No state, no allocation. Times are ns; torques N m; angles rad. */
 
-#ifndef STEWART_PROTOCOL_H
-#define STEWART_PROTOCOL_H
+#pragma once
 
 #include <stddef.h>
 #include <stdint.h>
@@ -192,5 +191,3 @@ stewart_session stewart_confirmed(const stewart_head *head, uint64_t now);
 
 /* Why a datagram is not of this session, or STEWART_TAKEN: then it is noted. A nonce of 0 takes any. */
 int stewart_note(stewart_session *session, const stewart_head *head, uint64_t now);
-
-#endif

@@ -1,8 +1,7 @@
 /* What stewart_machine.c asks of a machine: write these for your motors and sensors, in place of
    stewart_board.c. Times are in ns of the clock of udp.c, from the start of the program. */
 
-#ifndef STEWART_BOARD_H
-#define STEWART_BOARD_H
+#pragma once
 
 #include "protocol.h"
 
@@ -25,5 +24,3 @@ void board_measure(uint64_t time, double *state);
 /* Return why the machine must stop (the plate left its workspace, STEWART_DRIVE), and set the time of that;
    else STEWART_NO_FAULT. After a fault the safe torque acts until a new session: put brakes on here. */
 stewart_reason board_fault(uint64_t time, uint64_t *left_at);
-
-#endif

@@ -1,7 +1,6 @@
 /* Data of the scenario for the examples over UDP: start, limits, motion. */
 
-#ifndef STEWART_EXAMPLE_H
-#define STEWART_EXAMPLE_H
+#pragma once
 
 #include "protocol.h"
 #include "stewart_motion.h"
@@ -15,5 +14,3 @@ extern const real stewart_home_sign;                   /* of the measure of para
 extern const stewart_identity stewart_own_identity;
 /* The words of each fault, with a place for the leg or the duration in s. */
 extern const char *const stewart_faults[STEWART_FAULTS];
-
-#endif

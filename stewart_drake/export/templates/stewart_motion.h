@@ -1,7 +1,6 @@
 /* The motion of the scenario. */
 
-#ifndef STEWART_MOTION_H
-#define STEWART_MOTION_H
+#pragma once
 
 #include "law.h"
 
@@ -16,5 +15,3 @@ void stewart_goal(double t, real *reference);
 /* For `.reference` and `.goal` of a sample. `.context` points to the time of the sample, a double in s. */
 void stewart_look_ahead(void *context, int number, const real *times, real *rows);
 void stewart_look_back(void *context, int number, const real *times, real *rows);
-
-#endif

@@ -1,7 +1,6 @@
 /* POSIX functions of the two examples: monotonic clock, non-blocking socket, key. */
 
-#ifndef STEWART_UDP_H
-#define STEWART_UDP_H
+#pragma once
 
 #include <netinet/in.h>
 #include <stdint.h>
@@ -59,5 +58,3 @@ void udp_reason(const stewart_reason *reason, const stewart_reason *before, char
 /* What differs between a machine and a controller, what each has, and what to do, in one line. */
 #define UDP_DIFFERING 768
 void udp_differing(const stewart_identity *machine, const stewart_identity *controller, char text[UDP_DIFFERING]);
-
-#endif
