@@ -14,7 +14,7 @@ from stewart_drake.law.compiled import address_of
 from stewart_drake.law.observers import CoreObserver
 from tests.backends import with_own
 
-HOST = ("dop853", "plant")
+HOST = ("dop853", "plant", "shooting")
 """Sources for the host alone, in double precision."""
 
 
