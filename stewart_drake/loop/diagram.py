@@ -13,7 +13,6 @@ from pydrake.systems.framework import (
     System,
 )
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Saturation
-from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
@@ -24,7 +23,6 @@ from stewart_drake.loop.controller import (
     Reference,
     SampledController,
     ServoController,
-    reported,
 )
 from stewart_drake.loop.exact import ExactPlant, Loads
 from stewart_drake.loop.kinds import LINKS, PLANTS, SENSORS, wire
@@ -50,7 +48,6 @@ from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.link import measurement_times
 from stewart_drake.scenario.signals import NUM_TORQUES, RATES, SIGNALS, exported_ports
 from stewart_drake.tuner.source import DensityFeatures, PaperPolicy
-from stewart_drake.types import Array
 
 _TUNER_INPUTS: Final = {
     "density": "density.density",
@@ -205,15 +202,15 @@ def _connect(builder: DiagramBuilder, source: OutputPort | str, target: str) -> 
 def _add_torques(builder: DiagramBuilder, experiment: Experiment) -> float:
     """Add a controller of torques, their limit and link; return its catch-up, s."""
     channel: Channel | Wire | Packets = Wire()
-    reports, catch_up = 1, 0.0
+    catch_up = 0.0
     if "controller" in experiment.own.systems:
         _add_own_controller(builder, experiment)
     else:
         law, catch_up = _add_law(builder, experiment)
-        channel, reports = law.channel, reported(law.extra_torques)
+        channel = law.channel
     link, config = experiment.own.systems.get("link"), experiment.scenario.link
     if link is None:
-        link = LINKS[type(config)].system(config, experiment, channel, reports)
+        link = LINKS[type(config)].system(config, experiment, channel)
     limit = np.full(link.GetInputPort("commanded").size(), experiment.torque_limit)
     limited = builder.AddNamedSystem("saturation", Saturation(-limit, limit))
     builder.AddNamedSystem("delay_chain", link)
@@ -233,7 +230,8 @@ def _add_servos(builder: DiagramBuilder, experiment: Experiment) -> float:
     law, planned, catch_up = servo_law(experiment)
     last = command_sent_last(experiment, law)
     builder.AddNamedSystem("controller", ServoController(law, last))
-    _add_reference(builder, experiment, planned, law.preview_times)
+    reference = Reference(experiment.reference, planned, law.preview_times)
+    builder.AddNamedSystem("reference", reference)
     first, in_flight = commands_in_flight(experiment, law, sc.true_delay)
     builder.AddNamedSystem("delay_chain", wire(experiment, in_flight, "command"))
     rest = machine, first, sc.controller.period, law.reports
@@ -335,7 +333,8 @@ def _measured(builder: DiagramBuilder, experiment: Experiment, motors: str) -> O
 def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[PredictiveLqi, float]:
     """Add the shipped controller, its reference and weights; return law and catch-up, s."""
     law, planned, catch_up = control_law(experiment)
-    _add_reference(builder, experiment, planned, law.preview_times)
+    reference = Reference(experiment.reference, planned, law.preview_times)
+    builder.AddNamedSystem("reference", reference)
     queue = first_queue(experiment, law)
     motion = followed_motion(law, planned, experiment.reference)
     builder.AddNamedSystem("controller", DelayLqiController(law, queue, motion))
@@ -356,20 +355,14 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[Predictiv
 def _add_own_controller(builder: DiagramBuilder, experiment: Experiment) -> None:
     """Add the user's controller, its reference, and the system that samples it."""
     sc, system = experiment.scenario, experiment.own.systems["controller"]
-    _add_reference(builder, experiment, experiment.reference, np.zeros(1))
+    motion = experiment.reference
+    builder.AddNamedSystem("reference", Reference(motion, motion, np.zeros(1)))
     builder.AddNamedSystem("own_controller", system)
     sampled = SampledController(sc.controller.period, experiment.torque_limit)
     builder.AddNamedSystem("controller", sampled)
     _connect(builder, "own_controller.torque", "controller.own_torque")
     if system.HasInputPort("reference"):
         _connect(builder, "reference.reference", "own_controller.reference")
-
-
-def _add_reference(
-    builder: DiagramBuilder, experiment: Experiment, planned: Trajectory, ahead: Array
-) -> None:
-    """Add the reference, with previews of the planned motion at times (n,) ahead, s."""
-    builder.AddNamedSystem("reference", Reference(experiment.reference, planned, ahead))
 
 
 def _disturb(builder: DiagramBuilder, disturbance: System | None, torque: OutputPort) -> None:

@@ -15,7 +15,6 @@ from pydrake.systems.framework import System
 from stewart_drake.law.channel import Channel, Packets, Wire
 from stewart_drake.law.sensing import EncoderSensing, Sensing, StateSensing
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.loop.controller import reported
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.link import DelayChain, PlayoutBuffer, VaryingDelay
 from stewart_drake.loop.platforms import MultibodyStewart
@@ -43,9 +42,8 @@ class SensorKind(NamedTuple):
 class LinkKind(NamedTuple):
     """A kind of link between controller and motors."""
 
-    # the link, a Drake system with the ports `commanded` and `torque`, for a channel of the law and
-    # a number of periods in a report
-    system: Callable[[Any, Experiment, Channel, int], System]
+    # the link, a Drake system with the ports `commanded` and `torque`, for a channel of the law
+    system: Callable[[Any, Experiment, Channel], System]
     # part of the law that models the link, for the longest wait for a measurement in periods
     channel: Callable[[Any, Experiment, Timeline, int], Channel]
 
@@ -99,14 +97,16 @@ def wire(experiment: Experiment, queue: Array, carries: Carried) -> System:
     return chain
 
 
-def _torque_wire(link: WireConfig, experiment: Experiment, *_: Any) -> System:
+def _torque_wire(link: WireConfig, experiment: Experiment, _: Channel) -> System:
     return wire(experiment, experiment.torques_in_flight(experiment.scenario.true_delay), "torque")
 
 
-def _playout(link: NetworkConfig, experiment: Experiment, channel: Channel, reports: int) -> System:
+def _playout(link: NetworkConfig, experiment: Experiment, channel: Channel) -> System:
     sc, delay = experiment.scenario, experiment.scenario.true_delay
     period = sc.controller.period
-    repeats = channel.repeats if isinstance(channel, Packets) else 0
+    repeats, history = 0, 1
+    if isinstance(channel, Packets):
+        repeats, history = channel.repeats, channel.report_periods
     return PlayoutBuffer(
         period,
         forward_times(sc, number_sent(sc.duration, period)),
@@ -115,7 +115,7 @@ def _playout(link: NetworkConfig, experiment: Experiment, channel: Channel, repo
         rows=repeats + channel.torques,
         repeats=repeats,
         dry=link.dry,
-        history=reports,
+        history=history,
     )
 
 
@@ -134,7 +134,7 @@ def _packets(_: NetworkConfig, experiment: Experiment, timeline: Timeline, waits
         arrived_by=tuple(in_time(link, c.period * np.arange(kept)).tolist()),
         losses=BurstChain(link.loss, link.burst),
         holds=link.dry == "hold",
-        report_periods=reported(waits + REPORTS),
+        report_periods=waits + REPORTS + 1,
     )
 
 
