@@ -161,8 +161,6 @@ class Ending(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """One run, ready to begin."""
-
     experiment: Experiment
     law: PredictiveLqi | ServoPreview
     planned: Trajectory  # motion that the law follows
@@ -256,8 +254,6 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 
 class Course(NamedTuple):
-    """Record of a run of the loop."""
-
     states: Array  # (n, 12) at the looks up to the end
     measured: Array  # (k, 12) at the samples, as the controller got them
     asked: Array  # (k, 6) torques in N m that the law asked for there

@@ -199,7 +199,6 @@ def _advance_to(t: float, simulator: Simulator, recorder: Recorder) -> bool:
 
 
 def make_simulator(machine: PlantDiagram) -> Simulator:
-    """Return a simulator at the initial context, with the scenario's accuracy."""
     plant = machine.experiment.scenario.plant
     simulator = Simulator(machine, machine.CreateDefaultContext())
     if plant.kind != "multibody":
