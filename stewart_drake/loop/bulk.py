@@ -404,7 +404,9 @@ def run_loop(
     if isinstance(law, ServoPreview):
         rows, servos = NUM_REFERENCE // NUM_TORQUES, position_servo(experiment).compiled
     reports = link.history if packets is not None and sc.link.acknowledged else 0
-    late = _padded(measurement_times(sc), number)
+    late = np.zeros(number)
+    if sensor.delay or sensor.loss or sc.link.back is not None:  # drawing takes a millisecond
+        late = _padded(measurement_times(sc), number)
     size = NUM_STATE + (1 + NUM_TORQUES) * reports
     back = wire_of(size, sc.controller.period, late)
     back_memory = back.start()
