@@ -13,8 +13,8 @@ pytestmark = pytest.mark.usefixtures("blank_figures")
 FOLDER = Path(__file__).resolve().parents[1] / "analysis"
 
 
-def script(name):
-    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+def script(name, folder=FOLDER):
+    spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -34,7 +34,7 @@ from stewart_drake.live.protocol import (
     encode,
 )
 from stewart_drake.live.session import drive, prepare_session
-from stewart_drake.loop.peer import FAULTS, Fault, Part, Reason, identity_of, in_words
+from stewart_drake.loop.peer import Fault, Part, Reason, identity_of, in_words
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.loading import load_scenario
 from tests.live_driver import Driver
@@ -295,7 +295,7 @@ def test_every_way_to_leave_the_workspace_has_its_fault():
         reason = reason_of(failure)
         assert reason.fault == fault and str(reason) == failure.reason
     for fault in (Fault.PITCH, Fault.SINGULAR):
-        failure = failure._replace(leg=None, reason=FAULTS[fault])
+        failure = failure._replace(leg=None, reason=fault.text)
         assert reason_of(failure).fault == fault
     assert reason_of(failure._replace(reason="something else")).fault == Fault.LEFT
 
@@ -303,7 +303,7 @@ def test_every_way_to_leave_the_workspace_has_its_fault():
 def test_the_documented_faults_are_those_of_the_table():
     text = (ROOT / "docs" / "protocol.md").read_text("utf-8").split("## Faults")[1]
     rows = dict(re.findall(r"^- (\d+): (.*)$", text.split("\n## ")[0], re.MULTILINE))
-    words = {f: re.sub("{.*?}", "N", text) for f, text in FAULTS.items()} | {Fault.NONE: "none"}
+    words = {f: re.sub("{.*?}", "N", f.text) for f in Fault} | {Fault.NONE: "none"}
     assert rows == {str(int(fault)): text for fault, text in words.items()}
 
 
@@ -343,7 +343,7 @@ def test_silence_stop_and_end_are_said():
     now = -(-run.machine.time() // run.driver.period) * run.driver.period
     run.greet(now + run.driver.period, now + 9 * run.driver.period)
     run.at(run.machine.time() + SECOND // 5)
-    assert messages(run)[-1].why == FAULTS[Fault.NONE]
+    assert messages(run)[-1].why == Fault.NONE.text
 
 
 @pytest.mark.slow
@@ -377,4 +377,4 @@ def test_a_machine_that_is_ended_ends_the_run_with_its_words():
         result = drive(ready, 8.0, accept_jitter=True, say=said.append)
         took = time.monotonic() - began
     assert result.status == "lost_machine" and result.stopped is not None
-    assert result.stopped.reason == FAULTS[Fault.ENDED] and took < 8
+    assert result.stopped.reason == Fault.ENDED.text and took < 8

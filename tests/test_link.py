@@ -128,14 +128,6 @@ def test_a_torque_that_was_overtaken_never_acts():
     assert takes_effect(np.array([0.5, np.inf, 3.5])).tolist() == [True, False, True]
 
 
-@pytest.mark.parametrize("wrong", [np.array([0.1, -0.1]), np.array([np.nan]), np.empty(0)])
-def test_what_is_no_delay_is_refused(wrong):
-    with pytest.raises(ValueError, match="delays: got"):
-        VaryingDelay(PERIOD, wrong, Delay(0), np.empty((0, 6)))
-    with pytest.raises(ValueError, match="queue: got shape"):
-        VaryingDelay(PERIOD, np.ones(3), Delay(2), np.empty((1, 6)))
-
-
 # The delay as a function of the sending time.
 
 

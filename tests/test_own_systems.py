@@ -1,8 +1,6 @@
 """Controllers, references and disturbances of a user in the loop of a scenario."""
 
-import importlib.util
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,17 +11,10 @@ from pydrake.trajectories import FunctionHandleTrajectory, PiecewisePolynomial
 import stewart_drake as sd
 from stewart_drake.loop.own import take
 from stewart_drake.loop.preparation import concrete, prepare
+from tests.test_analysis_scripts import script
 
-ROOT = Path(__file__).resolve().parents[1]
 FAST = ("plant.kind=exact", "delay.steps=0", "controller.period=0.01", "start=on_reference")
 """No delay, so that a controller which knows of none can hold the plate."""
-
-
-def example(name):
-    spec = importlib.util.spec_from_file_location(name, ROOT / "analysis" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def scenario(*settings):
@@ -71,7 +62,7 @@ def disturbance(name="torque", size=6, value=0.0):
 @pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
 def test_own_computed_torque_controller_with_table_figures_and_replay(tmp_path, capsys, plant):
-    result = example("own_controller").main(str(tmp_path), "duration=2", f"plant.kind={plant}")
+    result = script("own_controller").main(str(tmp_path), "duration=2", f"plant.kind={plant}")
     table = capsys.readouterr().out
     assert "completed" in table and "ComputedTorque" in table
     assert result.summary["own"] == {"controller": "ComputedTorque"}
@@ -86,7 +77,7 @@ def test_own_computed_torque_controller_with_table_figures_and_replay(tmp_path, 
 
 
 def test_own_kick_moves_the_plate_at_three_seconds(capsys):
-    results = example("own_disturbance").main("plant.kind=exact", "duration=4")
+    results = script("own_disturbance").main("plant.kind=exact", "duration=4")
     assert "kicked: E_ac" in capsys.readouterr().out
     calm, kicked = (results[name].signals.pose.sel(coordinate="x") for name in ("calm", "kicked"))
     moved = np.abs(kicked - calm)
@@ -97,7 +88,7 @@ def test_own_kick_moves_the_plate_at_three_seconds(capsys):
 
 def test_a_wrench_gives_the_momentum_of_its_impulse():
     """A free plate, no gravity: right after a short push M rates = N' integral of the wrench."""
-    kick, settings = example("own_disturbance").Kick, ("reference.kind=hold", "duration=0.002")
+    kick, settings = script("own_disturbance").Kick, ("reference.kind=hold", "duration=0.002")
     sc = scenario(*settings, "plant.accuracy=1e-12")
     start = np.array(sc.reference.offset)
     force = (30.0, -20.0, 40.0)

@@ -1,6 +1,5 @@
 """A platform in a user's diagram."""
 
-import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,23 +17,17 @@ import stewart_drake as sd
 from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.signals import PLANT_PARAMETERS
+from tests.test_analysis_scripts import script
 
-ROOT = Path(__file__).resolve().parents[1] / "diagrams"
+DIAGRAMS = Path(__file__).resolve().parents[1] / "diagrams"
 PAPER = sd.load_mechanism("paper")
 ELSEWHERE = RigidTransform(RollPitchYaw(0.1, -0.2, 0.7), [1.0, -0.5, 0.3])
 TORQUE = np.array([0.02, -0.01, 0.03, 0.01, -0.02, 0.01])
 
 
-def example():
-    spec = importlib.util.spec_from_file_location("box_on_plate", ROOT / "box_on_plate.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("X_WB", [None, RigidTransform([1.0, -0.5, 0.3])])
 def test_a_box_stays_on_the_plate_while_it_moves(X_WB, capsys):
-    module = example()
+    module = script("box_on_plate", DIAGRAMS)
     places = module.main(X_WB)
     heights = [float(line.split()[-1]) for line in capsys.readouterr().out.splitlines()[1:]]
     assert len(places) == len(heights) == 20

@@ -12,7 +12,7 @@ import pytest
 
 from stewart_drake.live.endpoint import LONGEST_KEY, SHORTEST_KEY, now
 from stewart_drake.live.protocol import ControllerMessage, MachineFlags, MachineMessage, encode
-from stewart_drake.loop.peer import FAULTS, Fault
+from stewart_drake.loop.peer import Fault
 from stewart_drake.scenario.loading import load_scenario
 from tests.building import make
 from tests.live_driver import Driver, in_real_time
@@ -235,4 +235,4 @@ def test_a_machine_in_c_says_why_it_stopped(folder):
     assert [m.reason for m in driver.got[-3:]] == [last.reason] * 3
     refusal = "refused a controller: it speaks protocol version 1; expected 3"
     assert running.lines.count(refusal) == 1
-    assert FAULTS[Fault.ENDED] == "the machine was ended"
+    assert Fault.ENDED.text == "the machine was ended"

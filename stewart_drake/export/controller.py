@@ -36,7 +36,7 @@ from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.law_design import control_law
-from stewart_drake.loop.peer import FAULTS, MOST_ROWS, MOST_SAMPLES, identity_of
+from stewart_drake.loop.peer import MOST_ROWS, MOST_SAMPLES, Fault, identity_of
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.servos import servo_law
 from stewart_drake.loop.tuner import weights_source
@@ -208,7 +208,8 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
     if over_udp:
         # Number of samples in memory, a power of two: those of a report and of the wait for it.
         kept = 1 << (2 * values["wait"] + 63).bit_length()
-        values |= {"identity": identity_of(scenario), "faults": FAULTS.values(), "kept": kept}
+        faults = [fault.text for fault in Fault]
+        values |= {"identity": identity_of(scenario), "faults": faults, "kept": kept}
     environment = _environment(suffix)
     files |= {name: environment.get_template(name).render(values) for name in templates - {README}}
     values["measured_sizes"] = _sizes(files) if measured else _UNMEASURED

@@ -28,7 +28,6 @@ from stewart_drake.live.learned import LearnedSetpoints, LearnedTorques
 from stewart_drake.live.log import LiveRecord
 from stewart_drake.live.protocol import NEVER, SECOND, ControllerFlags, MachineMessage
 from stewart_drake.live.viewer import End, Snapshot, Viewer
-from stewart_drake.loop.controller import reported
 from stewart_drake.loop.recording import has_measured
 from stewart_drake.mechanism.kinematics import UnreachablePoseError
 from stewart_drake.mechanism.trajectories import catch_up, evaluate
@@ -342,7 +341,7 @@ class LiveLoop:
         """Record the torques that have acted, and return the report on them for the law."""
         self.record.acted(acted)
         law, rows = self._design.law, list[Array]()
-        number = reported(law.extra_torques)
+        number = law.extra_torques + 1
         for n in range(k - 1, k - 1 - number, -1):
             torque = self.record.applied.get(n)
             if torque is None:

@@ -41,7 +41,7 @@ from stewart_drake.live.simulated import (
     body_of,
     first_rows,
 )
-from stewart_drake.loop.peer import FAULTS, Fault, Reason, check_samples, identity_of, in_words
+from stewart_drake.loop.peer import Fault, Reason, check_samples, identity_of, in_words
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.dependencies import differing
@@ -68,7 +68,7 @@ def reason_of(failure: Failure) -> Reason:
     """Return the reason in a datagram for a plate that has left its workspace."""
     if failure.leg is not None:
         return Reason(Fault.REACH, failure.leg)
-    known = (fault for fault, words in FAULTS.items() if words == failure.reason)
+    known = (fault for fault in Fault if fault.text == failure.reason)
     return Reason(next(known, Fault.LEFT))
 
 
@@ -421,7 +421,7 @@ class Machine:
                 self._go_safe(time)
             if self.failure is None:
                 self._fail(Reason(Fault.STOP), time)
-            self._report_safe(time, FAULTS[Fault.STOP])
+            self._report_safe(time, Fault.STOP.text)
             return
         if max(message.begin % NEVER, message.playout) > time + FURTHEST:
             self._refuse(Refusal.MALFORMED)

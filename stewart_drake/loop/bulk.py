@@ -29,7 +29,6 @@ from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
-from stewart_drake.loop.controller import reported
 from stewart_drake.loop.law_design import (
     compose_law,
     first_queue,
@@ -162,8 +161,6 @@ class Ending(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """One run, ready to begin."""
-
     experiment: Experiment
     law: PredictiveLqi | ServoPreview
     planned: Trajectory  # motion that the law follows
@@ -257,8 +254,6 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 
 class Course(NamedTuple):
-    """Record of a run of the loop."""
-
     states: Array  # (n, 12) at the looks up to the end
     measured: Array  # (k, 12) at the samples, as the controller got them
     asked: Array  # (k, 6) torques in N m that the law asked for there
@@ -403,13 +398,14 @@ def run_loop(
     channel = law.channel if isinstance(law, PredictiveLqi) else None
     packets = channel if isinstance(channel, Packets) else None
     rows, repeats = (1, 0) if packets is None else (len(packets.in_time), packets.repeats)
-    link, memory, transit = _link(experiment, law, number, rows)
+    history = 1 if packets is None else packets.report_periods
+    link, memory, transit = _link(experiment, law, number, rows, history)
     servos = None
     if isinstance(law, ServoPreview):
         rows, servos = NUM_REFERENCE // NUM_TORQUES, position_servo(experiment).compiled
     reports = link.history if packets is not None and sc.link.acknowledged else 0
     late = np.zeros(number)
-    if sensor.delay or sensor.loss or sc.link.back is not None:
+    if sensor.delay or sensor.loss or sc.link.back is not None:  # drawing takes a millisecond
         late = _padded(measurement_times(sc), number)
     size = NUM_STATE + (1 + NUM_TORQUES) * reports
     back = wire_of(size, sc.controller.period, late)
@@ -457,11 +453,15 @@ def run_loop(
 
 
 def _link(
-    experiment: Experiment, law: PredictiveLqi | ServoPreview | None, number: int, rows: int
+    experiment: Experiment,
+    law: PredictiveLqi | ServoPreview | None,
+    number: int,
+    rows: int,
+    history: int,
 ) -> tuple[Link, Array, Array]:
     """Return the link to the motors, its memory at t = 0, and the transit times (number,) in s.
 
-    Packets have a number of `rows`.
+    Over a network packets have `rows` torques, and reports `history` periods.
     """
     sc, delay = experiment.scenario, experiment.scenario.true_delay
     period, size = sc.controller.period, NUM_TORQUES
@@ -471,7 +471,6 @@ def _link(
     else:
         queue, limit = experiment.torques_in_flight(delay), experiment.torque_limit
     if sc.link.kind == "network":
-        history = reported(law.extra_torques) if isinstance(law, PredictiveLqi) else 1
         transit = _padded(forward_times(sc, number), number)
         link = buffer_of(period, delay, rows, sc.link.dry, history, limit)
     else:

@@ -35,7 +35,6 @@ class Pair(NamedTuple):
 
     @property
     def fixed(self) -> bool:
-        """Whether one of them belongs to the base."""
         return any(_kind(name) in _ON_BASE for name in self)
 
     def __str__(self) -> str:
@@ -94,7 +93,6 @@ class ClearanceScene:
 
 
 def _round_rod_ends(scene_graph: SceneGraph, plant: MultibodyPlant) -> None:
-    """Replace the cylinders of the rods by capsules."""
     for shape in scene_graph.model_inspector().GetAllGeometryIds(Role.kProximity):
         inspector = scene_graph.model_inspector()
         if inspector.GetName(shape).endswith("tube"):

@@ -1,7 +1,7 @@
 """The controllers and their reference as Drake systems."""
 
 from collections.abc import Callable, Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
@@ -29,7 +29,7 @@ from stewart_drake.scenario.signals import (
     WRENCHES,
     ports_of,
 )
-from stewart_drake.types import Array
+from stewart_drake.types import Array, ArrayLike
 
 
 class Reference(LeafSystem):
@@ -70,49 +70,45 @@ class Reference(LeafSystem):
         output.SetFromVector(rows_along(self._planned, times).ravel())
 
 
-HELD: Final[dict[str, Callable[[Memory], Array]]] = {
+HELD_BY_ANY: Final[dict[str, Callable[[Any], Array]]] = {
     "torque_commanded": lambda memory: memory.torque,
-    "integral": lambda memory: memory.integral,
-    "weights": lambda memory: memory.weights,
     "measurement": lambda memory: memory.measurement,
-    "state_estimate": lambda memory: memory.belief.state,
-    "parameters": lambda memory: memory.belief.parameters,
-    "parameter_std": lambda memory: memory.belief.estimate.parameter_std,
-    "wrench_estimate": lambda memory: memory.belief.parameters,
-    "wrench_std": lambda memory: memory.belief.estimate.parameter_std,
-    "delay_estimate": lambda memory: memory.belief.delay,
-    "delay_std": lambda memory: np.array([memory.belief.delay_std]),
 }
-"""Signal of the table `scenario.signals.SIGNALS` -> its value in the controller's memory."""
+"""Signals of any controller, see `held_by`."""
 
 
 def held_by(dynamics: StewartDynamics) -> dict[str, Callable[[Memory], Array]]:
-    """Return HELD for the law of a plant, with its parameters at their places in the record.
+    """Return the controller's rows of `scenario.signals.SIGNALS`, as functions of its memory.
 
     A parameter that is not estimated is recorded with its assumed value, without a deviation; a
     wrench that is not estimated is NaN.
     """
     known = dynamics.plant_parameters[:NUM_PARAMETERS]
-    unknown, nothing = np.full(NUM_PARAMETERS, np.nan), np.full(len(WRENCHES), np.nan)
-
     places = {name: place for place, name in enumerate(dynamics.free)}
 
-    def recorded(signal: str, names: Sequence[str], otherwise: Array) -> Callable[[Memory], Array]:
+    def mean(memory: Memory) -> Array:
+        return memory.belief.parameters
+
+    def std(memory: Memory) -> Array:
+        return memory.belief.estimate.parameter_std
+
+    def recorded(
+        part: Callable[[Memory], Array], names: Sequence[str], otherwise: ArrayLike = np.nan
+    ) -> Callable[[Memory], Array]:
         place = np.array([places.get(name, -1) for name in names])
-        return lambda memory: np.where(place < 0, otherwise, HELD[signal](memory)[place])
+        return lambda memory: np.where(place < 0, otherwise, part(memory)[place])
 
-    own = {
-        "parameters": recorded("parameters", PARAMETERS, known),
-        "parameter_std": recorded("parameter_std", PARAMETERS, unknown),
-        "wrench_estimate": recorded("wrench_estimate", WRENCHES, nothing),
-        "wrench_std": recorded("wrench_std", WRENCHES, nothing),
+    return HELD_BY_ANY | {
+        "integral": lambda memory: memory.integral,
+        "weights": lambda memory: memory.weights,
+        "state_estimate": lambda memory: memory.belief.state,
+        "parameters": recorded(mean, PARAMETERS, known),
+        "parameter_std": recorded(std, PARAMETERS),
+        "wrench_estimate": recorded(mean, WRENCHES),
+        "wrench_std": recorded(std, WRENCHES),
+        "delay_estimate": lambda memory: memory.belief.delay,
+        "delay_std": lambda memory: np.array([memory.belief.delay_std]),
     }
-    return HELD | own
-
-
-def reported(extra_torques: int) -> int:
-    """Return the periods of a report for a law with extra torques in memory."""
-    return extra_torques + 1
 
 
 class _RecordedLaw(SteppedLaw):
@@ -196,7 +192,7 @@ class DelayLqiController(_RecordedLaw):
         self._weights = self.DeclareVectorInputPort("weights", len(WEIGHTS))
         self._age = self.DeclareVectorInputPort("age", 1) if law.longest_wait else None
         sends = isinstance(law.channel, Packets)
-        size = reported(law.extra_torques) * (1 + NUM_TORQUES)
+        size = (law.extra_torques + 1) * (1 + NUM_TORQUES)
         self._report = self.DeclareVectorInputPort("report", size) if sends else None
         self._record(law, first)
         self._put_out("torque", NUM_TORQUES, lambda m: m.torque, now=True)
@@ -274,7 +270,7 @@ class ServoController(_RecordedLaw):
         self._age = self.DeclareVectorInputPort("age", 1)
         self._record(law, first)
         self._put_out("command", NUM_REFERENCE, lambda m: m.command, now=True)
-        self._put_out("torque", NUM_TORQUES, HELD["torque_commanded"])
+        self._put_out("torque", NUM_TORQUES, lambda m: m.torque)
 
     def _prepared(self, context: Context) -> Callable[[], Memory]:
         measured = np.asarray(self._measurement.Eval(context))
@@ -283,10 +279,6 @@ class ServoController(_RecordedLaw):
         motion, report = Preview(self._law.preview_times, reference), self._report.Eval(context)
         memory = self.sample(context).memory
         return lambda: self._law.step(memory, measurement, motion, np.asarray(report))
-
-
-_KNOWN: Final = ("torque_commanded", "measurement")
-"""Signals of any controller."""
 
 
 class OwnMemory(NamedTuple):
@@ -331,10 +323,10 @@ class SampledController(SteppedLaw):
         self._measurement = self.DeclareVectorInputPort("measurement", NUM_STATE)
         self._own = self.DeclareVectorInputPort("own_torque", NUM_TORQUES)
         self._begin(first, period)
-        self._put_out("torque", NUM_TORQUES, HELD["torque_commanded"], now=True)
+        self._put_out("torque", NUM_TORQUES, lambda m: m.torque, now=True)
         for port, signal in ports_of("controller").items():
-            if signal.name in _KNOWN:
-                self._put_out(port, signal.size, HELD[signal.name])
+            if part := HELD_BY_ANY.get(signal.name):
+                self._put_out(port, signal.size, part)
             else:
                 declare_constant(self, port, np.full(signal.size, np.nan))
 

@@ -13,7 +13,6 @@ from pydrake.systems.framework import (
     System,
 )
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Saturation
-from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.errors import ConfigError
@@ -24,14 +23,13 @@ from stewart_drake.loop.controller import (
     Reference,
     SampledController,
     ServoController,
-    reported,
 )
 from stewart_drake.loop.exact import ExactPlant, Loads
-from stewart_drake.loop.kinds import LINKS, PLANTS, SENSORS, wire
+from stewart_drake.loop.kinds import make_link, make_plant, make_sensor, wire
 from stewart_drake.loop.law_design import control_law, first_queue, followed_motion
 from stewart_drake.loop.link import LateMeasurements
 from stewart_drake.loop.own import OwnSystems
-from stewart_drake.loop.platforms import MultibodyStewart, StartCheck, add_to_torque
+from stewart_drake.loop.platforms import StartCheck, add_to_torque
 from stewart_drake.loop.preparation import Experiment, concrete
 from stewart_drake.loop.push import Push
 from stewart_drake.loop.servos import (
@@ -50,7 +48,6 @@ from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.link import measurement_times
 from stewart_drake.scenario.signals import NUM_TORQUES, RATES, SIGNALS, exported_ports
 from stewart_drake.tuner.source import DensityFeatures, PaperPolicy
-from stewart_drake.types import Array
 
 _TUNER_INPUTS: Final = {
     "density": "density.density",
@@ -147,9 +144,10 @@ def build_closed_loop(
     experiment.own.claim(experiment.scenario)
     builder = DiagramBuilder()
     sc, network = experiment.scenario, experiment.network
-    builder.AddNamedSystem("sensor", _sensor(experiment))
+    own_sensor = experiment.own.systems.get("sensor")
+    builder.AddNamedSystem("sensor", own_sensor or make_sensor(experiment))
     builder.AddNamedSystem("torque_bias", add_to_torque(np.array(sc.plant.torque_bias)))
-    builder.AddNamedSystem("plant", _plant(experiment, meshcat))
+    builder.AddNamedSystem("plant", make_plant(experiment, meshcat))
     kind = "magnitude" if network is None else network.density
     builder.AddNamedSystem("density", DensityWindow(sc.controller.period, kind))
     add = _add_torques if sc.actuator.kind == "torque" else _add_servos
@@ -175,8 +173,8 @@ def build_machine(experiment: Experiment) -> PlantDiagram:
         experiment: of a scenario whose motors take torques.
     """
     builder = DiagramBuilder()
-    plant = builder.AddNamedSystem("plant", _plant(experiment, None))
-    builder.AddNamedSystem("sensor", _sensor(experiment))
+    plant = builder.AddNamedSystem("plant", make_plant(experiment))
+    builder.AddNamedSystem("sensor", make_sensor(experiment))
     _push(builder, experiment)
     _connect(builder, "plant.state", "sensor.state")
     builder.ExportInput(plant.GetInputPort("torque"), "torque")
@@ -205,15 +203,13 @@ def _connect(builder: DiagramBuilder, source: OutputPort | str, target: str) -> 
 def _add_torques(builder: DiagramBuilder, experiment: Experiment) -> float:
     """Add a controller of torques, their limit and link; return its catch-up, s."""
     channel: Channel | Wire | Packets = Wire()
-    reports, catch_up = 1, 0.0
+    catch_up = 0.0
     if "controller" in experiment.own.systems:
         _add_own_controller(builder, experiment)
     else:
         law, catch_up = _add_law(builder, experiment)
-        channel, reports = law.channel, reported(law.extra_torques)
-    link, config = experiment.own.systems.get("link"), experiment.scenario.link
-    if link is None:
-        link = LINKS[type(config)].system(config, experiment, channel, reports)
+        channel = law.channel
+    link = experiment.own.systems.get("link") or make_link(experiment, channel)
     limit = np.full(link.GetInputPort("commanded").size(), experiment.torque_limit)
     limited = builder.AddNamedSystem("saturation", Saturation(-limit, limit))
     builder.AddNamedSystem("delay_chain", link)
@@ -233,7 +229,8 @@ def _add_servos(builder: DiagramBuilder, experiment: Experiment) -> float:
     law, planned, catch_up = servo_law(experiment)
     last = command_sent_last(experiment, law)
     builder.AddNamedSystem("controller", ServoController(law, last))
-    _add_reference(builder, experiment, planned, law.preview_times)
+    reference = Reference(experiment.reference, planned, law.preview_times)
+    builder.AddNamedSystem("reference", reference)
     first, in_flight = commands_in_flight(experiment, law, sc.true_delay)
     builder.AddNamedSystem("delay_chain", wire(experiment, in_flight, "command"))
     rest = machine, first, sc.controller.period, law.reports
@@ -253,21 +250,6 @@ def _add_servos(builder: DiagramBuilder, experiment: Experiment) -> float:
     if servos.HasInputPort("arrived"):
         _connect(builder, "delay_chain.arrived", "servos.arrived")
     return catch_up
-
-
-def _sensor(experiment: Experiment) -> System:
-    own, config = experiment.own.systems.get("sensor"), experiment.scenario.sensor
-    return SENSORS[type(config)].system(config, experiment) if own is None else own
-
-
-def _plant(experiment: Experiment, meshcat: Meshcat | None) -> ExactPlant | MultibodyStewart:
-    plant = experiment.scenario.plant
-    wrench = any(plant.push.wrench) or _has_wrench(experiment.own.systems.get("disturbance"))
-    return PLANTS[plant.kind](experiment, wrench, meshcat)
-
-
-def _has_wrench(disturbance: System | None) -> bool:
-    return disturbance is not None and disturbance.HasOutputPort("wrench")
 
 
 def _connect_loop(builder: DiagramBuilder, experiment: Experiment) -> None:
@@ -335,7 +317,8 @@ def _measured(builder: DiagramBuilder, experiment: Experiment, motors: str) -> O
 def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[PredictiveLqi, float]:
     """Add the shipped controller, its reference and weights; return law and catch-up, s."""
     law, planned, catch_up = control_law(experiment)
-    _add_reference(builder, experiment, planned, law.preview_times)
+    reference = Reference(experiment.reference, planned, law.preview_times)
+    builder.AddNamedSystem("reference", reference)
     queue = first_queue(experiment, law)
     motion = followed_motion(law, planned, experiment.reference)
     builder.AddNamedSystem("controller", DelayLqiController(law, queue, motion))
@@ -354,22 +337,15 @@ def _add_law(builder: DiagramBuilder, experiment: Experiment) -> tuple[Predictiv
 
 
 def _add_own_controller(builder: DiagramBuilder, experiment: Experiment) -> None:
-    """Add the user's controller, its reference, and the system that samples it."""
     sc, system = experiment.scenario, experiment.own.systems["controller"]
-    _add_reference(builder, experiment, experiment.reference, np.zeros(1))
+    motion = experiment.reference
+    builder.AddNamedSystem("reference", Reference(motion, motion, np.zeros(1)))
     builder.AddNamedSystem("own_controller", system)
     sampled = SampledController(sc.controller.period, experiment.torque_limit)
     builder.AddNamedSystem("controller", sampled)
     _connect(builder, "own_controller.torque", "controller.own_torque")
     if system.HasInputPort("reference"):
         _connect(builder, "reference.reference", "own_controller.reference")
-
-
-def _add_reference(
-    builder: DiagramBuilder, experiment: Experiment, planned: Trajectory, ahead: Array
-) -> None:
-    """Add the reference, with previews of the planned motion at times (n,) ahead, s."""
-    builder.AddNamedSystem("reference", Reference(experiment.reference, planned, ahead))
 
 
 def _disturb(builder: DiagramBuilder, disturbance: System | None, torque: OutputPort) -> None:
@@ -386,12 +362,11 @@ def _disturb(builder: DiagramBuilder, disturbance: System | None, torque: Output
 
 def _push(builder: DiagramBuilder, experiment: Experiment) -> None:
     """Connect the plant with the wrenches of the scenario and of the user's disturbance."""
-    push, wrenches = experiment.scenario.plant.push, []
+    push, wrenches = experiment.scenario.plant.push, list[System]()
     if any(push.wrench):
         wrenches.append(builder.AddNamedSystem("push", Push(push)))
-    if builder.HasSubsystemNamed("disturbance"):
-        disturbance = builder.GetSubsystemByName("disturbance")
-        wrenches += [disturbance] if _has_wrench(disturbance) else []
+    if experiment.own.pushes:
+        wrenches.append(experiment.own.systems["disturbance"])
     if not wrenches:
         return
     total = builder.AddNamedSystem("wrench", Adder(len(wrenches), len(push.wrench)))

@@ -207,16 +207,7 @@ def ExactPlant_(T):
             context.SetContinuousState(state)
 
         def set_parameters(self, context, *, plate_mass=None, **loads: Unpack[Loads]) -> None:
-            """Change parameters in this system's context; others stay.
-
-            Args:
-                context: of this system.
-                plate_mass: kg; the plate's moments of inertia stay.
-                **loads: `Loads`.
-
-            Raises:
-                ConfigError: another name, or a value out of its bounds.
-            """
+            """Change the parameters in its context as `StewartPlatform.SetParameters` does."""
             values = checked_loads(loads).parameters
             if plate_mass is not None:
                 mass = plate_of_mass(self.dynamics.mechanism, plate_mass).mass
@@ -231,7 +222,6 @@ def ExactPlant_(T):
             return self.limits.margin(context.get_time(), self._pose(context))
 
         def diagnose(self, context) -> Failure | None:
-            """Return why the plate is outside its limits, or None."""
             return self.limits.diagnose(context.get_time(), self._pose(context))
 
         def _pose(self, context):

@@ -1,12 +1,11 @@
-"""Kinds of a scenario's sections: a row of factories per class of configuration.
+"""Sensor, link and plant of a scenario by their `kind`, and the parts of the law that model them.
 
 Bulk runs and live machines have tables of the values that they cover
 (`scenario.dependencies.Accepted`).
 """
 
-from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -15,7 +14,6 @@ from pydrake.systems.framework import System
 from stewart_drake.law.channel import Channel, Packets, Wire
 from stewart_drake.law.sensing import EncoderSensing, Sensing, StateSensing
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.loop.controller import reported
 from stewart_drake.loop.exact import ExactPlant
 from stewart_drake.loop.link import DelayChain, PlayoutBuffer, VaryingDelay
 from stewart_drake.loop.platforms import MultibodyStewart
@@ -23,9 +21,7 @@ from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sampling import declare_constant
 from stewart_drake.loop.sensor import Encoders, Sensor
 from stewart_drake.scenario.calibration import OFFSETS
-from stewart_drake.scenario.config import EncoderSensorConfig, StateSensorConfig
 from stewart_drake.scenario.link import forward_times, number_sent, torque_delays
-from stewart_drake.scenario.link_config import NetworkConfig, WireConfig
 from stewart_drake.scenario.packets import BurstChain, in_time
 from stewart_drake.scenario.signals import PACKETS, POSE, Carried
 from stewart_drake.types import Array
@@ -34,57 +30,34 @@ REPORTS: Final = 10
 """Number of consecutive lost reports without a loss of information."""
 
 
-class SensorKind(NamedTuple):
-    # the sensor, a Drake system with the ports `state` and `measurement`
-    system: Callable[[Any, Experiment], System]
-    sensing: Callable[[Any, Experiment], Sensing]  # part of the law that models the measurement
-
-
-class LinkKind(NamedTuple):
-    """A kind of link between controller and motors."""
-
-    # the link, a Drake system with the ports `commanded` and `torque`, for a channel of the law and
-    # a number of periods in a report
-    system: Callable[[Any, Experiment, Channel, int], System]
-    # part of the law that models the link, for the longest wait for a measurement in periods
-    channel: Callable[[Any, Experiment, Timeline, int], Channel]
-
-
-def _sensor(config: StateSensorConfig, experiment: Experiment) -> Sensor:
-    period, motion = experiment.scenario.controller.period, experiment.motion_scale
-    return Sensor(np.array(config.noise_std), config.seed, period, config.faults, motion)
-
-
-def _state_sensing(config: StateSensorConfig, experiment: Experiment) -> Sensing:
-    anywhere = experiment.scenario.plant.kind == "paper"
-    return StateSensing(np.array(config.noise_std), experiment.motion_scale, anywhere)
-
-
-def _encoders(c: EncoderSensorConfig, experiment: Experiment) -> Encoders:
-    truth, period = experiment.truth, experiment.scenario.controller.period
-    cranks = np.abs(truth.jacobian(experiment.start[POSE])) @ experiment.motion_scale
+def make_sensor(experiment: Experiment) -> System:
+    """Make the sensor, with the ports `state` and `measurement`."""
+    c, period = experiment.scenario.sensor, experiment.scenario.controller.period
+    motion = experiment.motion_scale
+    if c.kind == "state":
+        return Sensor(np.array(c.noise_std), c.seed, period, c.faults, motion)
+    truth = experiment.truth
+    cranks = np.abs(truth.jacobian(experiment.start[POSE])) @ motion
     return Encoders(truth, c.bits, c.samples, c.offset, c.seed, period, c.faults, cranks)
 
 
-def _encoder_sensing(config: EncoderSensorConfig, experiment: Experiment) -> Sensing:
-    rates, motion = experiment.scenario.controller.prior.rates, experiment.motion_scale
+def make_sensing(experiment: Experiment) -> Sensing:
+    """Make the part of the law that models the measurement."""
+    sc, c, motion = experiment.scenario, experiment.scenario.sensor, experiment.motion_scale
+    if c.kind == "state":
+        return StateSensing(np.array(c.noise_std), motion, anywhere=sc.plant.kind == "paper")
+    rates = sc.controller.prior.rates
     calibration, estimated = experiment.calibration, OFFSETS[0] in experiment.nominal.free
     known = None if calibration is None or estimated else calibration
     return EncoderSensing(
         mechanism=experiment.mechanism,
-        samples=config.samples,
-        quantum=0.0 if config.bits is None else 2 * np.pi / 2**config.bits,
+        samples=c.samples,
+        quantum=0.0 if c.bits is None else 2 * np.pi / 2**c.bits,
         initial_state=experiment.start,
         rates_std=motion if rates is None else np.array(rates),
         motion=motion,
         offset=np.array([(known and known.value(name)) or 0.0 for name in OFFSETS]),
     )
-
-
-SENSORS: Final[Mapping[type, SensorKind]] = {
-    StateSensorConfig: SensorKind(_sensor, _state_sensing),
-    EncoderSensorConfig: SensorKind(_encoders, _encoder_sensing),
-}
 
 
 def wire(experiment: Experiment, queue: Array, carries: Carried) -> System:
@@ -99,30 +72,34 @@ def wire(experiment: Experiment, queue: Array, carries: Carried) -> System:
     return chain
 
 
-def _torque_wire(link: WireConfig, experiment: Experiment, *_: Any) -> System:
-    return wire(experiment, experiment.torques_in_flight(experiment.scenario.true_delay), "torque")
-
-
-def _playout(link: NetworkConfig, experiment: Experiment, channel: Channel, reports: int) -> System:
-    sc, delay = experiment.scenario, experiment.scenario.true_delay
-    period = sc.controller.period
-    repeats = channel.repeats if isinstance(channel, Packets) else 0
+def make_link(experiment: Experiment, channel: Channel) -> System:
+    """Make the link, with the ports `commanded` and `torque`, for a channel of the law."""
+    sc, link, delay = experiment.scenario, experiment.scenario.link, experiment.scenario.true_delay
+    period, queue = sc.controller.period, experiment.torques_in_flight(delay)
+    if link.kind == "wire":
+        return wire(experiment, queue, "torque")
+    repeats, history = 0, 1
+    if isinstance(channel, Packets):
+        repeats, history = channel.repeats, channel.report_periods
     return PlayoutBuffer(
         period,
         forward_times(sc, number_sent(sc.duration, period)),
         delay,
-        experiment.torques_in_flight(delay),
+        queue,
         rows=repeats + channel.torques,
         repeats=repeats,
         dry=link.dry,
-        history=reports,
+        history=history,
     )
 
 
-def _packets(_: NetworkConfig, experiment: Experiment, timeline: Timeline, waits: int) -> Channel:
+def make_channel(experiment: Experiment, timeline: Timeline, waits: int) -> Wire | Packets:
+    """Make the part of the law that models the link.
+
+    Measurements arrive after at most `waits` periods.
+    """
     c, link = experiment.scenario.controller, experiment.scenario.assumed_link
-    assert link.kind == "network"
-    if c.delay_steps == 0:
+    if link.kind == "wire" or c.delay_steps == 0:
         return Wire()
     rows = c.packet_repeats + c.packet_torques
     due = timeline.eta + (np.arange(rows) - c.packet_repeats) * c.period
@@ -134,32 +111,20 @@ def _packets(_: NetworkConfig, experiment: Experiment, timeline: Timeline, waits
         arrived_by=tuple(in_time(link, c.period * np.arange(kept)).tolist()),
         losses=BurstChain(link.loss, link.burst),
         holds=link.dry == "hold",
-        report_periods=reported(waits + REPORTS),
+        report_periods=waits + REPORTS + 1,
     )
 
 
-LINKS: Final[Mapping[type, LinkKind]] = {
-    WireConfig: LinkKind(_torque_wire, lambda *_: Wire()),
-    NetworkConfig: LinkKind(_playout, _packets),
-}
-
-
-def _multibody(experiment: Experiment, wrench: bool, meshcat: Meshcat | None) -> MultibodyStewart:
-    fields, start = asdict(experiment.scenario.plant), experiment.start[POSE]
+def make_plant(
+    experiment: Experiment, meshcat: Meshcat | None = None
+) -> ExactPlant | MultibodyStewart:
+    """Make the plant, with an input `wrench` if something pushes it."""
+    plant, truth, start = experiment.scenario.plant, experiment.truth, experiment.start
+    wrench = any(plant.push.wrench) or experiment.own.pushes
+    if plant.kind != "multibody":
+        dynamics = experiment.true_dynamics(biased=False)
+        return ExactPlant(dynamics, start, wrench, experiment.limits)
+    fields = asdict(plant)
     for added in ("mechanism", "torque_bias", "push"):  # by the diagram
         del fields[added]
-    return MultibodyStewart(experiment.truth, meshcat=meshcat, start=start, wrench=wrench, **fields)
-
-
-def _exact(experiment: Experiment, wrench: bool, meshcat: Meshcat | None) -> ExactPlant:
-    truth = experiment.true_dynamics(biased=False)
-    return ExactPlant(truth, experiment.start, wrench, experiment.limits)
-
-
-MakePlant = Callable[[Experiment, bool, Meshcat | None], ExactPlant | MultibodyStewart]
-"""Makes a plant: (experiment, whether it has an input for a wrench, Meshcat or None)."""
-PLANTS: Final[Mapping[str, MakePlant]] = {
-    "multibody": _multibody,
-    "exact": _exact,
-    "paper": _exact,
-}
+    return MultibodyStewart(truth, meshcat=meshcat, start=start[POSE], wrench=wrench, **fields)

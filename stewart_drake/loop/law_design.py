@@ -60,7 +60,7 @@ from stewart_drake.law.startup import (
 )
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.controller import DelayLqiController, Reference
-from stewart_drake.loop.kinds import LINKS, REPORTS, SENSORS
+from stewart_drake.loop.kinds import REPORTS, make_channel, make_sensing
 from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.link import DelayChain
 from stewart_drake.loop.own import Own, own_motion
@@ -134,7 +134,12 @@ _PATIENCE = 10
 def cost_of(experiment: Experiment, peak_torque: float) -> Cost:
     """Return the part of a law that computes its gain; `peak_torque` of the reference, N m."""
     c = experiment.scenario.controller
-    return quadratic_cost(experiment, peak_torque) if c.kind == "lqi" else pd_gain(experiment)
+    if c.kind == "pd":
+        return pd_gain(experiment)
+    errors, integrals, torques = weight_scales(
+        c.weight_scaling, experiment.nominal, experiment.peak_to_peak, peak_torque
+    )
+    return QuadraticCost(errors, c.integral_weight * integrals if c.integral else None, torques)
 
 
 def pd_gain(experiment: Experiment) -> PdGain:
@@ -152,15 +157,6 @@ def pd_gain(experiment: Experiment) -> PdGain:
         return PdGain(*pd_gains(late, pole), c.period)
     kp = (c.kd or 0.0) ** 2 / 4 if c.kp is None else c.kp
     return PdGain(kp, 2 * math.sqrt(kp) if c.kd is None else c.kd, c.period)
-
-
-def quadratic_cost(experiment: Experiment, peak_torque: float) -> QuadraticCost:
-    """Return the cost that the gain minimises; `peak_torque` of the reference, N m."""
-    c = experiment.scenario.controller
-    errors, integrals, torques = weight_scales(
-        c.weight_scaling, experiment.nominal, experiment.peak_to_peak, peak_torque
-    )
-    return QuadraticCost(errors, c.integral_weight * integrals if c.integral else None, torques)
 
 
 class Sizing(NamedTuple):
@@ -213,7 +209,7 @@ _FEEDFORWARDS: Final[Mapping[str, Feedforward]] = {
 
 
 def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> PredictiveLqi:
-    """Compose the law of a scenario from parts, with the factories of `loop.kinds`.
+    """Compose the law of a scenario from parts.
 
     Args:
         sizing: `sizing_of` the experiment, computed if None.
@@ -225,7 +221,6 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     if found := differing(sc, {"controller.command": "torque"}):
         raise ConfigError(found.problem(hint=", for a law that closes its loop across the delay"))
     c, motion = sc.controller, experiment.motion_scale
-    sensor, link = SENSORS[type(sc.sensor)], LINKS[type(sc.link)]
     timeline = Timeline(c.period, believed_delay(sc))
     substeps, peak_torque, reachable, machine_scale, frequency = sizing or sizing_of(experiment)
     torque_scale = max(machine_scale, reachable)
@@ -249,13 +244,13 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     open_loop = c.open_loop_start and sc.start == "rest"
     before = int(bool(c.estimate) and c.delay_estimator == "none")  # torques, as the filter asks
     waits = longest_wait(sc)
-    channel = link.channel(sc.link, experiment, timeline, waits)
+    channel = make_channel(experiment, timeline, waits)
     motors = TorqueLimit(experiment.torque_limit)
     gentle = GENTLE * min(1.0, _GENTLE_PERIOD / c.period) ** 2
     law = PredictiveLqi(
         timeline=timeline,
         plant=NominalPlant(nominal, substeps, gentle * torque_scale, motors),
-        sensing=sensor.sensing(sc.sensor, experiment),
+        sensing=make_sensing(experiment),
         observer=observer,
         predictor=_PREDICTORS[c.prediction],
         feedforward=_FEEDFORWARDS[c.feedforward],

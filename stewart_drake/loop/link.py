@@ -27,6 +27,9 @@ from stewart_drake.types import Array
 class LinkSystem(LeafSystem):
     """A link with its memory as discrete state, which takes a command at each sample."""
 
+    _at_samples = True
+    """Whether commands may begin to act at the samples."""
+
     def _begin(self, link: Link, period: float, rows: int, delay: Delay, queue: Array) -> None:
         """Declare input, state and samples.
 
@@ -43,6 +46,17 @@ class LinkSystem(LeafSystem):
         self._memory = self.DeclareDiscreteState(begun(link, delay, period, queue))
         update_every(self, period, self._take)
 
+    def _release_between(self, delay: Delay) -> None:
+        """Let commands act at k dt + eta0 too, if eta0 is above 0."""
+        self._delay = delay
+        if delay.fraction > 0:
+            early, offset = event_time(self._period), event_time(delay.fraction * self._period)
+            self.DeclarePeriodicUnrestrictedUpdateEvent(early, offset, weak(self._release))
+
+    def _release(self, context: Context, state: State) -> None:
+        memory = self._of(state)
+        self._change(memory, (self._taken(memory) - 1 + self._delay.fraction) * self._period)
+
     @abstractmethod
     def _send(self, memory: Array, number: int, command: Array) -> int:
         """Pass the command of a sample to the link; return the result of `Link.take`."""
@@ -53,7 +67,8 @@ class LinkSystem(LeafSystem):
         number = self._taken(memory)
         result = self._send(memory, number, self._commanded.Eval(context))
         assert result != NO_ROOM, "more commands are in flight than the link has places for"
-        self._change(memory, number * self._period)
+        if self._at_samples:
+            self._change(memory, number * self._period)
 
     def _change(self, memory: Array, time: float) -> None:
         if self._link.next_change(memory) <= time + SIMULTANEOUS * self._period:
@@ -174,19 +189,12 @@ class DelayChain(Wire):
         self, period: float, steps: int, fraction: float, queue: Array, carries: Carried = "torque"
     ) -> None:
         super().__init__()
-        period, self._delay = positive("period", period), Delay(steps, fraction)
-        self._lay(period, np.array([self._delay.eta(period)]), self._delay, queue, carries)
-        if fraction > 0:
-            self.DeclarePeriodicUnrestrictedUpdateEvent(
-                event_time(period), event_time(fraction * period), weak(self._release)
-            )
+        period, delay = positive("period", period), Delay(steps, fraction)
+        self._lay(period, np.array([delay.eta(period)]), delay, queue, carries)
+        self._release_between(delay)
 
     def _arrival(self, number: int) -> float:
         return (number + self._delay.periods) * self._period
-
-    def _release(self, context: Context, state: State) -> None:
-        memory = self._of(state)
-        self._change(memory, (self._taken(memory) - 1 + self._delay.fraction) * self._period)
 
 
 class VaryingDelay(Wire):
@@ -236,7 +244,7 @@ class VaryingDelay(Wire):
         self._delays = np.where(delays > SIMULTANEOUS * period, delays, 0.0)
         self._lay(period, self._delays, delay, queue, carries)
         ticket = self.discrete_state_ticket(self._memory)
-        self.DeclareVectorOutputPort("delay", 1, weak(self._delay), {ticket})
+        self.DeclareVectorOutputPort("delay", 1, weak(self._newest_delay), {ticket})
         declare_constant(self, "packets", np.full(len(PACKETS), np.nan))
         numbers, times = releases(period, delays, delay)
         # The sample itself is the event of a torque that arrives as it is sent.
@@ -250,7 +258,7 @@ class VaryingDelay(Wire):
     def _arrive(self, time: float, context: Context, state: State) -> None:
         self._change(self._of(state), time)
 
-    def _delay(self, context: Context, output: BasicVector) -> None:
+    def _newest_delay(self, context: Context, output: BasicVector) -> None:
         sent = max(self._taken(self._of(context)), 1)
         output.SetFromVector([self._delays[min(sent, len(self._delays)) - 1]])
 
@@ -304,7 +312,7 @@ class PlayoutBuffer(LinkSystem):
         super().__init__()
         of_kind("delay", delay, Delay)
         period, times = positive("period", period), _times("times", times)
-        self._delay, self._rows = delay, whole("rows", rows, 1)
+        self._rows = whole("rows", rows, 1)
         self._repeats, history = whole("repeats", repeats, 0), whole("history", history, 1)
         one_of("dry", dry, ("hold", "zero"))
         self._arrivals = period * np.arange(len(times)) + times
@@ -315,9 +323,8 @@ class PlayoutBuffer(LinkSystem):
         self.DeclareVectorOutputPort("packets", len(PACKETS), weak(self._count), {memory})
         size = history * (1 + NUM_TORQUES)
         self.DeclareVectorOutputPort("report", size, weak(self._report), {memory, timed})
-        if delay.fraction > 0:
-            early, offset = event_time(period), event_time(delay.fraction * period)
-            self.DeclarePeriodicUnrestrictedUpdateEvent(early, offset, weak(self._play))
+        self._at_samples = delay.fraction == 0
+        self._release_between(delay)
 
     def _send(self, memory: Array, number: int, command: Array) -> int:
         arrival = self._arrivals[number] if number < len(self._arrivals) else np.inf
@@ -327,14 +334,7 @@ class PlayoutBuffer(LinkSystem):
         return self._link.take(memory, now, number + 1, first, packet, arrival)
 
     def _change(self, memory: Array, time: float) -> None:
-        """Begin a period, with a torque or dry."""
-        if self._delay.fraction == 0:
-            self._link.change(memory, time)
-
-    def _play(self, context: Context, state: State) -> None:
-        memory = self._of(state)
-        period = self._taken(memory) - 1 + self._delay.fraction
-        self._link.change(memory, period * self._period)
+        self._link.change(memory, time)  # every period begins, with a torque or dry
 
     def _count(self, context: Context, output: BasicVector) -> None:
         memory, period = self._of(context), self._period

@@ -120,6 +120,12 @@ class Own(NamedTuple):
             (role for role in ("controller", "sensor", "link") if role in self.systems), None
         )
 
+    @property
+    def pushes(self) -> bool:
+        """Whether there is a disturbance with a wrench."""
+        disturbance = self.systems.get("disturbance")
+        return disturbance is not None and disturbance.HasOutputPort("wrench")
+
     def place(self, error: Exception) -> str:
         """Return the system in which an error was raised, with its output, or an empty text."""
         for frame, _ in walk_tb(error.__traceback__):
@@ -221,7 +227,6 @@ def _roles_ports(role: str) -> list[dict[str, int]]:
 
 
 def _ports(role: str) -> str:
-    """Return the ports that a system in a role needs, and may have."""
     needed, optional, offered = _roles_ports(role)
     wanted = f", if wanted {_listed(optional)}" if optional else ""
     return f"inputs {_listed(needed)}{wanted}, and output {_listed(offered, ' or ')}"

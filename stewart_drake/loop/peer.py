@@ -23,37 +23,31 @@ SECOND: Final = 10**9
 
 
 class Fault(IntEnum):
-    """Reason of a machine's stop; `FAULTS` has the texts."""
+    """Reason of a machine's stop.
 
-    NONE = 0
-    REACH = 1
-    PITCH = 2
-    SINGULAR = 3
-    NOT_FINITE = 4
-    LEFT = 5
-    SILENCE = 6
-    STOP = 7
-    STOOD = 8
-    ENDED = 9
-    DRIVE = 10
-    DRY = 11
+    Attributes:
+        text: for `live`, its page, `machine` and C. The number in it is the leg or s.
+    """
 
+    text: str
 
-FAULTS: Final = {
-    Fault.NONE: "no fault",
-    Fault.REACH: "leg {:g} reached the end of its reach",
-    Fault.PITCH: "the pitch passed 85 degrees",
-    Fault.SINGULAR: "parallel singularity: the cranks do not hold the plate",
-    Fault.NOT_FINITE: "the simulated state is not finite",
-    Fault.LEFT: "the plate left its workspace",
-    Fault.SILENCE: "nothing was heard from the controller for {:g} s",
-    Fault.STOP: "the controller said stop",
-    Fault.STOOD: "the machine stood still for {:.2f} s",
-    Fault.ENDED: "the machine was ended",
-    Fault.DRIVE: "a drive of the machine failed",
-    Fault.DRY: "no torque or setpoint came in time for {:g} s",
-}
-"""Texts of the faults, for `live`, its page, `machine` and C. The number is the leg or s."""
+    def __new__(cls, number: int, text: str = "") -> "Fault":
+        fault = int.__new__(cls, number)
+        fault._value_, fault.text = number, text
+        return fault
+
+    NONE = 0, "no fault"
+    REACH = 1, "leg {:g} reached the end of its reach"
+    PITCH = 2, "the pitch passed 85 degrees"
+    SINGULAR = 3, "parallel singularity: the cranks do not hold the plate"
+    NOT_FINITE = 4, "the simulated state is not finite"
+    LEFT = 5, "the plate left its workspace"
+    SILENCE = 6, "nothing was heard from the controller for {:g} s"
+    STOP = 7, "the controller said stop"
+    STOOD = 8, "the machine stood still for {:.2f} s"
+    ENDED = 9, "the machine was ended"
+    DRIVE = 10, "a drive of the machine failed"
+    DRY = 11, "no torque or setpoint came in time for {:g} s"
 
 
 class Reason(NamedTuple):
@@ -64,7 +58,7 @@ class Reason(NamedTuple):
     lasted: int = 0
 
     def __str__(self) -> str:
-        return FAULTS[self.fault].format(self.leg or self.lasted / SECOND)
+        return self.fault.text.format(self.leg or self.lasted / SECOND)
 
 
 def in_words(reason: Reason, before: Reason) -> str:

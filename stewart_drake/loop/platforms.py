@@ -3,7 +3,7 @@
 import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, Final, Unpack, cast
+from typing import Any, Unpack, cast
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
@@ -72,22 +72,17 @@ def add_scene(
     return plant, scene_graph
 
 
-def add_mechanism(
-    plant: MultibodyPlant, mechanism: Mechanism, collision: bool = False
-) -> ModelInstanceIndex:
+def add_mechanism(plant: MultibodyPlant, mechanism: Mechanism, collision: bool = False) -> None:
     """Add the mechanism to an otherwise empty `plant`, and finalize it."""
-    model = add_model(plant, mechanism, collision=collision)
+    add_model(plant, mechanism, PlantConfig(), collision=collision)
     plant.Finalize()
-    return model
 
 
 def add_model(
     plant: MultibodyPlant,
     mechanism: Mechanism,
+    config: PlantConfig,
     *,
-    payload_mass: float = 0.0,
-    payload_position: Sequence[float] = (0.0, 0.0, 0.0),
-    joint_damping: float = 0.0,
     collision: bool = False,
     parent: Frame | None = None,
     X_PB: RigidTransform | None = None,
@@ -99,9 +94,7 @@ def add_model(
 
     Args:
         mechanism: the machine; the name of a second one gets a number.
-        payload_mass: kg, a point mass.
-        payload_position: m, in the plate's frame, from its COM.
-        joint_damping: N m s/rad on the six crank shafts.
+        config: of which payload and joint damping are used here.
         collision: whether its shapes collide with other bodies of `plant`; the search for contacts
             takes a fifth of the time.
         parent: frame of the base's weld, the world's if None.
@@ -121,7 +114,7 @@ def add_model(
     joint = plant.AddJoint(RpyFloatingJoint("plate", under, plate.body_frame()))
     floating = cast(RpyFloatingJoint, joint)
     # Also without mass, which a context may change.
-    point_mass = _point_mass(payload_mass, payload_position)
+    point_mass = _point_mass(config.payload_mass, config.payload_position)
     payload = plant.AddRigidBody("payload", model, point_mass)
     plant.WeldFrames(plate.body_frame(), payload.body_frame())
     pose = mechanism.home if start is None else start
@@ -130,7 +123,7 @@ def add_model(
     floating.set_default_translation(pose[POSITION])
     for i, leg in enumerate(LEGS):
         motor = cast(RevoluteJoint, plant.GetJointByName(f"motor_{leg}", model))
-        motor.set_default_damping(joint_damping)
+        motor.set_default_damping(config.joint_damping)
         motor.set_default_angle(joints.crank[i])
         universal = cast(UniversalJoint, plant.GetJointByName(f"universal_{leg}", model))
         universal.set_default_angles(joints.universal[i])
@@ -299,11 +292,6 @@ class PlateWrench(LeafSystem):
         output.set_value(forces)
 
 
-_INPUTS: Final = ("torque", "wrench")
-_STATE: Final = "state"
-_CRANKS: Final = "crank_angles"
-
-
 class StewartPlatform:
     """Ports of a platform that `AddStewartPlatform` added to a diagram.
 
@@ -349,8 +337,8 @@ class StewartPlatform:
         Raises:
             ConfigError: another name, or a MultibodyPlant that is not finalized.
         """
-        if name not in _INPUTS:
-            raise ConfigError(f"input port: got {name!r}; expected {' or '.join(_INPUTS)}")
+        if name not in ("torque", "wrench"):
+            raise ConfigError(f"input port: got {name!r}; expected torque or wrench")
         if self.model is None:
             return self.plant.GetInputPort(name)
         self._check_finalized()
@@ -372,7 +360,7 @@ class StewartPlatform:
         Raises:
             ConfigError: another name, or a MultibodyPlant that is not finalized.
         """
-        names = (_STATE,) if self.model is None else (_STATE, _CRANKS)
+        names = ("state",) if self.model is None else ("state", "crank_angles")
         if name not in names:
             raise ConfigError(f"output port: got {name!r}; expected {' or '.join(names)}")
         if self.model is None:
@@ -564,9 +552,7 @@ def AddStewartPlatform(
     model = add_model(
         plant,
         dataclasses.replace(machine, effort_limit=None),
-        payload_mass=config.payload_mass,
-        payload_position=config.payload_position,
-        joint_damping=config.joint_damping,
+        config,
         collision=collision and not own,
         parent=parent,
         X_PB=X_PB,
@@ -631,7 +617,6 @@ class MultibodyStewart(Diagram):
         set_pose(self.tree, tree_context, self.mechanism, state[POSE], state[RATES])
 
     def diagnose(self, context: Context) -> Failure | None:
-        """Return why the plate is outside its workspace, or None."""
         state, cranks = (
             np.asarray(self.GetOutputPort(name).Eval(context)) for name in ("state", "crank_angles")
         )

@@ -122,7 +122,6 @@ class Experiment(NamedTuple):
 
     @property
     def limits(self) -> Limits:
-        """Limits of the plate's motion."""
         if self.scenario.plant.kind != "paper":
             return Workspace(self.truth)
         reference = self.reference

@@ -170,7 +170,6 @@ class SteppedLaw(LeafSystem):
 
 
 def declare_constant(system: LeafSystem, name: str, value: Array) -> None:
-    """Declare a constant output port (n,) of a system."""
 
     def put_out(context: Context, output: BasicVector) -> None:
         output.SetFromVector(value)

@@ -4,6 +4,7 @@ The reference is a ring with a pointer along its x axis, at the plate's wanted p
 the colour of its motor's torque, blue or orange by its sign.
 """
 
+from collections.abc import Callable
 from typing import Any, Final, cast
 
 import numpy as np
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from pydrake.geometry import Cylinder, Meshcat, Rgba, Role, SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Diagram
 
 from stewart_drake.loop.diagram import ClosedLoop
 from stewart_drake.loop.platforms import build_viewer, set_pose
@@ -21,6 +23,8 @@ from stewart_drake.mechanism.kinematics import UnreachablePoseError, rotation
 from stewart_drake.scenario.signals import ANGLES, LEGS, POSE, POSITION
 from stewart_drake.types import Array
 
+Progress = Callable[[float, float], None]
+"""Called with simulated time in s and the current pose error in % of peak to peak."""
 CRANK_PARTS: Final = ("arm", "hub")
 """Parts of the SDFormat model in the torque's colour."""
 TORQUE_COLORS: Final = ("#0072b2", "#dadada", "#d55e00")
@@ -98,20 +102,26 @@ class Scene:
 
 
 class Live:
-    """Shows a closed loop, with either plant, while it runs."""
+    """Shows a running loop, with either plant, at most in real time; a `Progress` function."""
 
-    def __init__(self, loop: ClosedLoop, meshcat: Meshcat) -> None:
+    def __init__(
+        self, loop: ClosedLoop, simulator: Simulator, meshcat: Meshcat, progress: Progress | None
+    ) -> None:
+        simulator.set_target_realtime_rate(1.0)
+        self._context, self._progress = simulator.get_context(), progress
         self._scene = Scene(loop.experiment.truth, meshcat)
         self._ports: Any = [
             loop.GetOutputPort(name) for name in ("state", "reference", "torque_applied")
         ]
         self._largest: list[float] = []
 
-    def show(self, context: Context) -> None:
-        state, reference, torque = (np.asarray(port.Eval(context)) for port in self._ports)
+    def __call__(self, time: float, error: float) -> None:
+        state, reference, torque = (np.asarray(port.Eval(self._context)) for port in self._ports)
         self._largest.append(float(np.abs(torque).max()))
-        self._scene.show(state[POSE], reference[POSE], context.get_time())
+        self._scene.show(state[POSE], reference[POSE], self._context.get_time())
         self._scene.paint(torque_shares(torque, full_color(np.array(self._largest))))
+        if self._progress is not None:
+            self._progress(time, error)
 
     def close(self) -> None:
         self._scene.close()

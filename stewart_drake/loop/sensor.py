@@ -12,7 +12,7 @@ from stewart_drake.loop.sampling import update_every, weak
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.field_types import SPIKE
 from stewart_drake.scenario.signals import LEGS, NUM_COORDINATES, NUM_LEGS, NUM_STATE, POSE
-from stewart_drake.types import Array, ArrayLike, Flags
+from stewart_drake.types import Array, ArrayLike
 
 _EARLY = 1e-9
 """Tolerance of the instants of a fault, s."""
@@ -23,21 +23,7 @@ _STRIKES: Final = 16
 
 
 def draws(seed: int, stream: int, k: int) -> np.random.Generator:
-    """Return the random numbers of sample k."""
     return np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, stream, k]))
-
-
-def acts(fault: Any, time: float) -> bool:
-    """Return whether a fault of a scenario is active at a time, s."""
-    return bool(fault["from"] <= time + _EARLY < fault["to"])
-
-
-def strikes(fault: Any, seed: int, place: int, k: int, size: int) -> Flags:
-    """Return whether fault number `place` affects each value (size,) of sample k."""
-    share = fault.get("share")
-    if share is None:
-        return np.ones(size, dtype=bool)
-    return draws(seed, _STRIKES + place, k).random(size) < share
 
 
 def faulty(
@@ -57,9 +43,11 @@ def faulty(
     legs = len(y) if len(y) == NUM_LEGS else 1  # a fault affects a whole state
     read, left = y.copy(), np.ones(legs, dtype=bool)
     for i, fault in enumerate(faults):
-        if not acts(fault, time):
+        if not fault["from"] <= time + _EARLY < fault["to"]:
             continue
-        struck = strikes(fault, seed, i, k, legs) & left
+        struck = left.copy()
+        if fault.get("share") is not None:
+            struck &= draws(seed, _STRIKES + i, k).random(legs) < fault["share"]
         if fault.get("leg"):
             struck &= np.isin(LEGS, fault["leg"])
         left &= ~struck
@@ -137,7 +125,6 @@ class Sensor(LeafSystem):
         self.DeclareVectorOutputPort("measurement", NUM_STATE, weak(self._measure))
 
     def noise(self, k: int) -> Array:
-        """Return the noise (12,) of sample k."""
         return self._std * white_noise(self._seed, k)
 
     def _measure(self, context: Context, output: BasicVector) -> None:

@@ -65,8 +65,6 @@ from stewart_drake.types import Array
 
 
 class ServoState(NamedTuple):
-    """Memory of servos."""
-
     segment: Segment  # path of the setpoint to the newest command
     arrived: float  # arrival of that command, s; NaN before the first
     setpoint: Array  # (12,) last setpoint

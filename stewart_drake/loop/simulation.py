@@ -1,7 +1,7 @@
 """Simulation of a scenario."""
 
 import time as clock
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from traceback import walk_tb
 from typing import Any, Final
@@ -22,15 +22,13 @@ from stewart_drake.loop.preparation import Experiment, concrete
 from stewart_drake.loop.recording import Recorder, summarize
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.sampling import dispose
-from stewart_drake.loop.scene import Live
+from stewart_drake.loop.scene import Live, Progress
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.run_log import RunLog, open_log
 from stewart_drake.scenario.timing import instants, look_time
 
 _PACKAGE: Final = __name__.partition(".")[0]
-Progress = Callable[[float, float], None]
-"""Called with simulated time in s and the current pose error in % of peak to peak."""
 
 
 def simulate(
@@ -132,12 +130,10 @@ def _run(
     started, scenario = clock.perf_counter(), experiment.scenario
     loop = build_closed_loop(experiment)
     simulator = make_simulator(loop)
-    live = None if meshcat is None else Live(loop, meshcat)
-    if live is not None:
-        progress = _shown(simulator, live, progress)
+    live = None if meshcat is None else Live(loop, simulator, meshcat, progress)
     recorder = Recorder(loop, logs)
     try:
-        status, stopped = _advance(simulator, recorder, loop, progress)
+        status, stopped = _advance(simulator, recorder, loop, live or progress)
         wall = clock.perf_counter() - started
         signals = recorder.dataset()
     finally:
@@ -202,21 +198,7 @@ def _advance_to(t: float, simulator: Simulator, recorder: Recorder) -> bool:
     return False
 
 
-def _shown(simulator: Simulator, live: Live, progress: Progress | None) -> Progress:
-    """Return a progress function that also shows the loop, and slow the run to real time."""
-    context = simulator.get_context()
-    simulator.set_target_realtime_rate(1.0)
-
-    def show(time: float, error: float) -> None:
-        live.show(context)
-        if progress is not None:
-            progress(time, error)
-
-    return show
-
-
 def make_simulator(machine: PlantDiagram) -> Simulator:
-    """Return a simulator at the initial context, with the scenario's accuracy."""
     plant = machine.experiment.scenario.plant
     simulator = Simulator(machine, machine.CreateDefaultContext())
     if plant.kind != "multibody":

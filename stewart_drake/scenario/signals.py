@@ -202,7 +202,7 @@ SIGNALS: Final[dict[str, Signal]] = {signal.name: signal for signal in _TABLE}
 
 The ports of the closed loop, the record, and names, units and labels in `signals.nc` and CSV follow
 from it. A new signal is one row, and a port of its source; for the controller that is an entry in
-`loop.controller.HELD`.
+`loop.controller.held_by`.
 """
 
 
