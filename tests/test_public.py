@@ -23,6 +23,7 @@ from stewart_drake.identification.logs import Precision
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.reporting.results import Figures, Replay
 from stewart_drake.studies.study_options import Ranges
+from tests.shorter import judge_few_delays
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -285,9 +286,17 @@ def test_replay_as_a_file_in_a_notebook_or_in_meshcat(run, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_poses")
-def test_analyses_are_answers_that_can_be_printed_shown_and_saved(tmp_path):
-    found = sd.analyze_workspace(sd.load_scenario("paper"))
+@pytest.mark.usefixtures("few_poses", "blank_figures")
+@pytest.mark.parametrize(
+    ("analyze", "how"),
+    [(sd.analyze_workspace, ()), (sd.analyze_hautus, ()), (sd.analyze_delay, (False,))],
+)
+def test_analyses_are_answers_that_can_be_printed_shown_and_saved(
+    analyze, how, tmp_path, monkeypatch
+):
+    judge_few_delays(monkeypatch)
+    short = ("plant.kind=exact", "duration=0.5", "delay.steps=2", "controller.catch_up=0")
+    found = analyze(sd.load_scenario("paper", settings=short), *how)
     assert isinstance(found, sd.AnalysisResult) and "\n" in str(found)
     assert found.verdict in repr(found) and len(repr(found)) < 500
     assert found._repr_html_().startswith("<iframe srcdoc=") and "&lt;html" in found._repr_html_()
