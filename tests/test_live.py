@@ -766,7 +766,7 @@ def test_what_is_no_number_is_null_on_the_page():
     board = Readouts()
     board.put({"error": math.nan, "pose": [1.0, math.inf], "limit": None, "missed": 3})
     refused = pytest.fail  # called for NaN and Infinity only
-    said = json.loads(board.after(0)[0], parse_constant=refused)
+    said = json.loads(next(board.events()), parse_constant=refused)
     assert said == {"error": None, "pose": [1.0, None], "limit": None, "missed": 3}
 
 
@@ -1034,23 +1034,15 @@ def test_the_page_is_driven_by_keys_alone_on_a_narrow_screen(tab, viewer):
     before = float(tab.evaluate("document.activeElement.value"))
     for _ in range(10):
         tab.press("ArrowRight")
-    wait_until(lambda: viewer.request().target is not None)
-    wait_until(lambda: abs(np.rad2deg(viewer.request().target[2]) - before - 1.0) < 0.05)
+    until(lambda: viewer.request().target is not None, 60.0)
+    until(lambda: abs(np.rad2deg(viewer.request().target[2]) - before - 1.0) < 0.05, 60.0)
     tab.go_to("document.getElementById('motion')")
     tab.press("Space")
-    wait_until(lambda: viewer.request().target is None)
+    until(lambda: viewer.request().target is None, 60.0)
     tab.go_to("document.getElementById('stop')")
     tab.press("Enter")
-    wait_until(lambda: (viewer.request(), viewer.stopped())[1])
+    until(lambda: (viewer.request(), viewer.stopped())[1], 60.0)
     assert tab.errors == []
-
-
-def wait_until(condition):
-    for _ in range(600):
-        if condition():
-            return
-        time.sleep(0.1)
-    raise AssertionError("never")
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 """Controllers, references and disturbances of a user in the loop of a scenario."""
 
-import importlib.util
 import json
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +14,9 @@ import stewart_drake as sd
 from stewart_drake.loop.own import take
 from stewart_drake.loop.preparation import concrete, prepare
 
-ROOT = Path(__file__).resolve().parents[1]
+KICKED = runpy.run_path(str(Path(__file__).parents[1] / "analysis/own_disturbance.py"))
 FAST = ("plant.kind=exact", "delay.steps=0", "controller.period=0.01", "start=on_reference")
 """No delay, so that a controller which knows of none can hold the plate."""
-
-
-def example(name):
-    spec = importlib.util.spec_from_file_location(name, ROOT / "analysis" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def scenario(*settings):
@@ -60,6 +53,22 @@ class OfTime(LeafSystem):
         )
 
 
+class ComputedTorque(LeafSystem):
+    """T = inverse dynamics of the accelerations r'' - 20 (v - r') - 100 (q - r)."""
+
+    def __init__(self, dynamics):
+        super().__init__()
+        self.dynamics = dynamics
+        self.DeclareVectorInputPort("measurement", 12)
+        self.DeclareVectorInputPort("reference", 18)
+        self.DeclareVectorOutputPort("torque", 6, self.calc_torque)
+
+    def calc_torque(self, context, output):
+        x, r = (self.GetInputPort(n).Eval(context) for n in ("measurement", "reference"))
+        wanted = r[12:] - 20 * (x[6:] - r[6:12]) - 100 * (x[:6] - r[:6])
+        output.SetFromVector(self.dynamics.inverse_dynamics(x[:6], x[6:], wanted))
+
+
 def disturbance(name="torque", size=6, value=0.0):
     return Constant((), ((name, size),), value)
 
@@ -70,10 +79,13 @@ def disturbance(name="torque", size=6, value=0.0):
 @pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize("plant", ["exact", "multibody"])
-def test_own_computed_torque_controller_with_table_figures_and_replay(tmp_path, capsys, plant):
-    result = example("own_controller").main(str(tmp_path), "duration=2", f"plant.kind={plant}")
-    table = capsys.readouterr().out
-    assert "completed" in table and "ComputedTorque" in table
+def test_own_computed_torque_controller_with_table_figures_and_replay(tmp_path, plant):
+    sc = scenario("duration=2", f"plant.kind={plant}")
+    result = sd.simulate(sc, controller=ComputedTorque(prepare(sc).nominal))
+    assert "completed" in result.table() and "ComputedTorque" in result.table()
+    result.save(tmp_path)
+    result.plot(tmp_path)
+    result.replay(tmp_path / "replay.html")
     assert result.summary["own"] == {"controller": "ComputedTorque"}
     # Poles of the error at -10 /s, sampled a hundred times a second: it follows to a millimetre.
     assert np.abs(result.signals.error.values).max() < 1e-3
@@ -86,7 +98,7 @@ def test_own_computed_torque_controller_with_table_figures_and_replay(tmp_path, 
 
 
 def test_own_kick_moves_the_plate_at_three_seconds(capsys):
-    results = example("own_disturbance").main("plant.kind=exact", "duration=4")
+    results = KICKED["main"]("plant.kind=exact", "duration=4")
     assert "kicked: E_ac" in capsys.readouterr().out
     calm, kicked = (results[name].signals.pose.sel(coordinate="x") for name in ("calm", "kicked"))
     moved = np.abs(kicked - calm)
@@ -97,7 +109,7 @@ def test_own_kick_moves_the_plate_at_three_seconds(capsys):
 
 def test_a_wrench_gives_the_momentum_of_its_impulse():
     """A free plate, no gravity: right after a short push M rates = N' integral of the wrench."""
-    kick, settings = example("own_disturbance").Kick, ("reference.kind=hold", "duration=0.002")
+    kick, settings = KICKED["Kick"], ("reference.kind=hold", "duration=0.002")
     sc = scenario(*settings, "plant.accuracy=1e-12")
     start = np.array(sc.reference.offset)
     force = (30.0, -20.0, 40.0)

@@ -1,6 +1,6 @@
 """A platform in a user's diagram."""
 
-import importlib.util
+import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,28 +19,20 @@ from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.scenario.signals import PLANT_PARAMETERS
 
-ROOT = Path(__file__).resolve().parents[1] / "diagrams"
 PAPER = sd.load_mechanism("paper")
 ELSEWHERE = RigidTransform(RollPitchYaw(0.1, -0.2, 0.7), [1.0, -0.5, 0.3])
 TORQUE = np.array([0.02, -0.01, 0.03, 0.01, -0.02, 0.01])
 
 
-def example():
-    spec = importlib.util.spec_from_file_location("box_on_plate", ROOT / "box_on_plate.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("X_WB", [None, RigidTransform([1.0, -0.5, 0.3])])
 def test_a_box_stays_on_the_plate_while_it_moves(X_WB, capsys):
-    module = example()
-    places = module.main(X_WB)
+    example = runpy.run_path(str(Path(__file__).parents[1] / "diagrams/box_on_plate.py"))
+    places = example["main"](X_WB)
     heights = [float(line.split()[-1]) for line in capsys.readouterr().out.splitlines()[1:]]
     assert len(places) == len(heights) == 20
     assert np.ptp(heights) > 15, "the plate did not move by mm"
     assert np.abs(places[:, :2]).max() < 1e-3, "it slid"
-    resting = deck_height(PAPER) + module.SIDE / 2
+    resting = deck_height(PAPER) + example["SIDE"] / 2
     np.testing.assert_allclose(places[1:, 2], resting, atol=1e-4, err_msg="it fell or bounced")
 
 

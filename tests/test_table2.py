@@ -1,7 +1,9 @@
 """The paper's Table II under the conditions in which it comes out, and rows of `compare`."""
 
+import runpy
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from stewart_drake.scenario.loading import load_comparison
 from stewart_drake.studies.compare import CONTROLLERS, is_papers, label
 from stewart_drake.studies.workspace_map import largest_factor
 from tests.mechanisms import PAPER
+from tests.shorter import judge_few_delays
 
 
 @pytest.fixture(scope="module")
@@ -187,3 +190,19 @@ def test_nobody_is_lost_before_the_first_torque_and_for_some_time_after():
         settings = ("start=rest", f"controller.w_Q={weight}", "controller.model=multibody")
         result = sd.simulate(sd.load_scenario("paper", "lqi", settings), judge_stability=False)
         assert result.stopped is not None and result.stopped.time > 1.05
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("blank_figures")
+def test_table_two_on_three_plants_and_what_its_law_lacks(tmp_path, capsys, monkeypatch):
+    judge_few_delays(monkeypatch)
+    main = runpy.run_path(str(Path(__file__).parents[1] / "analysis/table2.py"))["main"]
+    tables, rows = main("duration=0.3", out=str(tmp_path))
+    assert list(tables) == ["exact", "multibody", "paper"]
+    for table in tables.values():
+        assert "delay_lqi_200" in table
+        assert "as printed" not in table, "Table II is of ten seconds"
+    lines = rows.splitlines()
+    assert len(lines) == 5 and all(line.count("|") == 4 for line in lines)
+    written = (tmp_path / "table2.txt").read_text()
+    assert rows in written and capsys.readouterr().out == written

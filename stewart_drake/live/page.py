@@ -125,16 +125,14 @@ class Readouts:
             self._number += 1
             self._changed.notify_all()
 
-    def after(self, number: int) -> tuple[str, int]:
-        """Wait up to 5 s for readouts other than `number`; return them and their number."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._number != number, timeout=5.0)
-            return self._text, self._number
-
     def events(self) -> Iterator[str]:
-        number = -1
+        """Yield the readouts whenever they change, at least every 5 s."""
+        seen = -1
         while True:
-            text, number = self.after(number)
+            with self._changed:
+                if self._number == seen:
+                    self._changed.wait(5.0)
+                text, seen = self._text, self._number
             yield text
 
 
