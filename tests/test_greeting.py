@@ -1,6 +1,5 @@
 """Requests, offers, identities and faults, as both sides say them."""
 
-import math
 import re
 import socket
 import threading
@@ -18,7 +17,7 @@ from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live import contact as contacts
 from stewart_drake.live import session as sessions
-from stewart_drake.live.checks import ReportCheck, WireCheck
+from stewart_drake.live.checks import DelayCheck
 from stewart_drake.live.contact import Contact, await_free, call, open_endpoint
 from stewart_drake.live.endpoint import ANSWERS, ANSWERS_AT_ONCE
 from stewart_drake.live.machine import Machine
@@ -217,31 +216,34 @@ def test_a_sequence_that_restarts_is_named(impatient):
     ), said
 
 
-@pytest.mark.parametrize(("off", "word"), [(-1, "early"), (1, "late")])
-def test_reports_that_are_a_period_off_are_named(off, word):
-    check, right = ReportCheck(1.0), ReportCheck(1.0)
-    rng = np.random.default_rng(3)
-    torques = rng.uniform(-2, 2, (40, 6))
-    for number in range(30):
+@pytest.mark.parametrize(
+    ("sends", "off", "words"),
+    [
+        (
+            True,
+            -1,
+            "is one period early: its last 8 rows of torques were sent for the period after",
+        ),
+        (True, 1, "is one period late: its last 8 rows of torques were sent for the period before"),
+        (False, -11, "commands act 0.04 s after their measurement, and this end expects 0.26 s"),
+        (False, 9, "commands act 0.44 s after their measurement, and this end expects 0.26 s"),
+    ],
+)
+def test_commands_that_act_in_other_periods_are_named(sends, off, words):
+    check, right = (DelayCheck(1.0, 0.26, 0.02, sends) for _ in range(2))
+    torques = np.random.default_rng(3).uniform(-2, 2, (60, 6))
+    rows, found = 3 if sends else 1, []
+    for number in range(50):
         for each in (check, right):
-            each.sent(number, torques[number : number + 3])
-        acted = {number - i: np.clip(torques[number - i], -1, 1) for i in range(3) if number >= i}
+            each.sent(number + 13, torques[number : number + rows])
+        acted = {n + 13: np.clip(torques[n], -1, 1) for n in range(max(0, number - 2), number + 1)}
         assert right.problem(acted) is None
-        if word in (check.problem({n + off: torque for n, torque in acted.items()}) or ""):
-            assert number < 12
-            return
-    raise AssertionError
-
-
-@pytest.mark.parametrize("steps", [2, 13])
-def test_another_delay_of_a_simulated_wire_is_reported(steps):
-    check, said, P = WireCheck(math.inf, 0.26, 0.02), list[str](), SECOND // 50
-    for k in range(30):
-        check.sent(k * P, np.full(6, float(k)))
-        if k >= steps:
-            said.append(check.warning(k * P, np.full(6, float(k - steps))))
-    expected = "commands act 0.04 s after their measurement, and this end expects 0.26 s"
-    assert any(expected in line for line in said) == (steps == 2)
+        found.append(check.problem({n + off: torque for n, torque in acted.items()}))
+    assert found[:7] == [None] * 7 and words in found[12]
+    at_rest = DelayCheck(1.0, 0.26, 0.02, sends)
+    for number in range(50):
+        at_rest.sent(number + 13, np.zeros((rows, 6)))
+        assert at_rest.problem({number + off: np.zeros(6)}) is None
 
 
 @pytest.mark.slow

@@ -46,8 +46,7 @@ def plan_of(learned, by_hand=lambda: False):
     """Return the learned part of a plan as a function of its time."""
     scenario = sd.load_scenario("reachy_mini", settings=(STEPS,))
     made = designing.design(scenario, Message(), designing.always(learned))
-
-    part = LearnedSetpoints(made.learned, 0.02)
+    part = LearnedSetpoints(made)
     return lambda t: part.plan(t, made.rows, by_hand())
 
 

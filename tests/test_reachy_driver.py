@@ -1,7 +1,6 @@
 """The driver of Reachy Mini, against a stand-in for the robot's daemon on loopback."""
 
 import json
-import re
 import runpy
 import threading
 import time
@@ -13,7 +12,6 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.cli import main
-from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.servo_logs import read_servo_log
 from stewart_drake.law.servos import Stiffness
 from stewart_drake.live.options import MachineOptions
@@ -164,33 +162,19 @@ def test_a_daemon_that_stops_is_found_again():
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("name", "words", "expected"),
     [
-        (
-            ("--reachy", "127.0.0.1:9"),
-            r"--reachy: got 127.0.0.1:9, which sent no positions for 5 s .*",
-        ),
-        (("--ahead", "0.1"), r"--ahead: got 0\.1 s without --reachy; expected both"),
+        ("reachy_mini", ("--reachy", "127.0.0.1:9"), "got 127.0.0.1:9, which sent no positions"),
+        ("reachy_mini", ("--reachy", "nowhere"), "--reachy: got 'nowhere'; expected HOST:PORT"),
+        ("reachy_mini", ("--ahead", "0.1"), "--ahead: got 0.1 s without --reachy; expected both"),
+        ("paper", ("--reachy", "127.0.0.1:9"), "actuator.kind: got 'torque' with --reachy"),
     ],
 )
-def test_a_wrong_command_is_one_line(words, expected, capsys):
-    assert main(["machine", "reachy_mini", *words, "--port", "0"]) == 2
+def test_a_wrong_command_is_one_line(name, words, expected, capsys):
+    assert main(["machine", name, *words, "--port", "0"]) == 2
     said = capsys.readouterr().err
-    assert re.fullmatch(f"error: {expected}\n", said)
+    assert said.startswith("error: ") and said.count("\n") == 1 and expected in said
     assert "trying again" not in said  # the command has ended
-
-
-@pytest.mark.parametrize(
-    ("name", "reachy", "message"),
-    [
-        ("paper", "127.0.0.1:9", "actuator.kind: got 'torque' with --reachy"),
-        ("reachy_mini", "nowhere", "--reachy: got 'nowhere'; expected HOST:PORT"),
-    ],
-)
-def test_another_machine_or_address_is_refused(name, reachy, message):
-    options = MachineOptions(reachy=reachy, port=0)
-    with pytest.raises(ConfigError, match=message), open_chosen(sd.load_scenario(name), options):
-        pass
 
 
 class Lost:

@@ -82,8 +82,9 @@ class Poses:
 
 @contextmanager
 def machine_of(case, *settings, key=None):
-    """Run the machine of a case in a thread; yield its address and log."""
-    log, scenario = Poses(), scenario_of(case, *settings)
+    """Run the machine of a case in a thread, for a wire with a buffer; yield address and log."""
+    buffer = [BUFFERS[case]] if case in BUFFERS else []
+    log, scenario = Poses(), scenario_of(case, *buffer, *settings)
     with closing(Endpoint(ControllerMessage, "127.0.0.1", 0, key)) as endpoint:
         machine = Machine(prepare(scenario), endpoint, Settings(), lambda line: None, log=log)
         with in_a_thread(machine):
@@ -119,12 +120,12 @@ def drive(folder, port, *options):
 @in_real_time
 def test_the_controller_in_c_follows_as_live_does(case, folder_of):
     """Its mean error is within 1.5 times that of `live` and 0.05 % of the motion."""
-    buffer, errors = [BUFFERS[case]] if case in BUFFERS else [], []
-    with machine_of(case, *buffer) as (address, log):
+    errors = []
+    with machine_of(case) as (address, log):
         done = drive(folder_of(case), address[1])
         assert done.returncode == 0, done
     errors.append(error_of(case, log))
-    with machine_of(case, *buffer) as ((host, port), log):
+    with machine_of(case) as ((host, port), log):
         run = sd.run_live(scenario_of(case), f"{host}:{port}", duration=SECONDS, accept_jitter=True)
         assert run.status == "completed"
     errors.append(error_of(case, log))
@@ -214,9 +215,8 @@ def test_damaged_replayed_and_reordered_datagrams_change_nothing(case, folder_of
     """Both sides have a key. A measurement that is overtaken counts as late, or is used later."""
     key = tmp_path / "key"
     key.write_bytes(KEY)
-    buffer = [BUFFERS[case]] if case in BUFFERS else []
     with (
-        machine_of(case, *buffer, key=KEY) as (address, log),
+        machine_of(case, key=KEY) as (address, log),
         Relay(address, disturbed(random.Random(7))) as relay,
     ):
         done = drive(folder_of(case), relay.port, f"key={key}")
@@ -284,12 +284,8 @@ def odd(rng):
 @pytest.mark.parametrize("case", ["state", "encoders, network", "setpoints"])
 def test_odd_numbers_in_valid_datagrams_are_survived(case, folder_of):
     """The run ends, completed or with a reason, without a word of the sanitizers."""
-    buffer = [BUFFERS[case]] if case in BUFFERS else []
     for seed in range(3):
-        with (
-            machine_of(case, *buffer) as (address, _),
-            Relay(address, odd(random.Random(seed))) as relay,
-        ):
+        with machine_of(case) as (address, _), Relay(address, odd(random.Random(seed))) as relay:
             done = drive(folder_of(case), relay.port)
         assert done.returncode in (0, 1) and done.stderr == "", (seed, done)
         assert " samples, " in done.stdout, (seed, done)

@@ -1,6 +1,5 @@
 """Checks of a live run, and references from where the plate is."""
 
-from collections import deque
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -10,7 +9,6 @@ from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.law.nominal import NominalPlant
 from stewart_drake.law.timeline import Timeline, TorqueSchedule
 from stewart_drake.live.governor import Steering
-from stewart_drake.live.protocol import SECOND
 from stewart_drake.scenario.signals import NUM_TORQUES, POSE, RATES
 from stewart_drake.types import Array
 
@@ -22,68 +20,55 @@ REPLAN_ERROR: Final = 0.08
 """Smallest prediction error at which a new reference is planned, as a share of the motion."""
 
 
-class ReportCheck:
-    """Compares reported torques with those that were sent for their periods, up to a limit."""
+class DelayCheck:
+    """Compares the periods in which commands act with those that they were sent for.
 
-    def __init__(self, limit: float) -> None:
-        self._limit = limit
+    Args:
+        limit: of a torque at the machine, N m; reported torques keep to it.
+        eta: designed delay, s.
+        period: of the controller, s.
+        sends: whether plans are sent to a buffer; otherwise commands pass a simulated wire.
+    """
+
+    def __init__(self, limit: float, eta: float, period: float, sends: bool) -> None:
+        self._limit, self._eta, self._period, self._sends = limit, eta, period, sends
+        self._shifts = (-1, 0, 1) if sends else range(-_KEPT, _KEPT)
         self._sent: dict[int, list[Array]] = {}
-        self._off: dict[int, int] = {-1: 0, 1: 0}
+        # of the last rows: by how many periods they were late, and how many were so in a row
+        self._shift = self._rows = 0
         self._newest = -1
 
     def sent(self, first: int, rows: Array) -> None:
-        """Note torques (n, 6) for the periods from `first` on."""
+        """Note commands (n, 6) for the periods from `first` on."""
         for i, row in enumerate(np.clip(rows, -self._limit, self._limit)):
             self._sent.setdefault(first + i, []).append(row)
         for old in [n for n in self._sent if n < first - _KEPT]:
             del self._sent[old]
 
     def problem(self, acted: Mapping[int, Array]) -> str | None:
-        """Return that torques (6,), by period, were reported a period early or late, or None."""
+        """Return how commands (6,), by period, acted early or late, or None if they did not."""
         for number in sorted(n for n in acted if n > self._newest):
             self._newest = number
-            here = self._was_sent(number, acted[number])
-            for shift in self._off:
-                off = not here and self._was_sent(number + shift, acted[number])
-                self._off[shift] = self._off[shift] + 1 if off else 0
-        for shift, rows in self._off.items():
-            if rows >= _ROWS:
-                early, after = ("early", "after") if shift > 0 else ("late", "before")
-                return (
-                    f"acted_from in the machine's datagrams is one period {early}: its last {_ROWS}"
-                    f" rows of torques were sent for the period {after}"
-                )
-        return None
-
-    def _was_sent(self, number: int, torque: Array) -> bool:
-        return any(np.array_equal(row, torque) for row in self._sent.get(number, []))
-
-
-class WireCheck:
-    """Compares the time after which commands act with the design's, over a simulated wire."""
-
-    def __init__(self, limit: float, eta: float, period: float) -> None:
-        self._limit, self._eta, self._period = limit, eta, period
-        self._sent: deque[tuple[int, Array]] = deque(maxlen=_KEPT)
-        self._last = self._off = 0
-
-    def sent(self, sampled: int, row: Array) -> None:
-        """Note the command (6,) of the measurement taken at `sampled`, ns."""
-        self._sent.append((sampled, np.clip(row, -self._limit, self._limit)))
-
-    def warning(self, acted_from: int, row: Array) -> str:
-        """Return a warning for commands that act another time than designed; mostly empty."""
-        times = [sampled for sampled, sent in self._sent if np.array_equal(sent, row)]
-        if acted_from == self._last or len(times) != 1:  # known before, or ambiguous at rest
-            return ""
-        self._last, took = acted_from, (acted_from - times[0]) / SECOND
-        self._off = self._off + 1 if abs(took - self._eta) > self._period / 2 else 0
-        if self._off < _ROWS:
-            return ""
+            found = [s for s in self._shifts if self._was_sent(number - s, acted[number])]
+            shift = found[0] if len(found) == 1 else 0  # at rest several match
+            self._rows = self._rows + 1 if shift == self._shift else 1
+            self._shift = shift
+        if not self._shift or self._rows < _ROWS:
+            return None
+        if self._sends:
+            early, after = ("early", "after") if self._shift < 0 else ("late", "before")
+            return (
+                f"acted_from in the machine's datagrams is one period {early}: its last {_ROWS} "
+                f"rows of torques were sent for the period {after}"
+            )
+        took = self._eta + self._shift * self._period
         return (
             f"commands act {took:.3g} s after their measurement, and this end expects "
             f"{self._eta:.3g} s: give machine and live the same delay.steps"
         )
+
+    def _was_sent(self, number: int, command: Array) -> bool:
+        return any(np.array_equal(row, command) for row in self._sent.get(number, []))
 
 
 # ---------------------------------------------------------------- new references

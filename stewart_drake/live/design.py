@@ -80,6 +80,15 @@ class Design(NamedTuple):
         """Whether plans are sent, to a buffer."""
         return self.rows > 1 if self.cranks else isinstance(self.law.channel, Packets)
 
+    @property
+    def horizon(self) -> float:
+        """Time ahead of a sample up to which the reference is fixed, s."""
+        if self.cranks:
+            return float(self.law.preview_times.max())
+        # The next torque needs the reference up to the end of the hold after its own. Later torques
+        # may still change. Within a hold the reference has no jump of its third derivative.
+        return float(self.law.timeline.holds(0, 2)[-1])
+
     def left_alone(self, machine: MachineMessage) -> str:
         """Return in words what becomes of the plate without a controller."""
         if self.cranks:

@@ -169,8 +169,6 @@ class Governor:
 
     def problem(self, states: Array) -> str | None:
         """Return the limit that reference states (n, 18) exceed, in words, or None."""
-        if self._within(states):
-            return None
         mechanism = self.dynamics.mechanism
         found = margins(mechanism, states[:, POSE])
         if found.min() >= LEAST_MARGIN + _GUARD:
@@ -185,9 +183,7 @@ class Governor:
         return min(limits, key=lambda limit: limits[limit])
 
     def _within(self, states: Array) -> bool:
-        """Return whether reference states (n, 18) keep to all limits."""
-        found = margins(self.dynamics.mechanism, states[:, POSE])
-        return found.min() >= LEAST_MARGIN + _GUARD and self._torque_problem(states) is None
+        return self.problem(states) is None
 
     def _torque_problem(self, states: Array) -> str | None:
         limit = TORQUE_SHARE * self.torque_limit

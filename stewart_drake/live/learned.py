@@ -8,12 +8,11 @@ motion that is, with c the mean of l for torques and 0 for setpoints,
 s goes from 0 to 1 within a second on the motion, and back by hand or on the way to rest.
 """
 
-from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
 
-from stewart_drake.law.learned import LearnedMemory, LearnedSignal
+from stewart_drake.law.learned import LearnedMemory
 from stewart_drake.law.servos import rise
 from stewart_drake.live.design import Design
 from stewart_drake.live.exchange import KEPT
@@ -27,8 +26,10 @@ _SOFT_START: Final = 1.0
 class LearnedSetpoints:
     """Learned part of the setpoints of a plan, by what was learned at present."""
 
-    def __init__(self, learned: Callable[[], LearnedSignal], period: float) -> None:
-        self.learned, self._period, self._share = learned, period, 0.0
+    def __init__(self, design: Design) -> None:
+        assert design.learned is not None
+        self.learned, self._share = design.learned, 0.0
+        self._period = design.experiment.scenario.controller.period
 
     def plan(self, t: float, rows: int, by_hand: bool) -> Array:
         """Return the part for a plan from the instant t of the motion on, (rows, 6), rad."""
@@ -49,8 +50,7 @@ class LearnedTorques(LearnedSetpoints):
     """Learned torques of a run, added to those of the law."""
 
     def __init__(self, design: Design) -> None:
-        assert design.learned is not None
-        super().__init__(design.learned, design.experiment.scenario.controller.period)
+        super().__init__(design)
         self._design, self._added = design, dict[int, Array]()
         self.saturated = 0  # number of samples whose sum was beyond the limit
 

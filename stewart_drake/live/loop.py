@@ -18,7 +18,7 @@ from stewart_drake.dynamics.workspace import margins
 from stewart_drake.law.channel import Report
 from stewart_drake.law.gaps import LONGEST_GAP, stays_within_reach
 from stewart_drake.law.sensing import Measurement
-from stewart_drake.live.checks import ReportCheck, WireCheck, recovered, replanned, until_next
+from stewart_drake.live.checks import DelayCheck, recovered, replanned, until_next
 from stewart_drake.live.contact import Contact
 from stewart_drake.live.design import Design
 from stewart_drake.live.endpoint import now
@@ -104,32 +104,24 @@ class LiveLoop:
         self._law: Any = design.law
         self.memory: Any = self._law.initial_memory(design.queue)
         self._period = design.experiment.scenario.controller.period
-        self._horizon, self._size = self._ahead(), 2 * design.experiment.motion_scale
+        self._horizon, self._size = design.horizon, 2 * design.experiment.motion_scale
         self.exchange = Exchange(contact, self._period, design.law.sensing.size)
         self._watch = Watch(self.exchange, self._period, say)
         self.record = LiveRecord(design.experiment, design.torque_limit, log, say, logs)
         limit = math.inf if design.cranks else design.torque_limit
-        self._check, self.delay_warning = ReportCheck(limit), ""
-        self._wire = WireCheck(limit, design.law.timeline.eta, self._period)
-        self._estimates_delay = design.experiment.scenario.controller.delay_estimator != "none"
+        self._check = DelayCheck(limit, design.law.timeline.eta, self._period, design.sends)
+        self._knows_delay = design.experiment.scenario.controller.delay_estimator == "none"
+        self.delay_warning = ""
         self._parked = self._leads = False
         self._recording, self._hold = True, hold
         self._max_missing = max_missing
         self._measured, self._known = -1, self.memory  # last usable measurement: sample, memory
         self._late = 0  # number of overtaken measurements before it
-        self._learned: Any = None if design.learned is None else self._learned_part(design)
+        part = LearnedSetpoints if design.cranks else LearnedTorques
+        self._learned: Any = None if design.learned is None else part(design)
         self.recoveries, self.taken_over = 0, False
         self.missed, self.resting = 0, list[float]()
         self._poses = deque[Array](maxlen=1 + math.ceil(_REST_TIME / self._period))
-
-    def _ahead(self) -> float:
-        """Return how far ahead of a sample the reference is fixed, s."""
-        # The next torque needs the reference up to the end of the hold after its own. Later torques
-        # may still change. Within a hold the reference has no jump of its third derivative.
-        return float(self._design.law.timeline.holds(0, 2)[-1])
-
-    def _learned_part(self, design: Design) -> Any:
-        return LearnedTorques(design)
 
     def begin(self, flags: ControllerFlags) -> None:
         """Agree with the machine on the begin of the run; see `Exchange.begin`."""
@@ -213,11 +205,12 @@ class LiveLoop:
         measurement, report = Measurement.of(missing if values is None else values), None
         if message is not None:
             acted = self._acted(message)
-            problem = self._check.problem(acted) if design.sends else None
-            if problem is not None:
+            problem = self._check.problem(acted)
+            if problem is not None and design.sends:
                 return self._watch.end("refused", k, problem)
-            if not (design.sends or self._estimates_delay or self.delay_warning):
-                self._compare_delays(message)
+            if problem is not None and self._knows_delay and not self.delay_warning:
+                self.delay_warning = problem
+                self._say(f"warning: {problem}")
             report = self._heard(k, acted)
         if not self._leads:
             if not measurement.complete and not self._parked:  # the pose is unknown
@@ -309,20 +302,11 @@ class LiveLoop:
             rows = self._learned.packet(k, memory, rows, self._by_hand)
         return rows, k - self._design.repeats
 
-    def _compare_delays(self, message: MachineMessage) -> None:
-        if message.acted_from == NEVER or not len(message.acted):
-            return
-        when = message.acted_from - message.begin
-        self.delay_warning = self._wire.warning(when, message.acted[0])
-        if self.delay_warning:
-            self._say(f"warning: {self.delay_warning}")
-
     def _send(self, k: int, packet: Array, first: int) -> None:
         P, timeline = round(self._period * SECOND), self._design.law.timeline
         eta = round(self.memory.belief.timeline.eta * SECOND)
         self.exchange.send(k, packet, first, eta, self._design.cranks)
         self._check.sent(first + round((eta - timeline.fraction * P) / P), packet)
-        self._wire.sent(k * P, packet[0])
 
     def _as_sent(self, k: int) -> Any:
         """Return the memory for the record, with the torque as it was sent."""
@@ -449,13 +433,6 @@ class CrankLoop(LiveLoop):
     _led_from = START_ERROR  # servos would jump
     _last: Array | None = None
     """Setpoint (6,) that was sent last, rad."""
-
-    def _ahead(self) -> float:
-        return float(self._design.law.preview_times.max())
-
-    def _learned_part(self, design: Design) -> Any:
-        assert design.learned is not None
-        return LearnedSetpoints(design.learned, self._period)
 
     def _heard(self, k: int, acted: dict[int, Array]) -> None:
         self.record.latest = self.memory.command[MODEL_TORQUE]  # the servos' own is not known

@@ -350,21 +350,17 @@ class Machine:
         self._motors.safe(time, self._settings.safe == "hold", keeps)
         self._safe = True
 
-    def _refuse(self, refusal: Refusal | None, detail: str = "") -> bool:
-        if refusal is not None:
-            self._endpoint.refuse(refusal, detail)
-        return refusal is not None
-
     def _arrive(self, message: ControllerMessage, address: Address, time: int) -> None:
         head, driving = message.head, self.session
         if message.identity is not None:
             self._greet(message, address, time)
             return
         if driving is not None and (head.session, head.nonce) == (driving.number, driving.nonce):
-            if self._refuse(driving.refusal(head, address, time)):
+            if refusal := driving.refusal(head, address, time):
+                self._endpoint.refuse(refusal)
                 return
         elif self._alive(time) or head.nonce != self.offers.nonce(head.session, address):
-            self._refuse(Refusal.FOREIGN)
+            self._endpoint.refuse(Refusal.FOREIGN)
             return
         else:
             self._adopt(Session.confirmed(head, address, time), time)
@@ -376,10 +372,10 @@ class Machine:
         head, nonce = request.head, self.offers.nonce(request.head.session, address)
         assert request.identity is not None
         if self.session is not None and head.session == self.session.number:
-            self._refuse(Refusal.LATE)  # overtaken or replayed
+            self._endpoint.refuse(Refusal.LATE)  # overtaken or replayed
             return
         if head.nonce != nonce and not self.offers.may_answer(self._clock()):
-            self._refuse(Refusal.RATE)
+            self._endpoint.refuse(Refusal.RATE)
             return
         differs = self.identity.differing(request.identity)
         if differs is not None:
@@ -424,7 +420,7 @@ class Machine:
             self._report_safe(time, Fault.STOP.text)
             return
         if max(message.begin % NEVER, message.playout) > time + FURTHEST:
-            self._refuse(Refusal.MALFORMED)
+            self._endpoint.refuse(Refusal.MALFORMED)
             return
         if message.begin != NEVER and self.begin == NEVER:
             real = MachineFlags.SIMULATION not in self._flags()
@@ -437,24 +433,27 @@ class Machine:
             if not self._running:
                 self._at(self.begin, 0, self._begin)
         if len(message.torques) and message.cranks != self._motors.cranks:
-            self._refuse(Refusal.MALFORMED, "torques for servos, or crank angles for motors")
+            self._endpoint.refuse(
+                Refusal.MALFORMED, "torques for servos, or crank angles for motors"
+            )
         elif self.failure is None and self.begin != NEVER and len(message.torques):
-            self._refuse(*self._take(message, time))
+            self._take(message, time)
 
-    def _take(self, message: ControllerMessage, time: int) -> tuple[Refusal | None, str]:
-        """Take the rows of a message; return why they are refused, or None.
+    def _take(self, message: ControllerMessage, time: int) -> None:
+        """Take the rows of a message, or refuse them.
 
         The first rows of a session that are taken set the phase of the changes of the torque.
         """
         phase = message.playout % self.period
         if not self._motors.is_wire and self._phase not in (None, phase):
-            return Refusal.MALFORMED, "a playout off the grid of the rows before it"
+            self._endpoint.refuse(Refusal.MALFORMED, "a playout off the grid of the rows before it")
+            return
         sample = max(0, round((message.sampled - self.begin) / self.period))
         numbers = message.sampled, sample, message.playout, message.torques
-        refusal = self._motors.take(Plan(message.head.sequence, *numbers), time, self.begin)
-        if refusal is None:
+        if refusal := self._motors.take(Plan(message.head.sequence, *numbers), time, self.begin):
+            self._endpoint.refuse(refusal)
+        else:
             self._phase = phase
-        return refusal, ""
 
     # -------------------------------------------------------------- messages
 

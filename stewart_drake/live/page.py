@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final
 
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, ValidationError
@@ -27,7 +27,6 @@ from stewart_drake.reporting.page import environment
 from stewart_drake.reporting.style import FACTORS
 from stewart_drake.reporting.viewer import slider_range
 from stewart_drake.scenario.signals import COORDINATE_NAMES, POSE, RATES
-from stewart_drake.types import Array
 
 _FRAME: Final = 1 / 30
 """Time between two frames, s."""
@@ -39,11 +38,6 @@ _START: Final = 60.0
 """Longest wait for the page, s."""
 _AHEAD: Final = 0.2
 """Longest extrapolation of the pose between two samples, s."""
-
-
-class PageRequest(NamedTuple):
-    target: Array | None
-    stop: bool
 
 
 class PageViewer(Viewer):
@@ -93,11 +87,11 @@ class PageViewer(Viewer):
         with self._until_closed():
             while self._open and self._connection.poll():
                 received = self._connection.recv()
-                if isinstance(received, PageRequest):
-                    self._request = Request(received.target)
-                    self._stop = self._stop or received.stop
-                else:
+                if received is None:
                     self._ready = True
+                else:
+                    target, stop = received
+                    self._request, self._stop = Request(target), self._stop or stop
 
     @contextmanager
     def _until_closed(self) -> Iterator[None]:
@@ -109,6 +103,13 @@ class PageViewer(Viewer):
 
 
 # ---------------------------------------------------------------- the page's process
+
+
+class PageRequest(BaseModel):
+    """Request of a browser: `target`, six numbers in degrees and mm or null, and `stop`."""
+
+    target: Annotated[list[FiniteFloat], Field(min_length=6, max_length=6)] | None = None
+    stop: bool = False
 
 
 class Readouts:
@@ -124,16 +125,14 @@ class Readouts:
             self._number += 1
             self._changed.notify_all()
 
-    def after(self, number: int) -> tuple[str, int]:
-        """Wait up to 5 s for readouts other than `number`; return them and their number."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._number != number, timeout=5.0)
-            return self._text, self._number
-
     def events(self) -> Iterator[str]:
-        number = -1
+        """Yield the readouts whenever they change, at least every 5 s."""
+        seen = -1
         while True:
-            text, number = self.after(number)
+            with self._changed:
+                if self._number == seen:
+                    self._changed.wait(5.0)
+                text, seen = self._text, self._number
             yield text
 
 
@@ -148,14 +147,13 @@ def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
     lock, (low, high) = threading.Lock(), slider_range(mechanism)
 
     def ask(_: str, data: bytes) -> str | None:
-        request = read_request(data)
-        if request is None:
+        try:
+            asked = PageRequest.model_validate_json(data, strict=True)
+        except ValidationError:
             return None
-        if request.target is not None:
-            target = np.clip(request.target, low / FACTORS, high / FACTORS)
-            request = request._replace(target=target)
+        target = None if asked.target is None else np.clip(asked.target, low, high) / FACTORS
         with lock, suppress(OSError):
-            connection.send(request)
+            connection.send((target, asked.stop))
         return "{}"
 
     sliders = [
@@ -225,20 +223,3 @@ def _values(seen: Snapshot) -> dict[str, Any]:
         "resting": seen.resting,
         "limit": seen.limit,
     }
-
-
-class _Asked(BaseModel):
-    """Request of a browser: `target`, six numbers in degrees and mm or null, and `stop`."""
-
-    target: Annotated[list[FiniteFloat], Field(min_length=6, max_length=6)] | None = None
-    stop: bool = False
-
-
-def read_request(data: bytes) -> PageRequest | None:
-    """Return a browser's request, `_Asked` as JSON, or None for anything else."""
-    try:
-        asked = _Asked.model_validate_json(data, strict=True)
-    except ValidationError:
-        return None
-    target = None if asked.target is None else np.array(asked.target) / FACTORS
-    return PageRequest(target, asked.stop)

@@ -280,22 +280,24 @@ def decode(data: bytes, key: bytes | None = None) -> Message:
     Raises:
         RefusedError: malformed, version or key.
     """
-    if not _HEAD.size <= len(data) <= LONGEST:
-        raise RefusedError(Refusal.MALFORMED, f"{len(data)} bytes")
+    _demand(_HEAD.size <= len(data) <= LONGEST, f"{len(data)} bytes")
     magic, version, tag, length, *numbers, flags = _HEAD.unpack_from(data)
-    if magic not in (MAGIC_MACHINE, MAGIC_CONTROLLER):
-        raise RefusedError(Refusal.MALFORMED, f"magic {magic!r}")
+    _demand(magic in (MAGIC_MACHINE, MAGIC_CONTROLLER), f"magic {magic!r}")
     if version != VERSION:
         raise RefusedError(Refusal.VERSION, str(version))
-    if length != len(data) or tag not in (0, TAG) or length < _HEAD.size + tag:
-        raise RefusedError(Refusal.MALFORMED, f"{len(data)} bytes that say {length}, tag {tag}")
+    fits = length == len(data) and tag in (0, TAG) and length >= _HEAD.size + tag
+    _demand(fits, f"{len(data)} bytes that say {length}, tag {tag}")
     _authenticate(data, tag, key)
     head, body = Head(*numbers), data[_HEAD.size : length - tag]
-    if head.session == 0 or head.sequence == 0:
-        raise RefusedError(Refusal.MALFORMED, "a session or a sequence of 0")
+    _demand(head.session > 0 and head.sequence > 0, "a session or a sequence of 0")
     if magic == MAGIC_MACHINE:
         return _machine(head, flags, body)
     return _controller(head, flags, body)
+
+
+def _demand(holds: bool | None, problem: str) -> None:
+    if not holds:
+        raise RefusedError(Refusal.MALFORMED, problem)
 
 
 def _authenticate(data: bytes, tag: int, key: bytes | None) -> None:
@@ -306,8 +308,7 @@ def _authenticate(data: bytes, tag: int, key: bytes | None) -> None:
 
 
 def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
-    if len(body) < _MACHINE.size:
-        raise RefusedError(Refusal.MALFORMED, "a short body")
+    _demand(len(body) >= _MACHINE.size, "a short body")
     n = dict(zip(_MACHINE_NUMBERS, _MACHINE.unpack_from(body), strict=True))
     kind, samples, bits, history = (n[name] for name in _MACHINE_NUMBERS[:4])
     fits = {
@@ -321,10 +322,10 @@ def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
     plausible = 0 < n["rate"] < math.inf and n["torque_limit"] > 0 and n["period"] > 0
     plausible = plausible and n["content"] in (0, _CRANKS) and n["leg"] <= NUM_LEGS
     plausible = plausible and max(n["fault"], n["before"]) < len(Fault) and flags < 1024
-    if not (fits.get(kind) and history <= MOST_HISTORY and plausible):
-        raise RefusedError(Refusal.MALFORMED, "a number outside its range")
-    if len(body) != _MACHINE.size + sizes[kind] + 8 * NUM_TORQUES * history:
-        raise RefusedError(Refusal.MALFORMED, "a body of another length")
+    plausible = plausible and history <= MOST_HISTORY
+    _demand(fits.get(kind) and plausible, "a number outside its range")
+    length = _MACHINE.size + sizes[kind] + 8 * NUM_TORQUES * history
+    _demand(len(body) == length, "a body of another length")
     measured = body[_MACHINE.size :]
     acted = _rows(body[_MACHINE.size + sizes[kind] :])
     state = codes = zeros = None
@@ -335,8 +336,8 @@ def _machine(head: Head, flags: int, body: bytes) -> MachineMessage:
         read = np.frombuffer(measured, "<i4", NUM_LEGS * samples, 8 * NUM_LEGS)
         codes = read.astype(np.int32).reshape(samples, NUM_LEGS)
     identity = _identity(measured) if kind == _OFFERS else None
-    if not np.all(np.isfinite(acted)) or (zeros is not None and not np.all(np.isfinite(zeros))):
-        raise RefusedError(Refusal.MALFORMED, "a torque or an angle that is not finite")
+    finite = np.all(np.isfinite(acted)) and (zeros is None or np.all(np.isfinite(zeros)))
+    _demand(bool(finite), "a torque or an angle that is not finite")
     own = {name: n[name] for name in n.keys() & MachineMessage.__annotations__.keys()}
     own |= {"head": head, "flags": MachineFlags(flags), "acted": acted, "state": state}
     own |= {"codes": codes, "zeros": zeros, "identity": identity, "cranks": n["content"] == _CRANKS}
@@ -349,31 +350,25 @@ def _identity(data: bytes) -> Identity:
     parts = []
     for digest, padded in _PART.iter_unpack(data[:_IDENTITY]):
         name = padded.rstrip(b"\0")
-        if any(not 0x20 <= letter <= 0x7E for letter in name):
-            raise RefusedError(Refusal.MALFORMED, "a name that cannot be printed")
+        _demand(all(0x20 <= letter <= 0x7E for letter in name), "a name that cannot be printed")
         parts.append(Part(digest, name.decode("ascii")))
     return Identity(*parts)
 
 
 def _controller(head: Head, flags: int, body: bytes) -> ControllerMessage:
-    if len(body) < _CONTROLLER.size:
-        raise RefusedError(Refusal.MALFORMED, "a short body")
+    _demand(len(body) >= _CONTROLLER.size, "a short body")
     rows, content, sampled, playout, begin = _CONTROLLER.unpack_from(body)
     asks, told = content == _REQUEST, body[_CONTROLLER.size :]
-    if rows > MOST_ROWS or content > _CRANKS or (asks and rows) or flags > 3 or any(body[2:4]):
-        raise RefusedError(Refusal.MALFORMED, "a number outside its range")
+    plausible = rows <= MOST_ROWS and content <= _CRANKS and flags <= 3 and not any(body[2:4])
+    _demand(plausible and not (asks and rows), "a number outside its range")
     if asks:
-        if told[_IDENTITY:] != _PADDING:
-            raise RefusedError(Refusal.MALFORMED, "a request of another length")
+        _demand(told[_IDENTITY:] == _PADDING, "a request of another length")
         torques, identity = _rows(b""), _identity(told)
-    elif len(told) != 8 * NUM_TORQUES * rows:
-        raise RefusedError(Refusal.MALFORMED, "a body of another length")
     else:
+        _demand(len(told) == 8 * NUM_TORQUES * rows, "a body of another length")
         torques, identity = _rows(told), None
-    if not np.all(np.isfinite(torques)):
-        raise RefusedError(Refusal.MALFORMED, "a torque that is not finite")
-    if rows and begin == NEVER:
-        raise RefusedError(Refusal.MALFORMED, "torques for no run")
+    _demand(bool(np.all(np.isfinite(torques))), "a torque that is not finite")
+    _demand(rows == 0 or begin != NEVER, "torques for no run")
     times, cranks = (sampled, playout, begin), content == _CRANKS
     return ControllerMessage(head, ControllerFlags(flags), *times, torques, identity, cranks)
 

@@ -97,10 +97,14 @@ class Motors:
     ) -> None:
         self.holds, self.is_wire, self._delay_of = holds or cranks, delay_of is not None, delay_of
         self.cranks = cranks
-        limit, holds = (math.inf, True) if cranks else (limit, holds)
-        given, history = (NUM_TORQUES, MOST_WAITING, period), MOST_HISTORY
         self._link = Link(
-            *given, is_wire=self.is_wire, hold_when_dry=holds, history=history, limit=limit
+            NUM_TORQUES,
+            MOST_WAITING,
+            period,
+            is_wire=self.is_wire,
+            hold_when_dry=self.holds,
+            history=MOST_HISTORY,
+            limit=math.inf if cranks else limit,
         )
         self._memory, self._begun = self._link.start(), False
 
