@@ -17,7 +17,7 @@ input does not change. Its transposed counterpart is a motion that no output sho
 
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,32 +81,21 @@ class Mode:
 
 @dataclass(frozen=True)
 class Hautus:
-    tolerance: ClassVar[float] = TOLERANCE  # margin below which a mode fails
     modes: tuple[Mode, ...]  # every distinct eigenvalue, least margin first
 
     @property
-    def complete(self) -> bool:
-        """Whether the pair is controllable; for the dual, observable."""
-        return not self.deficient
-
-    @property
-    def harmless(self) -> bool:
-        """Whether the pair is stabilisable; for the dual, detectable."""
-        return all(mode.decays for mode in self.deficient)
-
-    @property
     def margin(self) -> float:
-        """Least margin of all modes."""
+        """Least margin of all modes; below TOLERANCE the pair is not controllable."""
         return min((mode.margin for mode in self.modes), default=np.inf)
 
     @property
     def lasting_margin(self) -> float:
-        """Least margin of the modes that do not decay; infinite without any."""
+        """The same of the modes that do not decay, for stabilisability; infinite without any."""
         return min((mode.margin for mode in self.modes if not mode.decays), default=np.inf)
 
     @property
     def deficient(self) -> tuple[Mode, ...]:
-        return tuple(mode for mode in self.modes if mode.margin < self.tolerance)
+        return tuple(mode for mode in self.modes if mode.margin < TOLERANCE)
 
 
 def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool) -> Hautus:
@@ -117,12 +106,6 @@ def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool) -> Hautus:
     first, see `scaled`.
     """
     A, B = np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64)
-    if A.ndim != 2 or A.shape[0] != A.shape[1] or A.size == 0:
-        raise ValueError(f"A: got shape {A.shape}; expected a square matrix")
-    if B.ndim != 2 or B.shape[0] != A.shape[0]:
-        raise ValueError(f"B: got shape {B.shape}; expected ({A.shape[0]}, m)")
-    if not (np.all(np.isfinite(A)) and np.all(np.isfinite(B))):
-        raise ValueError("A, B: have entries that are not finite")
     eigenvalues = np.linalg.eigvals(A).astype(np.complex128)
     radius = float(np.abs(eigenvalues).max()) or 1.0
     size = float(np.linalg.norm(np.hstack([A, B]), 2)) or 1.0
