@@ -238,11 +238,11 @@ def sections(mechanism: Mechanism, points: int = POINTS) -> list[Section]:
     return [_section(mechanism, pair, spans, points) for pair in SECTIONS if spans]
 
 
-def pose_in_section(mechanism: Mechanism, pair: tuple[int, int], a: float, b: float) -> Array:
-    """Return the home pose with two other coordinates."""
-    pose = mechanism.home.copy()
-    pose[list(pair)] = a, b
-    return pose
+def poses_in_section(mechanism: Mechanism, pair: tuple[int, int], x: Array, y: Array) -> Array:
+    """Return poses (len(y), len(x), 6) as at home but for the pair of coordinates."""
+    poses = np.tile(mechanism.home, (len(y), len(x), 1))
+    poses[..., list(pair)] = np.stack(np.meshgrid(x, y), axis=-1)
+    return poses
 
 
 def _section(
@@ -256,8 +256,7 @@ def _section(
     # Twice: over a window that is surely too large, then over the part that the workspace fills.
     for number in (_ROUGH, points):
         x, y = np.linspace(*x_range, number), np.linspace(*y_range, number)
-        poses = np.tile(mechanism.home, (number, number, 1))
-        poses[..., list(pair)] = np.stack(np.meshgrid(x, y), axis=-1)
+        poses = poses_in_section(mechanism, pair, x, y)
         inside = margins(mechanism, poses.reshape(-1, NUM_COORDINATES)).reshape(number, number)
         connected = _connected(inside > 0, np.hypot(*np.meshgrid(x - home[0], y - home[1])))
         x_range, y_range = _window(x, connected), _window(y, connected.T)
