@@ -77,10 +77,6 @@ def live(
     loaded, name = chosen.load(), chosen.title
     span = math.inf if options.duration is None else options.duration
     if options.learn:
-        if options.hold or {options.duration, options.log, options.mirror} != {None}:
-            raise ConfigError(
-                "--learn: expected none of --duration, --log, --mirror and --hold with it"
-            )
         typed = {"machine": machine, "demo": demo, **given.words}
         shown = {name: value for name, value in typed.items() if value}
         line = chosen.line("live", **shown, out=delivery.out)
