@@ -45,7 +45,6 @@ _REFUSED: Final = {
     "rate": "above the rate of requests",
 }
 """Words for the causes of `live.protocol.Refusal`."""
-_REQUESTS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
 @command(LiveOptions)
@@ -293,7 +292,7 @@ def _ending() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         asked = True
 
-    with _handled(ask, *_REQUESTS):
+    with _handled(ask, signal.SIGINT, signal.SIGTERM):
         yield lambda: asked
 
 
