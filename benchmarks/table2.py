@@ -99,7 +99,7 @@ def longer_cranks() -> str:
             e = prepare(sd.load_scenario("table2", settings=settings))
             room = largest_factor(e.mechanism, e.reference, check_instants(e.scenario.duration))
             runs = in_parallel(run, [(row, *settings) for row in names])
-            rows.append([f"{length:g}", f"{room.value:.2f}", *map(outcome, runs)])
+            rows.append([f"{length:g}", f"{room:.2f}", *map(outcome, runs)])
     heads = ("crank, m", "room, of (46)", *names)
     return section("(46) at full size, longer cranks", table(heads, rows))
 

@@ -5,7 +5,8 @@ Bad input raises a ConfigError of one line.
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -19,7 +20,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import make_folder, write_asked, write_whole
 from stewart_drake.files.yamlio import validate, yaml_text
 from stewart_drake.identification import identify as identification
-from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
+from stewart_drake.identification.logs import POSE, Precision, angle_std, read_log
 from stewart_drake.identification.plan import MOTION, Plan, motion_csv, plan
 from stewart_drake.identification.servo_fit import ServoIdentification, identify_servos
 from stewart_drake.identification.servo_logs import is_servo_log, read_servo_log
@@ -32,7 +33,6 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.sdformat import to_sdformat
 from stewart_drake.reporting import servo_identification
 from stewart_drake.reporting.csv_file import read_signals, signals_csv
-from stewart_drake.reporting.document import Document
 from stewart_drake.reporting.identification import document, plan_document
 from stewart_drake.reporting.page import Provenance
 from stewart_drake.reporting.results import (
@@ -167,10 +167,9 @@ def plan_identification(
     sensor = loaded.sensor
     if precision is None and sensor.kind == "encoders" and sensor.bits is not None:
         precision = Precision(angle=angle_std(sensor.bits))
-    all_std = (precision or Precision()).std
-    std = np.full_like(all_std, np.inf)  # not measured
-    for part in (ANGLES, POSE) if poses else (ANGLES,):
-        std[part] = all_std[part]
+    std = (precision or Precision()).std
+    if not poses:
+        std[POSE] = np.inf  # not measured
     make_plan = partial(plan, prepare(loaded), std, tolerances)
     return analysis_result(make_plan, plan_document, typed, _write_plan)
 
@@ -198,26 +197,22 @@ def _write_machine(found: identification.Identification, folder: Path) -> list[s
     save_calibration(folder / CALIBRATION, calibration)
     files = {"mechanism": MECHANISM, "controller": {"calibration": CALIBRATION}}
     like = {"plant": found.plant} | ({"sensor": found.sensor} if found.sensor else {})
-    fields = files | like if found.right else None
-    return [MECHANISM, CALIBRATION, *_write_overlay(folder / FOUND, fields)]
+    overlay = yaml_text(files | like) if found.right else None
+    return [MECHANISM, CALIBRATION, *_write_texts(folder, {FOUND: overlay})]
 
 
 def _write_servos(found: ServoIdentification, folder: Path) -> list[str]:
-    return _write_overlay(folder / SERVOS, found.overlay if found.right else None)
+    return _write_texts(folder, {SERVOS: yaml_text(found.overlay) if found.right else None})
 
 
-def _write_overlay(path: Path, fields: dict[str, Any] | None) -> list[str]:
-    """Write an overlay, or for None remove that of an earlier log; return the names written."""
-    if fields is None:
-        path.unlink(missing_ok=True)
-        return []
-    return _write_texts(path.parent, {path.name: yaml_text(fields)})
-
-
-def _write_texts(folder: Path, texts: dict[str, str]) -> list[str]:
+def _write_texts(folder: Path, texts: Mapping[str, str | None]) -> list[str]:
+    """Write files, or for None remove that of an earlier log; return the names written."""
     for name, text in texts.items():
-        write_whole(folder / name, text)
-    return list(texts)
+        if text is None:
+            (folder / name).unlink(missing_ok=True)
+        else:
+            write_whole(folder / name, text)
+    return [name for name, text in texts.items() if text is not None]
 
 
 def export_csv(signals: str | Path, out: str | Path | None = None) -> str:
@@ -386,8 +381,6 @@ def run_live(
 
     options.check_learned()
     if options.learn:
-        without_learning = options.model_dump(include={"duration", "log", "mirror"})
-        refuse(without_learning, "with --learn; expected none")
         learnt = learn_live(as_scenario(scenario), machine, options, print).run
         return SimulationResult.of(learnt)
     ready = prepare_session(as_scenario(scenario), address_of(machine), read_key(options.key))
@@ -440,9 +433,10 @@ def make_tuner_data(
 
     family, started = options.conditions(scenario, controller, settings), time.perf_counter()
     data = make_data(family, directory, progress=progress, **options.jobs)
-    command = f"sd.make_tuner_data({str(directory)!r}, {scenario!r})"
-    summary = summarize(data)
-    return _timed(data, summary, partial(data_document, data, summary), command, started)
+    seconds = time.perf_counter() - started
+    made = Provenance(f"sd.make_tuner_data({str(directory)!r}, {scenario!r})", seconds=seconds)
+    summary = summarize(data) | {"wall_s": seconds}
+    return AnalysisResult(data, summary, data_document(data, summary), made)
 
 
 @takes(TrainingOptions)
@@ -511,21 +505,9 @@ def evaluate_tuner(
     from stewart_drake.reporting.tuner import evaluation_document
     from stewart_drake.tuning.evaluation import evaluate
 
-    family, started = options.conditions(scenario, controller, settings), time.perf_counter()
+    family = options.conditions(scenario, controller, settings)
     networks = [networks] if isinstance(networks, str | Path) else networks
-    found = evaluate(family, networks, directory, progress=progress, **options.jobs)
     command = command or f"sd.evaluate_tuner({str(directory)!r}, {list(networks)!r})"
-    return _timed(found, found.summary, partial(evaluation_document, found), command, started)
-
-
-def _timed(
-    study: Any,
-    summary: dict[str, Any],
-    make_page: Callable[[], Document],
-    command: str,
-    started: float,
-) -> AnalysisResult:
-    """Return the result of a study with its duration; `started` is of `time.perf_counter`."""
-    seconds = time.perf_counter() - started
-    made = Provenance(command, seconds=seconds)
-    return AnalysisResult(study, summary | {"wall_s": seconds}, make_page(), made)
+    run = partial(evaluate, family, networks, directory, progress=progress, **options.jobs)
+    found = analysis_result(run, evaluation_document, command)
+    return replace(found, summary=found.summary | {"wall_s": found.made.seconds})

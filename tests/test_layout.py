@@ -32,7 +32,7 @@ from stewart_drake.studies.layout_space import (
     Requirements,
     geometry,
     motion_of,
-    own_values,
+    own_numbers,
     peak_torque,
     requirements,
     space_around,
@@ -47,8 +47,13 @@ from tests.screen import said, summary_in
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
 SPEC = mechanism_spec("paper")
-OWN = Arrangement((5, 0, 1, 2, 3, 4), (-1, 1) * 3, 60.0)
+OWN = Arrangement((5, 0, 1, 2, 3, 4), (-1, 1) * 3)
 QUICK = ("plant.kind=exact", "duration=1.5")
+
+
+def numbers(**other):
+    """Return `PARAMETERS` of the paper's machine with other numbers."""
+    return np.array(list((own_numbers(SPEC) | other).values()))
 
 
 def problem(**options):
@@ -116,11 +121,11 @@ def test_requirements_say_which_limits_are_missed_and_by_which_share():
 
 def test_the_machine_it_begins_from_is_in_the_space():
     space = space_around(SPEC, {}, ())
-    machine = build_mechanism(space.machine(own_values(SPEC), OWN, "paper"))
+    machine = build_mechanism(space.machine(numbers(), OWN, "paper"))
     assert machine == PAPER
-    assert space.arrangements()[0] == OWN
+    assert space.arrangements()[0] == OWN and OWN.centre_deg == 60
     low, high = np.array(space.ranges(OWN)).T
-    assert np.all((low <= own_values(SPEC)) & (own_values(SPEC) <= high))
+    assert np.all((low <= numbers()) & (numbers() <= high))
 
 
 @given(order=st.sampled_from([(5, 0, 1, 2, 3, 4), (0, 1, 2, 3, 4, 5)]), signs=st.booleans())
@@ -131,9 +136,7 @@ def test_at_the_centre_the_legs_of_a_pair_are_mirror_images(order, signs):
     arrangement = next(
         one for one in space.arrangements() if (one.order, one.branches) == (order, branches)
     )
-    values = own_values(SPEC)
-    values[PARAMETERS.index("rotation_deg")] = 0.0
-    values[PARAMETERS.index("plate_offset_deg")] = arrangement.centre_deg
+    values = numbers(rotation_deg=0.0, plate_offset_deg=arrangement.centre_deg)
     legs = space.legs(values, arrangement)
     np.testing.assert_allclose(legs.p_WS[0] * [1, -1, 1], legs.p_WS[1], atol=1e-12)
     np.testing.assert_allclose(legs.p_PQ[0] * [1, -1, 1], legs.p_PQ[1], atol=1e-12)
@@ -143,9 +146,8 @@ def test_links_of_the_same_section_keep_a_uniform_bar_s_inertia():
     """The moment of a thin bar, m l^2 / 12, grows with the cube of its length."""
     moments = bar_inertia(0.08, 0.404).tolist()
     spec = dataclasses.replace(SPEC, rod=dataclasses.replace(SPEC.rod, inertia=moments))
-    values = own_values(spec)
-    values[PARAMETERS.index("rod")] *= 1.3
-    values[PARAMETERS.index("plate_radius")] *= 1.2
+    own = own_numbers(spec)
+    values = numbers(rod=1.3 * own["rod"], plate_radius=1.2 * own["plate_radius"])
     made = space_around(spec, {}, ()).machine(values, OWN, "longer")
     assert made.rod.inertia is not None and made.plate.inertia is not None
     assert made.rod.mass == pytest.approx(1.3 * 0.08)
@@ -182,7 +184,7 @@ def test_a_search_keeps_limits_and_betters_the_goal(monkeypatch):
     monkeypatch.setattr("stewart_drake.studies.layout.POPULATION", 3)
     asked = problem(limits={"reach": 0.005, "clearance": -1.0}, vary={"crank": (0.1, 0.12)})
     found = json.loads(search(asked, OWN, 3, 0, 4))
-    values, own = np.array(found["values"]), asked.trial(own_values(SPEC), OWN)
+    values, own = np.array(found["values"]), asked.trial(numbers(), OWN)
     assert found["missed"] == {} and not asked.requirements.missed(own)
     # The machine itself is among the first, so that nothing worse is found, but for rounding.
     assert found["measures"]["condition"] < 1.001 * own["condition"]
@@ -195,17 +197,13 @@ def test_a_search_keeps_limits_and_betters_the_goal(monkeypatch):
 
 def test_reach_counts_before_limits_and_limits_before_the_goal():
     asked = problem(goal="torque", limits={"reach": 0.005, "clearance": -1.0})
-    own = own_values(SPEC)
-    short, shorter = own.copy(), own.copy()
-    short[PARAMETERS.index("rod")], shorter[PARAMETERS.index("rod")] = 0.33, 0.3
+    own, short, shorter = numbers(), numbers(rod=0.33), numbers(rod=0.3)
     costs = [asked.cost(asked.trial(values, OWN)) for values in (own, short, shorter)]
     tight = problem(goal="torque", limits={"reach": 0.1, "clearance": -1.0})
     missed = tight.trial(own, OWN)
     assert costs[0] == pytest.approx(asked.trial(own, OWN)["torque"]) and "torque" not in missed
     assert costs[0] < tight.cost(missed) < costs[1] < costs[2]
-    crank_as_long = own.copy()
-    crank_as_long[PARAMETERS.index("crank")] = 0.41
-    assert asked.cost(asked.trial(crank_as_long, OWN)) > tight.cost(missed)
+    assert asked.cost(asked.trial(numbers(crank=0.41), OWN)) > tight.cost(missed)  # as the rod
 
 
 def test_a_judgement_is_of_all_instants_and_a_run_unless_out_of_reach():
@@ -224,7 +222,7 @@ def test_a_judgement_is_of_all_instants_and_a_run_unless_out_of_reach():
 
 
 def test_a_layout_that_loses_its_goal_between_the_instants_looked_at_is_reported():
-    own = own_values(SPEC)
+    own = numbers()
     lost = Layout("layout_1", PAPER, OWN.order, own, {"reach": -0.01}, {"reach": 1.02}, None,
                   Outcome("refused", "out of reach", time=0.0))  # fmt: skip
     found = Found(list(OWN.order), list(OWN.branches), own.tolist(), {"condition": 3.0}, {}, 7)
@@ -242,15 +240,13 @@ def test_errata_another_layout_is_conditioned_better():
     """Published lengths and separations, and the search of docs/errata.md."""
     limits = {"reach": 0.005, "clearance": -1.0}
     asked = problem_of(load_scenario("paper"), LayoutOptions(limits=limits))
-    other = own_values(SPEC)
-    for name, value in (
-        ("rotation_deg", 9.7451),
-        ("plate_offset_deg", 68.9924),
-        ("shaft_height", 0.0229),
-        ("installation_deg", 68.2484),
-    ):
-        other[PARAMETERS.index(name)] = value
-    ours, theirs = asked.trial(own_values(SPEC), OWN), asked.trial(other, OWN)
+    other = numbers(
+        rotation_deg=9.7451,
+        plate_offset_deg=68.9924,
+        shaft_height=0.0229,
+        installation_deg=68.2484,
+    )
+    ours, theirs = asked.trial(numbers(), OWN), asked.trial(other, OWN)
     assert not asked.requirements.missed(theirs)
     assert ours["condition"] == pytest.approx(5.07, abs=0.01)
     assert theirs["condition"] == pytest.approx(3.73, abs=0.01)

@@ -85,8 +85,8 @@ def test_a_file_gives_the_same_as_the_signal(tmp_path, name, settings):
         (["paper", "--set", "link.kind=network"], "link.kind: got 'network' for learning"),
         (["reachy_mini", "--set", "reference.kind=hold"], "only a motion that repeats is learned"),
         (["reachy_mini", "--learned", "no/such/l.npz"], "--learned: got no/such/l.npz; expected"),
-        (["reachy_mini", "--duration", "5"], "--learn: expected none of --duration, --log"),
-        (["reachy_mini", "--hold"], "--mirror and --hold with it"),
+        (["reachy_mini", "--duration", "5"], "--duration: got 5.0 with --learn; expected none"),
+        (["reachy_mini", "--hold"], "--hold: got True with --learn; expected none"),
         (["reachy_mini", "--set", "controller.learned=x.npz"], "expected null, where learning"),
     ],
 )

@@ -147,9 +147,6 @@ def test_small_samples_leave_quantiles_open():
     found = statistics.quantile_interval([1.0, 2.0, 3.0], 0.9)
     assert (found.value, found.high) == (3.0, np.inf)
     assert statistics.quantile_interval([1.0, np.inf], 0.99).value == np.inf
-    for bad in ([], [1.0, np.nan]):
-        with pytest.raises(ValueError, match="expected"):
-            statistics.quantile_interval(bad, 0.5)
 
 
 def test_holm_by_hand():
@@ -516,24 +513,26 @@ def test_scales_of_the_paper():
 # ---------------------------------------------------------------- what is told of it
 
 
+LOST = Outcome("left_workspace", "leg 3 reached the end of its reach", 3, 2.0, peak_torque=1.0)
+
+
+def completed(error):
+    return Outcome("completed", error=error, peak_torque=1.0)
+
+
 @functools.cache
 def made_up(n=400, limit=None):
     """E_ac grows with the noise, the delay and nothing else; late delays fail."""
     scenario = short()
     draws = [draw(Ranges(), SCALES, scenario, 1, i) for i in range(n)]
-    outcomes = []
-    for one in draws:
-        error = math.exp(5e3 * one["noise"] + 3e3 * abs(one["delay"]))
-        failed = one["delay"] > 8e-4
-        outcomes.append(
-            Outcome("left_workspace", "leg 3 reached the end of its reach", 3, 2.0, math.nan, 1.0)
-            if failed
-            else Outcome("completed", "", None, math.nan, error, 1.0)
-        )
-    undisturbed = Outcome("completed", "", None, math.nan, 1.0, 1.0)
-    return RobustnessStudy(
-        prepare(scenario), Ranges(), SCALES, 0, limit, undisturbed, draws, outcomes
-    )
+    outcomes = [
+        LOST
+        if one["delay"] > 8e-4
+        else completed(math.exp(5e3 * one["noise"] + 3e3 * abs(one["delay"])))
+        for one in draws
+    ]
+    study = prepare(scenario), Ranges(), SCALES, 0, limit, completed(1.0), draws, outcomes
+    return RobustnessStudy(*study)
 
 
 def test_influences_are_found():
@@ -557,9 +556,7 @@ def with_failures(failing, n=300):
     study = made_up(n)
     rng = np.random.default_rng(7)
     outcomes = [
-        Outcome("left_workspace", "leg 2 reached the end of its reach", 2, 3.0, math.nan, 1.0)
-        if failing(one, rng.uniform())
-        else Outcome("completed", "", None, math.nan, math.exp(5e3 * one["noise"]), 1.0)
+        LOST if failing(one, rng.uniform()) else completed(math.exp(5e3 * one["noise"]))
         for one in study.draws
     ]
     return study._replace(outcomes=outcomes)
@@ -686,7 +683,7 @@ def test_failures_are_counted_and_never_dropped():
 
 @pytest.mark.slow
 def test_tables_and_pages_of_extreme_studies():
-    lost = Outcome("not_assembled", "home", None, 0.0, math.nan, math.nan)
+    lost = Outcome("not_assembled", "home", time=0.0)
     uniform = [with_failures(lambda one, luck, fails=fails: fails, 20) for fails in (True, False)]
     for study in (
         made_up(1),

@@ -14,7 +14,7 @@ import typer
 
 import stewart_drake as sd
 from stewart_drake.cli import analyze, identify, live, model, run, tune
-from stewart_drake.cli.common import INTERRUPTED, release
+from stewart_drake.cli.common import AT_EXIT, INTERRUPTED
 from stewart_drake.cli.examples import add_examples
 from stewart_drake.files.errors import ConfigError, resembling
 from stewart_drake.files.resources import KINDS, shipped
@@ -75,7 +75,7 @@ def main(arguments: list[str] | None = None) -> int:
         where = f" (standard output, or a file in {tempfile.gettempdir()})" if no_room else ""
         return _complain(f"{error}{where}")
     finally:
-        release()
+        AT_EXIT.close()
 
 
 def _without_value(words: list[str]) -> str | None:

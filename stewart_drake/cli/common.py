@@ -29,8 +29,8 @@ INTERRUPTED: Final = 130
 
 RESUMABLE: Final = "finished runs are kept, the same command goes on from there"
 """Text after Ctrl-C of commands that continue."""
-_at_exit: Final = contextlib.ExitStack()
-"""Clean-up when the running command ends."""
+AT_EXIT: Final = contextlib.ExitStack()
+"""Clean-up when the running command ends: unlock directories, and remove new ones if empty."""
 
 
 def _shipped_argument(kind: Kind) -> Any:
@@ -113,8 +113,6 @@ def command_line(
 def check_writable(directory: Path | None, *, alone: bool = True) -> None:
     """Make the directory of `--out`, and check that files can be written there.
 
-    `release` unlocks it, and removes it if it was made here and stayed empty.
-
     Args:
         directory: of the output; nothing is done for None.
         alone: whether to lock it against other commands until this one ends.
@@ -124,13 +122,13 @@ def check_writable(directory: Path | None, *, alone: bool = True) -> None:
     try:
         made = [path for path in (directory, *directory.parents) if not path.exists()]
         directory.mkdir(parents=True, exist_ok=True)
-        _at_exit.callback(_remove_empty, made)
+        AT_EXIT.callback(_remove_empty, made)
         with tempfile.TemporaryFile(dir=directory):
             pass
         if alone:
             # A lock on the directory itself leaves no file and ends with the process.
             lock = os.open(directory, os.O_RDONLY)
-            _at_exit.callback(os.close, lock)
+            AT_EXIT.callback(os.close, lock)
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         remove_partials(directory)
     except BlockingIOError:
@@ -164,7 +162,6 @@ def check_file(path: Path | None, option: str = "--out") -> None:
 
 
 def write_or_print(text: Callable[[], str], out: Path | None) -> None:
-    """Write a text into a file, or print it."""
     check_file(out)
     if out is None:
         typer.echo(text(), nl=False)
@@ -180,11 +177,6 @@ def check_log(path: Path | None) -> None:
 
         check_file(path, "--log")
         kind_of_log(path, "--log")
-
-
-def release() -> None:
-    """Unlock directories, and remove new ones that stayed empty."""
-    _at_exit.close()
 
 
 def _remove_empty(directories: list[Path]) -> None:

@@ -45,7 +45,6 @@ _REFUSED: Final = {
     "rate": "above the rate of requests",
 }
 """Words for the causes of `live.protocol.Refusal`."""
-_REQUESTS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
 @command(LiveOptions)
@@ -77,10 +76,6 @@ def live(
     loaded, name = chosen.load(), chosen.title
     span = math.inf if options.duration is None else options.duration
     if options.learn:
-        if options.hold or {options.duration, options.log, options.mirror} != {None}:
-            raise ConfigError(
-                "--learn: expected none of --duration, --log, --mirror and --hold with it"
-            )
         typed = {"machine": machine, "demo": demo, **given.words}
         shown = {name: value for name, value in typed.items() if value}
         line = chosen.line("live", **shown, out=delivery.out)
@@ -297,7 +292,7 @@ def _ending() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         asked = True
 
-    with _handled(ask, *_REQUESTS):
+    with _handled(ask, signal.SIGINT, signal.SIGTERM):
         yield lambda: asked
 
 

@@ -116,14 +116,14 @@ def _new(
     delivery: Delivery, given: Given, measurements: Measurements, folder: Path
 ) -> tuple[int, str]:
     """Write the files; return the exit status and the report as HTML."""
+    from stewart_drake import functions
     from stewart_drake.loop.simulation import simulate
     from stewart_drake.reporting.page import Provenance, html
     from stewart_drake.reporting.report import first_report
-    from stewart_drake.reporting.results import NewMachine
     from stewart_drake.studies import new_machine as study
 
     with given.named():
-        made = NewMachine(*study.new_machine(measurements, _name_of(folder), folder))
+        made = functions.new(folder, _name_of(folder), options=measurements)
     delivery.add_files(study.MACHINE, study.SCENARIO)
     delivery.say(made.table())
     delivery.say_wrapped(*_assumptions(measurements))
@@ -163,7 +163,7 @@ def _measured(given: Given, asking: bool) -> Measurements:
     missing, asked = {one.name: one for one in given.missing}, dict[str, float]()
     while True:
         try:
-            measurements: Measurements = given.options(more=asked)
+            return given.options(more=asked)
         except MissingOption:
             if not asking:
                 flags = ", ".join(f"--{one.dashed}" for one in given.missing)
@@ -179,8 +179,6 @@ def _measured(given: Given, asking: bool) -> Measurements:
                 raise
             echo(f"{error}", error=True)
             asked[name] = _ask(missing[name])
-        else:
-            return measurements
 
 
 def _ask(one: Option) -> float:

@@ -76,8 +76,6 @@ class Residuals(NamedTuple):
 
 
 class Change(NamedTuple):
-    """Change of a guess."""
-
     unknown: Array  # (k,) of the free unknowns
     first: Array  # (n, 12) of the first states
 

@@ -56,8 +56,6 @@ _SHORT_SHARE: Final = 0.2  # length of the segments that are tried last, by the 
 
 @dataclass(frozen=True)
 class Identification:
-    """Machine identified from logs."""
-
     logs: Sequence[Log]  # of the machine
     unknowns: Unknowns  # prior
     fit: Solution
@@ -97,8 +95,7 @@ class Identification:
 
     @property
     def std(self) -> Array:
-        found: Array = np.sqrt(np.diag(self.covariance))
-        return found
+        return np.sqrt(np.diag(self.covariance))
 
     @property
     def mechanism(self) -> Mechanism:

@@ -30,23 +30,21 @@ class Innovations:
     def __post_init__(self) -> None:
         P, noise = np.zeros(self.maps.shape[1:]), self.std**2 * np.eye(self.outputs.shape[1])
         roots, gains = [], []
-        for C, Phi, G in zip(self.outputs, self.maps, self.inputs, strict=False):
-            L = np.linalg.cholesky(C @ P @ C.T + noise)
-            KL = np.linalg.solve(L, C @ P).T
-            roots.append(L)
-            gains.append(Phi @ KL)
-            P = Phi @ (P - KL @ KL.T) @ Phi.T + G @ G.T
-            P = (P + P.T) / 2
-        roots.append(np.linalg.cholesky(self.outputs[-1] @ P @ self.outputs[-1].T + noise))
+        for k, C in enumerate(self.outputs):
+            roots.append(np.linalg.cholesky(C @ P @ C.T + noise))
+            if k < len(self.maps):
+                Phi, G, KL = self.maps[k], self.inputs[k], np.linalg.solve(roots[k], C @ P).T
+                gains.append(Phi @ KL)
+                P = Phi @ (P - KL @ KL.T) @ Phi.T + G @ G.T
+                P = (P + P.T) / 2
         self._whiten, self._gains = np.linalg.inv(roots), np.array(gains)
 
     def __call__(self, residuals: Array) -> Array:
         """Return the innovations of residuals (m, p, ...), each column by itself."""
         flat = residuals.reshape(*residuals.shape[:2], -1)
         found, x = np.empty_like(flat), np.zeros((self.maps.shape[1], flat.shape[2]))
-        steps = zip(self.maps, self._gains, strict=True)
         for k, r in enumerate(flat):
             found[k] = self._whiten[k] @ (r - self.outputs[k] @ x)
-            if (step := next(steps, None)) is not None:
-                x = step[0] @ x + step[1] @ found[k]
+            if k < len(self.maps):
+                x = self.maps[k] @ x + self._gains[k] @ found[k]
         return found.reshape(residuals.shape)

@@ -168,8 +168,7 @@ def pose_slopes(unknowns: Unknowns, numbers: Numbers, poses: Array) -> Array:
     model = MachineModel(unknowns.mechanism, 0.0)
     _, J, by_geometry = model.crank_angles(poses, numbers)
     offsets = np.broadcast_to(np.eye(len(LEGS)), (len(poses), NUM_LEGS, NUM_LEGS))
-    found: Array = -np.linalg.solve(J, np.concatenate([by_geometry, offsets], axis=2))
-    return found
+    return -np.linalg.solve(J, np.concatenate([by_geometry, offsets], axis=2))
 
 
 def _spread(slopes: Array, P: Array) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -207,7 +207,8 @@ def plan(experiment: Experiment, std: Array, tolerances: Tolerances | None = Non
     with following(sc, times, poses) as followed:
         judged = controller_margin(followed)
     motion = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(times, poses.T)
-    log, states = _predicted(experiment, motion, times[-1], std)
+    log = _predicted(experiment, motion, times[-1], std)
+    states = log.values[:, POSE.start :]
     torque = float(np.abs(log.torques).max())
     speeds = np.einsum("ij,nj->ni", mechanism.jacobian(middle), states[:, 6:])
     speed = float(np.abs(speeds).max())
@@ -229,10 +230,8 @@ def plan(experiment: Experiment, std: Array, tolerances: Tolerances | None = Non
     return Plan(changed, share, lost, kept, judged, times, poses, std, unknowns, spread)
 
 
-def _predicted(
-    experiment: Experiment, motion: PiecewisePolynomial, end: float, std: Array
-) -> tuple[Log, Array]:
-    """Return the log of perfect tracking of the motion, and its states (n, 12)."""
+def _predicted(experiment: Experiment, motion: PiecewisePolynomial, end: float, std: Array) -> Log:
+    """Return the log of perfect tracking of the motion, with crank angles and states."""
     sc, mechanism = experiment.scenario, experiment.mechanism
     dynamics = StewartDynamics(mechanism, experiment.nominal.gravity)
     period, eta = sc.controller.period, sc.eta
@@ -245,5 +244,4 @@ def _predicted(
     values = np.full((len(times), NUM_MEASURED), np.nan)
     values[:, ANGLES] = [mechanism.crank_angles(pose) for pose in states[:, :6]]
     values[:, POSE.start :] = states
-    log = Log("plan", sent, torques, times, values, std, dynamics.gravity)
-    return log, states
+    return Log("plan", sent, torques, times, values, std, dynamics.gravity)

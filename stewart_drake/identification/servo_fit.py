@@ -85,7 +85,6 @@ NAMES: Final = (
 UNITS: Final = ("s", "N m/rad", "N m s/rad", "N m", "rad/s", "kg m^2", "N m", "N m s/rad")
 """Of the unknowns theta."""
 D, K, DAMPING, FRICTION, SPEED, ARMATURE, BALL_FRICTION, BALL_DAMPING = range(len(NAMES))
-OF_BALL_JOINTS: Final = (BALL_FRICTION, BALL_DAMPING)
 WEAK: Final = 0.2
 """Half width of an interval, as a share of the value, above which a number is weak."""
 WEAK_DELAY: Final = 3e-3  # s
@@ -220,8 +219,6 @@ def scale_of(theta: Array) -> Array:
 
 @dataclass(frozen=True)
 class ServoIdentification:
-    """Position servos identified from a log."""
-
     model: ServoModel  # with the log
     theta: Array  # (8,) values found, of NAMES
     residuals: Array  # (m, 6) rad
@@ -405,7 +402,7 @@ def regression(model: ServoModel, ball_joints: bool) -> Array:
     theta = np.zeros(len(NAMES))
     stiffness = 1 / found[0] if found[0] > 0 else 1.0
     theta[[D, K, SPEED]] = delay, stiffness, _START_SPEED
-    places = (DAMPING, FRICTION, ARMATURE, *OF_BALL_JOINTS)
+    places = (DAMPING, FRICTION, ARMATURE, BALL_FRICTION, BALL_DAMPING)
     theta[list(places[: len(found) - 1])] = stiffness * found[1:]
     return np.clip(theta, _LOW, _HIGH)
 

@@ -29,7 +29,7 @@ from stewart_drake.identification.servo_fit import (
     ServoModel,
 )
 from stewart_drake.identification.servo_logs import SETPOINTS, ServoLog, servo_log
-from stewart_drake.law.servos import Stiffness, rise
+from stewart_drake.law.servos import rise
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.servos import known_stiffness
 from stewart_drake.mechanism.geometry import Mechanism
@@ -66,7 +66,6 @@ class ServoPlan:
 
     @property
     def csv(self) -> str:
-        """Setpoints to send, as a file."""
         heads = ["time[s]", *(f"{name}[rad]" for name in SETPOINTS)]
         return csv_text(heads, np.column_stack([self.log.times, self.log.setpoints]), digits=9)
 
@@ -167,9 +166,7 @@ class _Planner:
         actuator = sc.actuator
         assert actuator.kind == "position_servo" and servo is not None
         self._experiment, self._middle = experiment, middle
-        self._servo: Stiffness = servo
-        self._period = sc.controller.period
-        self._speed = math.inf if actuator.speed_limit is None else actuator.speed_limit
+        self._actuator, self._servo = actuator, servo
         damping, friction, _ = np.array(sc.plant_parameters)[BALL_JOINTS]
         self.theta = np.array(
             [
@@ -187,11 +184,12 @@ class _Planner:
 
     def model(self, setpoints: Array) -> ServoModel:
         """Return the machine under setpoints (n, 6)."""
-        truth, gravity = self._experiment.truth, self._experiment.nominal.gravity
-        times: Array = self._period * np.arange(len(setpoints), dtype=np.float64)
-        poses = np.broadcast_to(self._middle, (1, 6))
-        log = ServoLog("plan", times, setpoints, setpoints, poses)
-        return ServoModel(log, truth, self._experiment.torque_limit, gravity)
+        experiment = self._experiment
+        period = experiment.scenario.controller.period
+        times: Array = period * np.arange(len(setpoints), dtype=np.float64)
+        log = ServoLog("plan", times, setpoints, setpoints, self._middle[None])
+        gravity = experiment.nominal.gravity
+        return ServoModel(log, experiment.truth, experiment.torque_limit, gravity)
 
     def fitted(self, motion: Array) -> tuple[float, Array]:
         """Return the largest share of a motion (n, 6) within all limits, and its setpoints."""
@@ -223,14 +221,14 @@ class _Planner:
         if states is None or margins(machine, states[:, POSE]).min() < self._least:
             return None
         torque, speed = self.peaks(model, states)
-        most = _USED * self._experiment.torque_limit
-        return setpoints if torque <= most and speed <= self._speed else None
+        within = torque <= _USED * self._experiment.torque_limit
+        fastest = self._actuator.speed_limit
+        return setpoints if within and (fastest is None or speed <= fastest) else None
 
     def peaks(self, model: ServoModel, states: Array) -> tuple[float, float]:
         """Return the largest torque without limit, N m, and crank speed, rad/s."""
         cranks = _cranks(self._experiment.truth, states)
-        log, actuator = model.log, self._experiment.scenario.actuator
-        assert actuator.kind == "position_servo"
+        log, actuator = model.log, self._actuator
         late = log.times - self.theta[0]
         torques = []
         for instants in (late, late - 1e-9):  # after and before a setpoint that arrives here

@@ -62,10 +62,9 @@ class LiveOptions(Options):
     )
 
     def check_learned(self) -> None:
-        """Refuse a file for learned setpoints where none are learned.
-
-        Raises:
-            ConfigError: such a file.
-        """
+        """Refuse options that count only with learning, or only without."""
         if not self.learn:
             refuse({"learned": self.learned}, "without --learn; expected both or neither")
+            return
+        unused = self.model_dump(include={"duration", "log", "mirror"})
+        refuse({**unused, "hold": self.hold or None}, "with --learn; expected none")

@@ -40,6 +40,7 @@ def document(study: HautusStudy) -> Document:
         sc=sc,
         useless=useless,
         own=next(own, None),
+        tolerance=TOLERANCE,
         least=min(study.systems, key=lambda s: s.margins["stabilizable"], default=None),
         chains=chains and shown,
         chains_fail=_deficiencies(chains),

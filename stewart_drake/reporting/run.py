@@ -198,7 +198,7 @@ def comparison_document(
             "share": sc.reference.amplitude[0] / whole.scenario.reference.amplitude[0],
             # At high gain x(t + eta) = x_d(t) + eta dx_d/dt, for a sine of 1 rad/s.
             "overshoot": math.hypot(1, sc.eta),
-            "room": largest_factor(whole.mechanism, whole.reference, instants).value,
+            "room": largest_factor(whole.mechanism, whole.reference, instants),
         }
     mark = {id(own): ", this run"}
     runs = [(label(name) + mark.get(id(run), ""), name, run) for name, run in results.items()]

@@ -48,7 +48,7 @@ def document(study: WorkspaceStudy) -> Document:
         nearest_text=_nearest_text,
         crossing=_crossing,
         crossings=[(str(one.pair), 1e3 * one.distance) for one in along.touching],
-        largest=not np.isnan(study.factor.value) and study.factor,
+        largest="-" if np.isnan(study.factor) else f"{study.factor_text} of this one",
         dead_centre=DEAD_CENTRE_SINE,
         singular=SINGULARITY_LIMIT,
         length=1e3 * summary["characteristic_length"],

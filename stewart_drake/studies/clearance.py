@@ -13,7 +13,7 @@ from stewart_drake.loop.clearance import ClearanceScene, Pair
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import reach_margins
 from stewart_drake.scenario.signals import NUM_COORDINATES
-from stewart_drake.studies.workspace_map import Section, Travel, last_inside, pose_in_section
+from stewart_drake.studies.workspace_map import Section, Travel, last_inside, poses_in_section
 from stewart_drake.types import Array
 
 EVERY: Final = 3
@@ -213,9 +213,8 @@ def _clear_travel(
 def _clear_section(scene: ClearanceScene, mechanism: Mechanism, section: Section) -> ClearSection:
     x, y = section.x[::EVERY], section.y[::EVERY]
     inside = np.isfinite(section.condition[::EVERY, ::EVERY])
+    poses = poses_in_section(mechanism, (section.first, section.second), x, y)
+    seen = np.array([scene.distances(pose).min() for pose in poses[inside]])
     distance = np.full(inside.shape, np.nan)
-    for j, i in zip(*np.nonzero(inside), strict=True):
-        pose = pose_in_section(mechanism, (section.first, section.second), x[i], y[j])
-        distance[j, i] = scene.distances(pose).min()
-    seen = distance[inside]
+    distance[inside] = seen
     return ClearSection(x, y, distance, float(np.mean(seen < 0)) if len(seen) else np.nan)

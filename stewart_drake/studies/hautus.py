@@ -16,8 +16,7 @@ input does not change. Its transposed counterpart is a motion that no output sho
 """
 
 from dataclasses import dataclass
-from itertools import groupby
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,32 +80,21 @@ class Mode:
 
 @dataclass(frozen=True)
 class Hautus:
-    tolerance: ClassVar[float] = TOLERANCE  # margin below which a mode fails
     modes: tuple[Mode, ...]  # every distinct eigenvalue, least margin first
 
     @property
-    def complete(self) -> bool:
-        """Whether the pair is controllable; for the dual, observable."""
-        return not self.deficient
-
-    @property
-    def harmless(self) -> bool:
-        """Whether the pair is stabilisable; for the dual, detectable."""
-        return all(mode.decays for mode in self.deficient)
-
-    @property
     def margin(self) -> float:
-        """Least margin of all modes."""
+        """Least margin of all modes; below TOLERANCE the pair is not controllable."""
         return min((mode.margin for mode in self.modes), default=np.inf)
 
     @property
     def lasting_margin(self) -> float:
-        """Least margin of the modes that do not decay; infinite without any."""
+        """The same of the modes that do not decay, for stabilisability; infinite without any."""
         return min((mode.margin for mode in self.modes if not mode.decays), default=np.inf)
 
     @property
     def deficient(self) -> tuple[Mode, ...]:
-        return tuple(mode for mode in self.modes if mode.margin < self.tolerance)
+        return tuple(mode for mode in self.modes if mode.margin < TOLERANCE)
 
 
 def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool) -> Hautus:
@@ -117,12 +105,6 @@ def hautus(A: ArrayLike, B: ArrayLike, *, discrete: bool) -> Hautus:
     first, see `scaled`.
     """
     A, B = np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64)
-    if A.ndim != 2 or A.shape[0] != A.shape[1] or A.size == 0:
-        raise ValueError(f"A: got shape {A.shape}; expected a square matrix")
-    if B.ndim != 2 or B.shape[0] != A.shape[0]:
-        raise ValueError(f"B: got shape {B.shape}; expected ({A.shape[0]}, m)")
-    if not (np.all(np.isfinite(A)) and np.all(np.isfinite(B))):
-        raise ValueError("A, B: have entries that are not finite")
     eigenvalues = np.linalg.eigvals(A).astype(np.complex128)
     radius = float(np.abs(eigenvalues).max()) or 1.0
     size = float(np.linalg.norm(np.hstack([A, B]), 2)) or 1.0
@@ -185,7 +167,6 @@ def cluster(values: Complex, distance: float) -> list[Complex]:
 
 # ---------------------------------------------------------------- the models
 
-_TORQUE: Final = "torque "
 _SHOWN: Final = 0.01
 """Share of a direction from which a state is named."""
 LONGEST: Final = 30
@@ -195,40 +176,22 @@ POSES: Final = 9
 QUESTIONS: Final = ("controllable", "stabilizable", "observable", "detectable")
 
 
-class Label(NamedTuple):
-    """A state's group, `pose error`, `torque T(k-8)`, and its name within, `roll`, `motor 1`."""
+def describe(directions: NDArray[np.complex128]) -> str:
+    """Return directions (n, d) in words: their number, and the states that they consist of.
 
-    group: str
-    name: str
-
-
-def state_labels(n: int) -> list[Label]:
-    """Return labels of the states of the plant (12) or error model (18), then torques in flight."""
-    groups = ("pose error", "rate error", "integral")[: min(n // len(COORDINATE_NAMES), 3)]
-    labels = [Label(group, name) for group in groups for name in COORDINATE_NAMES]
-    length = (n - len(labels)) // NUM_TORQUES
-    for place in range(length):
-        group = f"{_TORQUE}T(k-{length - place})"
-        labels += [Label(group, f"motor {motor + 1}") for motor in range(NUM_TORQUES)]
-    return labels
-
-
-def describe(directions: NDArray[np.complex128], labels: list[Label]) -> str:
-    """Return directions (n, d) in words: their number, and the states that they consist of."""
+    The n states are six by six the pose error, rate error and integral, then torques in flight.
+    """
     d = directions.shape[1]
     share = (np.abs(directions) ** 2).sum(axis=1) / d
-    named, torques = list[str](), list[str]()
-    pairs = zip(labels, share, strict=True)
-    for group, states in groupby(pairs, key=lambda pair: pair[0].group):
-        shown = [(label.name, part >= _SHOWN / NUM_TORQUES) for label, part in states]
-        names = [name for name, large in shown if large]
-        if names and group.startswith(_TORQUE):
-            torques.append(group.removeprefix(_TORQUE))
-        elif names:
-            part_of_it = "" if len(names) == len(shown) else f" ({', '.join(names)})"
-            named.append(group + part_of_it)
+    large = share.reshape(-1, NUM_TORQUES) >= _SHOWN / NUM_TORQUES
+    named = list[str]()
+    for group, part in zip(("pose error", "rate error", "integral"), large, strict=False):
+        if part.any():
+            names = ", ".join(np.array(COORDINATE_NAMES)[part])
+            named.append(group if part.all() else f"{group} ({names})")
+    torques = [f"T(k-{len(large) - row})" for row in np.flatnonzero(large[3:].any(axis=1)) + 3]
     if len(torques) == 1:
-        named.append(_TORQUE + torques[0])
+        named.append(f"torque {torques[0]}")
     elif torques:
         named.append(f"torques {torques[0]} to {torques[-1]}")
     return f"{d} direction{'s' if d > 1 else ''} in {' and '.join(named)}"
@@ -400,7 +363,6 @@ def _test(
 ) -> System:
     n, m = model.B.shape
     p = len(found.motion)
-    labels = state_labels(n)
     states = np.concatenate([np.tile(found.motion, 3), np.full(max(0, n - 3 * p), found.torque)])
     inputs, outputs = np.full(m, found.torque), np.tile(found.motion, len(model.C) // p)
     A, B, C = scaled(*model, states[:n], inputs, outputs)
@@ -409,7 +371,7 @@ def _test(
     asked = (IsControllable, IsStabilizable, IsObservable, IsDetectable)
     drake = {word: bool(ask(system)) for word, ask in zip(QUESTIONS, asked, strict=True)}
     words = [
-        f"no {part} {describe(mode.directions, labels)}, mode {mode.name}"
+        f"no {part} {describe(mode.directions)}, mode {mode.name}"
         for part, test in (("torque reaches", reach), ("output shows", view))
         for mode in test.deficient
     ]

@@ -46,7 +46,6 @@ _Call = Callable[[], tuple[str, bytes]]
 
 _LOCK: Final = ".lock"
 _MAX_MANIFEST: Final = 10_000_000
-_KEY: Final = re.compile(r"[A-Za-z0-9_+-][A-Za-z0-9_.+-]{0,199}")
 _WATCH: Final = 0.5
 """Time between two checks by a worker that the process that started it is alive, s."""
 _CONNECT_TIMEOUT: Final = 10.0
@@ -80,8 +79,8 @@ def run_jobs(
         suffix: of the files.
         read: reads a file. If it raises ConfigError for a file of an earlier start, that job is
             done again, with a warning of one line from the package's logger.
-        workers: number of processes on this machine, each with one numerical thread; all cores by
-            default.
+        workers: number of processes on this machine, 1 or more, each with one numerical thread;
+            all cores by default.
         scheduler: address of a Dask scheduler whose workers are used instead.
         progress: called at the start and for each finished job.
 
@@ -94,11 +93,6 @@ def run_jobs(
         ChildProcessError: a worker process died, e.g. for want of memory.
         Exception: the exception of `function`, with a note that names the job.
     """
-    for key in jobs:
-        if not _KEY.fullmatch(key):
-            raise ValueError(f"{key!r} is not a file name; expected letters, digits and _.+-")
-    if workers is not None and workers < 1:
-        raise ConfigError(f"--workers: got {workers}; expected 1 or more processes")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = {key: folder / f"{key}{suffix}" for key in jobs}
@@ -213,10 +207,9 @@ class _Unreadable(NamedTuple):
 def _pack(call: _Call) -> bytes | str:
     """Return a call as bytes, or the reason why it cannot be sent."""
     try:
-        packed: bytes = cloudpickle.dumps(call)
+        return cloudpickle.dumps(call)
     except Exception as error:
         return f"{type(error).__name__}: {error}"
-    return packed
 
 
 def _call_packed(number: int, packed: bytes | str) -> tuple[str, bytes] | _Unreadable:

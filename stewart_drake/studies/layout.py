@@ -53,6 +53,7 @@ from stewart_drake.studies.layout_space import (
     geometry,
     least_reach,
     motion_of,
+    own_numbers,
     own_values,
     peak_torque,
     requirements,
@@ -170,7 +171,7 @@ class Problem:
     @property
     def rod(self) -> float:
         """Length of a rod in m, the scale of missing reach."""
-        return float(own_values(self.space.spec)[PARAMETERS.index("rod")])
+        return own_numbers(self.space.spec)["rod"]
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -274,7 +275,7 @@ def study_layout(
     chosen = _best_of(problem, list(searches.values()), options.best)
     texts = {}
     for k, one in enumerate(chosen, 1):
-        arrangement = Arrangement(tuple(one.order), tuple(one.branches), 0.0)
+        arrangement = Arrangement(tuple(one.order), tuple(one.branches))
         machine = problem.space.machine(one.values, arrangement, f"layout_{k}")
         texts[machine.name] = yaml_text(_plain(machine))
         write_whole(folder / f"{machine.name}.yaml", texts[machine.name])
@@ -312,7 +313,7 @@ def problem_of(scenario: Scenario, options: LayoutOptions) -> Problem:
     refuse(fixed, "where the machine is searched for; expected null")
     experiment, spec = assemble(scenario), mechanism_spec(resolve("mechanism", scenario.mechanism))
     space = space_around(spec, options.vary or {}, options.keep)
-    crank = float(own_values(spec)[PARAMETERS.index("crank")])
+    crank = own_numbers(spec)["crank"]
     usual = {"reach": _REACH * crank, "clearance": _APART * crank, **_USUAL}
     if math.isfinite(experiment.torque_limit):
         usual["torque"] = experiment.torque_limit

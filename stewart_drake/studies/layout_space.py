@@ -39,26 +39,19 @@ class Measure(NamedTuple):
     """Quantity that a layout is judged by."""
 
     more: bool  # whether more is better
-    unit: str  # in files
-    factor: float  # from `unit` to `shown`
+    factor: float  # from SI units, or degrees, to `shown`
     shown: str  # unit for readers
     text: str
 
 
 MEASURES: Final = {
-    "reach": Measure(True, "m", 1e3, "mm", "least reach that a leg has left"),
-    "transmission": Measure(True, "-", 1, "-", "least share of a crank's push along its rod"),
-    "condition": Measure(
-        False, "-", 1, "-", "worst condition number, 1 is alike in all directions"
-    ),
-    "clearance": Measure(True, "m", 1e3, "mm", "least distance of links that no joint holds"),
-    "plate_joint_deg": Measure(
-        False, "deg", 1, "deg", "largest turn of a rod at the plate from home"
-    ),
-    "crank_joint_deg": Measure(
-        False, "deg", 1, "deg", "largest lean of a rod out of its crank's plane"
-    ),
-    "torque": Measure(False, "N m", 1, "N m", "largest motor torque, nominal plant"),
+    "reach": Measure(True, 1e3, "mm", "least reach that a leg has left"),
+    "transmission": Measure(True, 1, "-", "least share of a crank's push along its rod"),
+    "condition": Measure(False, 1, "-", "worst condition number, 1 is alike in all directions"),
+    "clearance": Measure(True, 1e3, "mm", "least distance of links that no joint holds"),
+    "plate_joint_deg": Measure(False, 1, "deg", "largest turn of a rod at the plate from home"),
+    "crank_joint_deg": Measure(False, 1, "deg", "largest lean of a rod out of its crank's plane"),
+    "torque": Measure(False, 1, "N m", "largest motor torque, nominal plant"),
 }
 """By name, the cheap ones first."""
 
@@ -182,7 +175,15 @@ class Arrangement(NamedTuple):
 
     order: tuple[int, ...]  # (6,): leg i takes joint order[i] of the plate
     branches: tuple[int, ...]  # (6,) of -1 or 1
-    centre_deg: float  # plate offset at which a pair's joints are symmetric about it
+
+    @property
+    def centre_deg(self) -> float:
+        """Offset of the plate at which the joints of legs 1 and 2 are symmetric about their pair.
+
+        Minus the mean azimuth of the joints, degrees.
+        """
+        azimuths = [(120.0 * (joint // 2) + 180.0) % 360.0 - 180.0 for joint in self.order[:2]]
+        return -float(np.mean(azimuths))
 
     @property
     def key(self) -> str:
@@ -212,8 +213,7 @@ class Space:
         signs += [sign * 3 for sign in product((-1, 1), repeat=2)]
         orders = orders[:1] if "plate_order" in self.kept else orders
         signs = signs[:1] if "branches" in self.kept else signs
-        unique = dict.fromkeys(product(orders, signs))
-        return [Arrangement(order, branches, _centre(order)) for order, branches in unique]
+        return [Arrangement(*one) for one in dict.fromkeys(product(orders, signs))]
 
     def ranges(self, arrangement: Arrangement) -> list[tuple[float, float]]:
         """Return the bounds of `PARAMETERS` for one arrangement."""
@@ -281,7 +281,7 @@ def space_around(
     for name in vary:
         if name in keep:
             raise ConfigError(f"--keep: got {name}, which --vary varies; expected one of the two")
-    own = _own(spec)
+    own = own_numbers(spec)
     rod, turned = own["rod"], own["rotation_deg"]
     usual = {
         "rotation_deg": (max(-360.0, turned - 60), min(360.0, turned + 60)),
@@ -311,22 +311,16 @@ def space_around(
 
 
 def own_values(spec: MechanismSpec) -> Array:
+    return np.array(list(own_numbers(spec).values()))
+
+
+def own_numbers(spec: MechanismSpec) -> dict[str, float]:
     """Return `PARAMETERS` of a machine with a pattern; the mean of lengths given leg by leg."""
-    return np.array(list(_own(spec).values()))
-
-
-def _own(spec: MechanismSpec) -> dict[str, float]:
     lengths = {"crank": spec.crank.length, "rod": spec.rod.length}
     return {
         name: float(np.mean(lengths[name])) if name in lengths else getattr(spec.pattern, name)
         for name in PARAMETERS
     }
-
-
-def _centre(order: tuple[int, ...]) -> float:
-    """Return minus the mean azimuth of the joints of legs 1 and 2 about their pair, degrees."""
-    azimuths = [(120.0 * (joint // 2) + 180.0) % 360.0 - 180.0 for joint in order[:2]]
-    return -float(np.mean(azimuths))
 
 
 def _longer(spec: LinkSpec, length: float) -> LinkSpec:

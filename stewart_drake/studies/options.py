@@ -218,7 +218,7 @@ class JobOptions(Options):
     """Options of a study whose runs go to several processes."""
 
     workers: int | None = option(
-        None, "Number of processes; all cores by default.", "N", recorded=False
+        None, "Number of processes; all cores by default.", "N", recorded=False, ge=1
     )
     scheduler: str | None = option(
         None, "Address of a Dask scheduler to run on.", "ADDRESS", recorded=False

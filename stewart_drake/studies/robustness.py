@@ -32,8 +32,6 @@ from stewart_drake.studies.uncertainty import MACHINE, Draw, Scales, draw, run_d
 from stewart_drake.types import Array, Flags
 
 QUANTILES: Final = (0.5, 0.75, 0.9, 0.95, 0.99)
-SIGNED: Final = tuple(name for name, one in MACHINE.items() if one.signed)
-"""Quantities with a sign; their sizes are ranked too, as |payload| and |delay|."""
 
 
 class Influence(NamedTuple):
@@ -246,12 +244,12 @@ def factors(draws: list[Draw]) -> dict[str, str]:
 
 
 def factor_values(draws: list[Draw]) -> dict[str, Array]:
-    """Return (n,) of each factor in its unit, and of the sizes of those with a sign."""
+    """Return (n,) of each factor in its unit, and of the sizes of those with a sign, as |delay|."""
     arrays = {
         name: np.array([MACHINE[name].in_unit(one[name]) for one in draws], dtype=np.float64)
         for name in factors(draws)
     }
-    return arrays | {f"|{name}|": np.abs(arrays[name]) for name in SIGNED}
+    return arrays | {f"|{name}|": np.abs(x) for name, x in arrays.items() if MACHINE[name].signed}
 
 
 def table(study: RobustnessStudy) -> str:

@@ -57,8 +57,6 @@ def wilson_interval(successes: int, trials: int, confidence: float = CONFIDENCE)
     Unlike those of s/n -+ z (s/n (1 - s/n) / n)^(1/2) its ends stay in [0, 1], and the coverage is
     close to the nominal one even if all trials succeed.
     """
-    if trials < 1 or not 0 <= successes <= trials:
-        raise ValueError(f"got {successes} of {trials}; expected 0 to all of at least one trial")
     share = successes / trials
     ends = stats.binomtest(successes, trials).proportion_ci(confidence, method="wilson")
     # Rounding must not cut the estimate off its own interval.
@@ -83,15 +81,12 @@ def quantile_interval(values: ArrayLike, probability: float) -> Interval:
 
     The number of values below the true quantile is binomial, which gives the ordered values that
     enclose it, each tail with at most half of the rest. Infinite values, such as of failed runs,
-    are values like all others. If the sample is too small, an end is infinite.
+    are values like all others; NaN is none. If the sample is too small, an end is infinite.
     """
-    x = np.asarray(values, dtype=np.float64)
-    if len(x) == 0 or np.isnan(x).any():
-        raise ValueError(f"got {len(x)} values, or NaN among them; expected at least one, none NaN")
-    low, high = _enclosing(len(x), probability)
-    ordered = np.sort(x)
+    ordered = np.sort(np.asarray(values, dtype=np.float64))
+    low, high = _enclosing(len(ordered), probability)
     return Interval(
-        float(np.quantile(x, probability, method="inverted_cdf")),
+        float(np.quantile(ordered, probability, method="inverted_cdf")),
         -np.inf if low is None else float(ordered[low]),
         np.inf if high is None else float(ordered[high]),
     )
@@ -276,14 +271,10 @@ def _pairs(values: Mapping[str, Array], failed: Flags) -> Iterator[Pair]:
             corner: max(_more_often(failed[x], y[x]), _more_often(failed[y], x[y]))
             for corner, (x, y) in corners.items()
         }
-        regions: list[tuple[tuple[tuple[bool, bool], ...], float]]
-        regions = [((corner,), p[corner]) for corner in corners]
-        for u in (True, False):
-            two = ((True, u), (False, not u))
-            regions.append((two, max(p[corner] for corner in two)))
-        for region, chance in regions:
+        opposite = [((True, u), (False, not u)) for u in (True, False)]
+        for region in [*((corner,) for corner in corners), *opposite]:
             there = np.any([np.all(corners[corner], axis=0) for corner in region], axis=0)
-            u, v = region[0]
+            chance, (u, v) = max(p[corner] for corner in region), region[0]
             counts = int(np.sum(there & failed)), int(np.sum(there & ~failed))
             yield Pair((a, b), (words[u], words[v]), len(region) > 1, chance, *counts)
 

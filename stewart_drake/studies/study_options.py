@@ -244,10 +244,11 @@ class Measurements(Options):
 
     def __init__(self, **values: object) -> None:
         super().__init__(**values)
-        for name in list(type(self).model_fields)[:6]:  # the lengths
-            if (value := getattr(self, name)) > LARGEST:
+        for one in self.described():
+            if one.unit == "m" and (value := getattr(self, one.name)) > LARGEST:
                 raise ConfigError(
-                    f"{name}: got {value:g} m; expected metres, {value / 1000:g} for {value:g} mm"
+                    f"{one.name}: got {value:g} m; expected metres, {value / 1000:g} for "
+                    f"{value:g} mm"
                 )
         if self.rod <= self.crank:
             raise ConfigError(

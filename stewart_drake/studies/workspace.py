@@ -17,7 +17,7 @@ from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.signals import COORDINATES, LEGS, POSE, RATES
 from stewart_drake.studies.clearance import ClearanceStudy, study_clearance
 from stewart_drake.studies.workspace_map import (
-    Factor,
+    LARGEST_FACTOR,
     Measures,
     Section,
     Travel,
@@ -87,7 +87,7 @@ class WorkspaceStudy:
     time: Array  # (n,) instants of the reference, s
     poses: Array  # (n, 6) of the reference
     margins: Measures  # along the reference
-    factor: Factor  # largest amplitude factor that fits
+    factor: float  # largest amplitude factor that fits, see `largest_factor`
     travel: list[Travel]  # per coordinate from home; empty with a bad home pose
     sections: list[Section]  # through home; empty with a bad home pose
     sizing: Sizing | None  # of the motors, or None if the reference leaves the workspace
@@ -128,16 +128,21 @@ class WorkspaceStudy:
         )
 
     @property
+    def factor_text(self) -> str:
+        """The factor, rounded down so that this motion does fit."""
+        more = "" if self.factor < LARGEST_FACTOR else "more than "
+        return f"{more}{np.floor(1e3 * self.factor) / 1e3:g}"
+
+    @property
     def _amplitude(self) -> str:
-        value = self.factor.value
-        if np.isnan(value):
+        if np.isnan(self.factor):
             return "it does not move"
-        if value == 0:
+        if self.factor == 0:
             pose = first_pose_text(self.poses[0], self.experiment.mechanism)
             return f"not even its first pose is inside: {pose}"
-        if not self.factor.limited:
-            return f"{value:g} times the amplitude fits, more was not tried"
-        return f"the largest amplitude that fits is {self.factor.rounded} times this one"
+        if self.factor == LARGEST_FACTOR:
+            return f"{self.factor:g} times the amplitude fits, more was not tried"
+        return f"the largest amplitude that fits is {self.factor_text} times this one"
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -150,8 +155,8 @@ class WorkspaceStudy:
             "home_failure": None if self.home is None else self.home._asdict(),
             "exit": None if self.exit is None else self.exit._asdict(),
             "worst": {"time": time, "leg": leg, "reach_margin": margin},
-            "largest_factor": self.factor.value,
-            "largest_factor_limited": self.factor.limited,
+            "largest_factor": self.factor,
+            "largest_factor_limited": self.factor < LARGEST_FACTOR,
             "legs": [
                 {
                     "leg": LEGS[i],

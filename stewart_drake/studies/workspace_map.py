@@ -11,6 +11,7 @@ locked cranks do not hold the plate (parallel singularity). Singular values of A
 do not change with the frame; by rho they do not change with the machine's size either.
 """
 
+import math
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
@@ -111,22 +112,6 @@ def measure(mechanism: Mechanism, poses: Array) -> Measures:
 # ---------------------------------------------------------------- along a motion
 
 
-class Factor(NamedTuple):
-    """Largest factor by which a motion can be scaled about its first pose.
-
-    `value` is NaN for a motion that does not move; 0 if its first pose is outside the workspace;
-    `LARGEST_FACTOR` with `limited` False if that much fits.
-    """
-
-    value: float
-    limited: bool
-
-    @property
-    def rounded(self) -> str:
-        """Value rounded down, so that this motion does fit."""
-        return f"{np.floor(1e3 * self.value) / 1e3:g}"
-
-
 def first_exit(mechanism: Mechanism, reference: Trajectory, time: Array) -> Failure | None:
     """Return why a reference leaves the workspace, and when to 1e-9 s; None if it never does.
 
@@ -143,8 +128,11 @@ def first_exit(mechanism: Mechanism, reference: Trajectory, time: Array) -> Fail
     return None
 
 
-def largest_factor(mechanism: Mechanism, reference: Trajectory, time: Array) -> Factor:
+def largest_factor(mechanism: Mechanism, reference: Trajectory, time: Array) -> float:
     """Return the largest f so that X(0) + f (X(t) - X(0)) is inside at all of `time` (n,).
+
+    It is NaN for a motion that does not move; 0 if the first pose is outside; `LARGEST_FACTOR`, the
+    largest one that is tried, if that much fits.
 
     For a sine, f scales its amplitude. Workspaces are not convex: a motion that does not fit may
     fit again when it is larger. So f is the end of the first range that fits, found by a scan in
@@ -157,12 +145,11 @@ def largest_factor(mechanism: Mechanism, reference: Trajectory, time: Array) -> 
         return bool(np.all(margins(mechanism, poses[0] + factor * change) > 0))
 
     if not fits(0.0):
-        return Factor(0.0, True)
+        return 0.0
     if not change.any():
-        return Factor(np.nan, False)
+        return math.nan
     steps = round(LARGEST_FACTOR / FACTOR_STEP)
-    factor = last_inside(fits, LARGEST_FACTOR, steps, _FACTOR_TOLERANCE)
-    return Factor(factor, factor < LARGEST_FACTOR)
+    return last_inside(fits, LARGEST_FACTOR, steps, _FACTOR_TOLERANCE)
 
 
 def last_inside(
@@ -238,11 +225,11 @@ def sections(mechanism: Mechanism, points: int = POINTS) -> list[Section]:
     return [_section(mechanism, pair, spans, points) for pair in SECTIONS if spans]
 
 
-def pose_in_section(mechanism: Mechanism, pair: tuple[int, int], a: float, b: float) -> Array:
-    """Return the home pose with two other coordinates."""
-    pose = mechanism.home.copy()
-    pose[list(pair)] = a, b
-    return pose
+def poses_in_section(mechanism: Mechanism, pair: tuple[int, int], x: Array, y: Array) -> Array:
+    """Return poses (len(y), len(x), 6) as at home but for the pair of coordinates."""
+    poses = np.tile(mechanism.home, (len(y), len(x), 1))
+    poses[..., list(pair)] = np.stack(np.meshgrid(x, y), axis=-1)
+    return poses
 
 
 def _section(
@@ -256,8 +243,7 @@ def _section(
     # Twice: over a window that is surely too large, then over the part that the workspace fills.
     for number in (_ROUGH, points):
         x, y = np.linspace(*x_range, number), np.linspace(*y_range, number)
-        poses = np.tile(mechanism.home, (number, number, 1))
-        poses[..., list(pair)] = np.stack(np.meshgrid(x, y), axis=-1)
+        poses = poses_in_section(mechanism, pair, x, y)
         inside = margins(mechanism, poses.reshape(-1, NUM_COORDINATES)).reshape(number, number)
         connected = _connected(inside > 0, np.hypot(*np.meshgrid(x - home[0], y - home[1])))
         x_range, y_range = _window(x, connected), _window(y, connected.T)

@@ -97,7 +97,7 @@ class TrainingOptions(Options):
         None, "Form of (45); magnitude by default."
     )
     seed: int = option(0, "Random seed.", ge=0)
-    workers: int | None = option(None, "Number of processes; all cores by default.", "N")
+    workers: int | None = option(None, "Number of processes; all cores by default.", "N", ge=1)
 
     def check(self) -> None:
         """Refuse options of the other kind of training."""
