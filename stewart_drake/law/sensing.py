@@ -237,22 +237,13 @@ def node_times(samples: int) -> Array:
     """Return the Gauss nodes (M,) of N samples at 1/N, 2/N, ..., 1 of a period, in periods.
 
     They are the roots of the polynomial of degree M that is orthogonal on the samples: eigenvalues
-    of the Jacobi matrix of its recurrence (Golub and Welsch).
+    of the multiplication by t, projected onto the polynomials of lower degree.
     """
-    number = min(NODES, samples)
-    t = 2 * np.arange(1, samples + 1) / samples - 1
-    if samples <= number:
-        return (t + 1) / 2
-    # Stieltjes: p_{k+1} = (t - a_k) p_k - b_k p_{k-1}, orthogonal on the samples.
-    a, b = np.empty(number), np.empty(number)
-    before, p, norm = np.zeros(samples), np.ones(samples), 1.0
-    for k in range(number):
-        square = float(np.mean(p * p))
-        a[k], b[k], norm = float(np.mean(t * p * p)) / square, square / norm, square
-        before, p = p, (t - a[k]) * p - (b[k] if k else 0.0) * before
-    off = np.sqrt(b[1:])
-    nodes = np.linalg.eigvalsh(np.diag(a) + np.diag(off, 1) + np.diag(off, -1))
-    return np.asarray((nodes + 1) / 2)
+    t = np.arange(1, samples + 1) / samples
+    if samples <= NODES:
+        return t
+    Q, _ = np.linalg.qr(np.vander(t, NODES))  # orthonormal polynomials on the samples
+    return np.linalg.eigvalsh(Q.T @ (t[:, None] * Q))
 
 
 @dataclass(frozen=True)
