@@ -97,7 +97,7 @@ def numpy_outputs(theta, u, hidden):
 
 def test_outputs_are_those_of_the_formula():
     theta, u = rng(0).standard_normal(212), rng(1).standard_normal((7, 18))
-    model = TorchModel(18, 10)
+    model = TorchModel(10)
     np.testing.assert_allclose(
         model.outputs(theta, u), numpy_outputs(theta, u, 10), rtol=1e-12, atol=1e-12
     )
@@ -105,7 +105,7 @@ def test_outputs_are_those_of_the_formula():
 
 def test_the_jacobian_is_that_of_finite_differences():
     theta, u = rng(2).standard_normal(212), rng(3).standard_normal((4, 18))
-    model, h = TorchModel(18, 10), 1e-6
+    model, h = TorchModel(10), 1e-6
     J = model.jacobian(theta, u)
     assert J.shape == (4, 2, 212)
     steps = h * np.eye(212)
@@ -137,7 +137,7 @@ def test_training_finds_the_minimum_that_a_dense_solver_finds():
     y = numpy_outputs(truth, u, hidden) + 0.1 * random.standard_normal((300, 2))
     start = truth + 0.1 * random.standard_normal(len(truth))
     expected, least = oracle(start, u, y, hidden)
-    found = fit(TorchModel(3, hidden), start, (u, y), (u[:0], y[:0]), 500)
+    found = fit(TorchModel(hidden), start, (u, y), (u[:0], y[:0]), 500)
     assert found.status > 0
     cost = float(np.sum((numpy_outputs(found.x, u, hidden) - y) ** 2))
     assert cost == pytest.approx(least, rel=1e-8) and cost > 1
@@ -163,7 +163,7 @@ def test_the_network_is_what_was_trained(trained, data):
     answers = np.log(network(rows.inputs))
     theta = np.concatenate([getattr(network, n).ravel() for n in ("W1", "b1", "W2", "b2")])
     u = (rows.inputs - network.input_mean) / network.input_scale
-    np.testing.assert_allclose(TorchModel(18, 10).outputs(theta, u), answers, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(TorchModel(10).outputs(theta, u), answers, rtol=0, atol=1e-12)
 
 
 def test_it_learns_what_there_is_to_learn(trained):
