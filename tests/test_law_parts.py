@@ -193,12 +193,6 @@ class Twice:
     def fault(self, measurement, last, period, mechanism):
         return None if measurement.complete else "measurements_missing"
 
-    def stood(self, measurement, last, still):
-        return still
-
-    def now(self, measurement):
-        return self, measurement
-
     def start(self, measurement, near=None):
         state = self.unit * measurement.values.reshape(2, 12).mean(axis=0)
         return FirstState(state, np.diag(self.std**2))
