@@ -515,15 +515,14 @@ class Mine:
         return getattr(self._part, name)
 
 
-def run_with(part=None, wrap=Mine, controller="adaptive_lqi"):
+def run_with(part=None, wrap=Mine):
     """Return a run whose part of the law is wrapped."""
 
     def modified(law):
         return law if part is None else replace(law, **{part: wrap(getattr(law, part))})
 
     settings = ("plant.kind=exact", "duration=3", "start=on_reference", "queue=reference")
-    believed = "controller.delay_steps=7"
-    scenario = sd.load_scenario("paper", controller, (*settings, believed))
+    scenario = sd.load_scenario("paper", "adaptive_lqi", (*settings, "controller.delay_steps=7"))
     return sd.simulate(scenario, modify_law=modified, judge_stability=False)
 
 

@@ -36,7 +36,7 @@ from tests.screen import said, summary_in
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
-pytest.importorskip("torch")
+torch = pytest.importorskip("torch")
 
 rng = np.random.default_rng
 NUMBERS = ("accumulated_error", "cost", "rms_torque", "peak_torque", "torque_variation")
@@ -243,12 +243,7 @@ def synthetic(number=60, seed=0):
     return Curves(np.exp((RATIOS - best[:, None]) ** 2 / 2), features)
 
 
-def network_of(one, theta):
-    return one.network(theta, {})
-
-
 def test_the_loss_is_the_regret_between_the_ratios():
-    torch = pytest.importorskip("torch")
     curves = synthetic()
     one = RegretTrainer(curves, 0)
     theta = initial_theta(18, 10, np.array([[0.3, -0.4]]), 5)
@@ -258,7 +253,7 @@ def test_the_loss_is_the_regret_between_the_ratios():
     found = float(
         one.loss(*(torch.tensor(a) for a in (theta, inputs, curves.regret[rows.condition])))
     )
-    y = np.log(network_of(one, theta)(rows.inputs))
+    y = np.log(one.network(theta, {})(rows.inputs))
     ratio = (y[:, 0] - y[:, 1]) / np.log(10)
     within = np.clip(ratio, RATIOS[0], RATIOS[-1])
     regret = [
@@ -272,7 +267,7 @@ def test_the_loss_is_the_regret_between_the_ratios():
 def test_a_network_learns_to_lose_little_where_it_was_not_trained():
     curves = synthetic(120)
     one = RegretTrainer(curves, 0)
-    network = network_of(one, one.fit(one.start, [one.rows], 1))
+    network = one.network(one.fit(one.start, [one.rows], 1), {})
     fresh = synthetic(80, seed=1)
     ratio = [ratio_of(w) for w in network(fresh.features[:, 0, 0].astype(float))]
     lost = np.mean([np.interp(r, RATIOS, g) for r, g in zip(ratio, fresh.regret, strict=True)])

@@ -135,7 +135,6 @@ def numbers(values: Any, *shape: int) -> Array:
 
 
 def address_of(pointer: Any) -> int:
-    """Return the address of a C structure."""
     return int(core().ffi.cast("intptr_t", pointer))
 
 

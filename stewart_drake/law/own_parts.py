@@ -116,7 +116,6 @@ class OwnParts:
     # -------------------------------------------------------------- observer
 
     def observer(self) -> None:
-        """Set the observer."""
         p, m = len(self.law.plant.dynamics.free), self.law.sensing.size
         self._has_observer, state = True, Out(NUM_STATE)
         self._data.observer = self._table(
@@ -305,7 +304,6 @@ class OwnParts:
     # -------------------------------------------------------------- planner and channel
 
     def planner(self) -> None:
-        """Set the planner."""
         self._data.planner = self._table(
             "planner",
             memory=(lambda: 0, ...),
@@ -330,7 +328,6 @@ class OwnParts:
         rows[:] = self.rows_of(times, self.now.followed)
 
     def channel(self) -> None:
-        """Set the channel."""
         lib = core().lib
         self._data.channel = self._table(
             "channel",

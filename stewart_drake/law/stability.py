@@ -72,7 +72,6 @@ def largest_delay(pole: float, tolerable: float) -> float:
 
 
 def spectral_radius(A: Array) -> float:
-    """Return the largest magnitude of the eigenvalues."""
     return float(np.abs(np.linalg.eigvals(A)).max())
 
 
