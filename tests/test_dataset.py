@@ -17,7 +17,7 @@ from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.tuner.network import WINDOW
-from stewart_drake.tuner.source import densities, ratio_of, weights_of
+from stewart_drake.tuner.source import FixedPolicy, densities, ratio_of, weights_of
 from stewart_drake.tuning import families
 from stewart_drake.tuning.data import (
     LOST,
@@ -28,7 +28,6 @@ from stewart_drake.tuning.data import (
     make_data,
     run_condition,
     watched_run,
-    watching,
 )
 from stewart_drake.tuning.families import (
     DELAYS,
@@ -313,7 +312,7 @@ def test_the_cost_of_a_run_is_its_error_and_a_lost_plate_counts_by_when_it_was_l
 
 def test_a_run_that_is_watched_is_the_same():
     one = at_ratio(faulty("T", "duration=2"), -1.5)
-    plain, (seen, _) = run_in_bulk(one), watched_run(one, watching(*weights_of(-1.5)), 20)
+    plain, (seen, _) = run_in_bulk(one), watched_run(one, FixedPolicy(weights_of(-1.5)), 20)
     assert cost(seen, 2.0) == cost(plain, 2.0)
     assert ratio_of(plain.weights[3]) == pytest.approx(-1.5)
 

@@ -19,7 +19,7 @@ from stewart_drake.tuner.source import (
     ratio_of,
     weights_of,
 )
-from stewart_drake.tuning.data import watched_run, watching
+from stewart_drake.tuning.data import watched_run
 from stewart_drake.tuning.families import FAMILIES, SAMPLES
 
 LOWEST, HIGHEST = -6.0, 4.0
@@ -44,7 +44,8 @@ def scenario(*settings):
 
 def seen(one, ratio=-2.0):
     """(k, 18) features of a run with a fixed ratio, NaN at every second sample."""
-    return np.asarray(watched_run(one, watching(*weights_of(ratio)), round(10 * one.duration))[1])
+    policy = FixedPolicy(weights_of(ratio))
+    return np.asarray(watched_run(one, policy, round(10 * one.duration))[1])
 
 
 def feature(values, name):
@@ -128,7 +129,7 @@ def test_what_is_lost_is_finite_and_bounded():
     one = scenario(
         *("delay.fraction=0.5", "controller.delay_steps=8", "controller.replan=0", *FOLLOWS)
     )
-    ending, found = watched_run(one, watching(*weights_of(1.0)), SAMPLES)
+    ending, found = watched_run(one, FixedPolicy(weights_of(1.0)), SAMPLES)
     values = found[np.isfinite(found).all(axis=1)]
     assert ending.stopped is not None
     assert len(values) > 5

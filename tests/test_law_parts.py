@@ -193,12 +193,6 @@ class Twice:
     def fault(self, measurement, last, period, mechanism):
         return None if measurement.complete else "measurements_missing"
 
-    def stood(self, measurement, last, still):
-        return still
-
-    def now(self, measurement):
-        return self, measurement
-
     def start(self, measurement, near=None):
         state = self.unit * measurement.values.reshape(2, 12).mean(axis=0)
         return FirstState(state, np.diag(self.std**2))
@@ -521,15 +515,14 @@ class Mine:
         return getattr(self._part, name)
 
 
-def run_with(part=None, wrap=Mine, controller="adaptive_lqi"):
+def run_with(part=None, wrap=Mine):
     """Return a run whose part of the law is wrapped."""
 
     def modified(law):
         return law if part is None else replace(law, **{part: wrap(getattr(law, part))})
 
     settings = ("plant.kind=exact", "duration=3", "start=on_reference", "queue=reference")
-    believed = "controller.delay_steps=7"
-    scenario = sd.load_scenario("paper", controller, (*settings, believed))
+    scenario = sd.load_scenario("paper", "adaptive_lqi", (*settings, "controller.delay_steps=7"))
     return sd.simulate(scenario, modify_law=modified, judge_stability=False)
 
 

@@ -32,7 +32,7 @@ from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.logs import Precision, read_log
 from stewart_drake.law.belief import Estimate
-from stewart_drake.law.gaps import longest_gap, stays_within_reach
+from stewart_drake.law.gaps import longest_gap, within_reach
 from stewart_drake.law.stability import Margins
 from stewart_drake.live import contact as contacts
 from stewart_drake.live.contact import Contact, Link, address_of, await_free, call, open_endpoint
@@ -493,7 +493,7 @@ def test_what_is_uncertain_grows_until_a_leg_may_be_out_of_reach(gravity):
 
     def safe(std, span):
         covariance = np.diag(np.concatenate([np.full(12, std), np.full(8, 1e-9)]) ** 2)
-        return stays_within_reach(made.plant, Estimate(mean, covariance), torque, span)
+        return within_reach(made.plant, Estimate(mean, covariance), torque)(span)
 
     assert safe(1e-6, 1.0) and not safe(0.1, 0.01)
     spans = np.linspace(0.0, 3.0, 31)
@@ -501,7 +501,7 @@ def test_what_is_uncertain_grows_until_a_leg_may_be_out_of_reach(gravity):
     assert held[0] and held == sorted(held, reverse=True)
     # A covariance of nothing is that of a law without an estimator.
     unknown = np.full((20, 20), np.nan)
-    assert stays_within_reach(made.plant, Estimate(mean, unknown), torque, 9.0)
+    assert within_reach(made.plant, Estimate(mean, unknown), torque)(9.0)
 
 
 def test_without_forces_the_limit_is_where_three_deviations_of_a_rate_lead():
@@ -515,7 +515,7 @@ def test_without_forces_the_limit_is_where_three_deviations_of_a_rate_lead():
     longest = np.min(left / (3 * rate * np.abs(higher - left) / 1e-6))
     for share in (0.99, 1.01):
         estimate = Estimate(mean, covariance)
-        within = stays_within_reach(made.plant, estimate, np.zeros(6), share * longest)
+        within = within_reach(made.plant, estimate, np.zeros(6))(share * longest)
         assert within == (share < 1)
     twice = Estimate(mean, 4 * covariance)
     found = longest_gap(made.plant, twice, np.zeros(6), 0.2)

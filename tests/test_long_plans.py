@@ -7,7 +7,7 @@ import pytest
 
 from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.catch_up import CatchUp, Model
+from stewart_drake.law.catch_up import CatchUp
 from stewart_drake.law.feedforward import mean_torques
 from stewart_drake.law.startup import BLOCK, choose_substeps, filter_substeps
 from stewart_drake.loop.preparation import prepare
@@ -55,8 +55,8 @@ def test_a_plan_of_many_periods_is_followed_period_by_period(period, duration):
 
 
 def test_the_shortest_plan_within_a_limit_is_found_in_a_few_steps(monkeypatch):
-    period, limit, made, plan = 1e-3, 0.5, [], Model.plan
-    monkeypatch.setattr(Model, "plan", lambda *given: (made.append(given[-1]), plan(*given))[1])
+    period, limit, made, over = 1e-3, 0.5, [], CatchUp.over
+    monkeypatch.setattr(CatchUp, "over", lambda *given: (made.append(given[-1]), over(*given))[1])
     experiment = prepare(
         load_scenario("paper", None, ("plant.kind=exact", f"controller.period={period}"))
     )
@@ -74,7 +74,7 @@ def test_a_way_planned_in_flight_is_what_drake_makes_of_its_pieces():
     experiment = prepare(load_scenario("paper"))
     reference, start = experiment.reference, np.zeros(12)
     start[:6] = experiment.mechanism.home
-    plan = Model(experiment.nominal).plan(reference, start, 0.8, 0.1, 3)
+    plan = CatchUp(experiment.nominal, reference, start, 0.8, 0.1).over(3)
     assert plan is not None
     pieces = plan.pieces.copy()
     pieces[:4, :2] -= 0.05  # a gap behind the fourth, as where a hold was too short for a piece

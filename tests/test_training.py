@@ -36,7 +36,7 @@ from tests.screen import said, summary_in
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
-pytest.importorskip("torch")
+torch = pytest.importorskip("torch")
 
 rng = np.random.default_rng
 NUMBERS = ("accumulated_error", "cost", "rms_torque", "peak_torque", "torque_variation")
@@ -97,7 +97,7 @@ def numpy_outputs(theta, u, hidden):
 
 def test_outputs_are_those_of_the_formula():
     theta, u = rng(0).standard_normal(212), rng(1).standard_normal((7, 18))
-    model = TorchModel(18, 10)
+    model = TorchModel(10)
     np.testing.assert_allclose(
         model.outputs(theta, u), numpy_outputs(theta, u, 10), rtol=1e-12, atol=1e-12
     )
@@ -105,7 +105,7 @@ def test_outputs_are_those_of_the_formula():
 
 def test_the_jacobian_is_that_of_finite_differences():
     theta, u = rng(2).standard_normal(212), rng(3).standard_normal((4, 18))
-    model, h = TorchModel(18, 10), 1e-6
+    model, h = TorchModel(10), 1e-6
     J = model.jacobian(theta, u)
     assert J.shape == (4, 2, 212)
     steps = h * np.eye(212)
@@ -137,7 +137,7 @@ def test_training_finds_the_minimum_that_a_dense_solver_finds():
     y = numpy_outputs(truth, u, hidden) + 0.1 * random.standard_normal((300, 2))
     start = truth + 0.1 * random.standard_normal(len(truth))
     expected, least = oracle(start, u, y, hidden)
-    found = fit(TorchModel(3, hidden), start, (u, y), (u[:0], y[:0]), 500)
+    found = fit(TorchModel(hidden), start, (u, y), (u[:0], y[:0]), 500)
     assert found.status > 0
     cost = float(np.sum((numpy_outputs(found.x, u, hidden) - y) ** 2))
     assert cost == pytest.approx(least, rel=1e-8) and cost > 1
@@ -163,7 +163,7 @@ def test_the_network_is_what_was_trained(trained, data):
     answers = np.log(network(rows.inputs))
     theta = np.concatenate([getattr(network, n).ravel() for n in ("W1", "b1", "W2", "b2")])
     u = (rows.inputs - network.input_mean) / network.input_scale
-    np.testing.assert_allclose(TorchModel(18, 10).outputs(theta, u), answers, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(TorchModel(10).outputs(theta, u), answers, rtol=0, atol=1e-12)
 
 
 def test_it_learns_what_there_is_to_learn(trained):
@@ -243,12 +243,7 @@ def synthetic(number=60, seed=0):
     return Curves(np.exp((RATIOS - best[:, None]) ** 2 / 2), features)
 
 
-def network_of(one, theta):
-    return one.network(theta, {})
-
-
 def test_the_loss_is_the_regret_between_the_ratios():
-    torch = pytest.importorskip("torch")
     curves = synthetic()
     one = RegretTrainer(curves, 0)
     theta = initial_theta(18, 10, np.array([[0.3, -0.4]]), 5)
@@ -258,7 +253,7 @@ def test_the_loss_is_the_regret_between_the_ratios():
     found = float(
         one.loss(*(torch.tensor(a) for a in (theta, inputs, curves.regret[rows.condition])))
     )
-    y = np.log(network_of(one, theta)(rows.inputs))
+    y = np.log(one.network(theta, {})(rows.inputs))
     ratio = (y[:, 0] - y[:, 1]) / np.log(10)
     within = np.clip(ratio, RATIOS[0], RATIOS[-1])
     regret = [
@@ -272,7 +267,7 @@ def test_the_loss_is_the_regret_between_the_ratios():
 def test_a_network_learns_to_lose_little_where_it_was_not_trained():
     curves = synthetic(120)
     one = RegretTrainer(curves, 0)
-    network = network_of(one, one.fit(one.start, [one.rows], 1))
+    network = one.network(one.fit(one.start, [one.rows], 1), {})
     fresh = synthetic(80, seed=1)
     ratio = [ratio_of(w) for w in network(fresh.features[:, 0, 0].astype(float))]
     lost = np.mean([np.interp(r, RATIOS, g) for r, g in zip(ratio, fresh.regret, strict=True)])

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -58,11 +58,15 @@ class CatchUp:
         period: float,
         least: Callable[[], LeastError] | None = None,
     ) -> None:
+        c = core()
         self._least = None if least is None else cache(least)
         self._reference, self._period = reference, period
         self._from = reference, start, t_start, period
-        self._planned = cache(partial(Model(dynamics).plan, *self._from))
-        self._motion, self._improved = cache(self._follow), cache(self._improve)
+        self._machine = machine_of(NominalPlant(dynamics, 1, math.inf, TorqueLimit()))
+        self._sign, self._model = home_sign(dynamics.mechanism), c.ffi.new("stewart_model *")
+        c.lib.stewart_set_model(self._machine.pointer, c.ffi.NULL, self._model)
+        self._planned, self._motion = cache(self.over), cache(self._follow)
+        self._improved = cache(self._improve)
 
     def plan(self, duration: float | None, torque_limit: float | None) -> tuple[Trajectory, float]:
         """Plan the motion, then the reference; return it with the duration of the plan in s.
@@ -86,6 +90,19 @@ class CatchUp:
         if self._least is None or torque_limit is None or duration is not None:
             return plan
         return self._improved(periods, torque_limit) or plan
+
+    def over(self, periods: int) -> Plan | None:
+        """Return the plan over a number of periods, two at least, or None without one."""
+        c, times, peak = core(), np.empty(3), np.empty(1)
+        reference, start, begin, period = self._from
+        c.lib.stewart_plan_times(begin, period, periods, c.at(times))
+        rows = rows_along(reference, times)
+        pieces = np.empty((c.lib.stewart_plan_pieces(period, periods), c.lib.STEWART_PIECE))
+        scratch = c.scratch(c.lib.stewart_plan_scratch(period, periods))
+        given = c.at(np.array(start, np.float64)), begin, period, periods, c.at(rows)
+        results = c.at(pieces), c.at(peak), scratch
+        number = c.lib.stewart_plan_path(self._model, self._sign, *given, *results)
+        return Plan(pieces, float(peak[0])) if number else None
 
     def _possible(self, periods: int, limit: float) -> bool:
         found = self._planned(periods)
@@ -151,34 +168,3 @@ def shortest(
 def periods_of(duration: float, period: float) -> int:
     """Return the number of periods of a plan with a duration in s."""
     return max(2, math.ceil(duration / period - 1e-9))
-
-
-class Model:
-    """The `stewart_model` of a plant for the functions of core/planning.h."""
-
-    def __init__(self, dynamics: StewartDynamics) -> None:
-        c = core()
-        self._machine = machine_of(NominalPlant(dynamics, 1, math.inf, TorqueLimit()))
-        self._sign, self.data = home_sign(dynamics.mechanism), c.ffi.new("stewart_model *")
-        c.lib.stewart_set_model(self._machine.pointer, c.ffi.NULL, self.data)
-
-    def plan(
-        self, reference: Trajectory, start: Array, begin: float, period: float, periods: int
-    ) -> Plan | None:
-        """Return the plan over a number of periods, or None without one.
-
-        Args:
-            reference: the motion to reach.
-            start: (12,) state at `begin`, s.
-            period: s.
-            periods: two at least.
-        """
-        c, times, peak = core(), np.empty(3), np.empty(1)
-        c.lib.stewart_plan_times(begin, period, periods, c.at(times))
-        rows = rows_along(reference, times)
-        pieces = np.empty((c.lib.stewart_plan_pieces(period, periods), c.lib.STEWART_PIECE))
-        scratch = c.scratch(c.lib.stewart_plan_scratch(period, periods))
-        given = c.at(np.array(start, np.float64)), begin, period, periods, c.at(rows)
-        results = c.at(pieces), c.at(peak), scratch
-        number = c.lib.stewart_plan_path(self.data, self._sign, *given, *results)
-        return Plan(pieces, float(peak[0])) if number else None

@@ -87,8 +87,8 @@ def call_back(it: Any, raised: list[BaseException], **functions: tuple[Any, ...]
         it: pointer to the table.
         raised: gets the errors of the functions, which C does not see.
         functions: (function, argument, ...) by name. An argument is the size of an array, which is
-            copied, None for NULL; or `Out`; or None for a value that is passed as it is. A size is
-            a number, or a function of all arguments.
+            copied, None for NULL; or `Out`; or None for a value that is passed as it is; or `...`
+            for one that is not passed. A size is a number, or a function of all arguments.
     """
     ffi = core().ffi
 
@@ -107,7 +107,11 @@ def call_back(it: Any, raised: list[BaseException], **functions: tuple[Any, ...]
 
     def called(function: Callable[..., Any], *sizes: Any) -> Callable[..., Any]:
         return lambda *given: function(
-            *(array(*one, given) for one in zip(given, sizes, strict=True))
+            *(
+                array(value, size, given)
+                for value, size in zip(given, sizes, strict=True)
+                if size is not ...
+            )
         )
 
     keep_alive = []
@@ -131,7 +135,6 @@ def numbers(values: Any, *shape: int) -> Array:
 
 
 def address_of(pointer: Any) -> int:
-    """Return the address of a C structure."""
     return int(core().ffi.cast("intptr_t", pointer))
 
 
@@ -173,7 +176,7 @@ def machine_of(plant: NominalPlant) -> Compiled:
 def _own_machine(plant: NominalPlant, machine: Any, raised: list[BaseException]) -> list[Any]:
     """Set the motion and the limit of a machine to those of a plant in Python."""
 
-    def predict(_: Any, theta: Array | None, it: Any, state: Array, states: Array) -> None:
+    def predict(theta: Array | None, it: Any, state: Array, states: Array) -> None:
         torques, durations = (
             np.reshape(core().ffi.unpack(values, it.number * n), (it.number, n))
             for values, n in ((it.torques, 6), (it.durations, 1))
@@ -182,21 +185,21 @@ def _own_machine(plant: NominalPlant, machine: Any, raised: list[BaseException])
             plant.predict(state, TorqueSchedule(torques, durations.ravel()), theta)
         )
 
-    def limit(_: Any, torque: Array, limited: Array) -> int:
+    def limit(torque: Array, limited: Array) -> int:
         limited[:] = plant.motors.saturate(torque)
         return int(np.any(limited != torque))
 
-    def at_limit(_: Any, number: int, torques: Array) -> int:
-        return int(plant.motors.reached(torques.reshape(number, 6)))
+    def at_limit(torques: Array) -> int:
+        return int(plant.motors.reached(torques.reshape(-1, 6)))
 
     own, p = core().ffi.new("stewart_own_machine *"), len(plant.dynamics.free)
     given = p, None, 12, Out(lambda _, __, it, *___: 12 * it.number)
     keep_alive = call_back(
         own,
         raised,
-        predict=(predict, None, *given),
-        limit=(limit, None, 6, Out(6)),
-        at_limit=(at_limit, None, None, lambda _, number, __: 6 * number),
+        predict=(predict, ..., *given),
+        limit=(limit, ..., 6, Out(6)),
+        at_limit=(at_limit, ..., ..., lambda _, number, __: 6 * number),
     )
     machine.own = own
     return [own, *keep_alive]

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -80,8 +79,8 @@ class QuadraticCost(Cost):
 
     def __post_init__(self) -> None:
         for name in ("errors", "integrals", "torques"):
-            if name != "integrals" or self.integrates:
-                fixed(name, getattr(self, name), (NUM_COORDINATES,), 0.0)
+            if (scale := getattr(self, name)) is not None:
+                fixed(name, scale, (NUM_COORDINATES,), 0.0)
 
     @property
     def integrates(self) -> bool:
@@ -89,13 +88,9 @@ class QuadraticCost(Cost):
 
     def matrices(self, weights: Array) -> tuple[Array, Array]:
         """Return w_Q Q and w_R R for w_Q and w_R (2,)."""
-        Q, R = self._unweighted
-        return weights[0] * Q, weights[1] * R
-
-    @cached_property
-    def _unweighted(self) -> tuple[Array, Array]:
         scales = [self.errors] if self.integrals is None else [self.errors, self.integrals]
-        return np.diag(np.concatenate(scales)), np.diag(self.torques)
+        Q, R = np.diag(np.concatenate(scales)), np.diag(self.torques)
+        return weights[0] * Q, weights[1] * R
 
     def gain(self, model: DelayedModel, weights: Array) -> Array:
         """Return `law.riccati.reduced_gain` of a model from `sampled`.

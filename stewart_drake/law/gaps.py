@@ -19,6 +19,7 @@ from scipy.linalg import expm
 
 from stewart_drake.law.belief import Estimate
 from stewart_drake.law.nominal import NominalPlant
+from stewart_drake.mechanism.kinematics import reach_margins
 from stewart_drake.scenario.signals import NUM_COORDINATES, NUM_STATE, POSE, RATES
 from stewart_drake.types import Array
 
@@ -29,21 +30,20 @@ _STEP: Final = 1e-6
 """Step of the differences for J, rad and m."""
 
 
-def _within_reach(
-    plant: NominalPlant, estimate: Estimate, torque: Array
-) -> Callable[[float], bool]:
-    """Return `stays_within_reach` as a function of the span."""
+def within_reach(plant: NominalPlant, estimate: Estimate, torque: Array) -> Callable[[float], bool]:
+    """Return whether the legs surely reach the pose after a span in s without measurements.
+
+    Estimate and torque (6,) in N m are those at the last measurement; without a covariance the
+    answer is yes.
+    """
     if not estimate.uncertain:
         return lambda span: True
     x, mechanism = estimate.state, plant.mechanism
     found = plant.dynamics.derivatives(x[POSE], x[RATES], torque, estimate.parameters)
     rate = np.zeros_like(estimate.covariance)
     rate[:NUM_STATE, :NUM_STATE], rate[:NUM_STATE, NUM_STATE:] = found.A, found.G
-    left = mechanism.reach_margins(x[POSE])
-    J = [
-        (mechanism.reach_margins(x[POSE] + _STEP * e) - left) / _STEP
-        for e in np.eye(NUM_COORDINATES)
-    ]
+    left = reach_margins(mechanism, x[POSE])
+    J = (reach_margins(mechanism, x[POSE] + _STEP * np.eye(NUM_COORDINATES)) - left) / _STEP
 
     def within(span: float) -> bool:
         with np.errstate(all="ignore"):
@@ -54,17 +54,8 @@ def _within_reach(
     return within
 
 
-def stays_within_reach(plant: NominalPlant, estimate: Estimate, torque: Array, span: float) -> bool:
-    """Return whether the legs surely reach the pose after `span` s without measurements.
-
-    Estimate and torque (6,) in N m are those at the last measurement; without a covariance the
-    answer is yes.
-    """
-    return _within_reach(plant, estimate, torque)(span)
-
-
 def longest_gap(plant: NominalPlant, estimate: Estimate, torque: Array, eta: float) -> float:
     """Return the longest gap in s, from eta to `LONGEST_GAP`, after which the legs surely reach."""
-    within = _within_reach(plant, estimate, torque)
+    within = within_reach(plant, estimate, torque)
     gaps = np.linspace(min(eta, LONGEST_GAP), LONGEST_GAP, 21)
     return float(next((a for a, b in pairwise(gaps) if not within(b + eta)), LONGEST_GAP))

@@ -83,29 +83,15 @@ class LimitedMemory(OuterMemory):
     Attributes:
         free: memory of the law without limits, with the torques that were sent.
         plan: last plan, where the limits did bind at the last sample, else None.
-        limited_steps, qp_failures, qp_late: as of `law.counts.Counts`.
+        of_limits: counts of the samples in which a limit did bind, and of failures then.
     """
 
     plan: Plan | None = None
-    limited_steps: int = 0
-    qp_failures: int = 0
-    qp_late: int = 0
+    of_limits: Counts = field(default_factory=Counts)
 
     @property
     def counts(self) -> Counts:
-        counts: Counts = self.free.counts
-        return counts._replace(
-            limited_steps=self.limited_steps, qp_failures=self.qp_failures, qp_late=self.qp_late
-        )
-
-    def following(self, free: Any) -> "LimitedMemory":
-        """Return the memory after a sample in which the free law's torque was sent."""
-        return replace(self, free=free, plan=None)
-
-    def limited(self, free: Any, plan: Plan | None, cause: str | None) -> "LimitedMemory":
-        """Return the memory after a sample with a plan, or without one for a cause."""
-        after = replace(self, free=free, plan=plan, limited_steps=self.limited_steps + 1)
-        return after if cause is None else replace(after, **{cause: getattr(self, cause) + 1})
+        return Counts(*map(sum, zip(self.free.counts, self.of_limits, strict=True)))
 
     def without_error(self) -> "LimitedMemory":
         return replace(self, free=self.free.without_error())
@@ -246,9 +232,10 @@ class LimitedLqi(OuterLqi):
             given, motion = Preview(own, rows[: len(own)]), Preview(times, rows[len(own) :])
         after = self.free.step(before, measurement, given, weights, report)
         further = after.compiled.followed(after, motion, times)
+        following = replace(memory, free=after, plan=None)  # with the free law's torque
         open_loop = before.open_loop_samples > 0 and after.open_loop_samples > 0
         if open_loop or not after.belief.feeds_back or not np.isfinite(further).all():
-            return memory.following(after)
+            return following
         belief, timeline = after.belief, after.belief.timeline
         flying = after.in_flight[:-1]
         queue = flying[len(flying) - timeline.queue_length :]
@@ -259,7 +246,7 @@ class LimitedLqi(OuterLqi):
         holds = HoldModel(self.plant, belief.parameters, timeline.period)
         ahead = self._ahead(further, belief)
         if self._meets_limits(after, ahead, start, holds):
-            return memory.following(after)
+            return following
         until = begun + self.limits.budget
         search = _Search(self.plant, self.limits, holds, start, self._reference_plan(ahead))
         plan = last = None if memory.plan is None else search.continued(memory.plan)
@@ -278,7 +265,9 @@ class LimitedLqi(OuterLqi):
         torques = after.plan
         if plan is not None:  # which may be shorter than a packet
             torques = np.vstack([plan.torques[: len(torques)], torques[len(plan.torques) :]])
-        return memory.limited(_sending(after, torques, before, self.plant.motors), plan, cause)
+        sent = _sending(after, torques, before, self.plant.motors)
+        counts = memory.of_limits.plus("limited_steps", cause)
+        return replace(memory, free=sent, plan=plan, of_limits=counts)
 
     def _ahead(self, further: Array, belief: Belief) -> _Ahead:
         n, space, dynamics = self.limits.horizon, self.limits.space, self.plant.dynamics

@@ -71,7 +71,6 @@ class Memory:
 
     @property
     def sent(self) -> Sent:
-        """Memory of the channel."""
         channel = self.law.channel
         if isinstance(channel, Packets):
             return Sent(self.field("channel"), len(channel.in_time))
@@ -97,7 +96,6 @@ class Memory:
         return belief.at(self.field("state"))
 
     def copy(self) -> "Memory":
-        """Return an independent copy."""
         return replace(self, data=self.data.copy(), own=deepcopy(self.own))
 
     def without_error(self) -> "Memory":

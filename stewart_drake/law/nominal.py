@@ -60,7 +60,6 @@ class NominalPlant:
 
     @property
     def mechanism(self) -> Mechanism:
-        """Geometry of the machine."""
         return self.dynamics.mechanism
 
     def substeps_for(self, torques: Array) -> int:

@@ -12,7 +12,6 @@ sensor and by what is to be estimated:
 
 import math
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any, Final, Literal, Protocol
 
 import numpy as np
@@ -248,12 +247,6 @@ def _law_of(
     return Compiled(law, (machine, part), (*machine.raised, *part.raised))
 
 
-@cache
-def _gate(size: int) -> float:
-    """Return the squared normalised innovation above which `size` values are an outlier."""
-    return float(chdtri(size, OUTLIER))
-
-
 @Once
 def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
     c, known, p = core(), settings.parameters, len(settings.parameters.names)
@@ -270,7 +263,9 @@ def filter_settings_of(settings: FilterSettings, size: int) -> Compiled:
     }
     if settings.jump_std is not None:
         arrays["jump_std"] = numbers(settings.jump_std, p)
-    it.prior, it.filter.gate, it.filter.timing_std = c.at(prior), _gate(size), settings.timing_std
+    # A larger squared normalised innovation is an outlier.
+    it.filter.gate, it.filter.timing_std = float(chdtri(size, OUTLIER)), settings.timing_std
+    it.prior = c.at(prior)
     it.filter.learns_timing = settings.learns_timing
     it.filter.forgetting = settings.forgetting
     it.filter.offsets = known.names.index(OFFSETS[0]) if OFFSETS[0] in known.names else -1

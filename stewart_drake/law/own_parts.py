@@ -1,8 +1,8 @@
 """Parts of a law in Python, as tables of functions that the step in C calls back.
 
-Tables and arguments are those of core/observer.h, core/law.h and core/servo.h. Arguments that are
-not used have an underscore. Memories of parts in Python are in `Memory.own`, not in the vector that
-C passes. Next to each function are the sizes of its arguments, as `call_back` takes them.
+Tables and arguments are those of core/observer.h, core/law.h and core/servo.h. Memories of parts in
+Python are in `Memory.own`, not in the vector that C passes. Next to each function are the sizes of
+its arguments, as `call_back` takes them.
 """
 
 import math
@@ -76,16 +76,16 @@ class OwnParts:
         """Functions `reference` and `goal` of a `stewart_sample`."""
         sample = core().ffi.new("stewart_sample *")
         rows = Out(lambda _sample, number, *_: NUM_REFERENCE * number)
-        sizes = None, None, lambda _sample, number, *_: number, rows
+        sizes = ..., ..., lambda _sample, number, *_: number, rows
         functions = {"reference": (self._reference, *sizes), "goal": (self._goal, *sizes)}
         reference, goal = call_back(sample, self.raised, **functions)
         return reference, goal
 
-    def _reference(self, _sample: Any, _number: int, times: Array, rows: Array) -> None:
+    def _reference(self, times: Array, rows: Array) -> None:
         rows[:] = np.nan
         rows[:] = self.rows_of(times, self.now.motion)
 
-    def _goal(self, _sample: Any, _number: int, times: Array, rows: Array) -> None:
+    def _goal(self, times: Array, rows: Array) -> None:
         assert isinstance(self.now.motion, KnownMotion)
         rows[:] = np.nan
         rows[:] = np.ravel(self.now.motion.goal(times))
@@ -116,34 +116,25 @@ class OwnParts:
     # -------------------------------------------------------------- observer
 
     def observer(self) -> None:
-        """Set the observer."""
         p, m = len(self.law.plant.dynamics.free), self.law.sensing.size
         self._has_observer, state = True, Out(NUM_STATE)
         self._data.observer = self._table(
             "observer",
-            memory=(lambda _law: NUM_STATE, None),
-            scratch=(lambda _law: 0, None),
-            start=(self._start, None, state),
-            observe=(self._observe, None, state, None, _torques, m, None),
-            restart=(self._restart, None, state),
-            parameters=(self._parameters, None, None, Out(p), Out(p)),
-            uncertainty=(self._uncertainty, None, None, Out((NUM_STATE + p) ** 2)),
+            memory=(lambda: NUM_STATE, ...),
+            scratch=(lambda: 0, ...),
+            start=(self._start, ..., state),
+            observe=(self._observe, ..., state, ..., _torques, m, ...),
+            restart=(self._restart, ..., state),
+            parameters=(self._parameters, ..., ..., Out(p), Out(p)),
+            uncertainty=(self._uncertainty, ..., ..., Out((NUM_STATE + p) ** 2)),
         )
 
-    def _start(self, _law: Any, state: Array) -> None:
+    def _start(self, state: Array) -> None:
         law, state[:] = self.law, np.nan
         belief = law.observer.start(law.timeline, law.sensing, law.plant)
         self.now.memory.own["observer"], state[:] = belief, belief.state
 
-    def _observe(
-        self,
-        _law: Any,
-        state: Array,
-        _number: int,
-        torques: Array,
-        values: Array,
-        _scratch: Any,
-    ) -> int:
+    def _observe(self, state: Array, torques: Array, values: Array) -> int:
         law, belief = self.law, self.now.memory.own["observer"]
         if not np.array_equal(state, belief.state, equal_nan=True):
             belief = belief.at(state.copy())
@@ -153,22 +144,21 @@ class OwnParts:
         self.now.memory.own["observer"], state[:] = after, after.state
         return sum(1 << Counts._fields.index(cause) for cause in set(after.faults))
 
-    def _restart(self, law: Any, state: Array) -> None:
+    def _restart(self, state: Array) -> None:
         belief = self.now.memory.own["observer"]
-        self._start(law, state)
+        self._start(state)
         fresh = self.now.memory.own["observer"].assuming(belief.parameters)
         self.now.memory.own["observer"] = replace(fresh, measured=belief.measured)
 
-    def _parameters(self, _law: Any, _memory: Any, theta: Array, std: Array) -> None:
+    def _parameters(self, theta: Array, std: Array) -> None:
         estimate = self.now.memory.own["observer"].estimate
         theta[:], std[:] = estimate.parameters, estimate.parameter_std
 
-    def _uncertainty(self, _law: Any, _memory: Any, root: Array | None) -> float:
+    def _uncertainty(self, root: Array | None) -> float:
         belief = self.now.memory.own["observer"]
         if root is not None:
-            root[:] = 0.0
-        if root is not None and belief.estimate.uncertain:
-            root[:] = belief.estimate.covariance_root.ravel()
+            known = belief.estimate.uncertain
+            root[:] = belief.estimate.covariance_root.ravel() if known else 0.0
         return float(belief.timing)
 
     # -------------------------------------------------------------- prediction and gain
@@ -181,9 +171,9 @@ class OwnParts:
             predicts: whether the prediction is in Python.
             designs: whether the gain is in Python.
         """
-        functions: dict[str, tuple[Any, ...]] = {"outlook": (self._outlook, None, None, None)}
+        functions: dict[str, tuple[Any, ...]] = {"outlook": (self._outlook, ..., None, None)}
         if predicts:
-            functions["predict"] = (self._predict, None, None, _followed, 6, None)
+            functions["predict"] = (self._predict, ..., None, _followed, 6, None)
         if designs:
             sizes = (
                 len(self.law.plant.dynamics.free),
@@ -194,18 +184,16 @@ class OwnParts:
                 Out(NUM_STATE),
                 Out(_gain),
             )
-            functions["design"] = (self._design, None, None, *sizes)
+            functions["design"] = (self._design, ..., ..., *sizes)
         self._data.design = self._table("design", **functions)
         self._data.design.columns = columns
 
     def timeline(self) -> Timeline:
         """Return the clock with the estimated delay."""
-        if self._has_observer:
-            found: Timeline = self.now.memory.own["observer"].timeline
-            return found
-        if not self.law.finds_delay:
-            return self.law.timeline
-        return self._observed().timeline
+        if self._has_observer or self.law.finds_delay:
+            return self._observed().timeline
+        timeline: Timeline = self.law.timeline
+        return timeline
 
     def _observed(self) -> Belief:
         if self._has_observer:
@@ -217,7 +205,7 @@ class OwnParts:
     def _belief(self, outlook: Any) -> Belief:
         return self._observed().at(np.array(list(outlook.state)))
 
-    def _outlook(self, _law: Any, lag: int, outlook: Any) -> None:
+    def _outlook(self, lag: int, outlook: Any) -> None:
         law, c, belief = self.law, core(), self._observed()
         timeline, in_flight = belief.timeline, self.now.memory.in_flight.copy()
         if self._has_observer:
@@ -250,9 +238,7 @@ class OwnParts:
         substeps = 0
         return [len(arrays[0]), *map(core().at, arrays), substeps]
 
-    def _predict(
-        self, _law: Any, outlook: Any, followed: Array, integral: Array, ahead: Any
-    ) -> None:
+    def _predict(self, outlook: Any, followed: Array, integral: Array, ahead: Any) -> None:
         belief, wanted = self._belief(outlook), followed.reshape(-1, NUM_REFERENCE)[:, :NUM_STATE]
         queue = belief.timeline.queue(self.now.memory.in_flight.copy())
         found = self.law.predictor.predict(belief, integral, queue, wanted, self.law.plant)
@@ -260,8 +246,6 @@ class OwnParts:
 
     def _design(
         self,
-        _law: Any,
-        _outlook: Any,
         theta: Array | None,
         nodes: Array,
         state: Array,
@@ -301,12 +285,11 @@ class OwnParts:
             computes: whether Python computes the command; otherwise it only adds what was learned.
         """
         p, row = len(self.law.plant.dynamics.free), NUM_REFERENCE
-        self.keep_alive += call_back(
-            servo, self.raised, command=(self._command, None, p, row, Out(row))
-        )
+        sizes = ..., p, row, Out(row)
+        self.keep_alive += call_back(servo, self.raised, command=(self._command, *sizes))
         self._computes = computes
 
-    def _command(self, _servo: Any, theta: Array, row: Array, command: Array) -> int:
+    def _command(self, theta: Array, row: Array, command: Array) -> int:
         law, sample = self.law, self.now.memory.own["sample"]
         if self._computes:
             try:
@@ -321,61 +304,53 @@ class OwnParts:
     # -------------------------------------------------------------- planner and channel
 
     def planner(self) -> None:
-        """Set the planner."""
         self._data.planner = self._table(
             "planner",
-            memory=(lambda _law: 0, None),
-            scratch=(lambda _law: 0, None),
-            start=(self._start_planner, None, None),
-            follow=(self._follow, None, None, None, None, None),
-            rows=(self._rows, None, None, None, None, _times, Out(_rows_at_times)),
+            memory=(lambda: 0, ...),
+            scratch=(lambda: 0, ...),
+            start=(self._start_planner, ..., ...),
+            follow=(self._follow, ..., ..., None, ..., ...),
+            rows=(self._rows, ..., ..., ..., ..., _times, Out(_rows_at_times)),
         )
 
-    def _start_planner(self, _law: Any, _memory: Any) -> None:
+    def _start_planner(self) -> None:
         self.now.memory.own["planner"] = None
 
-    def _follow(self, _law: Any, _memory: Any, outlook: Any, _sample: Any, _scratch: Any) -> int:
+    def _follow(self, outlook: Any) -> int:
         belief = replace(self._belief(outlook), caution=outlook.caution)
         in_flight, path = self.now.memory.in_flight.copy(), self.now.memory.own["planner"]
         followed = self.law.planner.follow(path, belief, in_flight, self.now.motion, self.law.plant)
         self.now.memory.own["planner"], self.now.followed = followed.path, followed.motion
         return int(followed.replanned)
 
-    def _rows(
-        self, _law: Any, _memory: Any, _sample: Any, _number: int, times: Array, rows: Array
-    ) -> None:
+    def _rows(self, times: Array, rows: Array) -> None:
         rows[:] = np.nan
         rows[:] = self.rows_of(times, self.now.followed)
 
     def channel(self) -> None:
-        """Set the channel."""
         lib = core().lib
         self._data.channel = self._table(
             "channel",
-            memory=(lambda _law: 0, None),
+            memory=(lambda: 0, ...),
             scratch=(lib.stewart_planning_scratch, None),
-            torques=(lambda _law: self.law.channel.torques, None),
-            start=(self._start_channel, None, None),
-            update=(self._update, None, None, None, Out(_in_flight), None),
-            send=(self._send, None, None, None, None, _in_flight, None),
+            torques=(lambda: self.law.channel.torques, ...),
+            start=(self._start_channel, ..., ...),
+            update=(self._update, ..., ..., ..., Out(_in_flight), ...),
+            send=(self._send, None, ..., None, None, _in_flight, None),
         )
 
-    def _start_channel(self, _law: Any, _memory: Any) -> None:
+    def _start_channel(self) -> None:
         self.now.memory.own["channel"] = self.law.channel.start()
         self.now.memory.own["plan"] = np.zeros((self.law.channel.torques, NUM_TORQUES))
 
-    def _update(
-        self, _law: Any, _memory: Any, _report: Any, in_flight: Array, _scratch: Any
-    ) -> None:
+    def _update(self, in_flight: Array) -> None:
         own, before = self.now.memory.own, in_flight.reshape(-1, NUM_TORQUES).copy()
         own["channel"], probable = self.law.channel.in_flight(
             own["channel"], before, self.timeline(), self.now.report
         )
         in_flight[:] = np.ravel(probable)
 
-    def _send(
-        self, law: Any, _memory: Any, outlook: Any, ahead: Any, in_flight: Array, scratch: Any
-    ) -> None:
+    def _send(self, law: Any, outlook: Any, ahead: Any, in_flight: Array, scratch: Any) -> None:
         c, plan = core(), np.empty((self.law.channel.torques, NUM_TORQUES))
         pending = in_flight[len(in_flight) - NUM_TORQUES * outlook.pending :].copy()
         c.lib.stewart_plan_torques(law, outlook, ahead, c.at(pending), c.at(plan), scratch)

@@ -101,15 +101,6 @@ class PredictiveLqi:
         """Whether the law reads the motion at times that it chooses itself."""
         return self.finds_delay or not isinstance(self.planner, NoPlanner)
 
-    def require_age(self, measurement: Measurement) -> None:
-        """Check that a measurement is of the present, unless the law waits for late ones.
-
-        Raises:
-            ValueError: it is older.
-        """
-        if measurement.age != 0 and self.longest_wait == 0:
-            raise ValueError(f"measurement: got an age of {measurement.age} s; expected 0")
-
     @cached_property
     def preview_times(self) -> Array:
         """`times_for` the delay that is assumed at the start."""
@@ -170,9 +161,11 @@ class PredictiveLqi:
             The new memory; its torque (6,) is finite. In flight is the torque within the limit.
 
         Raises:
-            ValueError: a shape that does not fit. Bad numbers are survived and counted.
+            ValueError: a shape that does not fit, or a late measurement for a law that does not
+                wait for one. Bad numbers are survived and counted.
         """
-        self.require_age(measurement)
+        if measurement.age != 0 and self.longest_wait == 0:
+            raise ValueError(f"measurement: got an age of {measurement.age} s; expected 0")
         compiled = memory.compiled if memory.law is self else self._compiled
         return compiled.step(memory, measurement, motion, report, weights)
 

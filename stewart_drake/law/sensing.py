@@ -190,22 +190,15 @@ def described(sensing: Sensing, mechanism: Mechanism) -> Compiled:
     c, m, raised = core(), sensing.size, list[BaseException]()
     noise = numbers(sensing.noise_std, m)
 
-    def seen(_sensing: Any, state: Array, values: Array) -> None:
+    def seen(state: Array, values: Array) -> None:
         values[:] = np.nan
         values[:] = sensing.seen(state)
 
-    def jacobian(_sensing: Any, state: Array, J: Array) -> None:
+    def jacobian(state: Array, J: Array) -> None:
         J[:] = np.nan
         J[:] = np.ravel(sensing.through(state, np.eye(NUM_STATE)))
 
-    def start(
-        _sensing: Any,
-        values: Array,
-        near: Array | None,
-        state: Array,
-        root: Array,
-        _scratch: Any,
-    ) -> int:
+    def start(values: Array, near: Array | None, state: Array, root: Array) -> int:
         first = sensing.start(Measurement.of(values), near)
         if first is None or not np.isfinite(first.covariance).all():
             return 0
@@ -215,7 +208,7 @@ def described(sensing: Sensing, mechanism: Mechanism) -> Compiled:
         state[:], root[:] = first.state, np.ravel(root_of(first.covariance))
         return 1
 
-    def fault(_sensing: Any, _geometry: Any, period: float, values: Array, last: Array) -> int:
+    def fault(period: float, values: Array, last: Array) -> int:
         found = sensing.fault(Measurement.of(values), last, period, mechanism)
         return 0 if found is None else 1 << FAULTS.index(found)
 
@@ -223,10 +216,10 @@ def described(sensing: Sensing, mechanism: Mechanism) -> Compiled:
     keep_alive = call_back(
         table,
         raised,
-        seen=(seen, None, n, Out(m)),
-        jacobian=(jacobian, None, n, Out(m * n)),
-        start=(start, None, m, n, Out(n), Out(n * n), None),
-        fault=(fault, None, None, None, m, m),
+        seen=(seen, ..., n, Out(m)),
+        jacobian=(jacobian, ..., n, Out(m * n)),
+        start=(start, ..., m, n, Out(n), Out(n * n), ...),
+        fault=(fault, ..., ..., None, m, m),
     )
     return Compiled(table, (noise, *keep_alive), (raised,))
 
@@ -244,22 +237,13 @@ def node_times(samples: int) -> Array:
     """Return the Gauss nodes (M,) of N samples at 1/N, 2/N, ..., 1 of a period, in periods.
 
     They are the roots of the polynomial of degree M that is orthogonal on the samples: eigenvalues
-    of the Jacobi matrix of its recurrence (Golub and Welsch).
+    of the multiplication by t, projected onto the polynomials of lower degree.
     """
-    number = min(NODES, samples)
-    t = 2 * np.arange(1, samples + 1) / samples - 1
-    if samples <= number:
-        return (t + 1) / 2
-    # Stieltjes: p_{k+1} = (t - a_k) p_k - b_k p_{k-1}, orthogonal on the samples.
-    a, b = np.empty(number), np.empty(number)
-    before, p, norm = np.zeros(samples), np.ones(samples), 1.0
-    for k in range(number):
-        square = float(np.mean(p * p))
-        a[k], b[k], norm = float(np.mean(t * p * p)) / square, square / norm, square
-        before, p = p, (t - a[k]) * p - (b[k] if k else 0.0) * before
-    off = np.sqrt(b[1:])
-    nodes = np.linalg.eigvalsh(np.diag(a) + np.diag(off, 1) + np.diag(off, -1))
-    return np.asarray((nodes + 1) / 2)
+    t = np.arange(1, samples + 1) / samples
+    if samples <= NODES:
+        return t
+    Q, _ = np.linalg.qr(np.vander(t, NODES))  # orthonormal polynomials on the samples
+    return np.linalg.eigvalsh(Q.T @ (t[:, None] * Q))
 
 
 @dataclass(frozen=True)

@@ -223,7 +223,6 @@ class ReportLayout:
 
     @property
     def width(self) -> int:
-        """Size of a row."""
         return NUM_TORQUES * self.parts + 1
 
     @property

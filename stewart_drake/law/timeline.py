@@ -105,11 +105,12 @@ class Timeline:
         Raises:
             ValueError: fewer torques than that takes.
         """
-        return self._first(number, self._since(in_flight, number))
+        return self.next_periods(self._since(in_flight, number), number)
 
-    def next_period(self, queue: Array) -> TorqueSchedule:
-        """Return the schedule of the period that the oldest of torques (n, 6) begins."""
-        return self._first(1, queue)
+    def next_periods(self, queue: Array, number: int = 1) -> TorqueSchedule:
+        """Return the schedule of the periods that the oldest of torques (n, 6) begin."""
+        n = number * self.per_period
+        return TorqueSchedule(*(part[:n] for part in self.schedule(queue)))
 
     def last_period(self, in_flight: Array) -> tuple[TorqueSchedule, Array]:
         """Return the schedule since the last sample, and the torque (6,) that acts next.
@@ -124,12 +125,7 @@ class Timeline:
             parts = np.full(len(in_flight), self.period / self.parts)
             return TorqueSchedule(in_flight, parts), in_flight[-1]
         since = self._since(in_flight, 1)
-        return self._first(1, since), since[min(1, len(since) - 1)]
-
-    def _first(self, periods: int, torques: Array) -> TorqueSchedule:
-        """Return the schedule of the periods that the oldest of torques (n, 6) begin."""
-        n = periods * self.per_period
-        return TorqueSchedule(*(part[:n] for part in self.schedule(torques)))
+        return self.next_periods(since), since[min(1, len(since) - 1)]
 
     def _since(self, in_flight: Array, periods: int) -> Array:
         """Return the torques (L + n, 6) that act from n = `periods` ago on."""

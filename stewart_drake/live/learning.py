@@ -327,7 +327,7 @@ class TorqueLessons(Viewer):
         dynamics = estimated(self.experiment, parameters, last)
         timeline = Timeline(self._dt, self.experiment.scenario.true_delay)
         for time, (begin, end), acted in measured:
-            schedule = timeline.next_period(acted)
+            schedule = timeline.next_periods(acted)
             yield time + self._dt / 2, lacking_torque(dynamics, begin, end, schedule)
 
     def _rests(self, snapshot: Snapshot) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 
 from stewart_drake.dynamics.workspace import margins
 from stewart_drake.law.channel import Report
-from stewart_drake.law.gaps import LONGEST_GAP, stays_within_reach
+from stewart_drake.law.gaps import LONGEST_GAP, within_reach
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.live.checks import DelayCheck, recovered, replanned, until_next
 from stewart_drake.live.contact import Contact
@@ -277,7 +277,7 @@ class LiveLoop:
         if gap > LONGEST_GAP + 1e-9 or starts or self._measured < 0:
             return gap <= LONGEST_GAP + 1e-9
         plant, estimate = self._design.law.plant, self._known.belief.estimate
-        return gap <= eta or stays_within_reach(plant, estimate, self.record.latest, gap + eta)
+        return gap <= eta or within_reach(plant, estimate, self.record.latest)(gap + eta)
 
     @property
     def _by_hand(self) -> bool:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Final, get_args
+from typing import Any, Final
 
 import numpy as np
 from pydrake.common.value import Value
@@ -60,12 +60,11 @@ class DensityWindow(SteppedLaw):
 
     def __init__(self, period: float, kind: Kind = "magnitude") -> None:
         super().__init__()
-        arguments.one_of("kind", kind, get_args(Kind))
+        density = density_source(kind).values
         self._measurement = self.DeclareVectorInputPort("measurement", NUM_STATE)
         self._reference = self.DeclareVectorInputPort("reference", NUM_REFERENCE)
         self._torque = self.DeclareVectorInputPort("torque", NUM_TORQUES)
         self._begin(np.full((WINDOW, NUM_INPUTS), np.nan), period)
-        density = density_source(kind).values
 
         def densities(window: Array) -> Array:
             return density(window) if np.isfinite(window).any() else window[-1]

@@ -301,7 +301,7 @@ def lacking_torques(
     for k, (begin, end) in enumerate(itertools.pairwise(states), first):
         if np.all(np.isfinite([begin, end])):
             times.append(dt * (k + 0.5))
-            acted = timeline.next_period(in_flight[k : k + 2])
+            acted = timeline.next_periods(in_flight[k : k + 2])
             found.append(lacking_torque(dynamics, begin, end, acted))
     return np.array(times), np.reshape(found, (-1, 6))
 

@@ -112,7 +112,6 @@ class Network:
 
     @property
     def hidden(self) -> int:
-        """Number of hidden neurons."""
         return len(self.b1)
 
     def __call__(self, densities: ArrayLike) -> Array:

@@ -12,11 +12,12 @@ of at most 1.5.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, get_args
 
 import numpy as np
 
 from stewart_drake.core.library import core
+from stewart_drake.files.arguments import one_of
 from stewart_drake.law.compiled import Compiled, machine_of, numbers
 from stewart_drake.law.memory import Memory
 from stewart_drake.law.nominal import NominalPlant
@@ -51,8 +52,7 @@ class DensityFeatures:
     kind: Kind = "magnitude"
 
     def __post_init__(self) -> None:
-        if self.kind not in ("magnitude", "signed"):
-            raise ValueError(f"kind: got {self.kind!r}; expected 'magnitude' or 'signed'")
+        one_of("kind", self.kind, get_args(Kind))
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials
 from stewart_drake.files.versions import versions
 from stewart_drake.law.predictive_lqi import PredictiveLqi
-from stewart_drake.loop.bulk import Ending, MakeTuner, run_in_bulk
+from stewart_drake.loop.bulk import Ending, run_in_bulk
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.tuner import health_of
 from stewart_drake.scenario.config import Scenario
@@ -36,7 +36,6 @@ from stewart_drake.studies.jobs import run_jobs
 from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Network
 from stewart_drake.tuner.source import (
     FixedPolicy,
-    HealthFeatures,
     RatioPolicy,
     WeightsSource,
     densities,
@@ -77,19 +76,6 @@ Gains = tuple[tuple[float, float], ...]
 # ---------------------------------------------------------------- one condition
 
 
-def _with_health(policy: FixedPolicy | RatioPolicy) -> MakeTuner:
-    """Return the factory of a tuner that computes `health`."""
-
-    def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
-        return WeightsSource(law.plant, health_of(experiment, law), policy)
-
-    return make
-
-
-def watching(w_Q: float, w_R: float) -> MakeTuner:
-    return _with_health(FixedPolicy(np.array([w_Q, w_R])))
-
-
 def cost(ending: Ending, duration: float) -> float:
     """Return J in % s of a run of a scenario of `duration` s."""
     so_far = ending.error_so_far if np.isfinite(ending.error_so_far) else 0.0
@@ -97,18 +83,18 @@ def cost(ending: Ending, duration: float) -> float:
     return so_far if stopped is None else so_far + LOST * (duration - stopped.time)
 
 
-def watched_run(scenario: Scenario, tuner: MakeTuner, samples: int) -> tuple[Ending, Array]:
-    """Run a scenario with a tuner of features `health`.
+def watched_run(
+    scenario: Scenario, policy: FixedPolicy | RatioPolicy, samples: int
+) -> tuple[Ending, Array]:
+    """Run a scenario with weights by a policy, from features `health`.
 
     Return how it ended, and the features (samples, 18) after every second sample, else NaN.
     """
     made: list[WeightsSource] = []
 
-    def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource | None:
-        source = tuner(experiment, law)
-        assert source is not None and isinstance(source.features, HealthFeatures)
-        made.append(source)
-        return source
+    def make(experiment: Experiment, law: PredictiveLqi) -> WeightsSource:
+        made.append(WeightsSource(law.plant, health_of(experiment, law), policy))
+        return made[0]
 
     ending, health = run_in_bulk(scenario, tuner=make), np.full((samples, NUM_INPUTS), np.nan)
     padded = np.vstack([np.full((WINDOW, ending.rows.shape[1]), np.nan), ending.rows])
@@ -129,7 +115,7 @@ def run_condition(
     for i, gain in enumerate(gains):
         run = with_gain(scenario, *gain)
         if watch and i % WATCHED == 0:
-            runs.append(watched_run(run, watching(*gain), samples))
+            runs.append(watched_run(run, FixedPolicy(np.array(gain)), samples))
         else:
             runs.append((run_in_bulk(run), nothing))
     return _file(runs or [(run_in_bulk(scenario), nothing)], scenario.duration)
@@ -137,8 +123,7 @@ def run_condition(
 
 def roll_out(scenario: Scenario, network: Network, samples: int) -> bytes:
     """Run a condition with a network; return the same file of one run."""
-    tuner = _with_health(RatioPolicy(network))
-    return _file([watched_run(scenario, tuner, samples)], scenario.duration)
+    return _file([watched_run(scenario, RatioPolicy(network), samples)], scenario.duration)
 
 
 def _file(runs: list[tuple[Ending, Array]], duration: float) -> bytes:

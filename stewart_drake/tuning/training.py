@@ -110,6 +110,12 @@ def unpack(theta: Any, inputs: int, hidden: int) -> tuple[Any, Any, Any, Any]:
     return W1.reshape(hidden, inputs), b1, W2.reshape(NUM_OUTPUTS, hidden), b2
 
 
+def outputs(theta: Any, u: Any, hidden: int) -> Any:
+    """Return f (..., 2) of inputs u (..., n), by torch."""
+    W1, b1, W2, b2 = unpack(theta, u.shape[-1], hidden)
+    return (u @ W1.T + b1).sigmoid() @ W2.T + b2
+
+
 def initial_theta(inputs: int, hidden: int, targets: Array, seed: int) -> Array:
     """Draw weights of variance 1 / fan-in; the output bias is the mean of the targets (N, 2)."""
     rng = np.random.default_rng(seed)
@@ -132,12 +138,8 @@ class TorchModel:
     `outputs` is f (N, 2) of theta and inputs u (N, n), `jacobian` df/dtheta (N, 2, len(theta)).
     """
 
-    def __init__(self, inputs: int, hidden: int) -> None:
-        torch = require_torch()
-
-        def forward(theta: Any, u: Any) -> Any:
-            W1, b1, W2, b2 = unpack(theta, inputs, hidden)
-            return W2 @ torch.sigmoid(W1 @ u + b1) + b2
+    def __init__(self, hidden: int) -> None:
+        torch, forward = require_torch(), partial(outputs, hidden=hidden)
 
         def of_arrays(function: Any) -> Callable[[Array, Array], Array]:
             over_rows = torch.func.vmap(function, in_dims=(None, 0))
@@ -281,7 +283,7 @@ def train(
             f"network with {hidden} hidden neurons; expected more runs that complete"
         )
     mean, scale = standard(rows.inputs[chosen])
-    u, model = (rows.inputs - mean) / scale, TorchModel(NUM_INPUTS, hidden)
+    u, model = (rows.inputs - mean) / scale, TorchModel(hidden)
     test = (u[~in_train], rows.targets[~in_train])
     found = fit(model, theta, (u[chosen], rows.targets[chosen]), test, evaluations)
     constant = np.sqrt(np.mean((test[1] - rows.targets[chosen].mean(axis=0)) ** 2))
@@ -503,8 +505,7 @@ class RegretTrainer:
 
     def loss(self, theta: Any, inputs: Any, regret: Any) -> Any:
         """Return the mean regret of the ratios that the network answers with."""
-        W1, b1, W2, b2 = unpack(theta, NUM_INPUTS, HIDDEN)
-        y = self._torch.sigmoid(inputs @ W1.T + b1) @ W2.T + b2
+        y = outputs(theta, inputs, HIDDEN)
         ratio = (y[:, 0] - y[:, 1]) / np.log(10)
         low, high, step = RATIOS[0], RATIOS[-1], RATIOS[1] - RATIOS[0]
         within = ratio.clamp(low, high)
