@@ -19,12 +19,11 @@ from stewart_drake.identification import logs
 from stewart_drake.scenario.run_log import (
     Background,
     UdpMirror,
-    channels_of,
     open_log,
     read_log,
     scenario_of,
 )
-from stewart_drake.scenario.signals import SIGNALS
+from stewart_drake.scenario.signals import SIGNALS, recorded_signals
 from tests.mechanisms import PAPER
 from tests.test_machine_process import free_port
 
@@ -171,7 +170,7 @@ def test_missing_logs_and_other_suffixes_are_said_in_a_line(tmp_path, capsys):
 
 
 def row(value):
-    return {one.name: np.full(len(one.fields), value) for one in channels_of(None)}
+    return {one.name: np.full(one.size, value) for one in recorded_signals(None)}
 
 
 def test_the_mirror_sends_every_row_as_json():
