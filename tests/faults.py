@@ -45,12 +45,20 @@ def tree(folder: Path) -> dict[str, bytes | None]:
     }
 
 
+def one_line(call: Callable[[], Any], *parts: str, start: str = "") -> str:
+    """Return the message of a call that is refused: a line with a beginning and further parts."""
+    with pytest.raises(ConfigError) as caught:
+        call()
+    said = str(caught.value)
+    assert len(said.splitlines()) == 1 and said.startswith(start)
+    for part in parts:
+        assert part in said
+    return said
+
+
 def complaint(load: Loader, path: Path) -> str:
     """Return the message of a file that is refused: one line that names the path."""
-    with pytest.raises(ConfigError) as caught:
-        load(path)
-    said = str(caught.value)
-    assert str(path) in said and len(said.splitlines()) == 1
+    said = one_line(lambda: load(path), str(path))
     check_remedy(said)
     return said
 

@@ -1,8 +1,6 @@
-"""Machines that are singular at home, and mechanism files of any machine."""
+"""Machines that are singular at home."""
 
 import dataclasses
-import json
-from pathlib import Path
 
 import numpy as np
 
@@ -42,39 +40,3 @@ def parallel_rods() -> Mechanism:
         rod_lengths=np.full(6, 0.35),
         branches=np.full(6, -1.0),
     )
-
-
-def write_mechanism(mechanism: Mechanism, path: Path) -> Path:
-    """Return a mechanism file with explicit legs; JSON is YAML."""
-    legs = [
-        {
-            "shaft": p_WS.tolist(),
-            "motor_axis": R_WS[:, 2].tolist(),
-            "crank_zero": R_WS[:, 0].tolist(),
-            "plate_joint": p_PQ.tolist(),
-            "branch": int(branch),
-        }
-        for p_WS, R_WS, p_PQ, branch in zip(
-            mechanism.p_WS, mechanism.R_WS, mechanism.p_PQ, mechanism.branches, strict=True
-        )
-    ]
-    bodies = {
-        name: {"mass": body.mass, "inertia": body.inertia.tolist()}
-        for name, body in (("base", mechanism.base), ("plate", mechanism.plate))
-    }
-    links = {
-        name: {
-            "length": lengths.tolist(),
-            "mass": link.mass,
-            "inertia": link.inertia.tolist(),
-            "center": link.center,
-        }
-        for name, link, lengths in (
-            ("crank", mechanism.crank, mechanism.crank_lengths),
-            ("rod", mechanism.rod, mechanism.rod_lengths),
-        )
-    }
-    head = {"name": mechanism.name, "home": mechanism.home.tolist()}
-    motor = {"motor": {"effort_limit": mechanism.effort_limit}}
-    path.write_text(json.dumps(head | bodies | links | motor | {"legs": legs}, indent=1))
-    return path

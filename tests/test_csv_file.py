@@ -102,10 +102,3 @@ def test_export_gives_what_simulate_wrote(tmp_path, capsys):
     assert out.read_text() == written and len(table(written)["time[s]"]) == 16
     assert main(["simulate", *SHORT, "--out", str(tmp_path), "--quiet"]) == 0
     assert not (tmp_path / "signals.csv").exists(), "of an earlier run"
-
-
-@pytest.mark.parametrize("option", ["--csv", "--replay"])
-def test_files_need_a_place(option, capsys):
-    assert main(["simulate", *SHORT, option]) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and option in err and "--out" in err

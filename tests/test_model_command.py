@@ -16,13 +16,14 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.resources import data_root, shipped
 from stewart_drake.mechanism.assembly import assemble
-from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.reporting.mechanism import mechanism_figure
 from stewart_drake.reporting.viewer import SLIDERS, STOP, PoseViewer, place, slider_range
 from stewart_drake.studies.new_machine import check_mechanism
+from tests.faults import written
 from tests.mechanisms import PAPER
 from tests.screen import said, summary_in
-from tests.singular import parallel_rods, stretched, write_mechanism
+from tests.singular import parallel_rods, stretched
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -69,7 +70,7 @@ def test_check_marks_moments_that_nobody_measured(tmp_path, capsys):
     ("machine", "why"), [(parallel_rods(), "parallel singularity"), (stretched(), "end of its")]
 )
 def test_a_singular_machine_gets_a_verdict_and_can_be_viewed(machine, why, tmp_path, capsys):
-    path = write_mechanism(machine, tmp_path / "machine.yaml")
+    path = written(tmp_path / "machine.yaml", mechanism_yaml(machine))
     lines = said(capsys, "model", "check", path, "--out", tmp_path / "out").splitlines()
     assert lines[0].startswith("no: the home pose is singular") and why in " ".join(lines[:2])
     assert (tmp_path / "out" / "mechanism.png").exists()

@@ -6,6 +6,7 @@ import pytest
 
 from stewart_drake.files import resources
 from stewart_drake.files.errors import ConfigError
+from tests.faults import one_line
 
 
 def test_a_wheel_carries_the_data_inside_the_package(tmp_path, monkeypatch):
@@ -59,10 +60,4 @@ def test_a_shipped_name_is_a_file_and_never_one_in_the_working_directory(tmp_pat
     ],
 )
 def test_what_is_missing_is_named_in_one_line(name, parts):
-    with pytest.raises(ConfigError) as caught:
-        resources.resolve("scenario", name)
-    message = str(caught.value)
-    assert message.startswith("scenario: ")
-    assert "\n" not in message
-    for part in parts:
-        assert part in message
+    one_line(lambda: resources.resolve("scenario", name), *parts, start="scenario: ")

@@ -19,12 +19,12 @@ from stewart_drake.identification import logs
 from stewart_drake.scenario.run_log import (
     Background,
     UdpMirror,
-    channels_of,
     open_log,
     read_log,
     scenario_of,
 )
-from stewart_drake.scenario.signals import SIGNALS
+from stewart_drake.scenario.signals import SIGNALS, recorded_signals
+from tests.faults import one_line, written
 from tests.mechanisms import PAPER
 from tests.test_machine_process import free_port
 
@@ -148,30 +148,20 @@ def test_a_log_is_replayed(run, tmp_path):
     ],
 )
 def test_what_is_no_log_is_said_in_a_line(tmp_path, name, data, words):
-    (tmp_path / name).write_bytes(data)
-    with pytest.raises(ConfigError, match=words) as said:
-        sd.read_log(tmp_path / name)
-    assert "\n" not in str(said.value) and name in str(said.value)
+    path = written(tmp_path / name, data)
+    one_line(lambda: sd.read_log(path), words, name)
 
 
-def test_missing_logs_and_other_suffixes_are_said_in_a_line(tmp_path, capsys):
-    with pytest.raises(ConfigError, match="no such file"):
-        sd.read_log(tmp_path / "none.mcap")
-    with pytest.raises(ConfigError, match=r"has no signals\.nc"):
-        sd.read_log(tmp_path)
-    for target, words in (("run.txt", "ends in .mcap or .csv"), (".", "a directory")):
-        arguments = ["simulate", "paper", *(f"--set={one}" for one in SHORT)]
-        assert main([*arguments, "--quiet", "--log", str(tmp_path / target)]) == 2
-        said = capsys.readouterr().err
-        assert words in said and said.count("\n") == 1
-    assert main(["live", "paper", "--machine", "127.0.0.1:1", "--mirror", "here", "--quiet"]) == 2
+def test_missing_logs_are_said_in_a_line(tmp_path):
+    one_line(lambda: sd.read_log(tmp_path / "none.mcap"), "no such file")
+    one_line(lambda: sd.read_log(tmp_path), "has no signals.nc")
 
 
 # Live.
 
 
 def row(value):
-    return {one.name: np.full(len(one.fields), value) for one in channels_of(None)}
+    return {one.name: np.full(one.size, value) for one in recorded_signals(None)}
 
 
 def test_the_mirror_sends_every_row_as_json():

@@ -14,12 +14,12 @@ from stewart_drake.law.riccati import full_gain
 from stewart_drake.law.startup import machine_torque
 from stewart_drake.loop import preparation as experiment_module
 from stewart_drake.loop.simulation import simulate
-from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import Body, Link
 from stewart_drake.scenario.loading import load_scenario
+from tests.faults import written
 from tests.mechanisms import PAPER
 from tests.oracles import relative
-from tests.singular import write_mechanism
 from tests.test_riccati import STEPS, UNIT, delayed
 
 SIZES = [(0.1, 1e-3), (0.01, 1e-6), (10.0, 1e3), (1.0, 100.0)]
@@ -120,7 +120,7 @@ def test_the_machines_torque_is_in_proportion(s, m):
 
 def test_a_file_may_describe_a_machine_of_a_few_millimetres(tmp_path):
     s, m = 0.01, 1e-6
-    path = write_mechanism(scaled(s, m), tmp_path / "small.yaml")
+    path = written(tmp_path / "small.yaml", mechanism_yaml(scaled(s, m)))
     assert relative(load_mechanism(path).p_WS, scaled(s, m).p_WS) < 1e-12
     settings = ("plant.kind=exact", "duration=2", *ON)
     sc = load_scenario("paper", None, (f"mechanism={path}", *settings))

@@ -16,7 +16,7 @@ from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, margin, measures
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop.preparation import assemble, check_instants, prepare
-from stewart_drake.mechanism.files import load_mechanism
+from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rotation
 from stewart_drake.mechanism.trajectories import make_reference, poses_along
@@ -33,9 +33,10 @@ from stewart_drake.studies.workspace_map import (
     travel,
     wrenches,
 )
+from tests.faults import written
 from tests.mechanisms import PAPER, random_mechanism, random_pose
 from tests.screen import said, summary_in
-from tests.singular import parallel_rods, stretched, write_mechanism
+from tests.singular import parallel_rods, stretched
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -310,7 +311,7 @@ def test_a_reference_that_leaves_is_analysed_not_refused(tmp_path, capsys):
 @pytest.mark.usefixtures("few_poses")
 @pytest.mark.parametrize("machine", [parallel_rods(), stretched()], ids=["parallel", "dead centre"])
 def test_a_singular_home_pose_gets_a_verdict(machine, tmp_path, capsys):
-    path = write_mechanism(machine, tmp_path / "singular.yaml")
+    path = written(tmp_path / "singular.yaml", mechanism_yaml(machine))
     hold = ["--set", "reference.kind=hold", "--set", f"reference.offset={machine.home.tolist()}"]
     chosen = ["--set", f"mechanism={path}", *hold]
     out = said(capsys, "analyze", "workspace", "paper", *chosen, "--out", tmp_path / "a")

@@ -22,8 +22,14 @@ from stewart_drake.loop.controller import held_by
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.recording import Record
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.run_log import Background, CsvFile, RunLog, channels_of, csv_heads
-from stewart_drake.scenario.signals import NUM_STATE, NUM_TORQUES, TUNER_INPUTS, ports_of
+from stewart_drake.scenario.run_log import Background, CsvFile, RunLog, csv_heads
+from stewart_drake.scenario.signals import (
+    NUM_STATE,
+    NUM_TORQUES,
+    TUNER_INPUTS,
+    ports_of,
+    recorded_signals,
+)
 from stewart_drake.types import Array
 
 _WAITS: Final = 24
@@ -96,7 +102,7 @@ class LiveRecord(Record):
         self.applied: dict[int, Array] = {}
         self.latest: Array = np.zeros(NUM_TORQUES)
         self._acts: Array = np.full(NUM_TORQUES, np.nan)
-        header = csv_heads(channels_of(experiment.scenario.sensor.samples))
+        header = csv_heads(recorded_signals(experiment.scenario.sensor.samples))
         self._file = RowFile(path, [*header, "step[s]", "late[s]"], say)
 
     def acted(self, torques: dict[int, Array]) -> None:

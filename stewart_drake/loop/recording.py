@@ -28,7 +28,7 @@ from stewart_drake.scenario.signals import (
     PACKETS,
     POSE,
     exported_ports,
-    run_signals,
+    recorded_signals,
 )
 from stewart_drake.scenario.timing import Instant
 from stewart_drake.types import Array
@@ -65,8 +65,7 @@ class Record:
         self._logs, self._scenario = logs, experiment.scenario
         self._functions = functions_of(mechanism)
         self.setpoint: Array = np.full(NUM_TORQUES, np.nan)
-        samples = experiment.scenario.sensor.samples
-        self._recorded = [one for one in run_signals(samples).values() if one.source]
+        self._recorded = recorded_signals(experiment.scenario.sensor.samples)
         self._log, self.on_grid, self.samples = list[Array](), list[Array](), list[Array]()
         self.peak_applied = 0.0
         self.counts, self.tuner_fallbacks = Counts(), 0

@@ -13,6 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import resolve
+from stewart_drake.files.schema import plain
 from stewart_drake.files.yamlio import exactly, load_yaml, one_message, rule, validate, yaml_text
 from stewart_drake.mechanism.geometry import Body, Link, Mechanism, bar_inertia, disc_inertia
 from stewart_drake.mechanism.kinematics import Legs, UnreachablePoseError, dot
@@ -179,40 +180,29 @@ def mechanism_yaml(mechanism: Mechanism) -> str:
     """Return a mechanism, leg by leg, as the text of a file that `load_mechanism` reads back."""
     m = mechanism
     legs = [
-        {
-            "shaft": p_WS.tolist(),
-            "motor_axis": R_WS[:, 2].tolist(),
-            "crank_zero": R_WS[:, 0].tolist(),
-            "plate_joint": p_PQ.tolist(),
-            "branch": int(branch),
-        }
+        LegSpec(p_WS.tolist(), R_WS[:, 2].tolist(), R_WS[:, 0].tolist(), p_PQ.tolist(), int(branch))
         for p_WS, R_WS, p_PQ, branch in zip(m.p_WS, m.R_WS, m.p_PQ, m.branches, strict=True)
     ]
+    rubbing = ([leg for leg, rubs in zip(LEGS, row, strict=True) if rubs] for row in m.ball_joints)
 
-    def body(one: Body, **others: object) -> dict[str, object]:
-        return {"mass": float(one.mass), "inertia": one.inertia.tolist(), **others}
+    def link(one: Link, lengths: Array) -> LinkSpec:
+        return LinkSpec(lengths.tolist(), one.mass, one.inertia.tolist(), one.center)
 
-    def link(one: Link, lengths: Array) -> dict[str, object]:
-        return body(one, length=lengths.tolist(), center=float(one.center))
-
-    rubbing = {
-        end: [leg for leg, rubs in zip(LEGS, row, strict=True) if rubs]
-        for end, row in zip(("crank", "plate"), m.ball_joints, strict=True)
-    }
-    return yaml_text(
-        {
-            "name": m.name,
-            "home": m.home.tolist(),
-            "legs": legs,
-            "base": body(m.base),
-            "plate": body(m.plate),
-            "crank": link(m.crank, m.crank_lengths),
-            "rod": link(m.rod, m.rod_lengths),
-            "motor": {"effort_limit": None if m.effort_limit is None else float(m.effort_limit)},
-            **({} if np.all(m.ball_joints) else {"ball_joints": rubbing}),
-            **({} if m.drawn is None else {"drawn": m.drawn}),
-        }
+    spec = MechanismSpec(
+        m.name,
+        m.home.tolist(),
+        base=BodySpec(m.base.mass, m.base.inertia.tolist()),
+        plate=BodySpec(m.plate.mass, m.plate.inertia.tolist()),
+        crank=link(m.crank, m.crank_lengths),
+        rod=link(m.rod, m.rod_lengths),
+        motor=MotorSpec(m.effort_limit),
+        ball_joints=BallJointSpec(*rubbing),
+        drawn=m.drawn,
+        legs=legs,
     )
+    usual = {"ball_joints"} if np.all(m.ball_joints) else set()
+    given = plain(spec).items()
+    return yaml_text({name: one for name, one in given if one is not None and name not in usual})
 
 
 def build_mechanism(spec: MechanismSpec) -> Mechanism:

@@ -1,6 +1,6 @@
 """SDFormat of a `Mechanism` for Drake: links, joints, shapes, a ball constraint per leg."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -42,8 +42,8 @@ def to_sdformat(mechanism: Mechanism, *, collision: bool = True, weld: bool = Tr
     if collision:
         group = _add(model, "drake:collision_filter_group", name="machine")
         for link in model.iter("link"):
-            _add(group, "drake:member", link.get("name"))
-        _add(group, "drake:ignored_collision_filter_group", "machine")
+            ET.SubElement(group, "drake:member").text = link.get("name")
+        ET.SubElement(group, "drake:ignored_collision_filter_group").text = "machine"
     else:
         for link in model.iter("link"):
             for shape in link.findall("collision"):
@@ -80,8 +80,7 @@ def _base(model: ET.Element, mechanism: Mechanism, weld: bool) -> None:
 
 
 def _plate(model: ET.Element, mechanism: Mechanism, home: Assembly) -> None:
-    link = _add(model, "link", name="plate")
-    _add(link, "pose", _pose(mechanism.home[3:], home.R_WP))
+    link = _add(model, "link", {"pose": _pose(mechanism.home[3:], home.R_WP)}, name="plate")
     _inertial(link, mechanism.plate, np.zeros(3))
     size = proportions(mechanism)
     radius = 1.08 * np.hypot(mechanism.p_PQ[:, 0], mechanism.p_PQ[:, 1]).max()
@@ -104,8 +103,8 @@ def _leg(model: ET.Element, mechanism: Mechanism, home: Assembly, leg: int) -> N
     i = leg - 1
     u, length = mechanism.crank_lengths[i], mechanism.rod_lengths[i]
     size = proportions(mechanism)
-    crank = _add(model, "link", name=f"crank_{leg}")
-    _add(crank, "pose", _pose(mechanism.p_WS[i], home.R_WC[i]))
+    place = {"pose": _pose(mechanism.p_WS[i], home.R_WC[i])}
+    crank = _add(model, "link", place, name=f"crank_{leg}")
     _inertial(crank, mechanism.crank, np.array([mechanism.crank.center * u, 0, 0]))
     arm = _shape("box", size=[u, size.crank_width, size.crank_thickness])
     _solid(crank, "arm", _pose([u / 2, 0, 0]), arm, CRANK_COLOR)
@@ -115,8 +114,7 @@ def _leg(model: ET.Element, mechanism: Mechanism, home: Assembly, leg: int) -> N
     _visual(crank, "tip", _pose([u, 0, 0]), ball, JOINT_COLOR)
     _frame(model, f"tip_{leg}", f"crank_{leg}", _pose([u, 0, 0]))
 
-    rod = _add(model, "link", name=f"rod_{leg}")
-    _add(rod, "pose", _pose(home.p_WT[i], home.R_WD[i]))
+    rod = _add(model, "link", {"pose": _pose(home.p_WT[i], home.R_WD[i])}, name=f"rod_{leg}")
     _inertial(rod, mechanism.rod, np.array([mechanism.rod.center * length, 0, 0]))
     along_x = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     tube = _cylinder(size.rod_radius, length)
@@ -124,31 +122,32 @@ def _leg(model: ET.Element, mechanism: Mechanism, home: Assembly, leg: int) -> N
     _frame(model, f"rod_end_{leg}", f"rod_{leg}", _pose([length, 0, 0]))
 
     motor = _joint(model, f"motor_{leg}", "revolute", "base", f"crank_{leg}")
-    axis = _axis(motor, "axis", np.array([0.0, 0, 1]))
+    axis = _add(motor, "axis", {"xyz": "0 0 1"})
     if mechanism.effort_limit is not None:
-        _add(_add(axis, "limit"), "effort", f"{mechanism.effort_limit:.17g}")
+        _add(axis, "limit", {"effort": f"{mechanism.effort_limit:.17g}"})
 
     universal = _joint(model, f"universal_{leg}", "universal", f"crank_{leg}", f"rod_{leg}")
-    for tag, direction in (
-        ("axis", home.R_WD[i].T @ mechanism.R_WS[i][:, 2]),
-        ("axis2", np.array([0.0, 1, 0])),
-    ):
-        passive = _add(_axis(universal, tag, direction), "limit")
-        _add(passive, "effort", "0")
+    first = _numbers(home.R_WD[i].T @ mechanism.R_WS[i][:, 2])
+    for tag, xyz in (("axis", first), ("axis2", "0 1 0")):
+        _add(_add(universal, tag, {"xyz": xyz}), "limit", {"effort": "0"})
 
-    loop = _add(model, "drake:ball_constraint")
-    for name, value in (
-        ("body_A", f"rod_{leg}"),
-        ("body_B", "plate"),
-        ("p_AP", _numbers([length, 0, 0])),
-        ("p_BQ", _numbers(mechanism.p_PQ[i])),
-    ):
-        _add(loop, f"drake:ball_constraint_{name}", value)
+    ends = {
+        "body_A": f"rod_{leg}",
+        "body_B": "plate",
+        "p_AP": _numbers([length, 0, 0]),
+        "p_BQ": _numbers(mechanism.p_PQ[i]),
+    }
+    parts = {f"drake:ball_constraint_{name}": value for name, value in ends.items()}
+    _add(model, "drake:ball_constraint", parts)
 
 
-def _add(parent: ET.Element, tag: str, text: str | None = None, **attributes: str) -> ET.Element:
+def _add(
+    parent: ET.Element, tag: str, parts: Mapping[str, str] | None = None, **attributes: str
+) -> ET.Element:
+    """Add an element whose `parts` are elements with a text each, by tag."""
     element = ET.SubElement(parent, tag, attributes)
-    element.text = text
+    for name, text in (parts or {}).items():
+        ET.SubElement(element, name).text = text
     return element
 
 
@@ -170,31 +169,18 @@ def _pose(p: Iterable[float], R: Array | None = None) -> str:
 
 
 def _frame(model: ET.Element, name: str, attached_to: str, pose: str) -> None:
-    frame = _add(model, "frame", name=name, attached_to=attached_to)
-    _add(frame, "pose", pose)
+    _add(model, "frame", {"pose": pose}, name=name, attached_to=attached_to)
 
 
 def _inertial(link: ET.Element, body: Body, com: Array) -> None:
-    inertial = _add(link, "inertial")
-    _add(inertial, "pose", _pose(com))
-    _add(inertial, "mass", _numbers([body.mass]))
-    inertia = _add(inertial, "inertia")
+    inertial = _add(link, "inertial", {"pose": _pose(com), "mass": _numbers([body.mass])})
     moments = dict(zip(("ixx", "iyy", "izz"), body.inertia, strict=True))
-    for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"):
-        _add(inertia, name, _numbers([moments.get(name, 0.0)]))
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    _add(inertial, "inertia", {name: _numbers([moments.get(name, 0.0)]) for name in names})
 
 
 def _joint(model: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:
-    joint = _add(model, "joint", name=name, type=kind)
-    _add(joint, "parent", parent)
-    _add(joint, "child", child)
-    return joint
-
-
-def _axis(joint: ET.Element, tag: str, xyz: Array) -> ET.Element:
-    axis = _add(joint, tag)
-    _add(axis, "xyz", _numbers(xyz))
-    return axis
+    return _add(model, "joint", {"parent": parent, "child": child}, name=name, type=kind)
 
 
 def _solid(
@@ -202,18 +188,16 @@ def _solid(
 ) -> None:
     """Add a shape for display and collisions."""
     _visual(link, name, pose, geometry, color)
-    collision = _add(link, "collision", name=name)
-    _add(collision, "pose", pose)
+    collision = _add(link, "collision", {"pose": pose}, name=name)
     _add(collision, "geometry").append(geometry)
 
 
 def _visual(
     link: ET.Element, name: str, pose: str, geometry: ET.Element, color: tuple[float, ...]
 ) -> None:
-    visual = _add(link, "visual", name=name)
-    _add(visual, "pose", pose)
+    visual = _add(link, "visual", {"pose": pose}, name=name)
     _add(visual, "geometry").append(geometry)
-    _add(_add(visual, "material"), "diffuse", _numbers(color))
+    _add(visual, "material", {"diffuse": _numbers(color)})
 
 
 def _cylinder(radius: float, length: float) -> ET.Element:
@@ -223,5 +207,5 @@ def _cylinder(radius: float, length: float) -> ET.Element:
 def _shape(kind: str, **sizes: Iterable[float]) -> ET.Element:
     shape = ET.Element(kind)
     for name, values in sizes.items():
-        _add(shape, name, _numbers(values))
+        ET.SubElement(shape, name).text = _numbers(values)
     return shape

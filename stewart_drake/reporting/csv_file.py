@@ -7,8 +7,8 @@ import xarray as xr
 
 from stewart_drake.files.csvio import csv_text
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.scenario.run_log import EXPECTED, headings, read_log
-from stewart_drake.scenario.signals import SIGNALS
+from stewart_drake.scenario.run_log import EXPECTED, read_log
+from stewart_drake.scenario.signals import NUM_LEGS, headings, run_signals
 from stewart_drake.types import Array
 
 
@@ -23,14 +23,11 @@ def signals_csv(signals: xr.Dataset) -> str:
 def columns_of(signals: xr.Dataset) -> tuple[list[str], Array]:
     """Return the heads of `signals_csv` and its numbers (instants, columns)."""
     header, columns = ["time[s]"], [signals.time.values[:, None]]
+    known = run_signals(signals.sizes.get("encoder", 0) // NUM_LEGS or None)
     for name, signal in signals.data_vars.items():
         others = [dimension for dimension in signal.dims if dimension != "time"]
-        labels = [str(label) for other in others for label in signal[other].values]
-        if signal.dims == ("time", "encoder"):  # measured crank angles, of any number
-            units = ["rad"] * len(labels)
-        else:
-            known = SIGNALS.get(str(name))
-            units = list(known.quantity.units) if known else ["1"] * max(1, len(labels))
+        labels = [label for other in others for label in signal[other].values]
+        units = known[str(name)].quantity.units if name in known else ["1"] * max(1, len(labels))
         header += headings(str(name), labels, units)
         columns.append(signal.transpose("time", *others).values.reshape(len(signal.time), -1))
     return header, np.hstack(columns)

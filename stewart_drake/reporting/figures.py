@@ -75,7 +75,7 @@ def draw_comparison(results: Mapping[str, SimulationResult]) -> dict[str, Figure
     for name, result in results.items():
         alone = lines[name]._replace(linestyle="-", marker="")
         figures[f"torques_{name}"] = _torques(result, spoken(name), alone)
-    figures |= {f"delay_{name}": _delay(one) for name, one in results.items() if _finds_delay(one)}
+    figures |= {f"delay_{n}": _delay(one) for n, one in results.items() if has(one, "delay_std")}
     tuned = {spoken(name): run for name, run in results.items() if _is_tuned(run)}
     if tuned:
         figures["weights"] = weights_figure(tuned)
@@ -89,9 +89,9 @@ def draw_run(result: SimulationResult) -> dict[str, Figure]:
     """
     figures = _poses({"plate": (result, style.RUN)})
     figures["torques"] = _torques(result, "applied", style.RUN, commanded=True)
-    if np.isfinite(result.signals.parameter_std.values).any():
+    if has(result, "parameter_std"):
         figures["parameters"] = _parameters(result)
-    if _finds_delay(result):
+    if has(result, "delay_std"):
         figures["delay"] = _delay(result)
     if _is_tuned(result):
         figures["weights"] = weights_figure({"": result})
@@ -102,13 +102,9 @@ def _is_tuned(run: SimulationResult) -> bool:
     return run.scenario.tuner.kind != "fixed"
 
 
-def _finds_delay(run: SimulationResult) -> bool:
-    return bool(np.isfinite(run.signals.delay_std.values).any())
-
-
-def has_packets(run: SimulationResult) -> bool:
-    """Return whether the torques of a run went over a network."""
-    return bool(np.isfinite(run.signals.packets.values).any())
+def has(run: SimulationResult, signal: str) -> bool:
+    """Return whether a run has a finite value of a signal."""
+    return bool(np.isfinite(run.signals[signal].values).any())
 
 
 def _poses(runs: _Runs) -> dict[str, Figure]:
@@ -210,18 +206,19 @@ def _torques(run: SimulationResult, label: str, line: Line, commanded: bool = Fa
     cut = run.stopped is None and bool(np.ptp(drawn) > _LARGE_START * np.ptp(late) > 0)
     unit, factor = style.unit_for(late if cut else drawn, style.TORQUES)
     ylim = _limits([factor * late.ravel()], [], 0.0) if cut else None
-    for k, leg in enumerate(LEGS):
-        wanted = factor * asked[:, k]
-        curves = [Curve(signals.time.values, wanted, "commanded", style.COMMANDED, steps=True)]
-        applied = _curve(run, factor * acted[:, k], label, line, steps=True)
+
+    def curves(asked: Array, acted: Array) -> list[Curve]:
+        wanted = Curve(signals.time.values, asked, "commanded", style.COMMANDED, steps=True)
+        applied = _curve(run, acted, label, line, steps=True)
+        return [wanted, applied] if commanded else [applied]
+
+    for leg, *torques in zip(LEGS, factor * asked.T, factor * acted.T, strict=True):
         name = f"motor {leg}{'' if commanded else ' applied'}  [{unit}]"
-        panels.append(Panel(name, [*curves * commanded, applied], xlim=xlim, ylim=ylim))
+        panels.append(Panel(name, curves(*torques), xlim=xlim, ylim=ylim))
     if commanded and (acted.any() or asked.any()):
         sizes = [np.abs(factor * torque).max(axis=1) for torque in (asked, acted)]
-        first = Curve(signals.time.values, sizes[0], "commanded", style.COMMANDED, steps=True)
-        second = _curve(run, sizes[1], label, line, steps=True)
-        panels.append(_sizes(f"largest of six  [{unit}]", [first, second], sizes, xlim))
-    if has_packets(run):
+        panels.append(_sizes(f"largest of six  [{unit}]", curves(*sizes), sizes, xlim))
+    if has(run, "packets"):
         strip = partial(_packet_strip, run=run)
         panels.append(Panel("", xlim=xlim, height=1.15, wide=True, paint=strip))
     title = "Torques of the motors"

@@ -37,7 +37,7 @@ from stewart_drake.reporting.document import (
 from stewart_drake.reporting.figures import (
     draw_comparison,
     draw_run,
-    has_packets,
+    has,
     weights_figure,
 )
 from stewart_drake.reporting.mechanism import document as describe
@@ -225,7 +225,7 @@ def document(found: ReportData, name: str, replay: str = "") -> Document:
     own = found.run and _blocks(run_document(found.run))
     said = found.run.summary["warnings"] if found.run else ()
     if found.run and own:
-        below = _PACKETS_BELOW if has_packets(found.run) else ""
+        below = _PACKETS_BELOW if has(found.run, "packets") else ""
         for what, figure in draw_run(found.run).items():
             own.append(Picture(figure, _CAPTIONS[what] + below * (what == "torques")))
     made = from_template(

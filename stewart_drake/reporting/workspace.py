@@ -96,9 +96,7 @@ def _crossing(nearest: Nearest) -> str:
 def margins_figure(study: WorkspaceStudy) -> Figure:
     margins, left = study.margins, study.exit
     time, top = study.time, min(np.nanmax(margins.condition, initial=2.0), 1e4)
-    sines = leg_curves(time, margins.sines)
-    lowest = float(np.nanmin(margins.sines))
-    inside = [Curve(time, np.where(np.isnan(margins.condition), np.nan, margins.parallel))]
+    parallel = np.where(np.isnan(margins.condition), np.nan, margins.parallel)
 
     def shade(ax: Axes) -> None:
         if left is not None:
@@ -106,27 +104,25 @@ def margins_figure(study: WorkspaceStudy) -> Figure:
             ax.axvspan(left.time, time[-1], label="after leaving", **style)
 
     how: Any = {"xlim": (0, time[-1]), "height": 2.8, "paint": shade}
-    condition = [Curve(time, margins.condition)]
-    reach = leg_curves(time, 1e3 * margins.reach)
     panels = [
-        Panel("reach margin  [mm]", reach, limits={0.0: ""}, **how),
+        Panel("reach margin  [mm]", leg_curves(time, 1e3 * margins.reach), limits={0.0: ""}, **how),
         Panel(
             "sine off dead centre  [-]",
-            sines,
+            leg_curves(time, margins.sines),
             limits={DEAD_CENTRE_SINE: ""},
-            ylim=(max(-0.05, lowest), 1.05),
+            ylim=(max(-0.05, float(np.nanmin(margins.sines))), 1.05),
             **how,
         ),
         Panel(
             "parallel measure, det W  [-]",
-            inside,
+            [Curve(time, parallel)],
             limits={SINGULARITY_LIMIT: ""},
             ylim=(-0.1, None),
             **how,
         ),
         Panel(
             "condition number of A  [-]",
-            condition,
+            [Curve(time, margins.condition)],
             ylim=(0.95, 1.25 * top),
             yscale="log",
             **how,

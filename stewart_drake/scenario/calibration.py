@@ -6,10 +6,11 @@ from typing import Final
 
 import numpy as np
 
+from stewart_drake.files.arguments import fixed
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
 from stewart_drake.files.jsonio import jsonable
-from stewart_drake.files.yamlio import brief, load_yaml, validate, yaml_text
+from stewart_drake.files.yamlio import load_yaml, validate, yaml_text
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.field_types import section
@@ -39,20 +40,14 @@ class Calibration:
     covariance: Array  # (n, n); zero for exactly known parameters
 
     def __post_init__(self) -> None:
-        n, mean, P = len(self.names), np.array(self.mean), np.array(self.covariance)
+        n = len(self.names)
         if len({*self.names} & {*CALIBRATED}) < n:
             accepted = ", ".join(CALIBRATED)
             raise ConfigError(
                 f"names: got {list(self.names)}; expected some of {accepted}, each once"
             )
-        for field, value, shape in (("mean", mean, (n,)), ("covariance", P, (n, n))):
-            if value.shape != shape:
-                raise ConfigError(
-                    f"{field}: got shape {value.shape}; expected {shape}, for {n} names"
-                )
-            if not np.all(np.isfinite(value)):
-                raise ConfigError(f"{field}: got {brief(value.tolist())}; expected finite numbers")
-        self._check_covariance(P)
+        fixed(f"mean of {n} names", self.mean, (n,))
+        self._check_covariance(fixed(f"covariance of {n} names", self.covariance, (n, n)))
         least = {DELAY: (0.0, "0 or more")} | {
             CONSTANTS[speed]: (1e-300, "above 0")
             for speed in (COULOMB_SPEED, BALL_JOINT_FRICTION_SPEED)

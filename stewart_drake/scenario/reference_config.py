@@ -27,13 +27,12 @@ def degrees_hint(angle: float, length: float = 0.0) -> str:
 
 
 def _angle_problem(offset: list[float], amplitude: list[float]) -> str | None:
-    for name, limit, expected, middle, swing in zip(
-        ("pitch", "roll", "yaw"),
-        (math.pi / 2, MOST_TURN, MOST_TURN),
-        ("pi/2, where roll and yaw stay distinct", "2 pi", "2 pi"),
-        *([abs(six[k]) for k in (1, 0, 2)] for six in (offset, amplitude)),
-        strict=True,
+    for k, name, limit, expected in (
+        (1, "pitch", math.pi / 2, "pi/2, where roll and yaw stay distinct"),
+        (0, "roll", MOST_TURN, "2 pi"),
+        (2, "yaw", MOST_TURN, "2 pi"),
     ):
+        middle, swing = abs(offset[k]), abs(amplitude[k])
         if middle + swing >= limit:
             field = "amplitude" if swing > middle else "offset"
             hint = degrees_hint(middle + swing, max(map(abs, amplitude[3:])))

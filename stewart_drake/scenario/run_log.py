@@ -5,7 +5,7 @@ the messages are JSON with a JSON schema, as Foxglove, rerun and PlotJuggler rea
 metadata record `stewart_drake` has the scenario. A CSV file has one column per component, and its
 scenario in a file of the same name that ends in .yaml. A killed run leaves a readable file.
 
-With position servos a log ends with SERVO_CHANNELS, for `identification.servo_logs`.
+With position servos a log ends with SERVO_SIGNALS, for `identification.servo_logs`.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 import xarray as xr
@@ -35,17 +35,15 @@ from stewart_drake.files.yamlio import parse_yaml, validate
 from stewart_drake.scenario.config import ESTIMATED, ControllerConfig, Scenario
 from stewart_drake.scenario.loading import scenario_yaml
 from stewart_drake.scenario.signals import (
-    COORDINATE_NAMES,
-    COORDINATES,
-    LEGS,
     NUM_LEGS,
-    run_dimensions,
+    SERVO_SIGNALS,
+    Signal,
+    recorded_signals,
     run_signals,
 )
 from stewart_drake.types import Array
 
 EXPECTED: Final = "signals.nc, a log (.mcap, .csv) or the folder of a run"
-_NAMES: Final = dict(zip(COORDINATES, COORDINATE_NAMES, strict=True))
 _METADATA: Final = "stewart_drake"
 _CHUNK: Final = 1 << 16
 """Bytes of JSON after which an MCAP file is written on."""
@@ -54,60 +52,10 @@ _QUEUE: Final = 4096
 _ENCODER: Final = re.compile(r"measurement_A\d")
 
 
-class Channel(NamedTuple):
-    name: str  # of the signal
-    fields: tuple[str, ...]  # names of its components in JSON
-    heads: tuple[str, ...]  # of its columns in CSV, with units
-    meaning: str  # in words
-
-
-def headings(name: str, labels: Iterable[str | int], units: Iterable[str]) -> list[str]:
-    """Return the column heads of a signal, such as `error_roll[rad]`; labels may be none."""
-    spoken = ("_".join(_NAMES.get(word, word) for word in str(one).split("_")) for one in labels)
-    columns = [f"{name}_{label}" for label in spoken] or [name]
-    pairs = zip(columns, units, strict=True)
-    return [f"{column}[{'-' if unit == '1' else unit}]" for column, unit in pairs]
-
-
-def channels_of(samples: int | None) -> list[Channel]:
-    """Return the recorded signals of a run with this number of encoder readings a period."""
-    dimensions, found = run_dimensions(samples), []
-    for signal in run_signals(samples).values():
-        if signal.source:
-            dimension = signal.quantity.dimension
-            labels = () if dimension is None else dimensions[dimension].labels
-            fields = tuple(_field(label) for label in labels) or ("value",)
-            heads = tuple(headings(signal.name, labels, signal.quantity.units))
-            found.append(Channel(signal.name, fields, heads, signal.long_name))
-    return found
-
-
-def logged(scenario: Scenario) -> list[Channel]:
-    """Return the channels of a log, with setpoints and cranks of position servos."""
+def logged(scenario: Scenario) -> list[Signal]:
+    """Return the signals of a log, with setpoints and cranks of position servos."""
     servos = scenario.actuator.kind == "position_servo"
-    return channels_of(scenario.sensor.samples) + (SERVO_CHANNELS if servos else [])
-
-
-def _field(label: str | int) -> str:
-    """Return a label as the name of a JSON field: `roll`, `rate_roll`, `leg_1`, `A1_0`."""
-    if isinstance(label, int):
-        return f"leg_{label}"
-    words = "_".join(_NAMES.get(word, word) for word in label.split("_"))
-    return re.sub(r"\W+", "_", words).strip("_")
-
-
-SERVO_CHANNELS: Final = [
-    Channel(
-        name,
-        tuple(_field(leg) for leg in LEGS),
-        tuple(headings(name, LEGS, ["rad"] * NUM_LEGS)),
-        meaning,
-    )
-    for name, meaning in (
-        ("setpoint", "crank angles sent at the last sample"),
-        ("crank", "crank angles of the pose"),
-    )
-]
+    return [*recorded_signals(scenario.sensor.samples), *(SERVO_SIGNALS if servos else ())]
 
 
 class RunLog(Protocol):
@@ -138,9 +86,9 @@ def open_log(path: Path, scenario: Scenario) -> RunLog:
         ) from None
 
 
-def _members(channel: Channel, values: Array) -> dict[str, float]:
+def _members(fields: Iterable[str], values: Array) -> dict[str, float]:
     """Return the finite components by field; JSON has no NaN."""
-    pairs = zip(channel.fields, np.atleast_1d(values).tolist(), strict=True)
+    pairs = zip(fields, np.atleast_1d(values).tolist(), strict=True)
     return {field: value for field, value in pairs if math.isfinite(value)}
 
 
@@ -154,7 +102,7 @@ class McapLog:
         self._writer.start(profile="", library=f"stewart_drake {versions()['stewart-drake']}")
         about = {"scenario": scenario_yaml(scenario), "versions": json.dumps(versions())}
         self._writer.add_metadata(_METADATA, about)
-        self._channels: dict[str, tuple[int, Channel]] = {}
+        self._channels: dict[str, tuple[int, tuple[str, ...]]] = {}
         for channel in logged(scenario):
             properties = {"time": {"type": "number", "description": "s"}}
             for field, head in zip(channel.fields, channel.heads, strict=True):
@@ -162,7 +110,7 @@ class McapLog:
                 properties[field] = {"type": "number", "description": unit}
             schema = {
                 "title": channel.name,
-                "description": channel.meaning,
+                "description": channel.long_name,
                 "type": "object",
                 "properties": properties,
             }
@@ -170,14 +118,14 @@ class McapLog:
                 f"stewart_drake.{channel.name}", "jsonschema", json.dumps(schema).encode()
             )
             topic = self._writer.register_channel(f"/{channel.name}", "json", number)
-            self._channels[channel.name] = topic, channel
+            self._channels[channel.name] = topic, channel.fields
         self._row = 0
 
     def write(self, time: float, values: Mapping[str, Array]) -> None:
         at = round(time * 1e9)
         for name, components in values.items():
-            topic, channel = self._channels[name]
-            data = json.dumps({"time": time} | _members(channel, components)).encode()
+            topic, fields = self._channels[name]
+            data = json.dumps({"time": time} | _members(fields, components)).encode()
             self._writer.add_message(topic, at, data, at, self._row)
         self._row += 1
 
@@ -237,7 +185,7 @@ class CsvLog:
     def write(self, time: float, values: Mapping[str, Array]) -> None:
         numbers = [time]
         for channel in self._channels:
-            missing = [math.nan] * len(channel.fields)
+            missing = [math.nan] * channel.size
             numbers += np.atleast_1d(values.get(channel.name, missing)).tolist()
         self._file.write(numbers)
 
@@ -245,7 +193,7 @@ class CsvLog:
         self._file.close()
 
 
-def csv_heads(channels: Iterable[Channel]) -> list[str]:
+def csv_heads(channels: Iterable[Signal]) -> list[str]:
     """Return the first line of a CSV log."""
     return ["time[s]", *(head for channel in channels for head in channel.heads)]
 
@@ -254,7 +202,7 @@ class UdpMirror:
     """JSON over UDP, one datagram per instant, for PlotJuggler's UDP server."""
 
     def __init__(self, address: tuple[str, int], scenario: Scenario) -> None:
-        self._channels = {one.name: one for one in logged(scenario)}
+        self._fields = {one.name: one.fields for one in logged(scenario)}
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._address = address
@@ -262,7 +210,7 @@ class UdpMirror:
     def write(self, time: float, values: Mapping[str, Array]) -> None:
         row: dict[str, Any] = {"timestamp": time}
         for name, components in values.items():
-            row[name] = _members(self._channels[name], components)
+            row[name] = _members(self._fields[name], components)
         with contextlib.suppress(OSError):  # nothing listens, or the network is full
             self._socket.sendto(json.dumps(row).encode(), self._address)
 
@@ -329,17 +277,18 @@ def dataset_of(
     values = dict(values)
     if "pose" in values and "reference" in values:
         values["error"] = values["pose"] - values["reference"]
-    variables: dict[str, Any] = {}
-    for name, signal in run_signals(samples).items():
+    variables, signals = dict[str, Any](), run_signals(samples)
+    for name, signal in signals.items():
         if name in values:
             about = {"units": signal.unit, "long_name": signal.long_name}
             if dimension := signal.quantity.dimension:
-                variables[name] = ("time", dimension), values[name], about
+                variables[name] = ("time", dimension.name), values[name], about
             else:
                 variables[name] = "time", values[name][:, 0], about
     coordinates: dict[str, Any] = {
-        name: (name, list(dimension.labels), {"long_name": dimension.long_name})
-        for name, dimension in run_dimensions(samples).items()
+        one.name: (one.name, list(one.labels), {"long_name": one.long_name})
+        for signal in signals.values()
+        if (one := signal.quantity.dimension)
     }
     coordinates["time"] = ("time", times, {"units": "s", "long_name": "time"})
     attributes = {
@@ -440,10 +389,11 @@ def _read_mcap(path: Path) -> xr.Dataset:
     sensor = parse_yaml(scenario, f"{path}: scenario").get("sensor", {})
     samples = int(sensor.get("samples", 1)) if sensor.get("kind") == "encoders" else None
     values, order = {}, sorted(times)
-    for channel in channels_of(samples):
+    for channel in recorded_signals(samples):
         if found := messages.get(channel.name):
             rows = (found.get(row, {}) for row in order)
-            numbers = [[row.get(field, math.nan) for field in channel.fields] for row in rows]
+            fields = channel.fields
+            numbers = [[row.get(field, math.nan) for field in fields] for row in rows]
             values[channel.name] = np.array(numbers)
     return dataset_of(np.array([times[row] for row in order]), values, scenario, samples)
 
@@ -454,7 +404,7 @@ def _read_csv(path: Path) -> xr.Dataset:
         heads, rows = next(lines, []), [*lines]
     encoders = sum(bool(_ENCODER.match(head)) for head in heads)
     samples = encoders // NUM_LEGS or None
-    channels = channels_of(samples)
+    channels = recorded_signals(samples)
     expected = csv_heads(channels)
     if heads[: len(expected)] != expected:
         wrong = next((a for a, b in zip(heads, expected, strict=False) if a != b), "")
@@ -467,7 +417,7 @@ def _read_csv(path: Path) -> xr.Dataset:
     if not rows:
         raise ValueError("no rows")
     table = np.array([[float(cell.strip() or "nan") for cell in row] for row in rows])
-    widths = [len(channel.fields) for channel in channels]
+    widths = [channel.size for channel in channels]
     parts = np.split(table[:, 1 : len(expected)], np.cumsum(widths)[:-1], axis=1)
     values = {channel.name: part for channel, part in zip(channels, parts, strict=True)}
     return dataset_of(table[:, 0], values, _scenario_near(path), samples)

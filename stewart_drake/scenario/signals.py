@@ -3,6 +3,8 @@
 Nothing else in the package does index arithmetic on these vectors.
 """
 
+import re
+from collections.abc import Iterable
 from typing import Final, Literal, NamedTuple
 
 COORDINATES: Final = ("phi", "theta", "psi", "x", "y", "z")
@@ -92,29 +94,15 @@ STATE: Final = (*COORDINATES, *(f"{name}_dot" for name in COORDINATES))  # label
 class Dimension(NamedTuple):
     """Labels of the components of signals, and their meaning."""
 
+    name: str
     labels: tuple[str, ...] | tuple[int, ...]
     long_name: str
-
-
-DIMENSIONS: Final[dict[str, Dimension]] = {
-    "coordinate": Dimension(
-        COORDINATES,
-        "phi, theta, psi are roll, pitch, yaw; x, y, z of the plate's centre of mass",
-    ),
-    "leg": Dimension(LEGS, "legs and their motors, numbered from one"),
-    "weight": Dimension(WEIGHTS, "weight of the errors, weight of the torques"),
-    "parameter": Dimension(PARAMETERS, "parameters that are unknown to the controller"),
-    "wrench": Dimension(WRENCHES, "moment, then force, in the world at the plate's centre of mass"),
-    "tuner_input": Dimension(TUNER_INPUTS, "inputs of a density"),
-    "state": Dimension(STATE, "coordinates, then their time derivatives"),
-    "packet": Dimension(PACKETS, "counts of packets, and of periods"),
-}
 
 
 class Quantity(NamedTuple):
     """Dimension of a signal, None for a single number, and units of its components."""
 
-    dimension: str | None
+    dimension: Dimension | None
     units: tuple[str, ...]
 
 
@@ -132,7 +120,18 @@ class Signal(NamedTuple):
     @property
     def labels(self) -> tuple[str, ...] | tuple[int, ...]:
         """Labels of the components; none for a single number."""
-        return DIMENSIONS[self.quantity.dimension].labels if self.quantity.dimension else ()
+        return self.quantity.dimension.labels if self.quantity.dimension else ()
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the components in JSON, such as `roll`, `leg_1`, `A1_0`."""
+        words = (f"leg_{label}" if isinstance(label, int) else label for label in self.labels)
+        return tuple(re.sub(r"\W+", "_", _spoken(word)).strip("_") for word in words) or ("value",)
+
+    @property
+    def heads(self) -> list[str]:
+        """Heads of the columns in CSV, with units."""
+        return headings(self.name, self.labels, self.quantity.units)
 
     @property
     def size(self) -> int:
@@ -158,17 +157,56 @@ class Signal(NamedTuple):
         return self.source.partition(".")[2] or self.exported
 
 
-_POSE: Final = Quantity("coordinate", COORDINATE_UNITS)
-_RATES: Final = Quantity("coordinate", RATE_UNITS)
-_INTEGRAL: Final = Quantity("coordinate", tuple(f"{unit} s" for unit in COORDINATE_UNITS))
-_TORQUE: Final = Quantity("leg", ("N m",) * NUM_TORQUES)
-_WEIGHTS: Final = Quantity("weight", ("1",) * len(WEIGHTS))
-_PARAMETERS: Final = Quantity("parameter", PARAMETER_UNITS)
-_WRENCH: Final = Quantity("wrench", WRENCH_UNITS)
-_DENSITY: Final = Quantity("tuner_input", ("1",) * len(TUNER_INPUTS))
+_NAMES: Final = dict(zip(COORDINATES, COORDINATE_NAMES, strict=True))
+
+
+def _spoken(label: object) -> str:
+    """Return a label in words of users: `roll_dot` for `phi_dot`."""
+    return "_".join(_NAMES.get(word, word) for word in str(label).split("_"))
+
+
+def headings(name: str, labels: Iterable[object], units: Iterable[str]) -> list[str]:
+    """Return the column heads of a signal, such as `error_roll[rad]`; labels may be none."""
+    columns = [f"{name}_{_spoken(label)}" for label in labels] or [name]
+    pairs = zip(columns, units, strict=True)
+    return [f"{column}[{'-' if unit == '1' else unit}]" for column, unit in pairs]
+
+
+_COORDINATE: Final = Dimension(
+    "coordinate",
+    COORDINATES,
+    "phi, theta, psi are roll, pitch, yaw; x, y, z of the plate's centre of mass",
+)
+_LEG: Final = Dimension("leg", LEGS, "legs and their motors, numbered from one")
+
+_POSE: Final = Quantity(_COORDINATE, COORDINATE_UNITS)
+_RATES: Final = Quantity(_COORDINATE, RATE_UNITS)
+_INTEGRAL: Final = Quantity(_COORDINATE, tuple(f"{unit} s" for unit in COORDINATE_UNITS))
+_TORQUE: Final = Quantity(_LEG, ("N m",) * NUM_TORQUES)
+_CRANKS: Final = Quantity(_LEG, ("rad",) * NUM_LEGS)
+_WEIGHTS: Final = Quantity(
+    Dimension("weight", WEIGHTS, "weight of the errors, weight of the torques"),
+    ("1",) * len(WEIGHTS),
+)
+_PARAMETERS: Final = Quantity(
+    Dimension("parameter", PARAMETERS, "parameters that are unknown to the controller"),
+    PARAMETER_UNITS,
+)
+_WRENCH: Final = Quantity(
+    Dimension("wrench", WRENCHES, "moment, then force, in the world at the plate's centre of mass"),
+    WRENCH_UNITS,
+)
+_DENSITY: Final = Quantity(
+    Dimension("tuner_input", TUNER_INPUTS, "inputs of a density"), ("1",) * len(TUNER_INPUTS)
+)
 _SECONDS: Final = Quantity(None, ("s",))
-_STATE: Final = Quantity("state", COORDINATE_UNITS + RATE_UNITS)
-_PACKETS: Final = Quantity("packet", ("1",) * len(PACKETS))
+_STATE: Final = Quantity(
+    Dimension("state", STATE, "coordinates, then their time derivatives"),
+    COORDINATE_UNITS + RATE_UNITS,
+)
+_PACKETS: Final = Quantity(
+    Dimension("packet", PACKETS, "counts of packets, and of periods"), ("1",) * len(PACKETS)
+)
 
 _TABLE: Final = (
     Signal("pose", _POSE, "pose of the plate", "plant", "state", POSE),
@@ -206,22 +244,27 @@ from it. A new signal is one row, and a port of its source; for the controller t
 """
 
 
+SERVO_SIGNALS: Final = (
+    Signal("setpoint", _CRANKS, "crank angles sent at the last sample"),
+    Signal("crank", _CRANKS, "crank angles of the pose"),
+)
+"""Signals of position servos in a log, in addition."""
+
+
 def run_signals(samples: int | None) -> dict[str, Signal]:
     """Return the signals of a run with this number of encoder readings a period, or without any."""
     if samples is None:
         return SIGNALS
-    angles = Quantity("encoder", ("rad",) * (NUM_LEGS * samples))
+    labels = tuple(f"A{leg}[{n}]" for n in range(samples) for leg in LEGS)
+    meaning = "encoders of the legs, and the readings of each within a period, the oldest first"
+    angles = Quantity(Dimension("encoder", labels, meaning), ("rad",) * len(labels))
     measured = SIGNALS["measurement"]._replace(quantity=angles, long_name="measured crank angles")
     return SIGNALS | {"measurement": measured}
 
 
-def run_dimensions(samples: int | None) -> dict[str, Dimension]:
-    """Return the dimensions of `run_signals`."""
-    if samples is None:
-        return DIMENSIONS
-    labels = tuple(f"A{leg}[{n}]" for n in range(samples) for leg in LEGS)
-    meaning = "encoders of the legs, and the readings of each within a period, the oldest first"
-    return DIMENSIONS | {"encoder": Dimension(labels, meaning)}
+def recorded_signals(samples: int | None) -> list[Signal]:
+    """Return those of `run_signals` that a record takes from the systems, without the error."""
+    return [signal for signal in run_signals(samples).values() if signal.source]
 
 
 def exported_ports() -> dict[str, tuple[str, str]]:
