@@ -10,12 +10,12 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.export.controller import exported
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.belief import Belief, Estimate
-from stewart_drake.law.catch_up import LEAST_ERROR_SHARE
 from stewart_drake.law.clear_space import ClearSpace
 from stewart_drake.law.coverage import uncovered
 from stewart_drake.law.feedforward import GAUSS_NODES, InverseDynamicsFeedforward, mean_torques
 from stewart_drake.law.horizon import HoldModel, HorizonCost, condense, pose_root, riccati
 from stewart_drake.law.horizon_qp import NEAR, QpError, problem_of, solve_by_daqp
+from stewart_drake.law.least_error import LEAST_ERROR_SHARE
 from stewart_drake.law.limited import LimitedLqi
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.timeline import Timeline
@@ -447,9 +447,9 @@ def test_it_is_not_exported():
 # ---------------------------------------------------------------- way of least error
 
 
-def from_rest(share):
+def from_rest(share, controller="predictor_lqi"):
     limit = f"actuator.torque_limit={share * TAU:g}"
-    experiment = prepare(load_scenario("paper", settings=("plant.kind=exact", NONE, limit)))
+    experiment = prepare(load_scenario("paper", controller, ("plant.kind=exact", NONE, limit)))
     law = compose_law(experiment)
     return experiment, law, way_onto(experiment, law)
 
@@ -510,9 +510,15 @@ def test_no_other_torques_within_the_limit_have_less_error():
             assert total(plan_, np.zeros(12), sign * change.reshape(-1, 6)) > base - 1e-9 * base
 
 
+LESS_ERROR = [
+    *(("predictor_lqi", *case) for case in ((1.5, 53.0), (2.3, 46.0), (7.5, 31.0), (49.5, 23.0))),
+    *(("predictor_mpc", *case) for case in ((1.5, 46.0), (2.3, 39.0), (4.0, 34.0), (7.5, 29.0))),
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("share", "most"), [(1.5, 53.0), (2.3, 46.0), (7.5, 31.0), (49.5, 23.0)])
-def test_the_way_of_least_error_is_nearer_than_the_shortest(share, most):
+@pytest.mark.parametrize(("controller", "share", "most"), LESS_ERROR)
+def test_the_way_of_least_error_is_nearer_than_the_shortest(controller, share, most):
     """The shortest ones have 84, 68, 36 and 23 % s."""
-    experiment, *_ = from_rest(share)
+    experiment, *_ = from_rest(share, controller)
     assert simulate(experiment.scenario, judge_stability=False).accumulated_error < most

@@ -24,8 +24,6 @@ DEFAULT_CATCH_UP = 0.3
 LONGEST_CATCH_UP = 10.0
 HEADROOM = 0.95
 """Share of the torque limit for a plan; feedback needs the rest."""
-LEAST_ERROR_SHARE = 0.65
-"""The same for a plan of least error, which is at its limit for most of its time."""
 PIECE = 0.025
 """s; largest distance of the times at which a planned motion is checked."""
 
@@ -116,8 +114,9 @@ class CatchUp:
     def _improve(self, periods: int, torque_limit: float) -> tuple[Trajectory, float] | None:
         """Return the plan of least error in place of the shortest one, or None without one."""
         assert self._least is not None
-        limit = LEAST_ERROR_SHARE * torque_limit
-        pieces = self._least().pieces(self._motion(periods), *self._from, periods, limit)
+        least = self._least()
+        limit = least.share * torque_limit
+        pieces = least.pieces(self._motion(periods), *self._from, periods, limit)
         if pieces is None:
             return None
         return self._through(pieces), float(pieces[-1, 1]) - self._from[2]

@@ -40,6 +40,9 @@ from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, POSE, RATES
 from stewart_drake.types import Array
 
+LEAST_ERROR_SHARE: Final = 0.65
+"""Share of the torque limit for a plan, which is at its limit for most of its time. Feedback needs
+the rest."""
 _LONGER: Final = 1.2
 """Length, as a share of that of the shortest plan; the error of longer ones is within 0.1 %."""
 _MOST_HOLDS: Final = 40
@@ -62,6 +65,7 @@ class LeastError:
     space: ClearSpace  # distances to keep
     Q: Array  # (6,) weights of the pose error
     R: Array  # (6, 6) weights of the torques
+    share: float = LEAST_ERROR_SHARE  # of the torque limit, see `law.catch_up`
 
     def pieces(
         self,

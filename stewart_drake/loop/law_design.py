@@ -18,7 +18,7 @@ from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.arguments import fixed, of_kind, positive
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.yamlio import validate
-from stewart_drake.law.catch_up import CatchUp
+from stewart_drake.law.catch_up import HEADROOM, CatchUp
 from stewart_drake.law.channel import Packets, Wire
 from stewart_drake.law.clear_space import ClearSpace
 from stewart_drake.law.cost import Cost, PdGain, QuadraticCost, pd_gains
@@ -35,7 +35,7 @@ from stewart_drake.law.filter_settings import (
     usual_parameters,
 )
 from stewart_drake.law.learned import with_learned
-from stewart_drake.law.least_error import LeastError
+from stewart_drake.law.least_error import LEAST_ERROR_SHARE, LeastError
 from stewart_drake.law.limited import LimitedLqi, QpLimits
 from stewart_drake.law.nominal import MultibodyModel, NominalPlant, PaperModel, TorqueLimit
 from stewart_drake.law.observers import CoreObserver, DelaySettings
@@ -463,8 +463,6 @@ def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
     c = sc.controller
     if sc.start != "rest" or c.catch_up == 0:
         return None
-    if c.catch_up is None and c.limits == "qp" and experiment.planned_limit is not None:
-        return None  # the quadratic program plans the way
     state, queue = experiment.start, experiment.torques_in_flight(timeline.delay)
     if len(queue):
         state = nominal.predict(state, *timeline.until_next(queue), law.plant.substeps)[-1]
@@ -474,7 +472,9 @@ def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
     Q, R = law.cost.matrices(np.array(c.weights))
 
     def least() -> LeastError:
-        return LeastError(law.plant, clear_space(experiment), np.diag(Q)[POSE], R)
+        # A quadratic program keeps feedback within the limits.
+        share = HEADROOM if c.limits == "qp" else LEAST_ERROR_SHARE
+        return LeastError(law.plant, clear_space(experiment), np.diag(Q)[POSE], R, share)
 
     return CatchUp(*given, least)
 
