@@ -90,11 +90,15 @@ def as_csv(path, times, setpoints, cranks):
 def test_servos_of_a_run_in_drake_are_found(drake_log, tmp_path, capsys):
     path = as_csv(tmp_path / "log.csv", *drake_log)
     out = tmp_path / "out"
+    out.mkdir()
+    earlier = out / "found.yaml"  # of a log of torques, whose machine goes as well
+    earlier.write_text("mechanism: mechanism.yaml")
     words = ["identify", str(path), "--mechanism", "reachy_mini", "--velocity-gain", "0.02"]
     assert main([*words, "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert not too_long(said)
     assert "mass of 0.280 kg is taken as known" in " ".join(said.split())
+    assert not earlier.exists()
     summary = json.loads((out / "summary.json").read_text())
     found = summary["parameters"]
     value = np.array([found[name]["value"] for name in NAMES])

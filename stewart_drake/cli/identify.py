@@ -133,7 +133,9 @@ def identify(
                 velocity_gain=velocity_gain,
                 **more,
             )
-        delivery.discard(functions.MECHANISM, functions.CALIBRATION, functions.SERVOS)
+        delivery.discard(
+            functions.MECHANISM, functions.CALIBRATION, functions.FOUND, functions.SERVOS
+        )
     unexplained = plan is None and not found.study.right
     return delivery.answer(found, *found.write_files(delivery.out)) or int(unexplained)
 
