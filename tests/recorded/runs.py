@@ -9,6 +9,7 @@ has what they report of the last period at its end, and the answers are commands
 """
 
 import hashlib
+import platform
 import sys
 from functools import cache
 from importlib.metadata import version
@@ -134,13 +135,26 @@ def answers(loop: ClosedLoop, measurements: Array) -> Array:
     return np.array(torques)
 
 
+def processor() -> str:
+    """Return the model of the processor, as Linux numbers it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    entries = dict(map(str.strip, line.split(":", 1)) for line in lines if ":" in line)
+    fields = "vendor_id", "cpu family", "model", "stepping"
+    return " ".join(entries.get(field, "?") for field in fields)
+
+
 def made_with() -> str:
     """Return a key of everything that rounding depends on: releases and processor.
 
     Sines, products and factorisations choose their code by the processor, which need not show in
-    its name: their own last bits are the witness, and those of the compiled core.
+    its name: their own last bits are the witness, and those of the compiled core. Neither suffices
+    alone.
     """
     releases = [f"{name} {version(name)}" for name in ("drake", "numpy", "scipy")]
+    releases.append(processor())
     draw = np.random.default_rng(0).standard_normal
     A, B, paper = draw((18, 18)), draw((18, 6)), StewartDynamics(load_mechanism("paper"))
     rounded = [
