@@ -87,7 +87,7 @@ def timed(times: list[float], bound: list[bool]) -> Iterator[None]:
         begun = time.thread_time()
         after = step(self, memory, *given)
         times.append(1e3 * (time.thread_time() - begun))
-        bound.append(after.limited_steps > memory.limited_steps)
+        bound.append(after.counts.limited_steps > memory.counts.limited_steps)
         return after
 
     limited.LimitedLqi.step = watched  # type: ignore[method-assign]
