@@ -21,7 +21,7 @@ from stewart_drake.cli.examples import EXAMPLES
 from stewart_drake.files.jsonio import jsonable
 from stewart_drake.identification.logs import Precision
 from stewart_drake.identification.tolerances import Tolerances
-from stewart_drake.reporting.results import Figures, Replay
+from stewart_drake.reporting.results import ComparisonResult, Figures, Replay
 from stewart_drake.studies.study_options import Ranges
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -282,6 +282,17 @@ def test_replay_as_a_file_in_a_notebook_or_in_meshcat(run, tmp_path):
     meshcat = Meshcat(MeshcatParams(host="localhost"))
     assert run.replay(meshcat=meshcat) is meshcat
     assert "/reference/ring" in meshcat.StaticHtml() or meshcat.HasPath("/reference/ring")
+
+
+def test_replays_of_a_comparison_name_their_controllers(run, tmp_path):
+    compared = ComparisonResult({"mine": run, "theirs": run})
+    for name, path in compared.replay(tmp_path / "new").items():
+        text = path.read_text()
+        assert path.name == f"{name}.html" and f"<title>{name}</title>" in text
+        assert f"<b>{name}</b>" in text
+    with pytest.raises(sd.ConfigError, match=r"directory: got .*film\.html; expected a folder"):
+        compared.replay(tmp_path / "film.html")
+    assert not (tmp_path / "film.html").exists()
 
 
 @pytest.mark.slow

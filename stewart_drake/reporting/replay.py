@@ -1,5 +1,6 @@
 """Animation of a finished run and its reference in Meshcat, with the SDFormat model."""
 
+import html
 import logging
 from pathlib import Path
 from typing import Final
@@ -112,7 +113,7 @@ def _html(signals: xr.Dataset, mechanism: Mechanism, title: str, outcome: str) -
         legs=LEGS,
         colors=TORQUE_COLORS,
     )
-    return scene_page(meshcat, overlay, "Replay")
+    return scene_page(meshcat, overlay, html.escape(title))
 
 
 def scene_page(meshcat: Meshcat, overlay: str, title: str) -> str:
