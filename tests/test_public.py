@@ -4,6 +4,7 @@ import ast
 import importlib.metadata
 import inspect
 import json
+import re
 import runpy
 import socket
 import subprocess
@@ -21,6 +22,7 @@ from stewart_drake.cli.examples import EXAMPLES
 from stewart_drake.files.jsonio import jsonable
 from stewart_drake.identification.logs import Precision
 from stewart_drake.identification.tolerances import Tolerances
+from stewart_drake.reporting.analyses import ANALYSES, words_of
 from stewart_drake.reporting.results import ComparisonResult, Figures, Replay
 from stewart_drake.studies.study_options import Ranges
 
@@ -89,6 +91,10 @@ def test_a_name_and_an_option_of_0_2_lead_to_todays():
         (
             lambda: sd.run_live("paper", "127.0.0.1:9", learn=2, duration=1.0),
             "duration: got 1.0 with learn; expected none",
+        ),
+        (
+            lambda: sd.analyze_delay("paper", settings="delay.steps=3"),
+            "settings: got 'delay.steps=3'; expected a list of texts",
         ),
         (lambda: sd.simulate("paper", log="run.txt"), "log: got 'run.txt'; expected a file"),
         (
@@ -207,7 +213,7 @@ FUNCTIONS = {
 def test_every_command_has_a_function(words):
     name = FUNCTIONS.get(words, words.replace(" ", "_").replace("-", "_"))
     assert name in sd.__all__
-    assert f"`sd.{name}`" in (ROOT / "docs" / "python.md").read_text()
+    assert re.search(rf"`sd\.{name}[`(]", (ROOT / "docs" / "python.md").read_text())
 
 
 @pytest.mark.slow
@@ -361,6 +367,31 @@ def test_the_signature_of_an_analysis_shows_its_options():
     assert "limit: E_ac above which a run counts as failed, % s" in (
         sd.analyze_robustness.__doc__ or ""
     )
+
+
+@pytest.mark.parametrize("name", ANALYSES)
+def test_an_analysis_takes_settings_like_its_command(name):
+    call = getattr(sd, "_".join(words_of(name)))
+    shown = inspect.signature(call).parameters
+    assert shown["settings"].kind is inspect.Parameter.KEYWORD_ONLY
+    assert ("controller" in shown) == ANALYSES[name].controller
+    with pytest.raises(sd.ConfigError, match=r"^settings: .*delay\.step: unknown key"):
+        call("paper", settings=["delay.step=3"])
+    with pytest.raises(TypeError, match=rf"^{call.__name__}: got .*; expected settings="):
+        call("paper", ["delay.steps=3"])
+    with pytest.raises(TypeError, match=rf"^{call.__name__}: got an unexpected .* 'setting'"):
+        call("paper", setting=["delay.steps=3"])
+
+
+def test_an_analysis_is_of_the_scenario_with_its_settings():
+    settings = ["delay.steps=3"]
+    found = sd.analyze_delay(
+        "paper", settings=iter(settings), controller="delay_lqr", simulations=False
+    )
+    scenario = sd.load_scenario("paper", "delay_lqr", settings)
+    assert found.summary == sd.analyze_delay(scenario, simulations=False).summary
+    command = "sd.analyze_delay('paper', settings=['delay.steps=3'], controller='delay_lqr', "
+    assert found.made.command.startswith(command)
 
 
 def test_the_signature_of_a_section_shows_types_without_their_ranges():
