@@ -17,7 +17,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import turns_between
 from stewart_drake.reporting.document import number
 from stewart_drake.reporting.page import environment
-from stewart_drake.reporting.run import late_error
+from stewart_drake.reporting.run import late_error, torqueless
 from stewart_drake.scenario.run_log import EXPECTED, read_log, scenario_of
 from stewart_drake.scenario.signals import ANGLES, LEGS, POSITION
 
@@ -57,6 +57,8 @@ def replay_html(result: SimulationResult, mechanism: Mechanism, title: str) -> s
     outcome = result.status.replace("_", " ")
     if result.stopped is not None:
         outcome += f" at {result.stopped.time:.2f} s"
+    elif torqueless(result):
+        outcome += ", without a finite torque of the controller"
     else:
         late = late_error(result) if result.scenario.actuator.kind == "position_servo" else ""
         error = late and f"rms error {late} in the second half"  # E_ac is that of the soft start
