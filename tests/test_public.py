@@ -12,6 +12,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from pydrake.systems.framework import LeafSystem
@@ -23,6 +24,8 @@ from stewart_drake.files.jsonio import jsonable
 from stewart_drake.identification.logs import Precision
 from stewart_drake.identification.tolerances import Tolerances
 from stewart_drake.reporting.analyses import ANALYSES, words_of
+from stewart_drake.reporting.document import Document, Picture, Section
+from stewart_drake.reporting.page import Provenance
 from stewart_drake.reporting.results import ComparisonResult, Figures, Replay
 from stewart_drake.studies.study_options import Ranges
 
@@ -301,6 +304,14 @@ def test_replays_of_a_comparison_name_their_controllers(run, tmp_path):
     assert not (tmp_path / "film.html").exists()
 
 
+def test_figures_of_one_name_are_numbered(tmp_path):
+    pictures = [Picture(plt.figure, "", name) for name in ("residuals", "states", "residuals")]
+    made = Document("", "", [Section("", *pictures)])
+    figures = sd.AnalysisResult(None, {}, made, Provenance("")).plot(tmp_path)
+    assert list(figures) == ["residuals", "states", "residuals_2"]
+    assert {path.stem for path in tmp_path.iterdir()} == set(figures)
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_poses")
 def test_analyses_are_answers_that_can_be_printed_shown_and_saved(tmp_path):
@@ -390,6 +401,7 @@ def test_an_analysis_is_of_the_scenario_with_its_settings():
     )
     scenario = sd.load_scenario("paper", "delay_lqr", settings)
     assert found.summary == sd.analyze_delay(scenario, simulations=False).summary
+    assert list(found.plot()) == ["growth", "loop"]
     command = "sd.analyze_delay('paper', settings=['delay.steps=3'], controller='delay_lqr', "
     assert found.made.command.startswith(command)
 

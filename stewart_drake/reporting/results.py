@@ -5,6 +5,7 @@
 
 import html as escaping
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -304,9 +305,17 @@ class AnalysisResult(Printed):
         return self.document.plain()
 
     def plot(self, directory: str | Path | None = None) -> Figures:
-        """Return the figures of the page; see `SimulationResult.plot`."""
-        pictures = enumerate(self.document.all(Picture), 1)
-        return drawn({f"figure_{k}": one.drawn for k, one in pictures}, directory)
+        """Return the figures of the page by name, numbered where one comes again.
+
+        Args:
+            directory: folder to write PNG and SVG files into, if not None; it is made.
+        """
+        counts, shown = Counter[str](), {}
+        for one in self.document.all(Picture):
+            counts[one.name] += 1
+            n = counts[one.name]
+            shown[f"{one.name}_{n}" if n > 1 else one.name] = one.drawn
+        return drawn(shown, directory)
 
     def replay(self, directory: str | Path | None = None) -> "dict[str, Replay | Path]":
         """Return the animations of the page by name, empty for a page without.
