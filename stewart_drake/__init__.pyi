@@ -161,21 +161,31 @@ def train_tuner(
     workers: int | None = None,
 ) -> stewart_drake.reporting.results.AnalysisResult: ...
 def analyze_delay(
-    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, simulations: bool = True
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+    simulations: bool = True,
+    *,
+    settings: collections.abc.Iterable[str] = (),
+    controller: str | pathlib.Path | None = None,
 ) -> stewart_drake.reporting.results.AnalysisResult: ...
 def analyze_hautus(
     scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+    *,
+    settings: collections.abc.Iterable[str] = (),
 ) -> stewart_drake.reporting.results.AnalysisResult: ...
 def analyze_link(
     scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
     runs: int = 5,
     *,
+    settings: collections.abc.Iterable[str] = (),
+    controller: str | pathlib.Path | None = None,
     directory: str | pathlib.Path | None = None,
 ) -> stewart_drake.reporting.results.AnalysisResult: ...
 def analyze_robustness(
     scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
     runs: int = 200,
     *,
+    settings: collections.abc.Iterable[str] = (),
+    controller: str | pathlib.Path | None = None,
     directory: str | pathlib.Path | None = None,
     ranges: collections.abc.Sequence[str]
     | stewart_drake.studies.study_options.Ranges
@@ -191,11 +201,14 @@ def analyze_robustness(
 ) -> stewart_drake.reporting.results.AnalysisResult: ...
 def analyze_workspace(
     scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+    *,
+    settings: collections.abc.Iterable[str] = (),
 ) -> stewart_drake.reporting.results.AnalysisResult: ...
 def layout(
     scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
     directory: str | pathlib.Path | None = None,
     *,
+    settings: collections.abc.Iterable[str] = (),
     goal: str = "condition",
     limits: collections.abc.Sequence[str] | collections.abc.Mapping[str, float] | None = None,
     vary: collections.abc.Sequence[str]
@@ -210,5 +223,9 @@ def layout(
     scheduler: str | None = None,
 ) -> stewart_drake.reporting.results.AnalysisResult: ...
 def learn(
-    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path, repetitions: int = 6
+    scenario: stewart_drake.scenario.config.Scenario | str | pathlib.Path,
+    repetitions: int = 6,
+    *,
+    settings: collections.abc.Iterable[str] = (),
+    controller: str | pathlib.Path | None = None,
 ) -> stewart_drake.reporting.results.AnalysisResult: ...

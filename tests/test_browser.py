@@ -50,7 +50,7 @@ def test_it_loads_without_an_error_and_without_a_network(replay):
     seek(replay, 1.0)
     assert replay.errors == []
     assert replay.requests == []
-    assert replay.evaluate("document.title") == "Replay"
+    assert replay.evaluate("document.title") == "paper, from rest"
 
 
 def test_the_canvas_shows_a_machine(replay):

@@ -1,6 +1,8 @@
 """Controllers, references and disturbances of a user in the loop of a scenario."""
 
 import json
+import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +13,8 @@ from pydrake.trajectories import FunctionHandleTrajectory, PiecewisePolynomial
 import stewart_drake as sd
 from stewart_drake.loop.own import take
 from stewart_drake.loop.preparation import concrete, prepare
+from stewart_drake.reporting.report import verdict
+from stewart_drake.reporting.results import ComparisonResult
 from tests.test_analysis_scripts import script
 
 FAST = ("plant.kind=exact", "delay.steps=0", "controller.period=0.01", "start=on_reference")
@@ -149,6 +153,18 @@ def test_what_is_no_number_is_sent_as_before_and_counted():
     assert (result.signals.torque_commanded == 1e-3).all()
     for name in ("integral", "weights", "parameters", "state_estimate"):
         assert np.isnan(result.signals[name]).all()
+
+
+def test_a_run_without_a_torque_has_no_score():
+    run = sd.simulate(scenario("duration=0.1"), controller=lambda: OfTime(lambda t: np.nan))
+    assert re.search(r"E_ac +none$", run.table(), re.MULTILINE)
+    (outcome,) = re.findall(r"completed, .*", run.replay().html)
+    assert "without a finite torque" in outcome and "E_ac" not in outcome
+    table = ComparisonResult({"broken": run}).table()
+    assert re.search(r"^broken +no finite( +-)+ ", table, re.MULTILINE)
+    workspace = SimpleNamespace(summary={})
+    text, tone = verdict(SimpleNamespace(run=run, analyses={"workspace": workspace}))
+    assert tone == "bad" and "never had a finite torque" in text and "E_ac" not in text
 
 
 def test_a_mistake_in_a_system_is_an_exception():

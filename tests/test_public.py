@@ -4,6 +4,7 @@ import ast
 import importlib.metadata
 import inspect
 import json
+import re
 import runpy
 import socket
 import subprocess
@@ -11,6 +12,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from pydrake.systems.framework import LeafSystem
@@ -21,7 +23,10 @@ from stewart_drake.cli.examples import EXAMPLES
 from stewart_drake.files.jsonio import jsonable
 from stewart_drake.identification.logs import Precision
 from stewart_drake.identification.tolerances import Tolerances
-from stewart_drake.reporting.results import Figures, Replay
+from stewart_drake.reporting.analyses import ANALYSES, words_of
+from stewart_drake.reporting.document import Document, Picture, Section
+from stewart_drake.reporting.page import Provenance
+from stewart_drake.reporting.results import ComparisonResult, Figures, Replay
 from stewart_drake.studies.study_options import Ranges
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -89,6 +94,10 @@ def test_a_name_and_an_option_of_0_2_lead_to_todays():
         (
             lambda: sd.run_live("paper", "127.0.0.1:9", learn=2, duration=1.0),
             "duration: got 1.0 with learn; expected none",
+        ),
+        (
+            lambda: sd.analyze_delay("paper", settings="delay.steps=3"),
+            "settings: got 'delay.steps=3'; expected a list of texts",
         ),
         (lambda: sd.simulate("paper", log="run.txt"), "log: got 'run.txt'; expected a file"),
         (
@@ -207,7 +216,7 @@ FUNCTIONS = {
 def test_every_command_has_a_function(words):
     name = FUNCTIONS.get(words, words.replace(" ", "_").replace("-", "_"))
     assert name in sd.__all__
-    assert f"`sd.{name}`" in (ROOT / "docs" / "python.md").read_text()
+    assert re.search(rf"`sd\.{name}[`(]", (ROOT / "docs" / "python.md").read_text())
 
 
 @pytest.mark.slow
@@ -284,6 +293,25 @@ def test_replay_as_a_file_in_a_notebook_or_in_meshcat(run, tmp_path):
     assert "/reference/ring" in meshcat.StaticHtml() or meshcat.HasPath("/reference/ring")
 
 
+def test_replays_of_a_comparison_name_their_controllers(run, tmp_path):
+    compared = ComparisonResult({"mine": run, "theirs": run})
+    for name, path in compared.replay(tmp_path / "new").items():
+        text = path.read_text()
+        assert path.name == f"{name}.html" and f"<title>{name}</title>" in text
+        assert f"<b>{name}</b>" in text
+    with pytest.raises(sd.ConfigError, match=r"directory: got .*film\.html; expected a folder"):
+        compared.replay(tmp_path / "film.html")
+    assert not (tmp_path / "film.html").exists()
+
+
+def test_figures_of_one_name_are_numbered(tmp_path):
+    pictures = [Picture(plt.figure, "", name) for name in ("residuals", "states", "residuals")]
+    made = Document("", "", [Section("", *pictures)])
+    figures = sd.AnalysisResult(None, {}, made, Provenance("")).plot(tmp_path)
+    assert list(figures) == ["residuals", "states", "residuals_2"]
+    assert {path.stem for path in tmp_path.iterdir()} == set(figures)
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_poses")
 def test_analyses_are_answers_that_can_be_printed_shown_and_saved(tmp_path):
@@ -350,6 +378,32 @@ def test_the_signature_of_an_analysis_shows_its_options():
     assert "limit: E_ac above which a run counts as failed, % s" in (
         sd.analyze_robustness.__doc__ or ""
     )
+
+
+@pytest.mark.parametrize("name", ANALYSES)
+def test_an_analysis_takes_settings_like_its_command(name):
+    call = getattr(sd, "_".join(words_of(name)))
+    shown = inspect.signature(call).parameters
+    assert shown["settings"].kind is inspect.Parameter.KEYWORD_ONLY
+    assert ("controller" in shown) == ANALYSES[name].controller
+    with pytest.raises(sd.ConfigError, match=r"^settings: .*delay\.step: unknown key"):
+        call("paper", settings=["delay.step=3"])
+    with pytest.raises(TypeError, match=rf"^{call.__name__}: got .*; expected settings="):
+        call("paper", ["delay.steps=3"])
+    with pytest.raises(TypeError, match=rf"^{call.__name__}: got an unexpected .* 'setting'"):
+        call("paper", setting=["delay.steps=3"])
+
+
+def test_an_analysis_is_of_the_scenario_with_its_settings():
+    settings = ["delay.steps=3"]
+    found = sd.analyze_delay(
+        "paper", settings=iter(settings), controller="delay_lqr", simulations=False
+    )
+    scenario = sd.load_scenario("paper", "delay_lqr", settings)
+    assert found.summary == sd.analyze_delay(scenario, simulations=False).summary
+    assert list(found.plot()) == ["growth", "loop"]
+    command = "sd.analyze_delay('paper', settings=['delay.steps=3'], controller='delay_lqr', "
+    assert found.made.command.startswith(command)
 
 
 def test_the_signature_of_a_section_shows_types_without_their_ranges():

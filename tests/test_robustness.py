@@ -149,6 +149,28 @@ def test_small_samples_leave_quantiles_open():
     assert statistics.quantile_interval([1.0, np.inf], 0.99).value == np.inf
 
 
+@pytest.mark.parametrize("q", [0.5, 0.75, 0.9, 0.95, 0.99])
+def test_the_runs_that_bound_a_quantile(q):
+    n = statistics.runs_to_bound(q)
+    assert np.isfinite(statistics.quantile_interval(np.arange(float(n)), q).high)
+    assert np.isinf(statistics.quantile_interval(np.arange(float(n - 1)), q).high)
+
+
+@pytest.mark.parametrize(
+    ("runs", "expected"),
+    [
+        (4, "Too few runs to bound E_ac: the median takes 6, 95 % takes 72."),
+        (8, "Half of all runs stay below E_ac = 3.00 % s; a bound of 95 % takes 72 runs."),
+        (80, "Half of all runs stay below E_ac = 39.0 % s, 95 % below 75.0."),
+    ],
+)
+def test_the_headline_has_the_quantiles_that_the_runs_bound(runs, expected):
+    study = made_up(runs)
+    study = study._replace(outcomes=[completed(float(k)) for k in range(runs)])
+    verdict = document(study).verdict
+    assert expected in verdict and "--" not in document(study).plain()
+
+
 def test_holm_by_hand():
     found = statistics.holm([0.01, 0.04, np.nan, 0.03, 0.005])
     assert found == pytest.approx([0.03, 0.06, np.nan, 0.06, 0.02], nan_ok=True)

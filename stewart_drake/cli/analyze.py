@@ -45,7 +45,9 @@ def _callback(name: str) -> Callable[..., int | None]:
         ):
             delivery.say_link(loaded)
             found = analyze(
-                *(name, loaded, options),
+                name,
+                loaded,
+                options,
                 command=line,
                 directory=out or scratch,
                 progress=counted(bar),

@@ -127,7 +127,8 @@ def identify(
             shown_by(show),
         ):
             found = functions.identify(
-                *(logs or [], mechanism or ""),
+                logs or [],
+                mechanism or "",
                 delay=delay,
                 gravity=gravity is not False,
                 velocity_gain=velocity_gain,

@@ -209,7 +209,9 @@ def setpoints(
     check_file(out)
     with named(start="--from", rate="--rate"):
         made = sd.setpoints(
-            *(chosen.scenario, rate, out),
+            chosen.scenario,
+            rate,
+            out,
             plain=plain,
             start=None if start is None else _pose(start),
             soft_end=soft_end,
@@ -265,7 +267,7 @@ def compare(
     delivery.say(results.table())
     known = dict.fromkeys((*names, *study.LABELS))
     drawn = [f"{what}_{name}" for what in OF_CONTROLLERS for name in known]
-    delivery.discard(*(f"{name}.nc" for name in known), *_pictures((*COMPARED_FIGURES, *drawn)))
+    delivery.discard(*[f"{name}.nc" for name in known], *_pictures([*COMPARED_FIGURES, *drawn]))
     if delivery.out is not None:
         results.save(delivery.out)
         delivery.add_files("summary.json", f"{len(results)} signal files")
@@ -292,21 +294,21 @@ def report(*, chosen: Chosen, delivery: Delivery) -> int:
     delivery.discard(REPLAY, PAGE)
     summary = report_document.report_summary(found)
     delivery.write(summary)
-    replay = ""
+    films = []  # empty where the replay could not be drawn
 
     def film(folder: Path) -> None:
-        nonlocal replay
-        replay = report_document.film(found, name)
-        write_whole(folder / REPLAY, replay)
-
-    def page(folder: Path) -> None:
-        shown = report_document.result(found, name, replay, made)
-        delivery.say(str(shown))
-        shown.write_page(folder)
+        films.append(report_document.film(found, name))
+        write_whole(folder / REPLAY, films[0])
 
     if found.run is not None:
         delivery.draw(REPLAY, film)
     line = chosen.line("report", out=delivery.out)
     made = Provenance(line, seconds=time.perf_counter() - started)
+
+    def page(folder: Path) -> None:
+        shown = report_document.result(found, name, "".join(films), made)
+        delivery.say(str(shown))
+        shown.write_page(folder)
+
     delivery.draw(PAGE, page)
     return delivery.end(summary)

@@ -138,5 +138,11 @@ def integrate(
     looks = np.array(times, dtype=np.float64)
     plant = NativePlant(dynamics, np.array(start), looks, accuracy, longest_step)
     failure, run = plant.failure(plant.hold([0.0], command, servo)), plant.run
-    kept = looks[: run.recorded], plant.states[: run.recorded]
-    return Course(*kept, run.time, plant.final, failure, run.steps)
+    return Course(
+        times=looks[: run.recorded],
+        states=plant.states[: run.recorded],
+        end=run.time,
+        final=plant.final,
+        failure=failure,
+        steps=run.steps,
+    )

@@ -97,6 +97,7 @@ class Setpoints:
     crank_rates: Array  # (n, 6) rad/s
     torques: Array  # (n, 6) that the motion takes there from the servos, N m
     steps: Array  # (n, 6) largest torques of servos that hold the setpoints, N m
+    period: float  # s, for which each is held
     blend: float  # length of the soft start and the soft end, s; 0 without both
     softens: str  # what is soft: "start", "end" or "start and end"; empty without both
     ends: float  # of the motion, s; infinite for one without an end
@@ -114,7 +115,7 @@ class Setpoints:
         torque, speed, step = (
             np.abs(values).max() for values in (self.torques, self.crank_rates, self.steps)
         )
-        end = self.times[-1] + self.times[1]
+        end = self.times[-1] + self.period
         text = (
             f"limits kept; the motion needs {torque:.3g} N m at most, crank speed {speed:.3g} rad/s"
         )
@@ -382,8 +383,18 @@ def _along(
     samples = course.times if isinstance(course, PlateTrajectory) else np.empty(0)
     ends = float(samples[-1]) if len(samples) else math.inf
     found = Setpoints(
-        *(times, setpoints, cranks, rates, torques, steps, soft.blend),
-        *(soft.name, ends, experiment.torque_limit, soft.from_rest),
+        times=times,
+        angles=setpoints,
+        cranks=cranks,
+        crank_rates=rates,
+        torques=torques,
+        steps=steps,
+        period=1 / rate,
+        blend=soft.blend,
+        softens=soft.name,
+        ends=ends,
+        torque_limit=experiment.torque_limit,
+        from_rest=soft.from_rest,
     )
     _check(found, servo, experiment, rate)
     return found
@@ -391,12 +402,13 @@ def _along(
 
 def _check(found: Setpoints, servo: Stiffness | None, experiment: Experiment, rate: float) -> None:
     """Raise _BrokenLimit for the setpoint furthest beyond a limit."""
-    speed = getattr(experiment.scenario.actuator, "speed_limit", None) or math.inf
-    low, high = (-math.inf, math.inf) if servo is None else (servo.low, servo.high)
+    actuator = experiment.scenario.actuator
+    speed = (actuator.kind != "torque" and actuator.speed_limit) or math.inf
+    lowest, highest = (-math.inf, math.inf) if servo is None else (servo.low, servo.high)
     moved = np.diff(found.angles, axis=0, prepend=found.angles[:1]) * rate
     torque = experiment.torque_limit
     limits: tuple[tuple[str, str, Array, Array | float, Array | float], ...] = (
-        ("setpoint", "rad", found.angles, low, high),
+        ("setpoint", "rad", found.angles, lowest, highest),
         ("speed of the setpoint", "rad/s", moved, -speed, speed),
         ("torque", "N m", found.torques, -torque, torque),
     )

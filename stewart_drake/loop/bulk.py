@@ -582,8 +582,14 @@ def run_prepared(preparation: Preparation, prepared: Prepared) -> Ending:
     asked, sent, measured = (x[:taken] for x in (course.asked, course.sent, course.measured))
     weights, rows = (np.array(x[:taken]) for x in (controller.weights, controller.rows))
     found = figures(
-        *(time, error[grid], experiment.scale, error[sampled]),
-        *(asked, sent, experiment.scenario.controller, done),
+        time=time,
+        error=error[grid],
+        scale=experiment.scale,
+        errors=error[sampled],
+        asked=asked,
+        sent=sent,
+        controller=experiment.scenario.controller,
+        completed=done,
     )
     counts = controller.counts.plus(*["saturated_steps"] * course.saturated)
     return Ending(

@@ -125,7 +125,9 @@ def buffer_of(
     """Return a buffer for packets of `rows` torques; see `PlayoutBuffer`."""
     places = (delay.steps + rows + 2) * rows  # a packet counts until its last row was due
     return Link(
-        *(NUM_TORQUES, places + delay.queue_length, period),
+        NUM_TORQUES,
+        places + delay.queue_length,
+        period,
         is_wire=False,
         hold_when_dry=dry == "hold",
         history=history,

@@ -214,7 +214,16 @@ def summarize(
     errors, torques, sent, rest = np.split(samples, [6, 12, 18], axis=1)
     seconds, some, scale = rest[:, 0], len(samples) > 0, experiment.scale
     completed = status == "completed"
-    found = metrics.figures(*(time, error, scale, errors, torques, sent), sc.controller, completed)
+    found = metrics.figures(
+        time=time,
+        error=error,
+        scale=scale,
+        errors=errors,
+        asked=torques,
+        sent=sent,
+        controller=sc.controller,
+        completed=completed,
+    )
     peaks = metrics.peak_error(error, scale).tolist() if len(error) else [nan] * 6
     floor = 0.0
     if waits_at_rest(sc) and len(time):

@@ -75,12 +75,18 @@ def analysis_function(name: str) -> Callable[..., AnalysisResult]:
     row, words = ANALYSES[name], "_".join(words_of(name))
 
     def call(
-        scenario: Scenario | str | Path, *, options: Options, directory: str | Path | None = None
+        scenario: Scenario | str | Path,
+        *,
+        settings: Iterable[str] = (),
+        controller: str | Path | None = None,
+        options: Options,
+        directory: str | Path | None = None,
     ) -> AnalysisResult:
-        shown = "".join(
-            f", {key}={value!r}" for key, value in options if key in options.model_fields_set
-        )
-        loaded = as_scenario(scenario)
+        settings = list(setting_texts(settings))
+        given = {"settings": settings or None, "controller": controller and str(controller)}
+        given |= {key: value for key, value in options if key in options.model_fields_set}
+        shown = "".join(f", {key}={value!r}" for key, value in given.items() if value is not None)
+        loaded = as_scenario(scenario, controller, settings)
         if row.exact:
             loaded = _exact(loaded)
             options = options.model_copy(update=_exact(dict(options)))
@@ -90,8 +96,10 @@ def analysis_function(name: str) -> Callable[..., AnalysisResult]:
             return analyze(name, loaded, options, command=command, directory=where)
 
     own = inspect.signature(call)
-    kept = [one for one in own.parameters.values() if row.keeps or one.name != "directory"]
+    left_out = {"directory": not row.keeps, "controller": not row.controller}
+    kept = [one for one in own.parameters.values() if not left_out.get(one.name)]
     call.__signature__ = own.replace(parameters=kept)  # type: ignore[attr-defined]
+    instead = "\n    controller: a shipped name or a YAML file, laid over the scenario's own."
     folder = f"\n    directory: folder of the {row.keeps}, from which a second call continues."
     exact = "; the exact plant replaces Drake's engine"
     call.__name__ = call.__qualname__ = words
@@ -99,6 +107,7 @@ def analysis_function(name: str) -> Callable[..., AnalysisResult]:
 
 Args:
     scenario: a Scenario, a shipped name or a path{exact if row.exact else ""}.
+    settings: as `load_scenario` takes them.{instead if row.controller else ""}
     OPTIONS{folder if row.keeps else ""}
 
 Raises:

@@ -217,6 +217,7 @@ class Picture:
     # drawn inside `style.figure_style`, or a function that draws it for a page
     figure: "Figure | Callable[[], Figure]"
     caption: str  # the sentence below it
+    name: str = "figure"
     brief: ClassVar = False
 
     @cached_property
@@ -224,7 +225,7 @@ class Picture:
         return self.figure() if callable(self.figure) else self.figure
 
     def __reduce__(self) -> tuple[Any, ...]:  # the function may hold what cannot be pickled
-        return Picture, (self.drawn, self.caption)
+        return Picture, (self.drawn, self.caption, self.name)
 
 
 @dataclass(frozen=True)
@@ -320,6 +321,7 @@ class _Part(NamedTuple):
     text: "Template"
     kind: str
     rows: "list[list[Template]]"
+    name: str  # of what is named, such as `runs_figure`
 
 
 def _blocks(part: _Part, value: Any, context: Mapping[str, Any]) -> Iterator[Block]:
@@ -343,7 +345,7 @@ def _blocks(part: _Part, value: Any, context: Mapping[str, Any]) -> Iterator[Blo
             if one is True:
                 yield Paragraph(text, part.mark == "@>")
             elif callable(one):
-                yield Picture(one, text)
+                yield Picture(one, text, part.name.removesuffix("_figure"))
             elif isinstance(one, str):
                 yield Caution(one)
             else:
@@ -385,7 +387,9 @@ def _template(name: str) -> "list[tuple[Template, bool, list[_Part]]]":
             pieces = columns[rows[0][0]]
         columns[f"@{named}"] = pieces
         entry = environment.compile_expression(named, undefined_to_none=False) if named else None
-        found[-1][2].append(_Part(mark, entry, template, lines[0][0] if lines else "", pieces))
+        found[-1][2].append(
+            _Part(mark, entry, template, lines[0][0] if lines else "", pieces, named)
+        )
     return found
 
 

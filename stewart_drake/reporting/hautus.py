@@ -1,6 +1,6 @@
 """Document and figures of a Hautus analysis."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import groupby
 from typing import Final
@@ -62,8 +62,8 @@ def document(study: HautusStudy) -> Document:
 def _typical_plants(study: HautusStudy) -> list[System]:
     """Return the plant at home and the worst plant, without and under gravity."""
     shown: dict[int, System] = {}
-    for where in ("without", "under"):
-        some = [s for s in study.family("plant") if s.name.startswith(f"plant {where} gravity")]
+    for gravity in (False, True):
+        some = [s for s in study.family("plant") if s.gravity is gravity]
         for one in some[:1] + sorted(some, key=lambda s: s.margins["controllable"])[:1]:
             shown[id(one)] = one
     return list(shown.values())
@@ -97,27 +97,34 @@ def _deficiencies(systems: Sequence[System]) -> list[Paragraph]:
 
 def chain_figure(study: HautusStudy) -> Figure:
     lines = {name: (study.family(name), line(k)) for k, name in enumerate(_CHAINS)}
-    return _margin_figure(lines, "delay μ  [periods]", _envelope(study))
+    over = "delay μ  [periods]"
+    return _margin_figure(lines, over, lambda one: float(one.steps or 0), _envelope(study))
 
 
 def plant_figure(study: HautusStudy) -> Figure:
     moved = [system for system in study.family("plant") if system.time is not None]
     lines = {
-        where: ([system for system in moved if where in system.name], look)
-        for where, look in (("without gravity", line(0)), ("under gravity", line(2)))
+        where: ([system for system in moved if system.gravity is gravity], look)
+        for where, gravity, look in (
+            ("without gravity", False, line(0)),
+            ("under gravity", True, line(2)),
+        )
     }
-    return _margin_figure(lines, "time on the reference  [s]")
+    return _margin_figure(lines, "time on the reference  [s]", lambda one: one.time or 0.0)
 
 
 def _margin_figure(
-    lines: Mapping[str, tuple[Sequence[System], Line]], over: str, more: Sequence[Curve] = ()
+    lines: Mapping[str, tuple[Sequence[System], Line]],
+    over: str,
+    place: Callable[[System], float],
+    more: Sequence[Curve] = (),
 ) -> Figure:
-    """Draw margins of controllability, with more curves, and of observability."""
+    """Draw margins of controllability, with more curves, and of observability over a place."""
     panels = []
     for word, title in {"controllable": "controllability", "observable": "observability"}.items():
         curves = []
         for label, (systems, look) in lines.items():
-            x = [one.steps or one.time or 0.0 for one in systems]
+            x = [place(one) for one in systems]
             margins = np.maximum([one.margins[word] for one in systems], _SMALLEST)
             curves.append(Curve(x, margins, label, look))
         curves += more if word == "controllable" else ()
@@ -137,7 +144,7 @@ def _margin_figure(
 def _envelope(study: HautusStudy) -> list[Curve]:
     """Return the margin without delay times e^(-p eta), with p the fastest mode."""
     chains = study.family("chain under gravity")
-    plants = [s for s in study.family("plant") if s.name == "plant under gravity, home"]
+    plants = [s for s in study.family("plant") if s.gravity and s.time is None]
     if not chains or not plants:
         return []
     pole = max(mode.eigenvalue.real for mode in plants[0].reach.modes)

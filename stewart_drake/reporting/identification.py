@@ -71,6 +71,7 @@ def document(found: Identification) -> Document:
             Picture(
                 partial(residual_figure, found, i),
                 f"{name}: residuals of the fit, in standard deviations of a measurement.",
+                "residuals",
             )
             for i, name in enumerate(names)
         ],

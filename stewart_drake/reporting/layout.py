@@ -43,7 +43,7 @@ def document(study: LayoutStudy) -> Document:
     for one in machines:
         figure = partial(mechanism_figure, one.mechanism)
         caption = f"{one.name} at home, from above and from the front."
-        found.sections.append(Section(one.name, Picture(figure, caption)))
+        found.sections.append(Section(one.name, Picture(figure, caption, one.name)))
     return found
 
 

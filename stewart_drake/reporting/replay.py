@@ -1,5 +1,6 @@
 """Animation of a finished run and its reference in Meshcat, with the SDFormat model."""
 
+import html
 import logging
 from pathlib import Path
 from typing import Final
@@ -16,7 +17,7 @@ from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import turns_between
 from stewart_drake.reporting.document import number
 from stewart_drake.reporting.page import environment
-from stewart_drake.reporting.run import late_error
+from stewart_drake.reporting.run import late_error, torqueless
 from stewart_drake.scenario.run_log import EXPECTED, read_log, scenario_of
 from stewart_drake.scenario.signals import ANGLES, LEGS, POSITION
 
@@ -56,6 +57,8 @@ def replay_html(result: SimulationResult, mechanism: Mechanism, title: str) -> s
     outcome = result.status.replace("_", " ")
     if result.stopped is not None:
         outcome += f" at {result.stopped.time:.2f} s"
+    elif torqueless(result):
+        outcome += ", without a finite torque of the controller"
     else:
         late = late_error(result) if result.scenario.actuator.kind == "position_servo" else ""
         error = late and f"rms error {late} in the second half"  # E_ac is that of the soft start
@@ -112,7 +115,7 @@ def _html(signals: xr.Dataset, mechanism: Mechanism, title: str, outcome: str) -
         legs=LEGS,
         colors=TORQUE_COLORS,
     )
-    return scene_page(meshcat, overlay, "Replay")
+    return scene_page(meshcat, overlay, html.escape(title))
 
 
 def scene_page(meshcat: Meshcat, overlay: str, title: str) -> str:

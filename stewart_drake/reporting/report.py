@@ -227,7 +227,7 @@ def document(found: ReportData, name: str, replay: str = "") -> Document:
     if found.run and own:
         below = _PACKETS_BELOW if has(found.run, "packets") else ""
         for what, figure in draw_run(found.run).items():
-            own.append(Picture(figure, _CAPTIONS[what] + below * (what == "torques")))
+            own.append(Picture(figure, _CAPTIONS[what] + below * (what == "torques"), what))
     made = from_template(
         "report",
         tone,
@@ -244,7 +244,7 @@ def document(found: ReportData, name: str, replay: str = "") -> Document:
         papers=is_papers(found.scenario),
         no_weights="weights" not in compared,
         compared=[
-            Picture(figure, _caption(what, is_papers(found.scenario)))
+            Picture(figure, _caption(what, is_papers(found.scenario)), f"compared_{what}")
             for what, figure in compared.items()
         ],
     )
@@ -326,6 +326,8 @@ def verdict(found: ReportData) -> tuple[str, Tone]:
     text = f"The plate follows its reference for {duration}: E_ac is "
     if bad:
         text = f"Not reliable: {bad}. The run completed {duration}: E_ac is "
+    if torqueless(run):
+        return f"Not reliable: {bad}.", "bad"
     if run.scenario.actuator.kind == "position_servo" and (late := late_error(run)):
         text = text.replace(": E_ac", f": rms error {late} in the second half. With the start E_ac")
     error, floor = number(round(s["accumulated_error"], 9)), s["delay_floor"]
@@ -409,8 +411,10 @@ def first_report(made: NewMachine, result: SimulationResult, findings: Iterable[
     """
     check, completed = made.check, result.status == "completed"
     good: Tone = "fair" if made.crossings else "good"
-    drawing = Picture(lambda: mechanism_figure(check.mechanism), "The machine at its home pose.")
-    figures = [Picture(figure, _CAPTIONS[name]) for name, figure in draw_run(result).items()]
+    drawing = Picture(
+        lambda: mechanism_figure(check.mechanism), "The machine at its home pose.", "machine"
+    )
+    figures = [Picture(figure, _CAPTIONS[name], name) for name, figure in draw_run(result).items()]
     motion = (
         "Up and down, once in two seconds. A log of this motion shows friction and payload, but "
         "hardly the lengths: stewart-drake identify --plan finds a better one."

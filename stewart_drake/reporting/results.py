@@ -5,6 +5,7 @@
 
 import html as escaping
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ import pandas
 import xarray
 
 from stewart_drake.files.arrayio import write_netcdf
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import remove_partials, write_asked, write_whole
 from stewart_drake.files.jsonio import write_json
 from stewart_drake.loop import controller_margin as loop_margin
@@ -182,9 +184,15 @@ class ComparisonResult(Printed, dict[str, SimulationResult]):
         return drawn(draw_comparison(self), directory)
 
     def replay(self, directory: str | Path | None = None) -> "dict[str, Replay | Path | Meshcat]":
-        """Return the replay of each run by controller, written as NAME.html into a directory."""
+        """Return the replay of each run by controller.
+
+        Args:
+            directory: folder to write them into as NAME.html, if not None; it is made. A single
+                run takes a file.
+        """
+        folder = _replays(directory)
         return {
-            name: run.replay(None if directory is None else Path(directory) / f"{name}.html")
+            name: run.replay(folder and folder / f"{name}.html", title=name)
             for name, run in self.items()
         }
 
@@ -297,9 +305,17 @@ class AnalysisResult(Printed):
         return self.document.plain()
 
     def plot(self, directory: str | Path | None = None) -> Figures:
-        """Return the figures of the page; see `SimulationResult.plot`."""
-        pictures = enumerate(self.document.all(Picture), 1)
-        return drawn({f"figure_{k}": one.drawn for k, one in pictures}, directory)
+        """Return the figures of the page by name, numbered where one comes again.
+
+        Args:
+            directory: folder to write PNG and SVG files into, if not None; it is made.
+        """
+        counts, shown = Counter[str](), {}
+        for one in self.document.all(Picture):
+            counts[one.name] += 1
+            n = counts[one.name]
+            shown[f"{one.name}_{n}" if n > 1 else one.name] = one.drawn
+        return drawn(shown, directory)
 
     def replay(self, directory: str | Path | None = None) -> "dict[str, Replay | Path]":
         """Return the animations of the page by name, empty for a page without.
@@ -307,8 +323,8 @@ class AnalysisResult(Printed):
         Args:
             directory: folder to write them into as NAME.html, if not None; it is made.
         """
-        frames = enumerate(self.document.all(Frame), 1)
-        return {f"replay_{k}": _kept(one.html, directory, f"replay_{k}.html") for k, one in frames}
+        folder, frames = _replays(directory), enumerate(self.document.all(Frame), 1)
+        return {f"replay_{k}": _kept(one.html, folder, f"replay_{k}.html") for k, one in frames}
 
     def write_page(self, directory: Path, name: str = PAGE) -> Path:
         """Write the page into a directory and return its path."""
@@ -350,6 +366,14 @@ def _framed(page: str) -> str:
         f'<iframe srcdoc="{escaping.escape(page)}" sandbox="allow-scripts" '
         'style="width: 100%; height: 600px; border: 0"></iframe>'
     )
+
+
+def _replays(directory: str | Path | None) -> Path | None:
+    """Return the folder of several animations; refuse the name of a file."""
+    folder = None if directory is None else Path(directory)
+    if folder is not None and folder.suffix == ".html":
+        raise ConfigError(f"directory: got {folder}; expected a folder, for a file per animation")
+    return folder
 
 
 def _kept(text: str, place: str | Path | None, *name: str) -> Replay | Path:

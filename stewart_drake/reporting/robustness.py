@@ -29,6 +29,7 @@ from stewart_drake.studies.statistics import (
     Interval,
     Pair,
     Separation,
+    runs_to_bound,
     wilson_interval,
 )
 from stewart_drake.studies.uncertainty import MACHINE
@@ -71,6 +72,7 @@ def document(study: RobustnessStudy) -> Document:
         where=_where,
         spans=_spans(study),
         enough=_ENOUGH,
+        to_bound=runs_to_bound,
         fewer=min(found.failing, found.others),
         errors=_errors(study),
         usual=1e3 * Tolerances().lengths,

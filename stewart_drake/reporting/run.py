@@ -239,10 +239,12 @@ def _best(runs: _Runs) -> str:
 
 
 def _row(title: str, name: str, run: SimulationResult) -> dict[str, Any]:
-    """Return a row of the comparison; a run that ended early shows how, not its errors."""
+    """Return a row of the comparison; one lost or without a torque shows that, no errors."""
     s, stopped = run.summary, run.stopped
     late = late_error(run).partition(" deg")[0] or "-"
     row = {"late": late, "title": title, "name": name, "paper": _paper_error(name, run), "s": s}
+    if torqueless(run):
+        return row | {"error": "no finite\ntorque", "worst": "-", "floor": "-", "cost": "-"}
     if stopped is None:
         floor = s["delay_floor"] if waits_at_rest(run.scenario) else "-"
         numbers = {"error": s["accumulated_error"], "floor": floor, "cost": s["cost"]}

@@ -203,6 +203,7 @@ class System:
     family: str  # `error model`, `minimal chain`, `paper's chain`, `chain under gravity` or `plant`
     steps: int | None  # of delay, or None
     time: float | None  # s along the reference, None for home
+    gravity: bool | None  # of a plant; None for the other families
     n: int  # states
     m: int  # inputs
     reach: Hautus  # test of (A, B)
@@ -304,7 +305,9 @@ def study_hautus(scenario: Scenario) -> HautusStudy:
                 if isinstance(model, str):
                     study.skipped[name] = model
                 else:
-                    study.systems.append(_test(found, name, "plant", model, time=time))
+                    study.systems.append(
+                        _test(found, name, "plant", model, time=time, gravity=gravity)
+                    )
         return study
 
 
@@ -359,6 +362,7 @@ def _test(
     model: ContinuousModel,
     steps: int | None = None,
     time: float | None = None,
+    gravity: bool | None = None,
     period: float = 0.0,
 ) -> System:
     n, m = model.B.shape
@@ -376,7 +380,20 @@ def _test(
         for mode in test.deficient
     ]
     radius = float(np.abs(np.linalg.eigvals(A)).max())
-    return System(name, family, steps, time, n, m, reach, view, radius, drake, tuple(words))
+    return System(
+        name=name,
+        family=family,
+        steps=steps,
+        time=time,
+        gravity=gravity,
+        n=n,
+        m=m,
+        reach=reach,
+        view=view,
+        radius=radius,
+        drake=drake,
+        words=tuple(words),
+    )
 
 
 def _modes_summary(test: Hautus) -> list[dict[str, Any]]:

@@ -178,9 +178,17 @@ def takes(
                 raise TypeError(
                     f"{function.__name__}: got {old}, an option of 0.2; expected {RENAMED[old]}"
                 )
-            given = shown.bind(*args, **kwargs).arguments
+            if "settings" in shown.parameters and any(map(_is_settings, args[1:2])):
+                raise TypeError(
+                    f"{function.__name__}: got {args[1]} without a name; expected "
+                    f"settings={args[1]}"
+                )
+            try:
+                given = shown.bind(*args, **kwargs).arguments
+            except TypeError as error:
+                raise TypeError(f"{function.__name__}: {error}") from None
             values = {name: given.pop(name) for name in kind.model_fields if name in given}
-            load = functools.partial(_load, given.get("scenario"))
+            load = functools.partial(_load, given.get("scenario"), given.get("settings", ()))
             try:
                 for one in kind.described():
                     texts = values.get(one.name)
@@ -201,10 +209,14 @@ def takes(
     return decorate
 
 
-def _load(scenario: Any, controller: str) -> "Scenario":
+def _is_settings(value: Any) -> bool:
+    return isinstance(value, list | tuple) and any("=" in str(one) for one in value)
+
+
+def _load(scenario: Any, settings: Any, controller: str) -> "Scenario":
     from stewart_drake.scenario.loading import load_compatible
 
-    return load_compatible(scenario, controller)
+    return load_compatible(scenario, controller, settings)
 
 
 def refuse(options: Mapping[str, object], why: str) -> None:

@@ -91,7 +91,9 @@ def run_scenarios(
         try:
             jobs = {key: (scenario,) for key, scenario in scenarios.items()}
             run_jobs(
-                *(jobs, run_scenario, folder),
+                jobs,
+                run_scenario,
+                folder,
                 settings=settings or {},
                 read=read_outcome,
                 progress=progress,

@@ -15,6 +15,7 @@ among those on b's side a's, each by Fisher's exact test; the p-value is the lar
 p-values are Holm's, over all questions.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from itertools import combinations, product
@@ -90,6 +91,14 @@ def quantile_interval(values: ArrayLike, probability: float) -> Interval:
         -np.inf if low is None else float(ordered[low]),
         np.inf if high is None else float(ordered[high]),
     )
+
+
+def runs_to_bound(probability: float) -> int:
+    """Return the least number of values for which `quantile_interval` has an upper end.
+
+    The true quantile lies above all n with probability p^n, for a quantile p of 0.5 or more.
+    """
+    return math.ceil(math.log((1 - CONFIDENCE) / 2) / math.log(probability))
 
 
 @lru_cache(maxsize=256)
