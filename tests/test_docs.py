@@ -309,12 +309,19 @@ ELSEWHERE = ("extending.md", "tutorial.md")
 
 
 @each([block for block in blocks("python", "py") if block.path.name not in ELSEWHERE])
-def test_python_runs(block, tmp_path, monkeypatch):
-    """All but those that tests/test_extending.py and tests/test_tutorial.py run and look into."""
+def test_python_runs(block, tmp_path, monkeypatch, capsys):
+    """All but those that tests/test_extending.py and tests/test_tutorial.py run and look into.
+
+    A sentence below that begins with "It prints" has the printed numbers.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")
     source = "\n" * block.line + block.text  # so that a traceback shows the document's line
     exec(compile(source, str(block.path), "exec"), {"__name__": "__main__"})
+    below = block.path.read_text(encoding="utf-8").split(f"{block.text}```\n", 1)[1].lstrip()
+    if below.startswith("It prints"):
+        sentence, number = re.split(r"\.\s", below)[0], r"\d+\.\d+"
+        assert re.findall(number, sentence) == re.findall(number, capsys.readouterr().out)
 
 
 def load_any(path):

@@ -9,7 +9,7 @@ from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, Ini
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
-from pydrake.multibody.tree import FixedOffsetFrame
+from pydrake.multibody.tree import FixedOffsetFrame, SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
@@ -146,6 +146,67 @@ def test_a_robot_beside_it_does_not_change_its_motion():
     simulated = run(beside, 0.3, look=look)
     np.testing.assert_allclose(simulated, run(lambda b: sd.AddStewartPlatform(b, PAPER), 0.3))
     assert np.abs(simulated[:6] - PAPER.home).max() > 1e-3
+
+
+YAWED = RigidTransform(RollPitchYaw(0, 0, 0.7), [1.0, 0, 0])
+HANGING = RigidTransform(RollPitchYaw(np.pi, 0, 0), [0, 0, 2.0])
+TILTED = RigidTransform(RollPitchYaw(0.5, 0, 0), [0, 0, 0])
+
+
+def with_gravity(builder, g=None, X_PB=None, parent=None, gravity=True):
+    """Add a platform to a plant with gravity g along -z of the world, Drake's default if None."""
+    plant, _ = AddMultibodyPlantSceneGraph(builder, 1e-3)
+    if g is not None:
+        plant.mutable_gravity_field().set_gravity_vector([0, 0, -g])
+    parent = parent and parent(plant)
+    config = sd.PlantConfig(gravity=gravity)
+    return sd.AddStewartPlatform(builder, PAPER, config, plant=plant, X_PB=X_PB, parent=parent)
+
+
+def on_a_table(plant, X_WT=TILTED, weld=True):
+    """Return a frame, upright again, of a table that is welded to the world, as its parent."""
+    table = plant.AddRigidBody("table", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    if weld:
+        plant.WeldFrames(table.body_frame(), plant.world_frame(), X_WT.inverse())
+    return plant.AddFrame(FixedOffsetFrame("top", table.body_frame(), TILTED.inverse()))
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, 9.81),
+        ({"g": 1.62}, 1.62),
+        ({"g": 0.0}, 0.0),
+        ({"g": 1.62, "X_PB": YAWED}, 1.62),
+        ({"X_PB": HANGING}, -9.81),
+        ({"g": 3.7, "parent": on_a_table}, 3.7),
+        ({"gravity": False}, 0.0),
+        ({"gravity": False, "g": 1.62, "X_PB": TILTED}, 0.0),
+    ],
+)
+def test_the_dynamics_have_the_gravity_of_the_plant(given, expected):
+    """The torques that hold the plate by `dynamics` hold it in the plant."""
+    builder = DiagramBuilder()
+    platform = with_gravity(builder, **given)
+    assert platform.dynamics.gravity == pytest.approx(expected, abs=1e-12)
+    platform.plant.Finalize()
+    holding = platform.dynamics.equilibrium_torque(PAPER.home)
+    builder.ExportInput(platform.GetInputPort("torque"), "torque")
+    builder.ExportOutput(platform.GetOutputPort("state"), "state")
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    diagram.GetInputPort("torque").FixValue(context, holding)
+    simulator.AdvanceTo(0.1)
+    state = diagram.GetOutputPort("state").Eval(context)
+    np.testing.assert_allclose(state[:6], PAPER.home, atol=1e-6)
+
+
+def changed_gravity(builder):
+    platform = with_gravity(builder)
+    platform.plant.mutable_gravity_field().set_gravity_vector([0, 0, -1.62])
+    platform.plant.Finalize()
+    platform.GetInputPort("torque")
 
 
 LOADS = {"payload_mass": 0.3, "payload_position": np.array([0.05, -0.03, 0.1])}
@@ -297,6 +358,15 @@ def own_plant(builder, finalized, time_step=1e-3):
             ),
             "not finalized; expected GetInputPort and GetOutputPort after plant.Finalize()",
         ),
+        (
+            lambda b: with_gravity(b, X_PB=TILTED),
+            "X_PB: got a base whose z is 28.6 degrees from the plant's gravity; expected 0",
+        ),
+        (
+            lambda b: with_gravity(b, parent=lambda plant: on_a_table(plant, weld=False)),
+            "parent: got top, a frame that can move; expected one that is welded",
+        ),
+        (changed_gravity, "[0.0, 0.0, -1.62], [0.0, 0.0, -9.81] when the platform was added"),
         (lambda b: sd.AddStewartPlatform(b, PAPER).GetInputPort("force"), "expected torque or wre"),
         (lambda b: sd.AddStewartPlatform(b, PAPER, start=[0.0]), "start: got shape (1,)"),
         (lambda b: sd.AddStewartPlatform(b, PAPER, start=[np.nan] * 6), "start: got [nan"),

@@ -153,6 +153,17 @@ def test_delay_chain_topology_and_initial_state():
             DelayChain(0.1, steps, fraction, queue(steps, 0.5 - fraction))
 
 
+@pytest.mark.parametrize(("carries", "size"), [("torque", 6), ("command", 18)])
+def test_a_delay_chain_without_a_queue_begins_with_zeros(carries, size):
+    chain = DelayChain(0.1, 2, carries=carries)
+    context = chain.CreateDefaultContext()
+    for commanded in (1.0, 2.0, 3.0):
+        chain.get_input_port().FixValue(context, np.full(size, commanded))
+        carry_out(chain._take, context)
+        acting = chain.GetOutputPort(carries).Eval(context)
+        assert np.array_equal(acting, np.full(size, max(0.0, commanded - 2)))
+
+
 NAN, SIX, TWELVE, EMPTY = np.nan, np.ones(6), np.zeros(12), np.zeros((0, 6))
 MACHINE = StewartDynamics(PAPER)
 AT_ONCE = Delay(0)
@@ -284,8 +295,7 @@ def chained(plant, period, steps, fraction, torque):
     """Counter, delay chain with nothing in flight, plant."""
     builder = DiagramBuilder()
     source = builder.AddSystem(Counter(period, torque))
-    empty = np.zeros((steps + (fraction > 0), 6))
-    chain = builder.AddSystem(DelayChain(period, steps, fraction, empty))
+    chain = builder.AddSystem(DelayChain(period, steps, fraction))
     builder.AddSystem(plant)
     builder.Connect(source.get_output_port(), chain.get_input_port())
     builder.Connect(chain.get_output_port(), plant.GetInputPort("torque"))

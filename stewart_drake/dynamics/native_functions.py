@@ -15,7 +15,6 @@ from stewart_drake.mechanism.kinematics import angle_rate_map
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     ANGLES,
-    NUM_PLANT_PARAMETERS,
     NUM_REFERENCE,
     NUM_STATE,
     NUM_TORQUES,
@@ -34,6 +33,22 @@ class Buffers(NamedTuple):
     arguments: list[Array]
     results: list[Array]
     evaluate: Callable[[], object]
+
+
+_IN_C: Final = {
+    "accelerations": ("stewart_accelerations", ["plant", "pose", "rates", "torque"]),
+    "inverse_dynamics": ("stewart_inverse_dynamics", ["plant", "pose", "rates", "accelerations"]),
+    "energy": ("stewart_energy", ["plant", "pose", "rates"]),
+    "residual_derivatives": (
+        "stewart_residual_derivatives",
+        ["plant", "pose", "rates", "accelerations", "torque"],
+    ),
+    "measures": ("stewart_measures", ["geometry", "pose", "NULL"]),
+    "measures_of_tree": ("stewart_measures", ["geometry", "pose", "angles"]),
+    "change": ("stewart_change", ["plant", "state", "torque"]),
+}
+"""Function of core/dynamics.h and its inputs, by the names of `core.layout.SIGNATURES`. Results
+follow. A plant is geometry, parameters and gravity."""
 
 
 class NativeFunction:
@@ -66,15 +81,17 @@ class NativeFunction:
 
     def _buffers(self) -> Buffers:
         (names, shapes), c = SIGNATURES[self._name], core()
-        given, results = ([np.zeros(s) for s in of] for of in ([SHAPES[n] for n in names], shapes))
-        first, inputs = c.at(self._geometry), [c.at(array) for array in given]
-        if "gravity" in names:
-            *inputs, parameters, gravity = inputs
-            first = c.plant(first, parameters, gravity)
-        no_angles = [c.ffi.NULL] if self._name == "measures" else []
-        function = getattr(c.lib, f"stewart_{self._name.removesuffix('_of_tree')}")
-        call = partial(function, first, *inputs, *no_angles, *map(c.at, results))
-        return Buffers(given, results, call)
+        given = {name: np.zeros(SHAPES[name]) for name in names}
+        results = [np.zeros(shape) for shape in shapes]
+        pointers = {name: c.at(array) for name, array in given.items()}
+        pointers |= {"geometry": c.at(self._geometry), "NULL": c.ffi.NULL}
+        function, arguments = _IN_C[self._name]
+        if "plant" in arguments:
+            parts = (pointers[name] for name in ("geometry", "parameters", "gravity"))
+            pointers["plant"] = c.plant(*parts)
+        inputs, outputs = (pointers[name] for name in arguments), map(c.at, results)
+        call = partial(getattr(c.lib, function), *inputs, *outputs)
+        return Buffers(list(given.values()), results, call)
 
 
 class NativeFunctions:
@@ -96,7 +113,7 @@ class NativeFunctions:
         for name in SIGNATURES.keys() - {"change"}:
             setattr(self, name, NativeFunction(name, geometry))
         self._change = NativeFunction("change", geometry)
-        self._first = core().at(geometry)
+        self._geometry = core().at(geometry)
 
     def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
         """Return d[pose; rates]/dt (12,), in half the time of a `Call`."""
@@ -109,9 +126,9 @@ class NativeFunctions:
     def torques(self, rows: Array, parameters: Array, gravity: float) -> Array:
         """Return `inverse_dynamics` (n, 6) of rows (n, 18), in a fifth of the time of `Call`s."""
         c, function = core(), core().lib.stewart_inverse_dynamics
-        rows, given = np.array(rows, np.float64), np.array([*parameters, gravity])
-        torques = np.empty((len(rows), NUM_TORQUES))
-        plant = c.plant(self._first, c.at(given), c.at(given) + NUM_PLANT_PARAMETERS)
+        rows, torques = np.array(rows, np.float64), np.empty((len(rows), NUM_TORQUES))
+        p, g = np.array(parameters, np.float64), np.array([gravity], np.float64)
+        plant = c.plant(self._geometry, c.at(p), c.at(g))
         first, result = c.at(rows), c.at(torques)
         for k in range(len(rows)):
             pose = first + NUM_REFERENCE * k
@@ -133,7 +150,7 @@ class NativeFunctions:
     def crank_angles(self, pose: ArrayLike) -> Array:
         """Return crank angles (6,), NaN where a leg does not reach."""
         c, pose, angles = core(), np.array(pose, np.float64), np.empty(NUM_TORQUES)
-        c.lib.stewart_crank_angles(self._first, c.at(pose), c.at(angles))
+        c.lib.stewart_crank_angles(self._geometry, c.at(pose), c.at(angles))
         return angles
 
     def cranks(self, state: ArrayLike) -> Array:
@@ -142,7 +159,7 @@ class NativeFunctions:
         NaN where a leg does not reach; rates also where a leg is at its dead centre.
         """
         c, state, J = core(), np.array(state, np.float64), np.empty((NUM_TORQUES, NUM_TORQUES))
-        c.lib.stewart_crank_jacobian(self._first, c.at(state), c.at(J))
+        c.lib.stewart_crank_jacobian(self._geometry, c.at(state), c.at(J))
         return np.concatenate([self.crank_angles(state[POSE]), J @ state[RATES]])
 
     def margins(self, poses: Array, sign: float, least: Array) -> Array:
@@ -154,7 +171,7 @@ class NativeFunctions:
         rows = np.array(poses, np.float64)
         first, limits = c.at(rows), c.at(least)
         number = range(0, rows.size, NUM_TORQUES)
-        return np.array([function(self._first, first + i, sign, limits) for i in number])
+        return np.array([function(self._geometry, first + i, sign, limits) for i in number])
 
     def many_steps(
         self, state: ArrayLike, torques: Array, parameters: Array, gravity: float, h: Array
@@ -163,12 +180,17 @@ class NativeFunctions:
 
         The torques (n, 6) are constant in each step.
         """
-        c, states = core(), np.empty((len(torques), NUM_STATE))
-        given = state, torques, parameters, [gravity], h
-        x, held, p, g, steps = (c.at(np.array(one, np.float64, order="C")) for one in given)
-        plant, every = c.plant(self._first, p, g), c.at(np.arange(len(states), dtype=np.intc))
-        times = 0, len(states), steps, held, held, every
-        c.lib.stewart_shoot(plant, *times, x, c.at(states), c.ffi.NULL)
+        c, number = core(), len(torques)
+        states = np.empty((number, NUM_STATE))
+        given = (np.array(one, np.float64, order="C") for one in (state, torques, h))
+        x, held, steps = map(c.at, given)
+        p, g = np.array(parameters, np.float64), np.array([gravity], np.float64)
+        plant = c.plant(self._geometry, c.at(p), c.at(g))
+        kept = c.at(np.arange(number, dtype=np.intc))  # each step's end is a row of `states`
+        with_legs, after, slopes = 0, held, c.ffi.NULL  # no slopes; `held` acts to the step's end
+        c.lib.stewart_shoot(
+            plant, with_legs, number, steps, held, after, kept, x, c.at(states), slopes
+        )
         return states
 
 

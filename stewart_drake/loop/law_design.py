@@ -597,8 +597,8 @@ def design_law(
         delay: assumed time from the computation of a torque to its action, s.
         start: (12,) pose and rates at t = 0, from which a way onto the reference is planned; on the
             reference if None.
-        queue: torques in flight at t = 0, as a scenario's `queue`; by default `zero` without
-            gravity and `equilibrium` with it.
+        queue: torques in flight at t = 0, as a scenario's `queue`: `zero`, the default without
+            gravity; `equilibrium`, that with it; `reference` for a motion already under way.
         noise_std: (12,) of the measurement, rad, m and per s.
         torque_limit: of each motor, N m; None is the mechanism's, if it has one.
         horizon: part of the reference for the choice of weights and steps, and for the check of

@@ -180,7 +180,8 @@ class DelayChain(Wire):
         period: dt in s.
         steps: mu.
         fraction: eta0 / dt, in [0, 1).
-        queue: (L, n) torques in flight at t = 0, oldest first, L = mu, or mu + 1 when eta0 > 0.
+        queue: (L, n) torques in flight at t = 0, oldest first, L = mu, or mu + 1 when eta0 > 0;
+            zeros if None.
         carries: torques of six motors, or commands to servos.
 
     Raises:
@@ -188,10 +189,18 @@ class DelayChain(Wire):
     """
 
     def __init__(
-        self, period: float, steps: int, fraction: float, queue: Array, carries: Carried = "torque"
+        self,
+        period: float,
+        steps: int,
+        fraction: float = 0.0,
+        queue: Array | None = None,
+        carries: Carried = "torque",
     ) -> None:
         super().__init__()
         period, delay = positive("period", period), Delay(steps, fraction)
+        if queue is None:
+            one_of("carries", carries, list(CARRIED))
+            queue = np.zeros((delay.queue_length, CARRIED[carries]))
         self._lay(period, np.array([delay.eta(period)]), delay, queue, carries)
         self._release_between(delay)
 

@@ -25,6 +25,7 @@ from pydrake.multibody.tree import (
     SpatialInertia,
     UnitInertia,
     UniversalJoint,
+    WeldJoint,
 )
 from pydrake.systems.framework import (
     BasicVector,
@@ -61,6 +62,9 @@ from stewart_drake.scenario.signals import (
     RATES,
 )
 from stewart_drake.types import Array, ArrayLike
+
+_LARGEST_TILT = 1e-6
+"""Of gravity from the base's z that counts as rounding, rad."""
 
 
 def add_scene(
@@ -128,6 +132,49 @@ def add_model(
         universal = cast(UniversalJoint, plant.GetJointByName(f"universal_{leg}", model))
         universal.set_default_angles(joints.universal[i])
     return model
+
+
+def _gravity_in_base(plant: MultibodyPlant, parent: Frame | None, X_PB: RigidTransform) -> float:
+    """Return the plant's gravity along -z of a base at X_PB in the parent, m/s^2.
+
+    Raises:
+        ConfigError: the base can move, or gravity is not along its z.
+    """
+    parent = parent or plant.world_frame()
+    X_WP = _welded_pose(plant, parent)
+    if X_WP is None:
+        raise ConfigError(
+            f"parent: got {parent.name()}, a frame that can move; expected one that is welded to "
+            "the world, or PlantConfig(gravity=False)"
+        )
+    g_W = plant.gravity_field().gravity_vector()
+    g_B = X_WP.rotation().multiply(X_PB.rotation()).inverse().multiply(g_W)
+    tilt = np.arctan2(np.hypot(g_B[0], g_B[1]), abs(g_B[2]))
+    if tilt > _LARGEST_TILT:
+        raise ConfigError(
+            f"X_PB: got a base whose z is {np.rad2deg(tilt):.3g} degrees from the plant's gravity; "
+            "expected 0 (with any yaw), or PlantConfig(gravity=False)"
+        )
+    return 0.0 - float(g_B[2])
+
+
+def _welded_pose(plant: MultibodyPlant, frame: Frame) -> RigidTransform | None:
+    """Return X_WF of a frame, also before `plant.Finalize()`; None if its body can move."""
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    welds = [joint for joint in joints if isinstance(joint, WeldJoint)]
+    poses = {plant.world_body().index(): RigidTransform()}
+    for _ in welds:  # each pass reaches the bodies that are one weld further from the world
+        for weld in welds:
+            P, C = weld.parent_body().index(), weld.child_body().index()
+            X_PF = weld.frame_on_parent().GetFixedPoseInBodyFrame()
+            X_CM = weld.frame_on_child().GetFixedPoseInBodyFrame()
+            X_PC = X_PF @ weld.X_FM() @ X_CM.inverse()
+            if P in poses:
+                poses[C] = poses[P] @ X_PC
+            elif C in poses:
+                poses[P] = poses[C] @ X_PC.inverse()
+    X_WB = poses.get(cast(Any, frame).body().index())  # Drake's stubs have no type of it
+    return None if X_WB is None else X_WB @ frame.GetFixedPoseInBodyFrame()
 
 
 def _point_mass(mass: float, place: Sequence[float]) -> SpatialInertia:
@@ -306,7 +353,8 @@ class StewartPlatform:
     workspace, as the exact one does, if one of the outputs is used.
 
     Attributes:
-        dynamics: its equations of motion, with its gravity and loads, for `sd.design_law`.
+        dynamics: its equations of motion, with its gravity and loads, for `sd.design_law`. Gravity
+            is that of the plant when the platform was added.
         plant: an `ExactPlant` or a `MultibodyPlant`.
         model: its model in the MultibodyPlant, None for an exact plant.
         scene_graph: added with a MultibodyPlant, else None.
@@ -317,15 +365,18 @@ class StewartPlatform:
         builder: DiagramBuilder,
         mechanism: Mechanism,
         config: PlantConfig,
+        dynamics: StewartDynamics,
         plant: Any,
         model: ModelInstanceIndex | None = None,
         scene_graph: SceneGraph | None = None,
     ) -> None:
         self.mechanism, self.plant, self.model = mechanism, plant, model
-        self.scene_graph = scene_graph
-        self.dynamics = StewartDynamics(mechanism, config.gravity, config.parameters)
+        self.scene_graph, self.dynamics = scene_graph, dynamics
         self._builder, self._config = builder, config
         self._added: dict[str, Any] = {}
+        self._gravity: Any = (
+            None if model is None else plant.gravity_field().gravity_vector().copy()
+        )
 
     def __repr__(self) -> str:
         engine = "exact" if self.model is None else "multibody"
@@ -335,7 +386,8 @@ class StewartPlatform:
         """Return the port `torque` or `wrench`.
 
         Raises:
-            ConfigError: another name, or a MultibodyPlant that is not finalized.
+            ConfigError: another name, a MultibodyPlant that is not finalized, or one whose gravity
+                was changed since the platform was added.
         """
         if name not in ("torque", "wrench"):
             raise ConfigError(f"input port: got {name!r}; expected torque or wrench")
@@ -358,7 +410,7 @@ class StewartPlatform:
         """Return the port `state`, or `crank_angles` of a multibody plant.
 
         Raises:
-            ConfigError: another name, or a MultibodyPlant that is not finalized.
+            ConfigError: as `GetInputPort`.
         """
         names = ("state",) if self.model is None else ("state", "crank_angles")
         if name not in names:
@@ -440,6 +492,12 @@ class StewartPlatform:
                 "plant: got one that is not finalized; expected GetInputPort and GetOutputPort "
                 "after plant.Finalize()"
             )
+        gravity = self.plant.gravity_field().gravity_vector()
+        if self._config.gravity and not np.array_equal(gravity, self._gravity):
+            raise ConfigError(
+                f"plant: got gravity {gravity.tolist()}, {self._gravity.tolist()} when the "
+                "platform was added; expected it to be set before AddStewartPlatform"
+            )
 
     def _added_once(self, name: str, make: Callable[[], System]) -> Any:
         if name in self._added:
@@ -492,17 +550,22 @@ def AddStewartPlatform(
     Args:
         mechanism: the machine, or a name or path for `load_mechanism`.
         config: kind, gravity, time step and loads, as a scenario's `plant`, by default without
-            gravity; with a `plant`, `time_step` is that plant's, and gravity is switched off for
-            the machine only. `mechanism` is ignored.
-        plant: a MultibodyPlant that is not finalized, registered with a SceneGraph.
-        parent: frame of `plant` for the weld of the base, the world's if None.
-        X_PB: pose of the base in that frame, identity if None.
+            gravity; with a `plant`, `time_step` is that plant's, and so is the size of gravity.
+            Without gravity, that of the `plant` is switched off for the machine only. `mechanism`
+            is ignored.
+        plant: a MultibodyPlant that is not finalized, registered with a SceneGraph. Set its gravity
+            before: `dynamics` reads it here.
+        parent: frame of `plant` for the weld of the base, the world's if None; with gravity of a
+            body that is welded to the world.
+        X_PB: pose of the base in that frame, identity if None. With gravity the base's z must be
+            vertical: a yaw is right.
         collision: whether plate, base, cranks and rods collide with other bodies of a given
             `plant`; never with each other.
         start: (6,) pose by default, home if None.
 
     Raises:
-        ConfigError: bad input: a plant that is finalized, or given for kind exact.
+        ConfigError: bad input: a plant that is finalized, or given for kind exact; gravity and a
+            base that is tilted or can move.
         UnreachablePoseError: a start out of reach.
     """
     machine = as_mechanism(mechanism)
@@ -533,7 +596,7 @@ def AddStewartPlatform(
         dynamics = StewartDynamics(machine, config.gravity, config.parameters)
         exact = ExactPlant(dynamics, np.concatenate([pose, np.zeros(6)]), wrench=True)
         exact.set_name(machine.name)
-        return StewartPlatform(builder, machine, config, builder.AddSystem(exact))
+        return StewartPlatform(builder, machine, config, dynamics, builder.AddSystem(exact))
     scene_graph = None
     if plant is not None:
         of_kind("plant", plant, MultibodyPlant)
@@ -549,6 +612,10 @@ def AddStewartPlatform(
     own = plant is None
     if plant is None:
         plant, scene_graph = add_scene(builder, config.time_step)
+    gravity = 0.0
+    if config.gravity:
+        gravity = _gravity_in_base(plant, parent, X_PB or RigidTransform())
+    dynamics = StewartDynamics(machine, gravity, config.parameters)
     model = add_model(
         plant,
         dataclasses.replace(machine, effort_limit=None),
@@ -562,7 +629,7 @@ def AddStewartPlatform(
         plant.set_gravity_enabled(model, False)
     if own:
         plant.Finalize()
-    return StewartPlatform(builder, machine, config, plant, model, scene_graph)
+    return StewartPlatform(builder, machine, config, dynamics, plant, model, scene_graph)
 
 
 class MultibodyStewart(Diagram):
