@@ -220,7 +220,7 @@ class RunSummary(TypedDict):
     status: str
     """`completed`, `left_workspace`, `solver_failed` or `interrupted`; in real time also
     `lost_machine` (no datagrams), `lost_contact` (datagrams without usable measurements) or
-    `refused` (the machine could not be taken over)."""
+    `refused` (the machine could not be taken over, or its delay is another)."""
     accumulated_error: float
     """E_ac in % s, equation (47). NaN for a run in real time with a `measured_share` below 0.9."""
     measured_share: float
