@@ -119,9 +119,9 @@ def identify(
         g = DEFAULT_GRAVITY if gravity else 0.0
         find_servos = partial(identify_servos, log, machine, std, g, velocity_gain)
         return analysis_result(find_servos, servo_identification.document, typed, _write_servos)
+    read = [read_log(Path(path), machine, precision or Precision(), gravity) for path in paths]
     if velocity_gain is not None:
         raise ConfigError("velocity_gain: got one; expected none without a log of setpoints")
-    read = [read_log(Path(path), machine, precision or Precision(), gravity) for path in paths]
     find = partial(identification.identify, read, machine, tolerances, delay)
     return analysis_result(find, document, typed, _write_machine)
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from stewart_drake.dynamics.workspace import Failure
+from stewart_drake.loop.results import rms_error
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.kinematics import rotation
 from stewart_drake.reporting.figures import draw_comparison, draw_run
@@ -151,6 +152,13 @@ def test_the_rms_error_is_an_angle_and_a_distance_after_the_first_half(run):
     assert "rms error  2.0 deg, 3.0 mm in the second half" in re.sub(" {3,}", "  ", there)
     turned["pose"][-1] = np.nan
     assert "2.0 deg, 3.0 mm" in run_document(dataclasses.replace(run, signals=turned)).plain()
+    rests = turned.copy(deep=True)
+    rests["reference"][: n // 4] = 0.5
+    followed = slice(n // 8, n // 4 + 1)
+    rests["pose"][followed] = rests["reference"][followed]
+    shown = run_document(dataclasses.replace(run, signals=rests)).plain()
+    assert "in the second half of the motion" in " ".join(shown.split())
+    assert rms_error(rests.pose.values, rests.reference.values)["angle_deg"] < 1
     lost = dataclasses.replace(run, signals=turned, status="left_workspace")
     assert "rms error" not in run_document(lost).plain()
 

@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from stewart_drake.identification.servo_logs import read_servo_log
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.live.log import LiveRecord, RowFile
@@ -20,9 +21,15 @@ from stewart_drake.live.session import drive, prepare_session
 from stewart_drake.loop import results as metrics
 from stewart_drake.loop.law_design import control_law, first_queue
 from stewart_drake.loop.preparation import prepare
+from stewart_drake.loop.recording import summarize
+from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.servos import servo_law
 from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.reporting.csv_file import signals_csv
+from stewart_drake.scenario.loading import load_scenario
+from stewart_drake.scenario.run_log import open_log
 from stewart_drake.scenario.signals import POSE
+from stewart_drake.studies.learn import lacking_angles
 from tests.copies import Command, status_of
 from tests.test_live import FROM_REST, OVER_A_NETWORK, SETTINGS, paper_machine, scenario_of
 
@@ -191,6 +198,39 @@ def test_a_killed_run_leaves_all_but_its_last_second(tmp_path):
     times = [float(row[0]) for row in rows]
     assert times[-1] > ran - 1.0
     assert all(b - a == pytest.approx(0.1) for a, b in pairwise(times))
+
+
+@pytest.mark.parametrize("sensor", ["state", "encoders"])
+def test_samples_of_servos_without_a_measurement_are_in_no_error(sensor, tmp_path):
+    """As `identify`, which fills short gaps, reads the log."""
+    scenario = load_scenario("reachy_mini", settings=("duration=5", f"sensor.kind={sensor}"))
+    experiment, path = prepare(scenario), tmp_path / "log.csv"
+    law, planned, _ = servo_law(experiment)
+    memory = law.initial_memory(law.command(evaluate(planned, 0.0), law.plant.dynamics.parameters))
+    record = LiveRecord(experiment, 10.0, None, print, [open_log(path, scenario)])
+    lost = {100, 101, 170}
+    for k in range(251):
+        wanted = evaluate(planned, 0.02 * k)
+        seen = wanted[:12] if sensor == "state" else experiment.mechanism.crank_angles(wanted[:6])
+        measurement = Measurement.of(seen * (math.nan if k in lost else 1.0))
+        nothing = np.full(law.reports.size, np.nan)
+        memory = law.step(memory, measurement, lambda _, rows=wanted[None]: rows, nothing)
+        record.sample(k, memory, measurement, wanted, 1e-3, 1e-3, np.full(5, np.nan))
+    record.finish()
+    for log in record._logs:
+        log.close()
+    record.ran(scenario)
+    summary = summarize(experiment, record, "completed", None, 1.0, None)
+    assert summary["measured_share"] == pytest.approx(248 / 251)
+    assert summary["rms_error"]["angle_deg"] < 1e-4 and max(summary["peak_error"]) < 1e-2
+    assert summary["accumulated_error"] < 1e-2
+    signals = record.dataset()
+    assert set(np.flatnonzero(np.isnan(signals.pose.values).any(axis=1))) == lost
+    result = SimulationResult(scenario, "completed", None, signals, summary)
+    assert len(lacking_angles(experiment, result, 4.98)[0]) == 246
+    read = read_servo_log(path, experiment.mechanism)
+    true = experiment.mechanism.crank_angles(evaluate(planned, 2.0)[:6])
+    assert len(read.times) == 251 and read.cranks[100] == pytest.approx(true, abs=5e-3)
 
 
 # ---------------------------------------------------------------- memory

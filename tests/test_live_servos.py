@@ -8,6 +8,8 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.live.design import design
+from stewart_drake.live.endpoint import now
+from stewart_drake.live.exchange import Watch
 from stewart_drake.live.machine import Machine, Settings
 from stewart_drake.live.protocol import (
     ControllerFlags,
@@ -17,6 +19,8 @@ from stewart_drake.live.protocol import (
     Refusal,
 )
 from stewart_drake.live.session import drive, plans, prepare_session
+from stewart_drake.live.viewer import End
+from stewart_drake.loop.peer import Fault, Reason
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.servos import servo_law
 from stewart_drake.mechanism.trajectories import evaluate
@@ -113,6 +117,34 @@ def test_rows_of_the_other_kind_are_refused():
     fed = Fed(NETWORK)
     fed.say(0, np.zeros((1, 6)), cranks=False)
     assert fed.wire.refused == {Refusal.MALFORMED: 1}
+
+
+def test_the_words_for_a_stop_are_those_of_servos(tmp_path):
+    said = []
+    contact = SimpleNamespace(heard=now(), machine=SimpleNamespace(reason=Reason()))
+    exchange = SimpleNamespace(contact=contact, late=lambda k: 0.0, jitter=0.0)
+    watch = Watch(exchange, 0.02, said.append)
+    why = str(Reason(Fault.DRIVE))
+    for flags in (MachineFlags.SAFE, MachineFlags(0)):
+        watch.ended(5, SimpleNamespace(flags=flags, why=why, cranks=True))
+    assert said == [
+        f"at 0.1 s: the machine holds its cranks: {why}",
+        "at 0.1 s: setpoints act again",
+    ]
+    assert "does not answer" in why
+    assert "servos hold their setpoint" in " ".join(End("lost_machine", None).advice.split())
+    with closing(open_log(tmp_path / "m.csv", Fed().experiment.scenario, servos=False)):
+        assert "setpoint_" not in (tmp_path / "m.csv").read_text()
+
+
+@pytest.mark.slow
+@in_real_time
+def test_a_machine_with_another_delay_ends_the_run():
+    machine = sd.load_scenario("reachy_mini", settings=("delay.steps=13",))
+    with running_machine(machine) as running:
+        ready = prepare_session(sd.load_scenario("reachy_mini"), running.address)
+        result = drive(ready, 4.0, accept_jitter=True, say=lambda line: None)
+    assert result.status == "refused" and "same delay.steps" in result.failure
 
 
 def test_live_compensates_what_the_scenario_says_of_the_plant():

@@ -140,6 +140,17 @@ def test_servos_are_found_from_the_log_of_a_simulation(tmp_path, capsys):
     assert "as a log of `machine`; expected" in capsys.readouterr().err
 
 
+def test_a_log_is_read_before_its_velocity_gain_is_refused(tmp_path, capsys):
+    words = ["--mechanism", "reachy_mini", "--velocity-gain", "0.1"]
+    assert main(["identify", str(tmp_path / "missing.csv"), *words]) == 2
+    assert "missing.csv: cannot be read (No such file" in capsys.readouterr().err
+    settings = ("duration=0.5",)
+    sd.simulate(sd.load_scenario("reachy_mini", settings=settings)).save(tmp_path / "run")
+    assert main(["identify", str(tmp_path / "run"), *words]) == 2
+    said = capsys.readouterr().err
+    assert "servos are found from CSV" in " ".join(said.split()) and "velocity" not in said
+
+
 def test_the_regression_is_a_start(drake_log):
     times, setpoints, cranks = drake_log
     log = servo_log("log", times, setpoints, cranks, ROBOT)

@@ -343,6 +343,7 @@ def machine(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
     if options.log is not None:
         delivery.say(f"log written to {options.log}")
     s: Any = running.summary()
+    commands = "setpoints" if loaded.actuator.kind == "position_servo" else "torques"
     refused = ", ".join(f"{n} {_REFUSED[cause]}" for cause, n in s["refused"].items() if n)
     delivery.say_wrapped(
         f"ended after {s['time_s']:.1f} s: {counted(s['sessions'], 'sessions')}, "
@@ -351,6 +352,6 @@ def machine(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
         f"datagrams: {s['received']} received, {s['sent']} sent, {s['unsent']} not sent, "
         f"{s['lost'] + s['measurements_lost']} lost by the simulated link; refused: "
         f"{refused or 'none'}",
-        f"torques: {s['played']} played, {counted(s['dry'], 'periods')} without one (dry)",
+        f"{commands}: {s['played']} played, {counted(s['dry'], 'periods')} without one (dry)",
     )
     return delivery.end(s, interrupted)

@@ -189,7 +189,8 @@ def _run_problem(scenario: Scenario) -> str | None:
     if scenario.actuator.kind != "torque":
         return (
             f"its motors got no torques (actuator.kind {scenario.actuator.kind!r}), and position "
-            "servos are found from CSV with setpoint_1[rad] to crank_6[rad], as of --log FILE.csv"
+            "servos are found from CSV with setpoint_1[rad] to crank_6[rad], as of live --log "
+            "FILE.csv"
         )
     if scenario.sensor.delay > 0:
         return f"its measurements are {scenario.sensor.delay:g} s old (sensor.delay)"

@@ -59,17 +59,25 @@ def read_servo_log(path: Path, mechanism: Mechanism) -> ServoLog:
     table = read_table(path, _EXPECTED, _HEADER, _UNITS, optional=lacking, others=run)
     times = table.stacked(["time"])[:, 0]
     setpoints, cranks = table.stacked(SETPOINTS), table.stacked(CRANKS)
-    if not np.isfinite([setpoints, cranks]).all():
+    known = np.arange(len(times))
+    if run:  # live may miss measurements
+        known = np.flatnonzero(np.isfinite(cranks).all(axis=1))
+    if not (len(known) and np.isfinite(setpoints).all()):
         raise ConfigError(
             f"{path}: lacks setpoints or cranks, as a log of `machine`; expected that of its "
             "controller, from `live --log`"
         )
-    gaps = np.diff(times)
+    at = times[known]
+    gaps = np.diff(at)
     for bad in 1 + np.flatnonzero(~((gaps > 0) & (gaps <= _LONGEST_GAP)))[:1]:
         raise ConfigError(
-            f"{table.location(bad, 'time')}: got {times[bad]:.9g} s after {times[bad - 1]:.9g} s; "
+            f"{table.location(known[bad], 'time')}: got {at[bad]:.9g} s after {at[bad - 1]:.9g} s; "
             f"expected a later time, by at most {_LONGEST_GAP:g} s"
         )
+    if len(known) < len(times):
+        whole, angles = slice(known[0], known[-1] + 1), np.unwrap(cranks[known], axis=0)
+        times, setpoints = times[whole], setpoints[whole]
+        cranks = np.column_stack([np.interp(times, at, angle) for angle in angles.T])
     if len(times) < 2 or times[-1] - times[0] < LEAST_LENGTH:
         length = float(np.ptp(times)) if len(times) else 0.0
         raise ConfigError(f"{path}: got {length:.3g} s; expected at least {LEAST_LENGTH:g} s")

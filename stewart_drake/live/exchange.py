@@ -225,10 +225,11 @@ class Watch:
         if MachineFlags.LEFT in message.flags:
             return self.end("left_workspace", k, message.why, message.reason.leg or None)
         self.safe = message.why if MachineFlags.SAFE in message.flags else None
+        held = "holds its cranks" if message.cranks else "is at its safe torque"
         if MachineFlags.SAFE in message.flags & ~before:
-            self.report(k, f"the machine is at its safe torque: {self.safe}")
+            self.report(k, f"the machine {held}: {self.safe}")
         if MachineFlags.SAFE in before & ~message.flags:
-            self.report(k, "torques act again")
+            self.report(k, f"{'setpoints' if message.cranks else 'torques'} act again")
         return None
 
     def _report_stall(self, k: int) -> None:

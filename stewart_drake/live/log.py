@@ -1,7 +1,8 @@
 """The record of a live run: the signals of a simulation at the controller's samples, as CSV.
 
 The true state is unknown: `pose` and `rates` are measured, or estimated if the measurement was not
-used or is of encoders. A row waits until the machine has reported the torque that acted.
+used or is of encoders. Servos given by their stiffness have no estimate: without a measurement
+they are NaN. A row waits until the machine has reported the torque that acted.
 
 A thread writes each row as a whole line, so that the file is readable up to its last row after the
 process is killed. An error, such as a full disk, is reported once; the run goes on without a log.
@@ -98,6 +99,7 @@ class LiveRecord(Record):
         # The torque at a sample began then, or in the period before if the delay has a fraction.
         self._began_before = int(experiment.scenario.true_delay.fraction > 0)
         self._measures_state = experiment.scenario.sensor.measures_state
+        self._cranks = experiment.scenario.controller.command == "cranks"
         self._rows: dict[int, dict[str, Array]] = {}
         self.applied: dict[int, Array] = {}
         self.latest: Array = np.zeros(NUM_TORQUES)
@@ -131,9 +133,11 @@ class LiveRecord(Record):
         Its step took `seconds`. `late` is the time from the earliest arrival of the measurement to
         the sending of torques, s; `packets` has the counts (5,) of `scenario.signals.PACKETS`.
         """
-        state = np.array(memory.belief.state)
-        if self.count(memory) and self._measures_state:
+        state, usable = np.array(memory.belief.state), self.count(memory)
+        if usable and self._measures_state:
             state = measurement.values
+        elif not usable and self._cranks:
+            state = np.full(NUM_STATE, np.nan)  # the law keeps that of the last measurement
         belief = memory.belief
         self.delay = {
             "true_s": self._eta,
@@ -143,6 +147,8 @@ class LiveRecord(Record):
         self.packets = packets
         seen = {signal.exported: self._held[signal.name](memory) for signal in _HELD}
         seen["measurement"] = measurement.known(measurement.values.size)
+        if self._cranks:
+            seen["state_estimate"] = state
         row = seen | {
             "state": state,
             "reference": wanted[:NUM_STATE],
@@ -171,7 +177,8 @@ class LiveRecord(Record):
         at, columns = 1, {}
         for signal in self._recorded:
             columns[signal.name], at = logged[:, at : at + signal.size], at + signal.size
-        asked, error = columns["torque_commanded"], columns["pose"] - columns["reference"]
+        asked = columns["torque_commanded"]
+        error = _interpolated(columns["pose"] - columns["reference"])
         sent = np.clip(asked, -self._limit, self._limit)
         self._log = list(logged)
         self.on_grid = list(np.column_stack([logged[:, 0], error]))
@@ -185,6 +192,15 @@ class LiveRecord(Record):
         parts = [row[signal.exported][signal.part] for signal in self._recorded]
         self._file.append(np.concatenate([[number * self._period], *parts, row["step"]]))
         self.mirror(number * self._period, row)
+
+
+def _interpolated(error: Array) -> Array:
+    """Return errors (n, 6) with NaN replaced from the samples around it, if there are any."""
+    known = np.flatnonzero(np.isfinite(error).all(axis=1))
+    if len(known) in (0, len(error)):
+        return error
+    every = np.arange(len(error))
+    return np.column_stack([np.interp(every, known, column) for column in error[known].T])
 
 
 _HELD: Final = tuple(ports_of("controller").values())

@@ -73,7 +73,6 @@ class LiveLoop:
         memory: memory of the law after the last sample.
         recoveries: number of new references that were planned.
         taken_over: whether the plate was not at the scenario's start.
-        delay_warning: text about a simulated wire with another delay, or empty.
         missed: number of steps whose delay exceeded a period and the usual jitter.
         resting: delays of the steps that bring the plate to rest, which are not recorded, s. A
             delay is from the earliest arrival of the measurement until its torques were sent. It
@@ -111,7 +110,6 @@ class LiveLoop:
         limit = math.inf if design.cranks else design.torque_limit
         self._check = DelayCheck(limit, design.law.timeline.eta, self._period, design.sends)
         self._knows_delay = design.experiment.scenario.controller.delay_estimator == "none"
-        self.delay_warning = ""
         self._parked = self._leads = False
         self._recording, self._hold = True, hold
         self._max_missing = max_missing
@@ -206,11 +204,8 @@ class LiveLoop:
         if message is not None:
             acted = self._acted(message)
             problem = self._check.problem(acted)
-            if problem is not None and design.sends:
+            if problem is not None and (design.sends or self._knows_delay):
                 return self._watch.end("refused", k, problem)
-            if problem is not None and self._knows_delay and not self.delay_warning:
-                self.delay_warning = problem
-                self._say(f"warning: {problem}")
             report = self._heard(k, acted)
         if not self._leads:
             if not measurement.complete and not self._parked:  # the pose is unknown
@@ -262,6 +257,8 @@ class LiveLoop:
         ]
         if late := self.exchange.overtaken - self._late:
             causes.append(f"{late} came too late")
+        if self._watch.safe:
+            causes.append(f"the machine reports: {self._watch.safe}")
         reason = f"no usable measurement for {gap:.3g} s ({', '.join(causes) or 'none came'})"
         return self._watch.end("lost_contact", k, reason)
 

@@ -293,7 +293,7 @@ class Machine:
         if self._safe and self._motors.fed:
             self._precede(self.reason, time)
             self._safe, self.reason = False, Reason()
-            self._report(time, "torques act again")
+            self._report(time, f"{'setpoints' if self._motors.cranks else 'torques'} act again")
 
     def _take_sample(self, time: int) -> None:
         self._follow(time)

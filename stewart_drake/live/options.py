@@ -8,9 +8,11 @@ from stewart_drake.studies.options import Options, option, refuse
 
 class Settings(Options):
     rate: float = option(1.0, "Speed of the machine's clock, 1: real time.", ge=1e-3, le=1e3)
-    watchdog: float = option(1.0, "Seconds of silence before the safe torque.", ge=1e-2, le=1e4)
+    watchdog: float = option(
+        1.0, "Seconds of silence before the safe torque, or held setpoint.", ge=1e-2, le=1e4
+    )
     safe: Literal["zero", "hold"] = option(
-        "zero", "Safe torque: zero, or the last one; held with --reachy."
+        "zero", "Safe torque: zero, or the last one. Servos hold their setpoint."
     )
     restart: Literal["rest", "motion"] = option(
         "rest",

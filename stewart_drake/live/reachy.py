@@ -375,7 +375,7 @@ def open_chosen(
         opened.callback(endpoint.close)
         log = None
         if options.log is not None:
-            log = Background(open_log(options.log, scenario), str(options.log), say)
+            log = Background(open_log(options.log, scenario, False), str(options.log), say)
             opened.callback(log.close)
         how: Any = {"say": say, "log": log}
         if options.reachy:

@@ -11,10 +11,12 @@ from stewart_drake.types import Array
 _ADVICE: Final = {
     "left_workspace": "Bring the plate back to its start and start live again. With --out the log "
     "shows the loss: stewart-drake replay LOG, stewart-drake identify LOG --mechanism FILE.",
-    "lost_contact": "Datagrams arrive, usable measurements do not. If these are late, relieve both "
+    "lost_contact": "Datagrams arrive, usable measurements do not. If the "
+    "machine reports a fault, see its terminal; if measurements are late, relieve both "
     "computers or the network; else check the sensor. --max-missing SECONDS allows longer gaps.",
     "lost_machine": "Check the machine's process and the network, and the load of its computer. "
-    "--max-missing SECONDS allows longer gaps. The machine goes to its safe torque by itself.",
+    "--max-missing SECONDS allows longer gaps. Without commands "
+    "motors go to their safe torque, servos hold their setpoint.",
     "refused": "Correct what is named, or bring the plate to its start; then start live again.",
 }
 """What to do after a run, by its status."""

@@ -46,7 +46,7 @@ class Fault(IntEnum):
     STOP = 7, "the controller said stop"
     STOOD = 8, "the machine stood still for {:.2f} s"
     ENDED = 9, "the machine was ended"
-    DRIVE = 10, "a drive of the machine failed"
+    DRIVE = 10, "a drive of the machine failed or does not answer"
     DRY = 11, "no torque or setpoint came in time for {:g} s"
 
 

@@ -106,6 +106,13 @@ class Record:
             for name, (value, std) in zip(names, each, strict=True)
         }
 
+    def logged(self, name: str) -> Array:
+        """Return the columns (n, size) of a signal in the log."""
+        ends = np.cumsum([1, *(signal.size for signal in self._recorded)])
+        rows = np.reshape(self._log, (-1, ends[-1]))
+        index = next(i for i, signal in enumerate(self._recorded) if signal.name == name)
+        return np.asarray(rows[:, ends[index] : ends[index + 1]])
+
     def dataset(self) -> xr.Dataset:
         """Return the log, see `SimulationResult.signals`."""
         ends = np.cumsum([1, *(signal.size for signal in self._recorded)])
@@ -239,6 +246,9 @@ def summarize(
         "rms_torque": found.rms_torque,
         "torque_variation": found.torque_variation,
         "peak_error": peaks,
+        "rms_error": metrics.rms_error(recorder.logged("pose"), recorder.logged("reference"))
+        if completed
+        else {"angle_deg": nan, "position_mm": nan},
         "delay_floor": floor,
         "controller_step_ms": {
             "median": float(1e3 * np.median(seconds)) if some else nan,

@@ -1,5 +1,6 @@
 """Results of a run: its figures of merit, its summary and its files."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypedDict
@@ -12,9 +13,14 @@ from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.arrayio import write_netcdf
 from stewart_drake.files.fileio import remove_partials
 from stewart_drake.files.jsonio import write_json
+from stewart_drake.mechanism.kinematics import turns_between
 from stewart_drake.mechanism.trajectories import poses_along
 from stewart_drake.scenario.config import ControllerConfig, Scenario
+from stewart_drake.scenario.signals import ANGLES, POSITION
 from stewart_drake.types import Array
+
+STILL: Final = 1e-9
+"""Motion below which a coordinate counts as still, rad or m."""
 
 
 class Figures(NamedTuple):
@@ -101,6 +107,25 @@ def peak_error(error: Array, scale: Array) -> Array:
     return 100 * np.abs(error).max(axis=0) / scale
 
 
+def second_half(reference: Array) -> slice:
+    """Return the later half of the rows (n, 6) of a reference, until it rests for good."""
+    moves = np.flatnonzero((np.abs(reference - reference[-1:]) > STILL).any(axis=1))
+    end = moves[-1] + 2 if len(moves) else len(reference)
+    return slice(end // 2, end)
+
+
+def rms_error(poses: Array, reference: Array) -> "RmsError":
+    """Return the error of poses (n, 6) in the `second_half`; NaN if none was measured there."""
+    later = np.stack([poses, reference])[:, second_half(reference)]
+    there, wanted = later[:, np.isfinite(later).all(axis=(0, 2))]  # live may miss measurements
+    if not len(there):
+        return {"angle_deg": math.nan, "position_mm": math.nan}
+    angles = turns_between(there[:, ANGLES], wanted[:, ANGLES])
+    distances = np.linalg.norm(there[:, POSITION] - wanted[:, POSITION], axis=1)
+    angle, distance = (math.sqrt(np.mean(error**2)) for error in (angles, distances))
+    return {"angle_deg": math.degrees(angle), "position_mm": 1e3 * distance}
+
+
 def delay_floor(reference: Trajectory, scale: Array, wait: float) -> float:
     """Return E_ac in % s of a plate that rests at the first pose of a reference for `wait` s.
 
@@ -120,6 +145,17 @@ def waits_at_rest(scenario: Scenario) -> bool:
     return scenario.start == "rest" and (
         held or (scenario.queue == "zero" and not scenario.plant.gravity)
     )
+
+
+class RmsError(TypedDict):
+    """Root mean square error in the second half of the motion; NaN for a lost run.
+
+    It is the half of the time until the reference rests, or of the run if it always moves.
+    """
+
+    angle_deg: float
+    """Angle of the rotation between reference and plate, deg."""
+    position_mm: float
 
 
 class StepTimes(TypedDict):
@@ -184,7 +220,7 @@ class RunSummary(TypedDict):
     status: str
     """`completed`, `left_workspace`, `solver_failed` or `interrupted`; in real time also
     `lost_machine` (no datagrams), `lost_contact` (datagrams without usable measurements) or
-    `refused` (the machine could not be taken over)."""
+    `refused` (the machine could not be taken over, or its delay is another)."""
     accumulated_error: float
     """E_ac in % s, equation (47). NaN for a run in real time with a `measured_share` below 0.9."""
     measured_share: float
@@ -203,6 +239,7 @@ class RunSummary(TypedDict):
     """Mean over the motors of sum |T_{k+1} - T_k| of the law's torques, N m."""
     peak_error: list[float]
     """(6,) of the pose, % of peak to peak; of 1 rad or 1 m where the reference is constant."""
+    rms_error: RmsError
     delay_floor: float
     """E_ac in % s of a plate that rests until a torque acts; 0 without rest."""
     controller_step_ms: StepTimes

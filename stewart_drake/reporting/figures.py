@@ -12,11 +12,11 @@ import xarray
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stewart_drake.loop.results import SimulationResult
+from stewart_drake.loop.results import STILL, SimulationResult
 from stewart_drake.reporting import style
 from stewart_drake.reporting.document import number
 from stewart_drake.reporting.panels import Curve, Panel, Scale, draw
-from stewart_drake.reporting.run import FINER, STILL, moving, span, worst
+from stewart_drake.reporting.run import FINER, moving, span, worst
 from stewart_drake.reporting.style import FACTORS, UNITS, Line
 from stewart_drake.scenario.signals import (
     ANGLES,

@@ -61,7 +61,7 @@ def replay_html(result: SimulationResult, mechanism: Mechanism, title: str) -> s
         outcome += ", without a finite torque of the controller"
     else:
         late = late_error(result) if result.scenario.actuator.kind == "position_servo" else ""
-        error = late and f"rms error {late} in the second half"  # E_ac is that of the soft start
+        error = late and f"rms error {late}"  # E_ac is that of the soft start
         outcome += f", {error or f'E_ac {number(result.accumulated_error)} % s'}"
     return _html(result.signals, mechanism, title, outcome)
 
@@ -139,4 +139,5 @@ def quiet_meshcat() -> Meshcat:
 
 
 def _thinned(signals: xr.Dataset) -> xr.Dataset:
+    signals = signals.isel(time=np.isfinite(signals.pose.values).all(axis=1))
     return signals.isel(time=slice(None, None, -(-signals.sizes["time"] // _MAX_FRAMES) or 1))

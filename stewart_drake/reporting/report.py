@@ -329,7 +329,7 @@ def verdict(found: ReportData) -> tuple[str, Tone]:
     if torqueless(run):
         return f"Not reliable: {bad}.", "bad"
     if run.scenario.actuator.kind == "position_servo" and (late := late_error(run)):
-        text = text.replace(": E_ac", f": rms error {late} in the second half. With the start E_ac")
+        text = text.replace(": E_ac", f": rms error {late}. With the start E_ac")
     error, floor = number(round(s["accumulated_error"], 9)), s["delay_floor"]
     average = f"{number(round(mean_error(run), 9), 2)} % {_averaged(run)}"
     if floor > 0:

@@ -8,8 +8,14 @@ from typing import Any, Final
 import numpy as np
 
 from stewart_drake.loop.preparation import assemble, check_instants
-from stewart_drake.loop.results import LEAST_MEASURED, SimulationResult, waits_at_rest
-from stewart_drake.mechanism.kinematics import turns_between
+from stewart_drake.loop.results import (
+    LEAST_MEASURED,
+    STILL,
+    SimulationResult,
+    rms_error,
+    second_half,
+    waits_at_rest,
+)
 from stewart_drake.reporting.document import Document, counted, from_template, measured, number
 from stewart_drake.reporting.style import FACTORS, TORQUES, UNITS, unit_for
 from stewart_drake.scenario.config import Scenario
@@ -29,9 +35,6 @@ from stewart_drake.studies.compare import PAPER_ERRORS, is_papers, label
 from stewart_drake.studies.verdict import loop_word
 from stewart_drake.studies.workspace_map import largest_factor
 from stewart_drake.types import Array, Flags
-
-STILL: Final = 1e-9
-"""Motion below which a coordinate counts as still, rad or m."""
 
 _EVENTS: Final = {
     "riccati_failures": "samples without a new gain",
@@ -145,19 +148,14 @@ def _peaks(run: SimulationResult) -> list[str]:
 
 
 def late_error(run: SimulationResult) -> str:
-    """Return the rms errors of angle and distance in the second half; empty for a lost run.
-
-    The angle is that of the rotation between the reference and the plate.
-    """
-    both = np.stack([run.signals.pose.values, run.signals.reference.values])
-    later = both[:, both.shape[1] // 2 :]
-    poses, wanted = later[:, np.isfinite(later).all(axis=(0, 2))]  # live may miss measurements
-    if run.status != "completed" or not len(poses):
+    """Return the rms errors of angle and distance, and of when; empty for a lost run."""
+    reference = run.signals.reference.values
+    found = rms_error(run.signals.pose.values, reference)
+    if run.status != "completed" or not math.isfinite(found["angle_deg"]):
         return ""
-    angles = turns_between(poses[:, ANGLES], wanted[:, ANGLES])
-    distances = np.linalg.norm(poses[:, POSITION] - wanted[:, POSITION], axis=1)
-    angle, distance = (math.sqrt(np.mean(error**2)) for error in (angles, distances))
-    return f"{number(math.degrees(angle), 2)} deg, {number(1e3 * distance, 2)} mm"
+    errors = f"{number(found['angle_deg'], 2)} deg, {number(found['position_mm'], 2)} mm"
+    rests = bool(second_half(reference).stop < len(reference))
+    return f"{errors} in the second half{' of the motion' * rests}"
 
 
 def worst(run: SimulationResult) -> str:

@@ -52,9 +52,9 @@ _QUEUE: Final = 4096
 _ENCODER: Final = re.compile(r"measurement_A\d")
 
 
-def logged(scenario: Scenario) -> list[Signal]:
-    """Return the signals of a log, with setpoints and cranks of position servos."""
-    servos = scenario.actuator.kind == "position_servo"
+def logged(scenario: Scenario, servos: bool = True) -> list[Signal]:
+    """Return the signals of a log, with setpoints and cranks of position servos if `servos`."""
+    servos = servos and scenario.actuator.kind == "position_servo"
     return [*recorded_signals(scenario.sensor.samples), *(SERVO_SIGNALS if servos else ())]
 
 
@@ -66,7 +66,7 @@ class RunLog(Protocol):
         """Complete the log."""
 
 
-def kind_of_log(path: Path, name: str = "log") -> Callable[[Path, Scenario], RunLog]:
+def kind_of_log(path: Path, name: str = "log") -> Callable[[Path, Scenario, bool], RunLog]:
     """Return the class of a log, by the suffix of its file; `name` opens an error."""
     if path.suffix == ".csv":
         return CsvLog
@@ -76,10 +76,10 @@ def kind_of_log(path: Path, name: str = "log") -> Callable[[Path, Scenario], Run
     return McapLog
 
 
-def open_log(path: Path, scenario: Scenario) -> RunLog:
-    """Open a log for writing, in a file that ends in .mcap or .csv."""
+def open_log(path: Path, scenario: Scenario, servos: bool = True) -> RunLog:
+    """Open a log for writing, in a file that ends in .mcap or .csv; `servos` as of `logged`."""
     try:
-        return kind_of_log(path)(path, scenario)
+        return kind_of_log(path)(path, scenario, servos)
     except OSError as error:
         raise ConfigError(
             f"{path}: cannot be written ({error.strerror}); expected a file"
@@ -95,7 +95,7 @@ def _members(fields: Iterable[str], values: Array) -> dict[str, float]:
 class McapLog:
     """An MCAP file, which is replaced, with one topic for each signal."""
 
-    def __init__(self, path: Path, scenario: Scenario) -> None:
+    def __init__(self, path: Path, scenario: Scenario, servos: bool = True) -> None:
         writer = _mcap("mcap.writer")
         self._file = open(path, "wb")  # noqa: SIM115 (closed by `close`)
         self._writer = writer.Writer(self._file, chunk_size=_CHUNK)
@@ -103,7 +103,7 @@ class McapLog:
         about = {"scenario": scenario_yaml(scenario), "versions": json.dumps(versions())}
         self._writer.add_metadata(_METADATA, about)
         self._channels: dict[str, tuple[int, tuple[str, ...]]] = {}
-        for channel in logged(scenario):
+        for channel in logged(scenario, servos):
             properties = {"time": {"type": "number", "description": "s"}}
             for field, head in zip(channel.fields, channel.heads, strict=True):
                 unit = head.partition("[")[2].removesuffix("]")
@@ -172,8 +172,8 @@ class CsvFile:
 class CsvLog:
     """A CSV file, which is replaced, with a line per instant; its scenario is in a .yaml."""
 
-    def __init__(self, path: Path, scenario: Scenario) -> None:
-        self._channels, companion = logged(scenario), path.with_suffix(".yaml")
+    def __init__(self, path: Path, scenario: Scenario, servos: bool = True) -> None:
+        self._channels, companion = logged(scenario, servos), path.with_suffix(".yaml")
         if companion.exists() and not path.exists():
             raise ConfigError(
                 f"{path}: its scenario would replace {companion.name}, which is of no log; "
