@@ -109,7 +109,8 @@ class LiveLoop:
         self.record = LiveRecord(design.experiment, design.torque_limit, log, say, logs)
         limit = math.inf if design.cranks else design.torque_limit
         self._check = DelayCheck(limit, design.law.timeline.eta, self._period, design.sends)
-        self._knows_delay = design.experiment.scenario.controller.delay_estimator == "none"
+        sc = design.experiment.scenario
+        self._knows_delay = sc.delay.constant and sc.controller.delay_estimator == "none"
         self._parked = self._leads = False
         self._recording, self._hold = True, hold
         self._max_missing = max_missing
