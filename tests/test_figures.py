@@ -92,6 +92,13 @@ def test_axes_name_their_units(run):
         assert {ax.get_xlim() for ax in drawn[name].axes} == {(0.0, 1.0)}
 
 
+def test_the_torques_of_position_servos_are_those_that_act(run):
+    """Those at the samples are from before the setpoint changes."""
+    scenario = load_scenario("reachy_mini", settings=("duration=1.0",))
+    axis = draw_run(dataclasses.replace(run, scenario=scenario))["torques"].axes[0]
+    assert [line.get_label() for line in axis.lines] == ["applied"]
+
+
 def test_a_diverging_run_does_not_squash_the_others_and_ends_with_a_cross(comparison):
     drawn = draw_comparison(comparison)
     assert list(drawn) == ["states", "errors", *(f"torques_{name}" for name in CONTROLLERS)]

@@ -9,6 +9,8 @@ from pydrake.trajectories import PiecewisePolynomial
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
+from stewart_drake.loop.law_design import control_law
+from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.mechanism.trajectories import make_reference
 from stewart_drake.scenario.calibration import Calibration, save_calibration
@@ -177,3 +179,14 @@ def test_the_names_to_estimate_are_those_of_the_options_or_of_the_dynamics():
 def test_motors_that_are_too_weak_for_the_motion_are_warned_of():
     with pytest.warns(UserWarning, match=r"takes up to .* give 0.5 \(torque_limit\)"):
         law_of(sd.load_scenario("gravity"), torque_limit=0.5)
+
+
+@pytest.mark.parametrize(("delay", "length"), [(0.0, 0.0), (0.2, 0.3)])
+def test_a_motion_that_begins_at_rest_where_the_plate_is_needs_no_catch_up(delay, length):
+    """It must still be at rest there when the first torque acts."""
+    home = PAPER.home.tolist()
+    there = [0.05, 0, 0, *home[3:]]
+    moves = f"reference={{kind: waypoints, times: [0, 1, 2], poses: [{home}, {there}, {home}]}}"
+    settings = (moves, f"delay={{steps: {round(delay / 0.05)}, fraction: 0}}", "start=rest")
+    experiment = prepare(sd.load_scenario("paper", settings=(*settings, "duration=2")))
+    assert control_law(experiment)[2] == pytest.approx(length)

@@ -2,6 +2,7 @@
 
 import json
 import runpy
+from dataclasses import replace
 from importlib import metadata, util
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from stewart_drake.dynamics.workspace import margin
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.servos import turned
 from stewart_drake.loop.bulk import run_in_bulk
+from stewart_drake.loop.preparation import prepare
+from stewart_drake.loop.servos import servo_law
 from stewart_drake.machines.reachy_mini import HEAD_HEIGHT, head_of_pose, pose_of_head, read_move
 from stewart_drake.mechanism.kinematics import legs_along, reach_margins, rotation
 from stewart_drake.mechanism.trajectories import make_reference
@@ -250,3 +253,21 @@ def test_a_file_that_is_no_move_is_refused(tmp_path, text):
     path.write_text(text)
     with pytest.raises(ConfigError, match=r"none\.json"):
         make_reference(sd.ReachyMoveConfig(file=str(path)), 2.0)
+
+
+def test_a_move_that_begins_at_rest_at_home_has_no_catch_up(tmp_path):
+    """`simulate` plays it as `setpoints` sends it."""
+    times = np.linspace(0, 4, 201)
+    window = np.sin(np.pi * times / 4) ** 2
+    reference = move(
+        tmp_path / "mine.json",
+        times,
+        ROBOT.home + np.outer(window, [0, 0.25, 0.1, 0, 0, 0.005]),
+        np.zeros(201),
+    )
+    scenario = replace(sd.load_scenario("reachy_mini"), duration=1.0, reference=reference)
+    assert sd.setpoints(scenario).from_rest
+    run = run_in_bulk(scenario)
+    assert np.abs(run.samples[:, :3]).max() < 0.002  # 0.0079 with a catch-up of 1 s
+    later = replace(scenario, delay=replace(scenario.delay, steps=20))
+    assert servo_law(prepare(later))[2] == 1.0  # the reference is on its way when setpoints act

@@ -94,3 +94,14 @@ def test_a_run_that_ends_outside_is_shown_up_to_there(followed):
     signals.pose.values[-3:, 5] += 1.0
     outside = dataclasses.replace(followed, signals=signals)
     assert "off by" in replay_html(outside, PAPER, "outside")
+
+
+def test_the_paths_run_through_the_drawn_plate(followed, monkeypatch):
+    """The centre of mass of Reachy Mini's head is 6 cm above its plate."""
+    robot, lines = sd.load_mechanism("reachy_mini"), []
+    monkeypatch.setattr(replay_module.Meshcat, "SetLine", lambda _, *args: lines.append(args[1]))
+    signals = followed.signals.isel(time=slice(0, 3)).copy(deep=True)
+    signals["pose"][:], signals["reference"][:] = robot.home, robot.home
+    joints = robot.home[3:] + robot.p_PQ.mean(axis=0)
+    replay_module.replay(signals, robot)
+    assert np.abs(np.array(lines) - joints[:, None]).max() < 0.01

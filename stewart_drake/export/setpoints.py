@@ -21,7 +21,7 @@ from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
 from stewart_drake.loop.servos import known_stiffness
 from stewart_drake.mechanism.kinematics import turned
-from stewart_drake.mechanism.trajectories import PlateTrajectory, evaluate, rows_along
+from stewart_drake.mechanism.trajectories import RESTING, PlateTrajectory, continues, evaluate
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.field_types import Row, section
 from stewart_drake.scenario.reference_config import degrees_hint
@@ -40,11 +40,7 @@ from stewart_drake.types import Array
 SHORTEST_BLEND: Final = 1.0
 """Shortest soft start, s; it is doubled until the motion keeps its limits."""
 _LARGEST_RATE: Final = 1000.0  # Hz
-_RESTING: Final = 0.02
-"""Crank speed of the first or last setpoint that counts as rest, as a share of the largest one."""
 _ROUNDING: Final = 1e-12
-_SAME_POSE: Final = 1e-6
-"""Largest difference of two poses that count as one, rad and m."""
 _REVERSED: Final = np.repeat([1.0, -1.0, 1.0], 6)  # a motion (18,) backwards in time
 
 
@@ -138,9 +134,9 @@ class Setpoints:
                 f"--set duration={self.ends:.6g}"
             )
         first, last = np.abs(self.crank_rates[[0, -1]]).max(axis=1)
-        if first > _RESTING * speed and not (self.from_rest or "start" in self.softens):
+        if first > RESTING * speed and not (self.from_rest or "start" in self.softens):
             text += f"\nwarning: the first setpoint is in motion ({first:.2g} rad/s): see --from"
-        if last > _RESTING * speed and "end" not in self.softens:
+        if last > RESTING * speed and "end" not in self.softens:
             text += f"\nwarning: the last setpoint is in motion ({last:.2g} rad/s): see --soft-end"
         return text
 
@@ -215,12 +211,15 @@ def make_setpoints(
         start = _checked(start, experiment)
     elif scenario.start == "rest":
         start = experiment.start[POSE]
-    from_rest = start is not None and _rests(experiment, start)
+    reference = experiment.reference
+    from_rest = start is not None and continues(
+        np.concatenate([start, np.zeros(6)]), reference, 0.0, scenario.duration
+    )
     if from_rest:
         start = None
     if start is None and not soft_end:
         return _along(experiment, _Soft(from_rest=from_rest), rate, plain, learned)
-    stop = evaluate(experiment.reference, scenario.duration)[POSE] if soft_end else None
+    stop = evaluate(reference, scenario.duration)[POSE] if soft_end else None
     soft = _Soft(start, stop, SHORTEST_BLEND, scenario.duration, from_rest)
     if scenario.duration < soft.blend:
         raise ConfigError(
@@ -257,15 +256,6 @@ def _check_learned(scenario: Scenario, rate: float, plain: bool) -> None:
             f"rate: got {rate:g} Hz; expected {1 / c.period:g} Hz, that of controller.period, for "
             "which the setpoints were learned"
         )
-
-
-def _rests(experiment: Experiment, pose: Array) -> bool:
-    """Return whether the reference begins at rest at a pose (6,)."""
-    sc, reference = experiment.scenario, experiment.reference
-    first = evaluate(reference, 0.0)
-    speeds = np.abs(rows_along(reference, np.linspace(0.0, sc.duration, 501))[:, RATES])
-    still = np.abs(first[RATES]) <= _RESTING * speeds.max(axis=0) + _ROUNDING
-    return bool(np.all(still) and np.abs(first[POSE] - pose).max() < _SAME_POSE)
 
 
 class _BrokenLimit(ConfigError):

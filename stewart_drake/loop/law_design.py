@@ -73,6 +73,7 @@ from stewart_drake.loop.preparation import (
 )
 from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.mechanism.trajectories import (
+    continues,
     evaluate,
     motion_range,
     poses_along,
@@ -386,24 +387,28 @@ def on_its_way(
     if way is not None:
         catch_up = experiment.scenario.controller.catch_up
         motion, length = way.plan(catch_up, experiment.planned_limit)
-    return _replanning(law, experiment, length), motion, length
+    c = experiment.scenario.controller
+    apart = experiment.scenario.start == "rest" and (way is not None or c.catch_up == 0)
+    return _replanning(law, experiment, length, apart), motion, length
 
 
-def _replanning(law: PredictiveLqi, experiment: Experiment, length: float) -> PredictiveLqi:
+def _replanning(
+    law: PredictiveLqi, experiment: Experiment, length: float, apart: bool
+) -> PredictiveLqi:
     """Return the law that plans a way back onto the reference, or `law` where it does not.
 
     After a start from rest with a catch-up of `length` s it plans again for as long, under a torque
     limit for half as long at the most: payload and bias were unknown before. After a start on the
-    reference it takes back what they moved the plate by before they were known. It does not plan
-    without estimated parameters, with a linear prediction, or with `replan: 0`. With a known delay
-    it also does not plan over packets, with late measurements, or after a start from rest without a
-    catch-up (0 s).
+    reference (not `apart` from it) it takes back what they moved the plate by before they were
+    known. It does not plan without estimated parameters, with a linear prediction, or with
+    `replan: 0`. With a known delay it also does not plan over packets, with late measurements, or
+    after a start `apart` without a catch-up (0 s).
     """
-    sc, replan = experiment.scenario, experiment.scenario.controller.replan
+    replan = experiment.scenario.controller.replan
     if replan == 0 or not law.estimates or isinstance(law.predictor, LinearPredictor):
         return law
     prompt = isinstance(law.channel, Wire) and law.longest_wait == 0
-    if not law.finds_delay and not (prompt and (length or sc.start != "rest")):
+    if not law.finds_delay and not (prompt and (length or not apart)):
         return law
     short = min(LONGEST_REPLAN, REPLAN_SHARE * law.timeline.eta)
     usual, longest = (length, length) if length else (short, LONGEST_REPLAN)
@@ -458,7 +463,10 @@ def tolerated_timing(experiment: Experiment, frequency: float) -> float:
 
 
 def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
-    """Return the plans onto the reference after a start from rest, or None without them."""
+    """Return the plans onto the reference after a start from rest, or None without them.
+
+    A reference that goes on from the plate's state when the first torque acts needs none.
+    """
     sc, nominal, timeline = experiment.scenario, experiment.nominal, law.timeline
     c = sc.controller
     if sc.start != "rest" or c.catch_up == 0:
@@ -466,6 +474,8 @@ def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
     state, queue = experiment.start, experiment.torques_in_flight(timeline.delay)
     if len(queue):
         state = nominal.predict(state, *timeline.until_next(queue), law.plant.substeps)[-1]
+    if continues(state, experiment.reference, timeline.eta, sc.duration):
+        return None
     given = nominal, experiment.reference, state, timeline.eta, c.period
     if not isinstance(law.cost, QuadraticCost):
         return CatchUp(*given)

@@ -47,7 +47,11 @@ _RING: Final = (1.14, 0.022)
 
 
 class Scene:
-    """The SDFormat model of a mechanism and the ring of its reference."""
+    """The SDFormat model of a mechanism and the ring of its reference.
+
+    Attributes:
+        disc: pose of the drawn plate in the plate's frame, whose origin may be far from it.
+    """
 
     def __init__(self, mechanism: Mechanism, meshcat: Meshcat) -> None:
         self._mechanism, self._meshcat = mechanism, meshcat
@@ -55,7 +59,7 @@ class Scene:
         self._diagram, self._plant = build_viewer(mechanism, meshcat)
         self._context = self._diagram.CreateDefaultContext()
         self._tree = self._plant.GetMyMutableContextFromRoot(self._context)
-        self._disc, radius = _drawn_plate(self._diagram, self._plant)
+        self.disc, radius = _drawn_plate(self._diagram, self._plant)
         self._diagram.ForcedPublish(self._context)
         arrange(meshcat, mechanism)
         shapes: dict[str, Any] = {"ring": ring(radius), "pointer": pointer(radius)}
@@ -84,7 +88,7 @@ class Scene:
     def _place_ring(self, wanted: Array, time: float = 0.0) -> None:
         angles, position = cast(Any, wanted[ANGLES]), cast(Any, wanted[POSITION])
         placed = RigidTransform(RollPitchYaw(angles), position)
-        self._meshcat.SetTransform(_GHOST, placed @ self._disc, time)
+        self._meshcat.SetTransform(_GHOST, placed @ self.disc, time)
 
     def close(self) -> None:
         """Dispose of the diagram; the scene is unusable afterwards.

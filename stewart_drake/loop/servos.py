@@ -47,7 +47,15 @@ from stewart_drake.loop.own import NOTHING
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sampling import SteppedLaw, update_every, weak
 from stewart_drake.mechanism.geometry import geometry_of
-from stewart_drake.mechanism.trajectories import catch_up, evaluate, poses_along, spread_instants
+from stewart_drake.mechanism.trajectories import (
+    RESTING,
+    SAME,
+    catch_up,
+    continues,
+    evaluate,
+    poses_along,
+    spread_instants,
+)
 from stewart_drake.scenario.config import Scenario, compatible_actuator
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.signals import (
@@ -354,7 +362,11 @@ def servo_law(experiment: Experiment) -> tuple[ServoPreview, Trajectory, float]:
     """Return the law, the motion that it follows, and the length of the blend, s."""
     sc, law = experiment.scenario, compose_servo_law(experiment)
     period, eta, reference = law.timeline.period, law.timeline.eta, experiment.reference
-    if sc.start != "rest" or sc.controller.catch_up == 0:
+    # The motion may have begun, if slightly, when the first command acts.
+    begun = evaluate(reference, float(law.preview_times[0]))[POSE] - experiment.start[POSE]
+    slight = np.all(np.abs(begun) <= RESTING * experiment.peak_to_peak + SAME)
+    from_rest = slight and continues(experiment.start, reference, 0.0, sc.duration)
+    if sc.start != "rest" or sc.controller.catch_up == 0 or from_rest:
         return law, reference, 0.0
 
     def blend(periods: int) -> Trajectory:

@@ -41,6 +41,10 @@ _STOP_SPEED: Final = 1e-3
 """Speed in rad/s or m/s up to which a motion ends at rest."""
 _STOP_SHARE: Final = 0.05
 """The same as a share of the coordinate's largest speed at a sample; the larger one counts."""
+RESTING: Final = 0.02
+"""Speed that counts as rest, as a share of the motion's largest one."""
+SAME: Final = 1e-6
+"""Largest difference of poses or rates that count as equal, rad, m and per s."""
 _GOLDEN: Final = (math.sqrt(5) - 1) / 2
 
 
@@ -197,6 +201,17 @@ def motion_range(trajectory: Trajectory, duration: float, span: Array | None = N
         span = np.ptp(poses_along(trajectory, np.linspace(0.0, duration, samples)), axis=0)
     furthest = np.abs(trajectory.value(0.0)[POSITION, 0]).max() + span[POSITION].max()
     return np.where(span < _CONSTANT * np.repeat([1.0, furthest], 3), 0.0, span)
+
+
+def continues(state: Array, reference: Trajectory, time: float, duration: float) -> bool:
+    """Return whether a reference goes on from a state (12,) at a time in s: it needs no catch-up.
+
+    Rates may differ by `RESTING` of the largest ones within [0, duration].
+    """
+    x, instants = evaluate(reference, time), np.linspace(0.0, duration, 501)
+    speeds = np.abs(rows_along(reference, instants)[:, RATES]).max(axis=0)
+    apart = np.abs(x[RATES] - state[RATES]) <= RESTING * speeds + SAME
+    return bool(np.all(apart) and np.abs(x[POSE] - state[POSE]).max() < SAME)
 
 
 def catch_up(

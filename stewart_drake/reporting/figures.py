@@ -88,7 +88,9 @@ def draw_run(result: SimulationResult) -> dict[str, Figure]:
     A reference that holds still has no errors: the states show them.
     """
     figures = _poses({"plate": (result, style.RUN)})
-    figures["torques"] = _torques(result, "applied", style.RUN, commanded=True)
+    # The torque that position servos ask for at samples is that before the setpoint changes.
+    commanded = result.scenario.actuator.kind != "position_servo"
+    figures["torques"] = _torques(result, "applied", style.RUN, commanded)
     if has(result, "parameter_std"):
         figures["parameters"] = _parameters(result)
     if has(result, "delay_std"):

@@ -14,7 +14,7 @@ from stewart_drake.loop.preparation import simulated_machine
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.scene import TORQUE_COLORS, Scene, crank_paths, full_color, torque_shares
 from stewart_drake.mechanism.geometry import Mechanism
-from stewart_drake.mechanism.kinematics import turns_between
+from stewart_drake.mechanism.kinematics import rotation, turns_between
 from stewart_drake.reporting.document import number
 from stewart_drake.reporting.page import environment
 from stewart_drake.reporting.run import late_error, torqueless
@@ -35,8 +35,10 @@ def replay(signals: xr.Dataset, mechanism: Mechanism, meshcat: Meshcat | None = 
     meshcat = meshcat or quiet_meshcat()
     scene, shown = Scene(mechanism, meshcat), _thinned(signals)
     for name, signal in (("reference", "reference"), ("plate", "pose")):
-        path = shown[signal].values[:, POSITION].T
-        if path.shape[1] > 1:
+        center = scene.disc.translation()  # of the drawn plate
+        poses = shown[signal].values
+        path = np.array([p[POSITION] + rotation(p[ANGLES]) @ center for p in poses]).T
+        if len(poses) > 1:
             meshcat.SetLine(f"/paths/{name}", path, 1.5, _PATH_COLORS[name])
     # The shortest time between two frames: samples may lie between grid steps.
     period = float(np.min(np.diff(shown.time.values), initial=1.0))

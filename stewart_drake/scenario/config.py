@@ -283,9 +283,9 @@ class ControllerConfig:
             network, where `delay_steps` is not 0.
         packet_repeats: number of earlier torques that a packet repeats, each for a period more of
             delay.
-        catch_up: blend onto the reference after a start from rest, s; 0 is none, null the one
-            of least error (for servos the shortest) within `actuator.torque_limit`, where that is a
-            number, else 0.3 s.
+        catch_up: blend onto the reference after a start from rest, s; none where the reference
+            itself begins there at rest. 0 is none, null the one of least error (for servos the
+            shortest) within `actuator.torque_limit`, where that is a number, else 0.3 s.
         command: sent to the motors: a `torque` each, or for servos `cranks`: crank angles and
             rates of the reference for the time of arrival, and the torque of `feedforward`. With
             `cranks` only `estimate` feeds back, and only period, delay, feedforward, estimate and
