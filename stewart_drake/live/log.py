@@ -21,7 +21,7 @@ from stewart_drake.law.memory import Memory
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.controller import held_by
 from stewart_drake.loop.preparation import Experiment
-from stewart_drake.loop.recording import Record
+from stewart_drake.loop.recording import Record, interpolated
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.run_log import Background, CsvFile, RunLog, csv_heads
 from stewart_drake.scenario.signals import (
@@ -178,10 +178,11 @@ class LiveRecord(Record):
         for signal in self._recorded:
             columns[signal.name], at = logged[:, at : at + signal.size], at + signal.size
         asked = columns["torque_commanded"]
-        error = _interpolated(columns["pose"] - columns["reference"])
+        poses = columns["pose"], columns["reference"]
+        error = interpolated(poses[0] - poses[1])
         sent = np.clip(asked, -self._limit, self._limit)
         self._log = list(logged)
-        self.on_grid = list(np.column_stack([logged[:, 0], error]))
+        self.on_grid = list(np.column_stack([logged[:, 0], *poses]))
         self.samples = list(np.column_stack([error, asked, sent, seconds]))
         return late
 
@@ -192,15 +193,6 @@ class LiveRecord(Record):
         parts = [row[signal.exported][signal.part] for signal in self._recorded]
         self._file.append(np.concatenate([[number * self._period], *parts, row["step"]]))
         self.mirror(number * self._period, row)
-
-
-def _interpolated(error: Array) -> Array:
-    """Return errors (n, 6) with NaN replaced from the samples around it, if there are any."""
-    known = np.flatnonzero(np.isfinite(error).all(axis=1))
-    if len(known) in (0, len(error)):
-        return error
-    every = np.arange(len(error))
-    return np.column_stack([np.interp(every, known, column) for column in error[known].T])
 
 
 _HELD: Final = tuple(ports_of("controller").values())

@@ -45,7 +45,7 @@ class Record:
         mechanism: whose cranks are logged with position servos.
 
     Attributes:
-        on_grid: rows (7,) of time and pose error on the metric's grid and at the end.
+        on_grid: rows (13,) of time, pose and reference on the metric's grid and at the end.
         samples: rows (19,) at the controller's samples: pose error, torque of the law, the same
             within the limit, computing time.
         peak_applied: largest torque that acted, N m.
@@ -105,13 +105,6 @@ class Record:
             name: {"value": value, "std": std}
             for name, (value, std) in zip(names, each, strict=True)
         }
-
-    def logged(self, name: str) -> Array:
-        """Return the columns (n, size) of a signal in the log."""
-        ends = np.cumsum([1, *(signal.size for signal in self._recorded)])
-        rows = np.reshape(self._log, (-1, ends[-1]))
-        index = next(i for i, signal in enumerate(self._recorded) if signal.name == name)
-        return np.asarray(rows[:, ends[index] : ends[index + 1]])
 
     def dataset(self) -> xr.Dataset:
         """Return the log, see `SimulationResult.signals`."""
@@ -180,7 +173,8 @@ class Recorder(Record):
             held = (port for port, system in self._systems.items() if system in _HELD_BY)
             self._held = {port: self._port(context, port) for port in held}
         if instant.on_grid:
-            self.on_grid.append(np.append(self._instant, self._error))
+            poses = self._state[POSE], self._wanted[POSE]
+            self.on_grid.append(np.concatenate([[self._instant], *poses]))
         if instant.logged:
             # Plant and reference as of `look`: the plant may have moved since.
             seen = self._held | {"state": self._state, "reference": self._wanted}
@@ -205,6 +199,15 @@ def has_measured(memory: Any, before: Counts) -> bool:
     return more <= partial
 
 
+def interpolated(error: Array) -> Array:
+    """Return errors (n, 6) with NaN replaced from the samples around it, if there are any."""
+    known = np.flatnonzero(np.isfinite(error).all(axis=1))
+    if len(known) in (0, len(error)):
+        return error
+    every = np.arange(len(error))
+    return np.column_stack([np.interp(every, known, column) for column in error[known].T])
+
+
 def summarize(
     experiment: Experiment,
     recorder: Record,
@@ -215,9 +218,10 @@ def summarize(
 ) -> RunSummary:
     """Return the summary of a run, without its warnings."""
     sc, nan = experiment.scenario, float("nan")
-    on_grid = np.vstack([np.empty((0, 7)), *recorder.on_grid])
+    on_grid = np.vstack([np.empty((0, 13)), *recorder.on_grid])
     samples = np.vstack([np.empty((0, 19)), *recorder.samples])
-    time, error = on_grid[:, 0], on_grid[:, 1:]
+    time, (poses, reference) = on_grid[:, 0], np.split(on_grid[:, 1:], 2, axis=1)
+    error = interpolated(poses - reference)
     errors, torques, sent, rest = np.split(samples, [6, 12, 18], axis=1)
     seconds, some, scale = rest[:, 0], len(samples) > 0, experiment.scale
     completed = status == "completed"
@@ -246,7 +250,7 @@ def summarize(
         "rms_torque": found.rms_torque,
         "torque_variation": found.torque_variation,
         "peak_error": peaks,
-        "rms_error": metrics.rms_error(recorder.logged("pose"), recorder.logged("reference"))
+        "rms_error": metrics.rms_error(poses, reference)
         if completed
         else {"angle_deg": nan, "position_mm": nan},
         "delay_floor": floor,

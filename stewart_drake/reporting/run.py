@@ -12,7 +12,6 @@ from stewart_drake.loop.results import (
     LEAST_MEASURED,
     STILL,
     SimulationResult,
-    rms_error,
     second_half,
     waits_at_rest,
 )
@@ -149,8 +148,7 @@ def _peaks(run: SimulationResult) -> list[str]:
 
 def late_error(run: SimulationResult) -> str:
     """Return the rms errors of angle and distance, and of when; empty for a lost run."""
-    reference = run.signals.reference.values
-    found = rms_error(run.signals.pose.values, reference)
+    reference, found = run.signals.reference.values, run.summary["rms_error"]
     if run.status != "completed" or not math.isfinite(found["angle_deg"]):
         return ""
     errors = f"{number(found['angle_deg'], 2)} deg, {number(found['position_mm'], 2)} mm"
