@@ -56,6 +56,8 @@ from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.mechanism.trajectories import evaluate, poses_along
 from stewart_drake.scenario.config import DelayConfig, Scenario
+from stewart_drake.scenario.field_types import MOST_PERIODS
+from stewart_drake.scenario.link import oldest_periods
 from stewart_drake.scenario.link_config import WireConfig
 from stewart_drake.scenario.loading import as_scenario
 from stewart_drake.scenario.signals import (
@@ -255,14 +257,20 @@ def controller_margin(
 
 
 def in_time(experiment: Experiment) -> Experiment:
-    """Return the experiment with a constant delay, as if every packet came in time."""
+    """Return the experiment with a constant delay, as if every packet came in time.
+
+    The delay is that from a measurement as old as `link.oldest_periods` to its torque: with
+    x_{k-m} and the torques since, the law computes at k the u_{k-m} of a wire with m more periods.
+    """
     sc = experiment.scenario
     if sc.link.kind == "wire":
         return experiment
-    eta = sc.true_delay
-    controller = replace(sc.controller, delay_steps=eta.steps, delay_fraction=eta.fraction)
-    delay = DelayConfig(steps=eta.steps, fraction=eta.fraction)
-    scenario = replace(sc, link=WireConfig(), delay=delay, controller=controller)
+    steps = min(sc.true_delay.steps + oldest_periods(sc), MOST_PERIODS)
+    fraction = sc.true_delay.fraction
+    controller = replace(sc.controller, delay_steps=steps, delay_fraction=fraction)
+    delay, sensor = DelayConfig(steps=steps, fraction=fraction), replace(sc.sensor, delay=0.0)
+    link = WireConfig()
+    scenario = replace(sc, link=link, delay=delay, sensor=sensor, controller=controller)
     return experiment._replace(scenario=scenario)
 
 
