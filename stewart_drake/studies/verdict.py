@@ -111,10 +111,16 @@ class Verdict:
         )
 
 
-def timing(scenario: Scenario) -> str:
-    """Return the condition of a verdict on the loop of `in_time`."""
-    late = scenario.controller.period * oldest_periods(scenario)
-    return f"if every packet is in time{f' and measurements are {late:g} s old' * bool(late)}, "
+def scenario_verdict(experiment: Experiment, loop: ControllerMargin) -> str:
+    """Return `loop_verdict` after its conditions: packets of `in_time`, and strong motors."""
+    sc, conditions = experiment.scenario, []
+    if sc.link.kind == "network" and not loop.problem:
+        conditions.append("every packet is in time")
+        if late := oldest_periods(sc):
+            conditions.append(f"measurements are {late * sc.controller.period:g} s old")
+    if loop.stable and experiment.weak_motors():
+        conditions.append("the motors give enough torque, which they do not")
+    return f"if {' and '.join(conditions)}, " * bool(conditions) + loop_verdict(loop)
 
 
 def loop_verdict(loop: ControllerMargin) -> str:
