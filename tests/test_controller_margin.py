@@ -278,7 +278,7 @@ def test_margins_over_a_network_count_the_way_back_of_the_measurements():
         assert found.margins == pytest.approx(wire.margins)
 
 
-def test_simulate_and_compare_state_the_delay_from_a_measurement_to_its_torque(capsys):
+def test_commands_state_the_delay_from_a_measurement_to_its_torque(capsys):
     network = ("plant.kind=exact", "link.kind=network", "duration=0.2", "controller.period=0.1")
     words = [w for one in (*network, "link.return={low: 0.1, high: 0.15}") for w in ("--set", one)]
     assert main(["simulate", "paper", *words]) == 0
@@ -287,6 +287,10 @@ def test_simulate_and_compare_state_the_delay_from_a_measurement_to_its_torque(c
     assert "up to 1.3 s after their measurement" in out and "delay of 1.3 s (13 periods)" in out
     assert main(["compare", "paper", "--controllers", "predictor_lqi", *words]) == 0
     assert "the delay of 1.3 s (13 periods)" in capsys.readouterr().out
+    assert main(["analyze", "delay", "paper", *words]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "If every packet is in time and measurements are 0.2 s old, this loop is stable" in out
+    assert "The delay of 1.3 s (13 periods)" in out
 
 
 @pytest.mark.parametrize(
