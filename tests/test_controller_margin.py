@@ -278,6 +278,15 @@ def test_margins_over_a_network_count_the_way_back_of_the_measurements():
         assert found.margins == pytest.approx(wire.margins)
 
 
+@pytest.mark.parametrize("controller", ["pd_gravity", "lqr_gravity"])
+def test_a_controller_that_assumes_no_delay_assumes_none_over_a_network(controller):
+    over, wire = (
+        controller_margin(in_time(prepare(scenario(*HOLD, one, controller=controller))))
+        for one in ("link={kind: network, low: 0.8, high: 0.8, playout: 0.9}", "delay.steps=10")
+    )
+    assert over.eta == wire.eta and over.radius == pytest.approx(wire.radius)
+
+
 def test_commands_state_the_delay_from_a_measurement_to_its_torque(capsys):
     network = ("plant.kind=exact", "link.kind=network", "duration=0.2", "controller.period=0.1")
     words = [w for one in (*network, "link.return={low: 0.1, high: 0.15}") for w in ("--set", one)]

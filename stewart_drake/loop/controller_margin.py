@@ -55,6 +55,7 @@ from stewart_drake.loop.law_design import DesignedLaw, compose_law, longest_wait
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.mechanism.trajectories import evaluate, poses_along
+from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.field_types import MOST_PERIODS
 from stewart_drake.scenario.link import oldest_periods
@@ -265,12 +266,17 @@ def in_time(experiment: Experiment) -> Experiment:
     sc = experiment.scenario
     if sc.link.kind == "wire":
         return experiment
-    steps = min(sc.true_delay.steps + oldest_periods(sc), MOST_PERIODS)
-    fraction = sc.true_delay.fraction
-    controller = replace(sc.controller, delay_steps=steps, delay_fraction=fraction)
-    delay, sensor = DelayConfig(steps=steps, fraction=fraction), replace(sc.sensor, delay=0.0)
+    late = oldest_periods(sc)
+    true, believed = (
+        DelayConfig(steps=min(eta.steps + late, MOST_PERIODS), fraction=eta.fraction)
+        for eta in (sc.true_delay, believed_delay(sc))
+    )
+    controller = replace(
+        sc.controller, delay_steps=believed.steps, delay_fraction=believed.fraction
+    )
+    sensor = replace(sc.sensor, delay=0.0)
     link = WireConfig()
-    scenario = replace(sc, link=link, delay=delay, sensor=sensor, controller=controller)
+    scenario = replace(sc, link=link, delay=true, sensor=sensor, controller=controller)
     return experiment._replace(scenario=scenario)
 
 
