@@ -260,7 +260,7 @@ def controller_margin(
 def in_time(experiment: Experiment) -> Experiment:
     """Return the experiment with a constant delay, as if every packet came in time.
 
-    The delay is that from a measurement as old as `link.oldest_periods` to its torque: with
+    The delay is that from a measurement as old as `oldest_periods` to its torque: with
     x_{k-m} and the torques since, the law computes at k the u_{k-m} of a wire with m more periods.
     """
     sc = experiment.scenario
