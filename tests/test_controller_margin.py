@@ -17,7 +17,7 @@ from stewart_drake.law.motion import Preview
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.stability import fastest_pole
 from stewart_drake.loop.cautions import cautions_after, cautions_before, coarse_step
-from stewart_drake.loop.controller_margin import controller_margin, true_model
+from stewart_drake.loop.controller_margin import controller_margin, in_time, true_model
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.loop.preparation import prepare
@@ -258,6 +258,48 @@ def test_the_first_line_is_about_the_loop(capsys, monkeypatch):
     said = result.summary["warnings"]
     assert "warning: the loop was not judged" in comparison_document({"lqi": result}).plain()
     assert "warning:" not in comparison_document({"lqi": result}, said=said).plain()
+
+
+def test_margins_over_a_network_count_the_way_back_of_the_measurements():
+    """Packets of 4 periods and measurements of an age of 3 are judged as a wire of 7 steps."""
+    period = "controller.period=0.02"
+    network = (
+        period,
+        "link.kind=network",
+        "link.low=0.015",
+        "link.high=0.045",
+        "link.playout=0.06",
+    )
+    back, late = "link.return={low: 0.015, high: 0.045}", "sensor.delay=0.06"
+    wire = judged(scenario(period, "delay.steps=7", name="gravity"))
+    for way in (back, late):
+        found = controller_margin(in_time(prepare(scenario(*network, way, name="gravity"))))
+        assert found.eta == pytest.approx(0.14) and found.radius == pytest.approx(wire.radius)
+        assert found.margins == pytest.approx(wire.margins)
+
+
+@pytest.mark.parametrize("controller", ["pd_gravity", "lqr_gravity"])
+def test_a_controller_that_assumes_no_delay_assumes_none_over_a_network(controller):
+    over, wire = (
+        controller_margin(in_time(prepare(scenario(*HOLD, one, controller=controller))))
+        for one in ("link={kind: network, low: 0.8, high: 0.8, playout: 0.9}", "delay.steps=10")
+    )
+    assert over.eta == wire.eta and over.radius == pytest.approx(wire.radius)
+
+
+def test_commands_state_the_delay_from_a_measurement_to_its_torque(capsys):
+    network = ("plant.kind=exact", "link.kind=network", "duration=0.2", "controller.period=0.1")
+    words = [w for one in (*network, "link.return={low: 0.1, high: 0.15}") for w in ("--set", one)]
+    assert main(["simulate", "paper", *words]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "if every packet is in time and measurements are 0.2 s old, this loop is stable" in out
+    assert "up to 1.3 s after their measurement" in out and "delay of 1.3 s (13 periods)" in out
+    assert main(["compare", "paper", "--controllers", "predictor_lqi", *words]) == 0
+    assert "the delay of 1.3 s (13 periods)" in capsys.readouterr().out
+    assert main(["analyze", "delay", "paper", *words]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "If every packet is in time and measurements are 0.2 s old, this loop is stable" in out
+    assert "The delay of 1.3 s (13 periods)" in out
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from stewart_drake.core.library import core
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.channel import Packets, Report, Sent, Wire, packets_of, report_of
 from stewart_drake.law.timeline import Timeline
+from stewart_drake.loop.cautions import cautions_before
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.link import LateMeasurements, PlayoutBuffer
@@ -615,3 +616,13 @@ def test_the_overlay_lays_fields_over_a_scenario():
         assert changed <= {"payload_mass", "torque_bias", "noise_std"}
     with pytest.raises(ConfigError, match="overlay: got 'drity'; expected one of dirty"):
         scenario("overlay=drity")
+
+
+def test_more_samples_than_a_datagram_holds_are_warned_of():
+    encoders = ("sensor.kind=encoders", "link.kind=network")
+    for samples, said in (
+        (16, []),
+        (17, ["sensor.samples is 17: live and machine take at most 16"]),
+    ):
+        sc = sd.load_scenario("gravity", settings=(*encoders, f"sensor.samples={samples}"))
+        assert cautions_before(prepare(sc), None) == said

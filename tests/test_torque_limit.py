@@ -11,6 +11,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import load_yaml
 from stewart_drake.loop.cautions import cautions_before
+from stewart_drake.loop.controller_margin import controller_margin
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.loop.preparation import assemble, prepare
@@ -18,6 +19,7 @@ from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.scenario.loading import load_scenario, scenario_yaml
 from stewart_drake.studies.study_options import Ranges
 from stewart_drake.studies.uncertainty import draw, scales_of
+from stewart_drake.studies.verdict import scenario_verdict
 from tests.mechanisms import PAPER
 
 PLANTS = ["exact", "multibody"]
@@ -187,6 +189,16 @@ def test_drawn_limits_are_never_above_the_motors(tmp_path):
 def test_motors_too_weak_for_the_motion_are_warned_of(settings, said):
     found = cautions_before(prepare(scenario(*settings)), None)
     assert len(found) == len(said) and all(map(str.startswith, found, said))
+
+
+def test_motors_that_cannot_hold_the_plate_qualify_the_verdict():
+    weak = prepare(load_scenario("gravity", settings=("actuator.torque_limit=0.02",)))
+    (said,) = cautions_before(weak, None)
+    assert "give 0.02 (actuator.torque_limit) and cannot hold the plate at home, which" in said
+    verdict = scenario_verdict(weak, controller_margin(weak))
+    assert verdict.startswith("if the motors give enough torque, which they do not, this loop is")
+    strong = prepare(load_scenario("gravity"))
+    assert scenario_verdict(strong, controller_margin(strong)).startswith("this loop is stable")
 
 
 def test_motors_at_their_limit_for_a_second():

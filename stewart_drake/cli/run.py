@@ -63,7 +63,7 @@ def simulate(
     from stewart_drake.loop.controller_margin import controller_margin, in_time
     from stewart_drake.loop.preparation import prepare
     from stewart_drake.reporting.run import run_document
-    from stewart_drake.studies.verdict import Verdict, loop_verdict
+    from stewart_drake.studies.verdict import Verdict, scenario_verdict
 
     for option, given in (("--csv", csv), ("--replay", replay)):
         if given and delivery.out is None:
@@ -73,11 +73,9 @@ def simulate(
     viewer = Meshcat() if meshcat else None
     delivery.say_link(experiment.scenario)
     margin = judged = controller_margin(experiment)
-    condition = ""
     if margin.problem and experiment.scenario.link.kind == "network":
         judged = controller_margin(in_time(experiment))
-        condition = "" if judged.problem else "if every packet is in time, "
-    delivery.say_wrapped(f"{condition}{loop_verdict(judged)}")
+    delivery.say_wrapped(scenario_verdict(experiment, judged))
     if experiment.scenario.controller.command == "torque":
         delivery.say_wrapped(str(Verdict.of(judged)))
     said = cautions_before(experiment, margin)

@@ -11,6 +11,7 @@ from typing import Final
 
 from stewart_drake.law.belief import TOLERATED
 from stewart_drake.loop.controller_margin import ControllerMargin
+from stewart_drake.loop.peer import MOST_SAMPLES
 from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.results import RunSummary
 from stewart_drake.loop.servos import quickest_crank
@@ -31,7 +32,7 @@ def cautions_before(experiment: Experiment, margin: ControllerMargin | None) -> 
     """Return the warnings before a run; `margin` is None for a loop that was not judged."""
     said = (
         *(experiment.weak_motors(), stiff_friction(experiment), idle_delay(experiment.scenario)),
-        _of_loop(experiment, margin),
+        *(many_samples(experiment.scenario), _of_loop(experiment, margin)),
     )
     return [line for line in said if line is not None]
 
@@ -75,6 +76,14 @@ def idle_delay(scenario: Scenario) -> str | None:
         f"delay.steps and delay.fraction, {given:.4g} s, have no effect: the times of link are "
         f"given, and link.playout makes the delay {scenario.eta:.4g} s"
     )
+
+
+def many_samples(scenario: Scenario) -> str | None:
+    """Return a warning about more readings a period than a network's datagram holds, or None."""
+    samples = scenario.sensor.samples
+    if scenario.link.kind == "wire" or samples is None or samples <= MOST_SAMPLES:
+        return None
+    return f"sensor.samples is {samples}: live and machine take at most {MOST_SAMPLES}"
 
 
 def stiff_friction(experiment: Experiment) -> str | None:

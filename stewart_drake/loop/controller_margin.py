@@ -55,7 +55,10 @@ from stewart_drake.loop.law_design import DesignedLaw, compose_law, longest_wait
 from stewart_drake.loop.preparation import Experiment, prepare
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.mechanism.trajectories import evaluate, poses_along
+from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import DelayConfig, Scenario
+from stewart_drake.scenario.field_types import MOST_PERIODS
+from stewart_drake.scenario.link import oldest_periods
 from stewart_drake.scenario.link_config import WireConfig
 from stewart_drake.scenario.loading import as_scenario
 from stewart_drake.scenario.signals import (
@@ -255,14 +258,25 @@ def controller_margin(
 
 
 def in_time(experiment: Experiment) -> Experiment:
-    """Return the experiment with a constant delay, as if every packet came in time."""
+    """Return the experiment with a constant delay, as if every packet came in time.
+
+    The delay is that from a measurement as old as `oldest_periods` to its torque: with
+    x_{k-m} and the torques since, the law computes at k the u_{k-m} of a wire with m more periods.
+    """
     sc = experiment.scenario
     if sc.link.kind == "wire":
         return experiment
-    eta = sc.true_delay
-    controller = replace(sc.controller, delay_steps=eta.steps, delay_fraction=eta.fraction)
-    delay = DelayConfig(steps=eta.steps, fraction=eta.fraction)
-    scenario = replace(sc, link=WireConfig(), delay=delay, controller=controller)
+    late = oldest_periods(sc)
+    true, believed = (
+        DelayConfig(steps=min(eta.steps + late, MOST_PERIODS), fraction=eta.fraction)
+        for eta in (sc.true_delay, believed_delay(sc))
+    )
+    controller = replace(
+        sc.controller, delay_steps=believed.steps, delay_fraction=believed.fraction
+    )
+    sensor = replace(sc.sensor, delay=0.0)
+    link = WireConfig()
+    scenario = replace(sc, link=link, delay=true, sensor=sensor, controller=controller)
     return experiment._replace(scenario=scenario)
 
 

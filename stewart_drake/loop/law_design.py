@@ -85,7 +85,7 @@ from stewart_drake.scenario.config import ControllerConfig, Scenario, StateSenso
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.field_types import MOST_PERIODS
-from stewart_drake.scenario.packets import times_under_way
+from stewart_drake.scenario.link import oldest
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     BIAS,
@@ -363,7 +363,7 @@ def longest_wait(scenario: Scenario) -> int:
     sc, period, back = scenario, scenario.controller.period, scenario.link.back
     if sc.sensor.delay == 0 and back is None:
         return 0
-    longest = sc.sensor.delay + (0.0 if back is None else times_under_way(back).ppf(_MOST))
+    longest = oldest(sc, _MOST)
     if longest > MOST_PERIODS * period:
         field = "sensor.delay" if back is None else "link.return"
         raise ConfigError(

@@ -143,14 +143,18 @@ class Experiment(NamedTuple):
         sc, limit = self.scenario, self.torque_limit
         if math.isinf(limit) or sc.actuator.kind == "servo":
             return None
-        needed = reference_torque(self.true_dynamics(), self.reference, sc.duration)
+        true, rest = self.true_dynamics(), np.zeros(6)
+        needed = reference_torque(true, self.reference, sc.duration)
         if not needed > limit:  # NaN beyond the reach, where the law keeps the limits
             return None
         factor, unit = (1e3, "mN m") if needed < 1 else (1.0, "N m")
         own = sc.actuator.torque_limit is not None
+        holding = np.abs(true.inverse_dynamics(self.truth.home, rest, rest)).max()
+        falls = f" and cannot hold the plate at home, which takes {factor * holding:.3g} {unit}"
         return (
             f"the motion takes up to {factor * needed:.3g} {unit}, the motors give "
             f"{factor * limit:.3g} ({'actuator.torque_limit' if own else 'motor.effort_limit'})"
+            f"{falls * bool(holding > limit)}"
         )
 
     def torques_in_flight(self, delay: Delay) -> Array:

@@ -17,7 +17,7 @@ from stewart_drake.reporting.panels import Curve, Panel, draw
 from stewart_drake.reporting.style import DATA_INK, DATA_PAPER, line
 from stewart_drake.scenario.delay import Delay
 from stewart_drake.studies.delay import Cell, DelayStudy, MotorMargins
-from stewart_drake.studies.verdict import HARDLY, NO, fragile, loop_verdict, milliseconds
+from stewart_drake.studies.verdict import HARDLY, NO, fragile, milliseconds, scenario_verdict
 
 _TONES: Final[dict[str, Tone]] = {"yes": "good", "hardly": "fair", "no": "bad"}
 _BANDWIDTH: Final = 10.0
@@ -38,7 +38,7 @@ def document(study: DelayStudy) -> Document:
         eta=partial(_eta, study),
         gains=gains_text,
         milliseconds=milliseconds,
-        spoken=own and loop_verdict(own),
+        spoken=own and scenario_verdict(study.assessment.experiment, own),
         growth=verdict and verdict.amplification,
         bandwidth=_BANDWIDTH,
         gives_way=1.0 / stiffness,

@@ -108,6 +108,18 @@ def measurement_times(scenario: Scenario) -> Array:
     return sensor_times(scenario, n) + return_times(scenario, n)
 
 
+def oldest(scenario: Scenario, share: float = _MOST) -> float:
+    """Return the age in s that this share of the measurements does not exceed."""
+    back = scenario.link.back
+    way = 0.0 if back is None else float(times_under_way(back).ppf(share))
+    return scenario.sensor.delay + way
+
+
+def oldest_periods(scenario: Scenario) -> int:
+    """Return the age `oldest` in whole periods: the law reads measurements once a period."""
+    return math.ceil(oldest(scenario) / scenario.controller.period - SIMULTANEOUS)
+
+
 def link_text(scenario: Scenario, bound: bool = True) -> str | None:
     """Return the assumed network in words, with its play-out bound if asked; None for a wire."""
     link = scenario.assumed_link
@@ -128,8 +140,7 @@ def link_text(scenario: Scenario, bound: bool = True) -> str | None:
     back = "measurements without delay" if link.back is None else "measurements over a network too"
     playout = f", play-out bound {link.playout:g} s" if bound else ""
     if bound and link.back is not None:
-        period = scenario.controller.period
-        age = period * math.ceil(times_under_way(link.back).ppf(_MOST) / period - SIMULTANEOUS)
+        age = scenario.controller.period * oldest_periods(scenario)
         back += (
             f"; torques act {scenario.eta:g} s after they are computed, up to "
             f"{scenario.eta + age:g} s after their measurement"

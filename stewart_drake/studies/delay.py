@@ -20,6 +20,7 @@ from stewart_drake.loop.controller_margin import (
     POLE_INSTANTS,
     ControllerMargin,
     controller_margin,
+    in_time,
     pole_in_motion,
 )
 from stewart_drake.loop.law_design import cost_of
@@ -136,7 +137,7 @@ class DelayStudy:
     # the scenario's loop along the reference, as far as that can be followed; None if it cannot be
     # followed at all
     controller: ControllerMargin | None
-    eta: float  # total delay, s
+    eta: float  # total delay, over a network that of `in_time`, s
     poles: list[PolePoint]  # along the reference, as far as it can be followed
     growths: list[Growth]  # simulated checks of e^(p eta); none if nothing grows
     floors: dict[int, float]  # E_ac in % s of a plate that waits at rest, by whole periods of delay
@@ -235,19 +236,21 @@ def study_delay(
             )
             for steps in {delay.steps, *map_delays(delay.steps)}
         }
-        own = controller_margin(found.experiment, found.followed_until) if poles else None
+        timed = found._replace(experiment=in_time(found.experiment))
+        eta = timed.experiment.scenario.eta
+        own = controller_margin(timed.experiment, found.followed_until) if poles else None
         return DelayStudy(
             assessment=found,
             controller=own,
-            eta=scenario.eta,
+            eta=eta,
             poles=poles,
-            growths=_growths(found, poles, scenario.eta),
+            growths=_growths(found, poles, eta),
             floors=floors,
             loops=loops,
             loop_problem=problem,
             cells=cells,
             interrupted=interrupted,
-            choices=_choices(found, own) if own and own.stable and own.weighted else {},
+            choices=_choices(timed, own) if own and own.stable and own.weighted else {},
         )
 
 

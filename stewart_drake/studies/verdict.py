@@ -9,10 +9,11 @@ import numpy as np
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law.stability import amplification
 from stewart_drake.law.startup import least_torque, reference_torques
-from stewart_drake.loop.controller_margin import ControllerMargin, fastest_in_motion
+from stewart_drake.loop.controller_margin import ControllerMargin, fastest_in_motion, in_time
 from stewart_drake.loop.preparation import REACH_CHECK_PERIOD, Experiment, assemble
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.link import oldest_periods
 from stewart_drake.types import Array
 
 
@@ -110,6 +111,18 @@ class Verdict:
         )
 
 
+def scenario_verdict(experiment: Experiment, loop: ControllerMargin) -> str:
+    """Return `loop_verdict` after its conditions: packets of `in_time`, and strong motors."""
+    sc, conditions = experiment.scenario, []
+    if sc.link.kind == "network" and not loop.problem:
+        conditions.append("every packet is in time")
+        if late := oldest_periods(sc):
+            conditions.append(f"measurements are {late * sc.controller.period:g} s old")
+    if loop.stable and experiment.weak_motors():
+        conditions.append("the motors give enough torque, which they do not")
+    return f"if {' and '.join(conditions)}, " * bool(conditions) + loop_verdict(loop)
+
+
 def loop_verdict(loop: ControllerMargin) -> str:
     """Return one sentence: stability and margins of this controller on this plant."""
     if loop.problem:
@@ -162,8 +175,8 @@ def loop_word(margin: MarginSummary | None) -> str:
 
 
 def delay_verdict(experiment: Experiment) -> Verdict:
-    """Judge the scenario's true delay by the open loop's poles along its reference."""
-    sc = experiment.scenario
+    """Judge the true delay, of `in_time`, by the open loop's poles along the reference."""
+    sc = in_time(experiment).scenario
     fastest = fastest_in_motion(experiment, experiment.true_dynamics(), sc.duration)
     return Verdict(sc.eta, *fastest, sc.controller.period)
 
