@@ -330,8 +330,8 @@ def test_a_run_ends_where_measurements_stay_away(kind, missing):
 @pytest.mark.parametrize(
     ("sent", "came", "words"),
     [
-        (0.16, 0.17, "the machine sent the last one 160 ms late: it lags"),
-        (0.0, 0.16, "the last one 160 ms on its way"),
+        (0.16, 0.32, "the last by 320 ms, as the machine lags by 160 ms"),
+        (0.0, 0.16, "the last by 160 ms, on the way back"),
     ],
 )
 def test_where_measurements_are_late_is_said(message, sent, came, words):

@@ -259,13 +259,16 @@ class Contact:
         return max((p - soonest for p in self._phases if p - soonest <= longest), default=0.0)
 
     def late_by(self) -> str:
-        """Return in words by how much the last measurement was late, and where."""
-        rate = self.machine.rate
-        sent = (self._age - self._least_age) / rate / SECOND
-        back = self._phases[-1] - min(self._phases) - sent
-        if sent > back:
-            return f"the machine sent the last one {1e3 * sent:.0f} ms late: it lags"
-        return f"the last one {1e3 * back:.0f} ms on its way"
+        """Return in words by how much the last measurement was late, and why.
+
+        A simulation that lags delays a measurement twice: before and after it counts as sent.
+        """
+        late = self._phases[-1] - min(self._phases)
+        sent = (self._age - self._least_age) / self.machine.rate / SECOND
+        why = "on the way back"
+        if sent > late / 4:
+            why = f"as the machine lags by {1e3 * sent:.0f} ms"
+        return f"the last by {1e3 * late:.0f} ms, {why}"
 
     def _check_identity(self) -> None:
         offered = None if self.last is None else self.last.identity

@@ -257,7 +257,7 @@ class LiveLoop:
             if name.startswith("measurements_") and after[name] > before[name]
         ]
         if late := self.exchange.overtaken - self._late:
-            causes.append(f"{late} came too late, {contact.late_by()}")
+            causes.append(f"{late} came too late: {contact.late_by()}")
         if self._watch.safe:
             causes.append(f"the machine reports: {self._watch.safe}")
         reason = f"no usable measurement for {gap:.3g} s ({', '.join(causes) or 'none came'})"
