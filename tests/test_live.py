@@ -496,6 +496,11 @@ def test_a_run_that_is_lost_while_it_comes_to_rest_is_not_completed():
     assert result.status == "lost_contact" and result.stopped.time > 1.3
 
 
+def test_advice_after_a_loss_begins_with_what_becomes_of_the_plate():
+    end = End("lost_contact", None, "now the motors have no torque: the plate falls")
+    assert end.advice.startswith("Now the motors have no torque: the plate falls. Datagrams arrive")
+
+
 @pytest.mark.parametrize(
     ("cranks", "flags", "gravity", "expected"),
     [
@@ -1023,6 +1028,11 @@ def test_after_a_loss_the_page_shows_reason_last_seconds_and_advice(tab, viewer)
     note = tab.evaluate("document.getElementById('note').textContent")
     assert "left workspace" in note and "crank 3 passed its dead centre" in note
     assert "Bring the plate back to its start" in note and "identify LOG" in note
+    assert "last torques before the end" in tab.evaluate(
+        "document.getElementById('full').textContent"
+    )
+    colors = "[...document.querySelectorAll('.bars i')].map(x => getComputedStyle(x).background)"
+    assert "rgb(213, 94, 0)" not in " ".join(tab.evaluate(colors))
     last = tab.evaluate("document.getElementById('last').textContent")
     span = float(last.split("last ")[1].split(" s:")[0])
     assert 4.5 < span <= 5.0, "not the last seconds"

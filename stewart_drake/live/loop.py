@@ -149,8 +149,10 @@ class LiveLoop:
             if not self._complete(k, duration):
                 end = self._watch.end("interrupted", k, "stopped")
         self.exchange.stop()
-        if end.status in ("completed", "interrupted"):
-            end = end._replace(then=f"now {self._design.left_alone(self.exchange.contact.machine)}")
+        if end.status != "left_workspace":
+            since = "without commands" if end.status == "lost_machine" else "now"
+            alone = self._design.left_alone(self.exchange.contact.machine)
+            end = end._replace(then=f"{since} {alone}")
             self._say(end.then)
         self._viewer.ended(end)
         return end
