@@ -278,6 +278,16 @@ def test_a_pipe_gets_a_line_now_and_then(capsys):
 
 
 @pytest.mark.usefixtures("often")
+def test_the_time_left_follows_runs_that_become_slower(capsys):
+    with terminal.count_bar("runs", False) as show:
+        for done in range(9):  # of a fast controller; the second one takes 0.5 s a run
+            show(done, 16)
+        time.sleep(1.2)
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert re.fullmatch(r"runs: 8 of 16, about [2-4] s left, after \d s", last), last
+
+
+@pytest.mark.usefixtures("often")
 def test_simulations_tell_their_time(capsys):
     with terminal.progress_bars(["lqr", "lqi"], 20.0, False) as show:
         time.sleep(0.12)

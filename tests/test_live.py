@@ -37,12 +37,13 @@ from stewart_drake.law.stability import Margins
 from stewart_drake.live import contact as contacts
 from stewart_drake.live.contact import Contact, Link, address_of, await_free, call, open_endpoint
 from stewart_drake.live.design import Design, as_seen, check_controller, design
-from stewart_drake.live.endpoint import Endpoint
+from stewart_drake.live.endpoint import Endpoint, now
+from stewart_drake.live.exchange import Watch
 from stewart_drake.live.governor import Governor, Request, Steering, Way
 from stewart_drake.live.loop import LiveLoop
 from stewart_drake.live.machine import Machine
 from stewart_drake.live.page import PageRequest, PageViewer, Readouts, serve
-from stewart_drake.live.protocol import NOTHING, SECOND, ControllerMessage, MachineFlags
+from stewart_drake.live.protocol import NEVER, NOTHING, SECOND, ControllerMessage, MachineFlags
 from stewart_drake.live.session import (
     _margin,
     _queue_advice,
@@ -53,7 +54,7 @@ from stewart_drake.live.session import (
 )
 from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.loop.law_design import control_law
-from stewart_drake.loop.peer import identity_of
+from stewart_drake.loop.peer import Fault, Reason, identity_of
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import fingerprint
@@ -66,7 +67,7 @@ from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.reference_config import SineConfig
 from stewart_drake.scenario.signals import ACCELERATIONS, POSE, RATES
 from tests.browser import browser, needs_chromium
-from tests.live_driver import in_real_time, running_machine, until
+from tests.live_driver import Together, Wire, in_real_time, running_machine, until
 
 
 def network(way, back=None):
@@ -299,6 +300,16 @@ def silent(when):
 Blind = silent(lambda time: time > 1)
 
 
+@pytest.fixture
+def message():
+    """Return a message of a machine with a session."""
+    run = Together(scenario_of())
+    run.greet(SECOND, 2 * SECOND)
+    run.at(2 * SECOND)
+    run.driver.receive(2 * SECOND)
+    return run.driver.got[-1]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "missing"), [(Misnumbers, None), (Blind, None), (Blind, 0.35)])
 @in_real_time
@@ -314,6 +325,35 @@ def test_a_run_ends_where_measurements_stay_away(kind, missing):
     assert "no usable measurement for" in result.stopped.reason
     assert math.isnan(result.accumulated_error)
     assert 0.4 < result.summary["measured_share"] < 0.8
+
+
+@pytest.mark.parametrize(
+    ("sent", "came", "words"),
+    [
+        (0.16, 0.32, "the last by 320 ms, as the machine lags by 160 ms"),
+        (0.0, 0.16, "the last by 160 ms, on the way back"),
+    ],
+)
+def test_where_measurements_are_late_is_said(message, sent, came, words):
+    contact = Contact(Wire(), ("127.0.0.1", 1), identity_of(scenario_of()))
+    for k, (held, under_way) in enumerate([(0.01, 0.02), (0.01 + sent, 0.02 + came)]):
+        time = SECOND * (2 + k)
+        head = replace(message.head, sequence=k + 1, time=time + round(held * SECOND))
+        one = replace(message, head=head, sampled=time, rate=1.0)
+        contact._note(one, time + round(under_way * SECOND))
+    assert contact.late_by() == words
+
+
+def test_a_lost_plate_is_said_though_its_measurements_come_too_late(message):
+    left = replace(
+        message, begin=SECOND, flags=MachineFlags.LEFT, reason=Reason(Fault.REACH, leg=3)
+    )
+    contact = SimpleNamespace(heard=now(), machine=left)
+    watch = Watch(SimpleNamespace(contact=contact, late=lambda k: 0, jitter=0), 0.02, print)
+    end = watch.ended(51, None)
+    assert end.words.startswith("left workspace: leg 3 reached the end of its reach at t = 1.02")
+    contact.machine = replace(left, begin=NEVER)  # an offer, of the run before
+    assert watch.ended(51, None) is None
 
 
 @pytest.mark.slow
@@ -454,6 +494,11 @@ def test_a_run_that_is_lost_while_it_comes_to_rest_is_not_completed():
     with paper_machine(kind=Blind, rate=2.0) as running:
         result = driven(running, 1.1, max_missing=0.35)
     assert result.status == "lost_contact" and result.stopped.time > 1.3
+
+
+def test_advice_after_a_loss_begins_with_what_becomes_of_the_plate():
+    end = End("lost_contact", None, "now the motors have no torque: the plate falls")
+    assert end.advice.startswith("Now the motors have no torque: the plate falls. Datagrams arrive")
 
 
 @pytest.mark.parametrize(
@@ -983,6 +1028,11 @@ def test_after_a_loss_the_page_shows_reason_last_seconds_and_advice(tab, viewer)
     note = tab.evaluate("document.getElementById('note').textContent")
     assert "left workspace" in note and "crank 3 passed its dead centre" in note
     assert "Bring the plate back to its start" in note and "identify LOG" in note
+    assert "last torques before the end" in tab.evaluate(
+        "document.getElementById('full').textContent"
+    )
+    colors = "[...document.querySelectorAll('.bars i')].map(x => getComputedStyle(x).background)"
+    assert "rgb(213, 94, 0)" not in " ".join(tab.evaluate(colors))
     last = tab.evaluate("document.getElementById('last').textContent")
     span = float(last.split("last ")[1].split(" s:")[0])
     assert 4.5 < span <= 5.0, "not the last seconds"

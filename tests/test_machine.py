@@ -196,6 +196,17 @@ def test_rows_that_are_always_late_end_in_the_safe_torque(safe, held):
     assert not np.any(np.array(times) % driver.period)
 
 
+def test_a_machine_that_lags_says_so_once():
+    run = begun("controller.period=0.02", samples=10)
+    lines = len(run.said)
+    for _ in range(3):
+        run.clock.time += 90_000_000
+        run.machine.advance(run.machine.time())
+    lagged = [line for line in run.said[lines:] if "behind real time" in line]
+    assert len(lagged) == 1 and " ms behind real time: measurements are sent late" in lagged[0]
+    assert run.machine.counts["stood still"] == 0
+
+
 def test_rows_for_times_before_the_begin_do_nothing():
     run = together(EXACT, "link={kind: network, low: 0, high: 0, loss: 0}", "queue=equilibrium")
     driver, period = run.driver, run.driver.period

@@ -126,6 +126,7 @@ class Contact:
         self._requests, self._packets = set[int](), set[int]()
         self._unanswered, self._first, self._followed = 0.0, 0, 0
         self._phases: deque[float] = deque(maxlen=_PHASES)
+        self._age, self._least_age = 0, NEVER
         self._newest = 0
 
     @property
@@ -220,6 +221,8 @@ class Contact:
             self.offered = head.nonce
         else:
             self._first, self._followed = self._first or head.sequence, self._followed + 1
+            self._age = head.time - message.sampled
+            self._least_age = min(self._least_age, self._age)
         gaps = self.session.window.newest - self._first + 1 - self._followed if self._first else 0
         self._phases.append((time - message.sampled / message.rate) / SECOND)
         if head.acknowledged > self._newest:  # the first answer to a datagram
@@ -254,6 +257,18 @@ class Contact:
         """
         soonest = min(self._phases, default=math.nan)
         return max((p - soonest for p in self._phases if p - soonest <= longest), default=0.0)
+
+    def late_by(self) -> str:
+        """Return in words by how much the last measurement was late, and why.
+
+        A simulation that lags delays a measurement twice: before and after it counts as sent.
+        """
+        late = self._phases[-1] - min(self._phases)
+        sent = (self._age - self._least_age) / self.machine.rate / SECOND
+        why = "on the way back"
+        if sent > late / 4:
+            why = f"as the machine lags by {1e3 * sent:.0f} ms"
+        return f"the last by {1e3 * late:.0f} ms, {why}"
 
     def _check_identity(self) -> None:
         offered = None if self.last is None else self.last.identity

@@ -219,8 +219,11 @@ class Watch:
             self.report(k, f"the machine is heard again, after {gone:.1f} s")
         if contact.machine.reason.fault == Fault.ENDED:
             return self.end("lost_machine", k, contact.machine.why)
-        if message is None:
-            return None
+        if message is None:  # a lagging machine sends its fault with measurements that are late
+            last = contact.machine
+            if last.begin == NEVER or MachineFlags.LEFT not in last.flags:
+                return None
+            message = last
         before, self._flags = self._flags, message.flags
         if MachineFlags.LEFT in message.flags:
             return self.end("left_workspace", k, message.why, message.reason.leg or None)

@@ -149,8 +149,10 @@ class LiveLoop:
             if not self._complete(k, duration):
                 end = self._watch.end("interrupted", k, "stopped")
         self.exchange.stop()
-        if end.status in ("completed", "interrupted"):
-            end = end._replace(then=f"now {self._design.left_alone(self.exchange.contact.machine)}")
+        if end.status != "left_workspace":
+            since = "without commands" if end.status == "lost_machine" else "now"
+            alone = self._design.left_alone(self.exchange.contact.machine)
+            end = end._replace(then=f"{since} {alone}")
             self._say(end.then)
         self._viewer.ended(end)
         return end
@@ -257,7 +259,7 @@ class LiveLoop:
             if name.startswith("measurements_") and after[name] > before[name]
         ]
         if late := self.exchange.overtaken - self._late:
-            causes.append(f"{late} came too late")
+            causes.append(f"{late} came too late: {contact.late_by()}")
         if self._watch.safe:
             causes.append(f"the machine reports: {self._watch.safe}")
         reason = f"no usable measurement for {gap:.3g} s ({', '.join(causes) or 'none came'})"

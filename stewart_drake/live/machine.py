@@ -130,7 +130,7 @@ class Machine:
         self.begin = self._origin = NEVER
         self._phase: int | None = None
         self.failure: Failure | None = None
-        self._running = False
+        self._running = self._lag_said = False
         self.reason = self.before = Reason()
         self._preceded = 0
 
@@ -217,8 +217,8 @@ class Machine:
             lag = time - when
             if self._running and not self._stopped and self.failure is None:
                 self.longest_lag = max(lag, self.longest_lag)
-                if lag > STALL and do != self._silence:
-                    self._report_stall(lag, when)
+                if do != self._silence:
+                    self._report_lag(lag, when)
             do(when)
 
     def _next(self) -> tuple[int, Callable[[int], None]]:
@@ -233,12 +233,17 @@ class Machine:
     def _pop(self, time: int) -> None:
         heapq.heappop(self._due)[3](time)
 
-    def _report_stall(self, lag: int, when: int) -> None:
-        if when > self._stalled_until:
-            self.counts["stood still"] += 1
-            self._precede(Reason(Fault.STOOD, lasted=lag), when)
-            self._report(when, f"{self.before}; the plate went on by its buffer")
-        self._stalled_until = when + lag
+    def _report_lag(self, lag: int, when: int) -> None:
+        if lag > STALL:
+            if when > self._stalled_until:
+                self.counts["stood still"] += 1
+                self._precede(Reason(Fault.STOOD, lasted=lag), when)
+                self._report(when, f"{self.before}; the plate went on by its buffer")
+            self._stalled_until = when + lag
+        elif lag > 2 * self.period and not self._lag_said:
+            self._lag_said = True
+            behind = f"{1e3 * lag / SECOND:.0f} ms behind real time"
+            self._report(when, f"{behind}: measurements are sent late; relieve this computer")
 
     # -------------------------------------------------------------- the plate
 

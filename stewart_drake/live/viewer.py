@@ -15,8 +15,7 @@ _ADVICE: Final = {
     "machine reports a fault, see its terminal; if measurements are late, relieve both "
     "computers or the network; else check the sensor. --max-missing SECONDS allows longer gaps.",
     "lost_machine": "Check the machine's process and the network, and the load of its computer. "
-    "--max-missing SECONDS allows longer gaps. Without commands "
-    "motors go to their safe torque, servos hold their setpoint.",
+    "--max-missing SECONDS allows longer gaps.",
     "refused": "Correct what is named, or bring the plate to its start; then start live again.",
 }
 """What to do after a run, by its status."""
@@ -25,7 +24,7 @@ _ADVICE: Final = {
 class End(NamedTuple):
     """How a run ended: its status (`loop.results.RunSummary`) and the failure, if any.
 
-    `then` says what becomes of the plate after a run that was not lost.
+    `then` says what becomes of the plate, unless it left its workspace.
     """
 
     status: str
@@ -43,8 +42,9 @@ class End(NamedTuple):
 
     @property
     def advice(self) -> str:
-        """Advice after a run that was lost, else what becomes of the plate."""
-        return _ADVICE.get(self.status) or (self.then and sentence(self.then))
+        """What becomes of the plate, and advice after a run that was lost."""
+        then = self.then and sentence(self.then)
+        return " ".join(filter(None, (then, _ADVICE.get(self.status))))
 
 
 class Snapshot(NamedTuple):

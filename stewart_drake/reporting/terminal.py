@@ -13,14 +13,14 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import typer
 
 from stewart_drake.reporting.document import rows, wrap
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+    from rich.progress import Progress
 
     from stewart_drake.files.resources import Kind
 
@@ -86,7 +86,9 @@ def progress_bars(
     def advance(name: str, time: float, error: float) -> None:
         times[name] = time
         text = f"{time:6.2f} of {duration:g} s, error {error:7.3f} %"
-        _update(bars, tasks[name], time, text)
+        left = next(one.time_remaining for one in bars.tasks if one.id == tasks[name])
+        text += "" if left is None else f", about {_duration(left)} left"
+        bars.update(tasks[name], completed=time, state=text)
 
     def state() -> str:
         runs = ", ".join(f"{name} {times[name]:.1f}" for name in names if name in times)
@@ -110,15 +112,38 @@ def count_bar(
     def show(done: int, total: int) -> None:
         if done and bars.tasks[0].total is None and not quiet:
             echo(f"{name}: {total}, {done} from before", error=True)
+        now = (time.monotonic(), done)
         if bars.tasks[0].total != total:
             # The pace is measured from here: an earlier start may have done some of them.
-            bars.reset(task, total=total, completed=done)
-            bars.advance(task, 0)
-        _update(bars, task, done, f"{done} of {total}", done >= _FEWEST)
+            finished[:] = [now]
+        finished.append(now)
+        bars.update(task, total=total, completed=done, state=_Counted(total, finished))
+
+    finished = list[tuple[float, int]]()
 
     with _bars(quiet, lambda: f"{name}: {bars.tasks[0].fields['state']}") as bars:
         task = bars.add_task(name, total=None, state=first)
         yield show
+
+
+class _Counted(NamedTuple):
+    """Text of a bar with the time left, by the mean pace of the later half until now.
+
+    Args:
+        finished: times, s, and the number of pieces done by then, the first at the start.
+    """
+
+    total: int
+    finished: list[tuple[float, int]]
+
+    def __format__(self, _: str) -> str:
+        before, done = self.finished[0][1], self.finished[-1][1]
+        text = f"{done} of {self.total}"
+        if done < _FEWEST or not before < done < self.total:
+            return text
+        since, first = next(one for one in reversed(self.finished) if one[1] <= (before + done) / 2)
+        left = (self.total - done) * (time.monotonic() - since) / (done - first)
+        return f"{text}, about {_duration(max(left, 1.0))} left"
 
 
 @contextmanager
@@ -127,18 +152,6 @@ def phase_bar(name: str, quiet: bool) -> Iterator[Callable[[str], None]]:
     with _bars(quiet, lambda: f"{name}: {bars.tasks[0].fields['state']}") as bars:
         task = bars.add_task(name, total=None, state="computing")
         yield lambda text: bars.update(task, state=text)
-
-
-def _update(
-    bars: "Progress", task: "TaskID", completed: float, text: str, estimated: bool = True
-) -> None:
-    """Advance a bar and show its text, with the estimated time left."""
-    bars.update(task, completed=completed)
-    left = None
-    if estimated:
-        left = next(one.time_remaining for one in bars.tasks if one.id == task)
-    text += "" if left is None else f", about {_duration(left)} left"
-    bars.update(task, state=text)
 
 
 @contextmanager
