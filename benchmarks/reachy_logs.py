@@ -11,8 +11,8 @@ and phase of the codes. The machine and the motors' torque limit are known.
 
 MuJoCo moves positions by the speeds at the end of a step, so that torques act half a step earlier:
 the true delay is that of the continuous machine. Its implicit damping adds half a step times the
-damping to the armature: 0.7 % of that of xc330 with steps of 0.25 ms, 2.6 % with 1 ms, which was as
-much as the width of an interval.
+damping to the armature. With steps of 1 ms that is 2.6 % of the armature of xc330, nearly the width
+of its interval; its logs with free ball joints have steps of 0.25 ms.
 
 The head then follows a motion that is not in the log, of three frequencies. Its setpoints have the
 numbers found and are sent ahead by the delay found, so that an error of the delay shifts the
@@ -44,10 +44,16 @@ from stewart_drake.identification.servo_plan import plan_servos
 from stewart_drake.loop.preparation import prepare
 
 SEEDS = size("SEEDS", 5)
-ROWS = [("perfect", 0.0), ("xc330", 0.0), ("perfect", 0.1), ("xc330", 0.1), ("perfect", 1.0)]
-"""Servo, and share of the ball joints' friction as shipped."""
-BITS, READING, STEP = 12, 0.008, 0.00025
-"""Bits of a turn, age of a measured angle in s, and step of the physics in s."""
+ROWS = [
+    ("perfect", 0.0, 1e-3),
+    ("xc330", 0.0, 2.5e-4),
+    ("perfect", 0.1, 1e-3),
+    ("xc330", 0.1, 1e-3),
+    ("perfect", 1.0, 1e-3),
+]
+"""Servo, share of the ball joints' friction as shipped, and step of the physics in s."""
+BITS, READING = 12, 0.008
+"""Bits of a turn, and age of a measured angle in s."""
 CODE = 2 * np.pi / 2**BITS
 OTHER = (0.4, 0.7, 1.0)
 """Frequencies in Hz of the motion that is not in the log."""
@@ -71,26 +77,28 @@ class Found(NamedTuple):
     seconds: float
 
 
-def log_of(planned: np.ndarray, servo: Any, ball: float, delay: float, seed: int) -> ServoLog:
+def log_of(
+    planned: np.ndarray, servo: Any, ball: float, step: float, delay: float, seed: int
+) -> ServoLog:
     """Return a log of the robot's model under setpoints (n, 6); `delay` is that of the log, s."""
     number = len(planned)
-    instants = STEP * np.arange(round(number * PERIOD / STEP))
+    instants = step * np.arange(round(number * PERIOD / step))
     newest = np.floor((instants - (delay - READING)) / PERIOD + 1e-9).astype(int)
     rows = planned[np.maximum(newest, 0)]
-    cranks = play(servo, ball, rows, planned[0], step=STEP, period=STEP)["cranks"]
+    cranks = play(servo, ball, rows, planned[0], step=step, period=step)["cranks"]
     times = PERIOD * np.arange(number)
-    seen = np.round((times - READING) / STEP).astype(int) - 1  # row k ends at (k + 1) STEP
+    seen = np.round((times - READING) / step).astype(int) - 1  # row k ends at (k + 1) step
     phase = np.random.default_rng(seed).uniform(-0.5, 0.5, 6)
     rounded = CODE * (np.round(cranks[np.maximum(seen, 0)] / CODE - phase) + phase)
     return servo_log("log", times, planned, rounded, sd.load_mechanism("reachy_mini"))
 
 
-def identified(planned: np.ndarray, name: str, ball: float, seed: int) -> Found:
+def identified(planned: np.ndarray, name: str, ball: float, step: float, seed: int) -> Found:
     """Return what the log of a seed shows, and the errors of the head."""
     kp, kv, damping, friction, armature, force = servo = SERVOS[name]
     late = 1e-3 * float(np.random.default_rng(seed).integers(20, 61))
-    delay = READING + late - 0.5 * STEP
-    log = log_of(planned, servo, ball, delay, seed)
+    delay = READING + late - 0.5 * step
+    log = log_of(planned, servo, ball, step, delay, seed)
     began = time.process_time()
     machine = replace(sd.load_mechanism("reachy_mini"), effort_limit=force)
     fit = identify_servos(log, machine, angle_std(BITS))
@@ -125,11 +133,11 @@ def identified(planned: np.ndarray, name: str, ball: float, seed: int) -> Found:
     return Found(found, (plain, truly, mine), seconds)
 
 
-def row(name: str, ball: float) -> str:
+def row(name: str, ball: float, step: float) -> str:
     """Return the section of a servo and its ball joints."""
     experiment = prepare(sd.load_scenario("reachy_mini"))
     plans = [plan_servos(experiment, angle_std(BITS), seed=seed).log for seed in range(SEEDS)]
-    cases = [(plan.setpoints, name, ball, seed) for seed, plan in enumerate(plans)]
+    cases = [(plan.setpoints, name, ball, step, seed) for seed, plan in enumerate(plans)]
     logs = in_parallel(identified, cases)
     rows = []
     for number in logs[0].numbers:
@@ -156,5 +164,5 @@ def row(name: str, ball: float) -> str:
 if __name__ == "__main__":
     if not os.environ.get("REACHY_PYTHON"):
         sys.exit("skipped: REACHY_PYTHON is not set, see the head of reachy.py")
-    sections = {f"{name}-{ball:g}": partial(row, name, ball) for name, ball in ROWS}
+    sections = {f"{name}-{ball:g}": partial(row, name, ball, step) for name, ball, step in ROWS}
     run_sections(__file__, "Numbers of Reachy Mini's servos from logs", sections)
