@@ -115,7 +115,7 @@ def test_on_a_wire_it_does_what_the_simulation_does(jumping_clock):
     with paper_machine() as running:
         ready = prepare_session(scenario_of(), running.address)
         told = "\n".join(plans(ready, 2.5, "paper"))
-        assert "a simulation" in told and "0.8 s after the measurement" in told
+        assert "a simulation" in told and "assumed delay: 0.8 s" in told
         result = drive(ready, 2.5, accept_jitter=True, say=lambda line: None)
     simulated = sd.simulate(scenario_of("duration=2.4"), judge_stability=False)
     assert result.status == "completed" and result.signals.sizes["time"] == 25
