@@ -21,7 +21,7 @@ from stewart_drake.law.memory import Memory
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.controller import held_by
 from stewart_drake.loop.preparation import Experiment
-from stewart_drake.loop.recording import Record, interpolated
+from stewart_drake.loop.recording import Record
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.run_log import Background, CsvFile, RunLog, csv_heads
 from stewart_drake.scenario.signals import (
@@ -179,12 +179,21 @@ class LiveRecord(Record):
             columns[signal.name], at = logged[:, at : at + signal.size], at + signal.size
         asked = columns["torque_commanded"]
         poses = columns["pose"], columns["reference"]
-        error = interpolated(poses[0] - poses[1])
+        error = self.errors(*poses)
         sent = np.clip(asked, -self._limit, self._limit)
         self._log = list(logged)
         self.on_grid = list(np.column_stack([logged[:, 0], *poses]))
         self.samples = list(np.column_stack([error, asked, sent, seconds]))
         return late
+
+    def errors(self, poses: Array, reference: Array) -> Array:
+        """Return the errors (n, 6), those without a measurement from the samples around them."""
+        error = poses - reference
+        known = np.flatnonzero(np.isfinite(error).all(axis=1))
+        if len(known) in (0, len(error)):
+            return error
+        every = np.arange(len(error))
+        return np.column_stack([np.interp(every, known, column) for column in error[known].T])
 
     def _write(self, number: int) -> None:
         row = self._rows.pop(number)

@@ -383,12 +383,10 @@ def on_its_way(
     law: PredictiveLqi, experiment: Experiment, way: CatchUp | None
 ) -> tuple[PredictiveLqi, Trajectory, float]:
     """Return `control_law` for a composed law and its `way_onto` the reference."""
-    motion, length = experiment.reference, 0.0
+    sc, motion, length = experiment.scenario, experiment.reference, 0.0
     if way is not None:
-        catch_up = experiment.scenario.controller.catch_up
-        motion, length = way.plan(catch_up, experiment.planned_limit)
-    c = experiment.scenario.controller
-    apart = experiment.scenario.start == "rest" and (way is not None or c.catch_up == 0)
+        motion, length = way.plan(sc.controller.catch_up, experiment.planned_limit)
+    apart = sc.start == "rest" and (way is not None or sc.controller.catch_up == 0)
     return _replanning(law, experiment, length, apart), motion, length
 
 

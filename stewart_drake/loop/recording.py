@@ -106,6 +106,10 @@ class Record:
             for name, (value, std) in zip(names, each, strict=True)
         }
 
+    def errors(self, poses: Array, reference: Array) -> Array:
+        """Return the errors (n, 6) of which the figures are made."""
+        return poses - reference
+
     def dataset(self) -> xr.Dataset:
         """Return the log, see `SimulationResult.signals`."""
         ends = np.cumsum([1, *(signal.size for signal in self._recorded)])
@@ -199,15 +203,6 @@ def has_measured(memory: Any, before: Counts) -> bool:
     return more <= partial
 
 
-def interpolated(error: Array) -> Array:
-    """Return errors (n, 6) with NaN replaced from the samples around it, if there are any."""
-    known = np.flatnonzero(np.isfinite(error).all(axis=1))
-    if len(known) in (0, len(error)):
-        return error
-    every = np.arange(len(error))
-    return np.column_stack([np.interp(every, known, column) for column in error[known].T])
-
-
 def summarize(
     experiment: Experiment,
     recorder: Record,
@@ -221,7 +216,7 @@ def summarize(
     on_grid = np.vstack([np.empty((0, 13)), *recorder.on_grid])
     samples = np.vstack([np.empty((0, 19)), *recorder.samples])
     time, (poses, reference) = on_grid[:, 0], np.split(on_grid[:, 1:], 2, axis=1)
-    error = interpolated(poses - reference)
+    error = recorder.errors(poses, reference)
     errors, torques, sent, rest = np.split(samples, [6, 12, 18], axis=1)
     seconds, some, scale = rest[:, 0], len(samples) > 0, experiment.scale
     completed = status == "completed"

@@ -362,11 +362,12 @@ def servo_law(experiment: Experiment) -> tuple[ServoPreview, Trajectory, float]:
     """Return the law, the motion that it follows, and the length of the blend, s."""
     sc, law = experiment.scenario, compose_servo_law(experiment)
     period, eta, reference = law.timeline.period, law.timeline.eta, experiment.reference
+    if sc.start != "rest" or sc.controller.catch_up == 0:
+        return law, reference, 0.0
     # The motion may have begun, if slightly, when the first command acts.
     begun = evaluate(reference, float(law.preview_times[0]))[POSE] - experiment.start[POSE]
     slight = np.all(np.abs(begun) <= RESTING * experiment.peak_to_peak + SAME)
-    from_rest = slight and continues(experiment.start, reference, 0.0, sc.duration)
-    if sc.start != "rest" or sc.controller.catch_up == 0 or from_rest:
+    if slight and continues(experiment.start, reference, 0.0, sc.duration):
         return law, reference, 0.0
 
     def blend(periods: int) -> Trajectory:

@@ -208,10 +208,12 @@ def continues(state: Array, reference: Trajectory, time: float, duration: float)
 
     Rates may differ by `RESTING` of the largest ones within [0, duration].
     """
-    x, instants = evaluate(reference, time), np.linspace(0.0, duration, 501)
+    x = evaluate(reference, time)
+    if not np.abs(x[POSE] - state[POSE]).max() < SAME:
+        return False
+    instants = np.linspace(0.0, duration, 501)
     speeds = np.abs(rows_along(reference, instants)[:, RATES]).max(axis=0)
-    apart = np.abs(x[RATES] - state[RATES]) <= RESTING * speeds + SAME
-    return bool(np.all(apart) and np.abs(x[POSE] - state[POSE]).max() < SAME)
+    return bool(np.all(np.abs(x[RATES] - state[RATES]) <= RESTING * speeds + SAME))
 
 
 def catch_up(

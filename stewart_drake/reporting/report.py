@@ -323,11 +323,11 @@ def verdict(found: ReportData) -> tuple[str, Tone]:
     bad, fair = (
         "; ".join(text for level, text in findings if level == tone) for tone in ("bad", "fair")
     )
+    if torqueless(run):
+        return f"Not reliable: {bad}.", "bad"
     text = f"The plate follows its reference for {duration}: E_ac is "
     if bad:
         text = f"Not reliable: {bad}. The run completed {duration}: E_ac is "
-    if torqueless(run):
-        return f"Not reliable: {bad}.", "bad"
     if run.scenario.actuator.kind == "position_servo" and (late := late_error(run)):
         text = text.replace(": E_ac", f": rms error {late}. With the start E_ac")
     error, floor = number(round(s["accumulated_error"], 9)), s["delay_floor"]
