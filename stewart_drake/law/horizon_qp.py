@@ -15,7 +15,8 @@ within the workspace exists, since w exceeds the multipliers. The identity as He
 factorisation, and a dual active-set method starts at v = 0.
 """
 
-from typing import Final, NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Final, NamedTuple
 
 import daqp
 import numpy as np
@@ -61,20 +62,8 @@ class QpError(ArithmeticError):
         self.late = late
 
 
-class Solver(Protocol):
-    """Solver of a `LeastDistance`."""
-
-    def __call__(self, problem: LeastDistance, seconds: float) -> Array:
-        """Return z (n,).
-
-        Args:
-            problem: to solve.
-            seconds: time that is left, infinite for any.
-
-        Raises:
-            QpError: no solution, or not in time.
-        """
-        ...
+Solver = Callable[[LeastDistance, float], Array]
+"""Returns z (n,) of a problem within a time in s, which may be infinite; else raises QpError."""
 
 
 def problem_of(

@@ -6,6 +6,7 @@ its arguments, as `call_back` takes them.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -75,8 +76,7 @@ class OwnParts:
     def motion(self) -> tuple[Any, Any]:
         """Functions `reference` and `goal` of a `stewart_sample`."""
         sample = core().ffi.new("stewart_sample *")
-        rows = Out(lambda _sample, number, *_: NUM_REFERENCE * number)
-        sizes = ..., ..., lambda _sample, number, *_: number, rows
+        sizes = ..., ..., _per(1), Out(_per(1, NUM_REFERENCE))
         functions = {"reference": (self._reference, *sizes), "goal": (self._goal, *sizes)}
         reference, goal = call_back(sample, self.raised, **functions)
         return reference, goal
@@ -123,7 +123,7 @@ class OwnParts:
             memory=(lambda: NUM_STATE, ...),
             scratch=(lambda: 0, ...),
             start=(self._start, ..., state),
-            observe=(self._observe, ..., state, ..., _torques, m, ...),
+            observe=(self._observe, ..., state, ..., _per(2, NUM_TORQUES), m, ...),
             restart=(self._restart, ..., state),
             parameters=(self._parameters, ..., ..., Out(p), Out(p)),
             uncertainty=(self._uncertainty, ..., ..., Out((NUM_STATE + p) ** 2)),
@@ -310,7 +310,7 @@ class OwnParts:
             scratch=(lambda: 0, ...),
             start=(self._start_planner, ..., ...),
             follow=(self._follow, ..., ..., None, ..., ...),
-            rows=(self._rows, ..., ..., ..., ..., _times, Out(_rows_at_times)),
+            rows=(self._rows, ..., ..., ..., ..., _per(3), Out(_per(3, NUM_REFERENCE))),
         )
 
     def _start_planner(self) -> None:
@@ -375,17 +375,18 @@ def preview_rows(rows: Any, number: int) -> Array:
 # Sizes of arrays, as functions of all arguments of the callback that takes them.
 
 
-def _torques(_law: Any, _memory: Any, number: int, *_: Any) -> int:
-    return NUM_TORQUES * number
+def _per(place: int, each: int = 1) -> Callable[..., int]:
+    """Return the size of an array with `each` numbers per unit of the argument at a place."""
+    return lambda *given: each * int(given[place])
 
 
 def _followed(_law: Any, outlook: Any, *_: Any) -> int:
-    """Size of the rows to follow, now and at the instants of the prediction."""
+    """Return the size of the rows to follow, now and at the instants of the prediction."""
     return NUM_REFERENCE * (1 + int(outlook.samples))
 
 
 def _nodes(_law: Any, outlook: Any, *_: Any) -> int:
-    """Size of the rows at two Gauss nodes in each hold of the feedforward."""
+    """Return the size of the rows at two Gauss nodes in each hold of the feedforward."""
     return 2 * NUM_REFERENCE * (3 + int(outlook.pending))
 
 
@@ -395,14 +396,6 @@ def _feedforward(_law: Any, outlook: Any, *_: Any) -> int:
 
 def _gain(law: Any, outlook: Any, *_: Any) -> int:
     return NUM_TORQUES * int(core().lib.stewart_order([law.cost], outlook.pending))
-
-
-def _times(_law: Any, _memory: Any, _sample: Any, number: int, *_: Any) -> int:
-    return number
-
-
-def _rows_at_times(_law: Any, _memory: Any, _sample: Any, number: int, *_: Any) -> int:
-    return NUM_REFERENCE * number
 
 
 def _in_flight(law: Any, *_: Any) -> int:
