@@ -11,7 +11,6 @@ from stewart_drake.law.belief import TOLERATED, Innovations
 from stewart_drake.law.filter_settings import (
     FilterSettings,
     acceleration_noise,
-    filter_settings,
     usual_model_error,
     usual_parameters,
 )
@@ -192,8 +191,7 @@ def test_the_default_goes_with_the_plant_and_the_sensor():
     for other in ("plant.kind=multibody", "sensor.kind=encoders"):
         found = settings_of("controller.period=0.01", "delay.steps=80", other)
         assert np.allclose(found.model_std, long.model_std)
-    direct = filter_settings(SCALE, 0.01, usual_parameters(4.0, 0.02, None))
-    assert np.allclose(direct.model_std, 2e-4 * np.tile(SCALE, 2))
+    assert np.allclose(usual_model_error(SCALE, 0.1), 2e-4 * np.tile(SCALE, 2))
 
 
 @pytest.mark.parametrize("seed", [71, 72, 73])

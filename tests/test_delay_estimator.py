@@ -34,7 +34,7 @@ DT = 0.1
 AMPLITUDES = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
 DYNAMICS = StewartDynamics(PAPER, gravity=False)
 PLANT = NominalPlant(DYNAMICS, 2, 1.0, TorqueLimit())
-SETTINGS = filter_settings(AMPLITUDES, DT, usual_parameters(4.0, 0.06, None))
+SETTINGS = filter_settings(2e-4 * np.tile(AMPLITUDES, 2), DT, usual_parameters(4.0, 0.06, None))
 NOISE = 1e-4 * np.tile(AMPLITUDES, 2)
 SENSING = StateSensing(NOISE, AMPLITUDES)
 DELAY = DelaySettings.of("constant", 0.45, 0.3, 1.5, open_loop_start=False)

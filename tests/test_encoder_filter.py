@@ -41,7 +41,7 @@ def sensing(samples, bits=None, offset=0.0):
 
 def settings(free=PARAMETERS):
     parameters = usual_parameters(PAPER.plate.mass, 0.06, None, 0.1, free)
-    return filter_settings(MOTION, DT, parameters)
+    return filter_settings(2e-4 * np.tile(MOTION, 2), DT, parameters)
 
 
 def angles_of(state, theta, samples):

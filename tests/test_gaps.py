@@ -1,7 +1,5 @@
 """Measurements that are missing for a while, against a filter that goes on without them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -21,11 +19,7 @@ AMPLITUDES = np.array([0.2617993878] * 3 + [0.02, 0.02, 0.08])
 DYNAMICS = StewartDynamics(PAPER, gravity=False)
 PLANT = NominalPlant(DYNAMICS, 20, 1.0, TorqueLimit())
 # The model is right and no torque is early or late: what is allowed for that is next to nothing.
-SETTINGS = replace(
-    filter_settings(AMPLITUDES, DT, usual_parameters(4.0, 0.02, None)),
-    model_std=np.full(12, 1e-7),
-    timing_std=1e-6,
-)
+SETTINGS = filter_settings(np.full(12, 1e-7), DT, usual_parameters(4.0, 0.02, None), 1e-6)
 LONGEST = 10  # gap in periods, as in core/filter_observers.c
 NOISE = 1e-3 * np.tile(AMPLITUDES, 2)
 SENSING = StateSensing(NOISE, AMPLITUDES)

@@ -252,46 +252,27 @@ def usual_model_error(motion_scale: Array, period: float) -> Array:
     return np.concatenate([poses, poses / share])
 
 
-def assumed_model_error(
-    motion_scale: Array, period: float, model_error: float | None, white: bool, noisy: bool
-) -> Array:
-    """Return the model's error (12,) over a period, for arguments of `filter_settings`."""
-    if model_error is not None:
-        return acceleration_noise(model_error, motion_scale, period)
-    share = INTEGRATION_ERROR / MODEL_ERROR if white and noisy else 1.0
-    return share * usual_model_error(motion_scale, period if white else USUAL_PERIOD)
-
-
 def filter_settings(
-    motion_scale: Array,
+    model_std: Array,
     period: float,
     parameters: ParameterSet,
-    model_error: float | None = None,
     timing_std: float | None = None,
-    white: bool = False,
-    noisy: bool = False,
     learns: bool = False,
 ) -> FilterSettings:
     """Return the settings for a machine.
 
     Args:
-        motion_scale: (6,) range of each coordinate, rad and m; the same per s for the rates.
+        model_std: (12,) error of the model over a period.
         period: between two torques, s.
         parameters: to estimate.
-        model_error: share of the motion per s^1.5, see `acceleration_noise`; None:
-            `usual_model_error`.
         timing_std: s, of the timing of a torque; None:
             TIMING_ERROR of the period, or FIRST_TIMING_ERROR with `learns`.
-        white: whether the errors of model and sensor are white. Those of an engine's steps and of
-            rounded angles add up instead: their default is that of a USUAL_PERIOD at any period.
-        noisy: whether a white sensor has noise. The model's error is then INTEGRATION_ERROR. The
-            filter of a sensor without noise would otherwise follow each digit of that error.
         learns: whether innovations correct the noise, see core/noise.h.
     """
     usual_timing = period * (FIRST_TIMING_ERROR if learns else TIMING_ERROR)
     return FilterSettings(
         parameters,
-        assumed_model_error(motion_scale, period, model_error, white, noisy),
+        model_std,
         usual_timing if timing_std is None else timing_std,
         None if parameters.walk is None else math.sqrt(period) * parameters.walk,
         parameters.jump,

@@ -29,9 +29,13 @@ from stewart_drake.law.feedforward import (
     NoFeedforward,
 )
 from stewart_drake.law.filter_settings import (
+    INTEGRATION_ERROR,
+    MODEL_ERROR,
+    USUAL_PERIOD,
     ParameterSet,
-    assumed_model_error,
+    acceleration_noise,
     filter_settings,
+    usual_model_error,
     usual_parameters,
 )
 from stewart_drake.law.learned import with_learned
@@ -190,8 +194,7 @@ def sizing_of(experiment: Experiment) -> Sizing:
     sizing = one_step_sizing(experiment)
     within_reach = sizing.reachable_torque == sizing.reference_torque
     if sc.controller.estimate and within_reach:  # no number of steps does beyond the reach
-        given = period, sc.controller.model_error, *white_errors(sc)
-        model_std = assumed_model_error(experiment.motion_scale, *given)
+        model_std = assumed_model_error(experiment)
         assumed = filter_substeps(nominal, reference, period, sc.duration, model_std)
         substeps = max(substeps, assumed)
     substeps = max(substeps, turning_substeps(nominal, reference, period, sc.duration))
@@ -221,24 +224,15 @@ def compose_law(experiment: Experiment, sizing: Sizing | None = None) -> Predict
     sc, nominal = experiment.scenario, experiment.nominal
     if found := differing(sc, {"controller.command": "torque"}):
         raise ConfigError(found.problem(hint=", for a law that closes its loop across the delay"))
-    c, motion = sc.controller, experiment.motion_scale
-    timeline = Timeline(c.period, believed_delay(sc))
+    c, timeline = sc.controller, Timeline(sc.controller.period, believed_delay(sc))
     substeps, peak_torque, reachable, machine_scale, frequency = sizing or sizing_of(experiment)
     torque_scale = max(machine_scale, reachable)
     motion_torque = max(STILL * machine_scale, reachable)
     parameters = estimated_parameters(experiment, torque_scale, motion_torque)
     noise = sc.sensor.noise_std if isinstance(sc.sensor, StateSensorConfig) else None
-    tolerated, (white, noisy) = tolerated_timing(experiment, frequency), white_errors(sc)
-    settings = filter_settings(
-        motion,
-        c.period,
-        parameters,
-        model_error=c.model_error,
-        timing_std=c.timing_std,
-        white=white,
-        noisy=noisy,
-        learns=_learns(sc),
-    )
+    tolerated, (white, _) = tolerated_timing(experiment, frequency), white_errors(sc)
+    model_std = assumed_model_error(experiment)
+    settings = filter_settings(model_std, c.period, parameters, c.timing_std, _learns(sc))
     gaps = sc.sensor.kind == "state" and sc.sensor.loss > 0
     timing = white and not any(noise or ()) and math.isfinite(tolerated)
     observer = CoreObserver(settings if c.estimate else None, gaps=gaps, timing=timing)
@@ -428,6 +422,21 @@ def white_errors(scenario: Scenario) -> tuple[bool, bool]:
     sensor = scenario.sensor
     white = _learns(scenario) and isinstance(sensor, StateSensorConfig)
     return white, isinstance(sensor, StateSensorConfig) and white and all(sensor.noise_std)
+
+
+def assumed_model_error(experiment: Experiment) -> Array:
+    """Return the error (12,) of the estimator's model over a period.
+
+    Errors of an engine's steps and of rounded angles are not white but add up: their default is
+    that of a USUAL_PERIOD at any period. With a white sensor that has noise, the default is
+    INTEGRATION_ERROR. Without noise the filter would follow each digit of that error.
+    """
+    c, scale = experiment.scenario.controller, experiment.motion_scale
+    if c.model_error is not None:
+        return acceleration_noise(c.model_error, scale, c.period)
+    white, noisy = white_errors(experiment.scenario)
+    share = INTEGRATION_ERROR / MODEL_ERROR if noisy else 1.0
+    return share * usual_model_error(scale, c.period if white else USUAL_PERIOD)
 
 
 def motion_frequency(experiment: Experiment) -> float:
