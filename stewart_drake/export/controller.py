@@ -220,7 +220,7 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
 
 
 def _is_tight(margin: ControllerMargin) -> bool:
-    """Whether a small error of the delay or of the motors' gain makes a stable loop unstable."""
+    """Return whether a small error of delay or motor gain makes a stable loop unstable."""
     delay, gain = TIGHT
     m = margin.margins
     return bool(margin.stable) and (

@@ -157,7 +157,7 @@ def choose_substeps(
 
     @functools.cache
     def block(t: float, first: int) -> tuple[Array, Array]:
-        """Torques and the poses they are for, (n, 6), of up to BLOCK holds."""
+        """Return torques of up to BLOCK holds and the poses they are for, (n, 6)."""
         holds = period * np.arange(first, min(first + BLOCK, horizon))
         wanted = np.array([reference.value(t + hold + period)[:, 0] for hold in holds])
         return mean_torques(dynamics, reference, t + holds, t + holds + period), wanted
@@ -212,7 +212,7 @@ def filter_substeps(
     ends = poses_along(reference, begin + period)
 
     def after(substeps: int) -> Array:
-        """States (FILTER_INSTANTS, 12) a period after each instant."""
+        """Return the states (FILTER_INSTANTS, 12) a period after each instant."""
         held = zip(states, torques, strict=True)
         return np.array([dynamics.predict(x, T[None], period, substeps)[-1] for x, T in held])
 

@@ -170,6 +170,7 @@ class SteppedLaw(LeafSystem):
 
 
 def declare_constant(system: LeafSystem, name: str, value: Array) -> None:
+    """Declare an output (n,) that never changes."""
 
     def put_out(context: Context, output: BasicVector) -> None:
         output.SetFromVector(value)

@@ -147,7 +147,7 @@ def _peaks(run: SimulationResult) -> list[str]:
 
 
 def late_error(run: SimulationResult) -> str:
-    """Return the rms errors of angle and distance, and of when; empty for a lost run."""
+    """Return the rms errors of angle and position as text; empty for a lost run."""
     reference, found = run.signals.reference.values, run.summary["rms_error"]
     if run.status != "completed" or not math.isfinite(found["angle_deg"]):
         return ""
@@ -275,6 +275,7 @@ def _paper_error(row: str, run: SimulationResult) -> str:
 
 
 def _two_row(name: str, run: SimulationResult, results: _Runs) -> dict[str, Any]:
+    """Return a row of the table that compares with the paper's Table II."""
     base = _base(name, run)
     printed, lqr = results.get(base), results.get("delay_lqr")
     below = math.nan

@@ -303,8 +303,8 @@ class ControllerConfig:
         model_error: of the estimator's model: white noise of the accelerations, as a share of the
             motion's range per s^1.5; null is 2e-4 of it in each period, and less in
             a short one on an exact plant.
-        timing_std: standard deviation of the time at which a torque acts, s; null is 1 % of the
-            period, and with a delay estimator learnt.
+        timing_std: standard deviation of the time at which a torque acts, s; null is learnt on an
+            exact plant or with a delay estimator, else 1 % of the period.
         prior: section of prior standard deviations; null is the default of each.
         limits: of torque, reach and clearance, `ignore`: torques are cut, or `qp`: where a limit
             binds within the horizon, a quadratic program plans the torques within all of them.

@@ -156,7 +156,7 @@ def loop_verdict(loop: ControllerMargin) -> str:
 
 
 def fragile(loop: ControllerMargin) -> bool:
-    """Whether a small error of the delay makes a loop unstable; False where it is not judged."""
+    """Return whether a small error of the delay makes a loop unstable; False if not judged."""
     return loop.share < FRAGILE
 
 
