@@ -16,7 +16,7 @@ from _bench import AMPLITUDE, EXACT, QUICK, delay_settings, in_parallel, noise, 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.identify import identify
-from stewart_drake.identification.logs import Precision, read_log
+from stewart_drake.identification.logs import Precision, load_log
 from stewart_drake.identification.unknowns import DELAY
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.simulation import simulate
@@ -91,7 +91,7 @@ def find(machine: str, delay: float, noise: float, seed: int, end: float = np.in
     run, drawing = short_run(machine, delay, noise, seed), sd.load_mechanism(machine)
     with TemporaryDirectory() as folder:
         run.save(folder)
-        log = read_log(Path(folder) / "signals.nc", drawing, Precision())
+        log = load_log(Path(folder) / "signals.nc", drawing, Precision())
     kept = log.times <= end
     log = replace(log, times=log.times[kept], values=log.values[kept])
     try:

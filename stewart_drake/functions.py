@@ -20,7 +20,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import make_folder, write_asked, write_whole
 from stewart_drake.files.yamlio import validate, yaml_text
 from stewart_drake.identification import identify as identification
-from stewart_drake.identification.logs import POSE, Precision, angle_std, read_log
+from stewart_drake.identification.logs import POSE, Precision, angle_std, load_log
 from stewart_drake.identification.plan import MOTION, Plan, motion_csv, plan
 from stewart_drake.identification.servo_fit import ServoIdentification, identify_servos
 from stewart_drake.identification.servo_logs import is_servo_log, read_servo_log
@@ -119,7 +119,7 @@ def identify(
         g = DEFAULT_GRAVITY if gravity else 0.0
         find_servos = partial(identify_servos, log, machine, std, g, velocity_gain)
         return analysis_result(find_servos, servo_identification.document, typed, _write_servos)
-    read = [read_log(Path(path), machine, precision or Precision(), gravity) for path in paths]
+    read = [load_log(Path(path), machine, precision or Precision(), gravity) for path in paths]
     if velocity_gain is not None:
         raise ConfigError("velocity_gain: got one; expected none without a log of setpoints")
     find = partial(identification.identify, read, machine, tolerances, delay)
@@ -374,7 +374,7 @@ def run_live(
     Raises:
         ConfigError: no such machine, or one that does not begin.
     """
-    from stewart_drake.live.contact import address_of
+    from stewart_drake.live.contact import parse_address
     from stewart_drake.live.endpoint import read_key
     from stewart_drake.live.learning import learn_live
     from stewart_drake.live.session import drive, open_logs, prepare_session
@@ -383,7 +383,7 @@ def run_live(
     if options.learn:
         learnt = learn_live(as_scenario(scenario), machine, options, print).run
         return SimulationResult.of(learnt)
-    ready = prepare_session(as_scenario(scenario), address_of(machine), read_key(options.key))
+    ready = prepare_session(as_scenario(scenario), parse_address(machine), read_key(options.key))
     rules: Any = options.model_dump(include={"armed", "accept_jitter", "max_missing", "hold"})
     duration = math.inf if options.duration is None else options.duration
     logs = open_logs(ready, options, print)

@@ -10,7 +10,7 @@ from scipy.optimize import lsq_linear
 
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop.clearance import ClearanceScene, Pair
-from stewart_drake.loop.preparation import assemble as made
+from stewart_drake.loop.preparation import prepare_unchecked
 from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.clearance import (
     LINK_PAIRS,
@@ -149,7 +149,7 @@ def by_projections(mechanism, pose, first, second):
 
 @pytest.mark.parametrize("name", ["paper_clear", "desktop"])
 def test_cranks_and_rods_are_as_far_apart_as_by_projections(name):
-    experiment = made(load_scenario("paper" if name == "paper_clear" else name))
+    experiment = prepare_unchecked(load_scenario("paper" if name == "paper_clear" else name))
     mechanism = load_mechanism(name)
     scene = ClearanceScene(mechanism, base=False)
     for time in (0.0, 2.3, 4.7):
@@ -183,7 +183,7 @@ def test_capsules_are_never_further_apart_than_the_links_in_them(seed):
 
 
 def along(name, machine=None):
-    experiment = made(load_scenario(name))
+    experiment = prepare_unchecked(load_scenario(name))
     mechanism = load_mechanism(machine or name)
     time = np.linspace(0, 10, 101)
     return mechanism, time, np.array([experiment.reference.value(t)[:, 0] for t in time])

@@ -17,7 +17,7 @@ from stewart_drake.law.motion import Preview
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.stability import fastest_pole
 from stewart_drake.loop.cautions import cautions_after, cautions_before, coarse_step
-from stewart_drake.loop.controller_margin import controller_margin, in_time, true_model
+from stewart_drake.loop.controller_margin import controller_margin, over_wire, true_model
 from stewart_drake.loop.law_design import control_law
 from stewart_drake.loop.platforms import MultibodyStewart
 from stewart_drake.loop.preparation import prepare
@@ -273,7 +273,7 @@ def test_margins_over_a_network_count_the_way_back_of_the_measurements():
     back, late = "link.return={low: 0.015, high: 0.045}", "sensor.delay=0.06"
     wire = judged(scenario(period, "delay.steps=7", name="gravity"))
     for way in (back, late):
-        found = controller_margin(in_time(prepare(scenario(*network, way, name="gravity"))))
+        found = controller_margin(over_wire(prepare(scenario(*network, way, name="gravity"))))
         assert found.eta == pytest.approx(0.14) and found.radius == pytest.approx(wire.radius)
         assert found.margins == pytest.approx(wire.margins)
 
@@ -281,7 +281,7 @@ def test_margins_over_a_network_count_the_way_back_of_the_measurements():
 @pytest.mark.parametrize("controller", ["pd_gravity", "lqr_gravity"])
 def test_a_controller_that_assumes_no_delay_assumes_none_over_a_network(controller):
     over, wire = (
-        controller_margin(in_time(prepare(scenario(*HOLD, one, controller=controller))))
+        controller_margin(over_wire(prepare(scenario(*HOLD, one, controller=controller))))
         for one in ("link={kind: network, low: 0.8, high: 0.8, playout: 0.9}", "delay.steps=10")
     )
     assert over.eta == wire.eta and over.radius == pytest.approx(wire.radius)

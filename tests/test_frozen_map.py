@@ -7,7 +7,7 @@ from pydrake.systems.framework import DiagramBuilder
 import stewart_drake as sd
 from stewart_drake.dynamics.frozen_map import Band, FrozenDynamics
 from stewart_drake.dynamics.stewart import StewartDynamics
-from stewart_drake.law.coverage import uncovered
+from stewart_drake.law.coverage import uncovered_part
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.mechanism.assembly import torque_map
@@ -136,7 +136,7 @@ def test_it_has_no_limits_but_one_that_is_asked_for():
     assert experiment.torque_limit == np.inf
     limited = sd.load_scenario("table2", settings=[FULL, "actuator.torque_limit=0.5"])
     assert prepare(limited).torque_limit == 0.5
-    assert uncovered(compose_law(experiment)) == "plant.kind"
+    assert uncovered_part(compose_law(experiment)) == "plant.kind"
 
 
 def test_the_controllers_of_this_package_follow_there_too():

@@ -28,7 +28,7 @@ from stewart_drake.identification.judgement import (
     unseen,
     workspace_poses,
 )
-from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, Log, Precision, read_log
+from stewart_drake.identification.logs import ANGLES, NUM_MEASURED, Log, Precision, load_log
 from stewart_drake.identification.model import (
     NUM_DYNAMIC,
     NUM_GEOMETRY,
@@ -471,7 +471,7 @@ def test_the_fit_ends_at_the_minimum_of_a_curved_valley(tmp_path):
     scenario = load_scenario("gravity", settings=settings)
     simulate(scenario, judge_stability=False).save(tmp_path)
     mechanism = load_mechanism(scenario.mechanism)
-    fit = identify([read_log(tmp_path / "signals.nc", mechanism, Precision())], mechanism).fit
+    fit = identify([load_log(tmp_path / "signals.nc", mechanism, Precision())], mechanism).fit
     _, normal = fit.problem.normal(fit.guess)
     assert normal.promised(normal.step(0.0)) < CONVERGED
 
@@ -547,7 +547,7 @@ def short_run_log(tmp_path_factory):
     """Return the first 1.2 s of a log with a delay of 0.8 s and noise; the queue was empty."""
     folder = tmp_path_factory.mktemp("short")
     short_logs.short_run("paper", 0.8, 1e-3, 4000).save(folder)
-    return up_to(read_log(folder / "signals.nc", PAPER, Precision()), 1.2)
+    return up_to(load_log(folder / "signals.nc", PAPER, Precision()), 1.2)
 
 
 def up_to(log, end):

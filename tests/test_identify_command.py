@@ -10,7 +10,7 @@ import xarray as xr
 import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, read_log
+from stewart_drake.identification.logs import ANGLES, POSE, Precision, angle_std, load_log
 from stewart_drake.identification.unknowns import DELAY, OFFSETS
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
@@ -46,7 +46,7 @@ def changed(row, column, text):
 
 
 def read(path):
-    return read_log(path, PAPER, Precision())
+    return load_log(path, PAPER, Precision())
 
 
 def test_a_csv_log_is_read(tmp_path):

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.loop.preparation import assemble, check_instants, prepare
-from stewart_drake.mechanism.assembly import assemble as placed
+from stewart_drake.loop.preparation import check_instants, prepare, prepare_unchecked
+from stewart_drake.mechanism.assembly import assemble
 from stewart_drake.mechanism.files import build_mechanism, load_mechanism, mechanism_spec
 from stewart_drake.mechanism.geometry import bar_inertia
 from stewart_drake.mechanism.kinematics import rotation
@@ -89,12 +89,12 @@ def _still(pose):
 
 
 def test_joint_angles_are_those_of_the_link_frames():
-    experiment = assemble(load_scenario("paper"))
+    experiment = prepare_unchecked(load_scenario("paper"))
     motion = motion_of(PAPER.home, experiment.reference, np.linspace(0, 6, 25))
-    found, home = geometry(PAPER, motion), placed(PAPER, PAPER.home)
+    found, home = geometry(PAPER, motion), assemble(PAPER, PAPER.home)
     turns, leans = [], []
     for pose in motion.poses:
-        now = placed(PAPER, pose)
+        now = assemble(PAPER, pose)
         for leg in range(6):
             seen = rotation(pose[:3]).T @ now.R_WD[leg][:, 0]
             turns.append(np.arccos(np.clip(seen @ home.R_WD[leg][:, 0], -1, 1)))
@@ -209,7 +209,7 @@ def test_reach_counts_before_limits_and_limits_before_the_goal():
 def test_a_judgement_is_of_all_instants_and_a_run_unless_out_of_reach():
     asked = problem(limits={"clearance": -1.0})
     found = json.loads(judge(asked, "paper"))
-    reference = assemble(asked.scenario).reference
+    reference = prepare_unchecked(asked.scenario).reference
     along = measure(PAPER, poses_along(reference, check_instants(1.5)))
     assert found["measures"]["reach"] == pytest.approx(along.reach.min(), abs=1e-4)
     assert found["measures"]["clearance"] == found["nearest"][1] < 0

@@ -11,7 +11,7 @@ from stewart_drake.export.controller import exported
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.belief import Belief, Estimate
 from stewart_drake.law.clear_space import ClearSpace
-from stewart_drake.law.coverage import uncovered
+from stewart_drake.law.coverage import uncovered_part
 from stewart_drake.law.feedforward import GAUSS_NODES, InverseDynamicsFeedforward, mean_torques
 from stewart_drake.law.horizon import HoldModel, HorizonCost, condense, pose_root, riccati
 from stewart_drake.law.horizon_qp import NEAR, QpError, problem_of, solve_by_daqp
@@ -20,7 +20,7 @@ from stewart_drake.law.limited import LimitedLqi
 from stewart_drake.law.nominal import NominalPlant, TorqueLimit
 from stewart_drake.law.timeline import Timeline
 from stewart_drake.loop.bulk import run_in_bulk
-from stewart_drake.loop.law_design import clear_space, compose_law, way_onto
+from stewart_drake.loop.law_design import catch_up_of, clear_space, compose_law
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.clearance import LINK_PAIRS
@@ -364,7 +364,8 @@ def test_it_works_next_to_a_part_in_python():
         simulate(scenario, judge_stability=False, modify_law=change)
         for change in (lambda law: law, with_part)
     )
-    assert uncovered(with_part(compose_law(prepare(scenario))).free) == "controller.feedforward"
+    free = with_part(compose_law(prepare(scenario))).free
+    assert uncovered_part(free) == "controller.feedforward"
     np.testing.assert_allclose(
         compiled.signals.torque_commanded, python.signals.torque_commanded, atol=1e-7
     )
@@ -451,7 +452,7 @@ def from_rest(share, controller="predictor_lqi"):
     limit = f"actuator.torque_limit={share * TAU:g}"
     experiment = prepare(load_scenario("paper", controller, ("plant.kind=exact", NONE, limit)))
     law = compose_law(experiment)
-    return experiment, law, way_onto(experiment, law)
+    return experiment, law, catch_up_of(experiment, law)
 
 
 @pytest.mark.parametrize("share", [2.3, 7.5])

@@ -30,12 +30,12 @@ from stewart_drake.cli import main
 from stewart_drake.cli.live import transit_times
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.identification.logs import Precision, read_log
+from stewart_drake.identification.logs import Precision, load_log
 from stewart_drake.law.belief import Estimate
 from stewart_drake.law.gaps import longest_gap, within_reach
 from stewart_drake.law.stability import Margins
 from stewart_drake.live import contact as contacts
-from stewart_drake.live.contact import Contact, Link, address_of, await_free, call, open_endpoint
+from stewart_drake.live.contact import Contact, Link, await_free, call, open_endpoint, parse_address
 from stewart_drake.live.design import Design, as_seen, check_controller, design
 from stewart_drake.live.endpoint import Endpoint, now
 from stewart_drake.live.exchange import Watch
@@ -142,7 +142,7 @@ def test_over_a_network_packets_bridge_what_is_lost(tmp_path):
     assert np.isfinite(applied).all() and result.summary["live"]["periods_played"] > 20
     result.save(tmp_path)
     assert json.loads((tmp_path / "summary.json").read_text())["live"]["deadlines_missed"] >= 0
-    log = read_log(tmp_path / "signals.nc", load_mechanism("paper"), Precision())
+    log = load_log(tmp_path / "signals.nc", load_mechanism("paper"), Precision())
     # What acted 0.8 s later is what was sent at a sample, as far as it was not lost.
     sent = result.signals.torque_commanded.values[:-10]
     same = np.isclose(log.torques[: len(sent)], sent, atol=1e-9).all(axis=1)
@@ -870,7 +870,7 @@ def test_a_demo_leaves_time_for_computing(eta, room):
 @pytest.mark.parametrize("text", ["localhost", "127.0.0.1:", "127.0.0.1:0", ":7000", "a b:7000"])
 def test_an_address_that_is_none_is_refused(text):
     with pytest.raises(ConfigError, match=r"^--machine: got"):
-        address_of(text)
+        parse_address(text)
 
 
 def test_beyond_loopback_a_key_is_needed():

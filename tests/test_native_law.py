@@ -11,7 +11,7 @@ from stewart_drake.core.library import core
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.law import core_law
 from stewart_drake.law.core_law import CompiledLaw
-from stewart_drake.law.coverage import backend, uncovered
+from stewart_drake.law.coverage import backend, uncovered_part
 from stewart_drake.law.delay_model import delayed_model, linear_model
 from stewart_drake.law.motion import KnownMotion, Preview
 from stewart_drake.law.predictive_lqi import PredictiveLqi
@@ -362,7 +362,7 @@ def law_of(*settings, controller=None):
     ],
 )
 def test_what_the_law_in_c_has_not_is_named(settings, field):
-    assert uncovered(law_of(*settings)) == field
+    assert uncovered_part(law_of(*settings)) == field
 
 
 def test_a_part_of_ones_own_is_named():
@@ -371,8 +371,8 @@ def test_a_part_of_ones_own_is_named():
 
     law = law_of()
     mine = replace(law, planner=type("Planner", (), {})())
-    assert uncovered(mine) == "controller.replan"
-    assert uncovered(Mine(**law.parts)) == "law"
+    assert uncovered_part(mine) == "controller.replan"
+    assert uncovered_part(Mine(**law.parts)) == "law"
     assert backend(law) == "native"
     assert backend(mine) == "native, controller.replan in Python"
 

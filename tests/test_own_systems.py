@@ -12,7 +12,7 @@ from pydrake.trajectories import FunctionHandleTrajectory, PiecewisePolynomial
 
 import stewart_drake as sd
 from stewart_drake.loop.own import take
-from stewart_drake.loop.preparation import concrete, prepare
+from stewart_drake.loop.preparation import as_experiment, prepare
 from stewart_drake.reporting.report import verdict
 from stewart_drake.reporting.results import ComparisonResult
 from tests.test_analysis_scripts import script
@@ -322,7 +322,7 @@ def test_systems_beside_an_experiment_are_refused_by_everybody():
 
 
 def test_an_unknown_argument_is_refused_by_everybody():
-    for build in (sd.build_closed_loop, concrete):
+    for build in (sd.build_closed_loop, as_experiment):
         for name in ("truth", "law", "foo"):
             with pytest.raises(TypeError, match=f"unexpected keyword argument '{name}'"):
                 build(scenario("duration=0.05"), **{name: None})

@@ -8,7 +8,7 @@ import pytest
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.cost import pd_gains
-from stewart_drake.law.coverage import uncovered
+from stewart_drake.law.coverage import uncovered_part
 from stewart_drake.law.delay_model import chain, delayed_model, linear_model
 from stewart_drake.law.stability import closed_loop, fastest_pole, spectral_radius
 from stewart_drake.loop.law_design import compose_law, pd_gain
@@ -116,8 +116,8 @@ def test_pd_follows_across_the_delay_with_the_predictor():
 
 def test_the_core_names_what_it_has_not():
     law = compose_law(prepare(load_scenario("paper", None, ("controller.kind=pd",))))
-    assert uncovered(law) == "controller.kind"
-    assert uncovered(compose_law(prepare(load_scenario("gravity", "lqr_gravity")))) is None
+    assert uncovered_part(law) == "controller.kind"
+    assert uncovered_part(compose_law(prepare(load_scenario("gravity", "lqr_gravity")))) is None
 
 
 def test_compare_shows_the_baselines_where_gravity_acts():

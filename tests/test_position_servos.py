@@ -9,7 +9,7 @@ from scipy.optimize import minimize_scalar
 
 import stewart_drake as sd
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.law.coverage import uncovered
+from stewart_drake.law.coverage import uncovered_part
 from stewart_drake.law.motion import Preview
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.loop.bulk import ending_of, run_in_bulk
@@ -231,7 +231,7 @@ def test_commands_are_the_same_with_a_feedforward_in_python(feedforward):
     limits = ("actuator.speed_limit=3", f"actuator.angle_range={ranges.tolist()}")
     experiment = prepare(scenario(f"controller.feedforward={feedforward}", *limits))
     law = compose_servo_law(experiment)
-    assert uncovered(law) is None
+    assert uncovered_part(law) is None
     rng, mine = np.random.default_rng(6), with_own(law, "feedforward")
     first, _ = commands_in_flight(experiment, law, law.timeline.delay)
     memories = [law.initial_memory(first), mine.initial_memory(first)]

@@ -450,7 +450,8 @@ def test_a_draw_beyond_all_scenarios_is_an_outcome(one, problem, monkeypatch):
     def refuse(*_, **__):
         raise ConfigError(problem)
 
-    for name in ("preparation_of", "assemble") if one is None else ():  # the two loops' first steps
+    first_steps = "preparation_of", "prepare_unchecked"  # of the two loops
+    for name in first_steps if one is None else ():
         monkeypatch.setattr(bulk, name, refuse)
     found = json.loads(run_draw(short(), one or {}))["outcome"]
     assert found["status"] == "refused" and problem in found["reason"]

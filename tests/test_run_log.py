@@ -98,7 +98,7 @@ def test_identify_and_export_read_the_same_from_every_kind_of_log(run):
     _, folder = run
     paths = [folder / name for name in ("signals.nc", "run.mcap", "run.csv", ".")]
     assert len({sd.export_csv(path) for path in paths}) == 1
-    read = [logs.read_log(path, PAPER, logs.Precision()) for path in paths]
+    read = [logs.load_log(path, PAPER, logs.Precision()) for path in paths]
     for other in read[1:]:
         for field in ("sent", "torques", "times", "values", "std", "before"):
             one, same = getattr(read[0], field), getattr(other, field)
@@ -112,7 +112,7 @@ def test_a_csv_log_without_its_scenario_is_read_but_not_identified(run, tmp_path
     alone.write_bytes((folder / "run.csv").read_bytes())
     assert "scenario" not in read_log(alone).attrs
     with pytest.raises(ConfigError, match=r"has no scenario; .* alone\.yaml or summary\.json"):
-        logs.read_log(alone, PAPER, logs.Precision())
+        logs.load_log(alone, PAPER, logs.Precision())
     write_json(tmp_path / "summary.json", result.summary)
     assert scenario_of(read_log(alone), alone) == result.scenario
 

@@ -14,7 +14,7 @@ from stewart_drake.loop.cautions import cautions_before
 from stewart_drake.loop.controller_margin import controller_margin
 from stewart_drake.loop.diagram import build_closed_loop
 from stewart_drake.loop.platforms import MultibodyStewart
-from stewart_drake.loop.preparation import assemble, prepare
+from stewart_drake.loop.preparation import prepare, prepare_unchecked
 from stewart_drake.loop.simulation import make_simulator, simulate
 from stewart_drake.scenario.loading import load_scenario, scenario_yaml
 from stewart_drake.studies.study_options import Ranges
@@ -117,14 +117,14 @@ def test_limits_come_from_the_scenario_else_from_the_machine(tmp_path):
     path = tmp_path / "again.yaml"
     for text, expected in {"null": 10.0, "none": np.inf, "0.5": 0.5, "20": 20.0}.items():
         sc = scenario(f"actuator.torque_limit={text}")
-        assert assemble(sc).torque_limit == expected, text
+        assert prepare_unchecked(sc).torque_limit == expected, text
         path.write_text(scenario_yaml(sc), encoding="utf-8")
         assert load_scenario(path) == sc
     stronger = dataclasses.replace(PAPER, effort_limit=12.0)
-    assert assemble(scenario(), stronger).torque_limit == 12.0
+    assert prepare_unchecked(scenario(), stronger).torque_limit == 12.0
     unlimited = dataclasses.replace(PAPER, effort_limit=None)
-    assert assemble(scenario(), unlimited).torque_limit == np.inf
-    assert assemble(scenario("actuator.torque_limit=3"), stronger).torque_limit == 3.0
+    assert prepare_unchecked(scenario(), unlimited).torque_limit == np.inf
+    assert prepare_unchecked(scenario("actuator.torque_limit=3"), stronger).torque_limit == 3.0
 
 
 def test_a_limit_of_the_machine_alone_plans_nothing():
@@ -163,12 +163,12 @@ def test_torques_in_flight_at_the_start_keep_it_too(tmp_path, queue):
 def test_drawn_limits_are_never_above_the_motors(tmp_path):
     """0.66 N m are commanded, so that limits of up to 1.97 would be drawn."""
     sc = scenario(paper_with(tmp_path, 0.8))
-    scales = scales_of(assemble(sc), 0.6559)
+    scales = scales_of(prepare_unchecked(sc), 0.6559)
     limits = [draw(Ranges(), scales, sc, 0, i)["torque_limit"] for i in range(50)]
     assert max(limits) == 0.8 > min(limits) > 0.6559
     assert draw(Ranges(torque_limit=None), scales, sc, 0, 0)["torque_limit"] is None
     sc.actuator.torque_limit = "none"
-    scales = scales_of(assemble(sc), 0.6559)
+    scales = scales_of(prepare_unchecked(sc), 0.6559)
     limits = [draw(Ranges(), scales, sc, 0, i)["torque_limit"] for i in range(50)]
     assert 0.8 < max(limits) < 3 * 0.6559
 

@@ -15,7 +15,7 @@ from stewart_drake.core.layout import DEAD_CENTRE_SINE
 from stewart_drake.dynamics.workspace import SINGULARITY_LIMIT, margin, measures_at
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
-from stewart_drake.loop.preparation import assemble, check_instants, prepare
+from stewart_drake.loop.preparation import check_instants, prepare, prepare_unchecked
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.mechanism.kinematics import angle_rate_map, leg_geometry, rotation
@@ -204,12 +204,12 @@ def test_a_motion_is_checked_up_to_its_end_and_not_beyond(later, fits):
     leaves = math.asin(travel(PAPER)[5].high / 0.2)
     scenario = dataclasses.replace(heave(0.2), duration=leaves + later)
     assert (study_workspace(scenario).exit is None) is fits
-    assert (assemble(scenario).reference_failure() is None) is fits
+    assert (prepare_unchecked(scenario).reference_failure() is None) is fits
 
 
 @pytest.mark.parametrize("name", shipped("scenario"))
 def test_every_shipped_reference_fits_and_so_does_its_largest_scaling(name):
-    experiment = assemble(load_scenario(name))
+    experiment = prepare_unchecked(load_scenario(name))
     time = check_instants(experiment.scenario.duration)
     assert first_exit(experiment.mechanism, experiment.reference, time) is None
     factor = largest_factor(experiment.mechanism, experiment.reference, time)
@@ -227,7 +227,7 @@ def test_the_table_in_the_theory_is_what_comes_out(name):
     section = text[text.index("largest amplitude factor") :]
     row = re.findall(rf"^\| `{name}`.*\|$", section, re.MULTILINE)[0]
     numbers = [float(n) for n in re.findall(r"-?\d+\.?\d*", row.replace("−", "-").split("|", 2)[2])]
-    experiment = assemble(load_scenario(name))
+    experiment = prepare_unchecked(load_scenario(name))
     mechanism, time = experiment.mechanism, check_instants(experiment.scenario.duration)
     heave_range = travel(mechanism)[5]
     found = [
@@ -257,7 +257,7 @@ def test_factors_at_the_ends_of_what_can_be():
 
 def test_the_motors_work_is_the_machine_s_energy():
     """Sum of powers over time = kinetic plus potential energy gained; no friction."""
-    experiment = assemble(load_scenario("motion_base"))
+    experiment = prepare_unchecked(load_scenario("motion_base"))
     time = np.linspace(0.0, 4.7, 2001)
     sizing = size_motors(experiment.nominal, experiment.reference, time)
     work = np.concatenate(

@@ -81,7 +81,7 @@ def live(
         line = chosen.line("live", **shown, out=delivery.out)
         return _learn(chosen, loaded, machine, options, delivery, line)
 
-    from stewart_drake.live.contact import address_of
+    from stewart_drake.live.contact import parse_address
     from stewart_drake.live.endpoint import read_key
     from stewart_drake.live.page import PageViewer
     from stewart_drake.mechanism.files import load_mechanism
@@ -90,7 +90,7 @@ def live(
     check_log(options.log)
     for option, address in (("--machine", machine), ("--mirror", options.mirror)):
         if address is not None:
-            address_of(address, option)
+            parse_address(address, option)
     with contextlib.ExitStack() as running:
         viewer = None
         if not no_browser:  # its process starts while the machine is being contacted
@@ -99,7 +99,7 @@ def live(
         where = machine or running.enter_context(_demo_machine(chosen, loaded.eta))
         from stewart_drake.live import session
 
-        ready = session.prepare_session(loaded, address_of(where), key, say=delivery.say)
+        ready = session.prepare_session(loaded, parse_address(where), key, say=delivery.say)
         delivery.say_wrapped(*session.plans(ready, span, name))
         session.check_armed(ready, options.armed)
         # The demo's machine is simulated and needs no consent.

@@ -60,7 +60,7 @@ def simulate(
     from pydrake.geometry import Meshcat
 
     from stewart_drake.loop.cautions import cautions_before
-    from stewart_drake.loop.controller_margin import controller_margin, in_time
+    from stewart_drake.loop.controller_margin import controller_margin, over_wire
     from stewart_drake.loop.preparation import prepare
     from stewart_drake.reporting.run import run_document
     from stewart_drake.studies.verdict import Verdict, scenario_verdict
@@ -74,7 +74,7 @@ def simulate(
     delivery.say_link(experiment.scenario)
     margin = judged = controller_margin(experiment)
     if margin.problem and experiment.scenario.link.kind == "network":
-        judged = controller_margin(in_time(experiment))
+        judged = controller_margin(over_wire(experiment))
     delivery.say_wrapped(scenario_verdict(experiment, judged))
     if experiment.scenario.controller.command == "torque":
         delivery.say_wrapped(str(Verdict.of(judged)))

@@ -10,7 +10,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.resources import shipped
 from stewart_drake.files.schema import plain
 from stewart_drake.law.channel import Report
-from stewart_drake.law.coverage import uncovered
+from stewart_drake.law.coverage import uncovered_part
 from stewart_drake.law.gaps import LONGEST_GAP, longest_gap
 from stewart_drake.law.motion import Motion
 from stewart_drake.law.predictive_lqi import PredictiveLqi
@@ -136,7 +136,7 @@ def record(scenario: Scenario) -> Recorded:
     found: list[Recorded] = []
 
     def recorded(law: Any) -> Any:
-        problem = uncovered(law)
+        problem = uncovered_part(law)
         if problem is not None:
             raise ConfigError(_refusal(scenario, problem))
         found.append(Recorded(law, scenario.duration))

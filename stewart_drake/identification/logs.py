@@ -15,8 +15,7 @@ from stewart_drake.files.csvio import ANGLE_UNITS, LENGTH_UNITS, TORQUE_UNITS, T
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.run_log import is_run, scenario_of
-from stewart_drake.scenario.run_log import read_log as read_run
+from stewart_drake.scenario.run_log import is_run, read_log, scenario_of
 from stewart_drake.scenario.signals import COORDINATE_NAMES, LEGS, NUM_LEGS, NUM_STATE
 from stewart_drake.types import Array
 
@@ -100,7 +99,7 @@ class Precision(NamedTuple):
         return np.array([self.angle] * 6 + pose + [np.inf] * 6)
 
 
-def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bool = True) -> Log:
+def load_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bool = True) -> Log:
     """Read a log without empty rows, and with at most one row per `FINEST` s.
 
     It is that of a run: signals.nc, .mcap, .csv or a folder; else CSV of a machine, in which the
@@ -130,7 +129,7 @@ def read_log(path: Path, mechanism: Mechanism, precision: Precision, gravity: bo
 
 
 def _of_run(path: Path, mechanism: Mechanism) -> Log:
-    signals = read_run(path)
+    signals = read_log(path)
     scenario = scenario_of(signals, path)
     if "torque_commanded" not in signals or not np.isfinite(signals.torque_commanded).any():
         raise ConfigError(

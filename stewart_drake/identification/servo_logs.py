@@ -12,8 +12,7 @@ from stewart_drake.identification.logs import in_effect
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.kinematics import ForwardKinematicsError, turned
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.run_log import is_run, scenario_of
-from stewart_drake.scenario.run_log import read_log as read_run
+from stewart_drake.scenario.run_log import is_run, read_log, scenario_of
 from stewart_drake.scenario.signals import LEGS
 from stewart_drake.types import Array, Flags
 
@@ -81,7 +80,7 @@ def read_servo_log(path: Path, mechanism: Mechanism) -> ServoLog:
     if len(times) < 2 or times[-1] - times[0] < LEAST_LENGTH:
         length = float(np.ptp(times)) if len(times) else 0.0
         raise ConfigError(f"{path}: got {length:.3g} s; expected at least {LEAST_LENGTH:g} s")
-    scenario = scenario_of(read_run(path), path) if run else None
+    scenario = scenario_of(read_log(path), path) if run else None
     if scenario is not None:
         period, step = scenario.controller.period, float(np.median(gaps))
         if step > period * (1 + 1e-6):

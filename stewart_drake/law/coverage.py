@@ -21,7 +21,7 @@ _FIELDS: Final = {
 }
 
 
-def uncovered(law: PredictiveLqi | ServoPreview) -> str | None:
+def uncovered_part(law: PredictiveLqi | ServoPreview) -> str | None:
     """Return the scenario field of the first part that the core does not have, or None.
 
     A user's part counts as another kind of that field.
@@ -41,5 +41,5 @@ def uncovered(law: PredictiveLqi | ServoPreview) -> str | None:
 
 def backend(law: PredictiveLqi | ServoPreview) -> str:
     """Return `native`, with the first part of a law that is in Python."""
-    field = uncovered(law)
+    field = uncovered_part(law)
     return "native" if field is None else f"native, {field} in Python"

@@ -283,7 +283,7 @@ class Contact:
 # ---------------------------------------------------------------- finding a machine
 
 
-def address_of(text: str, option: str = "--machine") -> Address:
+def parse_address(text: str, option: str = "--machine") -> Address:
     """Return the address of HOST:PORT, which an option names."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:

@@ -17,7 +17,7 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.channel import Packets
-from stewart_drake.law.coverage import uncovered
+from stewart_drake.law.coverage import uncovered_part
 from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.limited import LimitedLqi
 from stewart_drake.law.motion import KnownMotion
@@ -195,7 +195,7 @@ def design(scenario: Scenario, machine: MachineMessage, learned: Learned = None)
     queue = first_queue(experiment, law)
     assert law.extra_torques < MOST_HISTORY
     took = _step_times(replace(law, open_loop_samples=0), planned, queue, _TRIED, np.ones(2))
-    step = min(took), uncovered(law)
+    step = min(took), uncovered_part(law)
     return Design(experiment, law, planned, queue, repeats, limit, step, learned=learned)
 
 
@@ -211,7 +211,7 @@ def _of_cranks(experiment: Experiment, machine: MachineMessage, learned: Learned
     first, _ = commands_in_flight(experiment, law, experiment.scenario.true_delay)
     rows = 1 if MachineFlags.WIRE in machine.flags else _PLAN
     took = _step_times(law, planned, first, rows, np.full(law.reports.size, np.nan))
-    step = sum(took), uncovered(law)
+    step = sum(took), uncovered_part(law)
     return Design(experiment, law, planned, first, 0, limit, step, rows, learned)
 
 

@@ -23,7 +23,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.servos import rise
 from stewart_drake.law.timeline import Timeline
-from stewart_drake.live.contact import address_of
+from stewart_drake.live.contact import parse_address
 from stewart_drake.live.design import Learned, always
 from stewart_drake.live.endpoint import read_key
 from stewart_drake.live.governor import PACE, Request
@@ -83,7 +83,7 @@ class _Asked(NamedTuple):
 
     def call(self, learned: Learned, duration: float = math.inf, plan: bool = True) -> Ready:
         """Find the machine; print the plan of a run of `duration` s."""
-        address, key = address_of(self.machine), read_key(self.options.key)
+        address, key = parse_address(self.machine), read_key(self.options.key)
         ready = prepare_session(self.scenario, address, key, learned)
         for line in plans(ready, duration, ready.design.experiment.mechanism.name) if plan else ():
             self.say(line)

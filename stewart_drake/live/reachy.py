@@ -21,7 +21,7 @@ from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.errors import ConfigError, optional
 from stewart_drake.files.yamlio import brief
 from stewart_drake.law.servos import Stiffness, rise
-from stewart_drake.live.contact import address_of
+from stewart_drake.live.contact import parse_address
 from stewart_drake.live.endpoint import Address, Endpoint, now, read_key
 from stewart_drake.live.machine import Machine, check_scenario
 from stewart_drake.live.options import MachineOptions
@@ -379,7 +379,7 @@ def open_chosen(
             opened.callback(log.close)
         how: Any = {"say": say, "log": log}
         if options.reachy:
-            daemon = Daemon(address_of(options.reachy, "--reachy"))
+            daemon = Daemon(parse_address(options.reachy, "--reachy"))
             opened.callback(daemon.close)
             _await_positions(daemon, options.reachy)
             machine: Machine = RobotMachine(experiment, endpoint, options, daemon, **how)

@@ -13,7 +13,7 @@ import numpy as np
 
 from stewart_drake.dynamics.native_functions import one_blas_thread
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.live.contact import Contact, address_of, await_free, call, open_endpoint
+from stewart_drake.live.contact import Contact, await_free, call, open_endpoint, parse_address
 from stewart_drake.live.design import (
     Design,
     Learned,
@@ -35,7 +35,7 @@ from stewart_drake.live.protocol import (
 )
 from stewart_drake.live.viewer import Viewer
 from stewart_drake.loop.cautions import delays_apart, overconfidence
-from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin, in_time
+from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin, over_wire
 from stewart_drake.loop.peer import check_samples, identity_of
 from stewart_drake.loop.preparation import Experiment, known_dynamics
 from stewart_drake.loop.recording import summarize
@@ -119,7 +119,7 @@ def prepare_session(
 def _margin(experiment: Experiment) -> ControllerMargin:
     """Judge the loop; a calibrated machine counts instead of the scenario's plant."""
     calibrated = None if experiment.calibration is None else known_dynamics(experiment)
-    return controller_margin(in_time(experiment), machine=calibrated)
+    return controller_margin(over_wire(experiment), machine=calibrated)
 
 
 def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
@@ -202,7 +202,7 @@ def open_logs(ready: Ready, options: LiveOptions, say: Callable[[str], None]) ->
     """
     scenario, logs = ready.design.experiment.scenario, list[RunLog]()
     if options.mirror is not None:
-        logs.append(UdpMirror(address_of(options.mirror, "--mirror"), scenario))
+        logs.append(UdpMirror(parse_address(options.mirror, "--mirror"), scenario))
     if options.log is not None:
         logs.append(Background(open_log(options.log, scenario), str(options.log), say))
     return logs

@@ -23,22 +23,21 @@ from stewart_drake.files.resources import resolve
 from stewart_drake.law.channel import Packets, Report
 from stewart_drake.law.compiled import Compiled
 from stewart_drake.law.counts import Counts
-from stewart_drake.law.coverage import backend
-from stewart_drake.law.coverage import uncovered as uncovered_part
+from stewart_drake.law.coverage import backend, uncovered_part
 from stewart_drake.law.motion import KnownMotion
 from stewart_drake.law.predictive_lqi import PredictiveLqi
 from stewart_drake.law.sensing import Measurement
 from stewart_drake.law.servo_preview import ServoPreview
 from stewart_drake.loop.law_design import (
+    catch_up_of,
     compose_law,
     first_queue,
-    on_its_way,
     sizing_of,
-    way_onto,
     white_errors,
+    with_catch_up,
 )
 from stewart_drake.loop.link import begun, buffer_of, wire_of
-from stewart_drake.loop.preparation import Experiment, assemble, network_of, prepare
+from stewart_drake.loop.preparation import Experiment, network_of, prepare, prepare_unchecked
 from stewart_drake.loop.results import Figures, SimulationResult, accumulated_error, figures
 from stewart_drake.loop.sensor import white_noises
 from stewart_drake.loop.servos import (
@@ -198,8 +197,8 @@ class Preparation:
         white = white_errors(experiment.scenario)
         law = compose_law(experiment, self._once(sizing_of, experiment, key=white))
         queue = experiment.torques_in_flight(law.timeline.delay).tobytes()
-        way = self._once(way_onto, experiment, law, key=(queue, law.plant.substeps))
-        law, motion, _ = on_its_way(law, experiment, way)
+        way = self._once(catch_up_of, experiment, law, key=(queue, law.plant.substeps))
+        law, motion, _ = with_catch_up(law, experiment, way)
         source = (tuner or weights_source)(experiment, law)
         return Prepared(experiment, law, motion, source)
 
@@ -253,7 +252,7 @@ def _stamp(path: Path) -> tuple[int, int]:
 # ---------------------------------------------------------------- the loop in C
 
 
-class Course(NamedTuple):
+class LoopRecord(NamedTuple):
     states: Array  # (n, 12) at the looks up to the end
     measured: Array  # (k, 12) at the samples, as the controller got them
     asked: Array  # (k, 6) torques in N m that the law asked for there
@@ -266,7 +265,7 @@ class CompiledController:
     """Law and tuner in C, or the law for servos without estimates.
 
     Args:
-        prepared: a run with a law that `law.coverage.uncovered` accepts.
+        prepared: a run with a law that `law.coverage.uncovered_part` accepts.
         tuner: `stewart_tuner`, or None.
         wanted: (k, 12) reference at each sample, for a tuner.
 
@@ -377,7 +376,7 @@ def run_loop(
     when: Instants,
     controller: CompiledController | Controller,
     law: PredictiveLqi | ServoPreview | None = None,
-) -> Course:
+) -> LoopRecord:
     """Run an experiment to its end.
 
     Args:
@@ -449,7 +448,7 @@ def run_loop(
     measured, asked = measured[: loop.taken], asked[: loop.taken]
     sent = np.clip(asked, -experiment.torque_limit, experiment.torque_limit)
     seen = plant.states[: plant.run.recorded]
-    return Course(seen, measured, asked, sent, stopped, loop.saturated)
+    return LoopRecord(seen, measured, asked, sent, stopped, loop.saturated)
 
 
 def _link(
@@ -538,7 +537,7 @@ def run_in_bulk(
     if only_drake is not None:
         if tuner is not None:
             raise ValueError(f"tuner: got one for Drake's loop ({only_drake}); expected None")
-        refused = _refused_start(assemble(scenario, truth))
+        refused = _refused_start(prepare_unchecked(scenario, truth))
         return refused or _in_drake(scenario, truth, only_drake)
     preparation = preparation_of(scenario)
     experiment = preparation.experiment(scenario, truth)
@@ -619,7 +618,7 @@ def ending_of(result: SimulationResult, loop: str = "drake") -> Ending:
     samples, signals = samples_of(result), result.signals
     so_far, weights = np.nan, np.empty((0, len(WEIGHTS)))
     if signals.sizes["time"]:
-        scale = assemble(result.scenario).scale
+        scale = prepare_unchecked(result.scenario).scale
         so_far = accumulated_error(signals.time.values, signals.error.values, scale)
         at = result.scenario.controller.period * np.arange(len(samples))
         weights = signals.weights.sel(time=at, method="nearest").values

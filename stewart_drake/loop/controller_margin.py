@@ -257,7 +257,7 @@ def controller_margin(
     )
 
 
-def in_time(experiment: Experiment) -> Experiment:
+def over_wire(experiment: Experiment) -> Experiment:
     """Return the experiment with a constant delay, as if every packet came in time.
 
     The delay is that from a measurement as old as `oldest_periods` to its torque: with

@@ -30,7 +30,7 @@ from stewart_drake.loop.law_design import control_law, first_queue, followed_mot
 from stewart_drake.loop.link import LateMeasurements
 from stewart_drake.loop.own import OwnSystems
 from stewart_drake.loop.platforms import StartCheck, add_to_torque
-from stewart_drake.loop.preparation import Experiment, concrete
+from stewart_drake.loop.preparation import Experiment, as_experiment
 from stewart_drake.loop.push import Push
 from stewart_drake.loop.servos import (
     PositionServos,
@@ -140,7 +140,7 @@ def build_closed_loop(
         ConfigError: bad input, an unreachable reference.
         TypeError: systems of the user with a prepared scenario, which has its own.
     """
-    experiment = concrete(scenario, true_mechanism, **own)
+    experiment = as_experiment(scenario, true_mechanism, **own)
     experiment.own.claim(experiment.scenario)
     builder = DiagramBuilder()
     sc, network = experiment.scenario, experiment.network

@@ -370,13 +370,13 @@ def longest_wait(scenario: Scenario) -> int:
 def control_law(experiment: Experiment) -> tuple[PredictiveLqi, Trajectory, float]:
     """Return the law, the motion that it follows, and the length of the blend, s."""
     law = compose_law(experiment)
-    return on_its_way(law, experiment, way_onto(experiment, law))
+    return with_catch_up(law, experiment, catch_up_of(experiment, law))
 
 
-def on_its_way(
+def with_catch_up(
     law: PredictiveLqi, experiment: Experiment, way: CatchUp | None
 ) -> tuple[PredictiveLqi, Trajectory, float]:
-    """Return `control_law` for a composed law and its `way_onto` the reference."""
+    """Return `control_law` for a composed law and its `catch_up_of` the reference."""
     sc, motion, length = experiment.scenario, experiment.reference, 0.0
     if way is not None:
         motion, length = way.plan(sc.controller.catch_up, experiment.planned_limit)
@@ -469,7 +469,7 @@ def tolerated_timing(experiment: Experiment, frequency: float) -> float:
     return TOLERATED / (bandwidth * (1 + late)) if bandwidth else math.inf
 
 
-def way_onto(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
+def catch_up_of(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
     """Return the plans onto the reference after a start from rest, or None without them.
 
     A reference that goes on from the plate's state when the first torque acts needs none.

@@ -204,7 +204,7 @@ def prepare(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHI
     Raises:
         ConfigError: one line; also where the reference leaves the workspace, with time and leg.
     """
-    experiment = assemble(scenario, truth, own)
+    experiment = prepare_unchecked(scenario, truth, own)
     check_reach(experiment)
     outside = diagnose(experiment.truth, 0.0, experiment.start[POSE])
     if outside is not None:
@@ -251,7 +251,7 @@ def _units_hint(experiment: Experiment) -> str:
     return ""
 
 
-def concrete(
+def as_experiment(
     scenario: Scenario | str | Path | Experiment,
     true_mechanism: Mechanism | None = None,
     settings: Iterable[str] = (),
@@ -278,7 +278,9 @@ def concrete(
     return scenario
 
 
-def assemble(scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHING) -> Experiment:
+def prepare_unchecked(
+    scenario: Scenario, truth: Mechanism | None = None, own: Own = NOTHING
+) -> Experiment:
     """Prepare a scenario without the check of its reference."""
     scenario.check()
     network = network_of(scenario)

@@ -18,7 +18,7 @@ from stewart_drake.loop.controller_margin import ControllerMargin, controller_ma
 from stewart_drake.loop.diagram import ClosedLoop, PlantDiagram, build_closed_loop
 from stewart_drake.loop.exact import set_accuracy
 from stewart_drake.loop.own import OwnLaw, OwnReference, OwnSystem
-from stewart_drake.loop.preparation import Experiment, concrete
+from stewart_drake.loop.preparation import Experiment, as_experiment
 from stewart_drake.loop.recording import Recorder, summarize
 from stewart_drake.loop.results import SimulationResult
 from stewart_drake.loop.sampling import dispose
@@ -95,7 +95,7 @@ def simulate(
     """
     # Matrices of twenty rows are slower on several threads, up to fifty times on busy cores.
     with one_blas_thread:
-        experiment = concrete(
+        experiment = as_experiment(
             scenario,
             true_mechanism,
             settings,

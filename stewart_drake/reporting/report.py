@@ -16,7 +16,7 @@ import numpy as np
 
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.resources import shipped
-from stewart_drake.loop.preparation import assemble, simulated_machine
+from stewart_drake.loop.preparation import prepare_unchecked, simulated_machine
 from stewart_drake.loop.results import SimulationResult, accumulated_error
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
@@ -145,7 +145,7 @@ def collect(
     """
     settings = setting_texts(settings)
     scenario = load_compatible(scenario_name, controller, settings)
-    failure = assemble(scenario).reference_failure()
+    failure = prepare_unchecked(scenario).reference_failure()
     scenarios: dict[str, Scenario] = {}
     rows: set[str] = set()
     if failure is None:
@@ -385,7 +385,8 @@ def _second_half(run: SimulationResult) -> str:
     if half <= run.scenario.eta:
         return ""
     late = run.signals.sel(time=slice(half, None))
-    after = accumulated_error(late.time.values, late.error.values, assemble(run.scenario).scale)
+    scale = prepare_unchecked(run.scenario).scale
+    after = accumulated_error(late.time.values, late.error.values, scale)
     between = s["accumulated_error"] - s["delay_floor"] - after
     return f", {number(between)} % s until half of the run, and {number(after)} % s after it"
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from stewart_drake.loop.preparation import assemble, check_instants
+from stewart_drake.loop.preparation import check_instants, prepare_unchecked
 from stewart_drake.loop.results import (
     LEAST_MEASURED,
     STILL,
@@ -186,7 +186,7 @@ def comparison_document(
     )
     context: dict[str, Any] = {}
     if table_two:
-        whole, sc = assemble(Scenario()), paper[added[0]].scenario
+        whole, sc = prepare_unchecked(Scenario()), paper[added[0]].scenario
         assert whole.scenario.reference.kind == "sine" and sc.reference.kind == "sine"
         instants = check_instants(whole.scenario.duration)
         context = {

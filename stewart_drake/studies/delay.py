@@ -20,11 +20,11 @@ from stewart_drake.loop.controller_margin import (
     POLE_INSTANTS,
     ControllerMargin,
     controller_margin,
-    in_time,
+    over_wire,
     pole_in_motion,
 )
 from stewart_drake.loop.law_design import cost_of
-from stewart_drake.loop.preparation import assemble
+from stewart_drake.loop.preparation import prepare_unchecked
 from stewart_drake.loop.results import delay_floor, waits_at_rest
 from stewart_drake.mechanism.assembly import torque_map
 from stewart_drake.mechanism.trajectories import evaluate
@@ -137,7 +137,7 @@ class DelayStudy:
     # the scenario's loop along the reference, as far as that can be followed; None if it cannot be
     # followed at all
     controller: ControllerMargin | None
-    eta: float  # total delay, over a network that of `in_time`, s
+    eta: float  # total delay, over a network that of `over_wire`, s
     poles: list[PolePoint]  # along the reference, as far as it can be followed
     growths: list[Growth]  # simulated checks of e^(p eta); none if nothing grows
     floors: dict[int, float]  # E_ac in % s of a plate that waits at rest, by whole periods of delay
@@ -236,7 +236,7 @@ def study_delay(
             )
             for steps in {delay.steps, *map_delays(delay.steps)}
         }
-        timed = found._replace(experiment=in_time(found.experiment))
+        timed = found._replace(experiment=over_wire(found.experiment))
         eta = timed.experiment.scenario.eta
         own = controller_margin(timed.experiment, found.followed_until) if poles else None
         return DelayStudy(
@@ -425,7 +425,7 @@ def delay_map(scenario: Scenario, progress: Progress | None = None) -> tuple[lis
         variant = replace(exact, reference=motion, delay=replace(scenario.delay, steps=steps))
         key = f"mu{steps}-x{factor}"
         cells[key] = Cell(steps, factor, "not_run", math.nan, math.nan)
-        if failure := assemble(variant).reference_failure():
+        if failure := prepare_unchecked(variant).reference_failure():
             cells[key] = cells[key]._replace(status="out_of_reach", time=float(failure.time))
         else:
             variants[key] = variant

@@ -28,7 +28,7 @@ from stewart_drake.files.resources import resolve
 from stewart_drake.files.yamlio import yaml_text
 from stewart_drake.loop.bulk import run_in_bulk
 from stewart_drake.loop.clearance import ClearanceScene
-from stewart_drake.loop.preparation import Experiment, assemble, check_instants
+from stewart_drake.loop.preparation import Experiment, check_instants, prepare_unchecked
 from stewart_drake.mechanism.files import (
     MechanismSpec,
     build_mechanism,
@@ -311,7 +311,8 @@ def problem_of(scenario: Scenario, options: LayoutOptions) -> Problem:
     calibration = scenario.controller.calibration
     fixed = {"plant.mechanism": scenario.plant.mechanism, "controller.calibration": calibration}
     refuse(fixed, "where the machine is searched for; expected null")
-    experiment, spec = assemble(scenario), mechanism_spec(resolve("mechanism", scenario.mechanism))
+    experiment = prepare_unchecked(scenario)
+    spec = mechanism_spec(resolve("mechanism", scenario.mechanism))
     space = space_around(spec, options.vary or {}, options.keep)
     crank = own_numbers(spec)["crank"]
     usual = {"reach": _REACH * crank, "clearance": _APART * crank, **_USUAL}
@@ -378,7 +379,7 @@ def search(
 def judge(problem: Problem, machine: str) -> bytes:
     """Measure a machine, by name or file, at all instants, and run it; return the file."""
     scenario = dataclasses.replace(problem.scenario, mechanism=machine)
-    experiment = assemble(scenario)
+    experiment = prepare_unchecked(scenario)
     mechanism, time = experiment.mechanism, check_instants(scenario.duration)
     motion = motion_of(mechanism.home, experiment.reference, time)
     links = ClearanceScene(mechanism, base=False)

@@ -9,8 +9,8 @@ import numpy as np
 from stewart_drake.dynamics.workspace import Failure, diagnose
 from stewart_drake.law.stability import amplification
 from stewart_drake.law.startup import least_torque, reference_torques
-from stewart_drake.loop.controller_margin import ControllerMargin, fastest_in_motion, in_time
-from stewart_drake.loop.preparation import REACH_CHECK_PERIOD, Experiment, assemble
+from stewart_drake.loop.controller_margin import ControllerMargin, fastest_in_motion, over_wire
+from stewart_drake.loop.preparation import REACH_CHECK_PERIOD, Experiment, prepare_unchecked
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.link import oldest_periods
@@ -45,7 +45,7 @@ class Assessment(NamedTuple):
 
 def assess(scenario: Scenario) -> Assessment:
     """Assess a scenario whose mechanism can be assembled at its home pose."""
-    experiment = assemble(scenario)
+    experiment = prepare_unchecked(scenario)
     mechanism, reference = experiment.mechanism, experiment.reference
     failure = experiment.reference_failure()
     end, torque = scenario.duration, 0.0
@@ -112,7 +112,7 @@ class Verdict:
 
 
 def scenario_verdict(experiment: Experiment, loop: ControllerMargin) -> str:
-    """Return `loop_verdict` after its conditions: packets of `in_time`, and strong motors."""
+    """Return `loop_verdict` after its conditions: packets of `over_wire`, and strong motors."""
     sc, conditions = experiment.scenario, []
     if sc.link.kind == "network" and not loop.problem:
         conditions.append("every packet is in time")
@@ -175,8 +175,8 @@ def loop_word(margin: MarginSummary | None) -> str:
 
 
 def delay_verdict(experiment: Experiment) -> Verdict:
-    """Judge the true delay, of `in_time`, by the open loop's poles along the reference."""
-    sc = in_time(experiment).scenario
+    """Judge the true delay, of `over_wire`, by the open loop's poles along the reference."""
+    sc = over_wire(experiment).scenario
     fastest = fastest_in_motion(experiment, experiment.true_dynamics(), sc.duration)
     return Verdict(sc.eta, *fastest, sc.controller.period)
 

@@ -10,7 +10,12 @@ from pydrake.trajectories import Trajectory
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import Failure, diagnose
-from stewart_drake.loop.preparation import Experiment, assemble, check_instants, first_pose_text
+from stewart_drake.loop.preparation import (
+    Experiment,
+    check_instants,
+    first_pose_text,
+    prepare_unchecked,
+)
 from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.mechanism.trajectories import poses_along, rows_along
 from stewart_drake.scenario.config import Scenario
@@ -184,7 +189,7 @@ class WorkspaceStudy:
 
 def study_workspace(scenario: Scenario) -> WorkspaceStudy:
     """Judge a scenario's reference; one that leaves the workspace is analysed, not refused."""
-    experiment = assemble(scenario)
+    experiment = prepare_unchecked(scenario)
     mechanism, reference = experiment.mechanism, experiment.reference
     time = check_instants(scenario.duration)
     left = first_exit(mechanism, reference, time)
