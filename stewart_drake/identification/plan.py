@@ -50,6 +50,7 @@ from stewart_drake.loop.preparation import Experiment
 from stewart_drake.mechanism.geometry import Mechanism
 from stewart_drake.mechanism.trajectories import poses_along, rows_along
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.link import number_sent
 from stewart_drake.scenario.reference_config import CsvConfig
 from stewart_drake.scenario.signals import COORDINATE_NAMES, COORDINATE_UNITS, NUM_STATE
 from stewart_drake.types import Array
@@ -235,7 +236,7 @@ def _predicted(experiment: Experiment, motion: PiecewisePolynomial, end: float, 
     sc, mechanism = experiment.scenario, experiment.mechanism
     dynamics = StewartDynamics(mechanism, experiment.nominal.gravity)
     period, eta = sc.controller.period, sc.eta
-    sent: Array = period * np.arange(int(end / period + 1e-9) + 1, dtype=np.float64)
+    sent: Array = period * np.arange(number_sent(end, period), dtype=np.float64)
     # The motion rests after its end.
     starts = np.minimum(sent + eta, end)
     torques = mean_torques(dynamics, motion, starts, np.minimum(starts + period, end))

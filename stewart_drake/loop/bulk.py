@@ -56,6 +56,7 @@ from stewart_drake.scenario.dependencies import Accepted, differing
 from stewart_drake.scenario.link import (
     forward_times,
     measurement_times,
+    number_sent,
     torque_delays,
 )
 from stewart_drake.scenario.loading import scenario_to_dict
@@ -641,8 +642,8 @@ def samples_of(result: SimulationResult) -> Array:
     if not signals.sizes["time"]:
         return np.empty((0, len(TUNER_INPUTS)))
     # A logged value holds from its time on, so that at k dt is T_k.
-    number = int(float(signals.time.values[-1]) / sc.controller.period + 1e-9) + 1
-    at = sc.controller.period * np.arange(number)
+    period = sc.controller.period
+    at = period * np.arange(number_sent(signals.time.values[-1], period))
     kept = signals.sel(time=at, method="nearest")
     wanted = np.hstack([kept.reference, kept.reference_rates])
     state = kept.measurement if sc.sensor.measures_state else kept.state_estimate

@@ -39,6 +39,7 @@ from stewart_drake.loop.results import SimulationResult, accumulated_error
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import ControllerConfig, Scenario
+from stewart_drake.scenario.link import number_sent
 from stewart_drake.scenario.signals import CONSTANTS, NUM_PARAMETERS, POSE, RATES
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.study_options import LearnOptions
@@ -273,7 +274,7 @@ def _last_samples(
     """
     sc, signals = experiment.scenario, result.signals
     dt, time = sc.controller.period, signals.time.values
-    wanted = dt * np.arange(math.floor(time[-1] / dt + 1e-9) + 1)
+    wanted = dt * np.arange(number_sent(time[-1], dt))
     rows = np.searchsorted(time, wanted - 1e-6)
     first = max(0, len(rows) - 1 - round(period / dt))
     measured = sc.sensor.measures_state and sc.sensor.delay == 0
