@@ -229,7 +229,8 @@ def figure(curves: Sequence[dict[str, Curve]]) -> Figure:
             panel.loglog(curve.time, curve.error, styles[family], ms=3.5, lw=1.2, label=family)
         panel.set(title=motion.title, xlabel="computing time, ms per simulated s")
     panels[0].set_ylabel("pose error at the end, rad or m")
-    panels[1].legend(fontsize=7)
+    shown = panels[0].get_legend_handles_labels()
+    drawn.legend(*shown, loc="outside upper center", ncols=6, fontsize=7)
     return drawn
 
 

@@ -49,6 +49,7 @@ BAD_ARGUMENTS = [
         ["simulate", "paper", "--set", "controller.w_R="],
         "error: --set: controller.w_R: got no value; expected a value, or null for none\n",
     ),
+    (["compare", "paper", "--set", "controler.w_R=3"], "error: --set: controler: unknown key; did"),
     (["simulate", "--csv"], "--csv: got it without --out; expected --out DIR to write into"),
     (["simulate", "--replay"], "--replay: got it without --out; expected --out DIR to write into"),
     (["simulate", "--log", "run.txt"], "--log: got 'run.txt'; expected a file that ends in .mcap"),

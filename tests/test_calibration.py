@@ -251,15 +251,15 @@ def test_what_cannot_be_used_is_refused_in_one_line(file, change, given, message
 
 
 def test_a_calibrated_delay_that_makes_the_loop_unstable_is_named(file):
-    for delay, said in ((0.79, ["the delay of controller.calibration, 0.79 s"]), (0.8, [])):
+    for delay, said in ((0.79, ["a delay of 0.79 s (controller.calibration)"]), (0.8, [])):
         save_calibration(file, dataclasses.replace(KNOWN, mean=np.array([0.4, 1e-3, 5e-4, delay])))
         found = experiment(f"controller.calibration={file}", "plant.kind=exact")
         lines = cautions_before(found, sd.controller_margin(found))
         assert len(lines) == len(said) and all(map(str.__contains__, lines, said))
     found = experiment("controller.delay_steps=7", "plant.kind=exact")
     lines = cautions_before(found, sd.controller_margin(found))
-    assert len(lines) == 1 and "0.7 s, where that of the scenario is 0.8 s" in lines[0]
-    assert "a controller.delay_estimator" in lines[0]
+    assert len(lines) == 1 and "assumes a delay of 0.7 s (controller.delay_steps" in lines[0]
+    assert "the scenario's is 0.8 s: leave both out, or set controller.delay_est" in lines[0]
 
 
 def test_what_is_known_is_worth_something(file):

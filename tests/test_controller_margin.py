@@ -415,6 +415,9 @@ def test_a_range_without_room_is_called_so():
     """With gravity an error of 1 us is multiplied by 1e8 over 0.8 s."""
     said = loop_verdict(judged(scenario("plant.kind=exact", "plant.gravity=true", "duration=1")))
     assert "stable in exact arithmetic only" in said and "-0 ms" not in said
+    blind = ("plant.kind=exact", "plant.gravity=true", "duration=1", "controller.period=0.02")
+    said = loop_verdict(judged(scenario(*blind, "delay.steps=0", controller="lqr_gravity")))
+    assert "from any time (true delay shorter) to +" in said
     said = loop_verdict(judged(scenario("plant.kind=exact", "duration=1")))
     assert re.search(r"longer\), 0\.23 % of the delay, and", said)
     assert said.endswith("; a larger controller.w_R widens it")

@@ -260,8 +260,8 @@ def test_the_command_writes_what_a_run_uses(tmp_path, capsys, monkeypatch):
     settings = [word for one in (*EXACT, *LAW, *UNKNOWN) for word in ("--set", one)]
     out = Path("out")
     assert main(["learn", "paper", *settings, "--repetitions", "2", "--out", str(out)]) == 0
-    text = capsys.readouterr().out
-    assert "Learning lowers E" in text and "learned.npz" in text
+    text, told = capsys.readouterr()
+    assert "Learning lowers E" in text and "learned.npz" in text and "from before" not in told
     assert max(map(len, text.splitlines())) <= 80
     page = (out / "report.html").read_text()
     assert page.count("<iframe") == 2

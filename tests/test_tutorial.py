@@ -96,9 +96,11 @@ def test_a_machine_and_a_motion_of_one_s_own(do, monkeypatch):
     assert own[0]["status"] == "completed" and own[0]["accumulated_error"] < 1
     assert own[1]["status"] == "left_workspace"
     assert "completed" in told["simulate waves.yaml --set plant.payload_mass=0.4"]
-    for words in ("--set delay.steps=5 --set controller.delay_steps=4", "--controller lqi"):
+    for words in ("--set delay.steps=5 --set controller.delay_steps=4", "--controller lqr_gravity"):
         out = told[f"simulate waves.yaml {words}"]
         assert "left workspace at" in out and re.search(r"leg \d", out)
+    assert main(f"simulate waves.yaml {words} --set delay.steps=0 --out out/prompt".split()) == 0
+    assert summary("prompt")["status"] == "completed"
     assert "completed" in told[SLOW]
     given = SLOW.split()
     for name, words in {

@@ -14,7 +14,7 @@ import typer
 
 import stewart_drake as sd
 from stewart_drake.cli import analyze, identify, live, model, run, tune
-from stewart_drake.cli.common import AT_EXIT, INTERRUPTED
+from stewart_drake.cli.common import AT_EXIT, INTERRUPTED, named
 from stewart_drake.cli.examples import add_examples
 from stewart_drake.files.errors import ConfigError, resembling
 from stewart_drake.files.resources import KINDS, shipped
@@ -55,7 +55,8 @@ def main(arguments: list[str] | None = None) -> int:
     if option := _without_value(words):
         return _complain(f"{option}: got ''; expected a value")
     try:
-        return _command().main(arguments, "stewart-drake", standalone_mode=False) or 0
+        with named(settings="--set"):
+            return _command().main(arguments, "stewart-drake", standalone_mode=False) or 0
     except _UsageError as error:
         return _complain(_usage_message(error, words))
     except typer.Abort:  # Ctrl-C

@@ -80,8 +80,7 @@ class Chosen(NamedTuple):
 
     def load(self, *settings: str) -> Scenario:
         """Return the scenario with these settings, which the typed ones may replace."""
-        with named(settings="--set"):
-            return load_scenario(self.scenario, self.controller, (*settings, *self.settings))
+        return load_scenario(self.scenario, self.controller, (*settings, *self.settings))
 
     @property
     def title(self) -> str:

@@ -54,13 +54,13 @@ def delays_apart(experiment: Experiment, margin: ControllerMargin) -> str | None
     chosen, blind = sc.controller.delay_steps is not None, sc.controller.delay_steps == 0
     if margin.stable or margin.delay_found or blind or math.isclose(assumed, sc.eta):
         return None
-    source, remedy = "controller.calibration", "the same, by delay.steps and delay.fraction"
+    source, remedy = "controller.calibration", "set delay.steps and delay.fraction to it"
     if chosen:
         source = "controller.delay_steps and controller.delay_fraction"
-        remedy = "the same, as without both, or a controller.delay_estimator"
+        remedy = "leave both out, or set controller.delay_estimator"
     return (
-        f"the loop is unstable, and its controller assumes the delay of {source}, "
-        f"{assumed:.6g} s, where that of the scenario is {sc.eta:.6g} s: expected {remedy}"
+        f"the loop is unstable, and its controller assumes a delay of {assumed:.6g} s ({source}), "
+        f"the scenario's is {sc.eta:.6g} s: {remedy}"
     )
 
 

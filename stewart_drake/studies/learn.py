@@ -182,6 +182,8 @@ def study_learn(
     interrupted = few = False
     lacking = lacking_torques if lessons.lag is None else lacking_angles
     for k in range(options.repetitions):
+        if progress is not None:
+            progress(k, options.repetitions)
         sensor = replace(run.sensor, seed=run.sensor.seed + k)
         law = partial(with_learned, learned=learned)
         result = simulate(replace(run, sensor=sensor), modify_law=law, judge_stability=False)
@@ -189,8 +191,6 @@ def study_learn(
             break
         lessons.errors.append(last_error(result, experiment.scale, period))
         done.append(Repetition(learned, result, lessons.errors[-1]))
-        if progress is not None:
-            progress(k + 1, options.repetitions)
         # The samples before a loss are those of another motion, far outside of the model.
         if result.stopped or lessons.ended or len(done) == options.repetitions:
             break
