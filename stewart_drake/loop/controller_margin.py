@@ -3,7 +3,8 @@
 Law and plant are linearised at instants along the reference, and each loop is judged as if that
 state of motion lasted ("frozen"): `law.stability`. The plant is the true one, with its payload,
 friction, dimensions and delay. The law has the delay it believes in, its model, its prediction and
-its initial weights. Left out are
+its initial weights. A controller of the user's own is linearised by differences: `own_loop`. Left
+out are
 
 - the estimator: a law with one is judged as if it had found torque bias, payload, friction and, if
   it estimates that, the delay;
@@ -52,7 +53,9 @@ from stewart_drake.law.stability import (
     worst_margins,
 )
 from stewart_drake.loop.law_design import DesignedLaw, compose_law, longest_wait
-from stewart_drake.loop.preparation import Experiment, prepare
+from stewart_drake.loop.own import OwnSystem
+from stewart_drake.loop.own_loop import OwnLoop, UnjudgedError, linearised
+from stewart_drake.loop.preparation import Experiment, concrete, prepare
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.mechanism.trajectories import evaluate, poses_along
 from stewart_drake.scenario.calibration import believed_delay
@@ -65,6 +68,7 @@ from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     COORDINATES,
     LEGS,
+    NUM_STATE,
     NUM_TORQUES,
     POSE,
     RATES,
@@ -182,7 +186,11 @@ class ControllerMargin:
 
 
 def controller_margin(
-    loop: Judged, until: float | None = None, machine: StewartDynamics | None = None
+    loop: Judged,
+    until: float | None = None,
+    machine: StewartDynamics | None = None,
+    *,
+    controller: OwnSystem | None = None,
 ) -> ControllerMargin:
     """Judge stability and margins of a loop along its reference.
 
@@ -193,12 +201,19 @@ def controller_margin(
             machine and the delay that it assumes.
         until: s; None is the duration, or the horizon of the design.
         machine: the machine that the law drives; None is that of the scenario's plant.
+        controller: your own in place of the scenario's, as of `simulate`: its class, or a function
+            that makes one. It is linearised by differences, and may have discrete state.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
     """
-    experiment = _experiment_of(loop)
-    sc = experiment.scenario
+    if controller is None:
+        experiment = _experiment_of(loop)
+    elif isinstance(loop, DesignedLaw):
+        raise ConfigError("controller: got one with a designed law; expected one with a scenario")
+    else:
+        experiment = concrete(loop, controller=controller)
+    sc, own = experiment.scenario, experiment.own.systems.get("controller")
     end = sc.duration if until is None else float(fixed("until", until, (), 0.0))
     if sc.controller.command != "torque":
         # The loops of servos are checked where the servos are made.
@@ -234,7 +249,11 @@ def controller_margin(
     else:
         every = math.ceil((max(rows, _COSTLY) / _COSTLY) ** 3)
         chosen = times[:: min(every, INSTANTS // _FEWEST)]
-        loops = _loops(experiment, truth, law, chosen)
+        try:
+            loops = (_loops if own is None else _own_loops)(experiment, truth, law, chosen)
+        except UnjudgedError as error:
+            problem = str(error)
+    if loops:
         radii = [spectral_radius(loop.matrix()) for loop in loops]
         worst = int(np.argmax(radii))
         radius, time = radii[worst], float(chosen[worst])
@@ -247,10 +266,10 @@ def controller_margin(
         margins=margins,
         pole=pole,
         pole_time=pole_time,
-        estimated=law.estimates,
-        delay_found=law.finds_delay,
+        estimated=law.estimates and own is None,
+        delay_found=law.finds_delay and own is None,
         tuned=experiment.tuned,
-        weighted=sc.controller.kind == "lqi",
+        weighted=sc.controller.kind == "lqi" and own is None,
         problem=problem,
         loops=tuple(loops),
         span=end,
@@ -350,6 +369,33 @@ def _loops(
             gain = _gain(experiment, truth, law, t)
         plant = true_model(experiment, truth, t)
         loops.append(LinearLoop(plant, gain, law.timeline.period, sc.true_delay, integrates))
+    return loops
+
+
+def _own_loops(
+    experiment: Experiment, truth: StewartDynamics, _: PredictiveLqi, times: Array
+) -> list[LinearLoop]:
+    """Return the loops of the user's controller.
+
+    Raises:
+        UnjudgedError: see `own_loop.linearised`.
+    """
+    sc, loops, n = experiment.scenario, list[LinearLoop](), NUM_TORQUES
+    if (system := experiment.own.another("controller")) is None:
+        raise UnjudgedError(
+            "its controller was given as an instance; its class, or a function that makes one, is "
+            "judged"
+        )
+    try:
+        found = linearised(system, experiment, times)
+    except UnjudgedError:
+        raise
+    except Exception as error:  # of the user's code; the run raises it where it belongs
+        raise UnjudgedError(f"its controller fails on the reference: {error}") from error
+    for t, J in zip(times, found, strict=True):
+        plant, parts = true_model(experiment, truth, t), (J[n:, NUM_STATE:], J[n:, :NUM_STATE])
+        period = sc.controller.period
+        loops.append(OwnLoop(plant, -J[:n], period, sc.true_delay, False, *parts))
     return loops
 
 
