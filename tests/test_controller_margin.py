@@ -257,6 +257,8 @@ def test_the_margin_of_an_own_controller_is_that_of_the_same_law():
         assert (now.gain_down, now.gain_up) == pytest.approx(gains, rel=3e-3)
         assert now.longer == pytest.approx(then.longer, rel=3e-3)
         assert "w_R" not in str(found)
+        models = sd.linear_models(sc, 0.0, controller=lambda p=period: Feedback(law, p))
+        assert np.abs(models.S.poles()).max() == pytest.approx(expected.radius, rel=1e-6)
     run = sd.simulate(early, ("duration=0.1",), controller=lambda: Feedback(law, 0.02))
     assert run.summary["controller_margin"]["stable"] is expected.stable
 
