@@ -44,7 +44,7 @@ from stewart_drake.reporting.results import (
 )
 from stewart_drake.scenario.calibration import save_calibration
 from stewart_drake.scenario.config import Scenario
-from stewart_drake.scenario.loading import as_scenario, scenario_yaml
+from stewart_drake.scenario.loading import as_scenario, scenario_yaml, setting_texts
 from stewart_drake.scenario.run_log import is_run
 from stewart_drake.studies.jobs import Progress
 from stewart_drake.studies.new_machine import check_mechanism, new_machine
@@ -134,6 +134,7 @@ def refuse_for_runs(logs: Iterable[str | Path], options: Mapping[str, object]) -
 
 def plan_identification(
     scenario: Scenario | str | Path,
+    settings: Iterable[str] = (),
     *,
     poses: bool = False,
     tolerances: Tolerances | Mapping[str, float] | None = None,
@@ -147,13 +148,16 @@ def plan_identification(
 
     Args:
         scenario: of the machine; a shipped name or a path.
+        settings: as `load_scenario` takes them.
         poses: whether poses are measured, not only crank angles.
         tolerances, precision: as of `identify`; by default the encoders of the scenario count.
         command: that the page names; by default the call of this function.
     """
     tolerances, precision = _expected(tolerances, precision)
-    loaded = as_scenario(scenario)
-    typed = command or f"sd.plan_identification({scenario!r})"
+    settings = list(setting_texts(settings))
+    loaded = as_scenario(scenario, settings=settings)
+    more = f", {settings}" if settings else ""
+    typed = command or f"sd.plan_identification({scenario!r}{more})"
     if loaded.actuator.kind == "position_servo":
         if poses or tolerances is not None:
             raise ConfigError(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import LeafSystem
 
 import stewart_drake as sd
 from stewart_drake.cli import main
@@ -208,6 +209,70 @@ def test_what_is_known_of_the_papers_loops():
     assert light.stable  # but at home only
     verdicts = {name: judged(scenario(controller=name)).stable for name in CONTROLLERS}
     assert verdicts == dict.fromkeys(CONTROLLERS, False) | {"predictor_lqi": True}
+
+
+class Feedback(LeafSystem):
+    """u = K (r - y), at once or, from its discrete state, a period later."""
+
+    def __init__(self, K, period=None):
+        super().__init__()
+        self.K = K
+        self.DeclareVectorInputPort("measurement", 12)
+        self.DeclareVectorInputPort("reference", 18)
+        if period is None:
+            self.DeclareVectorOutputPort("torque", 6, lambda c, y: y.SetFromVector(self.torque(c)))
+        else:
+            last = self.DeclareDiscreteState(6)
+            self.DeclareStateOutputPort("torque", last)
+            self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self.update)
+
+    def torque(self, context):
+        wanted = self.GetInputPort("reference").Eval(context)[:12]
+        return self.K @ (wanted - self.GetInputPort("measurement").Eval(context))
+
+    def update(self, context, state):
+        state.set_value(self.torque(context))
+
+
+class Counting(Feedback):
+    """State that is not in the Context."""
+
+    def torque(self, context):
+        self.K = 1.1 * self.K
+        return super().torque(context) + self.K[:, 0]
+
+
+def test_the_margin_of_an_own_controller_is_that_of_the_same_law():
+    """A period in its state counts as a period of delay."""
+    early, late = (
+        scenario(*HOLD, f"delay.steps={n}", "controller.period=0.02", controller="lqr")
+        for n in (1, 2)
+    )
+    expected, law = judged(late), judged(early).loops[0].K
+    for sc, period in ((late, None), (early, 0.02)):
+        found = sd.controller_margin(sc, controller=lambda p=period: Feedback(law, p))
+        assert found.radius == pytest.approx(expected.radius, rel=1e-6)
+        now, then = found.margins, expected.margins
+        gains = then.gain_down, then.gain_up
+        assert (now.gain_down, now.gain_up) == pytest.approx(gains, rel=3e-3)
+        assert now.longer == pytest.approx(then.longer, rel=3e-3)
+        assert "w_R" not in str(found)
+        models = sd.linear_models(sc, 0.0, controller=lambda p=period: Feedback(law, p))
+        assert np.abs(models.S.poles()).max() == pytest.approx(expected.radius, rel=1e-6)
+    run = sd.simulate(early, ("duration=0.1",), controller=lambda: Feedback(law, 0.02))
+    assert run.summary["controller_margin"]["stable"] is expected.stable
+
+
+def test_what_has_no_linear_model_is_not_judged():
+    sc, K = scenario(*HOLD, "duration=1", "delay.steps=1"), np.zeros((6, 12))
+    for controller, reason in (
+        (Feedback(K), "was given as an instance; its class"),
+        (lambda: Feedback(K, 0.05), "does not update once every 0.1 s"),
+        (lambda: Counting(K + 1), "not a function of its inputs and its Context"),
+        (lambda: Feedback(np.zeros((6, 11))), "fails on the reference"),
+    ):
+        found = sd.controller_margin(sc, controller=controller)
+        assert found.stable is None and reason in found.problem
 
 
 def test_a_delay_of_very_many_periods_is_not_judged_but_reported():

@@ -321,8 +321,7 @@ def test_a_plan_counts_with_the_encoders_of_its_scenario():
     """2 pi / 2^n / sqrt(12) of n bits, 14 where the scenario measures the state."""
     said, delays = [], []
     for encoders in ((), ("sensor={kind: encoders, bits: 10, samples: 1}",)):
-        settings = (*encoders, "plant.kind=exact", "duration=2")
-        found = sd.plan_identification(sd.load_scenario("paper", settings=settings))
+        found = sd.plan_identification("paper", (*encoders, "plant.kind=exact", "duration=2"))
         said.append(" ".join(str(found).split()))
         delays.append(found.study.std[DELAY])
     assert "crank angles to ± 0.11 mrad" in said[0] and "crank angles to ± 1.8 mrad" in said[1]

@@ -163,6 +163,24 @@ def with_gravity(builder, g=None, X_PB=None, parent=None, gravity=True):
     return sd.AddStewartPlatform(builder, PAPER, config, plant=plant, X_PB=X_PB, parent=parent)
 
 
+def test_a_base_may_tilt_under_gravity():
+    """It moves as an upright one does under gravity that is turned the other way round."""
+
+    def welded(builder, g_W, X_WB):
+        plant, _ = AddMultibodyPlantSceneGraph(builder, 1e-3)
+        plant.mutable_gravity_field().set_gravity_vector(g_W)
+        config = sd.PlantConfig(gravity=True)
+        platform = sd.AddStewartPlatform(builder, PAPER, config, plant=plant, X_PB=X_WB)
+        plant.Finalize()
+        return platform
+
+    down = np.array([0, 0, -9.81])
+    turned = TILTED.rotation().inverse().multiply(down)
+    tilted = run(lambda b: welded(b, down, TILTED), state=MOVING)
+    np.testing.assert_allclose(tilted, run(lambda b: welded(b, turned, None), state=MOVING))
+    assert np.abs(tilted - run(lambda b: welded(b, down, None), state=MOVING)).max() > 1e-2
+
+
 def on_a_table(plant, X_WT=TILTED, weld=True):
     """Return a frame, upright again, of a table that is welded to the world, as its parent."""
     table = plant.AddRigidBody("table", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
@@ -359,11 +377,11 @@ def own_plant(builder, finalized, time_step=1e-3):
             "not finalized; expected GetInputPort and GetOutputPort after plant.Finalize()",
         ),
         (
-            lambda b: with_gravity(b, X_PB=TILTED),
+            lambda b: with_gravity(b, X_PB=TILTED).dynamics,
             "X_PB: got a base whose z is 28.6 degrees from the plant's gravity; expected 0",
         ),
         (
-            lambda b: with_gravity(b, parent=lambda plant: on_a_table(plant, weld=False)),
+            lambda b: with_gravity(b, parent=lambda plant: on_a_table(plant, weld=False)).dynamics,
             "parent: got top, a frame that can move; expected one that is welded",
         ),
         (changed_gravity, "[0.0, 0.0, -1.62], [0.0, 0.0, -9.81] when the platform was added"),
@@ -371,6 +389,7 @@ def own_plant(builder, finalized, time_step=1e-3):
         (lambda b: sd.AddStewartPlatform(b, PAPER, start=[0.0]), "start: got shape (1,)"),
         (lambda b: sd.AddStewartPlatform(b, PAPER, start=[np.nan] * 6), "start: got [nan"),
         (lambda b: sd.AddStewartPlatform(b, PAPER, {"kind": "exact"}), "config: got {'kind'"),
+        (lambda b: sd.AddStewartPlatform(b, PAPER, X_PB=np.eye(4)), "expected a RigidTransform"),
         (lambda b: set_state(b, [np.nan] * 12), "state: got [nan"),
         (lambda b: set_state(b, [0.0] * 6), "state: got shape (6,)"),
         (lambda b: sd.StewartDynamics("no_such_machine"), "no_such_machine"),

@@ -17,7 +17,7 @@ import stewart_drake as sd
 from stewart_drake.cli import main
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.jsonio import jsonable
-from stewart_drake.files.yamlio import validate_pairs
+from stewart_drake.files.yamlio import validate, validate_pairs
 from stewart_drake.loop import bulk
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.loop.simulation import simulate
@@ -254,6 +254,31 @@ def test_friction_and_the_payloads_place_are_drawn_where_they_are_asked_for():
     assert plant.coulomb_friction == 1e-3 + draws[0]["coulomb"]
     x, y, z = draws[0]["payload_position"]
     assert plant.payload_position == [x, y, 0.05 + z]
+
+
+def test_the_motors_gain_is_drawn_and_multiplies_their_torques():
+    """The accelerations are those of the machine as it is under g times the torque."""
+    scenario, asked = short(), Ranges(gain=0.2)
+    push = {"wrench": [0.1, 0.0, 0.2, 1.0, -2.0, 0.5]}
+    loads = {"payload_mass": 0.3, "torque_bias": [0.01, -0.02, 0.0, 0.01, 0.0, 0.03]}
+    frictions = ("joint_damping", "coulomb_friction", "ball_joint_damping", "ball_joint_friction")
+    plant = validate(PlantConfig, loads | dict.fromkeys(frictions, 0.02) | {"push": push}, "plant")
+    scenario.plant = plant
+    one = {"gain": draw(asked, SCALES, scenario, 0, 0)["gain"]}
+    g = 1 + one["gain"]
+    assert 0.8 < g < 1.2 and g != 1
+    drawn = apply_draw(MACHINE, scenario, PAPER, one)
+    x, torque = np.concatenate([PAPER.home, np.full(6, 0.05)]), np.linspace(-1, 1, 6)
+
+    def accelerations(mechanism, plant, torque):
+        dynamics = sd.StewartDynamics(mechanism, True, [*plant.parameters, *plant.push.wrench])
+        return dynamics.accelerations(x[:6], x[6:], torque)
+
+    expected = accelerations(PAPER, plant, g * torque)
+    found = accelerations(drawn.machine(), drawn.as_scenario().plant, torque)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    scenario.actuator = sd.PositionServoConfig()
+    assert draw(asked, SCALES, scenario, 0, 0)["gain"] == 0
 
 
 def test_a_delay_is_never_negative():

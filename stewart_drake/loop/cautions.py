@@ -52,7 +52,8 @@ def delays_apart(experiment: Experiment, margin: ControllerMargin) -> str | None
     sc = experiment.scenario
     assumed = believed_delay(sc).eta(sc.controller.period)
     chosen, blind = sc.controller.delay_steps is not None, sc.controller.delay_steps == 0
-    if margin.stable or margin.delay_found or blind or math.isclose(assumed, sc.eta):
+    known = blind or "controller" in experiment.own.systems or math.isclose(assumed, sc.eta)
+    if margin.stable or margin.delay_found or known:
         return None
     source, remedy = "controller.calibration", "set delay.steps and delay.fraction to it"
     if chosen:

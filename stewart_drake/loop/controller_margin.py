@@ -3,7 +3,8 @@
 Law and plant are linearised at instants along the reference, and each loop is judged as if that
 state of motion lasted ("frozen"): `law.stability`. The plant is the true one, with its payload,
 friction, dimensions and delay. The law has the delay it believes in, its model, its prediction and
-its initial weights. Left out are
+its initial weights. A controller of the user's own is linearised by differences: `own_loop`. Left
+out are
 
 - the estimator: a law with one is judged as if it had found torque bias, payload, friction and, if
   it estimates that, the delay;
@@ -25,6 +26,7 @@ and `disk_margins` expect. S leads from a torque added at the motors to the torq
 """
 
 import math
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -52,7 +54,9 @@ from stewart_drake.law.stability import (
     worst_margins,
 )
 from stewart_drake.loop.law_design import DesignedLaw, compose_law, longest_wait
-from stewart_drake.loop.preparation import Experiment, prepare
+from stewart_drake.loop.own import OwnSystem
+from stewart_drake.loop.own_loop import OwnLoop, UnjudgedError, linearised
+from stewart_drake.loop.preparation import Experiment, concrete
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.mechanism.trajectories import evaluate, poses_along
 from stewart_drake.scenario.calibration import believed_delay
@@ -60,11 +64,11 @@ from stewart_drake.scenario.config import DelayConfig, Scenario
 from stewart_drake.scenario.field_types import MOST_PERIODS
 from stewart_drake.scenario.link import oldest_periods
 from stewart_drake.scenario.link_config import WireConfig
-from stewart_drake.scenario.loading import as_scenario
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     COORDINATES,
     LEGS,
+    NUM_STATE,
     NUM_TORQUES,
     POSE,
     RATES,
@@ -182,7 +186,12 @@ class ControllerMargin:
 
 
 def controller_margin(
-    loop: Judged, until: float | None = None, machine: StewartDynamics | None = None
+    loop: Judged,
+    until: float | None = None,
+    machine: StewartDynamics | None = None,
+    *,
+    settings: Iterable[str] = (),
+    controller: OwnSystem | None = None,
 ) -> ControllerMargin:
     """Judge stability and margins of a loop along its reference.
 
@@ -193,12 +202,16 @@ def controller_margin(
             machine and the delay that it assumes.
         until: s; None is the duration, or the horizon of the design.
         machine: the machine that the law drives; None is that of the scenario's plant.
+        settings: as `load_scenario` takes them.
+        controller: your own in place of the scenario's, as of `simulate`: its class, or a function
+            that makes one. It is linearised by differences, and may have discrete state.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
+        TypeError: settings or a controller without a scenario.
     """
-    experiment = _experiment_of(loop)
-    sc = experiment.scenario
+    experiment = _experiment_of(loop, settings, controller)
+    sc, own = experiment.scenario, experiment.own.systems.get("controller")
     end = sc.duration if until is None else float(fixed("until", until, (), 0.0))
     if sc.controller.command != "torque":
         # The loops of servos are checked where the servos are made.
@@ -234,7 +247,11 @@ def controller_margin(
     else:
         every = math.ceil((max(rows, _COSTLY) / _COSTLY) ** 3)
         chosen = times[:: min(every, INSTANTS // _FEWEST)]
-        loops = _loops(experiment, truth, law, chosen)
+        try:
+            loops = _loops(experiment, truth, law, chosen)
+        except UnjudgedError as error:
+            problem = str(error)
+    if loops:
         radii = [spectral_radius(loop.matrix()) for loop in loops]
         worst = int(np.argmax(radii))
         radius, time = radii[worst], float(chosen[worst])
@@ -247,10 +264,10 @@ def controller_margin(
         margins=margins,
         pole=pole,
         pole_time=pole_time,
-        estimated=law.estimates,
-        delay_found=law.finds_delay,
+        estimated=law.estimates and own is None,
+        delay_found=law.finds_delay and own is None,
         tuned=experiment.tuned,
-        weighted=sc.controller.kind == "lqi",
+        weighted=sc.controller.kind == "lqi" and own is None,
         problem=problem,
         loops=tuple(loops),
         span=end,
@@ -320,10 +337,11 @@ def loop_at(loop: Judged, time: float) -> LinearLoop:
     return _loops(experiment, *_parts(loop, experiment), np.array([time]))[0]
 
 
-def _experiment_of(loop: Judged) -> Experiment:
-    if isinstance(loop, DesignedLaw):
-        return loop.experiment
-    return loop if isinstance(loop, Experiment) else prepare(as_scenario(loop))
+def _experiment_of(
+    loop: Judged, settings: Iterable[str] = (), controller: OwnSystem | None = None
+) -> Experiment:
+    given = loop.experiment if isinstance(loop, DesignedLaw) else loop
+    return concrete(given, settings=settings, controller=controller)
 
 
 def _parts(loop: Judged, experiment: Experiment) -> tuple[StewartDynamics, PredictiveLqi]:
@@ -341,6 +359,8 @@ def _parts(loop: Judged, experiment: Experiment) -> tuple[StewartDynamics, Predi
 def _loops(
     experiment: Experiment, truth: StewartDynamics, law: PredictiveLqi, times: Array
 ) -> list[LinearLoop]:
+    if "controller" in experiment.own.systems:
+        return _own_loops(experiment, truth, times)
     sc, loops, integrates = experiment.scenario, [], law.cost.integrates
     states = 12 + 6 * integrates
     gain = np.zeros((NUM_TORQUES, states + NUM_TORQUES * law.timeline.queue_length))
@@ -350,6 +370,31 @@ def _loops(
             gain = _gain(experiment, truth, law, t)
         plant = true_model(experiment, truth, t)
         loops.append(LinearLoop(plant, gain, law.timeline.period, sc.true_delay, integrates))
+    return loops
+
+
+def _own_loops(experiment: Experiment, truth: StewartDynamics, times: Array) -> list[LinearLoop]:
+    """Return the loops of the user's controller.
+
+    Raises:
+        UnjudgedError: see `own_loop.linearised`.
+    """
+    sc, loops, n = experiment.scenario, list[LinearLoop](), NUM_TORQUES
+    if (system := experiment.own.another("controller")) is None:
+        raise UnjudgedError(
+            "its controller was given as an instance; its class, or a function that makes one, is "
+            "judged"
+        )
+    try:
+        found = linearised(system, experiment, times)
+    except UnjudgedError:
+        raise
+    except Exception as error:  # of the user's code; the run raises it where it belongs
+        raise UnjudgedError(f"its controller fails on the reference: {error}") from error
+    for t, J in zip(times, found, strict=True):
+        plant, parts = true_model(experiment, truth, t), (J[n:, NUM_STATE:], J[n:, :NUM_STATE])
+        period = sc.controller.period
+        loops.append(OwnLoop(plant, -J[:n], period, sc.true_delay, False, *parts))
     return loops
 
 
@@ -409,7 +454,13 @@ class LinearModels(NamedTuple):
         )
 
 
-def linear_models(scenario: Judged, time: float | None = None) -> LinearModels:
+def linear_models(
+    scenario: Judged,
+    time: float | None = None,
+    *,
+    settings: Iterable[str] = (),
+    controller: OwnSystem | None = None,
+) -> LinearModels:
     """Return a loop, linearised about its moving reference ("frozen").
 
     An estimator, a tuner and torque limits are left out, see `controller_margin`.
@@ -417,11 +468,14 @@ def linear_models(scenario: Judged, time: float | None = None) -> LinearModels:
     Args:
         scenario: a Scenario, a shipped name or a path; or a `DesignedLaw`.
         time: s; None is that of the largest spectral radius.
+        settings, controller: as of `controller_margin`.
 
     Raises:
         ConfigError: bad input, an unreachable reference; no time, and a loop that was not judged.
+        TypeError: settings or a controller without a scenario.
     """
-    loop = scenario if isinstance(scenario, DesignedLaw) else _experiment_of(scenario)
+    experiment = _experiment_of(scenario, settings, controller)
+    loop = scenario if isinstance(scenario, DesignedLaw) else experiment
     duration = _experiment_of(loop).scenario.duration
     if time is None:
         margin = controller_margin(loop)
@@ -431,7 +485,10 @@ def linear_models(scenario: Judged, time: float | None = None) -> LinearModels:
     time = float(fixed("time", time, ()))
     if not 0 <= time <= duration:
         raise ConfigError(f"time: got {time!r}; expected 0 to {duration:g} s")
-    return state_spaces(loop_at(loop, time), time)
+    try:
+        return state_spaces(loop_at(loop, time), time)
+    except UnjudgedError as error:
+        raise ConfigError(f"controller: {error}") from None
 
 
 def state_spaces(loop: LinearLoop, time: float = 0.0) -> LinearModels:
@@ -467,7 +524,7 @@ def _plant(loop: LinearLoop) -> Any:
     """Return P with the states [e; torques under way, oldest first]."""
     import control  # slow
 
-    model = loop.sampled()
+    model = LinearLoop.sampled(loop)
     line, n = chain(model), len(model.A)
     return control.ss(line.A, line.B, np.eye(n, len(line.A)), 0, loop.period)
 
@@ -477,6 +534,9 @@ def _law(loop: LinearLoop) -> Any:
     import control  # slow
 
     K, m = loop.K, len(loop.K)
+    if isinstance(loop, OwnLoop):
+        n = len(loop.plant.A)
+        return control.ss(loop.F, loop.G, -K[:, n:], -K[:, :n], loop.period)
     n = loop.plant.A.shape[0] + (loop.plant.C.shape[0] if loop.integral else 0)
     size = K.shape[1] - n
     A, B = np.zeros((size, size)), np.zeros((size, n))

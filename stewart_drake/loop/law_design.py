@@ -68,6 +68,7 @@ from stewart_drake.loop.kinds import REPORTS, make_channel, make_sensing
 from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.link import DelayChain
 from stewart_drake.loop.own import Own, own_motion
+from stewart_drake.loop.platforms import StewartPlatform
 from stewart_drake.loop.preparation import (
     Experiment,
     calibration_of,
@@ -75,6 +76,7 @@ from stewart_drake.loop.preparation import (
     check_reach,
     estimated_names,
 )
+from stewart_drake.loop.sampling import free_name
 from stewart_drake.mechanism.geometry import plate_radius
 from stewart_drake.mechanism.trajectories import (
     continues,
@@ -560,7 +562,8 @@ class DesignedLaw:
         """Add the law, connected with its reference and weights.
 
         Args:
-            name: of the controller; its reference is `NAME_reference`, its weights `NAME_weights`.
+            name: of the controller, with a number if the builder has it already; its reference is
+                `NAME_reference`, its weights `NAME_weights`.
             weights: w_Q and w_R (2,) of a tuner in the diagram; constant ones if None.
 
         Returns:
@@ -568,6 +571,7 @@ class DesignedLaw:
             holds and delays the torque must read it at the samples, multiples of the period less
             the lead of `scenario.timing.event_time`.
         """
+        name = free_name(builder, name)
         controller = builder.AddNamedSystem(name, self.controller())
         reference = builder.AddNamedSystem(
             f"{name}_reference", Reference(self.reference, self.planned, self.law.preview_times)
@@ -589,7 +593,7 @@ def _of_argument(message: str) -> str:
 
 
 def design_law(
-    dynamics: StewartDynamics,
+    dynamics: StewartDynamics | StewartPlatform,
     reference: Trajectory,
     period: float,
     delay: float,
@@ -606,8 +610,9 @@ def design_law(
     `sd.controller_margin` computes the stability margins of the result.
 
     Args:
-        dynamics: the machine that the law assumes. Its `free` parameters are estimated; those of
-            `options.estimate` where they are the default ones.
+        dynamics: the machine that the law assumes, or the platform that it is to drive: then the
+            estimator does not take the errors of a MultibodyPlant's steps for a payload. Its `free`
+            parameters are estimated; those of `options.estimate` where they are the default ones.
         reference: 6 x 1 trajectory of the pose, rad and m, with derivatives of order 1 and 2; held
             after its end.
         period: of the controller, s.
@@ -626,6 +631,9 @@ def design_law(
         ConfigError: bad input, a reference or a start out of reach.
     """
     options = ControllerConfig() if options is None else options
+    engine = {}
+    if isinstance(dynamics, StewartPlatform):
+        engine, dynamics = dynamics.engine, dynamics.dynamics
     of_kind("dynamics", dynamics, StewartDynamics)
     of_kind("reference", reference, Trajectory)
     of_kind("options", options, ControllerConfig)
@@ -637,7 +645,7 @@ def design_law(
         "duration": positive("horizon", horizon),
         "start": "on_reference" if start is None else "rest",
         "queue": ("zero" if dynamics.gravity == 0 else "equilibrium") if queue is None else queue,
-        "plant": {"kind": "exact", "gravity": dynamics.gravity != 0},
+        "plant": {"kind": "exact", "gravity": dynamics.gravity != 0, **engine},
         "delay": dataclasses.asdict(believed),
         "controller": dataclasses.asdict(options)
         | {"period": period, "delay_steps": believed.steps, "delay_fraction": believed.fraction},

@@ -102,6 +102,7 @@ class Own(NamedTuple):
     reference: Trajectory | None = None  # a 6 x 1 trajectory of the pose with two derivatives
     law: OwnLaw | None = None  # changes the scenario's law
     instances: tuple[System, ...] = ()  # systems given as instances, which remain the user's
+    makers: Mapping[str, Callable[[], System]] = MappingProxyType({})  # of the others
 
     @property
     def names(self) -> dict[str, str]:
@@ -116,9 +117,12 @@ class Own(NamedTuple):
     @property
     def unjudged(self) -> str | None:
         """Role of a system with unknown dynamics, which prevents a stability verdict, or None."""
-        return next(
-            (role for role in ("controller", "sensor", "link") if role in self.systems), None
-        )
+        return next((role for role in ("sensor", "link") if role in self.systems), None)
+
+    def another(self, role: str) -> System | None:
+        """Return a second system of a role, None of one that was given as an instance."""
+        made = self.makers[role]() if role in self.makers else None
+        return None if made is self.systems[role] else made
 
     @property
     def pushes(self) -> bool:
@@ -194,6 +198,7 @@ def take(given: Mapping[str, Any]) -> Own:
         None if reference is None else _make("reference", reference, Trajectory),
         law,
         tuple(given[role] for role in systems if isinstance(given[role], System)),
+        {role: given[role] for role in systems if not isinstance(given[role], System)},
     )
 
 

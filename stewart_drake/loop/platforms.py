@@ -45,7 +45,7 @@ from stewart_drake.dynamics.workspace import Failure, diagnose, measures_at
 from stewart_drake.files.arguments import fixed, of_kind
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.loop.exact import ExactPlant, Loads, checked_loads, plate_of_mass
-from stewart_drake.loop.sampling import weak
+from stewart_drake.loop.sampling import free_name, weak
 from stewart_drake.mechanism.assembly import joint_state
 from stewart_drake.mechanism.files import as_mechanism
 from stewart_drake.mechanism.geometry import Mechanism
@@ -72,7 +72,10 @@ def add_scene(
 ) -> tuple[MultibodyPlant, SceneGraph]:
     """Add an empty plant with a time step in s, and its scene."""
     config = MultibodyPlantConfig(time_step=time_step, discrete_contact_approximation="sap")
+    names = [free_name(builder, name) for name in ("plant", "scene_graph")]
     plant, scene_graph = AddMultibodyPlant(config, builder)
+    for system, name in zip((plant, scene_graph), names, strict=True):
+        system.set_name(name)
     return plant, scene_graph
 
 
@@ -353,8 +356,6 @@ class StewartPlatform:
     workspace, as the exact one does, if one of the outputs is used.
 
     Attributes:
-        dynamics: its equations of motion, with its gravity and loads, for `sd.design_law`. Gravity
-            is that of the plant when the platform was added.
         plant: an `ExactPlant` or a `MultibodyPlant`.
         model: its model in the MultibodyPlant, None for an exact plant.
         scene_graph: added with a MultibodyPlant, else None.
@@ -365,13 +366,13 @@ class StewartPlatform:
         builder: DiagramBuilder,
         mechanism: Mechanism,
         config: PlantConfig,
-        dynamics: StewartDynamics,
+        dynamics: StewartDynamics | ConfigError,
         plant: Any,
         model: ModelInstanceIndex | None = None,
         scene_graph: SceneGraph | None = None,
     ) -> None:
         self.mechanism, self.plant, self.model = mechanism, plant, model
-        self.scene_graph, self.dynamics = scene_graph, dynamics
+        self.scene_graph, self._dynamics = scene_graph, dynamics
         self._builder, self._config = builder, config
         self._added: dict[str, Any] = {}
         self._gravity: Any = (
@@ -381,6 +382,24 @@ class StewartPlatform:
     def __repr__(self) -> str:
         engine = "exact" if self.model is None else "multibody"
         return f"StewartPlatform({self.mechanism}, {engine})"
+
+    @property
+    def dynamics(self) -> StewartDynamics:
+        """Equations of motion, with the gravity and loads of the platform when it was added.
+
+        Raises:
+            ConfigError: gravity, and a base that is tilted or can move.
+        """
+        if isinstance(self._dynamics, ConfigError):
+            raise self._dynamics
+        return self._dynamics
+
+    @property
+    def engine(self) -> dict[str, Any]:
+        """Fields `kind` and, of a MultibodyPlant, `time_step` of a scenario's `plant`."""
+        if self.model is None:
+            return {"kind": "exact"}
+        return {"kind": "multibody", "time_step": self.plant.time_step()}
 
     def GetInputPort(self, name: str) -> InputPort:
         """Return the port `torque` or `wrench`.
@@ -503,8 +522,9 @@ class StewartPlatform:
         if name in self._added:
             return self._added[name]
         self._check_finalized()
-        system = self._builder.AddSystem(make())
-        system.set_name(f"{self.plant.GetModelInstanceName(self.model)}_{name}")
+        system = make()
+        name_there = f"{self.plant.GetModelInstanceName(self.model)}_{name}"
+        self._builder.AddNamedSystem(free_name(self._builder, name_there), system)
         if system.HasInputPort("tree_state"):
             tree = self.plant.get_state_output_port()
             self._builder.Connect(tree, system.GetInputPort("tree_state"))
@@ -555,22 +575,22 @@ def AddStewartPlatform(
             is ignored.
         plant: a MultibodyPlant that is not finalized, registered with a SceneGraph. Set its gravity
             before: `dynamics` reads it here.
-        parent: frame of `plant` for the weld of the base, the world's if None; with gravity of a
-            body that is welded to the world.
-        X_PB: pose of the base in that frame, identity if None. With gravity the base's z must be
-            vertical: a yaw is right.
+        parent: frame of `plant` for the weld of the base, the world's if None.
+        X_PB: pose of the base in that frame, identity if None. With gravity, `dynamics` and thus a
+            law need a base that cannot move, with a vertical z.
         collision: whether plate, base, cranks and rods collide with other bodies of a given
             `plant`; never with each other.
         start: (6,) pose by default, home if None.
 
     Raises:
-        ConfigError: bad input: a plant that is finalized, or given for kind exact; gravity and a
-            base that is tilted or can move.
+        ConfigError: bad input, such as a plant that is finalized, or given for kind exact.
         UnreachablePoseError: a start out of reach.
     """
     machine = as_mechanism(mechanism)
     config = PlantConfig() if config is None else config
     of_kind("config", config, PlantConfig)
+    if X_PB is not None:
+        of_kind("X_PB", X_PB, RigidTransform)
     pose = machine.home if start is None else fixed("start", start, (6,))
     machine.crank_angles(pose)  # raises if out of reach
     if config.kind == "paper":
@@ -593,10 +613,10 @@ def AddStewartPlatform(
                     f"{name}: got one for plant.kind exact; expected kind multibody, which can be "
                     "among other bodies"
                 )
-        dynamics = StewartDynamics(machine, config.gravity, config.parameters)
-        exact = ExactPlant(dynamics, np.concatenate([pose, np.zeros(6)]), wrench=True)
-        exact.set_name(machine.name)
-        return StewartPlatform(builder, machine, config, dynamics, builder.AddSystem(exact))
+        equations = StewartDynamics(machine, config.gravity, config.parameters)
+        exact = ExactPlant(equations, np.concatenate([pose, np.zeros(6)]), wrench=True)
+        exact.set_name(free_name(builder, machine.name))
+        return StewartPlatform(builder, machine, config, equations, builder.AddSystem(exact))
     scene_graph = None
     if plant is not None:
         of_kind("plant", plant, MultibodyPlant)
@@ -612,10 +632,13 @@ def AddStewartPlatform(
     own = plant is None
     if plant is None:
         plant, scene_graph = add_scene(builder, config.time_step)
-    gravity = 0.0
-    if config.gravity:
-        gravity = _gravity_in_base(plant, parent, X_PB or RigidTransform())
-    dynamics = StewartDynamics(machine, gravity, config.parameters)
+    dynamics: StewartDynamics | ConfigError
+    try:
+        g = _gravity_in_base(plant, parent, X_PB or RigidTransform()) if config.gravity else 0.0
+    except ConfigError as error:
+        dynamics = error  # raised where a law asks for them
+    else:
+        dynamics = StewartDynamics(machine, g, config.parameters)
     model = add_model(
         plant,
         dataclasses.replace(machine, effort_limit=None),

@@ -12,12 +12,14 @@ import time
 import weakref
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from itertools import count
 from typing import Any, Final, NamedTuple
 
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
     BasicVector,
     Context,
+    DiagramBuilder,
     EventStatus,
     LeafSystem,
     State,
@@ -46,6 +48,15 @@ def weak(method: Callable[..., Any], *first: Any) -> Callable[..., Any]:
         return target(*first, *arguments)
 
     return call
+
+
+def free_name(builder: DiagramBuilder, name: str) -> str:
+    """Return the name, or with a number if a system of the builder has it.
+
+    Drake ends the process at `Build` where two systems have one name.
+    """
+    names = (name if i == 0 else f"{name}_{i}" for i in count())
+    return next(one for one in names if not builder.HasSubsystemNamed(one))
 
 
 def dispose(diagram: Any, kept: Sequence[Any] = (), made: Sequence[Any] = ()) -> None:

@@ -54,7 +54,7 @@ def simulate(
 
     A system of your own is an instance for one run, or a function that makes one, such as its
     class. `own` of the summary names them. With a controller of your own, estimates and weights are
-    NaN in the record, counts are 0, and the loop is not judged.
+    NaN in the record, and counts are 0.
 
     Args:
         scenario: a scenario, prepared or not, or a shipped name or file as for `load_scenario`.

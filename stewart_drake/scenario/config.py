@@ -240,7 +240,8 @@ def _no_controllers_name(value: Any, accept: pydantic.ValidatorFunctionWrapHandl
             raise
         raise ValueError(
             f"{error.errors()[0]['ctx']['expected']}; {value} is a shipped controller: "
-            f"--controller {value}, or a copy of {resolve('controller', value)} as your file"
+            f"--controller {value}, load_scenario(..., {value!r}).controller, or a copy of "
+            f"{resolve('controller', value)} as your file"
         ) from None
 
 

@@ -66,6 +66,8 @@ class Ranges:
     loss: Annotated[float, _share("share of measurements, of packets over a network", lt=0.99)] = (
         0.0
     )
+    # true over believed torque of all motors less 1, uniform in +-; not of servos
+    gain: Annotated[float, _share("+-share of the motors' torque", lt=1)] = 0.0
 
 
 RANGE_UNITS: Final = units_of(Ranges)

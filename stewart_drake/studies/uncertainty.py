@@ -206,6 +206,22 @@ def _add_to_machine(*names: str) -> Callable[[Variant, tuple[float, ...]], None]
     return apply
 
 
+def _strengthen(variant: Variant, share: float) -> None:
+    """Multiply the motors' torques by g = 1 + share: M a + c = g T + F is (M a + c - F) / g = T."""
+    if share == 0:
+        return
+    g, plant, machine = 1 + share, variant.fields["plant"], variant.machine()
+    for name in ("plate", "crank", "rod"):
+        body = getattr(machine, name)
+        lighter = {"mass": body.mass / g, "inertia": body.inertia / g}
+        variant.parts[name] = dataclasses.replace(body, **lighter)
+    frictions = ("joint_damping", "coulomb_friction", "ball_joint_damping", "ball_joint_friction")
+    for name in ("payload_mass", *frictions):
+        plant[name] /= g
+    plant["torque_bias"] = [one / g for one in plant["torque_bias"]]
+    plant["push"]["wrench"] = [one / g for one in plant["push"]["wrench"]]
+
+
 # ---------------------------------------------------------------- the unknown machine
 
 
@@ -288,6 +304,11 @@ def _draw_damping(rng: Generator, about: About) -> float:
     return float(damping * s.torque / s.speed if scaled else 0.0)
 
 
+def _draw_gain(rng: Generator, about: About) -> float:
+    share = about.ranges.gain * float(rng.uniform(-1, 1))
+    return share if about.scenario.actuator.kind == "torque" else 0.0
+
+
 def _draw_delay(rng: Generator, about: About) -> float:
     r, period, plant = about.ranges, about.scales.period, about.scenario.plant
     steps = math.floor((2 * r.delay_steps + 1) * rng.uniform()) - r.delay_steps
@@ -335,6 +356,9 @@ MACHINE: Final[Model] = {
     ),
     "loss": Quantity(_number("loss"), _lose, "%", 100, optional=True, title="lost on the way"),
     "link_seed": Quantity(draw_seed, _seed_link),
+    "gain": Quantity(
+        _draw_gain, _strengthen, "%", 100, signed=True, optional=True, title="motors' gain"
+    ),
 }  # fmt: skip
 """True minus believed value of each quantity of `Ranges`."""
 
