@@ -56,7 +56,7 @@ from stewart_drake.law.stability import (
 from stewart_drake.loop.law_design import DesignedLaw, compose_law, longest_wait
 from stewart_drake.loop.own import OwnSystem
 from stewart_drake.loop.own_loop import OwnLoop, UnjudgedError, linearised
-from stewart_drake.loop.preparation import Experiment, concrete
+from stewart_drake.loop.preparation import Experiment, as_experiment
 from stewart_drake.loop.results import MarginSummary
 from stewart_drake.mechanism.trajectories import evaluate, poses_along
 from stewart_drake.scenario.calibration import believed_delay
@@ -341,7 +341,7 @@ def _experiment_of(
     loop: Judged, settings: Iterable[str] = (), controller: OwnSystem | None = None
 ) -> Experiment:
     given = loop.experiment if isinstance(loop, DesignedLaw) else loop
-    return concrete(given, settings=settings, controller=controller)
+    return as_experiment(given, settings=settings, controller=controller)
 
 
 def _parts(loop: Judged, experiment: Experiment) -> tuple[StewartDynamics, PredictiveLqi]:
