@@ -14,7 +14,7 @@ from stewart_drake.live.endpoint import LONGEST_KEY, SHORTEST_KEY, now
 from stewart_drake.live.protocol import ControllerMessage, MachineFlags, MachineMessage, encode
 from stewart_drake.loop.peer import Fault
 from stewart_drake.scenario.loading import load_scenario
-from tests.building import make
+from tests.building import SANITIZED, make
 from tests.live_driver import Driver, in_real_time
 from tests.test_machine_process import (
     DRAKE,
@@ -56,6 +56,22 @@ def test_without_random_bytes_there_is_no_session(folder, tmp_path):
     command = [str(own / "stewart_udp"), "127.0.0.1", str(free_port())]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode != 0 and done.stderr.startswith("/nowhere: no random bytes")
+
+
+def test_the_controller_in_c_keeps_its_times_in_a_flood(folder, tmp_path):
+    """There is always one more datagram, which is malformed; it gives up a machine after 1 s."""
+    own = shutil.copytree(folder, tmp_path / "own")
+    for name, old, new in (
+        ("udp.c", "return got >= 0;", "return 1;"),
+        ("stewart_udp.c", "10ull * SECOND", "1ull * SECOND"),
+    ):
+        text = (own / name).read_text()
+        assert text.count(old) == 1
+        (own / name).write_text(text.replace(old, new))
+    make(own, "stewart_udp", f"CFLAGS={' '.join(SANITIZED)}")
+    command = [str(own / "stewart_udp"), "127.0.0.1", str(free_port())]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1 and "does not answer" in done.stdout
 
 
 # ---------------------------------------------------------------- what both sides say
