@@ -324,6 +324,8 @@ static int arrive(machine *m, const stewart_plan *plan, const struct sockaddr_in
     }
     if (alive(m, now) || h->nonce != udp_nonce(&m->offers, h->session, from))
         return STEWART_FOREIGN;
+    if (m->running && !m->safe) /* its silence is found here first */
+        go_safe(m, now);
     m->session = stewart_confirmed(h, now);
     m->driver = *from;
     m->offers.sessions++; /* withdraws what else was offered */
