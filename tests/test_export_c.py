@@ -330,7 +330,9 @@ def test_what_is_not_exported_is_refused_by_its_field(tmp_path, capsys):
     options = ["--out", str(folder), "--set", "controller.prediction=linear"]
     assert main(["export-c", "paper", *options]) == 2
     error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "controller.prediction: got linear, which is not exp" in error
+    assert error.count("\n") == 1
+    said = "controller.prediction: got linear, which is not exported; expected nonlinear, as in"
+    assert said in error
     assert not folder.exists()
 
 

@@ -126,11 +126,11 @@ def machine_in_c(folder, *options, kind="simulated", port=None):
         assert made.end(signal.SIGINT) == 0
 
 
-def exported(made, settings):
+def exported(made, settings, single=False):
     """Write what export-c writes, and compile the examples over UDP under the sanitizers."""
     c_compiler()
     scenario = load_scenario("paper", settings=settings)
-    export_c.write(export_c.exported(scenario, measured=False), made)
+    export_c.write(export_c.exported(scenario, single, measured=False), made)
     # tests/test_export_c.py tries the long sources under them, and has these objects, too.
     make(made, *LONG_SOURCES)
     make(made, "flags.txt", f"CFLAGS={' '.join(SANITIZED)}")
@@ -240,9 +240,10 @@ def test_the_controller_in_c_hears_what_has_acted(soon, tmp_path):
 
 
 @pytest.mark.slow
-def test_live_drives_a_board_of_ones_own_once_it_is_armed(folder, tmp_path):
-    """The board is the shipped one, but real: no simulation, and nothing in flight at its begin."""
-    own = shutil.copytree(folder, tmp_path / "own")
+def test_live_drives_a_board_of_ones_own_once_it_is_armed(tmp_path):
+    """The board is the shipped one, but real, and in single precision: no simulation, and nothing
+    in flight at its begin."""
+    own = exported(tmp_path, SETTINGS, single=True)
     board = own / "stewart_board.c"
     simulated_flags = "board_flags = STEWART_SIMULATION | STEWART_RESETS;"
     assert simulated_flags in board.read_text()

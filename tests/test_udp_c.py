@@ -11,10 +11,16 @@ import numpy as np
 import pytest
 
 from stewart_drake.live.endpoint import LONGEST_KEY, SHORTEST_KEY, now
-from stewart_drake.live.protocol import ControllerMessage, MachineFlags, MachineMessage, encode
+from stewart_drake.live.protocol import (
+    ControllerFlags,
+    ControllerMessage,
+    MachineFlags,
+    MachineMessage,
+    encode,
+)
 from stewart_drake.loop.peer import Fault
 from stewart_drake.scenario.loading import load_scenario
-from tests.building import make
+from tests.building import SANITIZED, make
 from tests.live_driver import Driver, in_real_time
 from tests.test_machine_process import (
     DRAKE,
@@ -56,6 +62,22 @@ def test_without_random_bytes_there_is_no_session(folder, tmp_path):
     command = [str(own / "stewart_udp"), "127.0.0.1", str(free_port())]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode != 0 and done.stderr.startswith("/nowhere: no random bytes")
+
+
+def test_the_controller_in_c_keeps_its_times_in_a_flood(folder, tmp_path):
+    """There is always one more datagram, which is malformed; it gives up a machine after 1 s."""
+    own = shutil.copytree(folder, tmp_path / "own")
+    for name, old, new in (
+        ("udp.c", "return got >= 0;", "return 1;"),
+        ("stewart_udp.c", "10ull * SECOND", "1ull * SECOND"),
+    ):
+        text = (own / name).read_text()
+        assert text.count(old) == 1
+        (own / name).write_text(text.replace(old, new))
+    make(own, "stewart_udp", f"CFLAGS={' '.join(SANITIZED)}")
+    command = [str(own / "stewart_udp"), "127.0.0.1", str(free_port())]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1 and "does not answer" in done.stdout
 
 
 # ---------------------------------------------------------------- what both sides say
@@ -189,6 +211,31 @@ def test_a_machine_in_c_plays_rows_in_time_on_one_grid_from_the_begin_on(folder)
         assert MachineFlags.SAFE not in send(5, 2).flags
     assert "no torque or setpoint came in time for 1 s: the safe torque acts" in running.said
     assert re.search(r"refused: 2 malformed, .* 2\d late, 0 rate", running.lines[-1])
+
+
+@pytest.mark.slow
+def test_a_real_machine_in_c_goes_safe_before_another_controller_takes_it_over(folder, tmp_path):
+    """Also where that one's datagram is there at the instant at which the watchdog ends."""
+    own = shutil.copytree(folder, tmp_path / "own")
+    board = own / "stewart_board.c"
+    text = board.read_text().replace("STEWART_SIMULATION | STEWART_RESETS;", "0;")
+    text = text.replace("#include <math.h>", "#include <math.h>\n#include <stdio.h>")
+    at = text.index("    follow(time);\n    for")
+    board.write_text(text[:at] + '    printf("drive %g\\n", torque[0]);\n' + text[at:])
+    make(own, "stewart_machine", f"CFLAGS={' '.join(SANITIZED)}")
+    armed, torques = ControllerFlags.ARMED, np.full((20, 6), 1e-4)
+    with machine_in_c(own, kind="real") as (running, port):
+        first = greeted(port)
+        first.begin = (first.got[-1].head.time // first.period + 3) * first.period
+        first.say(now(), armed, playout=first.begin + first.period, torques=torques)
+        running.until("drive 0.0001")
+        second, end = greeted(port), time.monotonic() + 1.5
+        while time.monotonic() < end:
+            second.say(now(), armed)
+            time.sleep(2e-4)
+    lines = [line for line in running.lines if not line.startswith("nothing was heard")]
+    again = len(lines) - lines[::-1].index("a session begins") - 1
+    assert lines.count("a session begins") == 2 and lines[again - 1] == "drive 0", lines
 
 
 @pytest.mark.slow

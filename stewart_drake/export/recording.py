@@ -115,15 +115,18 @@ def _recording(law: Any, record: Recorded) -> Any:
 
 def _refusal(scenario: Scenario, field: str) -> str:
     """Return why a law is not exported, by the name of its shipped controller if it is one."""
-    given, known = plain(scenario.controller).items(), ", ".join(EXPORTED)
+    fixed, known = plain(scenario.controller).items(), ", ".join(EXPORTED)
     fields = {name: load_controller(name) for name in shipped("controller")}
-    names = [name for name in fields if fields[name].items() <= given]
+    names = [name for name in fields if fields[name].items() <= fixed]
     name = max(names, key=lambda name: len(fields[name]), default=EXPORTED[0])
     value: Any = scenario
+    usual: Any = Scenario()
     for key in field.split("."):
-        value = getattr(value, key, "a law of your own")
+        value, usual = getattr(value, key, None), getattr(usual, key, None)
     if name in EXPORTED:
-        return f"{field}: got {value}, which is not exported; expected that of {known}"
+        own = value == usual
+        given, expected = ("a law of your own", "that of") if own else (value, f"{usual}, as in")
+        return f"{field}: got {given}, which is not exported; expected {expected} {known}"
     return f"controller: {name} is not exported, because of {field}: {value}; exported are {known}"
 
 

@@ -12,7 +12,7 @@ extern const uint32_t board_flags;
 /* Put the plate at its start, and the brakes on. */
 void board_park(void);
 
-/* Take the brakes off. */
+/* Take the brakes off. Until the first `board_drive`, apply the safe torque. */
 void board_release(uint64_t time);
 
 /* Apply torques (6), N m, within their limits, from now on. */

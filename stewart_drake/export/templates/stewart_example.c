@@ -2,6 +2,7 @@
 
 #include "stewart_example.h"
 
+const uint64_t stewart_period = @(1e9 * scenario.controller.period)|round|int@;
 const real stewart_weights[2] = @scenario.controller.weights|c@;
 const real stewart_first_state[STEWART_STATES] = @experiment.start|c@;
 const real stewart_least[STEWART_NUM_MEASURES] = @least|c@;

@@ -5,6 +5,7 @@
 #include "protocol.h"
 #include "stewart_motion.h"
 
+extern const uint64_t stewart_period;                  /* ns; exact, also where `real` is float */
 extern const real stewart_weights[2];                  /* of errors and of torques */
 extern const real stewart_first_state[STEWART_STATES]; /* of the plate */
 extern const real stewart_least[STEWART_NUM_MEASURES];     /* lower limits of the workspace measures */

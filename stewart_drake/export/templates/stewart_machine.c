@@ -112,7 +112,7 @@ static void watch(machine *m, uint64_t time)
 
 static uint64_t next_change(const machine *m)
 {
-    double next = m->running && !m->left ? stewart_link_next(&m->buffer, m->link) : INFINITY;
+    double next = m->running && !m->left ? stewart_link_next(&m->buffer, m->link) : (double)INFINITY;
     return isfinite(next) ? (uint64_t)next : STEWART_NEVER;
 }
 
@@ -324,6 +324,8 @@ static int arrive(machine *m, const stewart_plan *plan, const struct sockaddr_in
     }
     if (alive(m, now) || h->nonce != udp_nonce(&m->offers, h->session, from))
         return STEWART_FOREIGN;
+    if (m->running && !m->safe) /* its silence is found here first */
+        go_safe(m, now);
     m->session = stewart_confirmed(h, now);
     m->driver = *from;
     m->offers.sessions++; /* withdraws what else was offered */
@@ -420,7 +422,7 @@ int main(int argc, char **argv)
         return 2;
     m.offers.tokens = STEWART_AT_ONCE;
     m.started = udp_now();
-    m.period = (uint64_t)((double)stewart_configuration.period * SECOND + 0.5);
+    m.period = stewart_period;
     m.buffer = (stewart_link){.size = STEWART_MOTORS,
                               .max_waiting = WAITING,
                               .history = STEWART_HISTORY,

@@ -26,6 +26,7 @@
     "stewart_udp ADDRESS PORT [seconds=S] [key=FILE] [log=FILE] [arm], the address in numbers, "   \
     "beyond 127.0.0.1 with a key"
 #define RECENT 128 /* datagrams by which the link is judged */
+#define AT_ONCE 256 /* datagrams that are read without a look at the clock */
 #define ENOUGH 50  /* round trips before the begin */
 #define REQUEST_PERIOD (SECOND / 50) /* ns between two requests */
 #define KEPT @kept@u  /* number of the last samples that are kept, a power of two */
@@ -279,7 +280,7 @@ static void receive(controller *c)
     struct sockaddr_in from;
     stewart_measured m;
     size_t size;
-    while (udp_get(c->socket, data, &size, &from)) {
+    for (int i = 0; i < AT_ONCE && udp_get(c->socket, data, &size, &from); i++) {
         uint64_t now = udp_now();
         int cause = stewart_read_measured(data, size, c->key, &m);
         if (cause == STEWART_VERSION && udp_same(&from, &c->machine))
@@ -380,7 +381,7 @@ static void correct(controller *c, unsigned k)
 /* Step a memory of the law at sample k. */
 static int compute(controller *c, real *memory, unsigned k, stewart_sample *sample)
 {
-    double now = k * (double)LAW->period;
+    double now = 1e-9 * k * (double)stewart_period;
     real output[@"STEWART_COMMAND" if servos else "STEWART_MOTORS"@];
     sample->reference = stewart_look_ahead;
     sample->goal = stewart_look_back;
@@ -529,7 +530,7 @@ static void step(controller *c, unsigned k)
     unsigned rows = fill_plan(c, k, repeats);
     say(c, 0, sampled, sampled + eta(c) - repeats * c->period, rows);
     if (c->log)
-        note(c, k * (double)LAW->period, sample.age);
+        note(c, 1e-9 * k * (double)stewart_period, sample.age);
     c->samples++;
     c->missed += (double)udp_now() > acts(c, sampled);
 }
@@ -551,9 +552,9 @@ static const char *objection(const controller *c)
         udp_differing(&c->identity, &stewart_own_identity, text);
         return text;
     }
-    if (fabs((double)c->last.period - SECOND * (double)DESIGN.period) > 1e-6 * (double)c->last.period) {
+    if (c->last.period != stewart_period) {
         snprintf(text, sizeof text, "the machine's datagrams say a period of %g s; expected %g s",
-                 1e-9 * (double)c->last.period, (double)DESIGN.period);
+                 1e-9 * (double)c->last.period, 1e-9 * (double)stewart_period);
         return text;
     }
 {% if network %}
@@ -661,7 +662,7 @@ static void warn_of_link(const controller *c)
 /* Run all samples; return why the run ended early, or NULL. */
 static const char *drive(controller *c)
 {
-    unsigned number = (unsigned)(c->seconds / (double)DESIGN.period + 0.5);
+    unsigned number = (unsigned)(1e9 * c->seconds / (double)stewart_period + 0.5);
     uint64_t t = latest(c, c->begin);
     if (t > udp_now() + PATIENCE)
         return "the machine begins too late";
