@@ -354,6 +354,13 @@ def test_setpoints_are_refused_where_they_were_learned_with_others(tmp_path):
     without = sd.setpoints(head(plain), 50.0, plain=True)
     added = some_torque(2 * np.pi / 3)(learned.times + 0.01)
     np.testing.assert_allclose(learned.angles - without.angles, added, atol=1e-15)
+    # `learn` does not know this friction and learns it, `setpoints` would compensate it again.
+    rubs = "plant.ball_joint_friction=0.01"
+    save_learned(file, some_torque(2 * np.pi / 3), prepare(head(rubs)))
+    assert sd.setpoints(head(f"controller.learned={file}"), 50.0) is not None
+    for other in (rubs, "actuator.stiffness=9"):
+        with pytest.raises(ConfigError, match=r"learned with another .*stiffness 10,.*; expected"):
+            sd.setpoints(head(other, f"controller.learned={file}"), 50.0)
 
 
 @pytest.mark.slow
