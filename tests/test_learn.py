@@ -388,7 +388,7 @@ def test_a_motion_of_few_samples_is_learned(tmp_path):
     assert last.error < 0.1 * first.error < 1
     assert "More is learned" not in str(found)
     films = found.replay(tmp_path)
-    assert list(films) == ["replay_1", "replay_2"]
+    assert list(films) == ["repetition_1", "repetition_3"]
     numbers = (1, found.summary["best"])
     for path, number in zip(films.values(), numbers, strict=True):
         assert f"repetition {number}" in path.read_text()
