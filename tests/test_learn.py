@@ -357,7 +357,9 @@ def test_setpoints_are_refused_where_they_were_learned_with_others(tmp_path):
     # `learn` does not know this friction and learns it, `setpoints` would compensate it again.
     rubs = "plant.ball_joint_friction=0.01"
     save_learned(file, some_torque(2 * np.pi / 3), prepare(head(rubs)))
-    assert sd.setpoints(head(f"controller.learned={file}"), 50.0) is not None
+    learned = sd.setpoints(head(f"controller.learned={file}"), 50.0)
+    torque = learned.torques - sd.setpoints(head(), 50.0).torques
+    np.testing.assert_allclose(torque, 10 * added, atol=1e-12)  # stiffness, checked with the limit
     for other in (rubs, "actuator.stiffness=9"):
         with pytest.raises(ConfigError, match=r"learned with another .*stiffness 10,.*; expected"):
             sd.setpoints(head(other, f"controller.learned={file}"), 50.0)

@@ -360,15 +360,19 @@ def _along(
         last = cranks[k] = turned(angles, last)
         torques[k] = dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
     setpoints = cranks
-    steps = np.abs(torques)
     if not plain:
         assert servo is not None
         setpoints = servo.setpoint(cranks, rates, torques)
-        # A period begins and ends half of it away from the angle for which the setpoint is.
-        steps = steps + servo.stiffness * np.abs(rates) * (0.5 / rate)
     if learned is not None:
+        assert servo is not None
         middles = times + 0.5 / rate
         setpoints = setpoints + soft.share(middles)[:, None] * learned(middles)
+        torques = servo.stiffness * (setpoints - cranks) - servo.velocity_gain * rates
+    steps = np.abs(torques)
+    if not plain:
+        assert servo is not None
+        # A period begins and ends half of it away from the angle for which the setpoint is.
+        steps = steps + servo.stiffness * np.abs(rates) * (0.5 / rate)
     course = experiment.reference
     samples = course.times if isinstance(course, PlateTrajectory) else np.empty(0)
     ends = float(samples[-1]) if len(samples) else math.inf
