@@ -3,12 +3,14 @@
     python analysis/reachy_send.py setpoints.csv --reachy 127.0.0.1:8000 --log log.csv --arm
 
 The head moves softly to the first row, then gets each row at its time, and is held at the end or
-at Ctrl-C. The body keeps its yaw. `stewart-drake identify` takes the log. Needs websockets only.
+at Ctrl-C. The body keeps its yaw. A file beyond the cranks' range or speed is refused.
+`stewart-drake identify` takes the log. Needs websockets only.
 """
 
 import argparse
 import csv
 import json
+import math
 import time
 
 from websockets.exceptions import WebSocketException
@@ -18,7 +20,50 @@ STALE = 0.5  # s without positions after which the daemon counts as lost
 SPEED = 0.5  # rad/s, largest of a crank on the way to the first row
 PERIOD = 0.02  # s, of setpoints on that way
 JOINTS = 7  # the body's yaw, then the cranks
+RANGES = [
+    *([-0.837758, 1.396263], [-1.396263, 1.221730], [-0.837758, 1.396263]),
+    *([-1.396263, 0.837758], [-1.221730, 1.396263], [-1.396263, 0.837758]),
+]  # rad, of the cranks
+SPEED_LIMIT = 8.0  # rad/s, of the cranks
+ROUNDING = 1e-5  # rad, of the file
 HEADER = ["time[s]"] + [f"{name}_{k}[rad]" for name in ("setpoint", "crank") for k in range(1, 7)]
+
+
+def read(path):
+    """Return the rows (time, six angles) of a file; refuse one that is not safe to send."""
+    with open(path, newline="") as file:
+        head, *lines = list(csv.reader(file)) or [[]]
+    if len(head) != JOINTS or not all("rad" in name for name in head[1:]) or not lines:
+        raise SystemExit(f"{path}: got columns {head}; expected time[s], six [rad], and rows")
+    rows = []
+    for number, cells in enumerate(lines, 2):
+        if not safe(row := numbers(cells), rows[-1] if rows else [-PERIOD, *row[1:]]):
+            raise SystemExit(
+                f"{path}, line {number}: got {','.join(cells)}; expected a later time and six "
+                f"angles in rad, within RANGES, at most {SPEED_LIMIT} rad/s from those before"
+            )
+        rows.append(row)
+    return rows
+
+
+def numbers(cells):
+    try:
+        return [float(cell) for cell in cells]
+    except ValueError:
+        return []
+
+
+def safe(row, before):
+    """Return whether a row is complete, later than the one before, and within the limits."""
+    return (
+        len(row) == JOINTS
+        and 0 < row[0] - before[0] < math.inf
+        and all(
+            low - ROUNDING <= angle <= high + ROUNDING
+            and abs(angle - last) <= SPEED_LIMIT * (row[0] - before[0]) + ROUNDING
+            for angle, last, (low, high) in zip(row[1:], before[1:], RANGES, strict=True)
+        )
+    )
 
 
 class Robot:
@@ -89,11 +134,7 @@ def main(words=None):
     parser.add_argument("--log", default="log.csv")
     parser.add_argument("--arm", action="store_true", help="drive a real robot")
     given = parser.parse_args(words)
-    with open(given.setpoints, newline="") as file:
-        head, *rows = csv.reader(file)
-    if len(head) != JOINTS or not all("rad" in name for name in head[1:]):
-        raise SystemExit(f"{given.setpoints}: got columns {head}; expected time[s] and six [rad]")
-    rows = [[float(cell) for cell in row] for row in rows]
+    rows = read(given.setpoints)
     with (
         connect(f"ws://{given.reachy}/ws/sdk", proxy=None) as socket,
         open(given.log, "w", newline="") as file,

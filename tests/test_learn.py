@@ -354,6 +354,15 @@ def test_setpoints_are_refused_where_they_were_learned_with_others(tmp_path):
     without = sd.setpoints(head(plain), 50.0, plain=True)
     added = some_torque(2 * np.pi / 3)(learned.times + 0.01)
     np.testing.assert_allclose(learned.angles - without.angles, added, atol=1e-15)
+    # `learn` does not know this friction and learns it, `setpoints` would compensate it again.
+    rubs = "plant.ball_joint_friction=0.01"
+    save_learned(file, some_torque(2 * np.pi / 3), prepare(head(rubs)))
+    learned = sd.setpoints(head(f"controller.learned={file}"), 50.0)
+    torque = learned.torques - sd.setpoints(head(), 50.0).torques
+    np.testing.assert_allclose(torque, 10 * added, atol=1e-12)  # stiffness, checked with the limit
+    for other in (rubs, "actuator.stiffness=9"):
+        with pytest.raises(ConfigError, match=r"learned with another .*stiffness 10,.*; expected"):
+            sd.setpoints(head(other, f"controller.learned={file}"), 50.0)
 
 
 @pytest.mark.slow
@@ -381,7 +390,7 @@ def test_a_motion_of_few_samples_is_learned(tmp_path):
     assert last.error < 0.1 * first.error < 1
     assert "More is learned" not in str(found)
     films = found.replay(tmp_path)
-    assert list(films) == ["replay_1", "replay_2"]
+    assert list(films) == ["repetition_1", "repetition_3"]
     numbers = (1, found.summary["best"])
     for path, number in zip(films.values(), numbers, strict=True):
         assert f"repetition {number}" in path.read_text()

@@ -215,6 +215,8 @@ def test_a_second_controller_takes_over_in_motion():
         first.endpoint.close()  # as a process that was killed
         result = drive(second, 3.0, accept_jitter=True, say=said.append)
         assert running.machine.failure is None or result.status in ("refused", "left_workspace")
+    live = result.summary["live"]
+    assert live["periods_played"] + live["periods_dry"] <= live["samples"]
     if result.status == "completed":
         assert result.summary["live"]["taken_over"]
         error = np.abs(result.signals.error.values[-1])

@@ -272,6 +272,22 @@ def test_a_file_of_setpoints_is_sent_and_logged(daemon, tmp_path, capsys):
     assert logged.cranks[1:] == pytest.approx(logged.setpoints[:-1], abs=0.05)
 
 
+@pytest.mark.parametrize(
+    "rows",
+    ["", "0,a,0,0,0,0,0", "0,0,0,0,0,0", "0,nan,0,0,0,0,0", "0,0.9,0,0,0.9,0,0",
+     "0,0,0,0,0,0,0\n0.02,0,0,0,0.17,0,0", "0,0,0,0,0,0,0\n0,0,0,0,0,0,0"],
+)  # fmt: skip
+def test_a_file_beyond_the_limits_is_not_sent(rows, tmp_path):
+    send = runpy.run_path(str(Path(__file__).parents[1] / "analysis/reachy_send.py"))
+    servo = sd.load_scenario("reachy_mini").actuator
+    assert np.array_equal(send["RANGES"], servo.angle_range)
+    assert send["SPEED_LIMIT"] == servo.speed_limit
+    file = tmp_path / "setpoints.csv"
+    file.write_text(f"{','.join(send['HEADER'][:7])}\n{rows}")
+    with pytest.raises(SystemExit, match=r"setpoints\.csv.* expected"):
+        send["main"]([str(file), "--reachy", "127.0.0.1:9", "--log", str(tmp_path / "l")])
+
+
 def test_a_robot_is_not_moved_without_consent(daemon, tmp_path, monkeypatch):
     monkeypatch.setitem(STATUS, "simulation_enabled", False)
     send = runpy.run_path(str(Path(__file__).parents[1] / "analysis/reachy_send.py"))["main"]

@@ -196,6 +196,8 @@ def test_the_command_writes_the_file(tmp_path, capsys):
         assert main([*common, option, wrong]) == 2
         said = capsys.readouterr().err
         assert said.count("\n") == 1 and (option == "--units" or f"error: {option}: got" in said)
+    assert main([*common, "--set", ON, "--set", "actuator.speed_limit=0.5"]) == 2
+    assert re.fullmatch(r"error: motor \d needs a speed .*\n", capsys.readouterr().err)
     assert out.read_text() == kept
 
 

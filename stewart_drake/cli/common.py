@@ -146,7 +146,7 @@ def named(**options: str) -> Iterator[None]:
         yield
     except ConfigError as error:
         name, colon, rest = str(error).partition(":")
-        raise type(error)(f"{options.get(name, name)}{colon}{rest}") from None
+        raise ConfigError(f"{options.get(name, name)}{colon}{rest}") from None
 
 
 def check_file(path: Path | None, option: str = "--out") -> None:

@@ -18,7 +18,7 @@ from stewart_drake.files.yamlio import load_yaml, one_message, validate
 from stewart_drake.law.learned import LearnedSignal
 from stewart_drake.law.servos import Stiffness, rise
 from stewart_drake.loop.learned import learned_signal
-from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
+from stewart_drake.loop.preparation import Experiment, knowing, prepare
 from stewart_drake.loop.servos import known_stiffness
 from stewart_drake.mechanism.kinematics import turned
 from stewart_drake.mechanism.trajectories import RESTING, PlateTrajectory, continues, evaluate
@@ -203,7 +203,7 @@ def make_setpoints(
             f"actuator.kind: got {scenario.actuator.kind!r}; expected position_servo, or plain "
             "setpoints, --plain"
         )
-    experiment = prepare(scenario)
+    experiment = knowing(prepare(scenario))
     learned = learned_signal(experiment)
     if learned is not None:
         _check_learned(scenario, rate, plain)
@@ -346,7 +346,7 @@ def _along(
     learned: LearnedSignal | None,
 ) -> Setpoints:
     """Return the setpoints of the motion, checked at the middle of each period."""
-    mechanism, dynamics = experiment.mechanism, known_dynamics(experiment)
+    mechanism, dynamics = experiment.mechanism, experiment.nominal
     servo, functions = known_stiffness(experiment.scenario), functions_of(mechanism)
     number = math.ceil(experiment.scenario.duration * rate - 1e-9)
     times, (cranks, rates, torques) = np.arange(number) / rate, np.empty((3, number, NUM_TORQUES))
@@ -360,15 +360,19 @@ def _along(
         last = cranks[k] = turned(angles, last)
         torques[k] = dynamics.inverse_dynamics(x[POSE], x[RATES], x[ACCELERATIONS])
     setpoints = cranks
-    steps = np.abs(torques)
     if not plain:
         assert servo is not None
         setpoints = servo.setpoint(cranks, rates, torques)
-        # A period begins and ends half of it away from the angle for which the setpoint is.
-        steps = steps + servo.stiffness * np.abs(rates) * (0.5 / rate)
     if learned is not None:
+        assert servo is not None
         middles = times + 0.5 / rate
         setpoints = setpoints + soft.share(middles)[:, None] * learned(middles)
+        torques = servo.stiffness * (setpoints - cranks) - servo.velocity_gain * rates
+    steps = np.abs(torques)
+    if not plain:
+        assert servo is not None
+        # A period begins and ends half of it away from the angle for which the setpoint is.
+        steps = steps + servo.stiffness * np.abs(rates) * (0.5 / rate)
     course = experiment.reference
     samples = course.times if isinstance(course, PlateTrajectory) else np.empty(0)
     ends = float(samples[-1]) if len(samples) else math.inf

@@ -128,6 +128,7 @@ class Contact:
         self._phases: deque[float] = deque(maxlen=_PHASES)
         self._age, self._least_age = 0, NEVER
         self._newest = 0
+        self._before = 0, 0  # periods played and dry in earlier sessions
 
     @property
     def refused(self) -> dict[str, int]:
@@ -220,7 +221,9 @@ class Contact:
         if message.identity is not None:
             self.offered = head.nonce
         else:
-            self._first, self._followed = self._first or head.sequence, self._followed + 1
+            if not self._first:
+                self._first, self._before = head.sequence, (message.played, message.dry)
+            self._followed += 1
             self._age = head.time - message.sampled
             self._least_age = min(self._least_age, self._age)
         gaps = self.session.window.newest - self._first + 1 - self._followed if self._first else 0
@@ -245,6 +248,11 @@ class Contact:
             behind = message.head.acknowledged - sequence
             if 0 <= behind < 64 and message.arrived >> behind & 1:
                 self._pending[sequence] = True
+
+    def periods(self, message: MachineMessage) -> tuple[int, int]:
+        """Return how many periods of this session had a row of a plan, and had none (dry)."""
+        played, dry = self._before
+        return message.played - played, message.dry - dry
 
     def due(self, sampled: int, rate: float) -> float:
         """Return the earliest arrival of a measurement taken at `sampled`, s of the own clock."""

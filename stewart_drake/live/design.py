@@ -29,7 +29,7 @@ from stewart_drake.live.protocol import MOST_HISTORY, MachineFlags, MachineMessa
 from stewart_drake.loop.law_design import control_law, first_queue
 from stewart_drake.loop.learned import learned_signal
 from stewart_drake.loop.peer import MOST_ROWS
-from stewart_drake.loop.preparation import Experiment, known_dynamics, prepare
+from stewart_drake.loop.preparation import Experiment, knowing, prepare
 from stewart_drake.loop.servos import commands_in_flight, servo_law
 from stewart_drake.mechanism.trajectories import evaluate
 from stewart_drake.reporting.document import counted
@@ -178,7 +178,7 @@ def read_learned(scenario: Scenario) -> tuple[Scenario, Learned]:
     if scenario.controller.learned is None:
         return scenario, None
     without = replace(scenario, controller=replace(scenario.controller, learned=None))
-    return without, always(learned_signal(prepare(scenario)))
+    return without, always(learned_signal(knowing(prepare(scenario))))
 
 
 def design(scenario: Scenario, machine: MachineMessage, learned: Learned = None) -> Design:
@@ -205,7 +205,7 @@ def _of_cranks(experiment: Experiment, machine: MachineMessage, learned: Learned
     Nothing is estimated, so that the law takes the numbers of the scenario's plant, as the command
     `setpoints` does.
     """
-    experiment = experiment._replace(nominal=known_dynamics(experiment))
+    experiment = knowing(experiment)
     law, planned, _ = servo_law(experiment)
     limit = min(experiment.torque_limit, machine.torque_limit)
     first, _ = commands_in_flight(experiment, law, experiment.scenario.true_delay)

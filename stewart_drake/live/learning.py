@@ -32,7 +32,7 @@ from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.session import Ready, drive, plans, prepare_session
 from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.loop.learned import HARMONICS, save_learned
-from stewart_drake.loop.preparation import Experiment, prepare
+from stewart_drake.loop.preparation import Experiment, knowing, prepare
 from stewart_drake.loop.results import SimulationResult, accumulated_error
 from stewart_drake.mechanism.trajectories import rows_along
 from stewart_drake.scenario.config import Scenario
@@ -362,7 +362,7 @@ def _learn_setpoints(asked: _Asked) -> LiveLessons:
     lessons, dt = Lessons(scenario), scenario.controller.period
     last = lessons.period * math.ceil(_LEARNED_FROM / lessons.period)
     duration = dt * math.ceil((_SETTLING + last) / dt + 1)
-    done, own = list[Repetition](), prepare(scenario)
+    done, own = list[Repetition](), knowing(prepare(scenario))
     arrivals = _Arrivals(lessons.least, say)
     while (k := len(done) + 1) <= asked.options.learn:
         ready = asked.call(always(learned), duration, plan=not done)

@@ -340,8 +340,8 @@ class LiveLoop:
         if not self._design.sends:
             return np.full(len(PACKETS), np.nan)
         contact = self.exchange.contact
-        last = message or contact.machine
-        return np.array([k + 1.0, contact.link.packets_lost, math.nan, last.played, last.dry])
+        periods = contact.periods(message or contact.machine)
+        return np.array([k + 1.0, contact.link.packets_lost, math.nan, *periods])
 
     # -------------------------------------------------------------- reference
 

@@ -287,6 +287,7 @@ def drive(
 def _live_summary(loop: LiveLoop, contact: Contact, recorded: Array) -> dict[str, Any]:
     """Return `live` of summary.json, from the delays (n,) of the recorded steps, s."""
     link, last = contact.link, contact.machine
+    played, dry = contact.periods(last)
     late = np.append(recorded, loop.resting)
     late = late if len(late) else np.array([math.nan])
     p99 = float(np.quantile(late, 0.99))
@@ -309,8 +310,8 @@ def _live_summary(loop: LiveLoop, contact: Contact, recorded: Array) -> dict[str
         },
         "lost_there": link.loss_there,
         "lost_back": link.loss_back,
-        "periods_played": last.played,
-        "periods_dry": last.dry,
+        "periods_played": played,
+        "periods_dry": dry,
         "refused": contact.refused,
         "refused_by_machine": last.refused,
         "unsent": contact.endpoint.unsent,

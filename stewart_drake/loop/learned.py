@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from stewart_drake.dynamics.stewart import plant_parameters
 from stewart_drake.files.arrayio import load_npz
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
@@ -14,6 +15,7 @@ from stewart_drake.loop.preparation import Experiment
 from stewart_drake.mechanism.geometry import fingerprint
 from stewart_drake.scenario.calibration import believed_delay
 from stewart_drake.scenario.config import Scenario
+from stewart_drake.scenario.signals import PLANT_PARAMETERS
 from stewart_drake.types import Array
 
 HARMONICS: Final = 8
@@ -100,7 +102,7 @@ def learned_signal(experiment: Experiment) -> LearnedSignal | None:
 
 _TEXTS: Final = {
     "machine": "machine",
-    "command": "controller.command or feedforward",
+    "command": "controller.command or feedforward, or another model",
     "motion": "motion",
     "motion_period": "period of the motion, s",
     "period": "controller.period, s",
@@ -108,10 +110,18 @@ _TEXTS: Final = {
 }
 
 
-def _command(scenario: Scenario) -> str:
-    # Setpoints are learned on top of the feedforward; what a model lacks does not depend on it.
-    c = scenario.controller
-    return c.command if c.command == "torque" else f"{c.command} with feedforward {c.feedforward}"
+def _command(experiment: Experiment) -> str:
+    # Setpoints are learned on top of the feedforward; the torque that a model lacks is not.
+    c, servo = experiment.scenario.controller, experiment.scenario.actuator
+    if c.command == "torque":
+        return c.command
+    words = [f"{c.command} with feedforward {c.feedforward}"]
+    if c.feedforward != "none" and servo.kind == "position_servo":
+        known = {"stiffness": servo.stiffness, "velocity_gain": servo.velocity_gain}
+        own, usual = experiment.nominal.plant_parameters, plant_parameters()
+        known |= {PLANT_PARAMETERS[k]: own[k] for k in np.flatnonzero(own != usual)}
+        words += [f"{name} {value:.9g}" for name, value in known.items()]
+    return ", ".join(words)
 
 
 def _marks(experiment: Experiment) -> dict[str, Array]:
@@ -121,7 +131,7 @@ def _marks(experiment: Experiment) -> dict[str, Array]:
     times = period / _POSES * np.arange(_POSES)
     return {
         "machine": np.array(fingerprint(experiment.mechanism)),
-        "command": np.array(_command(sc)),
+        "command": np.array(_command(experiment)),
         "motion_period": np.array(period),
         "motion": np.array(experiment.reference.vector_values(times).T),
         "period": np.array(sc.controller.period),

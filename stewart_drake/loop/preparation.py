@@ -329,6 +329,11 @@ def known_dynamics(experiment: Experiment) -> StewartDynamics:
     return StewartDynamics(experiment.mechanism, scenario.plant.gravity, parameters, names)
 
 
+def knowing(experiment: Experiment) -> Experiment:
+    """Return the experiment with a controller that knows the numbers of the plant."""
+    return experiment._replace(nominal=known_dynamics(experiment))
+
+
 def _calibrated(parameters: Array, calibration: Calibration | None) -> Array:
     """Return the first of `PLANT_PARAMETERS` (n,), calibrated ones in their place."""
     values = [calibration and calibration.value(name) for name in PLANT_PARAMETERS]

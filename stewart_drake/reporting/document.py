@@ -239,6 +239,7 @@ class Frame:
     """An HTML page inside a page, on screen only; its scripts reach nothing outside."""
 
     source: str | Callable[[], str]  # the page, or a function that makes it when it is written
+    name: str = "replay"
     brief: ClassVar = False
 
     @property

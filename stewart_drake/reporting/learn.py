@@ -35,8 +35,9 @@ def document(study: LearnStudy) -> Document:
         on_reference=(scenario.start, scenario.queue) == ("on_reference", "reference"),
         number=lambda one: numbers[id(one)],
         films=[
-            Frame(partial(replay_html, one.result, machine, f"repetition {numbers[id(one)]}"))
+            Frame(partial(replay_html, one.result, machine, title), title.replace(" ", "_"))
             for one in shown
+            for title in [f"repetition {numbers[id(one)]}"]
         ],
         errors=partial(error_figure, study),
         over_time=partial(time_figure, study),

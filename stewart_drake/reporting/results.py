@@ -323,8 +323,8 @@ class AnalysisResult(Printed):
         Args:
             directory: folder to write them into as NAME.html, if not None; it is made.
         """
-        folder, frames = _replays(directory), enumerate(self.document.all(Frame), 1)
-        return {f"replay_{k}": _kept(one.html, folder, f"replay_{k}.html") for k, one in frames}
+        folder, frames = _replays(directory), self.document.all(Frame)
+        return {one.name: _kept(one.html, folder, f"{one.name}.html") for one in frames}
 
     def write_page(self, directory: Path, name: str = PAGE) -> Path:
         """Write the page into a directory and return its path."""
