@@ -499,6 +499,7 @@ def test_a_run_that_is_lost_while_it_comes_to_rest_is_not_completed():
 def test_advice_after_a_loss_begins_with_what_becomes_of_the_plate():
     end = End("lost_contact", None, "now the motors have no torque: the plate falls")
     assert end.advice.startswith("Now the motors have no torque: the plate falls. Datagrams arrive")
+    assert "2 s longer than the delay" in End("left_workspace", None).advice  # else it is refused
 
 
 @pytest.mark.parametrize(
