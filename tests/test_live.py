@@ -501,6 +501,7 @@ def test_a_run_that_is_lost_while_it_comes_to_rest_is_not_completed():
 def test_advice_after_a_loss_begins_with_what_becomes_of_the_plate():
     end = End("lost_contact", None, "now the motors have no torque: the plate falls")
     assert end.advice.startswith("Now the motors have no torque: the plate falls. Datagrams arrive")
+    assert "2 s longer than the delay" in End("left_workspace", None).advice  # else it is refused
 
 
 @pytest.mark.parametrize(
@@ -719,6 +720,9 @@ def test_a_law_that_is_too_slow_for_its_period_says_so_before_it_starts():
         assert told.startswith(f"law: a step takes {1e3 * seconds:.1f} ms of a period of 100 ms")
         assert "controller.replan is in Python" in told
         assert ("more than 50%: expect missed deadlines" in told) == (seconds > 0.05)
+    weak = ready._replace(design=ready.design._replace(torque_limit=1e-3))
+    (told,) = [line for line in plans(weak, 1.0, "paper") if line.startswith("warning: the motion")]
+    assert "the motors give 1 (the machine's limit)" in told
     # One slow round trip, which decides the delay, is named as an exception.
     link = ready.contact.link
     for longest, named in ((max(link.trips), False), (3 * link.usual, True)):
@@ -1030,6 +1034,8 @@ def test_after_a_loss_the_page_shows_reason_last_seconds_and_advice(tab, viewer)
     note = tab.evaluate("document.getElementById('note').textContent")
     assert "left workspace" in note and "crank 3 passed its dead centre" in note
     assert "Bring the plate back to its start" in note and "identify LOG" in note
+    assert "The picture is of the last sample" in note
+    assert not tab.evaluate("document.getElementById('sliders').getClientRects().length")
     assert "last torques before the end" in tab.evaluate(
         "document.getElementById('full').textContent"
     )

@@ -191,7 +191,7 @@ def test_a_lost_run_names_its_log_and_what_may_have_caused_the_loss(tmp_path, ca
     assert _delivered(Delivery(tmp_path), run, LOG) == 1
     said = " ".join(capsys.readouterr().out.split())
     assert said.startswith("left workspace: leg 2 reached the end of its reach at t = 1.3")
-    assert f"The log shows the loss: stewart-drake replay {tmp_path / LOG}," in said
+    assert f"The log shows the loss: stewart-drake replay {tmp_path / LOG}. If it" in said
     assert "1 sample with those of coming to rest, 1 deadline missed;" in said
     assert "for 14 periods, and none (dry) for 9, with those of coming to rest" in said
     assert "torques came too late or not at all" in said

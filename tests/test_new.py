@@ -258,6 +258,10 @@ def test_the_form_draws_before_masses_are_known_and_names_what_is_wrong(form):
     _, found = asked(form.url, "/check", json.dumps(lengths))
     assert found["drawing"].startswith("data:image/svg")
     assert (found["field"], found["problem"]) == ("plate_mass", "is missing")
+    assert not found["example"]
+    # Before the lengths it draws the examples.
+    _, begun = asked(form.url, "/check", json.dumps({"rod": "260 mm"}))
+    assert begun["drawing"].startswith("data:image/svg") and begun["example"]
     # The other refusals are those of the command.
     for field, value, words in (
         ("rod", "55 mm", "reach the plate"),

@@ -77,8 +77,8 @@ def fit_short(pairs: Sequence[Pair], unknowns: Unknowns, worst: float) -> Soluti
         f"{'explained by delays of ' + found if found else 'too short, and explained by no delay'}"
         "; expected one delay, known to "
         f"{1e3 * _VAGUE:g} ms: a log of at least {length_needed(unknowns):.3g} s (the longest "
-        f"possible delay and {_RESPONSE:g} s of motion){narrower}. If the plate was lost, log a "
-        "smaller motion, or raise controller.w_R"
+        f"possible delay and {_RESPONSE:g} s of motion){narrower}. If the plate was lost, add "
+        "coulomb to controller.estimate, or log a smaller motion"
     )
 
 

@@ -143,6 +143,7 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
             most=_MOST,
             ms=milliseconds,
             advice=_queue_advice(made.experiment.scenario),
+            weak=made.experiment.weak_motors(made.torque_limit),
         )
     )
     return [" ".join(line.split()) for line in text.split("\n\n") if line.strip()]

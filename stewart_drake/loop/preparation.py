@@ -138,9 +138,12 @@ class Experiment(NamedTuple):
         parameters[BIAS] *= biased
         return type(self.nominal)(self.truth, plant.gravity, parameters)
 
-    def weak_motors(self) -> str | None:
-        """Return a warning about a motion that takes more torque than the motors give, or None."""
-        sc, limit = self.scenario, self.torque_limit
+    def weak_motors(self, machine: float = math.inf) -> str | None:
+        """Return a warning about a motion that takes more torque than the motors give, or None.
+
+        A `machine` may have a tighter limit than the scenario, N m.
+        """
+        sc, limit = self.scenario, min(self.torque_limit, machine)
         if math.isinf(limit) or sc.actuator.kind == "servo":
             return None
         true, rest = self.true_dynamics(), np.zeros(6)
@@ -148,12 +151,16 @@ class Experiment(NamedTuple):
         if not needed > limit:  # NaN beyond the reach, where the law keeps the limits
             return None
         factor, unit = (1e3, "mN m") if needed < 1 else (1.0, "N m")
-        own = sc.actuator.torque_limit is not None
+        source = (
+            "motor.effort_limit" if sc.actuator.torque_limit is None else "actuator.torque_limit"
+        )
+        if limit < self.torque_limit:
+            source = "the machine's limit"
         holding = np.abs(true.inverse_dynamics(self.truth.home, rest, rest)).max()
         falls = f" and cannot hold the plate at home, which takes {factor * holding:.3g} {unit}"
         return (
             f"the motion takes up to {factor * needed:.3g} {unit}, the motors give "
-            f"{factor * limit:.3g} ({'actuator.torque_limit' if own else 'motor.effort_limit'})"
+            f"{factor * limit:.3g} ({source})"
             f"{falls * bool(holding > limit)}"
         )
 

@@ -17,10 +17,17 @@ from stewart_drake.studies.new_machine import machine_text, proposed
 from stewart_drake.studies.options import Option
 from stewart_drake.studies.study_options import Measurements
 
+_MASSES: Final = ("plate_mass", "crank_mass", "rod_mass")
 _ANY_MASS: Final = 1e-3
 """Mass of a part in a drawing before the mass is given, kg."""
 _PATIENCE: Final = 10.0
 """Longest wait for a browser that fetches the report, s."""
+_EXAMPLE: Final = {
+    **{"base_radius": "200 mm", "shaft_distance": "130 mm", "plate_radius": "110 mm"},
+    **{"joint_distance": "60 mm", "crank": "50 mm", "rod": "260 mm"},
+    **{"plate_mass": "2.5 kg", "crank_mass": "60 g", "rod_mass": "50 g", "torque_limit": "6 N m"},
+}
+"""Measurements of a machine that is shown until the own lengths are complete."""
 
 
 Entries = dict[str, str]
@@ -29,7 +36,7 @@ Entries = dict[str, str]
 
 def drawing(entries: Entries) -> str:
     """Return the drawing as a data URI; masses that are missing do not matter."""
-    masses = dict.fromkeys(("plate_mass", "crank_mass", "rod_mass"), str(_ANY_MASS))
+    masses = dict.fromkeys(_MASSES, str(_ANY_MASS))
     with TemporaryDirectory() as folder:
         path = Path(folder) / "machine.yaml"
         path.write_text(machine_text(Measurements(**entries | masses), "machine"))
@@ -40,10 +47,14 @@ def drawing(entries: Entries) -> str:
 
 
 def answer(entries: Entries) -> dict[str, Any]:
-    """Return what the page shows: `drawing` or null, `field` and `problem` or null."""
-    found: dict[str, Any] = {"drawing": None, "field": None, "problem": None}
+    """Return what the page shows: `drawing` or null, `field` and `problem` or null.
+
+    The drawing is an `example` while a length is missing.
+    """
+    example = not entries.keys() >= _EXAMPLE.keys() - {*_MASSES, "torque_limit"}
+    found: dict[str, Any] = {"drawing": None, "field": None, "problem": None, "example": example}
     try:
-        found["drawing"] = drawing(entries)
+        found["drawing"] = drawing(_EXAMPLE if example else entries)
         measurements = Measurements(**entries)
         with TemporaryDirectory() as folder:
             proposed(measurements, "machine", Path(folder) / "machine.yaml")
@@ -128,11 +139,10 @@ def _field(one: Option, given: Any) -> dict[str, Any]:
     value = default if given is None else given
     text = str(value).lower() if isinstance(value, bool) else f"{value}"
     label = one.help.removesuffix(".").removesuffix(f", {one.unit}")
-    example = {"m": "300 mm", "kg": "250 g", "N m": "6 N m"}.get(one.unit or "", "")
     return {
         "name": one.name,
         "label": label,
-        "example": example,
+        "example": _EXAMPLE.get(one.name, ""),
         "value": text,
         "choices": choices,
         "required": one.required,

@@ -177,8 +177,8 @@ class NewMachine(NamedTuple):
         found = [self.verdict, loop_verdict(self.margin), str(Verdict.of(self.margin))]
         if self.margin.stable and self.margin.delay_margin < _CLOSE * self.margin.period:
             found.append(
-                f"know the delay to {milliseconds(self.margin.delay_margin)}, or raise "
-                "controller.w_R"
+                f"know the delay to {milliseconds(self.margin.delay_margin)}, as with a play-out "
+                "buffer, or raise controller.w_R (stewart-drake analyze delay compares)"
             )
         return found
 
