@@ -271,6 +271,9 @@ def test_a_prepared_run_is_that_of_the_scenario_alone(limit):
     one = scenario("paper", "duration=2", f"actuator.torque_limit={limit}", *DIRTY)
     preparation = preparation_of(one)
     assert preparation is first
+    other = dataclasses.replace(one, controller=dataclasses.replace(one.controller, w_R=1e3))
+    assert preparation_of(other) is first
+    preparation.prepared(preparation.experiment(other))  # its plan of least error is another
     prepared, alone = preparation.prepared(preparation.experiment(one)), prepare(one)
     law, planned, _ = control_law(alone)
     assert repr(prepared.law) == repr(law)

@@ -198,7 +198,8 @@ class Preparation:
         white = white_errors(experiment.scenario)
         law = compose_law(experiment, self._once(sizing_of, experiment, key=white))
         queue = experiment.torques_in_flight(law.timeline.delay).tobytes()
-        way = self._once(way_onto, experiment, law, key=(queue, law.plant.substeps))
+        decisive = queue, law.plant.substeps, experiment.scenario.controller.weights
+        way = self._once(way_onto, experiment, law, key=decisive)
         law, motion, _ = on_its_way(law, experiment, way)
         source = (tuner or weights_source)(experiment, law)
         return Prepared(experiment, law, motion, source)
