@@ -4,6 +4,7 @@ import json
 import socket
 import threading
 import time
+from functools import partial
 from unittest.mock import Mock
 
 import numpy as np
@@ -92,6 +93,16 @@ def test_a_run_that_was_killed_leaves_its_log_up_to_there(run, tmp_path, name, s
     assert 0.3 * share * len(result.signals.time) < len(read.time) <= len(result.signals.time)
     assert np.array_equal(read.time, whole.time)
     assert np.array_equal(read.pose[:-1], whole.pose[:-1])
+
+
+def test_a_damaged_mcap_log_is_refused(run, tmp_path):
+    """The decompressor has exceptions of its own, and a wrong length looks like a cut."""
+    data = (run[1] / "run.mcap").read_bytes()
+    second = data.index(b"zstd", data.index(b"zstd") + 4)  # chunk
+    for at in (second + 100, second - 33):  # its data, its length
+        changed = data[:at] + bytes([data[at] ^ 0x7F]) + data[at + 1 :]
+        path = written(tmp_path / "run.mcap", changed)
+        one_line(partial(sd.read_log, path), "damaged after t = ", "run.mcap")
 
 
 def test_identify_and_export_read_the_same_from_every_kind_of_log(run):

@@ -17,7 +17,6 @@ import os
 import queue
 import re
 import socket
-import struct
 import tempfile
 import threading
 from collections.abc import Callable, Iterable, Mapping
@@ -45,6 +44,8 @@ from stewart_drake.types import Array
 
 EXPECTED: Final = "signals.nc, a log (.mcap, .csv) or the folder of a run"
 _METADATA: Final = "stewart_drake"
+_MAGIC: Final = b"\x89MCAP0\r\n"
+"""First and last bytes of a whole MCAP file."""
 _CHUNK: Final = 1 << 16
 """Bytes of JSON after which an MCAP file is written on."""
 _QUEUE: Final = 4096
@@ -362,13 +363,13 @@ def scenario_of(signals: xr.Dataset, path: Path) -> Scenario:
 
 
 def _read_mcap(path: Path) -> xr.Dataset:
-    records, errors = _mcap("mcap.records"), _mcap("mcap.exceptions")
+    records = _mcap("mcap.records")
     topics: dict[int, str] = {}
     times: dict[int, float] = {}
     messages: dict[str, dict[int, dict[str, float]]] = {}
     scenario = None
     with open(path, "rb") as file:
-        reader = _mcap("mcap.stream_reader").StreamReader(file)
+        reader = _mcap("mcap.stream_reader").StreamReader(file, validate_crcs=True)
         try:
             for record in reader.records:
                 if isinstance(record, records.Metadata) and record.name == _METADATA:
@@ -379,9 +380,12 @@ def _read_mcap(path: Path) -> xr.Dataset:
                     found = json.loads(record.data)
                     times[record.sequence] = float(found["time"])
                     messages.setdefault(topics[record.channel_id], {})[record.sequence] = found
-        except (errors.McapError, struct.error, EOFError, OSError):  # cut in a record
+        except Exception:  # of the decompressor too
             if not times:
                 raise ValueError("no MCAP file, or one cut before its messages") from None
+            file.seek(-len(_MAGIC), os.SEEK_END)
+            if file.read() == _MAGIC:  # it was not cut
+                raise ValueError(f"damaged after t = {max(times.values()):g} s") from None
     if not times:
         raise ValueError("no messages")
     if scenario is None:
