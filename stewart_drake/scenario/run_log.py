@@ -19,7 +19,7 @@ import re
 import socket
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -93,11 +93,21 @@ def _members(fields: Iterable[str], values: Array) -> dict[str, float]:
     return {field: value for field, value in pairs if math.isfinite(value)}
 
 
+@contextlib.contextmanager
+def _naming(path: Path | None) -> Iterator[None]:
+    """Name a file in an error of writing, as on a full disk, which names none."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = None if path is None else str(path)
+        raise
+
+
 class McapLog:
     """An MCAP file, which is replaced, with one topic for each signal."""
 
     def __init__(self, path: Path, scenario: Scenario, servos: bool = True) -> None:
-        writer = _mcap("mcap.writer")
+        writer, self._path = _mcap("mcap.writer"), path
         self._file = open(path, "wb")  # noqa: SIM115 (closed by `close`)
         self._writer = writer.Writer(self._file, chunk_size=_CHUNK)
         self._writer.start(profile="", library=f"stewart_drake {versions()['stewart-drake']}")
@@ -127,12 +137,13 @@ class McapLog:
         for name, components in values.items():
             topic, fields = self._channels[name]
             data = json.dumps({"time": time} | _members(fields, components)).encode()
-            self._writer.add_message(topic, at, data, at, self._row)
+            with _naming(self._path):
+                self._writer.add_message(topic, at, data, at, self._row)
         self._row += 1
 
     def close(self) -> None:
-        self._writer.finish()
-        self._file.close()
+        with _naming(self._path), self._file:
+            self._writer.finish()
 
 
 class CsvFile:
@@ -149,7 +160,7 @@ class CsvFile:
         else:
             flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
             self.descriptor = os.open(path, flags, 0o666)
-        self._whole = 0
+        self._whole, self._path = 0, path
         self._add(heads)
 
     def write(self, row: Iterable[float]) -> None:
@@ -161,9 +172,10 @@ class CsvFile:
     def _add(self, cells: Iterable[str]) -> None:
         data = (",".join(cells) + "\n").encode("ascii")
         try:
-            done = 0
-            while done < len(data):
-                done += os.write(self.descriptor, data[done:])
+            with _naming(self._path):
+                done = 0
+                while done < len(data):
+                    done += os.write(self.descriptor, data[done:])
         except OSError:
             os.ftruncate(self.descriptor, self._whole)
             raise
