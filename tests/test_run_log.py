@@ -1,6 +1,7 @@
 """Logs that are written during a run, and their reading."""
 
 import json
+import os
 import socket
 import threading
 import time
@@ -166,6 +167,10 @@ def test_what_is_no_log_is_said_in_a_line(tmp_path, name, data, words):
 def test_missing_logs_are_said_in_a_line(tmp_path):
     one_line(lambda: sd.read_log(tmp_path / "none.mcap"), "no such file")
     one_line(lambda: sd.read_log(tmp_path), "has no signals.nc")
+    pipe = tmp_path / "pipe.csv"
+    os.mkfifo(pipe)
+    one_line(lambda: sd.read_log(pipe), "is not a file")
+    one_line(lambda: sd.identify(pipe, PAPER), "is not a file")
 
 
 # Live.

@@ -313,7 +313,7 @@ def dataset_of(
 
 def is_run(path: Path) -> bool:
     """Return whether a file or folder is of a run, not the CSV log of a real machine."""
-    if path.suffix != ".csv" or path.is_dir():
+    if path.suffix != ".csv" or not path.is_file():
         return path.suffix in (".nc", ".mcap") or path.is_dir()
     with contextlib.suppress(OSError, UnicodeDecodeError), open(path, encoding="utf-8") as file:
         return file.readline(1 << 16).startswith("time[s],pose_roll[rad]")
@@ -336,8 +336,9 @@ def read_log(path: str | Path) -> xr.Dataset:
         if not found:
             raise ConfigError(f"{path}: has no signals.nc, .mcap or log.csv; expected {EXPECTED}")
         return read_log(found[0])
-    if not path.exists():
-        raise ConfigError(f"{path}: no such file; expected {EXPECTED}")
+    if not path.is_file():  # opening a pipe would wait for ever
+        problem = "is not a file" if path.exists() else "no such file"
+        raise ConfigError(f"{path}: {problem}; expected {EXPECTED}")
     if path.suffix == ".nc":
         return load_netcdf(path, EXPECTED)
     if path.suffix not in (".mcap", ".csv"):
