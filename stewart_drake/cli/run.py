@@ -151,7 +151,8 @@ def replay(
 ) -> None:
     """Write a log as a 3-D animation, one HTML file."""
     check_file(out)
-    sd.replay_log(log, out)
+    with named(out="--out"):
+        sd.replay_log(log, out)
     echo(f"written to {out}")
 
 
