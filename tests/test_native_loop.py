@@ -319,6 +319,12 @@ def test_another_mechanism_file_is_another_preparation(tmp_path):
     assert preparation_of(one) is not first
 
 
+def test_a_shipped_move_is_run():
+    """Its name is that of no file in the working folder."""
+    motion = "reference={kind: reachy_move, file: look_around}"
+    assert run_in_bulk(scenario("reachy_mini", motion, "duration=0.1")).status == "completed"
+
+
 def test_a_motion_that_cannot_be_is_refused_each_time():
     one = scenario("paper", "reference.amplitude=[0,0,0,0,0,0.3]", "duration=2")
     for _ in range(2):

@@ -237,7 +237,10 @@ def _key(scenario: Scenario) -> tuple[Any, ...]:
     fields["link"] = scenario.link.kind
     machines = scenario.mechanism, scenario.plant.mechanism
     files = [resolve("mechanism", name) for name in machines if name is not None]
-    named = getattr(scenario.reference, "file", None), scenario.controller.calibration
+    motion = getattr(scenario.reference, "file", None)
+    if motion is not None and scenario.reference.kind == "reachy_move":
+        motion = resolve("move", motion)
+    named = motion, scenario.controller.calibration
     files += [Path(name) for name in named if name is not None]
     return json.dumps(fields, default=str), *(_stamp(file) for file in files)
 
