@@ -162,20 +162,33 @@ def check_whole(folder):
         assert (folder / "signals.nc").exists()
 
 
-@pytest.mark.parametrize("largest", [1_000, 20_000, 60_000])
-def test_a_full_disk_is_one_line_and_leaves_no_half_file(largest, tmp_path):
-    """A limit on the sizes of files stands for the disk; it holds in a copy of a process only."""
+def said_at(largest, folder, *options):
+    """Return the error of a run that may not write files larger than that."""
 
     def work():
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
         with said.open("w") as file, contextlib.redirect_stderr(file):
-            return main(["simulate", *EXACT, "--quiet", "--out", str(out)])
+            return main(["simulate", *EXACT, "--quiet", *options])
 
-    said, out = tmp_path / "said", tmp_path / "out"
-    out.mkdir()
+    said = folder / "said"
     assert status_of(work) == 2
-    assert f"File too large: '{out}/" in said.read_text()
+    return said.read_text()
+
+
+@pytest.mark.parametrize("name", ["run.csv", "run.mcap"])
+def test_a_full_disk_under_a_log_is_not_called_the_standard_output(name, tmp_path):
+    said = said_at(8_000, tmp_path, "--log", str(tmp_path / name))
+    assert said.endswith(f"File too large: '{tmp_path / name}'\n") and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("largest", [1_000, 20_000, 60_000])
+def test_a_full_disk_is_one_line_and_leaves_no_half_file(largest, tmp_path):
+    """A limit on the sizes of files stands for the disk; it holds in a copy of a process only."""
+
+    out = tmp_path / "out"
+    out.mkdir()
+    assert f"File too large: '{out}/" in said_at(largest, tmp_path, "--out", str(out))
     check_whole(out)
     assert not list(out.glob(".*.part"))
     there = {path.name for path in out.iterdir()}

@@ -271,6 +271,9 @@ def test_a_prepared_run_is_that_of_the_scenario_alone(limit):
     one = scenario("paper", "duration=2", f"actuator.torque_limit={limit}", *DIRTY)
     preparation = preparation_of(one)
     assert preparation is first
+    other = dataclasses.replace(one, controller=dataclasses.replace(one.controller, w_R=1e3))
+    assert preparation_of(other) is first
+    preparation.prepared(preparation.experiment(other))  # its plan of least error is another
     prepared, alone = preparation.prepared(preparation.experiment(one)), prepare(one)
     law, planned, _ = control_law(alone)
     assert repr(prepared.law) == repr(law)
@@ -314,6 +317,12 @@ def test_another_mechanism_file_is_another_preparation(tmp_path):
     path.write_text(text + "# changed\n")
     os.utime(path, ns=(1, 1))
     assert preparation_of(one) is not first
+
+
+def test_a_shipped_move_is_run():
+    """Its name is that of no file in the working folder."""
+    motion = "reference={kind: reachy_move, file: look_around}"
+    assert run_in_bulk(scenario("reachy_mini", motion, "duration=0.1")).status == "completed"
 
 
 def test_a_motion_that_cannot_be_is_refused_each_time():

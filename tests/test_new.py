@@ -102,10 +102,11 @@ def test_its_scenario_starts_as_live_advises(gravity, queue, tmp_path):
 
 @pytest.mark.usefixtures("blank_figures")
 def test_what_it_proposes_runs_and_is_reported(tmp_path, capsys):
-    folder = tmp_path / "mine"
+    folder = tmp_path / "of mine" / "mine"
     assert main(["new", str(folder), *flags(**UNITS)]) == 0
     said = capsys.readouterr().out
     assert said.startswith("yes: ") and not too_long(said)
+    assert f"next: stewart-drake simulate '{folder}/scenario.yaml' --out '{folder}/run'" in said
     assert "(estimated: uniform disc)" in said and "the motors have 2" in said
     words = " ".join(said.split())
     assert (

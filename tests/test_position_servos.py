@@ -219,6 +219,19 @@ def test_bulk_runs_are_those_of_drake(more):
     assert native.counts == drake.counts
 
 
+def test_torques_that_no_report_brought_are_unknown():
+    """They counted as zero, or as those of the last report."""
+    held, unheard = "queue=equilibrium", "sensor.faults=[{kind: missing, from: 0, to: 9}]"
+    results = [
+        sd.simulate(scenario("duration=1", held, lost), judge_stability=False).summary
+        for lost in ("sensor.loss=0", "sensor.loss=0.5", unheard)
+    ]
+    whole, half, nothing = (one["rms_torque"] for one in results)
+    assert half == pytest.approx(whole, rel=0.05) and np.isnan(nothing)
+    assert np.isnan([results[2][name] for name in ("peak_torque", "torque_variation")]).all()
+    assert results[2]["peak_torque_applied"] == results[0]["peak_torque_applied"] > 0
+
+
 def test_estimates_need_the_reports_of_drakes_loop():
     sc = scenario("controller.estimate=[payload]", "duration=0.1")
     assert run_in_bulk(sc).loop == "drake, controller.estimate"

@@ -1,9 +1,11 @@
 """Logs that are written during a run, and their reading."""
 
 import json
+import os
 import socket
 import threading
 import time
+from functools import partial
 from unittest.mock import Mock
 
 import numpy as np
@@ -94,6 +96,16 @@ def test_a_run_that_was_killed_leaves_its_log_up_to_there(run, tmp_path, name, s
     assert np.array_equal(read.pose[:-1], whole.pose[:-1])
 
 
+def test_a_damaged_mcap_log_is_refused(run, tmp_path):
+    """The decompressor has exceptions of its own, and a wrong length looks like a cut."""
+    data = (run[1] / "run.mcap").read_bytes()
+    second = data.index(b"zstd", data.index(b"zstd") + 4)  # chunk
+    for at in (second + 100, second - 33):  # its data, its length
+        changed = data[:at] + bytes([data[at] ^ 0x7F]) + data[at + 1 :]
+        path = written(tmp_path / "run.mcap", changed)
+        one_line(partial(sd.read_log, path), "damaged after t = ", "run.mcap")
+
+
 def test_identify_and_export_read_the_same_from_every_kind_of_log(run):
     _, folder = run
     paths = [folder / name for name in ("signals.nc", "run.mcap", "run.csv", ".")]
@@ -155,6 +167,10 @@ def test_what_is_no_log_is_said_in_a_line(tmp_path, name, data, words):
 def test_missing_logs_are_said_in_a_line(tmp_path):
     one_line(lambda: sd.read_log(tmp_path / "none.mcap"), "no such file")
     one_line(lambda: sd.read_log(tmp_path), "has no signals.nc")
+    pipe = tmp_path / "pipe.csv"
+    os.mkfifo(pipe)
+    one_line(lambda: sd.read_log(pipe), "is not a file")
+    one_line(lambda: sd.identify(pipe, PAPER), "is not a file")
 
 
 # Live.

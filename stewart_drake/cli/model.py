@@ -141,7 +141,10 @@ def _new(
 
     delivery.draw(PAGE, draw)
     status = delivery.end(made.summary)
-    delivery.say(f"next: stewart-drake simulate {folder / study.SCENARIO} --out {folder / 'run'}")
+    following = command_line(
+        "simulate", str(folder / study.SCENARIO), options={"out": folder / "run"}
+    )
+    delivery.say(f"next: {following}")
     return status, text or "The report could not be written; see the terminal."
 
 

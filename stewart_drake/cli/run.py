@@ -24,7 +24,7 @@ from stewart_drake.cli.common import (
 from stewart_drake.cli.options import command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.files.fileio import write_whole
-from stewart_drake.reporting.document import PAGE, Caution
+from stewart_drake.reporting.document import PAGE, Caution, counted
 from stewart_drake.reporting.terminal import count_bar, echo, phase_bar, progress_bars
 from stewart_drake.scenario.loading import load_compatible
 
@@ -151,7 +151,8 @@ def replay(
 ) -> None:
     """Write a log as a 3-D animation, one HTML file."""
     check_file(out)
-    sd.replay_log(log, out)
+    with named(out="--out"):
+        sd.replay_log(log, out)
     echo(f"written to {out}")
 
 
@@ -268,7 +269,7 @@ def compare(
     delivery.discard(*[f"{name}.nc" for name in known], *_pictures([*COMPARED_FIGURES, *drawn]))
     if delivery.out is not None:
         results.save(delivery.out)
-        delivery.add_files("summary.json", f"{len(results)} signal files")
+        delivery.add_files("summary.json", counted(len(results), "files of signals"))
     delivery.draw("figures", results.plot)
     ended = [result.status for result in results.values()]
     interrupted = "interrupted" in ended or len(ended) < len(names)

@@ -118,7 +118,7 @@ def read_table(
         if len(wrong):
             raise ConfigError(
                 f"{path}: row {lines[1:][wrong[0]]}, column {first[column]}: got "
-                f"{texts.iloc[wrong[0]]!r}; expected a finite number"
+                f"{brief(texts.iloc[wrong[0]])}; expected a finite number"
             )
         columns[name] = values * scale
     return Table(path, header, labels, scales, lines[1:], columns)

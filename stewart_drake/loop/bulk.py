@@ -198,7 +198,8 @@ class Preparation:
         white = white_errors(experiment.scenario)
         law = compose_law(experiment, self._once(sizing_of, experiment, key=white))
         queue = experiment.torques_in_flight(law.timeline.delay).tobytes()
-        way = self._once(catch_up_of, experiment, law, key=(queue, law.plant.substeps))
+        decisive = queue, law.plant.substeps, experiment.scenario.controller.weights
+        way = self._once(catch_up_of, experiment, law, key=decisive)
         law, motion, _ = with_catch_up(law, experiment, way)
         source = (tuner or weights_source)(experiment, law)
         return Prepared(experiment, law, motion, source)
@@ -236,7 +237,10 @@ def _key(scenario: Scenario) -> tuple[Any, ...]:
     fields["link"] = scenario.link.kind
     machines = scenario.mechanism, scenario.plant.mechanism
     files = [resolve("mechanism", name) for name in machines if name is not None]
-    named = getattr(scenario.reference, "file", None), scenario.controller.calibration
+    motion = getattr(scenario.reference, "file", None)
+    if motion is not None and scenario.reference.kind == "reachy_move":
+        motion = resolve("move", motion)
+    named = motion, scenario.controller.calibration
     files += [Path(name) for name in named if name is not None]
     return json.dumps(fields, default=str), *(_stamp(file) for file in files)
 

@@ -163,7 +163,7 @@ class Recorder(Record):
         if instant.sampled:
             controller_context = self._controller.GetMyContextFromRoot(context)
             memory, seconds = self._controller.sample(controller_context)
-            self.count(memory)
+            usable = self.count(memory)
             if self._tuner is not None:
                 tuner_context = self._tuner.GetMyContextFromRoot(context)
                 self.tuner_fallbacks = self._tuner.fallbacks(tuner_context)
@@ -172,7 +172,9 @@ class Recorder(Record):
                 "estimated_s": float(self._port(context, "delay_estimate")[0]),
                 "std_s": float(self._port(context, "delay_std")[0]),
             }
-            torques = memory.torque, memory.in_flight[-1]
+            torques = np.array([memory.torque, memory.in_flight[-1]])
+            if self._loop.HasSubsystemNamed("servos") and not usable:
+                torques *= np.nan  # they come with the measurement
             self.samples.append(np.concatenate([self._error, *torques, [seconds]]))
             held = (port for port, system in self._systems.items() if system in _HELD_BY)
             self._held = {port: self._port(context, port) for port in held}

@@ -50,13 +50,15 @@ def figures(
         error: (n, 6) on that grid, as of `accumulated_error`.
         scale: (6,) as of `accumulated_error`.
         errors: (k, 6) pose error at the controller's samples.
-        asked: (k, 6) torques of the law there, N m.
+        asked: (k, 6) torques of the law there, N m; NaN if servos did not report theirs.
         sent: (k, 6) the same within the limit, N m.
         controller: section of the scenario.
         completed: whether the run completed; error and cost are NaN otherwise.
     """
-    c, nan, some = controller, float("nan"), len(asked) > 0
+    c, nan = controller, float("nan")
     cost = quadratic_cost(errors, sent, c.period, *c.weights, c.integral) if completed else nan
+    asked = asked[np.isfinite(asked).all(axis=1)]
+    some = len(asked) > 0
     return Figures(
         accumulated_error=accumulated_error(time, error, scale) if completed else nan,
         cost=cost,
@@ -230,7 +232,8 @@ class RunSummary(TypedDict):
     cost: float
     """Equation (40) on the samples, for torques within the limit."""
     peak_torque: float
-    """Largest torque of the law, before the limit, N m."""
+    """Largest torque of the law, before the limit, N m; of servos, among those that came with a
+    measurement, NaN if none did."""
     peak_torque_applied: float
     """Largest torque that acted, N m."""
     rms_torque: float

@@ -17,10 +17,9 @@ import os
 import queue
 import re
 import socket
-import struct
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -45,6 +44,8 @@ from stewart_drake.types import Array
 
 EXPECTED: Final = "signals.nc, a log (.mcap, .csv) or the folder of a run"
 _METADATA: Final = "stewart_drake"
+_MAGIC: Final = b"\x89MCAP0\r\n"
+"""First and last bytes of a whole MCAP file."""
 _CHUNK: Final = 1 << 16
 """Bytes of JSON after which an MCAP file is written on."""
 _QUEUE: Final = 4096
@@ -92,11 +93,21 @@ def _members(fields: Iterable[str], values: Array) -> dict[str, float]:
     return {field: value for field, value in pairs if math.isfinite(value)}
 
 
+@contextlib.contextmanager
+def _naming(path: Path | None) -> Iterator[None]:
+    """Name a file in an error of writing, as on a full disk, which names none."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = None if path is None else str(path)
+        raise
+
+
 class McapLog:
     """An MCAP file, which is replaced, with one topic for each signal."""
 
     def __init__(self, path: Path, scenario: Scenario, servos: bool = True) -> None:
-        writer = _mcap("mcap.writer")
+        writer, self._path = _mcap("mcap.writer"), path
         self._file = open(path, "wb")  # noqa: SIM115 (closed by `close`)
         self._writer = writer.Writer(self._file, chunk_size=_CHUNK)
         self._writer.start(profile="", library=f"stewart_drake {versions()['stewart-drake']}")
@@ -126,12 +137,13 @@ class McapLog:
         for name, components in values.items():
             topic, fields = self._channels[name]
             data = json.dumps({"time": time} | _members(fields, components)).encode()
-            self._writer.add_message(topic, at, data, at, self._row)
+            with _naming(self._path):
+                self._writer.add_message(topic, at, data, at, self._row)
         self._row += 1
 
     def close(self) -> None:
-        self._writer.finish()
-        self._file.close()
+        with _naming(self._path), self._file:
+            self._writer.finish()
 
 
 class CsvFile:
@@ -148,7 +160,7 @@ class CsvFile:
         else:
             flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
             self.descriptor = os.open(path, flags, 0o666)
-        self._whole = 0
+        self._whole, self._path = 0, path
         self._add(heads)
 
     def write(self, row: Iterable[float]) -> None:
@@ -160,9 +172,10 @@ class CsvFile:
     def _add(self, cells: Iterable[str]) -> None:
         data = (",".join(cells) + "\n").encode("ascii")
         try:
-            done = 0
-            while done < len(data):
-                done += os.write(self.descriptor, data[done:])
+            with _naming(self._path):
+                done = 0
+                while done < len(data):
+                    done += os.write(self.descriptor, data[done:])
         except OSError:
             os.ftruncate(self.descriptor, self._whole)
             raise
@@ -300,7 +313,7 @@ def dataset_of(
 
 def is_run(path: Path) -> bool:
     """Return whether a file or folder is of a run, not the CSV log of a real machine."""
-    if path.suffix != ".csv" or path.is_dir():
+    if path.suffix != ".csv" or not path.is_file():
         return path.suffix in (".nc", ".mcap") or path.is_dir()
     with contextlib.suppress(OSError, UnicodeDecodeError), open(path, encoding="utf-8") as file:
         return file.readline(1 << 16).startswith("time[s],pose_roll[rad]")
@@ -323,8 +336,9 @@ def read_log(path: str | Path) -> xr.Dataset:
         if not found:
             raise ConfigError(f"{path}: has no signals.nc, .mcap or log.csv; expected {EXPECTED}")
         return read_log(found[0])
-    if not path.exists():
-        raise ConfigError(f"{path}: no such file; expected {EXPECTED}")
+    if not path.is_file():  # opening a pipe would wait for ever
+        problem = "is not a file" if path.exists() else "no such file"
+        raise ConfigError(f"{path}: {problem}; expected {EXPECTED}")
     if path.suffix == ".nc":
         return load_netcdf(path, EXPECTED)
     if path.suffix not in (".mcap", ".csv"):
@@ -362,13 +376,13 @@ def scenario_of(signals: xr.Dataset, path: Path) -> Scenario:
 
 
 def _read_mcap(path: Path) -> xr.Dataset:
-    records, errors = _mcap("mcap.records"), _mcap("mcap.exceptions")
+    records = _mcap("mcap.records")
     topics: dict[int, str] = {}
     times: dict[int, float] = {}
     messages: dict[str, dict[int, dict[str, float]]] = {}
     scenario = None
     with open(path, "rb") as file:
-        reader = _mcap("mcap.stream_reader").StreamReader(file)
+        reader = _mcap("mcap.stream_reader").StreamReader(file, validate_crcs=True)
         try:
             for record in reader.records:
                 if isinstance(record, records.Metadata) and record.name == _METADATA:
@@ -379,9 +393,12 @@ def _read_mcap(path: Path) -> xr.Dataset:
                     found = json.loads(record.data)
                     times[record.sequence] = float(found["time"])
                     messages.setdefault(topics[record.channel_id], {})[record.sequence] = found
-        except (errors.McapError, struct.error, EOFError, OSError):  # cut in a record
+        except Exception:  # of the decompressor too
             if not times:
                 raise ValueError("no MCAP file, or one cut before its messages") from None
+            file.seek(-len(_MAGIC), os.SEEK_END)
+            if file.read() == _MAGIC:  # it was not cut
+                raise ValueError(f"damaged after t = {max(times.values()):g} s") from None
     if not times:
         raise ValueError("no messages")
     if scenario is None:
