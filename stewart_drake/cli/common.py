@@ -146,7 +146,8 @@ def named(**options: str) -> Iterator[None]:
         yield
     except ConfigError as error:
         name, colon, rest = str(error).partition(":")
-        raise ConfigError(f"{options.get(name, name)}{colon}{rest}") from None
+        error.args = (f"{options.get(name, name)}{colon}{rest}",)
+        raise
 
 
 def check_file(path: Path | None, option: str = "--out") -> None:
