@@ -2,9 +2,9 @@
 #include "short.h"
 
 #define ONE_TORQUE ((real)0.5) /* information of one torque at t = 1: 1 / (2 t^2) */
-#define SIGNIFICANT ((real)2.3) /* standard deviations by which w exceeds 0 if it is significant */
+#define SIGNIFICANT ((real)2.5) /* standard deviations by which w exceeds 0 if it is significant */
 #define LATENESS_SIGNIFICANT ((real)3.5) /* the same for l: friction causes a small one */
-#define WIDER 40 /* factor on that excess: W is the change in one period, an effect lasts for many */
+#define WIDER 12 /* factor on that excess: W is the change in one period, an effect lasts for many */
 #define MOST_EXCESS 3 /* largest nu_i^2 / S_ii - 1 in the slope of w */
 #define LARGEST_T 1000 /* largest t */
 #define CHANGED_T 4  /* t at twice the assumed standard deviation */
