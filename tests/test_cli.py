@@ -196,6 +196,23 @@ def test_a_process_says_the_same(tmp_path):
     assert done.stderr == f"error: {path}: duration: got '2021-05-30'; expected a number\n"
 
 
+def test_an_interrupt_while_the_command_is_imported_shows_no_traceback():
+    code = """
+import os, signal, sys
+from stewart_drake.__main__ import run
+
+class Interrupt:
+    def find_spec(self, name, *_):
+        if name == "stewart_drake.cli.common":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupt())
+run()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
 def test_help_comes_without_drake():
     code = (
         "import sys; from stewart_drake.cli import main; main(['--help']);"
