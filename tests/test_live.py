@@ -228,9 +228,10 @@ def test_a_second_controller_takes_over_in_motion():
 @pytest.mark.slow
 @in_real_time
 def test_a_parked_plate_that_is_not_at_the_start_is_held_on_the_way_to_it():
-    """The torques that hold it act until the first ones of the law arrive."""
+    """The torques that hold it there act until the first ones of the law arrive."""
     settings = (*PARKED, "reference.amplitude=[0, 0, 0, 0, 0, 0.02]")
-    with paper_machine(*settings, "reference.offset=[0, 0, 0, 0, 0, 0.384]", rate=5.0) as running:
+    away = "reference.offset=[0, 0, 0.06, 0, 0, 0.384]"
+    with paper_machine(*settings, away, rate=5.0) as running:
         result = driven(running, 4.0, *settings)
     assert result.status == "completed" and result.summary["live"]["taken_over"]
 

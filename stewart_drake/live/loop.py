@@ -374,6 +374,11 @@ class LiveLoop:
         queue = design.queue if self._parked else np.zeros_like(design.queue)
         if message is not None and len(message.acted):
             queue = np.tile(message.acted[0], (len(queue), 1))
+        elif self._parked and design.experiment.scenario.queue == "equilibrium":
+            # Those of another pose would make it fall in the model, also where the lengths are off.
+            rest, limit = np.zeros(NUM_TORQUES), design.torque_limit
+            hold = design.law.plant.dynamics.inverse_dynamics(state[POSE], rest, rest)
+            queue = np.tile(np.clip(hold, -limit, limit), (len(queue), 1))
         self._law = replace(design.law, open_loop_samples=0)
         self.memory = self._law.initial_memory(queue)
         schedule = until_next(design.law.timeline, queue)
