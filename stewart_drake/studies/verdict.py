@@ -149,9 +149,8 @@ def loop_verdict(loop: ControllerMargin) -> str:
     up = f"{m.gain_up:.4g}" if math.isfinite(m.gain_up) else "any"
     widen = "; a larger controller.w_R widens it" if fragile(loop) and loop.weighted else ""
     return (
-        "this loop is stable: linearised along the reference, for delay errors from "
-        f"{milliseconds(-m.shorter)} (true delay shorter) to {milliseconds(m.longer, '+')} (longer)"
-        f"{share} and motor gains from {m.gain_down:.3g} to {up}{assumed}{widen}"
+        "this loop is stable: linearised along the reference, with a true delay from "
+        f"{milliseconds(m.shorter)} shorter to {milliseconds(m.longer)} longer{share} and motor gains from {m.gain_down:.3g} to {up}{assumed}{widen}"
     )
 
 
@@ -181,9 +180,9 @@ def delay_verdict(experiment: Experiment) -> Verdict:
     return Verdict(sc.eta, *fastest, sc.controller.period)
 
 
-def milliseconds(seconds: float, sign: str = "") -> str:
+def milliseconds(seconds: float) -> str:
     """Return a time in three digits, or `any time` if it is infinite."""
-    return f"{1e3 * seconds:{sign}.3g} ms" if math.isfinite(seconds) else "any time"
+    return f"{1e3 * seconds:.3g} ms" if math.isfinite(seconds) else "any time"
 
 
 def _power(exponent: float) -> str:
