@@ -42,6 +42,9 @@ def test_a_law_for_a_platform_knows_its_engine(kind):
     motion = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
         [0.0, 1.0, 2.0], moves.T, np.zeros(6), np.zeros(6)
     )
+    if kind == "multibody":
+        with pytest.raises(ConfigError, match=r"^delay: got 0.0996; .* nearest 0.1$"):
+            sd.design_law(platforms[0], motion, 0.02, 0.0996)
     law = sd.design_law(platforms[0], motion, 0.02, 0.1, queue="reference")
     for platform in platforms:
         controller, chain = law.AddToBuilder(builder), builder.AddSystem(law.delay_chain())

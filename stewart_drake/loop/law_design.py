@@ -104,6 +104,7 @@ from stewart_drake.scenario.signals import (
     POSE,
     WRENCHES,
 )
+from stewart_drake.scenario.timing import multiple_problem
 from stewart_drake.types import Array, ArrayLike
 
 LONGEST_REPLAN = 0.4
@@ -656,7 +657,10 @@ def design_law(
         scenario = validate(Scenario, sections, "design_law")
         scenario.check("design_law")
     except ConfigError as error:
-        raise ConfigError(_of_argument(str(error))) from None
+        message = _of_argument(str(error))
+        if "time_step" in engine and message.startswith("design_law: delay.fraction"):
+            message = multiple_problem("delay", late, engine["time_step"]) or message
+        raise ConfigError(message) from None
     names = estimated_names(scenario)
     if dynamics.free == PARAMETERS:
         parts = dynamics.mechanism, dynamics.gravity, dynamics.plant_parameters

@@ -104,7 +104,7 @@ def step_problem(
             f"plant.time_step: got {step!r}; expected {METRIC_PERIOD} s divided by a whole "
             f"number, nearest {nearest!r}"
         )
-    if problem := _multiple_problem("controller.period", period, step):
+    if problem := multiple_problem("controller.period", period, step):
         return problem
     steps = period / step
     if samples is not None and not _is_whole(steps / samples):
@@ -119,10 +119,10 @@ def step_problem(
             f"delay.fraction: got {fraction!r}, {fraction * steps:.6g} steps; expected a whole "
             f"number of plant.time_step ({step!r} s) within the period, nearest {nearest!r}"
         )
-    return _multiple_problem("link.playout", playout, step) if playout else None
+    return multiple_problem("link.playout", playout, step) if playout else None
 
 
-def _multiple_problem(field: str, value: float, step: float) -> str | None:
+def multiple_problem(field: str, value: float, step: float) -> str | None:
     """Return that a field in s is not a multiple of a discrete plant's step, or None."""
     if _is_whole(value / step):
         return None
@@ -146,7 +146,7 @@ def log_problem(log_period: float | None, duration: float, step: float | None = 
             f"log_period: got {log_period!r}; expected at least {least:.4g} s, {MOST_INSTANTS} "
             f"instants in duration {duration!r}, or null"
         )
-    problem = step and _multiple_problem("log_period", log_period, step)
+    problem = step and multiple_problem("log_period", log_period, step)
     return f"{problem}, or null" if problem else None
 
 
