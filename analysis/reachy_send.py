@@ -31,9 +31,12 @@ HEADER = ["time[s]"] + [f"{name}_{k}[rad]" for name in ("setpoint", "crank") for
 
 def read(path):
     """Return the rows (time, six angles) of a file; refuse one that is not safe to send."""
-    with open(path, newline="") as file:
-        head, *lines = list(csv.reader(file)) or [[]]
-    if len(head) != JOINTS or not all("rad" in name for name in head[1:]) or not lines:
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            head, *lines = list(csv.reader(file)) or [[]]
+    except (OSError, UnicodeError, csv.Error) as error:
+        raise SystemExit(f"{path}: got {error}; expected a file of setpoints") from None
+    if len(head) != JOINTS or not all(name.endswith("[rad]") for name in head[1:]) or not lines:
         raise SystemExit(f"{path}: got columns {head}; expected time[s], six [rad], and rows")
     rows = []
     for number, cells in enumerate(lines, 2):

@@ -288,6 +288,17 @@ def test_a_file_beyond_the_limits_is_not_sent(rows, tmp_path):
         send["main"]([str(file), "--reachy", "127.0.0.1:9", "--log", str(tmp_path / "l")])
 
 
+def test_what_is_no_file_of_setpoints_in_rad_is_not_sent(tmp_path):
+    read = runpy.run_path(str(Path(__file__).parents[1] / "analysis/reachy_send.py"))["read"]
+    file, missing = tmp_path / "setpoints.csv", tmp_path / "none.csv"
+    for content in (b"\xff\xfe\x91", b"t" + b",a[grad]" * 6 + b"\n0,0,0,0,0,0,0\n"):
+        file.write_bytes(content)
+        with pytest.raises(SystemExit, match=r"setpoints\.csv: got .* expected"):
+            read(file)
+    with pytest.raises(SystemExit, match=r"none\.csv: got .*No such file"):
+        read(missing)
+
+
 def test_a_robot_is_not_moved_without_consent(daemon, tmp_path, monkeypatch):
     monkeypatch.setitem(STATUS, "simulation_enabled", False)
     send = runpy.run_path(str(Path(__file__).parents[1] / "analysis/reachy_send.py"))["main"]

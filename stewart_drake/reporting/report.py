@@ -17,7 +17,12 @@ import numpy as np
 from stewart_drake.dynamics.workspace import Failure
 from stewart_drake.files.resources import shipped
 from stewart_drake.loop.preparation import prepare_unchecked, simulated_machine
-from stewart_drake.loop.results import SimulationResult, accumulated_error
+from stewart_drake.loop.results import (
+    SimulationResult,
+    accumulated_error,
+    peak_error,
+    second_half,
+)
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism
 from stewart_drake.reporting.analyses import analyze, options_of
@@ -339,7 +344,7 @@ def verdict(found: ReportData) -> tuple[str, Tone]:
         )
     else:
         text += f"{error} % s; the error averages {average}."
-    text += f" Largest error: {worst(run).replace('%', '% of its motion')}."
+    text += f" Largest error: {worst(run).replace('%', '% of its motion')}{_worst_later(run)}."
     if fair:
         text += f" Caution: {fair}."
     return text, max((level for level, _ in findings), key=_LEVELS.index, default="good")
@@ -389,6 +394,15 @@ def _second_half(run: SimulationResult) -> str:
     after = accumulated_error(late.time.values, late.error.values, scale)
     between = s["accumulated_error"] - s["delay_floor"] - after
     return f", {number(between)} % s until half of the run, and {number(after)} % s after it"
+
+
+def _worst_later(run: SimulationResult) -> str:
+    """Return the largest error of the second half, if one in the first was twice that or more."""
+    errors, scale = run.signals.error.values, prepare_unchecked(run.scenario).scale
+    later = peak_error(errors[second_half(run.signals.reference.values)], scale)
+    if not max(run.summary["peak_error"]) > 2 * later.max():
+        return ""
+    return f" in the first half, {worst(run, later.tolist())} in the second"
 
 
 def mean_error(run: SimulationResult) -> float:

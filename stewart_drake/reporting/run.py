@@ -1,7 +1,7 @@
 """Documents of a run, and of a comparison with the paper's Table II."""
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, Final
 
@@ -73,7 +73,7 @@ def run_document(result: SimulationResult, said: Collection[str] = ()) -> Docume
         run=result,
         torqueless=torqueless(result),
         s=s,
-        peaks=", ".join(_peaks(result)),
+        peaks=", ".join(_peaks(result, result.summary["peak_error"])),
         second_half=late_error(result),
         floor=waits_at_rest(result.scenario),
         delay=measured(2e3 * s["delay"]["std_s"], 1e3 * s["delay"]["estimated_s"]),
@@ -135,9 +135,9 @@ def moving(run: SimulationResult) -> Flags:
     return span(run.signals.reference.values) > STILL
 
 
-def _peaks(run: SimulationResult) -> list[str]:
+def _peaks(run: SimulationResult, percent: Sequence[float]) -> list[str]:
     """Return the largest error of each coordinate, in % of its motion; of a still one absolute."""
-    percent, moved = run.summary["peak_error"], moving(run)
+    moved = moving(run)
     return [
         f"{name} {number(percent[k], 2)} %"
         if moved[k]
@@ -156,16 +156,17 @@ def late_error(run: SimulationResult) -> str:
     return f"{errors} in the second half{' of the motion' * rests}"
 
 
-def worst(run: SimulationResult) -> str:
-    """Return the coordinate with the largest error and that error, as in `_peaks`.
+def worst(run: SimulationResult, peaks: Sequence[float] | None = None) -> str:
+    """Return the coordinate with the largest error, of `peaks` or of the run, as in `_peaks`.
 
     The error of a still coordinate is compared with the largest motion in its unit, or with 1 rad
     or 1 m, as in E_ac, if there is none.
     """
-    percent, motion = np.array(run.summary["peak_error"]), span(run.signals.reference.values)
+    peaks = run.summary["peak_error"] if peaks is None else peaks
+    motion = span(run.signals.reference.values)
     largest = np.repeat([motion[ANGLES].max(), motion[POSITION].max()], 3)
-    share = percent / np.where(moving(run) | (largest <= STILL), 1.0, largest)
-    return _peaks(run)[int(np.argmax(share))]
+    share = np.array(peaks) / np.where(moving(run) | (largest <= STILL), 1.0, largest)
+    return _peaks(run, peaks)[int(np.argmax(share))]
 
 
 def comparison_document(
