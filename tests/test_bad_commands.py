@@ -83,6 +83,10 @@ BAD_ARGUMENTS = [
         ["identify", "run.nc", "--mechanism", "paper", "--bits", "14"],
         "--bits: got 14 with logs of runs, which contain it",
     ),
+    (
+        ["layout", "--limit", "reach=20mm"],
+        "--limit: got 'reach=20mm'; expected NAME=VALUE, numbers without units",
+    ),
     (["layout", "paper", "--goal", "beauty"], "--goal: got beauty"),
     (["layout", "paper", "--set", "plant.mechanism=desktop"], "plant.mechanism: got desktop"),
     (["export", "nowhere.nc"], "nowhere.nc"),

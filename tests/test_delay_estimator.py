@@ -543,7 +543,7 @@ def test_the_loop_is_judged_with_the_delay_as_it_will_be_found():
     assert known.stable and not lost.stable and found.stable
     assert found.radius == pytest.approx(known.radius, rel=1e-9)
     assert found.delay_found and not known.delay_found
-    assert "payload, friction, delay known" in loop_verdict(found)
+    assert "estimated parameters and delay known" in loop_verdict(found)
     assert judged("delay.drift=0.01").problem == "its delay changes"
 
 

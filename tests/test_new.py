@@ -277,6 +277,15 @@ def test_the_form_draws_before_masses_are_known_and_names_what_is_wrong(form):
     assert longer["drawing"] != asked(form.url, "/check", json.dumps(fields()))[1]["drawing"]
 
 
+def test_the_form_draws_for_one_request_at_a_time(form):
+    with ThreadPoolExecutor(4) as tabs:
+        waiting = [
+            tabs.submit(asked, form.url, "/check", json.dumps(fields(rod=f"{260 + 5 * one} mm")))
+            for one in range(4)
+        ]
+    assert all(one.result()[1]["problem"] is None for one in waiting)
+
+
 def test_the_form_refuses_strangers_and_malformed_requests(form):
     assert asked(form.url, "/check", b"{}", token="guess")[0] == 403
     for data in (b"", b"[]", b"{", b'{"rod": 1}', b'{"other": "1"}', b"[" * 4000, b"x" * 5000):
@@ -297,6 +306,7 @@ def test_the_form_gives_the_measurements_and_shows_the_report(form):
     assert asked(form.url, "/write", json.dumps(fields(rod="")))[1]["problem"] == "is missing"
     assert not measured.done()
     assert asked(form.url, "/write", json.dumps(fields(rod="260 mm", **late)))[1]["problem"] is None
+    assert asked(form.url, "/check", json.dumps(fields()))[0] == 400  # not beside the report
     taken = measured.result(timeout=30)
     assert (taken.rod, taken.delay, taken.torque_limit) == (0.26, 0.08, 6)
     shown = waiting.submit(form.show, "<p>done</p>")

@@ -6,8 +6,8 @@ friction, dimensions and delay. The law has the delay it believes in, its model,
 its initial weights. A controller of the user's own is linearised by differences: `own_loop`. Left
 out are
 
-- the estimator: a law with one is judged as if it had found torque bias, payload, friction and, if
-  it estimates that, the delay;
+- the estimator: a law with one is judged as if it had found the parameters that it estimates and,
+  if it estimates that, the delay;
 - the tuner, torque limits and the catch-up from rest;
 - the change of reference and gain during the life of an error.
 

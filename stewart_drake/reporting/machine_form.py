@@ -85,6 +85,7 @@ class MachineForm:
 
     def __init__(self, given: Mapping[str, Any], title: str) -> None:
         self._entries: Entries = {}
+        self._drawing = threading.Lock()  # Matplotlib draws in one thread at a time
         self._asked, self._ready, self._fetched = (threading.Event() for _ in range(3))
         self._report = ""
         fields = [_field(one, given.get(one.name)) for one in Measurements.described()]
@@ -95,14 +96,17 @@ class MachineForm:
         self.url = self._server.url
 
     def _take(self, path: str, data: bytes) -> str | None:
-        """Return `answer` as JSON; take complete entries that are to be written."""
+        """Return `answer` as JSON; take complete entries that are to be written, once."""
         entries = read_entries(data)
         if entries is None or path not in ("/check", "/write"):
             return None
-        found = answer(entries)
-        if path == "/write" and found["problem"] is None:
-            self._entries = entries
-            self._asked.set()
+        with self._drawing:
+            if self._asked.is_set():  # the report is being drawn
+                return None
+            found = answer(entries)
+            if path == "/write" and found["problem"] is None:
+                self._entries = entries
+                self._asked.set()
         return json.dumps(found)
 
     def wait(self) -> Measurements:

@@ -153,7 +153,9 @@ def _numbers(option: str, form: str, texts: list[str], most: int) -> dict[str, l
         try:
             found[name.strip()] = [float(value) for value in values.split(":", most - 1)]
         except ValueError:
-            raise ConfigError(f"--{option}: got {text!r}; expected {form}") from None
+            raise ConfigError(
+                f"--{option}: got {text!r}; expected {form}, numbers without units"
+            ) from None
     return found
 
 

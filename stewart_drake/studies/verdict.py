@@ -129,8 +129,8 @@ def loop_verdict(loop: ControllerMargin) -> str:
         return f"no stability check of this loop: {loop.problem}"
     assumptions = []
     if loop.estimated:
-        found = "payload, friction, delay" if loop.delay_found else "payload, friction"
-        assumptions.append(f"estimator off; {found} known")
+        found = "parameters and delay" if loop.delay_found else "parameters"
+        assumptions.append(f"estimator off; estimated {found} known")
     if loop.tuned:
         assumptions.append("with the weights that the tuner starts from")
     assumed = f" ({'; '.join(assumptions)})" if assumptions else ""
