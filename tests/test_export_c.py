@@ -434,7 +434,12 @@ DESCRIBED = {
         FEW,
         ("not here because of `sensor.kind: encoders`",),
     ),
-    "unknown delay": ("paper", "adaptive_lqi", (), ("It is assumed to be 8 periods",)),
+    "unknown delay": (
+        "paper",
+        "adaptive_lqi",
+        (),
+        ("It is assumed to be 8 periods", "--delay 0.8 --no-gravity"),
+    ),
     "weights": ("desktop", None, ("tuner.kind=ann",), ("stewart_tuned_step(", "= 3 periods")),
     "servos": (
         *("paper", "servo_preview", ("actuator.kind=servo",)),
