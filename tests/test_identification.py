@@ -566,6 +566,14 @@ def test_a_log_that_ends_before_its_torques_act_is_refused(short_run_log):
     assert said[:2] == ["delay 1 of 19", "delay 1 of 19, iteration 1 of at most 4"]
 
 
+def test_a_log_without_gravity_read_as_one_with_it_is_refused(tmp_path):
+    settings = ("plant.kind=exact", "duration=3")
+    simulate(load_scenario("paper", settings=settings), judge_stability=False).save(tmp_path)
+    log = load_log(tmp_path / "signals.nc", PAPER, Precision())
+    with pytest.raises(ConfigError, match="under these torques with gravity; expected"):
+        identify([dataclasses.replace(log, gravity=9.81)], PAPER)
+
+
 # ---------------------------------------------------------------- excitation and files
 
 

@@ -313,10 +313,12 @@ def _fit_all(first_fit: _FirstFit) -> Solution:
     problem, guess = without_diverged(first_fit.whole, first_fit.guess)
     if not problem.segments:
         name = first_fit.whole.unknowns.mechanism.name
+        logs = [s.log for s in first_fit.whole.segments]
+        acting = "with" if logs[0].gravity else "without"
         raise ConfigError(
-            f"{_files(s.log for s in first_fit.whole.segments)}: got no stretch that the mechanism "
-            f"{name} could have moved through under these torques; expected a log of this machine, "
-            "torques in N m as they were commanded"
+            f"{_files(logs)}: got no stretch that the mechanism {name} could have moved through "
+            f"under these torques {acting} gravity; expected a log of this machine, torques in N m "
+            "as they were commanded, gravity as it acted"
         )
     if first_fit.chi2 > WRONG:
         return solve(problem, guess, whole=first_fit.whole)

@@ -328,7 +328,7 @@ static void say(controller *c, uint32_t flags, uint64_t sampled, uint64_t playou
    of the newest datagram, which a report is of; negative without one" if network@. */
 static int take(controller *c, unsigned k)
 {
-    int age = @-1 if network else 0@, found = 0;
+    int age = @"-1" if network else "0"@, found = 0;
     for (int i = 0; i < STEWART_MEASUREMENT_SIZE; i++)
         c->measured[i] = (real)NAN;
     for (int a = 0; !found && a <= LONGEST_WAIT && (unsigned)a + c->next <= k; a++) {
