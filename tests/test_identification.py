@@ -52,7 +52,7 @@ from stewart_drake.identification.unknowns import (
 )
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
-from stewart_drake.reporting.identification import document
+from stewart_drake.reporting.identification import document, residuals_of
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import BALL_JOINTS
 from tests.mechanisms import PAPER, random_mechanism
@@ -564,6 +564,14 @@ def test_a_log_that_ends_before_its_torques_act_is_refused(short_run_log):
     with pytest.raises(ConfigError, match=message), shown_by(said.append):
         identify([up_to(short_run_log, 0.9)], PAPER)
     assert said[:2] == ["delay 1 of 19", "delay 1 of 19, iteration 1 of at most 4"]
+
+
+def test_the_residuals_of_a_short_log_are_drawn(short_run_log):
+    """Its fit leaves out samples, and knows torques before it."""
+    found = identify([short_run_log], PAPER)
+    times, residuals = residuals_of(found, found.logs[0])
+    assert len(times) > 10 and set(times) <= set(short_run_log.times)
+    assert 0.7 < np.nanstd(residuals) < 1.1
 
 
 # ---------------------------------------------------------------- excitation and files
