@@ -73,6 +73,7 @@ def test_means_are_over_the_scenarios_that_all_complete():
     assert [found["candidates"][n]["failures"] for n in NAMES] == [0, 1, 1]
     assert [found["candidates"][n]["mean"] for n in NAMES] == [1.5, 3.0, 1.0]
     assert [found["candidates"][n]["worst"] for n in NAMES] == [2.0, 4.0, 1.0]
+    assert [found["candidates"][n]["interval"][0] for n in NAMES] == [0.0, 0.0, 1.0], "E_ac >= 0"
     assert found["best_fixed"] == "a"
     assert found["improvement"] == pytest.approx(1 - 1 / 1.5)
     assert found["hindsight"] == 0.0

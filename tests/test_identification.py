@@ -52,7 +52,7 @@ from stewart_drake.identification.unknowns import (
 )
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
-from stewart_drake.reporting.identification import document
+from stewart_drake.reporting.identification import document, residuals_of
 from stewart_drake.scenario.loading import load_scenario
 from stewart_drake.scenario.signals import BALL_JOINTS
 from tests.mechanisms import PAPER, random_mechanism
@@ -572,6 +572,14 @@ def test_a_log_without_gravity_read_as_one_with_it_is_refused(tmp_path):
     log = load_log(tmp_path / "signals.nc", PAPER, Precision())
     with pytest.raises(ConfigError, match="under these torques with gravity; expected"):
         identify([dataclasses.replace(log, gravity=9.81)], PAPER)
+
+
+def test_the_residuals_of_a_short_log_are_drawn(short_run_log):
+    """Its fit leaves out samples, and knows torques before it."""
+    found = identify([short_run_log], PAPER)
+    times, residuals = residuals_of(found, found.logs[0])
+    assert len(times) > 10 and set(times) <= set(short_run_log.times)
+    assert 0.7 < np.nanstd(residuals) < 1.1
 
 
 # ---------------------------------------------------------------- excitation and files

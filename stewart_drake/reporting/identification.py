@@ -188,9 +188,9 @@ def _left_out(found: Identification) -> list[str]:
             if segment.log.name != log.name or id(segment) in kept:
                 continue
             if spans and spans[-1][1] >= segment.start - _ADJACENT:
-                spans[-1][1] = log.times[segment.rows[-1]]
+                spans[-1][1] = segment.log.times[segment.rows[-1]]
             else:
-                spans.append([segment.start, log.times[segment.rows[-1]]])
+                spans.append([segment.start, segment.log.times[segment.rows[-1]]])
         if spans:
             listed = ", ".join(f"{a:.4g} to {b:.4g} s" for a, b in spans[:5])
             more = f" and {len(spans) - 5} more" if len(spans) > 5 else ""
@@ -270,10 +270,10 @@ def residuals_of(found: Identification, log: Log) -> tuple[Array, Array]:
     """Return times (n,) of a log in s, and residuals (n, 18) in standard deviations."""
     times, rows = [np.empty(0)], [np.empty((0, 18))]
     for i, segment in enumerate(found.fit.problem.segments):
-        if segment.log is log:
+        if segment.log.name == log.name:  # a fit may leave out samples of the log
             fitted = found.fit.residuals.measured[: len(segment.rows), i]
-            has_value = np.isfinite(log.values[segment.rows])
-            times.append(log.times[segment.rows])
+            has_value = np.isfinite(segment.log.values[segment.rows])
+            times.append(segment.log.times[segment.rows])
             rows.append(np.where(has_value, fitted, np.nan))
     return np.concatenate(times), np.concatenate(rows)
 

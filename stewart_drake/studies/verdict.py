@@ -150,7 +150,8 @@ def loop_verdict(loop: ControllerMargin) -> str:
     widen = "; a larger controller.w_R widens it" if fragile(loop) and loop.weighted else ""
     return (
         "this loop is stable: linearised along the reference, with a true delay from "
-        f"{milliseconds(m.shorter)} shorter to {milliseconds(m.longer)} longer{share} and motor gains from {m.gain_down:.3g} to {up}{assumed}{widen}"
+        f"{milliseconds(m.shorter)} shorter to {milliseconds(m.longer)} longer{share} and "
+        f"motor gains from {m.gain_down:.3g} to {up}{assumed}{widen}"
     )
 
 

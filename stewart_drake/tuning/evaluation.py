@@ -229,7 +229,7 @@ def compare_errors(names: Sequence[str], fixed: int, error: Array, seed: int) ->
             name: {
                 "failures": int(failures[i]),
                 "mean": mean[i],
-                "interval": [mean[i] - half[i], mean[i] + half[i]],
+                "interval": [np.maximum(0.0, mean[i] - half[i]), mean[i] + half[i]],
                 "worst": common[i].max(),
             }
             for i, name in enumerate(names)
