@@ -314,10 +314,10 @@ def _fit_all(first_fit: _FirstFit) -> Solution:
     if not problem.segments:
         name = first_fit.whole.unknowns.mechanism.name
         logs = [s.log for s in first_fit.whole.segments]
-        acting = "with" if logs[0].gravity else "without"
+        field = "with gravity" if logs[0].gravity else "without gravity"
         raise ConfigError(
             f"{_files(logs)}: got no stretch that the mechanism {name} could have moved through "
-            f"under these torques {acting} gravity; expected a log of this machine, torques in N m "
+            f"under these torques {field}; expected a log of this machine, torques in N m "
             "as they were commanded, gravity as it acted"
         )
     if first_fit.chi2 > WRONG:
