@@ -203,6 +203,14 @@ def test_a_delay_a_little_off_is_survived_from_rest(late):
     assert np.abs(result.signals.parameters.values[-1]).max() < 1e-2
 
 
+def test_a_plan_without_torques_in_flight_sends_no_impossible_torques():
+    """The first hold of a plan has the change of the one before, which the plan does not have."""
+    moved = "start=on_reference", "reference.frequency=6", "duration=3"
+    result = run(EXACT, *moved, "delay.steps=0")
+    assert result.status == "completed"
+    assert abs(result.signals.torque_commanded).max() < 1
+
+
 def test_full_amplitude_under_gravity_on_the_exact_plant():
     scenario = sd.load_scenario("gravity", settings=(EXACT, "duration=3.0"))
     assert sd.simulate(scenario, judge_stability=False).accumulated_error <= 0.05

@@ -45,7 +45,8 @@ static int has_acted(const stewart_law *law, const stewart_outlook *outlook, con
     return memory[SINCE_START] >= outlook->eta / law->period + 2 - ROUNDING;
 }
 
-/* Compute the rows of the plan, then of the goal; without a plan those of the caller's reference. */
+/* Compute the rows of the plan, before and after it of the goal; without a plan those of the caller's
+   reference. Without torques in flight a hold's change begins before the plan. */
 static void rows_of(const stewart_law *law, const real *memory, const stewart_sample *sample, int number,
                     const real *times, real *rows)
 {
@@ -55,7 +56,8 @@ static void rows_of(const stewart_law *law, const real *memory, const stewart_sa
         sample->reference(sample->context, number, times, rows);
     for (int i = 0; i < number && pieces > 0; i++) {
         real *row = rows + ROW * i;
-        if (!stewart_path_row(pieces, memory + PATH, now + times[i], row))
+        const int before = now + times[i] < memory[PATH] - ROUNDING * law->period;
+        if (before || !stewart_path_row(pieces, memory + PATH, now + times[i], row))
             (sample->goal ? sample->goal : sample->reference)(sample->context, 1, times + i, row);
     }
 }
