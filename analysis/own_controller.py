@@ -28,7 +28,7 @@ def main(out: str = "out/own_controller", *settings: str) -> sd.SimulationResult
     fast = ("delay.steps=0", "controller.period=0.01", "start=on_reference")
     scenario = sd.load_scenario("paper", settings=[*fast, *settings])
     dynamics = sd.StewartDynamics(sd.load_mechanism(scenario.mechanism), scenario.plant.gravity)
-    result = sd.simulate(scenario, controller=ComputedTorque(dynamics))
+    result = sd.simulate(scenario, controller=lambda: ComputedTorque(dynamics))
     print(result.table())
     result.save(out)
     result.plot(out)
