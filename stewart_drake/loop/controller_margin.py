@@ -476,7 +476,7 @@ def linear_models(
     """
     experiment = _experiment_of(scenario, settings, controller)
     loop = scenario if isinstance(scenario, DesignedLaw) else experiment
-    duration = _experiment_of(loop).scenario.duration
+    duration = experiment.scenario.duration
     if time is None:
         margin = controller_margin(loop)
         if margin.problem:

@@ -61,7 +61,7 @@ def linearised(system: System, experiment: Experiment, times: Array) -> list[Arr
     sizes = [context.get_discrete_state(i).size() for i in groups]
     if context.num_continuous_states() or context.num_abstract_states():
         raise UnjudgedError("its controller has continuous or abstract state")
-    period, every = experiment.scenario.controller.period, None
+    period = experiment.scenario.controller.period
     if sizes:
         every = system.GetUniquePeriodicDiscreteUpdateAttribute()
         if every is None or not np.isclose(every.period_sec(), period, rtol=1e-9):
