@@ -5,14 +5,21 @@ import sys
 
 
 def run() -> int:
-    """Run the command. Until `main` handles Ctrl-C it ends the process without a traceback."""
+    """Run the command, which SIGTERM ends as Ctrl-C does, with 143 in place of 130.
+
+    Until `main` handles them both end the process without a traceback.
+    """
     handler = signal.getsignal(signal.SIGINT)
     if handler is signal.default_int_handler:  # else it is ignored, as in the background
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     from stewart_drake.cli import main
+    from stewart_drake.cli.common import INTERRUPTED, SIGNALS, TERMINATED, interrupt
 
     signal.signal(signal.SIGINT, handler)
-    return main()
+    if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, interrupt)
+    status = main()
+    return TERMINATED if status == INTERRUPTED and signal.SIGTERM in SIGNALS else status
 
 
 if __name__ == "__main__":

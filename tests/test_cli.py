@@ -100,13 +100,13 @@ def test_compare_prints_table_ii_and_writes_everything(tmp_path, capsys):
 
 
 WITHOUT_FIGURES = (
-    "import sys, pytest; from tests.shorter import leave_blank; from stewart_drake.cli import main;"
-    "leave_blank(pytest.MonkeyPatch()); sys.exit(main(sys.argv[1:]))"
+    "import sys, pytest; from tests.shorter import leave_blank; from stewart_drake import __main__;"
+    "leave_blank(pytest.MonkeyPatch()); sys.exit(__main__.run())"
 )
 
 
-def interrupted(arguments, wait, group, code=WITHOUT_FIGURES):
-    """Exit status and stderr of a command that gets Ctrl-C some time after its first line.
+def interrupted(arguments, wait, group, code=WITHOUT_FIGURES, number=signal.SIGINT):
+    """Exit status and stderr of a command that gets a signal some time after its first line.
 
     Without the lines of progress that a busy machine gives it time for.
     """
@@ -121,20 +121,26 @@ def interrupted(arguments, wait, group, code=WITHOUT_FIGURES):
     assert process.stdout is not None
     assert process.stdout.readline()  # the verdict: it has begun
     time.sleep(wait)
-    # A terminal sends it to the whole group, `kill -INT` to one process.
-    (os.killpg if group else os.kill)(process.pid, signal.SIGINT)
+    # A terminal and `timeout` send it to the whole group, `kill -INT` to one process.
+    (os.killpg if group else os.kill)(process.pid, number)
     _, err = process.communicate(timeout=180)  # figures of all runs, on a busy machine
     assert "Traceback" not in err
     kept = [line for line in err.splitlines() if not re.search(r", after \d+ s$", line)]
     return process.returncode, "\n".join(kept)
 
 
+ENDINGS = pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
+)
+
+
 @pytest.mark.slow
-def test_ctrl_c_in_simulate_keeps_what_was_computed(tmp_path):
+@ENDINGS
+def test_ctrl_c_in_simulate_keeps_what_was_computed(tmp_path, number, status):
     settings = ("--set", "controller.period=0.02", "--set", "delay.steps=4")
     arguments = ["simulate", "paper", *MULTIBODY, "--set", "duration=200", *settings]
     arguments += ["--out", str(tmp_path)]
-    assert interrupted(arguments, wait=3.0, group=False) == (130, "")
+    assert interrupted(arguments, wait=3.0, group=False, number=number) == (status, "")
     assert files(tmp_path) >= RUN_FILES
     summary = summary_in(tmp_path)
     assert summary["status"] == summary["failure"]["reason"] == "interrupted"
@@ -175,10 +181,11 @@ def test_ctrl_c_while_drake_is_loaded_is_one_as_well(monkeypatch):
 
 
 @pytest.mark.slow
-def test_ctrl_c_in_compare_reaches_the_processes_in_an_orderly_way(tmp_path):
+@ENDINGS
+def test_ctrl_c_in_compare_reaches_the_processes_in_an_orderly_way(tmp_path, number, status):
     # Early, when they are still importing: there a signal of their own would break them.
     arguments = ["compare", "paper", *MULTIBODY, "--set", "duration=40", "--out", str(tmp_path)]
-    assert interrupted(arguments, wait=1.0, group=True) == (130, "")
+    assert interrupted(arguments, wait=1.0, group=True, number=number) == (status, "")
     for name, run in summary_in(tmp_path)["controllers"].items():
         assert run["status"] in ("interrupted", "left_workspace")
         assert f"{name}.nc" in files(tmp_path)

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 
 INTERRUPTED: Final = 130
 """Exit status after Ctrl-C."""
+TERMINATED: Final = 143
+"""Exit status after SIGTERM."""
+SIGNALS: Final = set[int]()
+"""Signals that have asked this process to end."""
 
 RESUMABLE: Final = "finished runs are kept, the same command goes on from there"
 """Text after Ctrl-C of commands that continue."""
@@ -183,6 +187,13 @@ def _remove_empty(directories: list[Path]) -> None:
     with contextlib.suppress(OSError):
         for path in directories:
             path.rmdir()
+
+
+def interrupt(number: int, _frame: object) -> None:
+    """Handle a signal as Ctrl-C. `timeout` may send it twice, so a repeated one is ignored."""
+    if number not in SIGNALS:
+        SIGNALS.add(number)
+        raise KeyboardInterrupt
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
-from stewart_drake.cli.common import Chosen, Delivery, check_log
+from stewart_drake.cli.common import SIGNALS, Chosen, Delivery, check_log
 from stewart_drake.cli.options import Given, command
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.options import LiveOptions, MachineOptions
@@ -286,8 +286,9 @@ def _ending() -> Iterator[Callable[[], bool]]:
     """Yield whether Ctrl-C or SIGTERM asks for rest; a second one raises KeyboardInterrupt."""
     asked = False
 
-    def ask(*_: Any) -> None:
+    def ask(number: int, _frame: object) -> None:
         nonlocal asked
+        SIGNALS.add(number)
         if asked:
             raise KeyboardInterrupt
         asked = True
@@ -331,13 +332,12 @@ def machine(*, chosen: Chosen, given: Given, delivery: Delivery) -> int:
         if options.reachy is not None:
             moved = f"drives the robot behind {options.reachy}"
         try:
-            with _handled(signal.default_int_handler, signal.SIGTERM):
-                delivery.say_wrapped(
-                    f"machine {chosen.scenario} at {address[0]}:{address[1]}: {moved}, "
-                    f"a sample every {1e-6 * running.period:g} ms",
-                    "waits for a controller; Ctrl-C ends it",
-                )
-                running.run(options.duration or math.inf)
+            delivery.say_wrapped(
+                f"machine {chosen.scenario} at {address[0]}:{address[1]}: {moved}, "
+                f"a sample every {1e-6 * running.period:g} ms",
+                "waits for a controller; Ctrl-C ends it",
+            )
+            running.run(options.duration or math.inf)
         except KeyboardInterrupt:
             interrupted = True
     if options.log is not None:

@@ -266,17 +266,17 @@ def _on_this_machine(workers: int | None, calls: Sequence[_Call]) -> Generator[t
 
 @contextmanager
 def _signals_blocked() -> Iterator[None]:
-    """Start processes that Ctrl-C does not reach, and resource trackers that print nothing.
+    """Start processes that Ctrl-C and SIGTERM to the group do not reach, and quiet trackers.
 
     A process inherits the signal mask of the thread that starts it, and a thread likewise; Ctrl-C
-    would break the imports of a worker in the middle. The tracker is started before the signal is
-    blocked, because some Pythons unblock it there. The tracker removes the resources that a killed
-    worker leaves; its warnings about them are turned off.
+    would break the imports of a worker in the middle. The tracker is started before the signals are
+    blocked, because some Pythons unblock them there. The tracker removes the resources that a
+    killed worker leaves; its warnings about them are turned off.
     """
     before = os.environ.get("PYTHONWARNINGS")
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [before, "ignore:resource_tracker"]))
     resource_tracker.ensure_running()
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
     finally:
