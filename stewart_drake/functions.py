@@ -71,6 +71,7 @@ def identify(
     gravity: bool = True,
     velocity_gain: float | None = None,
     command: str = "",
+    folder: str | Path = "",
 ) -> AnalysisResult:
     """Find delay, friction and geometry in logs of one machine.
 
@@ -91,6 +92,7 @@ def identify(
         velocity_gain: of the position servos, N m s/rad, which a log does not tell from damping;
             by default that of the log's scenario, or 0.
         command: that the page names; by default the call of this function.
+        folder: of `save`, for the command on the page that reads its files.
     """
     tolerances, precision = _expected(tolerances, precision)
     paths = [logs] if isinstance(logs, str | Path) else list(logs)
@@ -118,12 +120,13 @@ def identify(
         std = _STD_12_BITS if precision is None else precision.angle
         g = DEFAULT_GRAVITY if gravity else 0.0
         find_servos = partial(identify_servos, log, machine, std, g, velocity_gain)
-        return analysis_result(find_servos, servo_identification.document, typed, _write_servos)
+        describe_servos = partial(servo_identification.document, folder=folder)
+        return analysis_result(find_servos, describe_servos, typed, _write_servos)
     read = [load_log(Path(path), machine, precision or Precision(), gravity) for path in paths]
     if velocity_gain is not None:
         raise ConfigError("velocity_gain: got one; expected none without a log of setpoints")
     find = partial(identification.identify, read, machine, tolerances, delay)
-    return analysis_result(find, document, typed, _write_machine)
+    return analysis_result(find, partial(document, folder=folder), typed, _write_machine)
 
 
 def refuse_for_runs(logs: Iterable[str | Path], options: Mapping[str, object]) -> None:

@@ -205,8 +205,9 @@ def test_an_error_names_the_log_and_the_mechanism(lost, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_lost_log_lets_the_next_run_be_held(lost, tmp_path, capsys):
-    assert main(["identify", str(lost), "--mechanism", "paper", "--out", str(tmp_path)]) == 0
+def test_a_lost_log_lets_the_next_run_be_held(lost, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path.parent)
+    assert main(["identify", str(lost), "--mechanism", "paper", "--out", tmp_path.name]) == 0
     out = capsys.readouterr().out
     assert "The delay is 9" in out and not too_long(out)
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -222,7 +223,10 @@ def test_a_lost_log_lets_the_next_run_be_held(lost, tmp_path, capsys):
     assert np.abs(machine.rod_lengths - PAPER.rod_lengths).max() < 1e-3
     assert machine.drawn == fingerprint(PAPER) != fingerprint(machine)
     page = (tmp_path / "report.html").read_text()
-    assert "--set overlay=DIR/found.yaml" in " ".join(out.split())
+    assert (
+        f"Use found.yaml: stewart-drake simulate SCENARIO --set overlay={tmp_path.name}/found.yaml"
+        in (" ".join(out.split()))
+    )
     overlay = f"overlay={tmp_path / 'found.yaml'}"
     found = sd.load_scenario("paper", settings=("overlay=dirty", overlay, "plant.kind=exact"))
     assert found.mechanism == str(tmp_path / "mechanism.yaml")

@@ -84,12 +84,14 @@ def test_the_reader_of_mcap_finds_schemas_that_fit_the_messages(run):
 
 @pytest.mark.parametrize("share", [0.4, 0.7, 0.95])
 @pytest.mark.parametrize("name", ["run.mcap", "run.csv"])
-def test_a_run_that_was_killed_leaves_its_log_up_to_there(run, tmp_path, name, share):
+def test_a_run_that_was_killed_leaves_its_log_up_to_there(run, tmp_path, name, share, caplog):
     result, folder = run
     data = (folder / name).read_bytes()
     (tmp_path / name).write_bytes(data[: int(share * len(data))])
     (tmp_path / "run.yaml").write_bytes((folder / "run.yaml").read_bytes())
     read = read_log(tmp_path / name)
+    end = f"{name}: cut off, as of a killed run; read up to t = {read.time.values[-1]:g} s"
+    assert caplog.text.count(end) == 1
     whole = result.signals.isel(time=slice(len(read.time)))
     assert 0.3 * share * len(result.signals.time) < len(read.time) <= len(result.signals.time)
     assert np.array_equal(read.time, whole.time)

@@ -132,6 +132,7 @@ def identify(
                 delay=delay,
                 gravity=gravity is not False,
                 velocity_gain=velocity_gain,
+                folder=delivery.out or "",
                 **more,
             )
         delivery.discard(

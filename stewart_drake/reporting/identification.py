@@ -1,5 +1,6 @@
 """Documents and figures of an identified machine, and of a planned log."""
 
+import shlex
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -48,7 +49,8 @@ _VALUE_NAMES: Final = {
 """Names of the measured values, by kind of measurement."""
 
 
-def document(found: Identification) -> Document:
+def document(found: Identification, folder: str | Path = "") -> Document:
+    """Describe the machine; `folder` is that of its files in the command that uses them."""
     delay_ms, right = 1e3 * found.values[DELAY], found.right
     interval, delay = measured(1e3 * found.std[DELAY], delay_ms)
     cautions, names = _cautions(found), file_names(found.logs)
@@ -78,6 +80,7 @@ def document(found: Identification) -> Document:
         weak=_weak(found) if right else [],
         poses=found.pose_uncertainty if right else None,
         outside=right and found.pose_uncertainty is None,
+        folder=folder and shlex.quote(str(folder)),
         **dict.fromkeys(("plan", "reduced", "motion", "risk", "heavier")),
         **_shared(found),
     )

@@ -1,6 +1,8 @@
 """Documents and figures of identified position servos, and of a planned log of them."""
 
+import shlex
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -24,13 +26,15 @@ _UNITS: Final = {"s": ("ms", 1e3), "rad": ("mrad", 1e3), "kg m^2": ("g m^2", 1e3
 """Unit in which a number is shown, and the factor, by its SI unit; others are shown as they are."""
 
 
-def document(found: ServoIdentification) -> Document:
+def document(found: ServoIdentification, folder: str | Path = "") -> Document:
+    """Describe the servos; `folder` is that of their file in the command that uses it."""
     notes, log = _cautions(found) if found.right else [], found.model.log
     return _document(
         found,
         "bad" if not found.right else "fair" if notes else "good",
         plan=None,
         cautions=notes,
+        folder=folder and shlex.quote(str(folder)),
         found=_table(found, weak=True),
         log=log.name,
         motion=partial(_figure, "crank angles", log.times, log.cranks),

@@ -12,6 +12,7 @@ import contextlib
 import copy
 import csv
 import json
+import logging
 import math
 import os
 import queue
@@ -50,6 +51,7 @@ _CHUNK: Final = 1 << 16
 """Bytes of JSON after which an MCAP file is written on."""
 _QUEUE: Final = 4096
 """Largest number of rows that wait for a slow disk."""
+_log: Final = logging.getLogger("stewart_drake")
 _ENCODER: Final = re.compile(r"measurement_A\d")
 
 
@@ -325,7 +327,8 @@ def read_log(path: str | Path) -> xr.Dataset:
 
     Args:
         path: signals.nc, a log (.mcap or .csv), or the folder of a run, whose signals.nc is taken
-            before its logs. A log without an end, of a run that was killed, is read up to there.
+            before its logs. A log without an end, of a run that was killed, is read up to there;
+            the package's logger warns of it.
 
     Raises:
         ConfigError: no such file, or not of a run; one line.
@@ -399,6 +402,7 @@ def _read_mcap(path: Path) -> xr.Dataset:
             file.seek(-len(_MAGIC), os.SEEK_END)
             if file.read() == _MAGIC:  # it was not cut
                 raise ValueError(f"damaged after t = {max(times.values()):g} s") from None
+            _warn_of_end(path, max(times.values()))
     if not times:
         raise ValueError("no messages")
     if scenario is None:
@@ -426,7 +430,7 @@ def _read_csv(path: Path) -> xr.Dataset:
     if heads[: len(expected)] != expected:
         wrong = next((a for a, b in zip(heads, expected, strict=False) if a != b), "")
         raise ValueError(f"column {wrong!r}, which a log of a run does not have there")
-    if rows and len(rows[-1]) < len(heads):
+    if cut := bool(rows) and len(rows[-1]) < len(heads):
         del rows[-1]  # of a run that was killed
     for number, row in enumerate(rows, 2):
         if len(row) != len(heads):
@@ -434,10 +438,16 @@ def _read_csv(path: Path) -> xr.Dataset:
     if not rows:
         raise ValueError("no rows")
     table = np.array([[float(cell.strip() or "nan") for cell in row] for row in rows])
+    if cut:
+        _warn_of_end(path, table[-1, 0])
     widths = [channel.size for channel in channels]
     parts = np.split(table[:, 1 : len(expected)], np.cumsum(widths)[:-1], axis=1)
     values = {channel.name: part for channel, part in zip(channels, parts, strict=True)}
     return dataset_of(table[:, 0], values, _scenario_near(path), samples)
+
+
+def _warn_of_end(path: Path, time: float) -> None:
+    _log.warning("%s: cut off, as of a killed run; read up to t = %g s", path, time)
 
 
 def _scenario_near(path: Path) -> str | None:
