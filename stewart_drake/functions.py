@@ -6,6 +6,7 @@ Bad input raises a ConfigError of one line.
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -393,8 +394,9 @@ def run_live(
     ready = prepare_session(as_scenario(scenario), parse_address(machine), read_key(options.key))
     rules: Any = options.model_dump(include={"armed", "accept_jitter", "max_missing", "hold"})
     duration = math.inf if options.duration is None else options.duration
-    logs = open_logs(ready, options, print)
-    return SimulationResult.of(drive(ready, duration, logs=logs, **rules))
+    with closing(ready.endpoint):
+        logs = open_logs(ready, options, print)
+        return SimulationResult.of(drive(ready, duration, logs=logs, **rules))
 
 
 @takes(MachineOptions)

@@ -753,9 +753,13 @@ def test_a_real_machine_wants_to_be_armed():
         ready = prepare_session(scenario_of(), running.address)
         ready.contact.last = replace(ready.contact.last, flags=MachineFlags.PARKED)
         assert "A REAL MACHINE" in plans(ready, math.inf, "paper")[0]
-        with pytest.raises(ConfigError, match=r"^--arm"):
+        with pytest.raises(
+            ConfigError, match=r"^--arm: not given, so nothing moved: the link is m"
+        ):
             check_armed(ready, False)
-        check_armed(ready, True)
+        check_armed(ready, True)  # the check has closed nothing
+        assert ready.endpoint.fileno() >= 0
+        ready.endpoint.close()
 
 
 @pytest.mark.slow
@@ -783,7 +787,8 @@ def test_the_jitter_stands_beside_the_margin_and_asks(settings, asks):
         assert ("ms: --set delay.steps sets a shorter delay" in told) == (not asks)
         assert ("Remedies: " in told) == asks
         if asks:
-            with pytest.raises(ConfigError, match=r"^--yes: not given, and (round trips|the loop)"):
+            expected = r"^--yes: not given, so nothing moved: (round trips|the loop) .*; expected a"
+            with pytest.raises(ConfigError, match=expected):
                 drive(ready, 1.0, say=lambda line: None)
         else:
             assert ready.jitter_problem is None

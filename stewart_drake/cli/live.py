@@ -100,6 +100,7 @@ def live(
         from stewart_drake.live import session
 
         ready = session.prepare_session(loaded, parse_address(where), key, say=delivery.say)
+        running.enter_context(contextlib.closing(ready.endpoint))
         delivery.say_wrapped(*session.plans(ready, span, name))
         session.check_armed(ready, options.armed)
         # The demo's machine is simulated and needs no consent.

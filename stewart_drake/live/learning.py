@@ -12,6 +12,7 @@ that the cranks lack in the last periods correct the setpoints of the next one.
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
@@ -91,7 +92,8 @@ class _Asked(NamedTuple):
 
     def drive(self, ready: Ready, duration: float = math.inf, **how: Any) -> SimulationResult:
         how |= self.options.model_dump(include={"armed", "accept_jitter", "max_missing"})
-        return drive(ready, duration, ending=self.ending, say=self.say, **how)
+        with closing(ready.endpoint):
+            return drive(ready, duration, ending=self.ending, say=self.say, **how)
 
     def end(self, lessons: Lessons, own: Experiment, done: list[Repetition]) -> LearnStudy:
         """Print the number of the best repetition; return all."""

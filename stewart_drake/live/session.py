@@ -88,7 +88,7 @@ def prepare_session(
     learned: Learned = None,
     say: Callable[[str], None] | None = None,
 ) -> Ready:
-    """Find a machine, measure the link and design the law for it.
+    """Find a machine, measure the link and design the law for it. The caller closes the endpoint.
 
     What was learned is by default that of `controller.learned`.
 
@@ -162,18 +162,20 @@ def _queue_advice(scenario: Scenario) -> str | None:
 
 def check_armed(ready: Ready, armed: bool) -> None:
     if not ready.simulated and not armed:
-        ready.endpoint.close()
         raise ConfigError(
-            "--arm: not given, for a machine that does not report that it is a simulation; "
-            "expected --arm, with all people out of its reach"
+            "--arm: not given, so nothing moved: the link is measured, and the machine does not "
+            "report that it is a simulation; expected --arm to drive it, with all people out of "
+            "its reach"
         )
 
 
 def check_jitter(ready: Ready, accepted: bool) -> None:
     problem = ready.jitter_problem
     if problem is not None and not accepted:
-        ready.endpoint.close()
-        raise ConfigError(f"--yes: not given, and {problem}; expected --yes to start anyway")
+        raise ConfigError(
+            f"--yes: not given, so nothing moved: {problem}; expected a longer play-out buffer, a "
+            "larger controller.w_R, or --yes to start anyway"
+        )
 
 
 @contextlib.contextmanager
@@ -224,7 +226,7 @@ def drive(
     hold: bool = False,
     pace: float | None = None,
 ) -> SimulationResult:
-    """Run the loop; the machine moves. In the end socket and logs are closed.
+    """Run the loop; the machine moves. In the end the logs are closed.
 
     Args:
         armed: whether a real machine may be driven.
@@ -256,7 +258,6 @@ def drive(
     except TimeoutError as error:
         raise ConfigError(f"--machine: {error}; expected one that does") from None
     finally:
-        ready.endpoint.close()
         late = loop.record.finish()
         for one in logs:
             one.close()
