@@ -59,6 +59,11 @@ BAD_ARGUMENTS = [
     (["model", "check"], "MECHANISM"),
     (["analyze", "robustness", "--limit", "nan"], "--limit"),
     (["analyze", "robustness", "--vary", "payload=nan"], "payload"),
+    (
+        ["analyze", "robustness", "--vary", "gain=5mm"],
+        "--vary: gain: got '5mm'; expected a number (gain: +-share of the motors' torque)\n",
+    ),
+    (["simulate", "--set", "delay.steps=5ms"], "delay.steps: got '5ms'; expected a whole number\n"),
     (["tune", "dataset", "--disturbed", "-1"], "--disturbed"),
     (["tune", "dataset", "--set", "duration=1"], "duration"),
     (["tune", "dataset", "--set", "reference.kind=hold"], "reference"),

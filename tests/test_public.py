@@ -123,6 +123,10 @@ def test_a_name_and_an_option_of_0_2_lead_to_todays():
             lambda: sd.analyze_robustness("paper", ranges={"payload": 2.0}),
             "ranges: payload: got 2.0; expected less than 1",
         ),
+        (  # the name of the command line
+            lambda: sd.analyze_robustness("paper", vary={"payload": "2kg"}),
+            "ranges: payload: got '2kg'; expected a number",
+        ),
         (lambda: sd.analyze_robustness("paper", also=["adaptive"]), "controller: got 'adaptive'"),
         (lambda: sd.identify("log.csv", "paper", delay=np.nan), "delay: got nan"),
         (lambda: sd.identify("run.nc", "paper", gravity=False), "gravity: got False with logs of"),

@@ -11,6 +11,7 @@ import pytest
 
 from stewart_drake.cli import main
 from stewart_drake.files.yamlio import load_yaml
+from stewart_drake.loop.preparation import prepare_unchecked
 from stewart_drake.loop.simulation import simulate
 from stewart_drake.mechanism.files import load_mechanism, mechanism_yaml
 from stewart_drake.reporting import report as report_document
@@ -157,6 +158,7 @@ def test_the_error_of_a_soft_start_is_told_from_the_later_one():
 def collect_of(scenario, **changes):
     """Return the parts of a report with one run and no analyses."""
     parts = {"run": changes.get("run") or simulate(scenario), "failure": None}
+    parts["scale"] = prepare_unchecked(scenario).scale
     parts["analyses"] = dict.fromkeys(ANALYSES, BLANK)
     return report_document.ReportData(scenario, **(parts | changes))
 

@@ -200,8 +200,9 @@ def _refusal(where: str, type_: type, data: Any, caught: pydantic.ValidationErro
     errors = caught.errors(include_url=False)
     unknown = [_explain_unknown(type_, data, one) for one in errors if one["type"] in _UNKNOWN]
     hidden = (*_UNKNOWN, "missing") if unknown else ()
+    units = units_of(type_)
     problems = unknown + [
-        explain(data, one) + _fields_of(type_, data, one)
+        explain(data, one, next(iter(one["loc"]), "") not in units) + _fields_of(type_, data, one)
         for one in errors
         if one["type"] not in hidden
     ]
@@ -236,8 +237,10 @@ def validate_pairs(type_: type[_T], settings: Iterable[str], option: str) -> _T:
 def units_of(type_: type) -> dict[str, str]:
     """Return the `description` of each annotated field of a pydantic dataclass, by its name."""
     return {
-        name: next(one.description for one in hint.__metadata__ if one.description)
+        name: one.description
         for name, hint in typing.get_type_hints(type_, include_extras=True).items()
+        for one in getattr(hint, "__metadata__", ())
+        if getattr(one, "description", None)
     }
 
 
@@ -329,14 +332,18 @@ def accepted(message: str) -> str:
     return expected
 
 
-def explain(data: Any, error: Any) -> str:
-    """Return an error of pydantic as `place: got value; expected what is accepted`."""
+def explain(data: Any, error: Any, of_si: bool = True) -> str:
+    """Return an error of pydantic as `place: got value; expected what is accepted`.
+
+    `of_si` is whether to name the SI unit where a number has come with a unit.
+    """
     place, value, expected = _place(data, error["loc"]), error["input"], accepted(error["msg"])
     if error["type"].startswith("missing"):
         return f"{place}.{error['loc'][-1]}: is missing".removeprefix(".")
     if error["type"] == "union_tag_invalid":
         place, value, expected = f"{place}.kind", error["ctx"]["tag"], error["ctx"]["expected_tags"]
-    with_unit = re.fullmatch(r"[-+.\deE]*\d\s*(\D+)", value) if isinstance(value, str) else None
+    of_si = of_si and isinstance(value, str) and error["type"].startswith("float")
+    with_unit = re.fullmatch(r"[-+.\deE]*\d\s*(\D+)", value) if of_si else None
     if with_unit and (unit := _SPELLED.get(with_unit[1].replace(" ", ""))):
         expected += f", in {unit}"
     return f"{place}: got {brief(value)}; expected {expected}".removeprefix(": ")

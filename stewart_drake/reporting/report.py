@@ -68,6 +68,7 @@ from stewart_drake.studies.jobs import Job, Progress, run_jobs
 from stewart_drake.studies.new_machine import NewMachine
 from stewart_drake.studies.verdict import fold
 from stewart_drake.tuner.network import DEFAULT
+from stewart_drake.types import Array
 
 ANALYSES: Final = ("delay", "hautus", "workspace")
 AS_GIVEN: Final = "as_given"
@@ -119,6 +120,7 @@ _PACKETS_BELOW: Final = (
 class ReportData:
     scenario: Scenario
     failure: Failure | None  # where the reference leaves the workspace; None with runs
+    scale: Array  # (6,) peak to peak of the reference, 1 where it is constant
     run: SimulationResult | None = None  # of the scenario; None with a `failure`
     # runs of the shipped controllers, by name
     comparison: dict[str, SimulationResult] = field(default_factory=dict)
@@ -150,7 +152,8 @@ def collect(
     """
     settings = setting_texts(settings)
     scenario = load_compatible(scenario_name, controller, settings)
-    failure = prepare_unchecked(scenario).reference_failure()
+    experiment = prepare_unchecked(scenario)
+    failure = experiment.reference_failure()
     scenarios: dict[str, Scenario] = {}
     rows: set[str] = set()
     if failure is None:
@@ -169,6 +172,7 @@ def collect(
     return ReportData(
         scenario=scenario,
         failure=failure,
+        scale=experiment.scale,
         run=next((done[key] for key, sc in scenarios.items() if sc == scenario), None),
         comparison={name: done[name] for name in scenarios if name in rows},
         tuned={name: done[_TUNED + name] for name in _WEIGHTED if _TUNED + name in done},
@@ -340,11 +344,12 @@ def verdict(found: ReportData) -> tuple[str, Tone]:
     if floor > 0:
         text += (
             f"{error} % s, {number(floor)} % s of it before any torque can act"
-            f"{_second_half(run)}. Once torques act the error averages {average}."
+            f"{_second_half(run, found.scale)}. Once torques act the error averages {average}."
         )
     else:
         text += f"{error} % s; the error averages {average}."
-    text += f" Largest error: {worst(run).replace('%', '% of its motion')}{_worst_later(run)}."
+    largest = worst(run).replace("%", "% of its motion")
+    text += f" Largest error: {largest}{_worst_later(run, found.scale)}."
     if fair:
         text += f" Caution: {fair}."
     return text, max((level for level, _ in findings), key=_LEVELS.index, default="good")
@@ -384,21 +389,20 @@ def _averaged(run: SimulationResult) -> str:
     return "of peak to peak" + ("" if moved.all() else f" over moving coordinates ({names})")
 
 
-def _second_half(run: SimulationResult) -> str:
+def _second_half(run: SimulationResult, scale: Array) -> str:
     """Return the parts of E_ac until half of the run and after it, if torques act by then."""
     s, half = run.summary, run.scenario.duration / 2
     if half <= run.scenario.eta:
         return ""
     late = run.signals.sel(time=slice(half, None))
-    scale = prepare_unchecked(run.scenario).scale
     after = accumulated_error(late.time.values, late.error.values, scale)
     between = s["accumulated_error"] - s["delay_floor"] - after
     return f", {number(between)} % s until half of the run, and {number(after)} % s after it"
 
 
-def _worst_later(run: SimulationResult) -> str:
+def _worst_later(run: SimulationResult, scale: Array) -> str:
     """Return the largest error of the second half, if one in the first was twice that or more."""
-    errors, scale = run.signals.error.values, prepare_unchecked(run.scenario).scale
+    errors = run.signals.error.values
     later = peak_error(errors[second_half(run.signals.reference.values)], scale)
     if not max(run.summary["peak_error"]) > 2 * later.max():
         return ""

@@ -156,7 +156,8 @@ def takes(
 ) -> Callable[[Callable[..., _R]], Callable[..., _R]]:
     """Return a decorator that replaces the argument `options` of a function by its options.
 
-    The argument `second` may be positional. Errors name arguments, see `in_python`.
+    The argument `second` may be positional. Errors name arguments, see `in_python`. An option may
+    also have its name of the command line.
     """
     by_place, by_name = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
 
@@ -169,6 +170,7 @@ def takes(
         ]
         parameters = [p.replace(kind=by_place) if p.name == second else p for p in parameters]
         shown = own.replace(parameters=sorted(parameters, key=lambda one: one.kind))
+        flags = {one.flag: one.name for one in kind.described() if one.flag}
 
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> _R:
@@ -183,6 +185,9 @@ def takes(
                     f"{function.__name__}: got {args[1]} without a name; expected "
                     f"settings={args[1]}"
                 )
+            for flag in flags.keys() & kwargs.keys():
+                if flags[flag] not in kwargs:
+                    kwargs[flags[flag]] = kwargs.pop(flag)
             try:
                 given = shown.bind(*args, **kwargs).arguments
             except TypeError as error:
