@@ -334,12 +334,15 @@ def test_the_form_in_a_browser_by_keyboard(tab, tmp_path):
         try:
             url = re.search(r"http://\S+", process.stdout.readline())[0]
             for width in (1280, 400):
-                tab.open(url, width, 900)
+                tab.open(url, width, 500)
                 assert tab.evaluate("document.documentElement.scrollWidth") == width
             names = [name.replace("-", "_") for name in MEASURED]
             tab.evaluate("document.forms[0].elements[0].focus()")
             for name in names:
                 assert tab.evaluate("document.activeElement.name") == name
+                bottom = "document.activeElement.getBoundingClientRect().bottom"
+                note = "document.getElementById('note').getBoundingClientRect().top"
+                assert tab.evaluate(f"{bottom} <= {note}"), name
                 unit = "kg" if "mass" in name else "m"
                 tab.type(f"{MEASURED[name.replace('_', '-')]} {unit}")
                 tab.press("Tab")

@@ -231,7 +231,7 @@ class Measurements(Options):
         90.0, "Degrees from the horizon of the planes the cranks turn in.", ge=-180, le=180
     )
     cranks: Literal["apart", "together"] = option(
-        "apart", "Of a pair: they point apart, or together."
+        "apart", "Cranks of a pair point apart, or together."
     )
     torque_limit: float | None = option(
         None, "Torque limit of each motor, N m.", unit="N m", gt=0, lt=1e6
