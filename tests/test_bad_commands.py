@@ -98,6 +98,8 @@ BAD_ARGUMENTS = [
     (["live", "--demo", "--learned", "a.npz"], "--learned: got a.npz without --learn; expected"),
     (["live", "--demo", "--mirror", "x"], "--mirror: got 'x'; expected HOST:PORT"),
     (["export"], "FILE"),
+    (["export-c", "."], "scenario: got '.', a folder without scenario.yaml; expected one of desk"),
+    (["export-c", "./"], "scenario: got './', a folder without scenario.yaml; expected a file, or"),
     (["export-c", "paper", "--out", ""], "--out: got ''; expected a value"),
 ]
 

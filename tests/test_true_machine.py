@@ -75,6 +75,11 @@ def test_a_step_in_which_friction_makes_cranks_tremble_is_reported():
     step = next(word for word in line.split() if word.startswith("plant.time_step="))
     assert said(heavy, step) == said(heavy, "plant.coulomb_speed=0.1") == []
     assert said(heavy, "plant.kind=exact") == said("plant.coulomb_friction=2e-3") == said() == []
+    stuck, told = ("plant.coulomb_friction=10", "plant.kind=exact"), "takes minutes"
+    (line,) = (one for one in said(*stuck) if told in one)
+    assert line.endswith("; plant.coulomb_speed of 0.06 or more takes less than one")
+    for shorter in ("plant.coulomb_speed=0.06", "duration=3"):
+        assert not any(told in one for one in said(*stuck, shorter))
 
 
 @pytest.mark.slow

@@ -92,21 +92,24 @@ CLOCKS: Final = {False: Clock("Cortex-M7", 400.0), True: Clock("Cortex-M4", 168.
 LINE: Final = 110
 """Length from which on a comment is above its line."""
 MILLIONS: Final = {
-    "plain": (1.8, 2.1),
-    "estimator": (2.9, 8.2),
-    "network": (5.0, 5.5),
-    "delay estimator": (3.0, 42.0),
-    "servos": (0.03, 0.03),
-    "servos, estimator": (5.8, 140.0),
+    "ideal": {False: (1.99, 7.74), True: (2.24, 6.13)},
+    "ideal, without estimator": {False: (1.60, 1.94), True: (1.72, 2.04)},
+    "encoders": {False: (2.53, 8.15), True: (2.80, 6.56)},
+    "delay estimator": {False: (2.67, 42.0), True: (2.91, 42.0)},
+    "network": {False: (4.91, 5.42)},
+    "servos": {False: (0.03, 0.03)},
+    "servos, estimator": {False: (5.70, 136.06)},
 }
 """Million instructions of a step, median and most, from the table of `make board`.
 
-That table lacks the most of a delay estimator: it is of a new search for the delay. Servos are
-those of `reachy_mini`, other kinds control `paper`.
+By row, and by whether numbers have single precision; a row without single precision counts for it
+too. The most of a delay estimator is not in that table: it is of a new search for the delay. Servos
+are those of `reachy_mini`, other rows control `paper`.
 """
 STACKS: Final = {
-    "plain": 13,
-    "estimator": 14,
+    "ideal": 14,
+    "ideal, without estimator": 13,
+    "encoders": 14,
     "network": 14,
     "delay estimator": 17,
     "servos": 5,
@@ -199,7 +202,9 @@ def exported(scenario: Scenario, single: bool = False, measured: bool = True) ->
         "period_ms": 1e3 * law.timeline.period,
     }
     kind = _kind(values)
-    values |= {"millions": MILLIONS[kind], "stack": STACKS[kind]}
+    by_precision = MILLIONS[kind]
+    values["millions"] = by_precision.get(single, by_precision[False])
+    values["stack"] = STACKS[kind]
     values["clocked"] = "reachy_mini" if servos else "paper"
     if tuner is not None:
         values |= _tuner(tuner, compiled, recorded, experiment, suffix)
@@ -243,14 +248,16 @@ def _without_folders(data: Any) -> Any:
 
 
 def _kind(values: Mapping[str, Any]) -> str:
-    """Return the kind of a law in MILLIONS, from the values of the templates."""
+    """Return the row of a law in MILLIONS, from the values of the templates."""
     if values["servos"]:
         return "servos" if values["law"].observer.settings is None else "servos, estimator"
     if values["finds_delay"]:
         return "delay estimator"
     if values["network"]:
         return "network"
-    return "plain" if values["law"].observer.settings is None else "estimator"
+    if values["law"].observer.settings is None:
+        return "ideal, without estimator"
+    return "encoders" if values["encoders"] else "ideal"
 
 
 def _environment(suffix: str) -> Environment:

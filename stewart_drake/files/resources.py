@@ -68,16 +68,23 @@ def resolve(kind: Kind, name_or_path: str | Path) -> Path:
         path = absolute_path(name_or_path)
         if os.path.exists(inside := path / f"{kind}.yaml"):
             return inside
+        if path.is_dir():
+            raise ConfigError(
+                f"{kind}: got {str(name_or_path)!r}, a folder without {kind}.yaml; expected a "
+                "file, or a folder with that one"
+            )
         if os.path.exists(path):
             return path
         raise ConfigError(f"{kind}: no file {str(path)!r}; shipped names: {_nearest(kind, '')}")
-    name, (_, folder, suffix) = str(name_or_path), KINDS[kind]
-    path = data_root() / folder / f"{name}{suffix}"
+    name, (_, place, suffix) = str(name_or_path), KINDS[kind]
+    path = data_root() / place / f"{name}{suffix}"
     if not name or not path.exists():
         own = f"{name}/{kind}.yaml"  # of a folder, without a slash
         nearest = f"{own}, " if name and absolute_path(own).exists() else ""
+        folder = name and not nearest and absolute_path(name).is_dir()
+        found = f"{name!r}, a folder without {kind}.yaml" if folder else repr(name)
         raise ConfigError(
-            f"{kind}: got {name!r}; expected {nearest}one of {_nearest(kind, name)}, or a path "
+            f"{kind}: got {found}; expected {nearest}one of {_nearest(kind, name)}, or a path "
             "(with a slash, or ending in .yaml, .yml or .json)"
         )
     return path

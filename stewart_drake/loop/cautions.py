@@ -26,6 +26,8 @@ The error of an engine's step is some 1e-5 of the motion. Measured with the pape
 gravity at full, a third and a tenth of its size: up to a growth of 5e4 runs complete as they
 should, from 5e6 on they are lost or wrong by a hundred times the exact plant's error.
 """
+_MANY_STEPS: Final = 1e6
+"""Steps of the exact plant that take about a minute."""
 
 
 def cautions_before(experiment: Experiment, margin: ControllerMargin | None) -> list[str]:
@@ -88,7 +90,7 @@ def many_samples(scenario: Scenario) -> str | None:
 
 
 def stiff_friction(experiment: Experiment) -> str | None:
-    """Return a warning about a time step too long for Coulomb friction, with a step that suits.
+    """Return a warning about friction too stiff for the plant's steps, with a remedy, or None.
 
     Friction c tanh(rate / s) acts on the rates at the beginning of a step h. Near rest it is a
     damper of c / s: with H^-1 the accelerations of the cranks per torque, rates follow
@@ -96,13 +98,22 @@ def stiff_friction(experiment: Experiment) -> str | None:
         rates_{k+1} = (1 - h c / s H^-1) rates_k,
 
     which grow, up to h c H^-1, if h c / s exceeds 2 over the largest eigenvalue of H^-1. A crank
-    that should creep then trembles.
+    that should creep then trembles. The integrator of the exact plant shortens its steps to about
+    as much instead.
     """
     plant = experiment.scenario.plant
-    if plant.kind != "multibody" or plant.coulomb_friction == 0:
+    if plant.kind not in ("multibody", "exact") or plant.coulomb_friction == 0:
         return None
     quickest = quickest_crank(experiment.true_dynamics(), experiment)
     longest = 2 * plant.coulomb_speed / (plant.coulomb_friction * quickest)
+    if plant.kind == "exact":
+        if (times := experiment.scenario.duration / longest / _MANY_STEPS) <= 1:
+            return None
+        return (
+            f"Coulomb friction of {plant.coulomb_friction:g} N m within {plant.coulomb_speed:g} "
+            "rad/s forces very short steps, so that this run takes minutes; "
+            f"plant.coulomb_speed of {times * plant.coulomb_speed:.1g} or more takes less than one"
+        )
     if plant.time_step <= longest:
         return None
     return (
