@@ -329,6 +329,15 @@ def test_both_ends_in_c(folder, tmp_path):
 
 
 @pytest.mark.slow
+def test_sigterm_ends_it_like_ctrl_c():
+    command = [sys.executable, "-m", "stewart_drake", "machine", "paper", "--port", "0"]
+    with process([*command, "--set", "plant.kind=exact"]) as running:
+        running.until("waits for a controller")
+        assert running.end(signal.SIGTERM) == 143
+    assert "ended after" in running.said and "Traceback" not in running.said
+
+
+@pytest.mark.slow
 def test_ctrl_c_ends_it_with_one_summary(capfd):
     with machine(command=(sys.executable, "-m", "stewart_drake")) as (running, _):
         pass

@@ -272,6 +272,9 @@ def test_the_form_draws_before_masses_are_known_and_names_what_is_wrong(form):
     ):
         _, found = asked(form.url, "/check", json.dumps(fields(**{field: value})))
         assert found["field"] == field and words in found["problem"]
+    folded = fields(rod="400 mm", plate_radius="60 mm", joint_distance="60 mm")
+    _, found = asked(form.url, "/check", json.dumps(folded))
+    assert found["problem"].endswith("expected other lengths, or cranks that point together")
     longer = asked(form.url, "/check", json.dumps(fields(rod="300 mm")))[1]
     assert longer["problem"] is None
     assert longer["drawing"] != asked(form.url, "/check", json.dumps(fields()))[1]["drawing"]
