@@ -68,7 +68,7 @@ def resolve(kind: Kind, name_or_path: str | Path) -> Path:
         path = absolute_path(name_or_path)
         if os.path.exists(inside := path / f"{kind}.yaml"):
             return inside
-        if path.is_dir():
+        if os.path.isdir(path):
             raise ConfigError(
                 f"{kind}: got {str(name_or_path)!r}, a folder without {kind}.yaml; expected a "
                 "file, or a folder with that one"
@@ -81,7 +81,7 @@ def resolve(kind: Kind, name_or_path: str | Path) -> Path:
     if not name or not path.exists():
         own = f"{name}/{kind}.yaml"  # of a folder, without a slash
         nearest = f"{own}, " if name and absolute_path(own).exists() else ""
-        folder = name and not nearest and absolute_path(name).is_dir()
+        folder = name and not nearest and os.path.isdir(name)
         found = f"{name!r}, a folder without {kind}.yaml" if folder else repr(name)
         raise ConfigError(
             f"{kind}: got {found}; expected {nearest}one of {_nearest(kind, name)}, or a path "
