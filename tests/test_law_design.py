@@ -29,23 +29,30 @@ def law_of(scenario, **changes):
     return sd.design_law(dynamics, reference, period, delay, **(given | changes))
 
 
-@pytest.mark.parametrize("kind", ["exact", "multibody"])
-def test_a_law_for_a_platform_knows_its_engine(kind):
-    """The estimator does not take the errors of a step of 1 ms for a payload.
+@pytest.mark.parametrize(
+    ("engine", "options"),
+    [
+        ({"kind": "exact"}, sd.ControllerConfig()),
+        ({"time_step": 1e-3}, sd.ControllerConfig()),
+        ({"time_step": 4e-3}, sd.ControllerConfig(estimate=["payload"])),
+    ],
+)
+def test_a_law_for_a_platform_knows_its_engine(engine, options):
+    """The estimator takes the errors of a step neither for a payload nor for outliers.
 
     Two loops in one diagram get names of their own, without which Drake ends the process.
     """
     builder = DiagramBuilder()
-    config = sd.PlantConfig(kind=kind, gravity=True)
+    config = sd.PlantConfig(gravity=True, **engine)
     platforms = [sd.AddStewartPlatform(builder, "paper", config) for _ in range(2)]
     moves = PAPER.home + np.array([np.zeros(6), [0.1, 0, 0.2, 0.02, 0, 0.02], np.zeros(6)])
     motion = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
         [0.0, 1.0, 2.0], moves.T, np.zeros(6), np.zeros(6)
     )
-    if kind == "multibody":
+    if config.step == 1e-3:
         with pytest.raises(ConfigError, match=r"^delay: got 0.0996; .* nearest 0.1$"):
             sd.design_law(platforms[0], motion, 0.02, 0.0996)
-    law = sd.design_law(platforms[0], motion, 0.02, 0.1, queue="reference")
+    law = sd.design_law(platforms[0], motion, 0.02, 0.1, queue="reference", options=options)
     for platform in platforms:
         controller, chain = law.AddToBuilder(builder), builder.AddSystem(law.delay_chain())
         builder.Connect(platform.GetOutputPort("state"), controller.GetInputPort("measurement"))
@@ -58,6 +65,18 @@ def test_a_law_for_a_platform_knows_its_engine(kind):
     simulator.AdvanceTo(2.0)
     state = diagram.GetOutputPort("state").Eval(simulator.get_context())
     np.testing.assert_allclose(state[POSE], PAPER.home, atol=2e-3)
+
+
+def test_steps_of_a_users_plant_need_to_fit_period_and_delay_only():
+    """The grid on which `simulate` records its error is not in the user's diagram."""
+    config = sd.PlantConfig(time_step=1.5e-3)
+    platform = sd.AddStewartPlatform(DiagramBuilder(), PAPER, config)
+    motion = PiecewisePolynomial(PAPER.home.reshape(6, 1))
+    law = sd.design_law(platform, motion, 0.015, 0.03)
+    assert law.experiment.scenario.plant.step == 1.5e-3
+    for period, delay, field in ((0.02, 0.03, "period: got 0.02"), (0.015, 0.02, "delay: got")):
+        with pytest.raises(ConfigError, match=f"^{field}.* of plant.time_step"):
+            sd.design_law(platform, motion, period, delay)
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.5])
@@ -141,7 +160,8 @@ def test_without_a_start_it_begins_on_the_reference():
         ({"period": 0.0}, "period: got 0.0"),
         ({"period": "0.1"}, "period: got '0.1'; expected a finite number above 0"),
         ({"horizon": np.inf}, "horizon: got inf; expected a finite number above 0"),
-        ({"dynamics": PAPER}, "dynamics: got Mechanism("),
+        ({"period": 1e-9}, "period: got 1e-09"),
+        ({"dynamics": PAPER}, "expected a StewartPlatform or a StewartDynamics"),
         ({"reference": "paper"}, "reference: got 'paper'; expected a Trajectory"),
         ({"reference": PiecewisePolynomial((PAPER.home + 9.0).reshape(6, 1))}, "reference: leg"),
         ({"options": {}}, "options: got {}; expected a ControllerConfig"),

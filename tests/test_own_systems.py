@@ -317,7 +317,7 @@ def test_own_reference_that_ends_is_held_there():
 def test_systems_beside_an_experiment_are_refused_by_everybody():
     prepared = prepare(scenario("duration=0.05"))
     for build in (sd.build_closed_loop, sd.simulate):
-        with pytest.raises(TypeError, match="controller: got one with an Experiment"):
+        with pytest.raises(TypeError, match="controller: got one with a loop that has its own"):
             build(prepared, controller=Constant)
 
 

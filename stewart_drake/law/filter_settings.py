@@ -152,11 +152,13 @@ WALK_SHARE = 2e-4
 CHANCE = 3.0
 """Largest distance of a calibrated mean beyond a bound, in standard deviations."""
 MODEL_ERROR = 2e-4
-"""Error of the model in a USUAL_PERIOD, as a share of the motion, for an engine's steps of 1 ms."""
+"""Error of the model in a USUAL_PERIOD, as a share of the motion, for an engine's USUAL_STEP."""
 INTEGRATION_ERROR = 4e-6
 """The same for an exact plant: error of the filter's own integration, 3e-6 rms on `paper`."""
 USUAL_PERIOD = 0.1
 """Period for which these errors are given, s."""
+USUAL_STEP = 1e-3
+"""Step of an engine for which MODEL_ERROR is given, s. Its error is of first order in the step."""
 TIMING_ERROR = 0.01
 """Standard deviation of the timing of a torque, in periods. Without it the filter would
 attribute the effect of a late torque, large in a catch-up, to payload and bias."""

@@ -96,8 +96,8 @@ def ExactPlant_(T):
         | 1 | 4 | mass of the plate, kg, and its moments of inertia, kg m^2 |
 
         In a diagram of your own, call `set_accuracy` on its simulator: without an accuracy in the
-        context Drake stops with an error. With
-        AutoDiffXd, derivatives by state, inputs and parameter 0 are exact and end at first order.
+        context Drake stops with an error where the plate leaves its workspace. With AutoDiffXd,
+        derivatives by state, inputs and parameter 0 are exact and end at first order.
 
         Args:
             dynamics: equations of motion, with gravity and the default parameters.

@@ -6,7 +6,7 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from pydrake.systems.framework import DiagramBuilder, OutputPort
@@ -17,7 +17,7 @@ from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import diagnose
 from stewart_drake.files.arguments import fixed, of_kind, positive
 from stewart_drake.files.errors import ConfigError
-from stewart_drake.files.yamlio import validate
+from stewart_drake.files.yamlio import brief, validate
 from stewart_drake.law.catch_up import HEADROOM, CatchUp
 from stewart_drake.law.channel import Packets, Wire
 from stewart_drake.law.clear_space import ClearSpace
@@ -32,6 +32,7 @@ from stewart_drake.law.filter_settings import (
     INTEGRATION_ERROR,
     MODEL_ERROR,
     USUAL_PERIOD,
+    USUAL_STEP,
     ParameterSet,
     acceleration_noise,
     filter_settings,
@@ -431,14 +432,16 @@ def assumed_model_error(experiment: Experiment) -> Array:
     """Return the error (12,) of the estimator's model over a period.
 
     Errors of an engine's steps and of rounded angles are not white but add up: their default is
-    that of a USUAL_PERIOD at any period. With a white sensor that has noise, the default is
-    INTEGRATION_ERROR. Without noise the filter would follow each digit of that error.
+    that of a USUAL_PERIOD at any period. It grows with steps above USUAL_STEP. With a white sensor
+    that has noise, the default is INTEGRATION_ERROR. Without noise the filter would follow each
+    digit of that error.
     """
     c, scale = experiment.scenario.controller, experiment.motion_scale
     if c.model_error is not None:
         return acceleration_noise(c.model_error, scale, c.period)
     white, noisy = white_errors(experiment.scenario)
-    share = INTEGRATION_ERROR / MODEL_ERROR if noisy else 1.0
+    steps = max(1.0, (experiment.scenario.plant.step or 0.0) / USUAL_STEP)
+    share = INTEGRATION_ERROR / MODEL_ERROR if noisy else steps
     return share * usual_model_error(scale, c.period if white else USUAL_PERIOD)
 
 
@@ -587,7 +590,11 @@ class DesignedLaw:
 
 def _of_argument(message: str) -> str:
     """Return an error about a scenario's field with the argument of `design_law` that sets it."""
-    fields = {"actuator.torque_limit": "torque_limit", "controller": "options"}
+    fields = {
+        "actuator.torque_limit": "torque_limit",
+        "controller.period": "period",
+        "controller": "options",
+    }
     for field, argument in fields.items():
         message = re.sub(rf"^design_law: {field}\b", argument, message)
     return message
@@ -632,13 +639,19 @@ def design_law(
         ConfigError: bad input, a reference or a start out of reach.
     """
     options = ControllerConfig() if options is None else options
-    engine = {}
+    engine: dict[str, Any] = {}
     if isinstance(dynamics, StewartPlatform):
         engine, dynamics = dynamics.engine, dynamics.dynamics
-    of_kind("dynamics", dynamics, StewartDynamics)
+    if not isinstance(dynamics, StewartDynamics):
+        expected = "expected a StewartPlatform or a StewartDynamics"
+        raise ConfigError(f"dynamics: got {brief(dynamics)}; {expected}")
     of_kind("reference", reference, Trajectory)
     of_kind("options", options, ControllerConfig)
     period, late = positive("period", period), float(fixed("delay", delay, (), 0.0))
+    if step := engine.get("time_step"):
+        for name, value in (("period", period), ("delay", late)):
+            if problem := multiple_problem(name, value, step):
+                raise ConfigError(problem)
     if horizon is None:
         horizon = reference.end_time() if math.isfinite(reference.end_time()) else _HORIZON
     believed = Delay.of(late, period)
@@ -646,7 +659,7 @@ def design_law(
         "duration": positive("horizon", horizon),
         "start": "on_reference" if start is None else "rest",
         "queue": ("zero" if dynamics.gravity == 0 else "equilibrium") if queue is None else queue,
-        "plant": {"kind": "exact", "gravity": dynamics.gravity != 0, **engine},
+        "plant": {"kind": "exact", "gravity": dynamics.gravity != 0},
         "delay": dataclasses.asdict(believed),
         "controller": dataclasses.asdict(options)
         | {"period": period, "delay_steps": believed.steps, "delay_fraction": believed.fraction},
@@ -657,10 +670,9 @@ def design_law(
         scenario = validate(Scenario, sections, "design_law")
         scenario.check("design_law")
     except ConfigError as error:
-        message = _of_argument(str(error))
-        if "time_step" in engine and message.startswith("design_law: delay.fraction"):
-            message = multiple_problem("delay", late, engine["time_step"]) or message
-        raise ConfigError(message) from None
+        raise ConfigError(_of_argument(str(error))) from None
+    for name, value in engine.items():  # after the check: its grid of 20 ms is that of `simulate`
+        setattr(scenario.plant, name, value)
     names = estimated_names(scenario)
     if dynamics.free == PARAMETERS:
         parts = dynamics.mechanism, dynamics.gravity, dynamics.plant_parameters

@@ -233,7 +233,7 @@ class VaryingDelay(Wire):
         period: dt in s.
         delays: (n,) eta_k of T_0 to T_{n-1}, s; the last one holds for all later torques.
         delay: mu and eta0 / dt, of the torques sent before t = 0, such as
-            `stewart_drake.scenario.delay.Delay(steps=5, fraction=0.5)`.
+            `sd.systems.Delay(steps=5, fraction=0.5)`.
         queue: (L, n) torques in flight at t = 0, oldest first, L = mu, or mu + 1 when eta0 > 0.
         carries: as of `DelayChain`.
 

@@ -82,7 +82,9 @@ class Role(NamedTuple):
 
 ROLES: Final[Mapping[str, Role]] = {
     "controller": Role(
-        *("measurement", "reference", "torque"),
+        "measurement",
+        "reference",
+        "torque",
         {"sensor.kind": "state", "tuner.kind": "fixed", "actuator.kind": "torque"},
     ),
     "disturbance": Role("", "", "torque wrench"),

@@ -352,10 +352,12 @@ class StewartPlatform:
     | state | output | 12, pose and rates relative to the base | rad, m, rad/s, m/s |
     | crank_angles | output | 6, of a multibody plant only | rad |
 
-    An unconnected wrench is zero. A multibody plant ends the simulation where the plate leaves its
-    workspace, as the exact one does, if one of the outputs is used.
+    An unconnected wrench is zero, and so is an unconnected torque of a multibody plant. The torque
+    has no limit: add a `Saturation` for that of the motors. A multibody plant ends the simulation
+    where the plate leaves its workspace, as the exact one does, if one of the outputs is used.
 
     Attributes:
+        mechanism: the machine.
         plant: an `ExactPlant` or a `MultibodyPlant`.
         model: its model in the MultibodyPlant, None for an exact plant.
         scene_graph: added with a MultibodyPlant, else None.
@@ -385,7 +387,7 @@ class StewartPlatform:
 
     @property
     def dynamics(self) -> StewartDynamics:
-        """Equations of motion, with the gravity and loads of the platform when it was added.
+        """Equations of motion, with gravity and the loads of `PlantConfig`, which a law then knows.
 
         Raises:
             ConfigError: gravity, and a base that is tilted or can move.

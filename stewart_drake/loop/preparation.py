@@ -274,14 +274,14 @@ def as_experiment(
 
     Raises:
         ConfigError: bad input, an unreachable reference.
-        TypeError: systems of the user with an Experiment, which already has its own.
+        TypeError: settings or systems of the user with an Experiment, which has its own.
     """
     if not isinstance(scenario, Experiment):
         return prepare(as_scenario(scenario, settings=settings), true_mechanism, take(own))
     given = {"true_mechanism": true_mechanism, "settings": settings or None}
     for name, thing in (given | own).items():
         if thing is not None:
-            raise TypeError(f"{name}: got one with an Experiment, which has its own; expected None")
+            raise TypeError(f"{name}: got one with a loop that has its own; expected none")
     return scenario
 
 

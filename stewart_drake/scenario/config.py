@@ -89,7 +89,7 @@ class PushConfig:
 
 @section
 class PlantConfig:
-    """The simulated platform; fields from the payload on are unknown to the controller.
+    """The simulated platform; fields from the payload on are unknown to a scenario's controller.
 
     Attributes:
         kind: `multibody` (MultibodyPlant with constraints, fixed steps), `exact` (closed-form
@@ -302,8 +302,8 @@ class ControllerConfig:
             jump of an estimated delay. null: that of the catch-up; after a start on the reference
             0.2 times the assumed delay, at least two periods and at most 0.4 s.
         model_error: of the estimator's model: white noise of the accelerations, as a share of the
-            motion's range per s^1.5; null is 2e-4 of it in each period, and less in
-            a short one on an exact plant.
+            motion's range per s^1.5; null is 2e-4 of it in each period, more with
+            steps above 1 ms of a multibody plant, less in a short period on an exact plant.
         timing_std: standard deviation of the time at which a torque acts, s; null is learnt on an
             exact plant or with a delay estimator, else 1 % of the period.
         prior: section of prior standard deviations; null is the default of each.
