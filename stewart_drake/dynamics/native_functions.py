@@ -6,10 +6,12 @@ from functools import lru_cache, partial
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import OpenBLASController, threadpool_limits
 
 from stewart_drake.core.layout import SHAPES, SIGNATURES
 from stewart_drake.core.library import core
+from stewart_drake.mechanism.clearance import LINK_PAIRS, link_radii
 from stewart_drake.mechanism.geometry import Mechanism, geometry_of
 from stewart_drake.mechanism.kinematics import angle_rate_map
 from stewart_drake.scenario.signals import (
@@ -114,6 +116,8 @@ class NativeFunctions:
             setattr(self, name, NativeFunction(name, geometry))
         self._change = NativeFunction("change", geometry)
         self._geometry = core().at(geometry)
+        self._links = np.array(LINK_PAIRS, np.intc)
+        self._radii, self._unit = link_radii(mechanism), mechanism.crank_lengths.min()
 
     def change(self, state: Array, torque: Array, parameters: Array, gravity: float) -> Array:
         """Return d[pose; rates]/dt (12,), in half the time of a `Call`."""
@@ -172,6 +176,17 @@ class NativeFunctions:
         first, limits = c.at(rows), c.at(least)
         number = range(0, rows.size, NUM_TORQUES)
         return np.array([function(self._geometry, first + i, sign, limits) for i in number])
+
+    def room(self, poses: Array, pairs: NDArray[np.intp], least: Array) -> Array:
+        """Return reach margins and clearances (n, 6 + k) of poses (n, 6) above `least` (6 + k,).
+
+        All are in shortest cranks; `pairs` (k,) are indices in `clearance.LINK_PAIRS`.
+        """
+        rows, links = np.array(poses, np.float64), self._links[pairs]
+        room = np.empty((len(rows), len(least)))
+        given = self._geometry, len(rows), rows, len(links), links, self._radii, self._unit
+        core().call("room", *given, least, room)
+        return room
 
     def many_steps(
         self, state: ArrayLike, torques: Array, parameters: Array, gravity: float, h: Array

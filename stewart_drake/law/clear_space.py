@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stewart_drake.dynamics.native_functions import functions_of
 from stewart_drake.dynamics.workspace import border
 from stewart_drake.mechanism.clearance import clearances
 from stewart_drake.mechanism.geometry import Mechanism
@@ -61,15 +62,10 @@ class ClearSpace:
         They are negative for legs out of reach, and NaN for links that cannot be placed then.
         `chosen` are places in `pairs`, by default all.
         """
-        m, unit = self.mechanism, self.mechanism.crank_lengths.min()
-        pairs, least = self.pairs, self.least[NUM_LEGS:]
-        if chosen is not None:
-            pairs, least = pairs[chosen], least[chosen]
-        legs = reach_margins(m, poses) / unit - self.least[:NUM_LEGS]
-        if len(pairs) == 0:
-            return legs
-        apart = clearances(m, poses, legs_along(m, poses), pairs) / unit - least
-        return np.hstack([legs, apart])
+        pairs, legs = self.pairs, np.arange(NUM_LEGS)
+        chosen = np.arange(len(pairs)) if chosen is None else chosen
+        least = self.least[np.concatenate([legs, NUM_LEGS + chosen])]
+        return functions_of(self.mechanism).room(poses, pairs[chosen], least)
 
     def near(self, poses: Array, below: float) -> NearLimit:
         """Return the distances with less room than `below` at poses (n, 6), with their slopes."""

@@ -224,14 +224,14 @@ def riccati(model: Linearised, cost: HorizonCost, states: Array, torques: Array)
     weights = np.tile(cost.Q, NODES) / NODES
     P, p = cost.P, cost.P @ (states[-1] - cost.end)
     maps = model.node_maps.reshape(n, NODES * NUM_COORDINATES, -1)
-    errors = (model.nodes - cost.wanted).reshape(n, -1)
+    weighted, errors = maps.swapaxes(1, 2) * weights, (model.nodes - cost.wanted).reshape(n, -1)
     M = np.concatenate([model.Phi, model.Gamma], axis=2)
+    Hs, gs = weighted @ maps, (weighted @ errors[..., None])[..., 0]
+    Hs[:, x:, x:] += cost.R
+    gs[:, x:] += (torques - cost.torques) @ cost.R.T
     for j in range(n - 1, -1, -1):
-        weighted = maps[j].T * weights
-        H = weighted @ maps[j] + M[j].T @ P @ M[j]
-        g = weighted @ errors[j] + M[j].T @ (P @ model.defects[j] + p)
-        H[x:, x:] += cost.R
-        g[x:] += cost.R @ (torques[j] - cost.torques[j])
+        H = Hs[j] + M[j].T @ P @ M[j]
+        g = gs[j] + M[j].T @ (P @ model.defects[j] + p)
         S[j] = H[x:, x:]
         solved = np.linalg.solve(S[j], np.column_stack([H[x:, :x], g[x:]]))
         K[j], d[j] = solved[:, :x], -solved[:, x]

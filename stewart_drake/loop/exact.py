@@ -4,6 +4,7 @@
 
 import math
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TypedDict, Unpack
 
@@ -236,7 +237,9 @@ def ExactPlant_(T):
     return Impl
 
 
-ExactPlant = ExactPlant_[None]
+# Drake reads the sources of all callers, which takes 0.2 s below an import. A thread has few.
+with ThreadPoolExecutor(1) as thread:
+    ExactPlant = thread.submit(lambda: ExactPlant_[None]).result()
 
 
 def set_accuracy(simulator: Simulator, accuracy: float = 1e-8) -> None:

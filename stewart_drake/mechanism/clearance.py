@@ -10,7 +10,6 @@ from itertools import combinations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stewart_drake.mechanism.kinematics import LegGeometry, Legs, dot
 from stewart_drake.scenario.signals import LEGS, NUM_LEGS, POSITION
@@ -22,7 +21,6 @@ LINK_PAIRS: Final = tuple(
     (i, j) for i, j in combinations(range(2 * NUM_LEGS), 2) if j - i != NUM_LEGS
 )
 """Pairs (60) of links without a common joint: all but a crank and its own rod."""
-_LINK_PAIRS: Final = np.array(LINK_PAIRS)
 
 
 class Proportions(NamedTuple):
@@ -75,17 +73,17 @@ def segment_distances(p: Array, u: Array, q: Array, v: Array) -> Array:
     return np.sqrt(dot(d := r + s[..., None] * u - t[..., None] * v, d))
 
 
-def clearances(
-    mechanism: Legs, poses: Array, legs: LegGeometry, pairs: NDArray[np.intp] | None = None
-) -> Array:
-    """Return lower bounds (n, 60) of the distances of the pairs `LINK_PAIRS`, m; may be negative.
-
-    `pairs` (k,) chooses some of them.
-    """
-    first, second = (_LINK_PAIRS if pairs is None else _LINK_PAIRS[pairs]).T
-    start, along = center_lines(mechanism, poses, legs)
-    lines = start[:, first], along[:, first], start[:, second], along[:, second]
+def link_radii(mechanism: Legs) -> Array:
+    """Return the radii (12,) of the links' capsules, m."""
     size = proportions(mechanism)
     crank = float(np.hypot(size.crank_width, size.crank_thickness)) / 2
-    radii = np.repeat([crank, size.rod_radius], NUM_LEGS)
+    return np.repeat([crank, size.rod_radius], NUM_LEGS)
+
+
+def clearances(mechanism: Legs, poses: Array, legs: LegGeometry) -> Array:
+    """Return lower bounds (n, 60) of the distances of the pairs `LINK_PAIRS`, m, also negative."""
+    first, second = np.transpose(LINK_PAIRS)
+    start, along = center_lines(mechanism, poses, legs)
+    lines = start[:, first], along[:, first], start[:, second], along[:, second]
+    radii = link_radii(mechanism)
     return segment_distances(*lines) - radii[first] - radii[second]

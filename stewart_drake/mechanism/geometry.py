@@ -129,9 +129,13 @@ class Mechanism(kinematics.Legs):
         return f"Mechanism({self.name!r}, cranks {cranks} mm, rods {rods} mm)"
 
     @cached_property
+    def _numbers(self) -> Array:
+        return geometry_of(self)
+
+    @cached_property
     def _key(self) -> tuple[object, ...]:
         bodies = (x for b in (self.base, self.crank) for x in (b.mass, *b.inertia))
-        numbers = np.array([*self.home, *bodies, *geometry_of(self)])
+        numbers = np.array([*self.home, *bodies, *self._numbers])
         return self.name, self.effort_limit, numbers.tobytes()
 
     def __eq__(self, other: object) -> bool:
@@ -218,7 +222,7 @@ class Mechanism(kinematics.Legs):
             ForwardKinematicsError: no such pose on the mechanism's crank branches.
         """
         guess = self.home if guess is None else _six("guess", guess)
-        angles, numbers = _six("crank_angles", crank_angles), geometry_of(self)
+        angles, numbers = _six("crank_angles", crank_angles), self._numbers
         pose = _pose_of(numbers, angles, guess)
         if pose is not None:
             return pose
