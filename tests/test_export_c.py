@@ -495,7 +495,8 @@ def test_the_readme_is_that_of_the_composition(case, single, tmp_path):
     all_headers = "\n".join([included, *(f'#include "{name}"' for name in own)])
     other = f'extern "C" {{\n{all_headers}\n{declared}}}\n{rest}'
     (tmp_path / "wiring.cpp").write_text(other, encoding="utf-8")
-    strict = ["-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-fsyntax-only"]
+    strict = ["-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Werror"]
+    strict += ["-fsyntax-only"]
     commands = [[*c_compiler(), "-std=c99", *strict, "wiring.c"]]
     if shutil.which("g++") is not None:
         commands.append(["g++", "-std=c++11", *strict, "wiring.cpp"])

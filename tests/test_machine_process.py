@@ -431,6 +431,8 @@ def test_a_killed_machine_in_c_ends_its_controller_and_the_next_one_drives_its_s
                 assert second.end() == 0, second.lines
     assert sum("a session begins" in line for line in anew.lines) == 1
     assert re.search(r" [1-9]\d* foreign", anew.lines[-1])
+    took, sent = re.match(r"ended after (.*) s: (\d+) measurements", anew.lines[-2]).groups()
+    assert int(sent) < 10 * float(took) + 5  # without offers
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ static void delayed_start(const stewart_law *law, real *memory)
     stewart_delay_start(&s.delay, s.num_in_flight, (stewart_delay_memory *)(memory + X));
 }
 
-/* The most probable hypothesis; NULL before the first measurement. */
+/* The most probable hypothesis; NULL before the first measurement. Only read: the cast removes const. */
 static const stewart_hypothesis *best_of(const Sizes *s, const real *memory)
 {
     stewart_delay_memory *m = (stewart_delay_memory *)(uintptr_t)(memory + X);

@@ -78,7 +78,7 @@ void stewart_energy(const stewart_plant *plant, const real *pose, const real *ra
 {
     Motion m;
     motion(plant, pose, rates, &m);
-    *energy = m.sums[SUMS - 1];
+    *energy = m.sums[SUMS - 1]; /* the last of `equations.Sums` */
 }
 
 void stewart_residual_derivatives(const stewart_plant *plant, const real *pose, const real *rates,
@@ -92,6 +92,7 @@ void stewart_residual_derivatives(const stewart_plant *plant, const real *pose, 
     plate_derivatives(pose, rates, accelerations, parameters, gravity, common, dF_dx, mass);
     crank_rates(pose, rates, legs, arm_rates);
     slips(arm_rates, parameters, slip);
+    /* The first six parameters are the biases of the torques. */
     leg_derivatives(pose, rates, accelerations, parameters, gravity, common, legs, torque, parameters,
                     slip, change_of_legs, mass_of_legs, B);
     for (int i = 0; i < 72; i++)

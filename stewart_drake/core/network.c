@@ -41,7 +41,7 @@ void stewart_plan_torques(const stewart_law *law, const stewart_outlook *outlook
         if (!stewart_at_limit(&law->machine, schedule.number, schedule.torques))
             for (int i = 0; i < 6; i++)
                 integral[i] += law->period / 2 * (before[i] + error[i]);
-        stewart_copy(X, error, before); /* without what held torques put there */
+        stewart_copy(X, error, before); /* then less the offset that held torques cause */
         const int failure =
             stewart_design_feedback(law, outlook, ahead->theta, rows + ROW, state, NULL, feedforward,
                                     ahead->gain ? before : NULL, NULL, rest);

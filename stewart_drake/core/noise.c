@@ -18,7 +18,7 @@ real stewart_timing_scatter(const stewart_noise *noise)
 {
     const real chance = LATENESS_SIGNIFICANT / REAL(sqrt)(noise->lateness_information);
     const real mean = REAL(fabs)(noise->lateness) - chance;
-    return REAL(fmax)(0, noise->timing - (mean > 0 ? mean * mean : 0)); /* not for NaN */
+    return REAL(fmax)(0, noise->timing - (mean > 0 ? mean * mean : 0)); /* 0 for NaN */
 }
 
 /* Return factor + slope / information, at least 0: one step of Fisher scoring. 0 for NaN. */
@@ -44,7 +44,7 @@ void stewart_noise_learn(int m, const real *innovations, const real *variances, 
             W += change * change;
         }
         const real S_at_w = S - (noise->wander_in_use - noise->wander) * W; /* not at the factor in use */
-        S = S_at_w > S / 10 ? S_at_w : S / 10;
+        S = S_at_w > S / 10 ? S_at_w : S / 10; /* above 0, also if W was most of it */
         const real excess_ratio = innovations[i] * innovations[i] / S - 1;
         wander_slope += W * (excess_ratio < MOST_EXCESS ? excess_ratio : MOST_EXCESS) / (2 * S);
         noise->wander_information += W * W / (2 * S * S);

@@ -65,7 +65,7 @@ typedef struct {
        `torques` (number, 6) in flight, the oldest first. Returns bits of `stewart_status`. */
     int (*observe)(const stewart_law *law, real *memory, int number, const real *torques,
                    const real *measurement, stewart_scratch scratch);
-    /* Begin again, with the estimated parameters and the last measurement. */
+    /* Begin again, with the estimated parameters and the last measurement: after a missing report of servos. */
     void (*restart)(const stewart_law *law, real *memory);
     /* Parameters (p) and their standard deviations (p), NaN where nothing is estimated. */
     void (*parameters)(const stewart_law *law, const real *memory, real *theta, real *std);

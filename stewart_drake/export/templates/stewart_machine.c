@@ -266,7 +266,7 @@ static int greet(machine *m, const stewart_plan *request, const struct sockaddr_
     s.kind = STEWART_OFFER;
     s.arrived = 1;
     s.identity = stewart_own_identity;
-    m->sent += (unsigned)udp_put(m->socket, data, stewart_write_measured(&s, m->key, data), from);
+    udp_put(m->socket, data, stewart_write_measured(&s, m->key, data), from);
     return STEWART_TAKEN;
 }
 
