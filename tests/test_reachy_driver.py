@@ -39,7 +39,6 @@ STATUS = {
     "type": "daemon_status",
     "state": "running",
     "simulation_enabled": True,
-    "backend_status": {"motor_control_mode": "enabled", "error": None},
 }
 
 
@@ -49,6 +48,7 @@ class StandIn:
     def __init__(self, port=0):
         self.joints, self.sent = np.append(0.1, SLEEP), []
         self.says = "positions"  # or garbage, nothing
+        self.motors, self.follows = "enabled", True
         self._server = server.serve(self._serve, "127.0.0.1", port)
         self.port = self._server.socket.getsockname()[1]
         self._closing = threading.Event()
@@ -56,8 +56,11 @@ class StandIn:
         self._thread.start()
 
     def _serve(self, socket):
-        socket.send(json.dumps(STATUS))
+        reported = ""
         while not self._closing.is_set():
+            if reported != (reported := self.motors):
+                backend = {"motor_control_mode": self.motors, "error": None}
+                socket.send(json.dumps(STATUS | {"backend_status": backend}))
             if self.says == "positions":
                 joints = self.joints.tolist()
                 message = {"head_joint_positions": joints, "antennas_joint_positions": [-3.0, 3.0]}
@@ -77,8 +80,10 @@ class StandIn:
             except TimeoutError:
                 return
             assert message["type"] == "set_head_joints" and len(message["joints"]) == 7
-            self.joints = np.array(message["joints"])
-            self.sent.append((time.monotonic(), self.joints))
+            joints = np.array(message["joints"])
+            self.sent.append((time.monotonic(), joints))
+            if self.follows:
+                self.joints = joints
 
     def close(self):
         self._closing.set()
@@ -159,6 +164,19 @@ def test_a_daemon_that_stops_is_found_again():
         second = StandIn(first.port)
         until(lambda: link.ready)
         second.close()
+
+
+def test_motors_that_are_off_are_reported_and_get_no_setpoints(daemon):
+    """Setpoints sent meanwhile would move the head at once when the motors are enabled."""
+    daemon.motors = "disabled"
+    scenario = sd.load_scenario("reachy_mini", settings=("delay.steps=13",))
+    options, said = MachineOptions(reachy=f"127.0.0.1:{daemon.port}", port=0), []
+    with open_chosen(scenario, options, said.append) as (machine, _), in_a_thread(machine):
+        until(lambda: any("motors disabled: no setpoints are sent" in line for line in said))
+        assert not machine._daemon.ready and not daemon.sent
+        daemon.motors = "enabled"
+        until(lambda: machine._daemon.ready)
+        until(lambda: any("motors enabled" in line for line in said))
 
 
 @pytest.mark.parametrize(
@@ -304,9 +322,44 @@ def test_a_robot_is_not_moved_without_consent(daemon, tmp_path, monkeypatch):
     send = runpy.run_path(str(Path(__file__).parents[1] / "analysis/reachy_send.py"))["main"]
     file = tmp_path / "setpoints.csv"
     sd.setpoints("reachy_mini", 50, file)
+    log = tmp_path / "log.csv"
+    log.write_text("of an earlier run")
     with pytest.raises(SystemExit, match="--arm: not given"):
-        send([str(file), "--reachy", f"127.0.0.1:{daemon.port}", "--log", str(tmp_path / "l")])
-    assert not daemon.sent
+        send([str(file), "--reachy", f"127.0.0.1:{daemon.port}", "--log", str(log)])
+    assert not daemon.sent and log.read_text() == "of an earlier run"
+
+
+@pytest.mark.parametrize(
+    ("motors", "follows", "expected"),
+    [("disabled", True, "motors disabled: nothing is sent"), ("enabled", False, "did not follow")],
+)
+def test_a_head_that_does_not_follow_gets_no_motion(daemon, tmp_path, motors, follows, expected):
+    daemon.motors, daemon.follows = motors, follows
+    daemon.joints = daemon.joints + 0.3
+    send = runpy.run_path(str(Path(__file__).parents[1] / "analysis/reachy_send.py"))["main"]
+    file, log = tmp_path / "setpoints.csv", str(tmp_path / "l")
+    sd.setpoints("reachy_mini", 50, file)
+    with pytest.raises(SystemExit, match=expected):
+        send([str(file), "--reachy", f"127.0.0.1:{daemon.port}", "--log", log, "--arm"])
+
+
+@in_real_time
+def test_after_a_pause_the_rows_follow_later(daemon):
+    """None of those missed is sent at once: the head would jump."""
+    sender = runpy.run_path(str(Path(__file__).parents[1] / "analysis/reachy_send.py"))
+    rows = [[1e3 + 0.02 * k, *[0.01 * k] * 6] for k in range(50)]
+    with sender["connect"](f"ws://127.0.0.1:{daemon.port}/ws/sdk", proxy=None) as socket:
+        robot = sender["Robot"](socket)
+        sender["check"](robot, False)
+        logged = []
+        for seconds, (goal, *_) in robot.play(rows):
+            logged.append(seconds)
+            if goal == 0.2:
+                daemon.says = "nothing"
+                threading.Timer(0.35, setattr, (daemon, "says", "positions")).start()
+    times = np.array([time_ for time_, _ in daemon.sent])
+    assert len(times) == 50 and np.diff(times).max() > 0.2 and logged[-1] > 0.98 + 0.2
+    assert max(np.sum((times >= t) & (times < t + 0.01)) for t in times) <= 3
 
 
 # ---------------------------------------------------------------- a whole run

@@ -71,7 +71,7 @@ def read_servo_log(path: Path, mechanism: Mechanism) -> ServoLog:
     for bad in 1 + np.flatnonzero(~((gaps > 0) & (gaps <= _LONGEST_GAP)))[:1]:
         raise ConfigError(
             f"{table.location(known[bad], 'time')}: got {at[bad]:.9g} s after {at[bad - 1]:.9g} s; "
-            f"expected a later time, by at most {_LONGEST_GAP:g} s"
+            f"expected a later time, by at most {_LONGEST_GAP:g} s; log again, next to the servos"
         )
     if len(known) < len(times):
         whole, angles = slice(known[0], known[-1] + 1), np.unwrap(cranks[known], axis=0)

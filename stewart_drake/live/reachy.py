@@ -100,9 +100,10 @@ class Daemon:
 
     @property
     def ready(self) -> bool:
-        """Whether positions come."""
+        """Whether positions come, and the motors are on."""
         there = self.positions
-        return bool(there) and now() - there[-1].stamp < STALE * SECOND
+        fresh = bool(there) and now() - there[-1].stamp < STALE * SECOND
+        return fresh and self._motors_on
 
     def send(self, joints: Array) -> None:
         """Send a setpoint (7,) in rad; one that is not sent yet is replaced."""
@@ -206,8 +207,8 @@ class Daemon:
         mode = (status.get("backend_status") or {}).get("motor_control_mode", "enabled")
         if (mode == "enabled") != self._motors_on:
             self._motors_on = mode == "enabled"
-            effect = "act" if self._motors_on else "have no effect"
-            self.lines.append(f"daemon at {self._where}: motors {mode}: setpoints {effect}")
+            effect = "start live" if self._motors_on else "no setpoints are sent; enable them"
+            self.lines.append(f"daemon at {self._where}: motors {mode}: {effect}")
 
 
 class SoftSetpoints:
@@ -400,7 +401,7 @@ def _check_robot(scenario: Scenario) -> None:
 
 def _await_positions(daemon: Daemon, where: str) -> None:
     began, waiting = now(), threading.Event()
-    while not daemon.ready:
+    while not daemon.positions:
         if now() - began > _PATIENCE * SECOND:
             said = f" ({daemon.problem})" if daemon.problem else ""
             raise ConfigError(
@@ -408,5 +409,4 @@ def _await_positions(daemon: Daemon, where: str) -> None:
                 "expected the daemon of the robot, usually at port 8000"
             )
         waiting.wait(0.05)
-    daemon.lines.clear()
     waiting.wait(2.5 * STALE)  # its status comes once a second

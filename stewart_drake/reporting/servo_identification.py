@@ -44,7 +44,7 @@ def document(found: ServoIdentification, folder: str | Path = "") -> Document:
 
 def plan_document(plan: ServoPlan) -> Document:
     shares = dict(zip(("sine", "sines", "steps"), plan.shares, strict=True))
-    smaller = [f"{name} {100 * share:.0f} %" for name, share in shares.items() if share < 1]
+    smaller = [f"{name} to {100 * share:.0f} %" for name, share in shares.items() if share < 1]
     notes = [f"reduced to keep the limits: {', '.join(smaller)}"] if smaller else []
     return _document(
         plan.expected,
