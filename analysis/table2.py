@@ -52,14 +52,15 @@ def ablation(*settings: str) -> str:
 
 def main(*settings: str, out: str = "out/table2") -> tuple[dict[str, str], str]:
     """Print the table on every plant, and the ablation, and write them."""
-    tables = {
-        kind: sd.compare("table2", (*plant, *settings)).table() for kind, plant in PLANTS.items()
-    }
-    text = "\n\n".join(f"plant.kind {kind}\n{table}" for kind, table in tables.items())
+    tables, parts = {}, []
+    for kind, plant in PLANTS.items():
+        tables[kind] = sd.compare("table2", (*plant, *settings)).table()
+        parts.append(f"plant.kind {kind}\n{tables[kind]}\n")
+        print(parts[-1], flush=True)
     rows = ablation(*settings)
-    print(f"{text}\n\n{rows}")
+    print(rows)
     Path(out).mkdir(parents=True, exist_ok=True)
-    (Path(out) / "table2.txt").write_text(f"{text}\n\n{rows}\n")
+    (Path(out) / "table2.txt").write_text("\n".join([*parts, rows, ""]))
     return tables, rows
 
 

@@ -105,6 +105,8 @@ def test_delay_under_gravity(tmp_path, capsys):
     summary, _, told = analyze(capsys, "delay", tmp_path, *settings("plant.gravity=true"))
     assert summary["beatable"] == "no"
     assert "The delay of 0.8 s (8 periods) cannot be compensated: under any controller," in told
+    assert not summary["error_floor_applies"], "it starts from rest, and falls"
+    assert "A plate at rest until the first torque acts has 15.2 % s; this one moves." in told
     checks = summary["growth_checks"]
     assert len(checks) == 5
     for check in checks:

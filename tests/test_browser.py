@@ -83,7 +83,8 @@ def test_plate_reference_and_readout_are_where_the_run_had_them(replay, run):
         assert told == pytest.approx(off, rel=0.1, abs=5e-3)
 
 
-@pytest.mark.parametrize(("width", "height"), [(400, 800), (552, 545)])  # the latter in a report
+# Alone; in a report on a tablet and on a phone.
+@pytest.mark.parametrize(("width", "height"), [(400, 800), (552, 641), (353, 641)])
 def test_a_narrow_screen_shows_all_and_keys_alone_drive_it(tab, page, width, height):
     tab.open(page, width, height)
     tab.wait("viewer.animator.actions.length > 0 && document.querySelector('canvas') !== null")
@@ -94,6 +95,11 @@ def test_a_narrow_screen_shows_all_and_keys_alone_drive_it(tab, page, width, hei
         assert min(box["left"], box["top"]) >= 0
         assert box["right"] <= width and box["bottom"] <= height
     assert about["bottom"] + 300 < play["top"], "the panels leave no room for the machine"
+    seek(tab, 1.5)  # where the plate is highest
+    plate = "viewer.scene_tree.find(['drake', 'visualizer', 'paper', 'plate']).object"
+    up = f"{plate}.getWorldPosition({plate}.position.clone()).project(viewer.camera).y"
+    centre = tab.evaluate(up)
+    assert (1 - centre) / 2 * height > about["bottom"] + 20, "a panel covers the plate"
 
     tab.go_to("button")
     tab.press("Enter")

@@ -243,6 +243,9 @@ def test_list_describes_everything_shipped(capsys):
     for kind in KINDS:
         for name in shipped(kind):
             assert any(line.split()[:1] == [name] for line in out.splitlines())
+    # Networks of other inputs or faults are not described alike.
+    assert "trained on faults N2" in out and "trained on faults T" in out
+    assert out.count("18 densities") == 1
     assert "LQR that ignores the delay" in out
 
 

@@ -249,6 +249,10 @@ REFUSED = [
     ("controller=5", "controller: got 5; expected a mapping of fields: kind, kp, kd, period, "),
     ("plant.push=1", "plant.push: got 1; expected a mapping of fields: wrench, from, to"),
     ("controller.period=0.1s", "controller.period: got '0.1s'; expected a number, in s"),
+    ("delay.steps=80ms", "got '80ms'; expected a whole number of periods, from 0 to 1000"),
+    ("delay.fraction=10ms", "got '10ms'; expected a share of a period, from 0 to below 1"),
+    ("controller.delay_steps=80ms", "got '80ms'; expected a whole number of periods, from 0 to"),
+    ("reference.frequency=1Hz", "got '1Hz'; expected a number above 0 and of at most 1e4, or six"),
     ("controller.period=100", "controller.period: got 100; expected at most 10 s; 20 ms is 0.02"),
     ("plant.payload_mass=20 g", "plant.payload_mass: got '20 g'; expected a number, in kg"),
     (

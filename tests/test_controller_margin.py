@@ -482,9 +482,9 @@ def test_a_range_without_room_is_called_so():
     assert "stable in exact arithmetic only" in said and "-0 ms" not in said
     blind = ("plant.kind=exact", "plant.gravity=true", "duration=1", "controller.period=0.02")
     said = loop_verdict(judged(scenario(*blind, "delay.steps=0", controller="lqr_gravity")))
-    assert "from any time shorter to 3" in said
+    assert "delay errors from any below 0 to +3" in said
     said = loop_verdict(judged(scenario("plant.kind=exact", "duration=1")))
-    assert re.search(r"longer, 0\.23 % of the delay, and", said)
+    assert re.search(r"-\S+ ms to \+\S+ ms, 0\.23 % of the delay, and", said)
     assert said.endswith("; a larger controller.w_R widens it")
     said = loop_verdict(judged(scenario("controller.w_R=1e4", "duration=1")))
     assert "of the delay" in said and "widens" not in said

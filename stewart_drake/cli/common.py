@@ -205,7 +205,7 @@ def on_interrupt(text: str) -> Iterator[Callable[["Progress"], "Progress"]]:
     """
     finished = ""
 
-    def counted(show: "Progress") -> "Progress":
+    def noted(show: "Progress") -> "Progress":
         def count(done: int, total: int) -> None:
             nonlocal finished
             finished = f"{done} of {total} finished; "
@@ -214,7 +214,7 @@ def on_interrupt(text: str) -> Iterator[Callable[["Progress"], "Progress"]]:
         return count
 
     try:
-        yield counted
+        yield noted
     except KeyboardInterrupt:
         echo(f"stopped; {finished}{text}", error=True)
         raise typer.Exit(INTERRUPTED) from None

@@ -19,7 +19,7 @@ from stewart_drake.types import Array, Flags
 SETPOINTS: Final = tuple(f"setpoint_{leg}" for leg in LEGS)
 CRANKS: Final = tuple(f"crank_{leg}" for leg in LEGS)
 LEAST_LENGTH: Final = 4.0
-"""s."""
+"""Least length of a log, s."""
 _UNITS: Final = {"time": {"s": 1.0}, **dict.fromkeys((*SETPOINTS, *CRANKS), ANGLE_UNITS)}
 _HEADER: Final = "time[s], setpoint_1[rad] to setpoint_6, crank_1[rad] to crank_6 (or deg)"
 _EXPECTED: Final = f"CSV with {_HEADER}"
@@ -143,6 +143,7 @@ def _check_following(name: str, times: Array, setpoints: Array, cranks: Array) -
     fit = np.array(fits)[np.argmax(np.sum(fits, axis=1, where=judged))]
     bad = judged & (fit < _FOLLOWS)
     if bad.any():
+        # At the delay at which they are most against them: wrong signs, or another motion.
         least = np.array(fits)[np.argmin(np.sum(fits, axis=1, where=bad))]
         against = bool(np.all(least[bad] < _AGAINST))
         if against:  # name those that hardly move, too

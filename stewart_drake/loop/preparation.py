@@ -58,7 +58,7 @@ MAX_FROZEN_ERROR = 10.0
 REACH_CHECK_PERIOD = 0.02
 """s between the instants at which a reference is checked against the workspace."""
 _FAR = 20
-"""Share of the reach of a leg from which a position counts as one in another unit."""
+"""Reaches of a leg from which a position counts as one in another unit."""
 _ESTIMATED = {
     "torque_bias": PARAMETERS[BIAS],
     "payload": (PARAMETERS[PAYLOAD],),
@@ -161,8 +161,7 @@ class Experiment(NamedTuple):
         return (
             f"the motion takes up to {factor * needed:.3g} {unit}, the motors give "
             f"{factor * limit:.3g} ({source})"
-            f"{falls * bool(holding > limit)}"
-        )
+        ) + (falls if holding > limit else "")
 
     def torques_in_flight(self, delay: Delay) -> Array:
         """Return the torques (L, 6) in N m in flight at t = 0 for a delay, within the limit."""
@@ -342,10 +341,10 @@ def knowing(experiment: Experiment) -> Experiment:
 
 
 def _calibrated(parameters: Array, calibration: Calibration | None) -> Array:
-    """Return the first of `PLANT_PARAMETERS` (n,), calibrated ones in their place."""
-    values = [calibration and calibration.value(name) for name in PLANT_PARAMETERS]
-    pairs = zip(values, parameters, strict=False)
-    return np.array([own if value is None else value for value, own in pairs])
+    """Return parameters (n,), the first n of `PLANT_PARAMETERS`, with calibrated values."""
+    pairs = zip(PLANT_PARAMETERS, parameters, strict=False)
+    values = [(calibration and calibration.value(name), own) for name, own in pairs]
+    return np.array([own if value is None else value for value, own in values])
 
 
 def estimated_names(scenario: Scenario) -> tuple[str, ...]:

@@ -63,10 +63,13 @@ def _description(kind: "Kind", path: Path) -> str:
 
         network = load_network(path)
         low, high = network.bounds.min(), network.bounds.max()
+        inputs, family = f"densities ({network.density})", network.card.get("family")
+        if network.features == "health":
+            inputs = "features of the estimator's health"
         return (
-            f"A network of {NUM_INPUTS} densities ({network.density}), {network.hidden} hidden "
+            f"A network of {NUM_INPUTS} {inputs}, {network.hidden} hidden "
             f"neurons and {NUM_OUTPUTS} weights from {low:g} to {high:g}"
-        )
+        ) + (f", trained on faults {family} (theory.md, section 34)" if family else "")
     comment = re.match(r"(#.*\n)*", path.read_text(encoding="utf-8"))
     text = " ".join(line.strip("# ") for line in comment[0].splitlines()) if comment else ""
     return text.partition(". ")[0].rstrip(".")

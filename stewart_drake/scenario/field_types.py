@@ -48,14 +48,21 @@ Deviation = Annotated[float, Field(ge=0, le=1e3)]
 Length = Annotated[float, Field(ge=-1e3, le=1e3)]
 Loss = Annotated[float, Field(ge=0, le=0.99)]
 Fraction = Annotated[
-    float, Field(ge=0, lt=1), AfterValidator(lambda f: f if f >= LEAST_FRACTION else 0.0)
+    float,
+    Field(ge=0, lt=1),
+    AfterValidator(lambda f: f if f >= LEAST_FRACTION else 0.0),
+    one_message("a share of a period, from 0 to below 1"),
 ]
 TorqueLimit = Annotated[
     Positive | Literal["none"] | None,
     one_message("a number above 0 and of at most 1e6, none for no limit"),
 ]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
-Steps = Annotated[int, Field(ge=0, le=MOST_PERIODS)]
+Steps = Annotated[
+    int,
+    Field(ge=0, le=MOST_PERIODS),
+    one_message(f"a whole number of periods, from 0 to {MOST_PERIODS}"),
+]
 Row = Annotated[list[float], exactly(6)]
 Six = Annotated[list[Length], exactly(6)]
 Name = Annotated[str, Field(min_length=1)]

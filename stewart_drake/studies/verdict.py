@@ -148,10 +148,11 @@ def loop_verdict(loop: ControllerMargin) -> str:
     share = f", {100 * loop.share:.2g} % of the delay," if loop.share < math.inf else ""
     up = f"{m.gain_up:.4g}" if math.isfinite(m.gain_up) else "any"
     widen = "; a larger controller.w_R widens it" if fragile(loop) and loop.weighted else ""
+    low = f"-{milliseconds(m.shorter)}" if math.isfinite(m.shorter) else "any below 0"
+    high = f"+{milliseconds(m.longer)}" if math.isfinite(m.longer) else "any"
     return (
-        "this loop is stable: linearised along the reference, with a true delay from "
-        f"{milliseconds(m.shorter)} shorter to {milliseconds(m.longer)} longer{share} and "
-        f"motor gains from {m.gain_down:.3g} to {up}{assumed}{widen}"
+        "this loop is stable: linearised along the reference, it tolerates delay errors from "
+        f"{low} to {high}{share} and motor gains from {m.gain_down:.3g} to {up}{assumed}{widen}"
     )
 
 
