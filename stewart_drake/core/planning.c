@@ -6,11 +6,14 @@
 
 #define ROUNDS 12 /* Newton steps */
 
-/* Largest error at the end of a plan: rad, m over the reach, and both per s. */
+/* Largest error at the end of a plan: rad, m over the reach, and both per s. In single precision a last step with
+   the same J removes what is left of it, down to rounding. */
 #ifdef STEWART_FLOAT
 #define TOLERANCE ((real)1e-4)
+#define LAST_STEPS 1
 #else
 #define TOLERANCE ((real)1e-10)
+#define LAST_STEPS 0
 #endif
 /* Longest and shortest piece between two states of the dynamics, s. */
 #define PIECE ((real)0.025)
@@ -251,11 +254,10 @@ static int differentiate(const real *size, Plan *p, stewart_scratch scratch)
     return stewart_all_finite(X * U * p->number, p->J);
 }
 
-/* x (m) += the shortest d with A' d = b, A (m, n), m >= n, which is lost, as b is. Householder
-   reflections make A = Q [R; 0], and d = Q [R'^-1 b; 0]. */
-static int add_least_norm(int m, int n, real *A, real *b, real *x, stewart_scratch scratch)
+/* J' = Q [R; 0] of J' (m, n), m >= n, by Householder reflections: their vectors take the place of J', and
+   `diagonal` is that of R. Returns 0 if J is singular. */
+static int factorise(int m, int n, real *A, real *diagonal, real *beta)
 {
-    real *d = stewart_take(&scratch, m), diagonal[X], beta[X];
     for (int k = 0; k < n; k++) {
         real square = 0;
         for (int i = k; i < m; i++)
@@ -263,7 +265,7 @@ static int add_least_norm(int m, int n, real *A, real *b, real *x, stewart_scrat
         diagonal[k] = A[n * k + k] > 0 ? -REAL(sqrt)(square) : REAL(sqrt)(square);
         if (!(square > 0))
             return 0;
-        A[n * k + k] -= diagonal[k]; /* the reflection's vector v takes the place of the column */
+        A[n * k + k] -= diagonal[k];
         beta[k] = -A[n * k + k] * diagonal[k];
         for (int j = k + 1; j < n; j++) {
             real sum = 0;
@@ -273,6 +275,14 @@ static int add_least_norm(int m, int n, real *A, real *b, real *x, stewart_scrat
                 A[n * i + j] -= sum / beta[k] * A[n * i + k];
         }
     }
+    return 1;
+}
+
+/* x (m) += the shortest d with J d = b, d = Q [R'^-1 b; 0]; b is lost. */
+static int add_least_norm(int m, int n, const real *A, const real *diagonal, const real *beta, real *b,
+                          real *x, stewart_scratch scratch)
+{
+    real *d = stewart_take(&scratch, m);
     stewart_fill(m, 0, d);
     for (int k = 0; k < n; k++) {
         for (int i = 0; i < k; i++)
@@ -295,6 +305,9 @@ static int solve(const real *goal, Plan *p, stewart_scratch scratch)
 {
     const real longest = reach(p->model->plant.geometry), size[6] = {1, 1, 1, longest, longest, longest};
     const real *last = p->states + X * p->number * p->pieces;
+    const int m = U * p->number;
+    real diagonal[X], beta[X];
+    int left = LAST_STEPS;
     for (int round = 0; round < ROUNDS; round++) {
         real miss[X], most = 0;
         if (!respond(p))
@@ -303,10 +316,12 @@ static int solve(const real *goal, Plan *p, stewart_scratch scratch)
             miss[i] = (goal[i] - last[i]) / size[i % 6];
             most = REAL(fabs)(miss[i]) > most ? REAL(fabs)(miss[i]) : most;
         }
-        if (most <= TOLERANCE)
+        const int close = most <= TOLERANCE;
+        if (close && left-- == 0)
             return stewart_all_finite(X, miss);
-        if (!differentiate(size, p, scratch) ||
-            !add_least_norm(U * p->number, X, p->J, miss, p->torques, scratch))
+        if (!(close && round > 0) && !(differentiate(size, p, scratch) && factorise(m, X, p->J, diagonal, beta)))
+            return 0;
+        if (!add_least_norm(m, X, p->J, diagonal, beta, miss, p->torques, scratch))
             return 0;
     }
     return 0;
