@@ -12,6 +12,7 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.cli import main
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.servo_logs import read_servo_log
 from stewart_drake.law.servos import Stiffness
 from stewart_drake.live.options import MachineOptions
@@ -360,6 +361,15 @@ def test_a_robot_with_unknown_motors_is_not_moved():
     positions = {"type": "joint_positions", "head_joint_positions": [0.1, *[0.5] * 6]}
     with pytest.raises(SystemExit, match="no status"):
         sender["check"](sender["Robot"](Replies([json.dumps(positions)] * 200)), True)
+
+
+@pytest.mark.slow
+def test_a_robot_with_unknown_motors_is_not_driven(daemon, monkeypatch):
+    monkeypatch.setitem(STATUS, "type", "other")
+    options = MachineOptions(reachy=f"127.0.0.1:{daemon.port}", port=0)
+    opened = open_chosen(sd.load_scenario("reachy_mini"), options, [].append)
+    with pytest.raises(ConfigError, match="sent no status for 5 s"), opened:
+        pass
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:x", "127.0.0.1:9"])
