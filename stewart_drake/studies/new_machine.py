@@ -299,7 +299,8 @@ def proposed(m: Measurements, name: str, machine: Path) -> MechanismCheck:
     check = check_mechanism(load_mechanism(machine), m.gravity)
     if check.failure is not None:
         other = "apart" if m.cranks == "together" else "together"
-        raise ConfigError(f"{check.verdict}; expected other lengths, or cranks that point {other}")
+        found = check.verdict.removeprefix("no: ")
+        raise ConfigError(f"{found}; expected other lengths, or cranks that point {other}")
     needed = float(np.abs(check.torque).max())
     if m.torque_limit is not None and m.torque_limit < needed:
         raise ConfigError(
