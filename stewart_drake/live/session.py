@@ -268,7 +268,7 @@ def drive(
     loop.record.ran(as_run)
     experiment = made.experiment._replace(scenario=as_run)
     summary = summarize(experiment, loop.record, status, stopped, wall, ready.margin)
-    summary["warnings"] += overconfidence(summary)
+    summary["warnings"] += overconfidence(as_run, summary)
     if len(late) < samples:
         summary["warnings"].append(
             f"the log ends {(samples - len(late)) * period:.3g} s before the run; signals and "
