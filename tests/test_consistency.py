@@ -16,6 +16,7 @@ from stewart_drake.law.filter_settings import (
 )
 from stewart_drake.law.sensing import StateSensing
 from stewart_drake.loop.bulk import run_in_bulk
+from stewart_drake.loop.cautions import overconfidence
 from stewart_drake.loop.law_design import compose_law
 from stewart_drake.loop.preparation import prepare
 from stewart_drake.scenario.loading import load_scenario
@@ -120,6 +121,17 @@ def test_what_it_cannot_explain_is_told(cause):
     changed = "parameters that it takes as constant had to change"
     assert f"and {off if ratio > TOLERATED else changed}" in text
     assert "controller.model_error" in text
+
+
+def test_the_advice_names_no_cause_that_is_estimated_already():
+    summary = {
+        "estimator_consistency": {"verdict": "overconfident", "nis_ratio": 1.0},
+        "delay": {"estimated_s": 0.8, "true_s": 0.8},
+        "controller_margin": None,
+    }
+    scenario = load_scenario("paper", settings=("controller.estimate=[damping,coulomb]",))
+    [text] = overconfidence(scenario, summary)
+    assert ", or with payload_position or wrench in controller.estimate, or" in text
 
 
 def test_a_quiet_sensor_is_assumed_to_be_worse_than_it_is():

@@ -91,6 +91,8 @@ def test_the_error_of_a_code_is_that_of_rounding():
         (changed(3, 9, "inf"), "row 5, column angle_3"),
         (changed(3, 2, ""), "row 5: got some of the six torques"),
         (csv_text([name.replace("deg", "rad") for name in HEADER]), "row 2, column angle_1[rad]"),
+        (changed(3, 9, "320"), "take off whole turns"),
+        (csv_text(rows=[[str(1e3 * float(row[0])), *row[1:]] for row in ROWS]), "and time in s"),
         (csv_text(rows=ROWS[:15]), "at 15 instants"),
         (csv_text(rows=[[row[0], *ROWS[0][1:]] for row in ROWS]), "one torque throughout"),
     ],

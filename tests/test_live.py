@@ -51,6 +51,7 @@ from stewart_drake.live.session import (
     drive,
     plans,
     prepare_session,
+    readings,
 )
 from stewart_drake.live.viewer import End, Snapshot, Viewer
 from stewart_drake.loop.law_design import control_law
@@ -757,9 +758,39 @@ def test_a_real_machine_wants_to_be_armed():
             ConfigError, match=r"^--arm: not given, so nothing moved: the link is m"
         ):
             check_armed(ready, False)
+        assert readings(ready).startswith("the plate is 0 deg and ")
+        assert running.machine.counts["runs"] == 0
         check_armed(ready, True)  # the check has closed nothing
         assert ready.endpoint.fileno() >= 0
         ready.endpoint.close()
+
+
+def test_the_readings_of_a_parked_machine_stand_beside_those_of_the_start():
+    settings = (*PARKED, "sensor.kind=encoders", "sensor.samples=2", "sensor.offset=[1,0,0,0,0,0]")
+    with paper_machine(*settings) as running:
+        ready = prepare_session(scenario_of(*settings), running.address)
+        support = "support the plate: brakes open at the begin, and for 0.8 s"
+        assert support not in "\n".join(plans(ready, 1.0, "paper"))
+        real = replace(ready.contact.machine, flags=MachineFlags.PARKED)
+        ready.contact.last = real
+        assert support in "\n".join(plans(ready, 1.0, "paper"))
+        read, known = (
+            [float(angle) for angle in part.split(" deg")[0].split(", ")]
+            for part in re.split("read |are at ", readings(ready))[1:]
+        )
+        ready.endpoint.close()
+        until(lambda: any("said stop" in line for line in running.lines))
+    assert np.subtract(read, known) == pytest.approx([57.3, 0, 0, 0, 0, 0], abs=0.11)
+    assert running.machine.counts["runs"] == 0
+
+
+def test_a_machine_that_is_not_parked_is_not_asked_for_its_readings():
+    with paper_machine() as running:
+        ready = prepare_session(scenario_of(), running.address)
+        running.machine._running = True
+        assert "not parked" in readings(ready)
+        ready.endpoint.close()
+        assert running.machine.counts["sessions"] == 0
 
 
 @pytest.mark.slow
@@ -774,6 +805,10 @@ def test_the_jitter_stands_beside_the_margin_and_asks(settings, asks):
         ready.contact.link.trips = trips
         if settings is None:
             trips.clear()
+            stiff = replace(ready.margin, margins=Margins(math.inf, 0.044, 1.0, 1.0))
+            assert "errors from any below 0 to +44 ms;" in " ".join(
+                plans(ready._replace(margin=stiff), 1.0, "paper")
+            )
             lost = replace(ready.margin, radius=1.1, margins=Margins(0.0, 0.0, 1.0, 1.0))
             ready = ready._replace(margin=lost)
         told = " ".join(plans(ready, 1.0, "paper"))

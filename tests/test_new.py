@@ -63,6 +63,12 @@ def test_the_start_is_planned_within_the_torque_limit(limit, tmp_path):
     assert sd.load_scenario(tmp_path / "scenario.yaml").actuator.torque_limit == limit
 
 
+def test_a_singular_home_is_an_error_that_says_what_else_to_try(tmp_path):
+    sizes = {"base_radius": 0.16, "shaft_distance": 0.11, "plate_radius": 0.12, "crank": 0.08}
+    with pytest.raises(ConfigError, match=r"^the home pose is singular, .* cranks that point toge"):
+        made(tmp_path, **sizes, joint_distance=0.05, rod=0.3)
+
+
 @pytest.mark.parametrize("cranks", ["apart", "together"])
 def test_the_machine_is_as_it_was_measured(cranks, tmp_path):
     machine = made(tmp_path, cranks=cranks, upright=80, shaft_height=0.03)

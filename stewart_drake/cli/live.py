@@ -102,6 +102,8 @@ def live(
         ready = session.prepare_session(loaded, parse_address(where), key, say=delivery.say)
         running.enter_context(contextlib.closing(ready.endpoint))
         delivery.say_wrapped(*session.plans(ready, span, name))
+        if not ready.simulated and not options.armed:
+            delivery.say_wrapped(session.readings(ready))
         session.check_armed(ready, options.armed)
         # The demo's machine is simulated and needs no consent.
         problem = None if options.accept_jitter or demo else ready.jitter_problem

@@ -28,6 +28,7 @@ KINDS: Final = {"angles": ANGLES, "pose": POSE, "rates": RATES}
 
 EXPECTED: Final = "a log of a run, or CSV with time, torque_1 ... and angle_1 ..."
 FINEST: Final = 0.01  # least time between two measurements, s; more frequent ones are left out
+_LONGEST_STEP: Final = 1.0  # longest median time between two rows of a CSV log, s
 _LEAST_VALUES: Final = 96  # of a log: six crank angles at 16 instants, or a state at eight
 _TORQUES: Final = [f"torque_{leg}" for leg in LEGS]
 _CRANKS: Final = [f"angle_{leg}" for leg in LEGS]
@@ -232,7 +233,8 @@ def _require_radians(table: Table, mechanism: Mechanism) -> None:
         for bad in np.flatnonzero(off > 2 * np.pi)[:1]:
             raise ConfigError(
                 f"{table.location(bad, name)}: got {table.columns[name][bad]:.4g} rad, more than a "
-                f"turn from home, {home[name]:.4g} rad; expected radians, or [deg] in the header"
+                f"turn from home, {home[name]:.4g} rad; expected radians, or [deg] in the header; "
+                "take off whole turns"
             )
 
 
@@ -248,6 +250,11 @@ def _of_csv(path: Path, mechanism: Mechanism, precision: Precision, gravity: flo
         raise ConfigError(
             f"{table.location(bad, 'time')}: got {time[bad]:.9g} s after {time[bad - 1]:.9g} s; "
             "expected increasing times"
+        )
+    if (step := float(np.median(np.diff(time, prepend=time[:1])))) > _LONGEST_STEP:
+        raise ConfigError(
+            f"{path}: got rows {step:.4g} s apart; expected at most {_LONGEST_STEP:g} s, and time "
+            "in s"
         )
     _require_radians(table, mechanism)
     there = np.isfinite(torques)

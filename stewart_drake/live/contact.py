@@ -295,7 +295,7 @@ def parse_address(text: str, option: str = "--machine") -> Address:
     """Return the address of HOST:PORT, which an option names."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise ConfigError(f"{option}: got {text!r}; expected HOST:PORT, such as 127.0.0.1:7000")
+        raise ConfigError(f"{option}: got {text!r}; expected HOST:PORT, such as 127.0.0.1:47000")
     with contextlib.suppress(OSError, UnicodeError):
         return socket.gethostbyname(host), int(port)
     raise ConfigError(f"{option}: got {text!r}; expected the name or address of a host")

@@ -196,7 +196,7 @@ class LiveLoop:
         return np.asarray(np.ptp(self._poses, axis=0))
 
     def _motion(self) -> str:
-        return f"by {_length(self._moved())} in {_REST_TIME:g} s"
+        return f"by {turn_and_way(self._moved())} in {_REST_TIME:g} s"
 
     def _sample(self, k: int, message: MachineMessage | None) -> End | None:
         """Step the law and send its torques; return the end of the run, or None."""
@@ -363,9 +363,8 @@ class LiveLoop:
         problem = self._lead(t, first.state, message)
         if problem is None:
             apart = np.abs(first.state - design.experiment.start)[POSE]
-            self._say(
-                f"the plate is {_length(apart)} off the scenario's start: it is led there first"
-            )
+            away = turn_and_way(apart)
+            self._say(f"the plate is {away} off the scenario's start: it is led there first")
         return problem
 
     def _lead(self, t: float, state: Array, message: MachineMessage | None) -> str | None:
@@ -423,7 +422,7 @@ class LiveLoop:
         )
 
 
-def _length(change: Array) -> str:
+def turn_and_way(change: Array) -> str:
     """Return the largest turn and the largest way of a change (6,) of the pose in words."""
     return f"{math.degrees(change[ANGLES].max()):.2g} deg and {1e3 * change[POSITION].max():.2g} mm"
 

@@ -22,9 +22,9 @@ from stewart_drake.live.design import (
     design,
     read_learned,
 )
-from stewart_drake.live.endpoint import Address, Endpoint
+from stewart_drake.live.endpoint import Address, Endpoint, now
 from stewart_drake.live.governor import FASTEST, PACE, Governor, Steering, Way
-from stewart_drake.live.loop import CrankLoop, LiveLoop
+from stewart_drake.live.loop import CrankLoop, LiveLoop, turn_and_way
 from stewart_drake.live.options import LiveOptions
 from stewart_drake.live.protocol import (
     NOTHING,
@@ -44,7 +44,8 @@ from stewart_drake.reporting.document import templates
 from stewart_drake.scenario.config import Scenario
 from stewart_drake.scenario.link_config import NetworkConfig, WireConfig
 from stewart_drake.scenario.run_log import Background, RunLog, UdpMirror, open_log
-from stewart_drake.studies.verdict import Verdict, milliseconds
+from stewart_drake.scenario.signals import NUM_TORQUES, POSE
+from stewart_drake.studies.verdict import Verdict, delay_range, milliseconds
 from stewart_drake.types import Array
 
 _MOST: Final = 0.5
@@ -142,6 +143,7 @@ def plans(ready: Ready, duration: float, scenario: str) -> list[str]:
             infinity=math.inf,
             most=_MOST,
             ms=milliseconds,
+            delay_range=delay_range,
             advice=_queue_advice(made.experiment.scenario),
             weak=made.experiment.weak_motors(made.torque_limit),
         )
@@ -158,6 +160,31 @@ def _queue_advice(scenario: Scenario) -> str | None:
         "queue: reference fills only the machine's own link; then it has no torques until those of "
         f"this controller act: better --set start=rest --set queue={better}, on both sides"
     )
+
+
+def readings(ready: Ready) -> str:
+    """Read the sensors of a parked machine, in a session that does not begin; return a line."""
+    contact, experiment = ready.contact, ready.design.experiment
+    await_free(contact)
+    if MachineFlags.PARKED not in contact.machine.flags:
+        return "the sensors were not read: the machine is not parked"
+    contact.join()
+    values, until = None, now() + 2 * SECOND
+    while values is None and now() < until:
+        contact.send()
+        for message in contact.wait(now() + SECOND // 20):
+            values = message.values if values is None else values
+    for _ in range(3):
+        contact.send(flags=ControllerFlags.STOP)
+    if values is None:
+        return "the sensors were not read: no measurement came"
+    start = experiment.start[POSE]
+    if experiment.scenario.sensor.kind == "state":
+        away = turn_and_way(np.abs(values[POSE] - start))
+        return f"the plate is {away} off the start of the motion"
+    cranks = values[-NUM_TORQUES:], experiment.mechanism.crank_angles(start)
+    read, known = (", ".join(f"{angle:.1f}" for angle in np.degrees(one)) for one in cranks)
+    return f"the cranks read {read} deg; at the start of the motion they are at {known} deg"
 
 
 def check_armed(ready: Ready, armed: bool) -> None:
@@ -268,7 +295,7 @@ def drive(
     loop.record.ran(as_run)
     experiment = made.experiment._replace(scenario=as_run)
     summary = summarize(experiment, loop.record, status, stopped, wall, ready.margin)
-    summary["warnings"] += overconfidence(summary)
+    summary["warnings"] += overconfidence(as_run, summary)
     if len(late) < samples:
         summary["warnings"].append(
             f"the log ends {(samples - len(late)) * period:.3g} s before the run; signals and "

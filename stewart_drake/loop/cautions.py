@@ -155,7 +155,7 @@ def _remedy(scenario: Scenario, suits: Callable[[float], bool]) -> str:
     return "no multibody step would do, or plant.kind=exact"
 
 
-def overconfidence(summary: RunSummary) -> list[str]:
+def overconfidence(scenario: Scenario, summary: RunSummary) -> list[str]:
     """Return a warning if the estimator's standard deviations are too small."""
     consistency = summary["estimator_consistency"]
     if consistency["verdict"] != "overconfident":
@@ -172,11 +172,14 @@ def overconfidence(summary: RunSummary) -> list[str]:
         f"Most likely it is the delay, which the controller takes for {delay['estimated_s']:.4g} s "
         f"and which is {delay['true_s']:.4g} s: the loop is unstable with this error. "
     ) * bool(wrong and margin and margin["stable"] is False)
+    estimated = scenario.controller.estimate
+    causes = [one for one in ("coulomb", "payload_position", "wrench") if one not in estimated]
+    further = f", or with {' or '.join(causes)} in controller.estimate" * bool(causes)
     return [
         "the estimator is overconfident: the machine does what its model cannot explain, as "
         f"friction, a payload off the centre, a push or a wrong delay do, and {shown}. {likely}"
-        "Estimate the cause, with controller.delay_estimator, or with coulomb, payload_position or "
-        "wrench in controller.estimate, or raise controller.model_error"
+        f"Estimate the cause, with controller.delay_estimator{further}, or raise "
+        "controller.model_error"
     ]
 
 
@@ -199,7 +202,7 @@ def cautions_after(experiment: Experiment, summary: RunSummary) -> list[str]:
             f"the controller's torque was not finite at {broken} samples, which sent the last "
             "finite one, or zero"
         )
-    found += overconfidence(summary)
+    found += overconfidence(experiment.scenario, summary)
     margin = summary["controller_margin"]
     if summary["status"] == "completed" and margin is not None and margin["stable"] is False:
         found.append(

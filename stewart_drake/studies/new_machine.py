@@ -298,7 +298,8 @@ def proposed(m: Measurements, name: str, machine: Path) -> MechanismCheck:
     machine.write_text(machine_text(m, name))
     check = check_mechanism(load_mechanism(machine), m.gravity)
     if check.failure is not None:
-        raise ConfigError(f"{check.verdict}; expected other lengths, or {_other_cranks(m)}")
+        found = check.verdict.removeprefix("no: ")
+        raise ConfigError(f"{found}; expected other lengths, or {_other_cranks(m)}")
     needed = float(np.abs(check.torque).max())
     if m.torque_limit is not None and m.torque_limit < needed:
         raise ConfigError(

@@ -7,7 +7,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from stewart_drake.dynamics.workspace import Failure, diagnose
-from stewart_drake.law.stability import amplification
+from stewart_drake.law.stability import Margins, amplification
 from stewart_drake.law.startup import least_torque, reference_torques
 from stewart_drake.loop.controller_margin import ControllerMargin, fastest_in_motion, over_wire
 from stewart_drake.loop.preparation import REACH_CHECK_PERIOD, Experiment, prepare_unchecked
@@ -148,12 +148,18 @@ def loop_verdict(loop: ControllerMargin) -> str:
     share = f", {100 * loop.share:.2g} % of the delay," if loop.share < math.inf else ""
     up = f"{m.gain_up:.4g}" if math.isfinite(m.gain_up) else "any"
     widen = "; a larger controller.w_R widens it" if fragile(loop) and loop.weighted else ""
-    low = f"-{milliseconds(m.shorter)}" if math.isfinite(m.shorter) else "any below 0"
-    high = f"+{milliseconds(m.longer)}" if math.isfinite(m.longer) else "any"
     return (
         "this loop is stable: linearised along the reference, it tolerates delay errors from "
-        f"{low} to {high}{share} and motor gains from {m.gain_down:.3g} to {up}{assumed}{widen}"
+        f"{delay_range(m)}{share} and motor gains from {m.gain_down:.3g} to {up}{assumed}{widen}"
     )
+
+
+def delay_range(margins: Margins) -> str:
+    """Return the delay errors for which a loop is stable, as `-0.6 ms to +0.5 ms`."""
+    shorter, longer = margins.shorter, margins.longer
+    low = f"-{milliseconds(shorter)}" if math.isfinite(shorter) else "any below 0"
+    high = f"+{milliseconds(longer)}" if math.isfinite(longer) else "any"
+    return f"{low} to {high}"
 
 
 def fragile(loop: ControllerMargin) -> bool:
