@@ -88,18 +88,27 @@ class Robot:
             if now - self.heard > STALE:
                 raise SystemExit(f"the daemon sent no positions for {STALE} s; the head is held")
             try:
-                message = json.loads(self.socket.recv(timeout=until - now if now < until else GAP))
+                text = self.socket.recv(timeout=until - now if now < until else GAP)
             except TimeoutError:
                 continue
-            if message.get("type") == "daemon_status":
-                self.status = message
-                mode = (message.get("backend_status") or {}).get("motor_control_mode", "enabled")
-                if mode != "enabled":
-                    raise SystemExit(f"motors {mode}: nothing is sent; enable them, start again")
-            if message.get("type") == "joint_positions":
-                yaw, *self.cranks = message["head_joint_positions"]
-                self.yaw = yaw if self.yaw is None else self.yaw
-                self.heard = time.monotonic()
+            try:
+                self.take(json.loads(text))
+            except (ValueError, LookupError, TypeError, AttributeError):
+                continue  # without usable positions for STALE it ends
+
+    def take(self, message):
+        """Take the status or the positions; raise ValueError where positions are unusable."""
+        if message["type"] == "daemon_status":
+            self.status = message
+            mode = (message.get("backend_status") or {}).get("motor_control_mode", "enabled")
+            if mode != "enabled":
+                raise SystemExit(f"motors {mode}: nothing is sent; enable them, start again")
+        if message["type"] == "joint_positions":
+            yaw, *cranks = message["head_joint_positions"]
+            if len(cranks) != JOINTS - 1 or not all(abs(a) < 2 * math.pi for a in (yaw, *cranks)):
+                raise ValueError
+            self.yaw = yaw if self.yaw is None else self.yaw
+            self.cranks, self.heard = cranks, time.monotonic()
 
     def send(self, cranks):
         message = {"type": "set_head_joints", "joints": [self.yaw, *cranks]}
@@ -124,10 +133,12 @@ class Robot:
 
 
 def check(robot, armed):
-    """Refuse a real robot without consent."""
+    """Refuse a daemon without a status, and a real robot without consent."""
     until = time.monotonic() + PATIENCE
     while (robot.cranks is None or not robot.status) and time.monotonic() < until:
         robot.listen(time.monotonic() + PERIOD)
+    if not robot.status:
+        raise SystemExit(f"the daemon sent no status for {PATIENCE} s: are the motors on?")
     simulated = robot.status.get("simulation_enabled") or robot.status.get("mockup_sim_enabled")
     if not (simulated or armed):
         raise SystemExit("--arm: not given, for a daemon that does not report a simulation")
@@ -172,8 +183,10 @@ def main(words=None):
                 for seconds, goals in robot.play(rows):
                     log.writerow([f"{seconds:.6f}", *goals, *robot.cranks])
                     furthest = max(furthest, robot.distance(goals))
-        except (OSError, WebSocketException) as error:
-            raise SystemExit(f"daemon at {given.reachy}: {error}") from None
+        except (OSError, ValueError, WebSocketException) as error:
+            raise SystemExit(
+                f"daemon at {given.reachy}: {error}; expected a daemon at HOST:PORT, usually 8000"
+            ) from None
     print(
         f"sent {len(rows)} setpoints in {seconds:.2f} s, the cranks at most {furthest:.2g} rad "
         f"from them, logged to {given.log}; the head is held"

@@ -63,7 +63,10 @@ BAD_ARGUMENTS = [
         ["analyze", "robustness", "--vary", "gain=5mm"],
         "--vary: gain: got '5mm'; expected a number (gain: +-share of the motors' torque)\n",
     ),
-    (["simulate", "--set", "delay.steps=5ms"], "delay.steps: got '5ms'; expected a whole number\n"),
+    (
+        ["simulate", "--set", "delay.steps=5ms"],
+        "delay.steps: got '5ms'; expected a whole number of periods",
+    ),
     (["tune", "dataset", "--disturbed", "-1"], "--disturbed"),
     (["tune", "dataset", "--set", "duration=1"], "duration"),
     (["tune", "dataset", "--set", "reference.kind=hold"], "reference"),

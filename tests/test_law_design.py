@@ -1,5 +1,7 @@
 """A law without a scenario, in a user's diagram."""
 
+import warnings
+
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -65,6 +67,41 @@ def test_a_law_for_a_platform_knows_its_engine(engine, options):
     simulator.AdvanceTo(2.0)
     state = diagram.GetOutputPort("state").Eval(simulator.get_context())
     np.testing.assert_allclose(state[POSE], PAPER.home, atol=2e-3)
+
+
+@pytest.mark.parametrize("port", ["torque", "torque_commanded"])
+def test_a_plant_that_reads_the_torque_between_the_samples_is_warned_of(port):
+    builder = DiagramBuilder()
+    platform = sd.AddStewartPlatform(builder, PAPER, sd.PlantConfig())
+    motion = PiecewisePolynomial(PAPER.home.reshape(6, 1))
+    controller = sd.design_law(platform, motion, 0.02, 0.0).AddToBuilder(builder)
+    builder.Connect(platform.GetOutputPort("state"), controller.GetInputPort("measurement"))
+    builder.Connect(controller.GetOutputPort(port), platform.GetInputPort("torque"))
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("default")
+        Simulator(builder.Build()).AdvanceTo(0.06)
+    messages = [str(one.message) for one in warned]
+    assert len(messages) == (port == "torque"), messages
+    assert all(one.startswith("delay_lqi: got a reader of the port torque b") for one in messages)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.1, 0.11])
+def test_the_delay_of_a_law_that_estimates_it_begins_as_that_of_the_known_one(delay):
+    moves = PAPER.home + np.array([np.zeros(6), [0.1, 0, 0.2, 0.02, 0, 0.02], np.zeros(6)])
+    motion = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
+        [0.0, 0.5, 1.0], moves.T, np.zeros(6), np.zeros(6)
+    )
+    dynamics = sd.StewartDynamics(PAPER, gravity=True)
+    known, found = (
+        sd.design_law(dynamics, motion, 0.02, delay, queue="reference", options=options)
+        for options in (sd.ControllerConfig(), sd.ControllerConfig(delay_estimator="constant"))
+    )
+    assert len(found.queue) > len(known.queue)
+    first, second = (
+        chain.GetOutputPort("torque").Eval(chain.CreateDefaultContext())
+        for chain in (known.delay_chain(), found.delay_chain())
+    )
+    np.testing.assert_allclose(second, first, atol=1e-12)
 
 
 def test_steps_of_a_users_plant_need_to_fit_period_and_delay_only():

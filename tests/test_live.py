@@ -992,6 +992,12 @@ def viewer():
 
 
 @pytest.mark.slow
+def test_ctrl_c_while_the_page_starts_ends_only_the_loop(viewer):
+    os.kill(viewer._process.pid, signal.SIGINT)
+    assert viewer.opened().startswith("http://")
+
+
+@pytest.mark.slow
 def test_the_page_does_what_its_own_buttons_ask_for_and_nobody_else(viewer, capfd):
     """No request causes a traceback, and the loop goes on without a page."""
     url = viewer.opened()

@@ -173,6 +173,7 @@ def test_links_that_cross_are_a_warning_below_the_findings(tmp_path, capsys):
     said = " ".join(capsys.readouterr().out.split())
     crossing = r"warning: \d+ pairs of links cross, at worst [\d.]+ mm deep \(crank \d and crank \d"
     assert re.search(f"prediction errors grow [^:]*{crossing}.* written to", said)
+    assert "; compare cranks that point apart" in said
     assert "cross, at worst" in json.loads((folder / "summary.json").read_text())["crossings"][0]
     page = (folder / "report.html").read_text()
     assert re.search(r"dead centre\. \d+ pairs of links cross", " ".join(page.split()))

@@ -530,6 +530,16 @@ def test_bounds_are_alike_where_the_seeds_do_not_tell_them_apart(known_outcomes)
     many = [cells[0]._replace(runs=8, errors=(*common, *common)), cells[4]._replace(runs=8)]
     assert replace(study, bounds=many).unconfirmed_losses == []  # 3 of 8 against 8 of 8
 
+    begun = [
+        cells[0],
+        cells[1]._replace(runs=2, errors=(1.2, 1.3)),
+        cells[2]._replace(runs=0, errors=()),
+    ]
+    partial = replace(study, bounds=begun, losses=[], interrupted=True)
+    assert partial.unconfirmed_losses == []  # nothing was lost, only not run
+    assert document(partial).verdict.startswith("Interrupted: not all simulations were run; with --out the same")
+    assert "is worse" not in document(partial).verdict
+
 
 def test_a_bound_at_which_most_packets_are_late_is_not_recommended(known_outcomes):
     """Old plans, which a simulation computes without an error, replace the torques there."""

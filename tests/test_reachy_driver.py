@@ -12,6 +12,7 @@ import pytest
 
 import stewart_drake as sd
 from stewart_drake.cli import main
+from stewart_drake.files.errors import ConfigError
 from stewart_drake.identification.servo_logs import read_servo_log
 from stewart_drake.law.servos import Stiffness
 from stewart_drake.live.options import MachineOptions
@@ -341,6 +342,57 @@ def test_a_head_that_does_not_follow_gets_no_motion(daemon, tmp_path, motors, fo
     sd.setpoints("reachy_mini", 50, file)
     with pytest.raises(SystemExit, match=expected):
         send([str(file), "--reachy", f"127.0.0.1:{daemon.port}", "--log", log, "--arm"])
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"type": "joint_positions"}'])
+def test_unusable_messages_do_not_reach_the_motors(text):
+    sender = runpy.run_path(str(Path(__file__).parents[1] / "analysis/reachy_send.py"))
+    positions = {"type": "joint_positions", "head_joint_positions": [0.1, *[0.5] * 6]}
+    unusable = ([float("nan")] * 7, [0.1] * 6, [0.1, *[9.0] * 6], [None] * 7)
+    bad = [json.dumps(positions | {"head_joint_positions": joints}) for joints in unusable]
+    robot = sender["Robot"](Replies([json.dumps(positions), text, *bad]))
+    robot.listen(time.monotonic() + 0.02)
+    assert robot.yaw == 0.1 and robot.cranks == [0.5] * 6
+
+
+def test_a_robot_with_unknown_motors_is_not_moved():
+    sender = runpy.run_path(str(Path(__file__).parents[1] / "analysis/reachy_send.py"))
+    sender["check"].__globals__["PATIENCE"] = 0.1
+    positions = {"type": "joint_positions", "head_joint_positions": [0.1, *[0.5] * 6]}
+    with pytest.raises(SystemExit, match="no status"):
+        sender["check"](sender["Robot"](Replies([json.dumps(positions)] * 200)), True)
+
+
+@pytest.mark.slow
+def test_a_robot_with_unknown_motors_is_not_driven(daemon, monkeypatch):
+    monkeypatch.setitem(STATUS, "type", "other")
+    options = MachineOptions(reachy=f"127.0.0.1:{daemon.port}", port=0)
+    opened = open_chosen(sd.load_scenario("reachy_mini"), options, [].append)
+    with pytest.raises(ConfigError, match="sent no status for 5 s"), opened:
+        pass
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:x", "127.0.0.1:9"])
+def test_an_address_without_a_daemon_is_named(address, tmp_path):
+    send = runpy.run_path(str(Path(__file__).parents[1] / "analysis/reachy_send.py"))["main"]
+    file = tmp_path / "setpoints.csv"
+    sd.setpoints("reachy_mini", 50, file, settings=("duration=1",))
+    with pytest.raises(SystemExit, match=r"daemon at .*; expected .*HOST:PORT"):
+        send([str(file), "--reachy", address, "--log", str(tmp_path / "l")])
+
+
+class Replies:
+    """A socket with these messages, then none."""
+
+    def __init__(self, texts):
+        self.texts = list(texts)
+
+    def recv(self, timeout):
+        if self.texts:
+            time.sleep(0.002)
+            return self.texts.pop(0)
+        time.sleep(timeout)
+        raise TimeoutError
 
 
 @in_real_time

@@ -68,7 +68,7 @@ def resolve(kind: Kind, name_or_path: str | Path) -> Path:
         path = absolute_path(name_or_path)
         if os.path.exists(inside := path / f"{kind}.yaml"):
             return inside
-        if os.path.isdir(path):
+        if os.path.isdir(path) and KINDS[kind][2] == ".yaml":
             raise ConfigError(
                 f"{kind}: got {str(name_or_path)!r}, a folder without {kind}.yaml; expected a "
                 "file, or a folder with that one"

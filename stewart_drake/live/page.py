@@ -7,6 +7,7 @@ listen on this computer only (`reporting.local_page`).
 import json
 import multiprocessing
 import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -45,7 +46,11 @@ class PageViewer(Viewer):
         context = multiprocessing.get_context("spawn")
         self._connection, other = context.Pipe()
         self._process = context.Process(target=serve, args=(other, mechanism, title), daemon=True)
-        self._process.start()
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            self._process.start()  # ignores Ctrl-C: that ends the loop, which closes the page
+        finally:
+            signal.signal(signal.SIGINT, handler)
         other.close()
         self._request, self._stop, self._open, self._ready = Request(), False, True, True
 
@@ -141,7 +146,7 @@ def serve(connection: Connection, mechanism: Mechanism, title: str) -> None:
     from stewart_drake.loop.scene import Scene
     from stewart_drake.reporting.replay import quiet_meshcat, scene_page
 
-    os.setsid()  # Ctrl-C and signals to the group end the loop, which closes this
+    os.setsid()  # signals to the group end the loop, which closes this
     meshcat = quiet_meshcat()
     scene, readouts = Scene(mechanism, meshcat), Readouts()
     lock, (low, high) = threading.Lock(), slider_range(mechanism)

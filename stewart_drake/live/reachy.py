@@ -93,6 +93,7 @@ class Daemon:
         self.positions: deque[Positions] = deque(maxlen=_KEPT)
         self.simulated, self.lines, self.problem = False, deque[str](), ""
         self._reported_loss = self._reported_message = self._closed = False
+        self.has_status = False
         self._motors_on, self._setpoint = True, ""
         self._loop, self._wake = asyncio.new_event_loop(), asyncio.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -209,6 +210,7 @@ class Daemon:
             self._motors_on = mode == "enabled"
             effect = "start live" if self._motors_on else "no setpoints are sent; enable them"
             self.lines.append(f"daemon at {self._where}: motors {mode}: {effect}")
+        self.has_status = True
 
 
 class SoftSetpoints:
@@ -363,7 +365,7 @@ def open_chosen(
     Raises:
         ConfigError: a scenario that the protocol does not cover, or an address in use. For a robot
             also other motors than position servos, more samples than the daemon sends, no package
-            websockets, or no daemon that sends positions.
+            websockets, or no daemon that sends positions and its status.
     """
     check_scenario(scenario)
     if options.reachy:
@@ -401,12 +403,12 @@ def _check_robot(scenario: Scenario) -> None:
 
 def _await_positions(daemon: Daemon, where: str) -> None:
     began, waiting = now(), threading.Event()
-    while not daemon.positions:
+    while not (daemon.positions and daemon.has_status):
         if now() - began > _PATIENCE * SECOND:
             said = f" ({daemon.problem})" if daemon.problem else ""
+            lacks = "status" if daemon.positions else "positions"
             raise ConfigError(
-                f"--reachy: got {where}, which sent no positions for {_PATIENCE:g} s{said}; "
+                f"--reachy: got {where}, which sent no {lacks} for {_PATIENCE:g} s{said}; "
                 "expected the daemon of the robot, usually at port 8000"
             )
-        waiting.wait(0.05)
-    waiting.wait(2.5 * STALE)  # its status comes once a second
+        waiting.wait(0.05)  # its status comes once a second

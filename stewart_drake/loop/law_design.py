@@ -552,10 +552,11 @@ class DesignedLaw:
         return DelayLqiController(self.law, self.queue, motion)
 
     def delay_chain(self) -> DelayChain:
-        """Return the delay that the law assumes as a LeafSystem, with `queue` under way."""
+        """Return the delay that the law assumes as a LeafSystem, with its torques under way."""
         timeline = self.law.timeline
         steps, fraction = timeline.delay.steps, timeline.delay.fraction
-        return DelayChain(timeline.period, steps, fraction, self.queue)
+        queue = self.experiment.torques_in_flight(timeline.delay)  # not up to the longest delay
+        return DelayChain(timeline.period, steps, fraction, queue)
 
     def AddToBuilder(
         self,

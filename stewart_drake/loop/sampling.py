@@ -9,6 +9,7 @@ it. A thousand runs would leak up to a gigabyte. `weak` makes callbacks without 
 
 import math
 import time
+import warnings
 import weakref
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -82,7 +83,7 @@ def update_every(
     period: float,
     update: Callable[[Context, Any], None],
     when: Callable[[float], float] = event_time,
-) -> None:
+) -> int:
     """Call a method of `system` at t = 0 and every `period` s, before a plant's step from there.
 
     The first call is at initialisation, before all periodic events and a plant's first step. Later
@@ -95,6 +96,9 @@ def update_every(
         period: s.
         update: takes a Context and the State to be changed.
         when: the lead, a function in `scenario.timing`.
+
+    Returns:
+        Index of that abstract state.
     """
     change, early = weak(update), when(positive("period", period))
     last = int(system.DeclareAbstractState(Value(math.inf)))
@@ -112,6 +116,7 @@ def update_every(
 
     system.DeclareInitializationUnrestrictedUpdateEvent(first)
     system.DeclarePeriodicUnrestrictedUpdateEvent(early, early, call)
+    return last
 
 
 class Sample(NamedTuple):
@@ -146,7 +151,7 @@ class SteppedLaw(LeafSystem):
             ValueProducer(allocate=lambda: Value(first), calc=weak(self._calc_step)),
             {self.all_input_ports_ticket(), *self._held},
         )
-        update_every(self, period, self._update, when)
+        self._period, self._called = period, update_every(self, period, self._update, when)
 
     @abstractmethod
     def _prepared(self, context: Context) -> Callable[[], Any]:
@@ -162,11 +167,24 @@ class SteppedLaw(LeafSystem):
     ) -> None:
         """Declare an output (size,) of the memory, of the last sample or of `now`."""
         ticket = {self._step.ticket()} if now else self._held
-        self.DeclareVectorOutputPort(port, size, weak(self._show, part, now), ticket)
+        self.DeclareVectorOutputPort(port, size, weak(self._show, port, part, now), ticket)
 
     def _show(
-        self, part: Callable[[Any], Array], now: bool, context: Context, output: BasicVector
+        self,
+        port: str,
+        part: Callable[[Any], Array],
+        now: bool,
+        context: Context,
+        output: BasicVector,
     ) -> None:
+        called: Any = context.get_abstract_state(self._called)
+        if now and 0 <= context.get_time() - called.get_value() < self._period * (1 - 1e-6):
+            warnings.warn(
+                f"{self.get_name()}: got a reader of the port {port} between the updates, every "
+                f"{self._period:g} s; expected one with `update_every`, such as DelayChain, or the "
+                "held port torque_commanded",
+                stacklevel=1,
+            )
         sample: Any = self._step.Eval(context) if now else self.sample(context)
         output.SetFromVector(part(sample.memory))
 

@@ -131,8 +131,8 @@ class LinkStudy:
     def unconfirmed_losses(self) -> list[float]:
         """Usable bounds in s that lost more runs than the best, unconfirmed by Fisher's test."""
         best, found = self.best, list[float]()
-        for cell in self.usable:
-            if best is None or len(cell.errors) >= len(best.errors):
+        for cell in self.usable:  # an interrupted study has cells of fewer runs, or none
+            if best is None or not cell.completed < best.completed:
                 continue
             table = np.array([[len(c.errors), c.runs - len(c.errors)] for c in (best, cell)])
             if stats.fisher_exact(table, "greater").pvalue > 1 - CONFIDENCE:

@@ -298,9 +298,8 @@ def proposed(m: Measurements, name: str, machine: Path) -> MechanismCheck:
     machine.write_text(machine_text(m, name))
     check = check_mechanism(load_mechanism(machine), m.gravity)
     if check.failure is not None:
-        other = "apart" if m.cranks == "together" else "together"
         found = check.verdict.removeprefix("no: ")
-        raise ConfigError(f"{found}; expected other lengths, or cranks that point {other}")
+        raise ConfigError(f"{found}; expected other lengths, or {_other_cranks(m)}")
     needed = float(np.abs(check.torque).max())
     if m.torque_limit is not None and m.torque_limit < needed:
         raise ConfigError(
@@ -308,6 +307,10 @@ def proposed(m: Measurements, name: str, machine: Path) -> MechanismCheck:
             f"expected more than {needed:.3g} N m, or other measurements"
         )
     return check
+
+
+def _other_cranks(m: Measurements) -> str:
+    return f"cranks that point {'apart' if m.cranks == 'together' else 'together'}"
 
 
 def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
@@ -324,7 +327,10 @@ def new_machine(m: Measurements, name: str, folder: Path) -> NewMachine:
         along = clearance_along(ClearanceScene(mechanism), mechanism, time, poses)
         plant, duration = experiment.nominal, experiment.scenario.duration
         torque = reference_torque(plant, experiment.reference, duration)
-        made = NewMachine(check, controller_margin(experiment), torque, along.crossings)
+        crossings = along.crossings
+        if along.touching:
+            crossings[0] += f"; compare {_other_cranks(m)}"
+        made = NewMachine(check, controller_margin(experiment), torque, crossings)
         for path in (machine, scenario):
             write_whole(folder / path.name, path.read_bytes())
     return made
