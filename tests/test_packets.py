@@ -537,8 +537,9 @@ def test_bounds_are_alike_where_the_seeds_do_not_tell_them_apart(known_outcomes)
     ]
     partial = replace(study, bounds=begun, losses=[], interrupted=True)
     assert partial.unconfirmed_losses == []  # nothing was lost, only not run
-    assert document(partial).verdict.startswith("Interrupted: not all simulations were run; with --out the same")
-    assert "is worse" not in document(partial).verdict
+    told = document(partial).verdict
+    assert told.startswith("Interrupted: not all simulations were run; with --out the same")
+    assert "is worse" not in told
 
 
 def test_a_bound_at_which_most_packets_are_late_is_not_recommended(known_outcomes):
