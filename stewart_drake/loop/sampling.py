@@ -151,7 +151,7 @@ class SteppedLaw(LeafSystem):
             ValueProducer(allocate=lambda: Value(first), calc=weak(self._calc_step)),
             {self.all_input_ports_ticket(), *self._held},
         )
-        self._period, self._called = period, update_every(self, period, self._update, when)
+        self._every, self._called = period, update_every(self, period, self._update, when)
 
     @abstractmethod
     def _prepared(self, context: Context) -> Callable[[], Any]:
@@ -178,10 +178,11 @@ class SteppedLaw(LeafSystem):
         output: BasicVector,
     ) -> None:
         called: Any = context.get_abstract_state(self._called)
-        if now and 0 <= context.get_time() - called.get_value() < self._period * (1 - 1e-6):
+        since = context.get_time() - called.get_value()
+        if now and port == "torque" and 0 <= since < self._every * (1 - 1e-6):
             warnings.warn(
                 f"{self.get_name()}: got a reader of the port {port} between the updates, every "
-                f"{self._period:g} s; expected one with `update_every`, such as DelayChain, or the "
+                f"{self._every:g} s; expected one with `update_every`, such as DelayChain, or the "
                 "held port torque_commanded",
                 stacklevel=1,
             )
