@@ -9,14 +9,6 @@
 #error "compile without -ffast-math and -ffinite-math-only: they remove the checks for NaN and infinity"
 #endif
 
-/* Also compile a function for AVX2, where the library's loader can choose. Without fused operations both
-   versions have the same results. */
-#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__gnu_linux__)
-#define WIDE __attribute__((target_clones("avx2", "default")))
-#else
-#define WIDE
-#endif
-
 #ifdef STEWART_FLOAT
 typedef float real;
 #define REAL(function) function##f

@@ -75,8 +75,7 @@ def c_function(name: str, inputs: Sequence[Input], **outputs: ca.SX) -> str:
     before, inside = _statements(function, inputs, list(outputs), looped)
     parameters = [f"fixed *restrict {i.name}" for i in inputs]
     parameters += [f"real *restrict {output}" for output in outputs]
-    wide = "WIDE " if looped else ""
-    lines = [f"static {wide}void {name}({', '.join(parameters)})", "{"]
+    lines = [f"static void {name}({', '.join(parameters)})", "{"]
     lines += [f"    {line}" for line in before]
     if looped:
         lines += ["    for (int leg = 0; leg < 6; leg++) {"]
