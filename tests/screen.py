@@ -6,12 +6,12 @@ from typing import Any
 
 from stewart_drake.cli import main
 
-NAMES_A_FILE = ("written to ", "next: ")
+NAMES_A_FILE = ("written to ", "next: ", "overlay=/")
 
 
 def too_long(printed: str) -> list[str]:
     """Return the lines that do not fit, but for those that name a file or folder, of any length."""
-    return [s for s in printed.splitlines() if len(s) > 80 and not s.startswith(NAMES_A_FILE)]
+    return [s for s in printed.splitlines() if len(s) > 80 and not s.lstrip().startswith(NAMES_A_FILE)]
 
 
 def said(capsys: Any, *words: str | Path) -> str:
