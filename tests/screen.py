@@ -11,7 +11,9 @@ NAMES_A_FILE = ("written to ", "next: ", "overlay=/")
 
 def too_long(printed: str) -> list[str]:
     """Return the lines that do not fit, but for those that name a file or folder, of any length."""
-    return [s for s in printed.splitlines() if len(s) > 80 and not s.lstrip().startswith(NAMES_A_FILE)]
+    return [
+        s for s in printed.splitlines() if len(s) > 80 and not s.lstrip().startswith(NAMES_A_FILE)
+    ]
 
 
 def said(capsys: Any, *words: str | Path) -> str:
