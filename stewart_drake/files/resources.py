@@ -64,25 +64,23 @@ def resolve(kind: Kind, name_or_path: str | Path) -> Path:
     Raises:
         ConfigError: no such name or file; the message lists what is shipped, nearest first.
     """
+    name, (_, place, suffix) = str(name_or_path), KINDS[kind]
+    inside = absolute_path(name) / f"{kind}.yaml"
+    holds_one = bool(name) and os.path.exists(inside)
+    lacks_one = bool(name) and os.path.isdir(name) and suffix == ".yaml" and not holds_one
+    found = f"{name!r}, a folder without {kind}.yaml" if lacks_one else repr(name)
     if is_path(name_or_path):
         path = absolute_path(name_or_path)
-        if os.path.exists(inside := path / f"{kind}.yaml"):
+        if holds_one:
             return inside
-        if os.path.isdir(path) and KINDS[kind][2] == ".yaml":
-            raise ConfigError(
-                f"{kind}: got {str(name_or_path)!r}, a folder without {kind}.yaml; expected a "
-                "file, or a folder with that one"
-            )
+        if lacks_one:
+            raise ConfigError(f"{kind}: got {found}; expected a file, or a folder with that one")
         if os.path.exists(path):
             return path
         raise ConfigError(f"{kind}: no file {str(path)!r}; shipped names: {_nearest(kind, '')}")
-    name, (_, place, suffix) = str(name_or_path), KINDS[kind]
     path = data_root() / place / f"{name}{suffix}"
     if not name or not path.exists():
-        own = f"{name}/{kind}.yaml"  # of a folder, without a slash
-        nearest = f"{own}, " if name and absolute_path(own).exists() else ""
-        folder = name and not nearest and os.path.isdir(name)
-        found = f"{name!r}, a folder without {kind}.yaml" if folder else repr(name)
+        nearest = f"{name}/{kind}.yaml, " if holds_one else ""
         raise ConfigError(
             f"{kind}: got {found}; expected {nearest}one of {_nearest(kind, name)}, or a path "
             "(with a slash, or ending in .yaml, .yml or .json)"
