@@ -164,8 +164,8 @@ int stewart_step_scratch(const stewart_law *law);
 /* Number of torques in flight at a sample, under the assumed delay. */
 int stewart_queue_length(const stewart_law *law);
 
-/* Call before the first step. `queue` (number, 6) has the torques in flight, the oldest first, which counts
-   as acting before, too. Of too many for the memory the newest count. */
+/* Call before the first step. `queue` (number, 6) has the torques in flight, the oldest first. The oldest one
+   is taken to have acted before, too. Of more than the memory holds, the newest are taken. */
 void stewart_start(const stewart_law *law, real *memory, int number, const real *queue);
 
 /* Compute the torque (6) of a sample. It is not limited: apply `stewart_limit` before you send it.
