@@ -1,6 +1,7 @@
 """Figures as lists of panels, drawn by one function."""
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
@@ -113,7 +114,6 @@ def draw(
         last = one.x not in below
         named |= {row} if last else set()
         _fill(ax, one, last=last, named=column == 0 or not alike)
-    figure.align_ylabels()
     titled = sum(any(one.title or one.legend == "panel" for one in row) for row in in_row)
     lines = _legend(figure, panels, title) + titled
     figure.set_figheight(sum(heights) + _LABELS * len(named) + _LEGEND_LINE * (lines + 0.5))
@@ -124,12 +124,25 @@ def draw(
     assert engine is not None
     engine.execute(figure)
     figure.set_layout_engine(None)
+    _align_ylabels(figure.axes[: len(pairs)])
     return figure
+
+
+def _align_ylabels(axes: Sequence[Axes]) -> None:
+    """Align the names of vertical axes in each column, once: Matplotlib does it at each drawing."""
+    columns = defaultdict[float, dict[Axes, float]](dict)
+    for ax in axes:
+        ax.yaxis.get_tightbbox()  # places its name
+        x, _ = ax.transAxes.inverted().transform((ax.yaxis.label.get_position()[0], 0))
+        columns[round(ax.get_position().x0, 3)][ax] = x
+    for column in columns.values():
+        for ax in column:
+            ax.yaxis.set_label_coords(min(column.values()), 0.5)
 
 
 def _fill(ax: Axes, panel: Panel, last: bool, named: bool) -> None:
     if isinstance(ax.yaxis.get_major_formatter(), ScalarFormatter):
-        ax.ticklabel_format(axis="y", scilimits=(-2, 4), useMathText=True, useOffset=False)
+        ax.yaxis.set_major_formatter(style.PlainNumbers())
     for one in panel.curves:
         how: dict[str, Any] = {"drawstyle": "steps-post"} if one.steps else {}
         ax.plot(one.x, one.y, label=one.label or None, **one.line._asdict(), **how)

@@ -10,7 +10,13 @@ import matplotlib
 import numpy as np
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import (
+    FormatStrFormatter,
+    LogLocator,
+    MaxNLocator,
+    NullFormatter,
+    ScalarFormatter,
+)
 
 from stewart_drake.files.fileio import replacing
 from stewart_drake.types import ArrayLike
@@ -166,9 +172,23 @@ def powers_of_ten(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
+_RAISED: Final = str.maketrans("-−0123456789", "⁻⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
 def _power_of_ten(value: float, _: float) -> str:
-    raised = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-    return "10" + f"{round(np.log10(value))}".translate(raised)
+    return "10" + f"{round(np.log10(value))}".translate(_RAISED)
+
+
+class PlainNumbers(ScalarFormatter):
+    """Numbers with a common power of ten above the axis, as text: see `powers_of_ten`."""
+
+    def __init__(self) -> None:
+        super().__init__(useOffset=False)
+        self.set_powerlimits((-2, 4))
+
+    def get_offset(self) -> str:
+        _, _, power = super().get_offset().partition("e")
+        return f"×10{power.translate(_RAISED)}" if power else ""
 
 
 def write_figures(figures: Mapping[str, Figure], directory: str | Path) -> list[Path]:
