@@ -160,6 +160,8 @@ def test_steps_of_a_users_plant_need_to_fit_period_and_delay_only():
     motion = PiecewisePolynomial(PAPER.home.reshape(6, 1))
     law = sd.design_law(platform, motion, 0.015, 0.03)
     assert law.experiment.scenario.plant.step == 1.5e-3
+    with pytest.raises(ConfigError, match=r"^delay: got 0.02; .* of plant.time_step"):
+        law.delay_chain(0.02)
     for period, delay, field in ((0.02, 0.03, "period: got 0.02"), (0.015, 0.02, "delay: got")):
         with pytest.raises(ConfigError, match=f"^{field}.* of plant.time_step"):
             sd.design_law(platform, motion, period, delay)

@@ -562,7 +562,10 @@ class DesignedLaw:
         """
         period, true = self.law.timeline.period, self.law.timeline.delay
         if delay is not None:
-            true = Delay.of(float(fixed("delay", delay, (), 0.0)), period)
+            late, step = float(fixed("delay", delay, (), 0.0)), self.experiment.scenario.plant.step
+            if step and (problem := multiple_problem("delay", late, step)):
+                raise ConfigError(problem)
+            true = Delay.of(late, period)
         queue = self.experiment.torques_in_flight(true)
         return DelayChain(period, true.steps, true.fraction, queue)
 

@@ -179,8 +179,9 @@ class SteppedLaw(LeafSystem):
         With the name of a `held` port, a reader of this one that does not read it at every sample,
         and then only, causes a warning.
         """
-        ticket, show = {self._step.ticket()} if now else self._held, self._show
-        self.DeclareVectorOutputPort(port, size, weak(show, port, part, now, held), ticket)
+        ticket = {self._step.ticket()} if now else self._held
+        show = weak(self._show, port, part, now, held)
+        self.DeclareVectorOutputPort(port, size, show, ticket)
 
     def _show(
         self,
