@@ -507,7 +507,8 @@ def catch_up_of(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
 def first_queue(experiment: Experiment, law: PredictiveLqi) -> Array:
     """Return the torques in flight at t = 0 that a law assumes.
 
-    For a law that estimates the delay there is one for each period up to the longest delay.
+    For a law that estimates the delay there is one for each period up to the longest delay. They
+    begin at the samples, while those of a plant begin at k dt + eta0.
     """
     delay = Delay(law.queue_length) if law.finds_delay else law.timeline.delay
     return experiment.torques_in_flight(delay)
@@ -532,8 +533,9 @@ class DesignedLaw:
         law: the control law, a pure function from one memory to the next.
         reference: trajectory (6, 1).
         planned: trajectory that the law follows: the reference, or first a way onto it.
-        queue: (L, 6) assumed torques in flight at t = 0 in N m, oldest first; of a law that
-            estimates the delay those of all periods of the longest delay.
+        queue: (L, 6) assumed torques in flight at t = 0 in N m, oldest first. A law that
+            estimates the delay has one for each period of the longest delay, from t = 0 on; those
+            of a plant whose delay is no whole number of periods begin between its samples.
         weights: (2,) w_Q and w_R.
         experiment: from which `sd.controller_margin` and `sd.linear_models` make the loop.
     """
