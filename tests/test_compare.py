@@ -170,6 +170,8 @@ def test_a_controller_that_assumes_no_delay_keeps_none(how, tmp_path):
         (["nothing"], "controller: got 'nothing'; expected one of adaptive_lqi, "),
         (["a/lqi.yaml"], "controllers: got 'a/lqi.yaml', named as a shipped controller"),
         ([], "controllers: got \\[\\]; expected a list of names, files, or mappings"),
+        ({}, "controllers: got {}; expected a list of names"),
+        ([{}], "controllers: got .{}.; expected a list of names"),
         ("lqi", "controllers: got 'lqi'; expected a list"),
         ([7], "controllers: got 7; expected a list"),
     ],

@@ -85,6 +85,55 @@ def test_a_plant_that_reads_the_torque_between_the_samples_is_warned_of(port):
     assert all(one.startswith("delay_lqi: got a reader of the port torque b") for one in messages)
 
 
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_delay_chain_that_leaves_out_torques_is_warned_of(every):
+    """It reads every torque, or only some at the samples."""
+    builder = DiagramBuilder()
+    platform = sd.AddStewartPlatform(builder, PAPER, sd.PlantConfig(kind="exact"))
+    motion = PiecewisePolynomial(PAPER.home.reshape(6, 1))
+    controller = sd.design_law(platform, motion, 0.02, 0.04).AddToBuilder(builder)
+    chain = builder.AddSystem(sd.systems.DelayChain(0.02 * every, 2))
+    builder.Connect(platform.GetOutputPort("state"), controller.GetInputPort("measurement"))
+    builder.Connect(controller.GetOutputPort("torque"), chain.get_input_port())
+    builder.Connect(chain.get_output_port(), platform.GetInputPort("torque"))
+    simulator = Simulator(builder.Build())
+    sd.set_accuracy(simulator)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("default")
+        simulator.AdvanceTo(0.1)
+        simulator.Initialize()
+        simulator.AdvanceTo(0.2)
+    assert any("that skips samples" in str(one.message) for one in warned) == (every == 2), warned
+    assert bool(warned) == (every == 2)
+
+
+@pytest.mark.parametrize("delay", [0.04, 0.1])
+def test_a_shipped_law_estimates_the_delay_of_a_chain(delay):
+    """The chain has the torques in flight for its own delay, which is not the assumed one."""
+    moves = PAPER.home + np.array([np.zeros(6), [0.1, 0, 0.2, 0.02, 0, 0.02], np.zeros(6)])
+    motion = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
+        [0.0, 1.0, 2.0], moves.T, np.zeros(6), np.zeros(6)
+    )
+    builder = DiagramBuilder()
+    platform = sd.AddStewartPlatform(builder, PAPER, sd.PlantConfig(kind="exact", gravity=True))
+    law = sd.design_law(platform, motion, 0.02, 0.06, queue="reference", options="adaptive_lqi")
+    controller, chain = law.AddToBuilder(builder), builder.AddSystem(law.delay_chain(delay))
+    builder.Connect(platform.GetOutputPort("state"), controller.GetInputPort("measurement"))
+    builder.Connect(controller.GetOutputPort("torque"), chain.get_input_port())
+    builder.Connect(chain.get_output_port(), platform.GetInputPort("torque"))
+    simulator = Simulator(builder.Build())
+    sd.set_accuracy(simulator)
+    simulator.AdvanceTo(1.0)
+    root = simulator.get_context()
+    at, context = platform.plant.GetMyContextFromRoot(root), controller.GetMyContextFromRoot(root)
+    pose = platform.GetOutputPort("state").Eval(at)[POSE]
+    assert np.abs(pose - motion.value(1.0)[:, 0]).max() < 2e-3
+    assert controller.GetOutputPort("delay_estimate").Eval(context) == pytest.approx(
+        delay, abs=1e-5
+    )
+    assert controller.memory(context).counts.bad_measurements == 0
+
+
 @pytest.mark.parametrize("delay", [0.0, 0.1, 0.11])
 def test_the_delay_of_a_law_that_estimates_it_begins_as_that_of_the_known_one(delay):
     moves = PAPER.home + np.array([np.zeros(6), [0.1, 0, 0.2, 0.02, 0, 0.02], np.zeros(6)])
@@ -111,6 +160,8 @@ def test_steps_of_a_users_plant_need_to_fit_period_and_delay_only():
     motion = PiecewisePolynomial(PAPER.home.reshape(6, 1))
     law = sd.design_law(platform, motion, 0.015, 0.03)
     assert law.experiment.scenario.plant.step == 1.5e-3
+    with pytest.raises(ConfigError, match=r"^delay: got 0.02; .* of plant.time_step"):
+        law.delay_chain(0.02)
     for period, delay, field in ((0.02, 0.03, "period: got 0.02"), (0.015, 0.02, "delay: got")):
         with pytest.raises(ConfigError, match=f"^{field}.* of plant.time_step"):
             sd.design_law(platform, motion, period, delay)
@@ -202,6 +253,7 @@ def test_without_a_start_it_begins_on_the_reference():
         ({"reference": "paper"}, "reference: got 'paper'; expected a Trajectory"),
         ({"reference": PiecewisePolynomial((PAPER.home + 9.0).reshape(6, 1))}, "reference: leg"),
         ({"options": {}}, "options: got {}; expected a ControllerConfig"),
+        ({"options": "no"}, "controller: got 'no'; expected one of adaptive_lqi"),
         ({"start": np.full(12, np.nan)}, "start: got [nan"),
         ({"start": np.full(12, 9.0)}, "start: got a pose where leg"),
         ({"noise_std": "low"}, "noise_std: got 'low'; expected numbers"),

@@ -200,6 +200,23 @@ def test_an_exception_of_a_system_names_it_and_the_time(size, error, note):
 # ------------------------------------------------------------------ the border
 
 
+def test_a_controller_is_also_a_shipped_name_or_a_file(tmp_path):
+    """It is laid over the scenario's, as by `load_scenario`, wherever an own system is accepted."""
+    chosen, laid = scenario("duration=0.1"), sd.load_scenario(scenario("duration=0.1"), "lqi")
+    path = tmp_path / "mine.yaml"
+    path.write_text("integral: false")
+    run = sd.simulate(chosen, controller="lqi", judge_stability=False)
+    assert run.scenario == laid and run.summary["own"] == {}
+    assert not sd.build_closed_loop(chosen, controller=path).experiment.scenario.controller.integral
+    found, expected = sd.controller_margin(chosen, controller="lqi"), sd.controller_margin(laid)
+    assert found.summary == expected.summary
+    assert sd.linear_models(chosen, 0.0, controller=str(path)).law.nstates == 0, "no integral"
+    with pytest.raises(sd.ConfigError, match=r"controller: got 'no'; expected one of adaptive_lqi"):
+        sd.simulate(chosen, controller="no")
+    with pytest.raises(TypeError, match="controller: got one with a loop that has its own"):
+        sd.simulate(prepare(chosen), controller="lqi")
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

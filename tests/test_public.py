@@ -327,6 +327,9 @@ def test_analyses_are_answers_that_can_be_printed_shown_and_saved(tmp_path):
     assert {path.name for path in (tmp_path / "new").iterdir()} == {"report.html", "summary.json"}
     saved = json.loads((tmp_path / "new" / "summary.json").read_text())
     assert saved == jsonable(found.summary)
+    tables = found.to_pandas()
+    assert list(tables) == ["legs", "travel", "sections", "motors"]
+    assert list(tables["motors"].leg) == [1, 2, 3, 4, 5, 6]
 
 
 def test_a_network_is_analysed():

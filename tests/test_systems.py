@@ -210,6 +210,8 @@ NETWORK = load_network(resolve("weights", "tuner"))
         (lambda: DensityWindow(0.1, "square"), "kind: got 'square'"),
         (lambda: DensityWindow(-0.1), "period: got -0.1"),
         (lambda: AnnTuner(NETWORK, [1.0, NAN], 0.1), "fixed: got [1, nan]"),
+        (lambda: AnnTuner("tuner", [1.0, NAN], 0.1), "fixed: got [1, nan]"),
+        (lambda: AnnTuner("health_T", [1.0, 1.0], 0.1), "network.features: got 'health'"),
         (lambda: ExactPlant(MACHINE, 0.1), "initial_state: got shape ()"),
         (lambda: Timeline(0.1, 0.8), "delay: got 0.8; expected a Delay"),
         (lambda: Timeline(0.0, AT_ONCE), "period: got 0.0"),

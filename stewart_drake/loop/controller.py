@@ -195,15 +195,16 @@ class DelayLqiController(_RecordedLaw):
         size = (law.extra_torques + 1) * (1 + NUM_TORQUES)
         self._report = self.DeclareVectorInputPort("report", size) if sends else None
         self._record(law, first)
-        self._put_out("torque", NUM_TORQUES, lambda m: m.torque, now=True)
+        self._put_out("torque", NUM_TORQUES, lambda m: m.torque, now=True, held="torque_commanded")
         self.DeclareAbstractOutputPort(
-            "memory", lambda: Value(Sample(first, 0.0)), weak(self._left), {self._step.ticket()}
+            "memory", lambda: Value(Sample(first)), weak(self._left), {self._step.ticket()}
         )
         if sends:
             size = first.sent.packets[0].size
             self._put_out("plan", size, lambda m: m.sent.packets[-1].ravel(), now=True)
 
     def memory(self, context: Context) -> Memory:
+        """Return the memory of the last sample, such as its `counts`, in this system's context."""
         return self.sample(context).memory
 
     def _prepared(self, context: Context) -> Callable[[], Memory]:
@@ -323,7 +324,7 @@ class SampledController(SteppedLaw):
         self._measurement = self.DeclareVectorInputPort("measurement", NUM_STATE)
         self._own = self.DeclareVectorInputPort("own_torque", NUM_TORQUES)
         self._begin(first, period)
-        self._put_out("torque", NUM_TORQUES, lambda m: m.torque, now=True)
+        self._put_out("torque", NUM_TORQUES, lambda m: m.torque, now=True, held="torque_commanded")
         for port, signal in ports_of("controller").items():
             if part := HELD_BY_ANY.get(signal.name):
                 self._put_out(port, signal.size, part)

@@ -36,7 +36,7 @@ import numpy as np
 
 from stewart_drake.dynamics.stewart import StewartDynamics
 from stewart_drake.dynamics.workspace import margin
-from stewart_drake.files.arguments import fixed
+from stewart_drake.files.arguments import fixed, of_kind
 from stewart_drake.files.errors import ConfigError
 from stewart_drake.law.cost import law_gain
 from stewart_drake.law.delay_model import ContinuousModel, chain, linear_model
@@ -54,7 +54,7 @@ from stewart_drake.law.stability import (
     worst_margins,
 )
 from stewart_drake.loop.law_design import DesignedLaw, compose_law, longest_wait
-from stewart_drake.loop.own import OwnSystem
+from stewart_drake.loop.own import OwnController
 from stewart_drake.loop.own_loop import OwnLoop, UnjudgedError, linearised
 from stewart_drake.loop.preparation import Experiment, as_experiment
 from stewart_drake.loop.results import MarginSummary
@@ -191,7 +191,7 @@ def controller_margin(
     machine: StewartDynamics | None = None,
     *,
     settings: Iterable[str] = (),
-    controller: OwnSystem | None = None,
+    controller: OwnController | None = None,
 ) -> ControllerMargin:
     """Judge stability and margins of a loop along its reference.
 
@@ -203,8 +203,8 @@ def controller_margin(
         until: s; None is the duration, or the horizon of the design.
         machine: the machine that the law drives; None is that of the scenario's plant.
         settings: as `load_scenario` takes them.
-        controller: your own in place of the scenario's, as of `simulate`: its class, or a function
-            that makes one. It is linearised by differences, and may have discrete state.
+        controller: in place of the scenario's, as of `simulate`: a name, a file, or your own class
+            or function. Your own is linearised by differences, and may have discrete state.
 
     Raises:
         ConfigError: bad input, an unreachable reference.
@@ -218,7 +218,9 @@ def controller_margin(
         problem = "the servos close their own loops, the delay is outside"
         return ControllerMargin(sc.controller.period, sc.eta, problem=problem, span=end)
     truth, law = _parts(loop, experiment)
-    truth = truth if machine is None else machine
+    if machine is not None:
+        of_kind("machine", machine, StewartDynamics)
+        truth = machine
     times = np.linspace(0.0, end, INSTANTS)
     poses = poses_along(experiment.reference, times)
     inside = [margin(truth.mechanism, pose) > 0 for pose in poses]
@@ -338,7 +340,7 @@ def loop_at(loop: Judged, time: float) -> LinearLoop:
 
 
 def _experiment_of(
-    loop: Judged, settings: Iterable[str] = (), controller: OwnSystem | None = None
+    loop: Judged, settings: Iterable[str] = (), controller: OwnController | None = None
 ) -> Experiment:
     given = loop.experiment if isinstance(loop, DesignedLaw) else loop
     return as_experiment(given, settings=settings, controller=controller)
@@ -459,7 +461,7 @@ def linear_models(
     time: float | None = None,
     *,
     settings: Iterable[str] = (),
-    controller: OwnSystem | None = None,
+    controller: OwnController | None = None,
 ) -> LinearModels:
     """Return a loop, linearised about its moving reference ("frozen").
 

@@ -6,6 +6,7 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -93,6 +94,7 @@ from stewart_drake.scenario.delay import Delay
 from stewart_drake.scenario.dependencies import differing
 from stewart_drake.scenario.field_types import MOST_PERIODS
 from stewart_drake.scenario.link import oldest
+from stewart_drake.scenario.loading import load_controller
 from stewart_drake.scenario.signals import (
     ACCELERATIONS,
     BIAS,
@@ -505,7 +507,8 @@ def catch_up_of(experiment: Experiment, law: PredictiveLqi) -> CatchUp | None:
 def first_queue(experiment: Experiment, law: PredictiveLqi) -> Array:
     """Return the torques in flight at t = 0 that a law assumes.
 
-    For a law that estimates the delay there is one for each period up to the longest delay.
+    For a law that estimates the delay there is one for each period up to the longest delay. They
+    begin at the samples, while those of a plant begin at k dt + eta0.
     """
     delay = Delay(law.queue_length) if law.finds_delay else law.timeline.delay
     return experiment.torques_in_flight(delay)
@@ -530,7 +533,9 @@ class DesignedLaw:
         law: the control law, a pure function from one memory to the next.
         reference: trajectory (6, 1).
         planned: trajectory that the law follows: the reference, or first a way onto it.
-        queue: (L, 6) assumed torques in flight at t = 0 in N m, oldest first.
+        queue: (L, 6) assumed torques in flight at t = 0 in N m, oldest first. A law that
+            estimates the delay has one for each period of the longest delay, from t = 0 on; those
+            of a plant whose delay is no whole number of periods begin between its samples.
         weights: (2,) w_Q and w_R.
         experiment: from which `sd.controller_margin` and `sd.linear_models` make the loop.
     """
@@ -551,12 +556,20 @@ class DesignedLaw:
         motion = followed_motion(self.law, self.planned, self.reference)
         return DelayLqiController(self.law, self.queue, motion)
 
-    def delay_chain(self) -> DelayChain:
-        """Return the delay that the law assumes as a LeafSystem, with its torques under way."""
-        timeline = self.law.timeline
-        steps, fraction = timeline.delay.steps, timeline.delay.fraction
-        queue = self.experiment.torques_in_flight(timeline.delay)  # not up to the longest delay
-        return DelayChain(timeline.period, steps, fraction, queue)
+    def delay_chain(self, delay: float | None = None) -> DelayChain:
+        """Return the delay of the torques as a LeafSystem, with those in flight at t = 0.
+
+        Args:
+            delay: true one, s; that which the law assumes if None.
+        """
+        period, true = self.law.timeline.period, self.law.timeline.delay
+        if delay is not None:
+            late, step = float(fixed("delay", delay, (), 0.0)), self.experiment.scenario.plant.step
+            if step and (problem := multiple_problem("delay", late, step)):
+                raise ConfigError(problem)
+            true = Delay.of(late, period)
+        queue = self.experiment.torques_in_flight(true)
+        return DelayChain(period, true.steps, true.fraction, queue)
 
     def AddToBuilder(
         self,
@@ -612,7 +625,7 @@ def design_law(
     noise_std: ArrayLike = (0.0,) * NUM_STATE,
     torque_limit: float | None = None,
     horizon: float | None = None,
-    options: ControllerConfig | None = None,
+    options: ControllerConfig | str | Path | None = None,
 ) -> DesignedLaw:
     """Design the delayed LQI law for a machine and a motion.
 
@@ -634,12 +647,15 @@ def design_law(
         torque_limit: of each motor, N m; None is the mechanism's, if it has one.
         horizon: part of the reference for the choice of weights and steps, and for the check of
             its reach, s; by default all of it, or 10 s of an endless one.
-        options: other options, as a scenario's `controller`; its period and delay are ignored.
+        options: other options, as a scenario's `controller`, or a controller's shipped name or
+            file; their period and delay are ignored.
 
     Raises:
         ConfigError: bad input, a reference or a start out of reach.
     """
-    options = ControllerConfig() if options is None else options
+    if options is None or isinstance(options, str | Path):
+        given = {} if options is None else load_controller(options)
+        options = validate(ControllerConfig, given, "options")
     engine: dict[str, Any] = {}
     if isinstance(dynamics, StewartPlatform):
         engine, dynamics = dynamics.engine, dynamics.dynamics

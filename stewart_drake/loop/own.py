@@ -3,6 +3,7 @@
 import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from traceback import walk_tb
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple, TypedDict, TypeVar
@@ -39,6 +40,8 @@ _CHECKS: Final = 200
 """Number of instants at which a trajectory is checked."""
 OwnSystem = System | Callable[[], System]
 """A system for one run, or a function that makes one, such as its class."""
+OwnController = str | Path | OwnSystem
+"""The same, or a controller's shipped name or file, laid over the scenario's."""
 OwnReference = Trajectory | Callable[[], Trajectory]
 OwnLaw = Callable[[Any], Any]
 """Takes the scenario's law, a `PredictiveLqi`, or `ServoPreview` for servos; returns a law of that
@@ -49,7 +52,7 @@ AnyLaw = TypeVar("AnyLaw", PredictiveLqi, ServoPreview)
 class OwnSystems(TypedDict, total=False):
     """What `loop.simulation.simulate` accepts in place of the scenario's."""
 
-    controller: OwnSystem | None
+    controller: OwnController | None
     reference: OwnReference | None
     disturbance: OwnSystem | None
     modify_law: OwnLaw | None
@@ -210,9 +213,10 @@ def _make(what: str, given: Any, kind: type) -> Any:
     made = given() if called and not misfit else given
     if not isinstance(made, kind):
         name = f"system with {_ports(what)}" if kind is System else "trajectory"
+        other = ", or a controller's name or path" if what == "controller" else ""
         raise ConfigError(
             f"{what}: got a {type(made).__name__}{misfit}; expected a Drake {name}, or a function "
-            "without arguments that makes one, such as its class"
+            f"without arguments that makes one, such as its class{other}"
         )
     return made
 

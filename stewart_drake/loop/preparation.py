@@ -276,7 +276,10 @@ def as_experiment(
         TypeError: settings or systems of the user with an Experiment, which has its own.
     """
     if not isinstance(scenario, Experiment):
-        return prepare(as_scenario(scenario, settings=settings), true_mechanism, take(own))
+        chosen = own.get("controller")
+        name = chosen if isinstance(chosen, str | Path) else None
+        own |= {"controller": None} if name is not None else {}
+        return prepare(as_scenario(scenario, name, settings), true_mechanism, take(own))
     given = {"true_mechanism": true_mechanism, "settings": settings or None}
     for name, thing in (given | own).items():
         if thing is not None:

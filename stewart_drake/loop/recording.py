@@ -162,7 +162,8 @@ class Recorder(Record):
         self.peak_applied = max(self.peak_applied, float(np.abs(applied).max()))
         if instant.sampled:
             controller_context = self._controller.GetMyContextFromRoot(context)
-            memory, seconds = self._controller.sample(controller_context)
+            sample = self._controller.sample(controller_context)
+            memory, seconds = sample.memory, sample.seconds
             usable = self.count(memory)
             if self._tuner is not None:
                 tuner_context = self._tuner.GetMyContextFromRoot(context)

@@ -13,8 +13,9 @@ import warnings
 import weakref
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import count
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
@@ -119,14 +120,16 @@ def update_every(
     return last
 
 
-class Sample(NamedTuple):
+@dataclass(eq=False)
+class Sample:
     """Result of one step of a law."""
 
     memory: Any
-    seconds: float  # computing time; 0 before the first step
+    seconds: float = 0.0  # computing time
+    read: bool = True  # whether a system has read it from a port for readers at the samples
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Sample":
-        """Return the same object: a memory is never changed."""
+        """Return the same object: only `read` is ever changed."""
         return self
 
 
@@ -143,7 +146,7 @@ class SteppedLaw(LeafSystem):
         self, memory: Any, period: float, when: Callable[[float], float] = event_time
     ) -> None:
         """Declare the state and its update, after the input ports."""
-        first = Sample(memory, 0.0)
+        first = Sample(memory)
         self._last = self.DeclareAbstractState(Value(first))
         self._held = {self.abstract_state_ticket(self._last)}
         self._step = self.DeclareCacheEntry(
@@ -163,37 +166,54 @@ class SteppedLaw(LeafSystem):
         return value.get_value()
 
     def _put_out(
-        self, port: str, size: int, part: Callable[[Any], Array], *, now: bool = False
+        self,
+        port: str,
+        size: int,
+        part: Callable[[Any], Array],
+        *,
+        now: bool = False,
+        held: str = "",
     ) -> None:
-        """Declare an output (size,) of the memory, of the last sample or of `now`."""
+        """Declare an output (size,) of the memory, of the last sample or of `now`.
+
+        With the name of a `held` port, a reader of this one that does not read it at every sample,
+        and then only, causes a warning.
+        """
         ticket = {self._step.ticket()} if now else self._held
-        self.DeclareVectorOutputPort(port, size, weak(self._show, port, part, now), ticket)
+        show = weak(self._show, port, part, now, held)
+        self.DeclareVectorOutputPort(port, size, show, ticket)
 
     def _show(
         self,
         port: str,
         part: Callable[[Any], Array],
         now: bool,
+        held: str,
         context: Context,
         output: BasicVector,
     ) -> None:
-        called: Any = context.get_abstract_state(self._called)
-        since = context.get_time() - called.get_value()
-        if now and port == "torque" and 0 <= since < self._every * (1 - 1e-6):
-            warnings.warn(
-                f"{self.get_name()}: got a reader of the port {port} between the updates, every "
-                f"{self._every:g} s; expected one with `update_every`, such as DelayChain, or the "
-                "held port torque_commanded",
-                stacklevel=1,
-            )
-        sample: Any = self._step.Eval(context) if now else self.sample(context)
+        last = self.sample(context)
+        sample: Any = self._step.Eval(context) if now else last
+        if held:
+            called: Any = context.get_abstract_state(self._called)
+            since = context.get_time() - called.get_value()
+            between = 0 <= since < self._every * (1 - 1e-6)
+            if between or not last.read:
+                warnings.warn(
+                    f"{self.get_name()}: got a reader of the port {port} "
+                    f"{'between the' if between else 'that skips'} samples; expected one that "
+                    f"reads every {self._every:g} s by `update_every`, such as DelayChain, or the "
+                    f"held port {held}",
+                    stacklevel=1,
+                )
+            sample.read = True
         output.SetFromVector(part(sample.memory))
 
     def _calc_step(self, context: Context, result: AbstractValue) -> None:
         step = self._prepared(context)
         started = time.perf_counter()
         memory = step()
-        result.set_value(Sample(memory, time.perf_counter() - started))
+        result.set_value(Sample(memory, time.perf_counter() - started, read=False))
 
     def _update(self, context: Context, state: State) -> None:
         state.get_mutable_abstract_state(int(self._last)).set_value(self._step.Eval(context))

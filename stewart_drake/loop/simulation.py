@@ -17,7 +17,7 @@ from stewart_drake.loop.cautions import cautions_after, cautions_before
 from stewart_drake.loop.controller_margin import ControllerMargin, controller_margin
 from stewart_drake.loop.diagram import ClosedLoop, PlantDiagram, build_closed_loop
 from stewart_drake.loop.exact import set_accuracy
-from stewart_drake.loop.own import OwnLaw, OwnReference, OwnSystem
+from stewart_drake.loop.own import OwnController, OwnLaw, OwnReference, OwnSystem
 from stewart_drake.loop.preparation import Experiment, as_experiment
 from stewart_drake.loop.recording import Recorder, summarize
 from stewart_drake.loop.results import SimulationResult
@@ -35,7 +35,7 @@ def simulate(
     scenario: Scenario | Experiment | str | Path,
     settings: Iterable[str] = (),
     *,
-    controller: OwnSystem | None = None,
+    controller: OwnController | None = None,
     reference: OwnReference | None = None,
     disturbance: OwnSystem | None = None,
     modify_law: OwnLaw | None = None,
@@ -59,10 +59,10 @@ def simulate(
     Args:
         scenario: a scenario, prepared or not, or a shipped name or file as for `load_scenario`.
         settings: as `load_scenario` takes them.
-        controller: a Drake system that replaces the shipped controller, with the inputs
-            `measurement` (12: measured pose and rates, rad, m and per s) and optionally `reference`
-            (18: present pose, rates, accelerations), and the output `torque` (6, N m), which is
-            read every `controller.period`, held, limited and delayed.
+        controller: a shipped name or a YAML file, laid over the scenario's own; or a Drake system
+            with the inputs `measurement` (12: measured pose and rates, rad, m and per s) and
+            optionally `reference` (18: present pose, rates, accelerations), and the output `torque`
+            (6, N m), which is read every `controller.period`, held, limited and delayed.
         reference: a 6 x 1 Drake Trajectory of the pose with derivatives of order 1 and 2, held
             after its end.
         disturbance: a Drake system with the output `torque` (6, N m), added at the shafts, or

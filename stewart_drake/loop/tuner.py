@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -18,7 +19,7 @@ from stewart_drake.loop.preparation import Experiment
 from stewart_drake.loop.sampling import Sample, SteppedLaw
 from stewart_drake.mechanism.trajectories import rows_along, spread_instants
 from stewart_drake.scenario.signals import NUM_REFERENCE, NUM_STATE, NUM_TORQUES, RATES, WEIGHTS
-from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Kind, Network
+from stewart_drake.tuner.network import NUM_INPUTS, WINDOW, Kind, Network, load_network
 from stewart_drake.tuner.source import (
     DensityFeatures,
     HealthFeatures,
@@ -105,13 +106,18 @@ class AnnTuner(SteppedLaw):
     | weights | output | 2 | w_Q, w_R | direct feedthrough |
 
     Args:
+        network: with densities for features, or its shipped name or file; its `density` is the kind
+            of the `DensityWindow`.
         fixed: (2,) w_Q and w_R at the first sample and after fallbacks.
         period: dt in s.
     """
 
-    def __init__(self, network: Network, fixed: Array, period: float) -> None:
+    def __init__(self, network: Network | str | Path, fixed: Array, period: float) -> None:
         super().__init__()
+        if isinstance(network, str | Path):
+            network = load_network(network)
         arguments.of_kind("network", network, Network)
+        arguments.one_of("network.features", network.features, ("densities",))
         first = arguments.fixed("fixed", fixed, (len(WEIGHTS),), 0.0)
         policy = PaperPolicy(network, first)
         self._source = WeightsSource(None, DensityFeatures(network.density), policy)

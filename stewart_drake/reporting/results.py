@@ -304,6 +304,18 @@ class AnalysisResult(Printed):
     def table(self) -> str:
         return self.document.plain()
 
+    def to_pandas(self) -> dict[str, pandas.DataFrame]:
+        """Return the lists of the summary by name, with a row per entry.
+
+        A nested entry is the column `error.rho`.
+        """
+        entries = {name: one for name, one in self.summary.items() if isinstance(one, list)}
+        return {
+            name: pandas.json_normalize(rows)
+            for name, rows in entries.items()
+            if rows and all(isinstance(row, dict) for row in rows)
+        }
+
     def plot(self, directory: str | Path | None = None) -> Figures:
         """Return the figures of the page by name, numbered where one comes again.
 

@@ -167,9 +167,11 @@ def shown(
 
 def _chosen(controllers: Any) -> tuple[list[str | Path] | None, dict[str, Callable[[], System]]]:
     """Return chosen names and files, None for the shipped controllers, and the user's systems."""
-    if controllers is None or isinstance(controllers, Mapping):
-        return None, dict(controllers or {})
-    few = isinstance(controllers, str) or len(controllers) == 0
+    if controllers is None:
+        return None, {}
+    if isinstance(controllers, Mapping) and controllers:
+        return None, dict(controllers)
+    few = isinstance(controllers, str | Mapping) or not any(map(bool, controllers))
     wrong = [] if few else [one for one in controllers if not isinstance(one, str | Path | Mapping)]
     if few or wrong:
         raise ConfigError(
