@@ -701,6 +701,13 @@ def test_a_delay_estimator_needs_a_wire(offer):
     assert as_seen(aware, link, replace(message, flags=message.flags | MachineFlags.WIRE))
 
 
+def test_a_network_is_refused_for_a_machine_that_simulates_a_wire(offer):
+    message, link = offer
+    wired = replace(message, flags=message.flags | MachineFlags.WIRE)
+    with pytest.raises(ConfigError, match=r"^link\.kind: got 'network' .* link\.kind=network$"):
+        as_seen(scenario_of("link.kind=network"), link, wired)
+
+
 def test_the_tighter_torque_limit_counts(offer):
     message, link = offer
     seen = as_seen(scenario_of(), link, message)

@@ -1,6 +1,7 @@
 """Documents of a run, and of a comparison with the paper's Table II."""
 
 import math
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, Final
@@ -59,6 +60,8 @@ FINER: Final = {
 }
 """Units of a parameter's value, by its SI unit."""
 
+_SHARE: Final = re.compile(r" .*\((.*)\)")
+"""Error of a moving coordinate with its share, which alone fits into a table."""
 _Runs = Mapping[str, SimulationResult]
 
 
@@ -136,12 +139,12 @@ def moving(run: SimulationResult) -> Flags:
 
 
 def _peaks(run: SimulationResult, percent: Sequence[float]) -> list[str]:
-    """Return the largest error of each coordinate, in % of its motion; of a still one absolute."""
+    """Return the largest error of each coordinate, of a moving one in % of its motion too."""
     moved = moving(run)
+    errors = FACTORS * np.where(moved, span(run.signals.reference.values), 1.0) * percent / 100
     return [
-        f"{name} {number(percent[k], 2)} %"
-        if moved[k]
-        else f"{name} {number(round(FACTORS[k] * percent[k] / 100, 9))} {UNITS[k]}"
+        f"{name} {number(round(float(errors[k]), 9))} {UNITS[k]}"
+        + f" ({number(percent[k], 2)} %)" * bool(moved[k])
         for k, name in enumerate(COORDINATE_NAMES)
     ]
 
@@ -245,7 +248,7 @@ def _row(title: str, name: str, run: SimulationResult) -> dict[str, Any]:
     if stopped is None:
         floor = s["delay_floor"] if waits_at_rest(run.scenario) else "-"
         numbers = {"error": s["accumulated_error"], "floor": floor, "cost": s["cost"]}
-        return row | numbers | {"worst": worst(run)}
+        return row | numbers | {"worst": _SHARE.sub(r" \1", worst(run))}
     leg = "" if stopped.leg is None else f",\nleg {stopped.leg}"
     ended = f"{run.status.replace('_', ' ')}\nat {stopped.time:.2f} s{leg}"
     return row | {"error": ended, "worst": "-", "floor": "-", "cost": "-"}
