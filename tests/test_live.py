@@ -1088,6 +1088,7 @@ def test_after_a_loss_the_page_shows_reason_last_seconds_and_advice(tab, viewer)
     note = tab.evaluate("document.getElementById('note').textContent")
     assert "left workspace" in note and "crank 3 passed its dead centre" in note
     assert "Bring the plate back to its start" in note and "identify LOG" in note
+    assert "a larger controller.w_R tolerates more" in note
     assert "The picture is of the last sample" in note
     assert not tab.evaluate("document.getElementById('sliders').getClientRects().length")
     assert "last torques before the end" in tab.evaluate(
