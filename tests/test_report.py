@@ -144,6 +144,14 @@ def test_still_coordinates_do_not_dilute_the_error(amplitude, moved, words):
     assert still.count("%)") == moved, "that of a moving one in % of its motion too"
 
 
+def test_a_lost_run_has_the_errors_of_its_part_of_the_motion():
+    run = simulate(load_scenario("paper", "lqr", EXACT))
+    assert run.status == "left_workspace"
+    z = 1e3 * np.abs(run.signals.error.values[:, 5]).max()
+    (found,) = re.findall(r"z (\S+) mm \(", run_document(run).plain())
+    assert float(found) == pytest.approx(z, rel=0.01)
+
+
 def test_the_error_of_a_soft_start_is_told_from_the_later_one():
     run = simulate(load_scenario("reachy_mini", None, ("duration=3",)))
     text, _ = report_document.verdict(collect_of(run.scenario, run=run))

@@ -138,12 +138,15 @@ def moving(run: SimulationResult) -> Flags:
     return span(run.signals.reference.values) > STILL
 
 
-def _peaks(run: SimulationResult, percent: Sequence[float]) -> list[str]:
-    """Return the largest error of each coordinate, of a moving one in % of its motion too."""
-    moved = moving(run)
-    errors = FACTORS * np.where(moved, span(run.signals.reference.values), 1.0) * percent / 100
+def _peaks(run: SimulationResult, percent: Sequence[float], rows: slice = slice(None)) -> list[str]:
+    """Return the largest error of each coordinate in some rows, of a moving one also in `percent`.
+
+    The percentage is that of the whole motion, of which a lost run has a part only.
+    """
+    moved, errors = moving(run), np.abs(run.signals.error.values[rows])
+    largest = FACTORS * np.fmax.reduce(errors, axis=0, initial=np.nan)  # leaves out NaN
     return [
-        f"{name} {number(round(float(errors[k]), 9))} {UNITS[k]}"
+        f"{name} {number(round(float(largest[k]), 9))} {UNITS[k]}"
         + f" ({number(percent[k], 2)} %)" * bool(moved[k])
         for k, name in enumerate(COORDINATE_NAMES)
     ]
@@ -159,8 +162,10 @@ def late_error(run: SimulationResult) -> str:
     return f"{errors} in the second half{' of the motion' * rests}"
 
 
-def worst(run: SimulationResult, peaks: Sequence[float] | None = None) -> str:
-    """Return the coordinate with the largest error, of `peaks` or of the run, as in `_peaks`.
+def worst(
+    run: SimulationResult, peaks: Sequence[float] | None = None, rows: slice = slice(None)
+) -> str:
+    """Return the coordinate with the largest error, of `rows` or of the run, as in `_peaks`.
 
     The error of a still coordinate is compared with the largest motion in its unit, or with 1 rad
     or 1 m, as in E_ac, if there is none.
@@ -169,7 +174,7 @@ def worst(run: SimulationResult, peaks: Sequence[float] | None = None) -> str:
     motion = span(run.signals.reference.values)
     largest = np.repeat([motion[ANGLES].max(), motion[POSITION].max()], 3)
     share = np.array(peaks) / np.where(moving(run) | (largest <= STILL), 1.0, largest)
-    return _peaks(run, peaks)[int(np.argmax(share))]
+    return _peaks(run, peaks, rows)[int(np.argmax(share))]
 
 
 def comparison_document(
