@@ -701,6 +701,13 @@ def test_a_delay_estimator_needs_a_wire(offer):
     assert as_seen(aware, link, replace(message, flags=message.flags | MachineFlags.WIRE))
 
 
+def test_a_network_is_refused_for_a_machine_that_simulates_a_wire(offer):
+    message, link = offer
+    wired = replace(message, flags=message.flags | MachineFlags.WIRE)
+    with pytest.raises(ConfigError, match=r"^link\.kind: got 'network' .* link\.kind=network$"):
+        as_seen(scenario_of("link.kind=network"), link, wired)
+
+
 def test_the_tighter_torque_limit_counts(offer):
     message, link = offer
     seen = as_seen(scenario_of(), link, message)
@@ -1081,6 +1088,7 @@ def test_after_a_loss_the_page_shows_reason_last_seconds_and_advice(tab, viewer)
     note = tab.evaluate("document.getElementById('note').textContent")
     assert "left workspace" in note and "crank 3 passed its dead centre" in note
     assert "Bring the plate back to its start" in note and "identify LOG" in note
+    assert "a larger controller.w_R tolerates more" in note
     assert "The picture is of the last sample" in note
     assert not tab.evaluate("document.getElementById('sliders').getClientRects().length")
     assert "last torques before the end" in tab.evaluate(

@@ -527,6 +527,10 @@ def test_bounds_are_alike_where_the_seeds_do_not_tell_them_apart(known_outcomes)
 
     assert document(study).tone == "fair"
     assert document(replace(study, bounds=cells[:2])).tone == "good"
+    new = cells[0]._replace(loss=study.scenario.link.loss, errors=(1.0, 1.3, 0.8, 5.0))
+    rare = document(replace(study, bounds=cells[:2], losses=[new]))
+    assert rare.tone == "fair" and "is worse" not in rare.verdict
+    assert "the worst run 5.00 % s: too few runs for such rare errors; repeat" in rare.verdict
     many = [cells[0]._replace(runs=8, errors=(*common, *common)), cells[4]._replace(runs=8)]
     assert replace(study, bounds=many).unconfirmed_losses == []  # 3 of 8 against 8 of 8
 

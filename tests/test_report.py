@@ -119,7 +119,7 @@ def test_the_mean_error_leaves_out_the_time_in_which_nothing_can_act(summary):
 @pytest.mark.parametrize(
     ("amplitude", "moved", "words"),
     [
-        (0.03, 1, r"moving coordinates \(z\)\. Largest error: z \d+ % of its motion in the first"),
+        (0.03, 1, r"coordinates \(z\)\. Largest error: z \S+ mm \(\d+ % of its motion\) in"),
         (0.0, 6, r"of 1 rad and 1 m, as no .* Largest error: \w+ \d\.\d+ (mm|deg)\."),
     ],
 )
@@ -140,13 +140,23 @@ def test_still_coordinates_do_not_dilute_the_error(amplitude, moved, words):
     text, _ = report_document.verdict(collect_of(run.scenario, run=run))
     assert re.search(words, text)
     still = run_document(run).plain().partition("peak error")[2].split("rms error")[0]
-    assert still.count("deg") == 3 and still.count("mm") == (3 if moved == 6 else 2)
+    assert still.count("deg") == still.count("mm") == 3, "an error of each coordinate with its unit"
+    assert still.count("%)") == moved, "that of a moving one in % of its motion too"
+
+
+def test_a_lost_run_has_the_errors_of_its_part_of_the_motion():
+    run = simulate(load_scenario("paper", "lqr", EXACT))
+    assert run.status == "left_workspace"
+    z = 1e3 * np.abs(run.signals.error.values[:, 5]).max()
+    (found,) = re.findall(r"z (\S+) mm \(", run_document(run).plain())
+    assert float(found) == pytest.approx(z, rel=0.01)
 
 
 def test_the_error_of_a_soft_start_is_told_from_the_later_one():
     run = simulate(load_scenario("reachy_mini", None, ("duration=3",)))
     text, _ = report_document.verdict(collect_of(run.scenario, run=run))
-    found = re.search(r"error: z 35 % of its motion in the first half, x (.*) % in the sec", text)
+    parts = r": z \S+ mm \(35 % of its motion\) in the first half, x \S+ mm \((\S+) %\) in the sec"
+    found = re.search(parts, text)
     x, wanted = (np.array(run.signals[name].values[:, 3]) for name in ("pose", "reference"))
     late = np.abs(x - wanted)[run.signals.time.values >= 1.5].max()
     assert float(found[1]) == pytest.approx(100 * late / np.ptp(wanted), rel=0.05)

@@ -34,6 +34,11 @@ def test_a_path_starts_from_the_working_directory(tmp_path, monkeypatch):
     assert resources.resolve("scenario", "./sub/mine.yaml") == file
     assert resources.resolve("scenario", "sub/mine.yaml") == file
     assert resources.resolve("scenario", Path("sub/mine.yaml")) == file
+    machine = inside.with_name("machine.yaml")
+    machine.touch()
+    assert resources.resolve("mechanism", "./sub") == machine
+    with pytest.raises(ConfigError, match=r"got 'sub'; expected sub/machine\.yaml, one of"):
+        resources.resolve("mechanism", "sub")
     with pytest.raises(ConfigError, match=r"got 'sub'; expected sub/scenario\.yaml, one of"):
         resources.resolve("scenario", "sub")
 

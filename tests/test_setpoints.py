@@ -142,10 +142,18 @@ def test_units_are_those_of_the_servos(tmp_path):
     degrees = ServoUnits(unit="deg", offset=[1.0, 0, 0, 0, 0, 0])
     assert degrees.converted(angles)[0, :2] == pytest.approx([91.0, -45.0])
     path = tmp_path / "units.yaml"
-    path.write_text("unit: ticks\noffset: 2048.0\n")
-    assert load_units(path) == ServoUnits(unit="ticks", offset=2048.0)
+    path.write_text("unit: ticks\nticks_per_turn: 16384\noffset: 2048.0\n")
+    assert load_units(path) == ServoUnits("ticks", 16384.0, 2048.0)
     turns = "unit: deg\nticks_per_turn: 4096"
-    for wrong in ("unit: turns", "sign: 2", "offset: [1.0, 2.0]", "ticks: 3", "sign: .nan", turns):
+    for wrong in (
+        "unit: turns",
+        "sign: 2",
+        "offset: [1.0, 2.0]",
+        "ticks: 3",
+        "sign: .nan",
+        turns,
+        "unit: ticks",
+    ):
         path.write_text(wrong + "\n")
         with pytest.raises(ConfigError, match=r"^[^\n]*units\.yaml: [^\n]*$") as said:
             load_units(path)

@@ -78,8 +78,11 @@ def load_units(path: str | Path) -> ServoUnits:
     """Read a YAML file with the fields of `ServoUnits`."""
     data = load_yaml(Path(path))
     units = validate(ServoUnits, data, str(path))
-    if "ticks_per_turn" in data and units.unit != "ticks":
-        raise ConfigError(f"{path}: ticks_per_turn: got one in {units.unit}; expected unit: ticks")
+    if ("ticks_per_turn" in data) != (units.unit == "ticks"):
+        got = "none" if units.unit == "ticks" else "one"
+        raise ConfigError(
+            f"{path}: ticks_per_turn: got {got} in {units.unit}; expected one with unit: ticks only"
+        )
     return units
 
 

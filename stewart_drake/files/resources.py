@@ -59,13 +59,17 @@ def resolve(kind: Kind, name_or_path: str | Path) -> Path:
     """Return the absolute path of an existing data file.
 
     Args:
-        name_or_path: a shipped name, or the path of a file or of a folder with a file KIND.yaml.
+        name_or_path: a shipped name, or the path of a file or of a folder with a file KIND.yaml; a
+            mechanism's may be machine.yaml, as `new` writes it.
 
     Raises:
         ConfigError: no such name or file; the message lists what is shipped, nearest first.
     """
     name, (_, place, suffix) = str(name_or_path), KINDS[kind]
     inside = absolute_path(name) / f"{kind}.yaml"
+    of_new = inside.with_name("machine.yaml")
+    if kind == "mechanism" and os.path.exists(of_new) and not os.path.exists(inside):
+        inside = of_new
     holds_one = bool(name) and os.path.exists(inside)
     lacks_one = bool(name) and os.path.isdir(name) and suffix == ".yaml" and not holds_one
     found = f"{name!r}, a folder without {kind}.yaml" if lacks_one else repr(name)
@@ -80,7 +84,7 @@ def resolve(kind: Kind, name_or_path: str | Path) -> Path:
         raise ConfigError(f"{kind}: no file {str(path)!r}; shipped names: {_nearest(kind, '')}")
     path = data_root() / place / f"{name}{suffix}"
     if not name or not path.exists():
-        nearest = f"{name}/{kind}.yaml, " if holds_one else ""
+        nearest = f"{name}/{inside.name}, " if holds_one else ""
         raise ConfigError(
             f"{kind}: got {found}; expected {nearest}one of {_nearest(kind, name)}, or a path "
             "(with a slash, or ending in .yaml, .yml or .json)"

@@ -122,6 +122,11 @@ def as_seen(scenario: Scenario, link: Link, machine: MachineMessage) -> Scenario
     sensor = replace(scenario.sensor, delay=0.0, loss=loss, faults=[])
     seen = replace(scenario, sensor=sensor, plant=replace(scenario.plant, kind="exact"))
     if MachineFlags.WIRE in machine.flags:  # it delays torques as the scenario does
+        if scenario.link.kind == "network":
+            raise ConfigError(
+                "link.kind: got 'network' for a machine that simulates a wire; expected 'wire', or "
+                "a machine started with --set link.kind=network"
+            )
         return seen
     c = scenario.controller
     if c.delay_estimator != "none":

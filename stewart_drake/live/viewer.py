@@ -9,9 +9,10 @@ from stewart_drake.reporting.document import sentence
 from stewart_drake.types import Array
 
 _ADVICE: Final = {
-    "left_workspace": "Bring the plate back to its start and start live again. With --out the log "
-    "shows the loss: stewart-drake replay LOG. If it is 2 s longer than the delay: stewart-drake "
-    "identify LOG --mechanism FILE; else add coulomb to controller.estimate.",
+    "left_workspace": "Bring the plate back to its start and start live again; a larger "
+    "controller.w_R tolerates more. A log (--out or --log) shows the loss: stewart-drake replay "
+    "LOG. If it is 2 s longer than the delay: stewart-drake identify LOG --mechanism FILE; else "
+    "add coulomb to controller.estimate.",
     "lost_contact": "Datagrams arrive, usable measurements do not. If the "
     "machine reports a fault, see its terminal; if measurements are late, relieve both "
     "computers or the network; else check the sensor. --max-missing SECONDS allows longer gaps.",

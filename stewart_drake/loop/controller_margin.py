@@ -233,7 +233,8 @@ def controller_margin(
         problem = "the true machine does not reach all of the reference"
     elif sc.link.kind == "network" or longest_wait(sc):
         problem = (
-            "its packets or measurements do not all take the same time; see analyze robustness"
+            "its packets or measurements do not all take the same time; see analyze robustness, "
+            "and over a network analyze delay, which assumes every packet in time"
         )
     elif isinstance(law.sensing, EncoderSensing) and not law.estimates:
         problem = (

@@ -15,6 +15,8 @@ from stewart_drake.studies.statistics import CONFIDENCE
 
 _ASSURED: Final = 0.9
 """Share of runs for which the verdict states the number of simulations."""
+_RARE: Final = 2.0
+"""Worst error with new seeds, relative to that with the first, from which these are too few."""
 
 
 def document(study: LinkStudy) -> Document:
@@ -24,15 +26,17 @@ def document(study: LinkStudy) -> Document:
     undecided = {bound: excess for bound, excess in study.alike.items() if not excess < NEGLIGIBLE}
     short = len(study.bounds) - len(study.usable)
     unsure = ", ".join(f"{bound:g}" for bound in study.unconfirmed_losses)
+    rare = best and checked and max(checked.errors, default=0) > _RARE * max(best.errors)
     return from_template(
         "link",
-        "bad" if not own else "fair" if undecided or unsure else "good",
+        "bad" if not own else "fair" if undecided or unsure or rare else "good",
         study=study,
         repeated=controller.packet_repeats * controller.period,
         spread=lambda cell: float(np.std(cell.errors, ddof=1)),
         same=", ".join(same),
         undecided=undecided,
         unsure=unsure,
+        rare=rare,
         short_better=best and any(cell.mean < best.mean for cell in study.bounds[:short]),
         most=lambda cell: max(cell.errors, default=math.nan),
         assured=_ASSURED,

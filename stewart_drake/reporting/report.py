@@ -403,10 +403,11 @@ def _second_half(run: SimulationResult, scale: Array) -> str:
 def _worst_later(run: SimulationResult, scale: Array) -> str:
     """Return the largest error of the second half, if one in the first was twice that or more."""
     errors = run.signals.error.values
-    later = peak_error(errors[second_half(run.signals.reference.values)], scale)
+    half = second_half(run.signals.reference.values)
+    later = peak_error(errors[half], scale)
     if not max(run.summary["peak_error"]) > 2 * later.max():
         return ""
-    return f" in the first half, {worst(run, later.tolist())} in the second"
+    return f" in the first half, {worst(run, later.tolist(), half)} in the second"
 
 
 def mean_error(run: SimulationResult) -> float:

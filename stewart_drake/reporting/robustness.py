@@ -76,6 +76,7 @@ def document(study: RobustnessStudy) -> Document:
         fewer=min(found.failing, found.others),
         errors=_errors(study),
         usual=1e3 * Tolerances().lengths,
+        share=Tolerances().lengths / float(study.experiment.mechanism.crank_lengths.mean()),
         singles=found.failing >= _FEW and found.singles,
         pairs=found.failing >= _FEW and found.pairs,
         kept=lambda one: int(np.sum(~one.failed)),

@@ -1,6 +1,7 @@
 """Documents of a run, and of a comparison with the paper's Table II."""
 
 import math
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, Final
@@ -59,6 +60,8 @@ FINER: Final = {
 }
 """Units of a parameter's value, by its SI unit."""
 
+_SHARE: Final = re.compile(r" .*\((.*)\)")
+"""Error of a moving coordinate with its share, which alone fits into a table."""
 _Runs = Mapping[str, SimulationResult]
 
 
@@ -135,13 +138,16 @@ def moving(run: SimulationResult) -> Flags:
     return span(run.signals.reference.values) > STILL
 
 
-def _peaks(run: SimulationResult, percent: Sequence[float]) -> list[str]:
-    """Return the largest error of each coordinate, in % of its motion; of a still one absolute."""
-    moved = moving(run)
+def _peaks(run: SimulationResult, percent: Sequence[float], rows: slice = slice(None)) -> list[str]:
+    """Return the largest error of each coordinate in some rows, of a moving one also in `percent`.
+
+    The percentage is that of the whole motion, of which a lost run has a part only.
+    """
+    moved, errors = moving(run), np.abs(run.signals.error.values[rows])
+    largest = FACTORS * np.fmax.reduce(errors, axis=0, initial=np.nan)  # leaves out NaN
     return [
-        f"{name} {number(percent[k], 2)} %"
-        if moved[k]
-        else f"{name} {number(round(FACTORS[k] * percent[k] / 100, 9))} {UNITS[k]}"
+        f"{name} {number(round(float(largest[k]), 9))} {UNITS[k]}"
+        + f" ({number(percent[k], 2)} %)" * bool(moved[k])
         for k, name in enumerate(COORDINATE_NAMES)
     ]
 
@@ -156,8 +162,10 @@ def late_error(run: SimulationResult) -> str:
     return f"{errors} in the second half{' of the motion' * rests}"
 
 
-def worst(run: SimulationResult, peaks: Sequence[float] | None = None) -> str:
-    """Return the coordinate with the largest error, of `peaks` or of the run, as in `_peaks`.
+def worst(
+    run: SimulationResult, peaks: Sequence[float] | None = None, rows: slice = slice(None)
+) -> str:
+    """Return the coordinate with the largest error, of `rows` or of the run, as in `_peaks`.
 
     The error of a still coordinate is compared with the largest motion in its unit, or with 1 rad
     or 1 m, as in E_ac, if there is none.
@@ -166,7 +174,7 @@ def worst(run: SimulationResult, peaks: Sequence[float] | None = None) -> str:
     motion = span(run.signals.reference.values)
     largest = np.repeat([motion[ANGLES].max(), motion[POSITION].max()], 3)
     share = np.array(peaks) / np.where(moving(run) | (largest <= STILL), 1.0, largest)
-    return _peaks(run, peaks)[int(np.argmax(share))]
+    return _peaks(run, peaks, rows)[int(np.argmax(share))]
 
 
 def comparison_document(
@@ -245,7 +253,7 @@ def _row(title: str, name: str, run: SimulationResult) -> dict[str, Any]:
     if stopped is None:
         floor = s["delay_floor"] if waits_at_rest(run.scenario) else "-"
         numbers = {"error": s["accumulated_error"], "floor": floor, "cost": s["cost"]}
-        return row | numbers | {"worst": worst(run)}
+        return row | numbers | {"worst": _SHARE.sub(r" \1", worst(run))}
     leg = "" if stopped.leg is None else f",\nleg {stopped.leg}"
     ended = f"{run.status.replace('_', ' ')}\nat {stopped.time:.2f} s{leg}"
     return row | {"error": ended, "worst": "-", "floor": "-", "cost": "-"}
