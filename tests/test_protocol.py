@@ -21,6 +21,7 @@ from stewart_drake.files.errors import ConfigError
 from stewart_drake.live.endpoint import (
     SHORTEST_KEY,
     Endpoint,
+    Offers,
     Session,
     read_key,
 )
@@ -376,6 +377,15 @@ def test_a_session_is_of_two_numbers_and_an_address():
     head = session.head(1500)
     assert (head.sequence, head.acknowledged, head.echo, head.held) == (1, 1, 100, 500)
     assert session.head(1600).sequence == 2
+
+
+def test_a_nonce_is_of_session_address_secret_and_the_sessions_so_far():
+    offers, address = Offers(bytes(range(32))), ("127.0.0.1", 50000)
+    first = offers.nonce(7, address)
+    others = offers.nonce(8, address), offers.nonce(7, ("127.0.0.2", 50000))
+    others = *others, offers.nonce(7, ("127.0.0.1", 50001)), Offers().nonce(7, address)
+    offers.taken()
+    assert len({0, first, *others, offers.nonce(7, address)}) == 7
 
 
 # ---------------------------------------------------------------- sockets
